@@ -1,0 +1,50 @@
+# Two commands do everything on a fresh machine with Python >= 3.11, git and make: `make train` and `make test`.
+
+PYTHON ?= python3
+ARGS ?=
+PYTEST_ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+# Two workers side by side, each with one thread: more only make them wait for one another.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+.DEFAULT_GOAL := help
+.PHONY: help train test format clean
+
+help:
+	@echo "make train    set up if needed, then train an agent        (ARGS=... go to train.py)"
+	@echo "make test     set up if needed, then check everything      (PYTEST_ARGS=... go to pytest)"
+	@echo "make format   set up if needed, then format and fix what can be fixed"
+	@echo "make clean    remove caches and build products; keeps .venv and results"
+	@echo ""
+	@echo "Set-up makes .venv with PYTHON=$(PYTHON), and is repeated when pyproject.toml or constraints.txt change."
+
+train: $(READY)
+	$(BIN)/python train.py $(ARGS)
+
+# Format, lint, types; then the tests compiled, and once more as plain Python.
+test: $(READY)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	NUMBA_DISABLE_JIT=0 $(PYTEST) $(PYTEST_ARGS)
+	NUMBA_DISABLE_JIT=1 $(PYTEST) -m "not slow" $(PYTEST_ARGS)
+
+format: $(READY)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean:
+	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find bufgym agents tests -name __pycache__ -prune -exec rm -rf {} +
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "bufgym needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) --version 2>&1 || true)." >&2; \
+	  echo "Name another one: make PYTHON=python3.11 ..." >&2; exit 1; }
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
+	$(PIP) install --quiet -c constraints.txt -e ".[dev]"
+	@touch $@

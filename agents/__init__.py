@@ -1,0 +1,1 @@
+"""Agents that learn to buffer: networks, training, evaluation. Imports bufgym, never the reverse."""

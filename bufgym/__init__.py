@@ -1,0 +1,27 @@
+"""bufgym: the Gymnasium environment for learned buffering on robots.
+
+import gymnasium as gym
+import bufgym
+
+env = gym.make("bufgym/Uplink-v0", capacity=8)
+envs = gym.make_vec("bufgym/Uplink-v0", num_envs=1024, capacity=8)
+"""
+
+import gymnasium as _gym
+
+__version__ = "0.1.0"
+
+ENVIRONMENTS = {
+    "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)"),
+    "bufgym/Uplink-v0": ("lte", "a camera stream over bandwidth traces"),
+}
+"""id -> (scenario, what it is)"""
+
+for _id, (_scenario, _) in ENVIRONMENTS.items():
+    if _id not in _gym.registry:
+        _gym.register(
+            _id,
+            entry_point="bufgym.envs:SenderEnv",
+            vector_entry_point="bufgym.envs:SenderVectorEnv",
+            kwargs={"scenario": _scenario},
+        )

@@ -1,0 +1,120 @@
+"""``gymnasium.Env``: one sender."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.envs.rows import DELIVERED, RETAINED, Rows
+from bufgym.errors import BufgymError
+from bufgym.scenario import Scenario
+
+Observation = dict[str, NDArray[np.float32]]
+
+
+class SenderEnv(gym.Env[Observation, np.int64]):
+    """A robot's send buffer holds L messages; a link that fades empties it; at every arrival, decide what goes.
+
+    **Action** ``Discrete(L + 2)``: 0..L-1 evict that slot (0 = oldest) and enqueue the newcomer; L reject the newcomer;
+    L + 1 accept it. ``action_masks()`` and ``info["action_mask"]`` say which are possible. An impossible action does
+    what a queue does: accept where there is room, else reject; ``info["impossible"]`` counts them.
+
+    **Observation** a Dict with one key for each field of ``bufgym.observe.FIELDS``: slot fields of shape (L + 1,) with
+    the newcomer last, context fields of shape (1,), all in [0, 1].
+
+    **Reward** one of the terms of ``bufgym.observe.REWARD_TERMS`` or a weighted sum: ``delivered`` and ``retained``
+    both add up to H - 1 over an episode (to H where nothing was delivered, H = 0). ``info["reward_terms"]`` has each.
+
+    **End** ``terminated`` when the episode's last message has left. In the step that ends it, ``info`` also has
+    ``qoi`` (H), ``arrived``, ``delivered``, ``dropped``. An episode that asks for no decision (``decide_at="overflow"``
+    and never full) ends with the first step, whose action counts for nothing.
+
+    **Arguments** ``scenario``: a name of ``bufgym.scenario.SCENARIOS`` or a scenario; ``capacity`` L; ``max_bytes`` B;
+    ``decide_at``: "arrival" or "overflow" (only when full); ``reward``; ``fields``: names to observe (all by default);
+    any further argument replaces a parameter of the scenario (``t_max=100``). ``reset(options={"episode": e})`` plays
+    a given ``bufgym.scenario.Episode``.
+    """
+
+    metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        scenario: str | Scenario = "lte",
+        capacity: int = 8,
+        *,
+        max_bytes: int | None = None,
+        decide_at: str = "arrival",
+        reward: str | Mapping[str, float] = "retained",
+        fields: Sequence[str] | None = None,
+        render_mode: str | None = None,
+        **parameters: Any,
+    ) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise BufgymError(f"render_mode = {render_mode!r}: must be one of {self.metadata['render_modes']}")
+        self.rows = Rows(
+            1,
+            scenario=scenario,
+            capacity=capacity,
+            max_bytes=max_bytes,
+            decide_at=decide_at,
+            reward=reward,
+            fields=fields,
+            parameters=parameters,
+        )
+        self.observation_space = self.rows.observation_space
+        self.action_space = self.rows.action_space
+        self.render_mode = render_mode
+        self._action = np.zeros(1, np.int64)
+        self._weights = self.rows.weights.tolist()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        super().reset(seed=seed)
+        if seed is not None or self.rows.streams[0] is None:
+            self.rows.seed(0, self.np_random)
+        self.rows.reset(0, (options or {}).get("episode"))
+        return self._observation(), {"action_mask": self.action_masks(), "impossible": 0}
+
+    def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        rows = self.rows
+        if rows.senders.episodes[0] is None:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        if not 0 <= action < rows.capacity + 2:
+            raise BufgymError(f"action = {action}: must lie in 0..{rows.capacity + 1} (L = {rows.capacity})")
+        self._action[0] = action
+        rows.step(self._action)
+        terms = rows.shown.terms[0].tolist()
+        reward = self._weights[DELIVERED] * terms[DELIVERED] + self._weights[RETAINED] * terms[RETAINED]
+        info = {
+            "action_mask": self.action_masks(),
+            "impossible": rows.senders.batch.senders["impossible"].item(),
+            "reward_terms": {"delivered": terms[DELIVERED], "retained": terms[RETAINED]},
+        }
+        ended = rows.shown.ended.item()
+        if ended:
+            info |= {name: number.item() for name, number in rows.summary(0).items()}
+        return self._observation(), reward, ended, False, info
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """bool[L + 2]: the actions that are possible now (the name that sb3-contrib looks for)."""
+        return self.rows.shown.mask[0].copy()
+
+    def render(self) -> Any:
+        """The buffer as a timeline of kept and dropped messages against the link's capacity."""
+        if self.render_mode is None:
+            gym.logger.warn("render() needs a render_mode: gym.make(..., render_mode='ansi' or 'rgb_array')")
+            return None
+        from bufgym.envs import render  # drawing is only loaded where it is wanted
+
+        if self.render_mode == "ansi":
+            return render.ansi(self.rows.senders, 0)
+        return render.rgb_array(self.rows.senders, 0)
+
+    def _observation(self) -> Observation:
+        shown = self.rows.shown
+        return self.rows.observation(shown.slots[0].copy(), shown.context[0].copy())

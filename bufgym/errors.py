@@ -1,0 +1,55 @@
+"""The errors that bufgym raises on purpose.
+
+One family: `except BufgymError` catches whatever the caller can put right (a bad parameter, a broken file).
+Anything else that escapes is a bug of bufgym.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+
+# Longer values are cut in messages: a broken file can hold a line of any length.
+_SHOWN_CHARACTERS = 60
+
+
+class BufgymError(ValueError):
+    """A value that bufgym cannot work with; the message names the value and the rule that it breaks."""
+
+
+class TraceError(BufgymError):
+    """A trace or motion file that cannot be read or written; the message names the file and the line."""
+
+
+def where(
+    path: str | PathLike[str],
+    line: int | None,
+    value: object | None,
+    rule: str,
+    *,
+    field: str | None = None,
+) -> str:
+    """Say where something is wrong, what it is, and which rule it breaks.
+
+    Args:
+        path: the file, as the caller wrote it.
+        line: line number, counted from 1; None when the file as a whole is meant.
+        value: the offending value as it stands in the file; None when there is none to show.
+        rule: what would have been right, to be read after the value ("must be a whole number >= 0").
+        field: what the value is, such as a column's name.
+
+    Returns:
+        For example "lte.csv, line 12: bytes = -3: must be a whole number >= 0".
+    """
+    place = f"{path}" if line is None else f"{path}, line {line}"
+    if value is None:
+        return f"{place}: {rule}" if field is None else f"{place}: {field} {rule}"
+    shown = _shown(value)
+    return f"{place}: {shown}: {rule}" if field is None else f"{place}: {field} = {shown}: {rule}"
+
+
+def _shown(value: object) -> str:
+    """Plain words and numbers as they stand; blanks, spaces and control characters quoted; long text cut."""
+    text = str(value)
+    cut = text if len(text) <= _SHOWN_CHARACTERS else text[: _SHOWN_CHARACTERS - 3] + "..."
+    plain = cut.isprintable() and cut.isascii() and cut != "" and " " not in cut
+    return cut if plain else repr(cut)

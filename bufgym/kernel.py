@@ -1,0 +1,85 @@
+"""The one decorator for compiled functions.
+
+A *kernel* is a plain Python function over arrays that the caller owns. Numba compiles it on its first call and keeps
+the machine code on disk; with ``NUMBA_DISABLE_JIT=1`` the same source runs as ordinary Python, which is how the tests
+check the compiled code against its own text.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+JIT = not numba.config.DISABLE_JIT
+"""False where compilation is off and every kernel is its Python source."""
+
+# Arithmetic follows IEEE 754 to the letter (no fast maths): single = batch and compiled = uncompiled, bit for bit.
+_OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False, "forceinline": True}
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def _cache_folder() -> str:
+    """A folder for machine code that is valid for exactly this state of the package's sources.
+
+    Numba renews a cached kernel when its own file changes but not when a kernel that it calls does. One folder for
+    each state of all the sources keeps a stale callee from living on inside its caller.
+    """
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        parent = Path(os.environ["NUMBA_CACHE_DIR"])
+    elif os.access(_PACKAGE, os.W_OK):
+        parent = _PACKAGE / "__pycache__"
+    else:
+        parent = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "bufgym"
+    state = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        about = path.stat()
+        state.update(f"{path}:{about.st_mtime_ns}:{about.st_size};".encode())
+    folder = parent / f"kernels-{state.hexdigest()[:12]}"
+    if not folder.exists():
+        for old in parent.glob("kernels-*"):
+            shutil.rmtree(old, ignore_errors=True)
+    return str(folder)
+
+
+_FOLDER = _cache_folder() if JIT else ""
+
+
+def _compile(function: Callable[..., Any], *signature: Any) -> Any:
+    # Numba reads the folder when the decorator runs; other packages' caches stay where they were.
+    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, _FOLDER or numba.config.CACHE_DIR
+    try:
+        return numba.njit(*signature, cache=True, **_OPTIONS)(function)
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def kernel(function: Function) -> Function:
+    """Compile ``function`` on its first call, for the types that it is called with."""
+    return cast(Function, _compile(function))
+
+
+def compile_for(signature: Any, function: Function) -> Function:
+    """Compile ``function`` now for exactly ``signature``, so that it can be passed to other kernels as a value.
+
+    Functions of one signature share one type: the kernel that receives them is compiled once and serves them all.
+    """
+    if not JIT:
+        return function
+    return cast(Function, _compile(function, signature))
+
+
+def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Zeroed records whose fields read as attributes (``a[i].field``) in kernels, compiled or not."""
+    zeros = np.zeros(shape, dtype)
+    return zeros if JIT else zeros.view(np.recarray)

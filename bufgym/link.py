@@ -1,0 +1,119 @@
+"""The link: a capacity trace turned into delivery times, exactly, in whole microseconds and bytes.
+
+A trace gives the bytes C(t) that the link could have carried up to time t, linear between its knots. The socket is
+serial and work-conserving: a message that starts at byte position u (u = C(t) for an idle link, else where the one
+before it ended) has crossed at the first microsecond t with C(t) >= u + bytes. Positions, not times, are carried
+from message to message, so nothing is lost to rounding however many follow each other.
+
+After the trace's end the link may *loop* (the trace begins again), *hold* (the last segment's rate goes on) or
+*stop* (nothing crosses any more).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.errors import BufgymError
+from bufgym.kernel import kernel
+from bufgym.traces.trace import Trace
+
+FOREVER = 2**62
+"""A time that never comes, us."""
+
+LOOP, HOLD, STOP = 0, 1, 2
+_AFTER = {"loop": LOOP, "hold": HOLD, "stop": STOP}
+
+
+@dataclass(frozen=True)
+class Link:
+    """One sender's link: ``trace`` from ``offset_us`` on; each message reaches the server ``propagation_us`` later."""
+
+    trace: Trace
+    offset_us: int = 0
+    propagation_us: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("offset_us", "propagation_us"):
+            if getattr(self, name) < 0:
+                raise BufgymError(f"link on {self.trace.name}: {name} = {getattr(self, name)}: must be >= 0")
+
+
+class Knots:
+    """The knots of several traces in two flat arrays, as kernels read them; each trace is stored once."""
+
+    def __init__(self) -> None:
+        self.us = np.zeros(0, np.int64)
+        self.bytes = np.zeros(0, np.int64)
+        self._places: dict[int, tuple[Trace, int, int]] = {}
+
+    def place(self, trace: Trace) -> tuple[int, int, int]:
+        """(first knot, last knot, what follows the end) of ``trace``, storing it at its first use."""
+        # The trace itself is kept as well: an id is only unique while its object lives.
+        if id(trace) not in self._places:
+            self._places[id(trace)] = (trace, len(self.us), len(self.us) + len(trace.time_us) - 1)
+            self.us = np.concatenate([self.us, trace.time_us])
+            self.bytes = np.concatenate([self.bytes, trace.cumulative_bytes])
+        _, first, last = self._places[id(trace)]
+        return first, last, _AFTER[trace.after]
+
+
+@kernel
+def segment(knots: NDArray[np.int64], first: int, last: int, hint: int, point: int) -> int:
+    """k with knots[k] <= point < knots[k + 1], first <= k < last. ``hint``: where it was last time, often still so."""
+    for k in range(hint, min(hint + 4, last)):
+        if knots[k] <= point < knots[k + 1]:
+            return k
+    low, high = first, last
+    while high - low > 1:
+        middle = (low + high) // 2
+        if knots[middle] <= point:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@kernel
+def position_at(
+    us: NDArray[np.int64], size: NDArray[np.int64], first: int, last: int, after: int, hint: int, t_us: int
+) -> tuple[int, int]:
+    """(C(t) rounded down, bytes; segment it lies in) on the trace with knots ``first..last``."""
+    duration, total = us[last], size[last]
+    laps, t = 0, t_us
+    if t_us >= duration:
+        if after == STOP:
+            return total, last - 1
+        if after == HOLD:
+            # Whole segment lengths first, so that the product below stays within 64 bits.
+            span, carried = duration - us[last - 1], total - size[last - 1]
+            whole, rest = (t_us - duration) // span, (t_us - duration) % span
+            return total + whole * carried + carried * rest // span, last - 1
+        laps, t = t_us // duration, t_us % duration
+    k = segment(us, first, last, hint, t)
+    return laps * total + size[k] + (size[k + 1] - size[k]) * (t - us[k]) // (us[k + 1] - us[k]), k
+
+
+@kernel
+def time_of(
+    us: NDArray[np.int64], size: NDArray[np.int64], first: int, last: int, after: int, hint: int, position: int
+) -> tuple[int, int]:
+    """(first t with C(t) >= position, us; segment it lies in); FOREVER where that never comes. position > 0."""
+    duration, total = us[last], size[last]
+    laps, wanted = 0, position
+    if position > total:
+        if after == STOP:
+            return FOREVER, last - 1
+        if after == HOLD:
+            span, carried = duration - us[last - 1], total - size[last - 1]
+            if carried == 0:
+                return FOREVER, last - 1
+            whole, rest = (position - total) // carried, (position - total) % carried
+            return duration + whole * span + -(-rest * span // carried), last - 1
+        laps = (position - 1) // total
+        wanted = position - laps * total
+    k = segment(size, first, last, hint, wanted - 1)  # size[k] < wanted <= size[k + 1]
+    need, carried = wanted - size[k], size[k + 1] - size[k]
+    return laps * duration + us[k] + -(-need * (us[k + 1] - us[k]) // carried), k

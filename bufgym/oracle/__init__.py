@@ -1,0 +1,5 @@
+"""The truth to measure against."""
+
+from bufgym.oracle.interruption import ideal, integer
+
+__all__ = ["ideal", "integer"]

@@ -1,0 +1,70 @@
+"""AFR, Adaptive Frame Rate: thin the queue to an even, adaptive frame rate.
+
+Variables are the paper's: dropping rate r, counter c, dropping position p; L the capacity, s the queued messages. One
+message in r is kept; among those kept before r grew, every second one is evicted, oldest pair first.
+
+`afr` is the released code (github Jrdevil-Wang/AFR, transport_subscriber_link.cpp), `afr-paper` the literal text of
+the paper. They differ in the bound for halving r (3s <= 2L against s/L < 2/3) and in what a departure does to p: the
+code moves p along with the queue, the text says nothing about it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.buffer import ACCEPT, REJECT, Buffer
+from bufgym.kernel import kernel
+from bufgym.policies.registry import register
+
+R, C, P = range(3)  # where r, c and p lie in the memory
+MEMORY = {"r": 1.0, "c": 0.0, "p": 0.0}
+
+
+@kernel
+def thin(r: float, c: float, p: float, s: int, L: int, memory: NDArray[np.float64]) -> int:
+    """The part that code and text share, after r was halved or not: count, and evict at p when full."""
+    c += 1
+    if c != r:
+        memory[R], memory[C], memory[P] = r, c, p
+        return REJECT  # even when there is room: the rate has been lowered to one in r
+    c = 0.0
+    decision = ACCEPT
+    if s == L:
+        decision = int(p)
+        p += 1
+        if p >= L:  # a whole pass done: every second message is gone, half the rate is left
+            r, p = 2 * r, 0.0
+    memory[R], memory[C], memory[P] = r, c, p
+    return decision
+
+
+def afr_departure(buffer: Buffer, memory: NDArray[np.float64]) -> None:
+    """The head is gone, so the same message is now one slot further to the front."""
+    memory[P] = max(0.0, memory[P] - 1)
+
+
+@register(
+    "afr", memory=MEMORY, on_departure=afr_departure, source="AFR paper, released code (Jrdevil-Wang/AFR)", compile=True
+)
+def afr(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Adaptive Frame Rate as released: an even, adaptive frame rate."""
+    r, c, p = memory[R], memory[C], memory[P]
+    L, s = buffer.capacity, len(buffer.slots)
+    if r > 1 and 3 * s <= 2 * L:
+        r = r / 2
+        c = c % r
+    return thin(r, c, p, s, L, memory)
+
+
+@register("afr-paper", memory=MEMORY, source="AFR paper, Sec. III (literal text)", compile=True)
+def afr_paper(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Adaptive Frame Rate by the letter of the paper: s/L < 2/3, p not moved at departures."""
+    r, c, p = memory[R], memory[C], memory[P]
+    L, s = buffer.capacity, len(buffer.slots)
+    if r > 1 and 3 * s < 2 * L:
+        r = r / 2
+        c = c % r
+    return thin(r, c, p, s, L, memory)

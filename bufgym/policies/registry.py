@@ -1,0 +1,167 @@
+"""The one registry of drop policies, by name.
+
+A policy is a plain function ``on_arrival(buffer, arrival, memory) -> decision`` and, where it keeps score of what
+leaves, ``on_departure(buffer, memory)``. ``buffer`` is ``bufgym.buffer.Buffer``; ``arrival`` a MESSAGE record;
+``memory`` a float64 array of the policy's own, laid out and initialised as its registration says; the decision a slot
+to evict for the newcomer (0 = oldest), REJECT or ACCEPT. ``arrival.luck`` is a uniform draw in [0, 1) for policies that
+randomise, so the functions themselves are deterministic.
+
+    from bufgym.policies import ACCEPT, register
+
+    @register("keep-even", memory={"count": 0})
+    def keep_even(buffer, arrival, memory):
+        "Drops every second arrival that finds the queue full, the oldest otherwise."
+        if len(buffer.slots) < buffer.capacity:
+            return ACCEPT
+        memory[0] += 1
+        return 0 if memory[0] % 2 else REJECT
+
+That name now works wherever the built-in ones do. Given ``compile=True`` the same function runs compiled.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.buffer import MESSAGE, Buffer
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT, compile_for
+
+OnArrival = Callable[[Buffer, Any, NDArray[np.float64]], int]
+OnDeparture = Callable[[Buffer, NDArray[np.float64]], None]
+
+
+def _nothing(buffer: Buffer, memory: NDArray[np.float64]) -> None:
+    """The departure hook of a policy that keeps no score of departures."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """One drop policy: what decides, what it remembers, where it comes from."""
+
+    name: str
+    on_arrival: OnArrival
+    on_departure: OnDeparture = _nothing
+    memory: Mapping[str, float] = field(default_factory=dict)
+    """Names and initial values of the memory's entries; those in ``parameters`` are its settings."""
+    parameters: tuple[str, ...] = ()
+    source: str = ""
+    compile: bool = False
+
+    @property
+    def hears_departures(self) -> bool:
+        """Whether departures change what it remembers."""
+        return self.on_departure is not _nothing
+
+    @property
+    def summary(self) -> str:
+        """First line of the function's docstring."""
+        return (inspect.getdoc(self.on_arrival) or "").split("\n")[0]
+
+    def new_memory(self, senders: int = 1) -> NDArray[np.float64]:
+        """Fresh memory for so many senders, float64[senders, entries]."""
+        start = np.array(list(self.memory.values()) or [0.0], np.float64)
+        return np.tile(start, (senders, 1))
+
+    def with_parameters(self, **settings: float) -> Policy:
+        """This policy with other settings, named accordingly; an error for an unknown name or an unusable number."""
+        for name, number in settings.items():
+            if name not in self.parameters:
+                known = ", ".join(self.parameters) or "none"
+                raise BufgymError(f"policy {self.name}: no parameter {name!r}; it has: {known}")
+            if not (isinstance(number, int | float) and math.isfinite(number) and number > 0):
+                raise BufgymError(f"policy {self.name}: {name} = {number!r}: must be a number > 0")
+        if not settings:
+            return self
+        label = ",".join(f"{name}={number:g}" for name, number in settings.items())
+        memory = {**self.memory, **{name: float(number) for name, number in settings.items()}}
+        return replace(self, name=f"{self.name}:{label}", memory=memory)
+
+    @functools.cached_property
+    def compiled(self) -> tuple[OnArrival, OnDeparture]:
+        """Both functions compiled for one signature each, so that one rollout kernel serves every policy."""
+        arrival, departure = signatures()
+        return compile_for(arrival, self.on_arrival), compile_for(departure, self.on_departure)
+
+
+@functools.cache
+def signatures() -> tuple[Any, Any]:
+    """Numba types of ``on_arrival`` and ``on_departure``."""
+    message = numba.from_dtype(MESSAGE)
+    int_, real = numba.types.int64, numba.types.float64
+    reals = numba.types.Array(real, 1, "C")
+    types = {"slots": numba.types.Array(message, 1, "C"), "v": numba.types.Array(real, 1, "C", readonly=True)}
+    reals_of = {"taken_x", "previous_x", "left_fraction", "period_us", "drain"}
+    view = numba.types.NamedTuple(
+        tuple(types.get(name, real if name in reals_of else int_) for name in Buffer._fields), Buffer
+    )
+    return int_(view, message, reals), numba.types.void(view, reals)
+
+
+_REGISTRY: dict[str, Policy] = {}
+
+
+def register(
+    name: str,
+    *,
+    memory: Mapping[str, float] | None = None,
+    parameters: tuple[str, ...] = (),
+    on_departure: OnDeparture = _nothing,
+    source: str = "",
+    compile: bool = False,
+) -> Callable[[OnArrival], OnArrival]:
+    """Register the decorated function as the policy ``name``; it comes back unchanged.
+
+    ``compile=True`` promises that Numba can compile it; else it runs as ordinary Python wherever policies run.
+    """
+    if name in _REGISTRY and _REGISTRY[name].source:
+        raise BufgymError(f"policy {name!r}: a built-in policy has this name")
+    if not name or any(c in ":,= \t\n" for c in name):
+        raise BufgymError(f"policy {name!r}: a name must be non-empty, without spaces, ':', ',' or '='")
+    unknown = set(parameters) - set(memory or {})
+    if unknown:
+        raise BufgymError(f"policy {name!r}: parameters {sorted(unknown)} are not entries of its memory")
+
+    def add(on_arrival: OnArrival) -> OnArrival:
+        if not callable(on_arrival):
+            raise BufgymError(f"policy {name!r}: {on_arrival!r} is not a function")
+        _REGISTRY[name] = Policy(name, on_arrival, on_departure, dict(memory or {}), parameters, source, compile)
+        return on_arrival
+
+    return add
+
+
+def names() -> Iterator[str]:
+    """All registered names, in the order of their registration."""
+    return iter(tuple(_REGISTRY))
+
+
+def get(spec: str | Policy) -> Policy:
+    """The policy that ``spec`` names: ``"afr"``, or with settings ``"decimate:every=2"``."""
+    if isinstance(spec, Policy):
+        return spec
+    name, _, settings = spec.partition(":")
+    if name not in _REGISTRY:
+        raise BufgymError(f"unknown policy {name!r}; known: {', '.join(_REGISTRY)}")
+    numbers: dict[str, float] = {}
+    for setting in filter(None, settings.split(",")):
+        key, equals, number = setting.partition("=")
+        try:
+            numbers[key.strip()] = float(number)
+        except ValueError:
+            raise BufgymError(f"policy {spec!r}: {setting!r} is not of the form parameter=number") from None
+    return _REGISTRY[name].with_parameters(**numbers)
+
+
+def runs_compiled(policy: Policy) -> bool:
+    """Whether this policy's functions run inside compiled rollouts here."""
+    return policy.compile and JIT

@@ -1,0 +1,52 @@
+"""Policies that sample the stream and do not look at what it holds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.buffer import ACCEPT, REJECT, Buffer
+from bufgym.policies.registry import register
+
+SEEN = 0
+
+
+def reservoir_departure(buffer: Buffer, memory: NDArray[np.float64]) -> None:
+    """The link moves again: what is still queued is the whole sample of a new interruption."""
+    memory[SEEN] = len(buffer.slots)
+
+
+@register(
+    "reservoir",
+    memory={"seen": 0.0},
+    on_departure=reservoir_departure,
+    source="Vitter, Random sampling with a reservoir, 1985 (algorithm R)",
+    compile=True,
+)
+def reservoir(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Reservoir sampling: every arrival of the interruption is kept with the same probability."""
+    memory[SEEN] += 1
+    if len(buffer.slots) < buffer.capacity:
+        return ACCEPT
+    place = int(arrival.luck * memory[SEEN])
+    return place if place < buffer.capacity else REJECT
+
+
+EVERY, COUNT = range(2)
+
+
+@register(
+    "decimate",
+    memory={"every": 3.0, "count": 0.0},
+    parameters=("every",),
+    source="fixed decimation, 30 to 10 frames/s (Golodetz et al. 2018)",
+    compile=True,
+)
+def decimate(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Fixed decimation: one arrival in `every` enters the queue, which loses its head when full."""
+    memory[COUNT] += 1
+    if (memory[COUNT] - 1) % memory[EVERY] != 0:
+        return REJECT
+    return ACCEPT if len(buffer.slots) < buffer.capacity else 0

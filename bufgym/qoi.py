@@ -1,0 +1,146 @@
+"""Quantity of Information: how much of the scene the server has seen (AFR paper, Eq. 2-6).
+
+For the received messages in order, with coordinates x_1 <= x_2 <= ...,
+
+    H = 1 + sum of V(x_i - x_{i-1}),
+
+where V says what a message adds that comes a distance d after the one before it. The coordinate is the frame index
+(time-based QoI, as in the paper) or the accumulated motion of the camera (motion-based QoI); V does not care which.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.errors import BufgymError
+from bufgym.kernel import kernel
+
+EXPONENTIAL, SATURATING, TABULATED = 0, 1, 2
+
+
+@kernel
+def value(v: NDArray[np.float64], d: float) -> float:
+    """V(d): what a message adds at distance ``d >= 0`` from the one received before it, in [0, 1].
+
+    ``v`` is ``Value.array``: the kind, its parameter, and for a table its distances and then its values.
+    """
+    if v[0] == EXPONENTIAL:
+        return 1.0 - math.exp(d * v[1])  # b^d with v[1] = ln b
+    if v[0] == SATURATING:
+        return min(1.0, d / v[1])
+    points = int(v[1])
+    if d >= v[1 + points]:
+        return float(v[1 + 2 * points])
+    k = 1
+    while v[2 + k] < d:
+        k += 1
+    left, right = v[1 + k], v[2 + k]
+    low, high = v[1 + points + k], v[2 + points + k]
+    return float(low + (high - low) * (d - left) / (right - left))
+
+
+@kernel
+def merging_loss(v: NDArray[np.float64], a: float, value_a: float, b: float, value_b: float) -> float:
+    """V(a) + V(b) - V(a + b), given V(a) and V(b): the QoI lost when the message between two gaps goes; >= 0."""
+    if v[0] == EXPONENTIAL:
+        return value_a * value_b  # the same: (1 - p) + (1 - q) - (1 - pq) = (1 - p)(1 - q)
+    return value_a + value_b - value(v, a + b)
+
+
+@kernel
+def information(v: NDArray[np.float64], x: NDArray[np.float64]) -> float:
+    """H of the received messages with coordinates ``x`` (shape [received], in order of receipt); 0 for none."""
+    if len(x) == 0:
+        return 0.0
+    gained = 0.0
+    for i in range(1, len(x)):
+        gained += value(v, x[i] - x[i - 1])
+    return 1.0 + gained
+
+
+@dataclass(frozen=True)
+class Value:
+    """A concave V with V(0) = 0, non-decreasing, at most 1. Build one with the functions below."""
+
+    name: str
+    array: NDArray[np.float64] = field(repr=False, compare=False)
+    """What the kernels read."""
+
+    def __call__(self, d: float) -> float:
+        if not d >= 0:
+            raise BufgymError(f"V({d}): a distance must be a number >= 0")
+        return float(value(self.array, float(d)))
+
+    def information(self, x: Sequence[float] | NDArray[np.float64]) -> float:
+        """H of messages received with these coordinates (Eq. 2)."""
+        return float(information(self.array, np.ascontiguousarray(x, np.float64)))
+
+
+def _checked(name: str, array: list[float], distances: NDArray[np.float64]) -> Value:
+    """A ``Value`` that keeps Eq. 3-6 at the given distances, or an error that says which one it breaks."""
+    made = Value(name, np.array(array, np.float64))
+    made.array.flags.writeable = False
+    levels = np.array([made(d) for d in distances])
+    slopes = np.diff(levels) / np.diff(distances)
+    if levels[0] != 0:
+        raise BufgymError(f"V = {name}: V(0) = {levels[0]:g}, but V(0) must be 0 (Eq. 3)")
+    if (slopes < 0).any():
+        at = int(np.argmax(slopes < 0))
+        raise BufgymError(f"V = {name}: V falls from d = {distances[at]:g} on, but must not decrease (Eq. 4)")
+    if levels.max() > 1:
+        raise BufgymError(f"V = {name}: V reaches {levels.max():g}, but must not exceed 1 (Eq. 5)")
+    rising = np.diff(slopes) > 1e-9 * np.abs(slopes).max()
+    if rising.any():
+        at = int(np.argmax(rising)) + 1
+        raise BufgymError(f"V = {name}: V grows faster after d = {distances[at]:g}, but must be concave (Eq. 6)")
+    if levels.max() == 0:
+        raise BufgymError(f"V = {name}: V is 0 everywhere, so no message is worth sending")
+    return made
+
+
+def exponential(base: float = 0.618) -> Value:
+    """V(d) = 1 - base^d. The paper's Fig. 5 has base 0.618: a camera moving back from a wall."""
+    if not 0 < base < 1:
+        raise BufgymError(f"V = exponential: base = {base}: must lie strictly between 0 and 1")
+    scale = -1 / math.log(base)
+    return _checked(f"exponential:{base:g}", [EXPONENTIAL, math.log(base)], np.linspace(0, 8 * scale, 33))
+
+
+def saturating(distance: float) -> Value:
+    """V(d) = min(1, d / distance): turning in place or driving along a corridor."""
+    if not 0 < distance < math.inf:
+        raise BufgymError(f"V = saturating: distance = {distance}: must be a number > 0")
+    return _checked(f"saturating:{distance:g}", [SATURATING, distance], np.linspace(0, 2 * distance, 33))
+
+
+def tabulated(distances: Sequence[float], values: Sequence[float]) -> Value:
+    """Your own V, linear between the given points and constant after the last; checked against Eq. 3-6."""
+    d, levels = np.asarray(distances, np.float64), np.asarray(values, np.float64)
+    if d.ndim != 1 or d.shape != levels.shape or len(d) < 2:
+        raise BufgymError(f"V = tabulated: {d.shape} distances and {levels.shape} values: need two equal lists of 2+")
+    if not (np.isfinite(d).all() and np.isfinite(levels).all()):
+        raise BufgymError("V = tabulated: every distance and value must be a finite number")
+    if d[0] != 0 or (np.diff(d) <= 0).any():
+        raise BufgymError(f"V = tabulated: distances {d.tolist()}: must begin at 0 and increase")
+    # Beyond the table V is constant: one more point lets the check see that corner too.
+    check = np.append(d, 2 * d[-1])
+    return _checked(f"tabulated:{len(d)} points", [TABULATED, len(d), *d, *levels], check)
+
+
+def parse(text: str) -> Value:
+    """``exponential:0.618`` or ``saturating:4``, as written on the command line."""
+    makers = {"exponential": exponential, "saturating": saturating}
+    kind, _, number = text.partition(":")
+    if kind not in makers:
+        raise BufgymError(f"V = {text!r}: unknown kind {kind!r}; known: {', '.join(makers)} (as in exponential:0.618)")
+    try:
+        return makers[kind](float(number)) if number or kind == "saturating" else exponential()
+    except ValueError as error:
+        if isinstance(error, BufgymError):
+            raise
+        raise BufgymError(f"V = {text!r}: {number!r} is not a number") from None

@@ -1,0 +1,33 @@
+"""Bandwidth traces and motion recordings: in from files, out to files, or made up from a seed.
+
+trace = load("lte-synthetic-3")            # shipped with bufgym
+trace = read_trace("TMobile-LTE-short.up.gz")
+trace = Trace.steps([(5, 8e6), (2, 0)])    # 5 s at 8 MB/s, 2 s of nothing
+motion = read_motion("freiburg1_desk.groundtruth.txt.gz")
+"""
+
+from bufgym.traces.motion import Motion, motion_from_poses, read_motion, write_motion_csv
+from bufgym.traces.readers import FORMATS, detect_format, read_trace
+from bufgym.traces.shipped import load, load_motion, shipped
+from bufgym.traces.synthetic import drive_motion, outage, synthetic_lte
+from bufgym.traces.trace import Trace, describe
+from bufgym.traces.writers import write_csv
+
+__all__ = [
+    "FORMATS",
+    "Motion",
+    "Trace",
+    "describe",
+    "detect_format",
+    "drive_motion",
+    "load",
+    "load_motion",
+    "motion_from_poses",
+    "outage",
+    "read_motion",
+    "read_trace",
+    "shipped",
+    "synthetic_lte",
+    "write_csv",
+    "write_motion_csv",
+]

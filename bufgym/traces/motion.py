@@ -1,0 +1,318 @@
+"""How far the scene has moved on: a recording's coordinate over time, from a camera trajectory.
+
+The coordinate is the fraction of the field of view that is new, summed over successive poses:
+rotation angle / field of view + translation / scene scale. One unit is a view with nothing left of the old
+one. It is what a robot's odometry can tell on board, and the scalar over which Quantity of Information is
+counted.
+
+Trajectories come in the TUM format `t tx ty tz qx qy qz qw` (s, m, unit quaternion; J. Sturm et al., "A
+Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012), as ground truth or from any odometry.
+Finished coordinates are kept in CSV files with the header `t_s,motion`.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from bufgym.errors import BufgymError, TraceError, where
+from bufgym.traces.files import Line, StrPath, TextFile
+from bufgym.traces.readers import trace_name
+from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Array
+
+# Takes a line apart, given the values of the one before: time as it stands, and values.
+_RowReader = Callable[[Line, list[float] | None], tuple[str, list[float]]]
+
+MOTION_HEADER: Final = "t_s,motion"
+
+# Horizontal field of view of the cameras in question: Kinect of the TUM sequences 57 degrees, RealSense D435
+# 69.
+DEFAULT_FOV_DEG: Final = 60.0
+# Distance at which things are seen indoors; moving by as much shows a new scene.
+DEFAULT_SCENE_SCALE_M: Final = 2.0
+# Camera rate. Motion capture at 100-300 Hz jitters by a fraction of a mm; adding up every sample counts that
+# as motion.
+DEFAULT_RATE_HZ: Final = 30.0
+DEFAULT_MAX_GAP_S: Final = 1.0
+
+_MAX_POSITION_M: Final = 1e7
+# Seconds since 1970 until the year 5138; a time in ns is caught by it.
+_MAX_EPOCH_S: Final = 1e11
+_MAX_COORDINATE: Final = 1e9
+_NORM_TOLERANCE: Final = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion recording, checked when it is made; its arrays are read-only.
+
+    Attributes:
+        name: what to call it in tables.
+        time_us: int64[M], M >= 2, microseconds, strictly increasing from 0.
+        coordinate: float64[M], fraction of the field of view that is new, summed; non-decreasing from 0.
+        source: where it comes from, in words.
+        gaps: (start, end) in microseconds of stretches without a pose, across which motion is taken as even.
+
+    Raises:
+        BufgymError: an array breaks one of these rules.
+    """
+
+    name: str
+    time_us: Int64Array
+    coordinate: Float64Array
+    source: str = ""
+    gaps: tuple[tuple[int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        time_us = np.array(self.time_us)
+        coordinate = np.array(self.coordinate, dtype=np.float64)
+        if time_us.dtype != np.int64 or time_us.ndim != 1 or time_us.shape != coordinate.shape or time_us.size < 2:
+            raise self._broken("time_us must be int64[M] and coordinate float64[M], with M >= 2")
+        if not np.isfinite(coordinate).all() or time_us[0] != 0 or coordinate[0] != 0:
+            raise self._broken("coordinate must be finite numbers, and both must begin with 0")
+        for what, bad in (
+            ("time_us must increase", time_us[1:] <= time_us[:-1]),
+            ("coordinate must not decrease", coordinate[1:] < coordinate[:-1]),
+        ):
+            if bad.any():
+                raise self._broken(f"{what} at index {int(np.argmax(bad)) + 1}")
+        for field, values in (("time_us", time_us), ("coordinate", coordinate)):
+            values.flags.writeable = False
+            object.__setattr__(self, field, values)
+
+    def _broken(self, what: str) -> BufgymError:
+        return BufgymError(f"motion {self.name!r}: {what}")
+
+    @property
+    def duration_us(self) -> int:
+        """Time of the last sample, microseconds."""
+        return int(self.time_us[-1])
+
+    @property
+    def total(self) -> float:
+        """Coordinate at the end."""
+        return float(self.coordinate[-1])
+
+    def at(self, time_us: npt.ArrayLike) -> Float64Array:
+        """Coordinate at each time (int64 microseconds, any shape), linear between samples.
+
+        Past the end the recording begins again and its total is carried on, so the coordinate never
+        decreases.
+
+        Raises:
+            BufgymError: a time before 0.
+        """
+        times = np.asarray(time_us, dtype=np.int64)
+        if (times < 0).any():
+            raise self._broken(f"time_us = {times.min()}: must be >= 0")
+        laps, inside = np.divmod(times, self.duration_us)
+        return np.asarray(laps * self.total + np.interp(inside, self.time_us, self.coordinate), dtype=np.float64)
+
+
+def read_motion(
+    path: StrPath,
+    *,
+    fov_deg: float = DEFAULT_FOV_DEG,
+    scene_scale_m: float = DEFAULT_SCENE_SCALE_M,
+    rate_hz: float = DEFAULT_RATE_HZ,
+    max_gap_s: float = DEFAULT_MAX_GAP_S,
+) -> Motion:
+    """Read a TUM trajectory or a `t_s,motion` CSV, plain or gzip'd, told apart by the first line.
+
+    The first time becomes 0. The other arguments are for trajectories (see `motion_from_poses`); a CSV holds
+    finished coordinates, which are taken as they are, less the first.
+
+    Raises:
+        TraceError: the file cannot be read, or a line breaks a rule: eight finite numbers, positions within
+            10**7 m, a quaternion of unit norm within 1 %, times in seconds that never go back and span at
+            most 10**7 s, two lines at least. The message names the file, the line, the value and the rule.
+        BufgymError: an argument that is not a finite number above 0.
+    """
+    with TextFile(path) as file:
+        first = next((line for line in file.lines() if not line.text.startswith("#")), None)
+    if first is None:
+        raise TraceError(where(path, None, None, "is empty: must hold a trajectory or a motion recording"))
+    if _is_header(first.text):
+        time_us, values = _read_columns(path, _motion_row, skip=first.number)
+        return Motion(trace_name(path), time_us, values[:, 0] - values[0, 0], f"{path} ({MOTION_HEADER})")
+    time_us, poses = _read_columns(path, _pose_row)
+    return motion_from_poses(
+        time_us,
+        poses[:, :3],
+        poses[:, 3:],
+        fov_deg=fov_deg,
+        scene_scale_m=scene_scale_m,
+        rate_hz=rate_hz,
+        max_gap_s=max_gap_s,
+        name=trace_name(path),
+        source=f"{path} (TUM trajectory)",
+    )
+
+
+def motion_from_poses(
+    time_us: Int64Array,
+    position_m: Float64Array,
+    quaternion: Float64Array,
+    *,
+    fov_deg: float = DEFAULT_FOV_DEG,
+    scene_scale_m: float = DEFAULT_SCENE_SCALE_M,
+    rate_hz: float = DEFAULT_RATE_HZ,
+    max_gap_s: float = DEFAULT_MAX_GAP_S,
+    name: str = "motion",
+    source: str = "",
+) -> Motion:
+    """Sum rotation / field of view + translation / scene scale over successive poses.
+
+    Poses that come faster than `rate_hz` (by their median distance) are first resampled to it: positions
+    along a line, orientations along the shortest arc (slerp). Slower ones are used as they are.
+
+    Args:
+        time_us: int64[n], n >= 2, microseconds, increasing from 0.
+        position_m: float64[n, 3].
+        quaternion: float64[n, 4], any order of the four, norm near 1; q and -q are the same orientation.
+        fov_deg: field of view, degrees.
+        scene_scale_m: distance after which the scene is a new one, m.
+        rate_hz: greatest rate at which poses are compared, 1/s.
+        max_gap_s: longer times between poses are listed in `Motion.gaps`, s. Motion across a gap counts as
+            the straight way from its first pose to its last, the least that can have happened.
+
+    Raises:
+        BufgymError: an argument that is not a finite number above 0.
+    """
+    for what, value in (
+        ("fov_deg", fov_deg),
+        ("scene_scale_m", scene_scale_m),
+        ("rate_hz", rate_hz),
+        ("max_gap_s", max_gap_s),
+    ):
+        if not (math.isfinite(value) and value > 0):
+            raise BufgymError(f"{what} = {value}: must be a finite number above 0")
+    between_us = np.diff(time_us)
+    long = np.flatnonzero(between_us > max_gap_s * US_PER_S)
+    gaps = tuple((int(time_us[k]), int(time_us[k + 1])) for k in long)
+    unit = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+    # A recording at the wanted rate jitters by some percent, and must not be resampled for that.
+    if np.median(between_us) < 0.9 * US_PER_S / rate_hz:
+        time_us, position_m, unit = _resample(time_us, position_m, unit, rate_hz)
+    turned_rad = _angles(unit[:-1], unit[1:])
+    moved_m = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
+    steps = turned_rad / math.radians(fov_deg) + moved_m / scene_scale_m
+    return Motion(name, time_us, np.append(0.0, np.cumsum(steps)), source, gaps)
+
+
+def write_motion_csv(motion: Motion, path: StrPath) -> None:
+    """Write `t_s,motion`; `read_motion` gives back the same times and coordinates, bit for bit.
+
+    Raises:
+        TraceError: the file cannot be written.
+    """
+    rows = [
+        f"{t // US_PER_S}.{t % US_PER_S:06d}".rstrip("0").rstrip(".") + f",{x!r}\n"
+        for t, x in zip(motion.time_us.tolist(), motion.coordinate.tolist(), strict=True)
+    ]
+    try:
+        with open(path, "w", encoding="ascii", newline="\n") as file:
+            file.write(MOTION_HEADER + "\n")
+            file.writelines(rows)
+    except OSError as error:
+        raise TraceError(where(path, None, None, f"cannot be written: {error.strerror or error}")) from error
+
+
+def _resample(
+    time_us: Int64Array, position_m: Float64Array, unit: Float64Array, rate_hz: float
+) -> tuple[Int64Array, Float64Array, Float64Array]:
+    """Poses at multiples of 1 / rate_hz and at the end: int64[m], float64[m, 3], quaternions [m, 4]."""
+    count = int(time_us[-1] * rate_hz / US_PER_S) + 1
+    grid_us = np.rint(np.arange(count) * (US_PER_S / rate_hz)).astype(np.int64)
+    grid_us = np.append(grid_us[grid_us < time_us[-1]], time_us[-1])
+    k = np.clip(np.searchsorted(time_us, grid_us, side="right") - 1, 0, time_us.size - 2)
+    share = ((grid_us - time_us[k]) / (time_us[k + 1] - time_us[k]))[:, None]
+    position = position_m[k] + share * (position_m[k + 1] - position_m[k])
+    return grid_us, position, _slerp(unit[k], unit[k + 1], share)
+
+
+def _slerp(start: Float64Array, end: Float64Array, share: Float64Array) -> Float64Array:
+    """Unit quaternions on the shortest arc from start to end, each float64[m, 4]; share is float64[m, 1]."""
+    cosine = np.sum(start * end, axis=1, keepdims=True)
+    end = np.where(cosine < 0, -end, end)
+    half = 2 * np.arctan2(np.linalg.norm(end - start, axis=1), np.linalg.norm(end + start, axis=1))[:, None]
+    sine = np.sin(half)
+    near = sine < 1e-9  # so close that arc and chord are one
+    safe = np.where(near, 1.0, sine)
+    mixed = np.where(
+        near,
+        (1 - share) * start + share * end,
+        (np.sin((1 - share) * half) * start + np.sin(share * half) * end) / safe,
+    )
+    return np.asarray(mixed / np.linalg.norm(mixed, axis=1, keepdims=True), dtype=np.float64)
+
+
+def _angles(a: Float64Array, b: Float64Array) -> Float64Array:
+    """Rotation angle in rad, 0..pi, between unit quaternions float64[m, 4].
+
+    By the half-angle's tangent: an arc cosine would lose the small angles between neighbouring poses.
+    """
+    b = np.where(np.sum(a * b, axis=1, keepdims=True) < 0, -b, b)
+    half = 2 * np.arctan2(np.linalg.norm(b - a, axis=1), np.linalg.norm(b + a, axis=1))
+    return np.asarray(2 * half, dtype=np.float64)
+
+
+def _is_header(text: str) -> bool:
+    return ",".join(cell.strip() for cell in text.split(",")) == MOTION_HEADER
+
+
+def _pose_row(line: Line, previous: list[float] | None) -> tuple[str, list[float]]:
+    """Time, then tx ty tz qx qy qz qw."""
+    cells = line.columns(8)
+    names = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
+    values = [
+        line.decimal(name, text, -_MAX_POSITION_M, _MAX_POSITION_M) for name, text in zip(names, cells[1:], strict=True)
+    ]
+    norm = math.hypot(*values[3:])
+    if abs(norm - 1) > _NORM_TOLERANCE:
+        raise line.error(f"{norm:.6g}", "must be 1 within 1 %", "norm of the quaternion")
+    return cells[0], values
+
+
+def _motion_row(line: Line, previous: list[float] | None) -> tuple[str, list[float]]:
+    """Time, then the coordinate, which must not decrease."""
+    time, text = line.columns(2, ",")
+    value = line.decimal("motion", text, 0, _MAX_COORDINATE)
+    if previous is not None and value < previous[0]:
+        raise line.error(text, f"must not be below the line above ({previous[0]!r})", "motion")
+    return time, [value]
+
+
+def _read_columns(path: StrPath, read_row: _RowReader, skip: int = 0) -> tuple[Int64Array, Float64Array]:
+    """Times int64[n] in microseconds from 0, values float64[n, columns], of the lines after number `skip`.
+
+    Of lines with one and the same time (freiburg2_desk has some) the last counts.
+    """
+    times = array("q")
+    rows: list[list[float]] = []
+    with TextFile(path) as file:
+        for line in file.lines():
+            if line.number <= skip or line.text.startswith("#"):
+                continue
+            text, row = read_row(line, rows[-1] if rows else None)
+            time_us = round(line.decimal("time in s", text, 0, _MAX_EPOCH_S) * US_PER_S)
+            if times and time_us < times[-1]:
+                rule = f"must not be before the line above ({times[-1] / US_PER_S:.6f})"
+                raise line.error(text, rule, "time in s")
+            if times and time_us - times[0] > MAX_DURATION_S * US_PER_S:
+                raise line.error(text, f"must be at most {MAX_DURATION_S} s after the first", "time in s")
+            if times and time_us == times[-1]:
+                rows[-1] = row
+                continue
+            times.append(time_us)
+            rows.append(row)
+    if len(times) < 2:
+        raise TraceError(where(path, None, None, f"holds {len(times)} samples: must hold at least 2"))
+    time_array = np.asarray(times, np.int64)
+    return time_array - time_array[0], np.array(rows, np.float64)

@@ -1,0 +1,57 @@
+"""The traces and motion recordings that come with bufgym, by name."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from bufgym.errors import TraceError, where
+from bufgym.traces.files import StrPath
+from bufgym.traces.motion import Motion, read_motion
+from bufgym.traces.readers import read_trace
+from bufgym.traces.trace import After, Trace
+
+
+def shipped() -> dict[str, Path]:
+    """Names of the shipped files, and where they are: `lte-synthetic-0` .. `7` and the motions `drive-0`,
+    `drive-1`.
+
+    A wheel carries them inside the package; a checkout has them in its top-level `traces/`. Empty if neither
+    is there.
+    """
+    checkout = Path(__file__).resolve().parents[2]
+    for folder in (Path(str(resources.files("bufgym"))) / "data" / "traces", checkout / "traces"):
+        # A folder with an __init__.py is somebody's package called "traces", next to an installed bufgym.
+        if folder.is_dir() and not (folder / "__init__.py").exists():
+            files = sorted(folder.glob("*.csv"))
+            if files:
+                return {path.stem: path for path in files}
+    return {}
+
+
+def load(name_or_path: StrPath, format: str | None = None, after: After = "loop") -> Trace:
+    """A bandwidth trace by its shipped name or from a file; a shipped name goes first.
+
+    Raises:
+        TraceError: neither a shipped name nor a file (the message lists the names), or a broken file.
+    """
+    return read_trace(_resolve(name_or_path), format, after)
+
+
+def load_motion(name_or_path: StrPath) -> Motion:
+    """A motion recording by its shipped name or from a file, trajectories with the defaults of `read_motion`.
+
+    Raises:
+        TraceError: as `load`.
+    """
+    return read_motion(_resolve(name_or_path))
+
+
+def _resolve(name_or_path: StrPath) -> StrPath:
+    known = shipped()
+    if isinstance(name_or_path, str) and name_or_path in known:
+        return known[name_or_path]
+    if not Path(name_or_path).exists():
+        names = ", ".join(known) or "none found"
+        raise TraceError(where(name_or_path, None, None, f"no such file, and no shipped trace (known: {names})"))
+    return name_or_path

@@ -1,0 +1,37 @@
+"""What all tests share: where the recorded data lie, and how hard Hypothesis tries.
+
+Hypothesis profiles, chosen by the environment variable HYPOTHESIS_PROFILE:
+
+- ``ci`` (default): the same examples in every run, no deadline (the first call of a kernel compiles it), and
+  fewer examples where compilation is off;
+- ``thorough``: new examples in each run, and many.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+REPO = Path(__file__).resolve().parent.parent
+COMPILED = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
+
+settings.register_profile("ci", deadline=None, max_examples=100 if COMPILED else 20, derandomize=True, database=None)
+settings.register_profile("thorough", deadline=None, max_examples=2000 if COMPILED else 200)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of recorded traces and trajectories, too big for the repository; skips where it is absent.
+
+    ``$BUFGYM_SHARED_DATA`` where that is set, else ``shared/data`` beside the checkout.
+    """
+    named = os.environ.get("BUFGYM_SHARED_DATA")
+    folder = Path(named) if named else REPO.parent / "shared" / "data"
+    if not folder.is_dir():
+        where = "$BUFGYM_SHARED_DATA" if named else "shared/data beside the checkout"
+        pytest.skip(f"recorded data absent: {where} is no folder (set BUFGYM_SHARED_DATA)")
+    return folder

@@ -1,0 +1,200 @@
+"""The house rules: rooms import only from rooms above, paths are relative, importing bufgym stays cheap."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parent.parent
+
+# -------------------- (a) import order
+
+ROOMS = [
+    "errors",
+    "kernel",
+    "qoi",
+    "buffer",
+    "traces",
+    "link",
+    "observe",
+    "policies",
+    "scenario",
+    "sender",
+    "metrics",
+    "oracle",
+    "envs",
+    "sb3",
+    "benchmark",
+    "reproduce",
+    "cli",
+    "__main__",
+]
+"""The rooms of the house, top to bottom. Each imports only from itself and from rooms above it."""
+
+OUTSIDE = {"agents", "train", "tests"}
+"""What imports bufgym, and is never imported by it."""
+
+
+def imported_names(tree: ast.Module, module: str, is_package: bool) -> Iterator[tuple[int, str]]:
+    """Each (line, full dotted name) that a module imports: at the top, in a function, or for types only."""
+    package = module.split(".") if is_package else module.split(".")[:-1]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            prefix = ".".join([*base, *([node.module] if node.module else [])])
+            for alias in node.names:
+                yield node.lineno, f"{prefix}.{alias.name}"
+
+
+def faults(source: str, module: str, is_package: bool = False) -> list[str]:
+    """What in one module's imports breaks the order of the rooms, a sentence each."""
+    room = module.split(".")[1]
+    if room not in ROOMS:
+        return [f"{module}: room '{room}' has no place in ROOMS; give it one"]
+    found = []
+    for line, name in imported_names(ast.parse(source), module, is_package):
+        top, *rest = name.split(".")
+        if top in OUTSIDE:
+            found.append(f"{module}:{line}: bufgym never imports {top}")
+        elif top == "bufgym" and rest != ["__version__"]:
+            if not rest or rest[0] not in ROOMS:
+                found.append(f"{module}:{line}: imports {name}: name a room, not the whole package")
+            elif ROOMS.index(rest[0]) > ROOMS.index(room):
+                found.append(f"{module}:{line}: imports {rest[0]}, which is below {room}")
+    return found
+
+
+def modules() -> dict[str, Path]:
+    """Dotted name -> file of every module in bufgym but ``bufgym/__init__.py``, which may import them all."""
+    found = {}
+    for path in sorted((REPO / "bufgym").rglob("*.py")):
+        parts = path.relative_to(REPO).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        if name != "bufgym":
+            found[name] = path
+    return found
+
+
+@pytest.mark.parametrize("module", modules())
+def test_each_room_imports_only_from_rooms_above(module: str) -> None:
+    path = modules()[module]
+    found = faults(path.read_text(encoding="utf-8"), module, is_package=path.name == "__init__.py")
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "fault"),
+    [
+        ("bufgym.link", "from bufgym.traces.trace import Trace", ""),
+        ("bufgym.link", "from bufgym import qoi, __version__", ""),
+        ("bufgym.link", "import numpy as np", ""),
+        ("bufgym.envs.single", "from .vector import Batch", ""),
+        ("bufgym.envs.single", "from ..sender import step", ""),
+        ("bufgym.link", "from bufgym.sender import step", "below link"),
+        ("bufgym.link", "def lazy():\n    import bufgym.envs.single", "below link"),
+        ("bufgym.link", "from bufgym import qoi, envs", "below link"),
+        ("bufgym.policies.afr", "from ..sender import step", "below policies"),
+        ("bufgym.link", "import bufgym", "not the whole package"),
+        ("bufgym.link", "from bufgym import *", "not the whole package"),
+        ("bufgym.sb3", "from agents.network import Scorer", "never imports agents"),
+        ("bufgym.attic", "", "has no place"),
+    ],
+)
+def test_the_order_check_finds_what_it_should(module: str, source: str, fault: str) -> None:
+    found = faults(source, module)
+    assert len(found) == bool(fault)
+    assert all(fault in sentence for sentence in found)
+
+
+# -------------------- (b) paths
+
+HOMES = ["home", "root", "Users", "work", "workspace", "workspaces", "builds"]
+"""Top folders where people and build machines keep checkouts: a path into one holds on one machine only."""
+
+ABSOLUTE = re.compile(rf"(?<![\w.~$*)}}>-])/(?:{'|'.join(HOMES)})/[\w.-]+|\b[A-Za-z]:\\+Users\\")
+
+
+def tracked_files() -> list[Path]:
+    """Every file that git tracks or would offer to track; outside a git checkout, all but what was built."""
+    try:
+        listed = subprocess.run(
+            ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+            cwd=REPO,
+            capture_output=True,
+            check=True,
+        ).stdout
+        paths = [REPO / name for name in listed.decode().split("\0") if name]
+    except (OSError, subprocess.CalledProcessError):
+        skip = {".venv", ".git", "build", "dist", "runs", "results", "__pycache__"}
+        paths = [
+            path
+            for path in REPO.rglob("*")
+            if not any(part in skip or part.endswith("_cache") for part in path.relative_to(REPO).parts)
+        ]
+    return [path for path in paths if path.is_file()]
+
+
+def test_no_text_file_holds_a_path_of_one_machine() -> None:
+    found = []
+    for path in tracked_files():
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            continue  # not text
+        found += [f"{path.relative_to(REPO)}: {match.group()}" for match in ABSOLUTE.finditer(text)]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("top", HOMES)
+def test_the_path_check_finds_what_it_should(top: str) -> None:
+    assert ABSOLUTE.search(f"see /{top}/robot/log.txt")
+    assert ABSOLUTE.search(f'open("/{top}/robot")')
+    assert not ABSOLUTE.search(f"maps/{top}/robot, ~/{top}/robot, $ROOT/{top}/robot, ${{ROOT}}/{top}/robot")
+
+
+# -------------------- (c) version
+
+
+def test_one_version_everywhere() -> None:
+    import bufgym  # here, so that a package that is broken fails this test alone
+
+    version = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert bufgym.__version__ == version
+    assert f"\nversion: {version}\n" in (REPO / "CITATION.cff").read_text(encoding="utf-8")
+    try:
+        installed = importlib.metadata.version("bufgym")
+    except importlib.metadata.PackageNotFoundError:
+        return  # run from the source tree alone
+    assert installed == version
+
+
+# -------------------- (d) light import
+
+HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "matplotlib", "scipy", "pandas", "pyarrow")
+
+
+def heavy_modules_after(statement: str) -> set[str]:
+    """Every module of the heavy packages that a fresh interpreter holds after one statement."""
+    program = f"{statement}\nimport sys\nprint(*[m for m in sys.modules if m.split('.')[0] in {HEAVY!r}])"
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=REPO, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
+
+
+def test_importing_bufgym_imports_nothing_heavy() -> None:
+    # Numba itself opens scipy where that is installed: what core dependencies bring is not bufgym's doing.
+    core = heavy_modules_after("import numpy, gymnasium, numba")
+    extra = heavy_modules_after("import bufgym") - core
+    assert not extra, f"import bufgym also imports {sorted(extra)[:5]}"
