@@ -11,7 +11,7 @@ where V says what a message adds that comes a distance d after the one before it
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -32,7 +32,7 @@ def value(v: NDArray[np.float64], d: float) -> float:
     if v[0] == EXPONENTIAL:
         return 1.0 - math.exp(d * v[1])  # b^d with v[1] = ln b
     if v[0] == SATURATING:
-        return min(1.0, d / v[1])
+        return float(min(1.0, d / v[1]))
     points = int(v[1])
     if d >= v[1 + points]:
         return float(v[1 + 2 * points])
@@ -134,7 +134,7 @@ def tabulated(distances: Sequence[float], values: Sequence[float]) -> Value:
 
 def parse(text: str) -> Value:
     """``exponential:0.618`` or ``saturating:4``, as written on the command line."""
-    makers = {"exponential": exponential, "saturating": saturating}
+    makers: dict[str, Callable[..., Value]] = {"exponential": exponential, "saturating": saturating}
     kind, _, number = text.partition(":")
     if kind not in makers:
         raise BufgymError(f"V = {text!r}: unknown kind {kind!r}; known: {', '.join(makers)} (as in exponential:0.618)")

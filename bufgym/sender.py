@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numba
 import numpy as np
@@ -403,7 +403,7 @@ def compiled_rollout() -> Any:
     array, int_ = numba.types.Array, numba.types.int64
     record = {name: numba.from_dtype(dtype) for name, dtype in (("s", SENDER), ("m", MESSAGE), ("f", FATE))}
     ints = array(int_, 1, "C")
-    batch = numba.types.NamedTuple(
+    batch = cast(Any, numba.types).NamedTuple(
         (
             array(record["s"], 1, "C"),
             array(record["m"], 2, "C"),
@@ -469,7 +469,6 @@ class Senders:
 
     def load(self, i: int, episode: Episode) -> None:
         """Begin ``episode`` at sender ``i``: empty buffer, idle socket, nothing arrived."""
-        n = len(episode.arrivals)
         link = episode.link
         first_knot, last_knot, after = self._knots.place(link.trace)
         if self._knots.us is not self.batch.knot_us:
@@ -496,7 +495,7 @@ class Senders:
 def python_rollout(batch: Batch, memory: NDArray[np.float64], policy: Policy) -> None:
     """``rollout`` for a policy that is ordinary Python: the transition stays compiled, views are made in Python."""
     # The same memory, as records whose fields read as attributes.
-    seen = Batch(*(a.view(np.recarray) if a.dtype.names else a for a in batch))
+    seen = Batch(*(cast(Any, a.view(np.recarray) if a.dtype.names else a) for a in batch))
     look = getattr(view, "py_func", view)
     for i in range(len(batch.senders)):
         event = next_event(batch, i)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -65,7 +65,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             fields=fields,
             parameters=parameters,
         )
-        self.observation_space = self.rows.observation_space
+        self.observation_space = cast(Any, self.rows.observation_space)
         self.action_space = self.rows.action_space
         self.render_mode = render_mode
         self._action = np.zeros(1, np.int64)
@@ -102,7 +102,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[L + 2]: the actions that are possible now (the name that sb3-contrib looks for)."""
-        return self.rows.shown.mask[0].copy()
+        mask: NDArray[np.bool_] = self.rows.shown.mask[0].copy()
+        return mask
 
     def render(self) -> Any:
         """The buffer as a timeline of kept and dropped messages against the link's capacity."""

@@ -96,7 +96,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise BufgymError(f"options['reset_mask'] has shape {mask.shape}: must be ({self.num_envs},)")
         episodes = options.get("episodes")
         self._turn_page(keep=True)
-        for i in np.flatnonzero(mask):
+        for i in np.flatnonzero(mask).tolist():
             if seeds[i] is not None:
                 self.rows.seed(i, seeding.np_random(seeds[i])[0])
             self.rows.reset(i, None if episodes is None else episodes[i])
@@ -119,7 +119,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if self.autoreset_mode == AutoresetMode.DISABLED and self._done.any():
             raise gym.error.ResetNeeded("rows have ended: call reset(options={'reset_mask': done}) first")
         fresh = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else None
-        restarted = np.flatnonzero(fresh) if fresh is not None else ()
+        restarted: list[int] = np.flatnonzero(fresh).tolist() if fresh is not None else []
         self._turn_page()
         rows.step(actions)  # rows that have ended stay as they are
         self._steps += 1
@@ -129,7 +129,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         shown = rows.shown
         rewards = shown.terms @ rows.weights
         terminated = shown.ended.copy()
-        if len(restarted):
+        if restarted:
             terminated[restarted] = False
         truncated = np.zeros(self.num_envs, np.bool_)
         if self.max_episode_steps is not None:
@@ -174,7 +174,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         mask = np.where(done[:, None], rows.shown.mask, False)
         last = self._info() | {"action_mask": mask, "_action_mask": done, "_impossible": done, "_reward_terms": done}
         last["impossible"] = np.where(done, last["impossible"], 0)
-        for i in np.flatnonzero(done):
+        for i in np.flatnonzero(done).tolist():
             terms = rows.shown.terms[i].copy()
             rows.reset(i)
             rows.shown.terms[i] = terms
@@ -183,7 +183,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _info(self, terms: bool = True) -> dict[str, Any]:
         shown, everywhere = self.rows.shown, self._every_row
-        info = {
+        info: dict[str, Any] = {
             "action_mask": shown.mask,
             "_action_mask": everywhere,
             "impossible": self.rows.senders.batch.senders["impossible"].copy(),

@@ -26,7 +26,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import numba
 import numpy as np
@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from bufgym.buffer import MESSAGE, Buffer
 from bufgym.errors import BufgymError
-from bufgym.kernel import JIT, compile_for
+from bufgym.kernel import compile_for
 
 OnArrival = Callable[[Buffer, Any, NDArray[np.float64]], int]
 OnDeparture = Callable[[Buffer, NDArray[np.float64]], None]
@@ -101,7 +101,7 @@ def signatures() -> tuple[Any, Any]:
     reals = numba.types.Array(real, 1, "C")
     types = {"slots": numba.types.Array(message, 1, "C"), "v": numba.types.Array(real, 1, "C", readonly=True)}
     reals_of = {"taken_x", "previous_x", "left_fraction", "period_us", "drain"}
-    view = numba.types.NamedTuple(
+    view = cast(Any, numba.types).NamedTuple(
         tuple(types.get(name, real if name in reals_of else int_) for name in Buffer._fields), Buffer
     )
     return int_(view, message, reals), numba.types.void(view, reals)
@@ -163,5 +163,5 @@ def get(spec: str | Policy) -> Policy:
 
 
 def runs_compiled(policy: Policy) -> bool:
-    """Whether this policy's functions run inside compiled rollouts here."""
-    return policy.compile and JIT
+    """Whether this policy's functions run inside compiled rollouts."""
+    return policy.compile
