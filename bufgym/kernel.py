@@ -45,11 +45,13 @@ def _cache_folder() -> str:
         parent = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "bufgym"
     state = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
-        about = path.stat()
-        state.update(f"{path}:{about.st_mtime_ns}:{about.st_size};".encode())
+        source = path.read_bytes()
+        if b"bufgym.kernel import" in source:
+            state.update(source)
     folder = parent / f"kernels-{state.hexdigest()[:12]}"
     if not folder.exists():
-        for old in parent.glob("kernels-*"):
+        # Earlier states are of no use, but a process that runs now may still be writing into the latest ones.
+        for old in sorted(parent.glob("kernels-*"), key=lambda path: path.stat().st_mtime)[:-8]:
             shutil.rmtree(old, ignore_errors=True)
     return str(folder)
 

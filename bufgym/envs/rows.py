@@ -7,7 +7,7 @@ environment with row i's seed go through the same code and are equal bit for bit
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -24,7 +24,6 @@ from bufgym.scenario import Episode, Scenario, Streams
 from bufgym.sender import (
     DECISION,
     DEPARTURE,
-    END,
     Batch,
     Senders,
     arrival_of,
@@ -103,11 +102,12 @@ def show(batch: Batch, i: int, shown: Shown) -> None:
 
 
 @kernel
-def begin_row(batch: Batch, i: int, shown: Shown) -> None:
-    """Bring a freshly loaded row to its first decision."""
-    advance(batch, i)
-    shown.terms[i, :] = 0.0
-    show(batch, i, shown)
+def begin_rows(batch: Batch, rows: NDArray[np.int64], paid: NDArray[np.float64], shown: Shown) -> None:
+    """Bring freshly loaded rows to their first decision; nothing is paid yet, and ``shown.terms`` stay as they are."""
+    for i in rows:
+        advance(batch, i)
+        paid[i, :] = 0.0
+        show(batch, i, shown)
 
 
 @kernel
@@ -205,16 +205,17 @@ class Rows:
         """Give row ``i`` streams of its own, derived from the generator that Gymnasium seeded."""
         self.streams[i] = Streams.seeded(int(rng.integers(2**63)))
 
-    def reset(self, i: int, episode: Episode | None = None) -> None:
-        """Begin a new episode in row ``i`` and show it: the given one, or the next that its streams draw."""
-        streams = self.streams[i]
-        if streams is None:
-            self.seed(i, seeding.np_random()[0])
-            streams = self.streams[i]
-        assert streams is not None
-        self.senders.load(i, self.scenario.draw(streams) if episode is None else episode)
-        self.paid[i] = 0.0
-        begin_row(self.senders.batch, i, self.shown)
+    def reset(self, rows: NDArray[np.int64], episodes: Sequence[Episode | None] | None = None) -> None:
+        """Begin a new episode in each of ``rows`` and show it: the given one (by row), or the next of its streams."""
+        draw, load = self.scenario.draw, self.senders.load
+        for i in rows.tolist():
+            episode = episodes[i] if episodes is not None else None
+            if episode is None:
+                if self.streams[i] is None:
+                    self.seed(i, seeding.np_random()[0])
+                episode = draw(cast(Streams, self.streams[i]))
+            load(i, episode)
+        begin_rows(self.senders.batch, rows, self.paid, self.shown)
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """One decision in every row; ``self.shown`` tells what came of it."""
@@ -238,6 +239,3 @@ class Rows:
         for name, f in self._context_keys:
             seen[name] = context[..., f : f + 1]
         return seen
-
-
-__all__ = ["END", "Rows", "Shown"]

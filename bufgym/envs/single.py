@@ -15,6 +15,8 @@ from bufgym.scenario import Scenario
 
 Observation = dict[str, NDArray[np.float32]]
 
+_ROW = np.zeros(1, np.int64)
+
 
 class SenderEnv(gym.Env[Observation, np.int64]):
     """A robot's send buffer holds L messages; a link that fades empties it; at every arrival, decide what goes.
@@ -77,7 +79,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         super().reset(seed=seed)
         if seed is not None or self.rows.streams[0] is None:
             self.rows.seed(0, self.np_random)
-        self.rows.reset(0, (options or {}).get("episode"))
+        self.rows.reset(_ROW, [(options or {}).get("episode")])
         return self._observation(), {"action_mask": self.action_masks(), "impossible": 0}
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

@@ -94,12 +94,12 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         mask = np.asarray(options.get("reset_mask", self._every_row), np.bool_)
         if mask.shape != (self.num_envs,):
             raise BufgymError(f"options['reset_mask'] has shape {mask.shape}: must be ({self.num_envs},)")
-        episodes = options.get("episodes")
         self._turn_page(keep=True)
-        for i in np.flatnonzero(mask).tolist():
+        chosen = np.flatnonzero(mask)
+        for i in chosen.tolist():
             if seeds[i] is not None:
                 self.rows.seed(i, seeding.np_random(seeds[i])[0])
-            self.rows.reset(i, None if episodes is None else episodes[i])
+        self.rows.reset(chosen, options.get("episodes"))
         self._steps[mask] = 0
         self._done[mask] = False
         return self._observation(), self._info(terms=False)
@@ -118,19 +118,17 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise gym.error.ResetNeeded("call reset() before step()")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._done.any():
             raise gym.error.ResetNeeded("rows have ended: call reset(options={'reset_mask': done}) first")
-        fresh = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else None
-        restarted: list[int] = np.flatnonzero(fresh).tolist() if fresh is not None else []
+        restart = self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any()
         self._turn_page()
         rows.step(actions)  # rows that have ended stay as they are
         self._steps += 1
-        for i in restarted:
-            rows.reset(i)
-            self._steps[i] = 0
+        if restart:
+            rows.reset(np.flatnonzero(self._done))
+            rows.shown.terms[self._done] = 0.0
+            self._steps[self._done] = 0
         shown = rows.shown
         rewards = shown.terms @ rows.weights
-        terminated = shown.ended.copy()
-        if restarted:
-            terminated[restarted] = False
+        terminated = shown.ended & ~self._done if restart else shown.ended.copy()
         truncated = np.zeros(self.num_envs, np.bool_)
         if self.max_episode_steps is not None:
             truncated = (self._steps >= self.max_episode_steps) & ~terminated
@@ -174,10 +172,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         mask = np.where(done[:, None], rows.shown.mask, False)
         last = self._info() | {"action_mask": mask, "_action_mask": done, "_impossible": done, "_reward_terms": done}
         last["impossible"] = np.where(done, last["impossible"], 0)
-        for i in np.flatnonzero(done).tolist():
-            terms = rows.shown.terms[i].copy()
-            rows.reset(i)
-            rows.shown.terms[i] = terms
+        rows.reset(np.flatnonzero(done))
         self._steps[done] = 0
         return {"final_obs": final, "_final_obs": done, "final_info": report | last, "_final_info": done}
 
