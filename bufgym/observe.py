@@ -29,7 +29,7 @@ class Field:
     name: str
     per: str
     group: str
-    """What it takes to know it: "queue" (counting), "time" (clock), "motion" (odometry), "value" (V), "link" (own socket)."""
+    """What it takes to know it: queue (counting), time (a clock), motion (odometry), value (V), link (its socket)."""
     unit: str
     meaning: str
     low: float = 0.0
@@ -85,7 +85,7 @@ REWARD_TERMS = (
     RewardTerm("delivered", "QoI", "V gained when a message arrives at the server; sums to H - 1"),
     RewardTerm("retained", "QoI", "change of the H that delivering all that is kept would give; sums to H - 1 too"),
 )
-"""``retained`` is ``delivered`` shaped by a potential (Ng, Harada and Russell 1999): the QoI held but not yet delivered.
+"""``retained`` is ``delivered`` shaped by a potential (Ng, Harada and Russell 1999): the QoI held, not yet delivered.
 It pays at the moment of the decision what the decision costs or gains, and telescopes to the same total."""
 
 

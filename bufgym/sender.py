@@ -95,6 +95,7 @@ FATE = np.dtype(
         ("taken_us", np.int64),  # the socket took it out of the buffer
         ("crossed_us", np.int64),  # its last byte crossed the link
         ("dropped_us", np.int64),  # it was evicted or rejected
+        ("gain", np.float64),  # V that its delivery adds; it is settled once the socket has taken it
     ],
     align=True,
 )
@@ -195,7 +196,8 @@ def take_head(batch: Batch, i: int, now_us: int, idle: bool) -> None:
     sender.taken += 1
     sender.taken_at_us = now_us
     sender.departures += 1
-    batch.fates[i, head.seq].taken_us = now_us
+    fate = batch.fates[i, head.seq]
+    fate.taken_us, fate.gain = now_us, head.gain
 
 
 @kernel
@@ -204,9 +206,10 @@ def credit(batch: Batch, i: int, until_us: int) -> None:
     sender = batch.senders[i]
     while sender.credited < sender.crossed:
         seq = batch.order[i, sender.credited]
-        if until_us < batch.fates[i, seq].crossed_us + sender.propagation_us:
+        fate = batch.fates[i, seq]
+        if until_us < fate.crossed_us + sender.propagation_us:
             break
-        sender.delivered_gain += batch.arrivals[i, seq].gain
+        sender.delivered_gain += fate.gain
         sender.credited += 1
 
 
@@ -323,7 +326,6 @@ def remove(batch: Batch, i: int, k: int) -> None:
         merged = value(batch.v, after.x - batch.slots[i, sender.first + k - 1].x)
         sender.retained_gain += merged - after.gain
         after.gain = merged
-        batch.arrivals[i, after.seq].gain = merged
     sender.first = evict(batch.slots, i, sender.first, sender.occupancy, k)
     sender.occupancy -= 1
 

@@ -18,7 +18,7 @@ from bufgym.qoi import value
 
 @register("min-gap", source="online checkpointing, smallest merged gap", compile=True)
 def min_gap(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """A full queue drops the message whose loss leaves the smallest time gap (newcomer included, ties to the oldest)."""
+    """A full queue drops what leaves the smallest merged time gap (newcomer included, ties to the oldest)."""
     s = len(buffer.slots)
     if s < buffer.capacity:
         return ACCEPT
@@ -32,7 +32,7 @@ def min_gap(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 
 @register("min-motion-gap", source="as min-gap, on the robot's odometry", compile=True)
 def min_motion_gap(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """A full queue drops the message whose loss leaves the smallest motion gap (newcomer included, ties to the oldest)."""
+    """A full queue drops what leaves the smallest merged motion gap (newcomer included, ties to the oldest)."""
     s = len(buffer.slots)
     if s < buffer.capacity:
         return ACCEPT

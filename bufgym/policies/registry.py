@@ -154,7 +154,7 @@ def get(spec: str | Policy) -> Policy:
         raise BufgymError(f"unknown policy {name!r}; known: {', '.join(_REGISTRY)}")
     numbers: dict[str, float] = {}
     for setting in filter(None, settings.split(",")):
-        key, equals, number = setting.partition("=")
+        key, _, number = setting.partition("=")
         try:
             numbers[key.strip()] = float(number)
         except ValueError:

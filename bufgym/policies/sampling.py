@@ -27,7 +27,8 @@ def reservoir_departure(buffer: Buffer, memory: NDArray[np.float64]) -> None:
 )
 def reservoir(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """Reservoir sampling: every arrival of the interruption is kept with the same probability."""
-    memory[SEEN] += 1
+    # What was accepted unasked (decide_at="overflow") is still queued here when the first victim is sought.
+    memory[SEEN] = max(memory[SEEN], len(buffer.slots)) + 1
     if len(buffer.slots) < buffer.capacity:
         return ACCEPT
     place = int(arrival.luck * memory[SEEN])
