@@ -1,0 +1,50 @@
+"""The AFR paper's figures and theorems again: our number beside the paper's.
+
+``run("afr-fig5", Path("out"))`` returns a text to print and saves the numbers (CSV) and the figure (PNG) under ``out``.
+Each figure is one file, imported only when it is asked for. The numbers need nothing beyond bufgym; the figure needs
+matplotlib, which comes with ``bufgym[plot]``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from pathlib import Path
+from typing import Any
+
+from bufgym.errors import BufgymError
+from bufgym.reproduce.report import Report
+
+FIGURES: dict[str, str] = {
+    "afr-fig4": "AFR paper, Fig. 4: which messages AFR keeps as an interruption grows, L = 8",
+    "afr-fig5": "AFR paper, Fig. 5: information gained against the length of the interruption, L = 8",
+    "afr-theorems": "AFR paper, Theorems 1-3: AFR against oracle-ideal for every L, T and V",
+    "afr-fig9": "AFR paper, Fig. 9: time of one decision of each built-in policy, on this machine",
+}
+"""Name -> what it shows, in one line."""
+
+
+def run(name: str, out: Path | None = None, **options: Any) -> str:
+    """Reproduce one figure; the text compares our numbers with the paper's.
+
+    Args:
+        name: a key of ``FIGURES``.
+        out: folder for ``<name>.csv`` and ``<name>.png``, made where absent; None saves nothing.
+        options: what that figure's ``report`` takes, such as ``runs`` for afr-fig5.
+    """
+    if name not in FIGURES:
+        raise BufgymError(f"unknown figure {name!r}; known: {', '.join(FIGURES)}")
+    make = importlib.import_module(f"bufgym.reproduce.{name.replace('-', '_')}").report
+    known = inspect.signature(make).parameters
+    for option in options:
+        if option not in known:
+            raise BufgymError(f"{name}: no option {option!r}; it has: {', '.join(known)}")
+    report: Report = make(**options)
+    if out is None:
+        return report.text
+    lines = [report.text, f"numbers: {report.save_numbers(out / f'{name}.csv')}"]
+    try:
+        lines.append(f"figure: {report.save_figure(out / f'{name}.png')}")
+    except BufgymError as error:  # the numbers stand without it
+        lines.append(f"no figure: {error}")
+    return "\n".join(lines)

@@ -1,0 +1,208 @@
+"""What the AFR paper states, against the simulator: Fig. 4 step by step, Fig. 5, Theorems 1-3, Eq. 9."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from bufgym import policies, qoi, sender
+from bufgym.kernel import JIT
+from bufgym.oracle import interruption as oracle
+from bufgym.qoi import Value
+from bufgym.reproduce import afr_fig4, afr_fig5, afr_fig9, afr_theorems
+from bufgym.scenario import Interruption
+from bufgym.sender import NEVER
+
+# -------------------- Fig. 4
+
+# Typed from the paper's figure: (T, dropped, r, c, p) with L = 8, the state after the decision.
+FIG4 = [
+    (8, None, 1, 0, 0),
+    (9, 1, 1, 0, 1),
+    (10, 3, 1, 0, 2),
+    (11, 5, 1, 0, 3),
+    (12, 7, 1, 0, 4),
+    (13, 9, 1, 0, 5),
+    (14, 11, 1, 0, 6),
+    (15, 13, 1, 0, 7),
+    (16, 15, 2, 0, 0),  # the pass is over: r doubles
+    (17, 17, 2, 1, 0),  # rejected by the counter
+    (18, 2, 2, 0, 1),
+]
+
+
+@pytest.mark.parametrize("policy", ["afr", "afr-paper"])
+def test_fig4_step_by_step(policy: str) -> None:
+    steps = afr_fig4.steps(8, 18, policy)
+    assert [step.T for step in steps] == list(range(1, 19))
+    assert all(step.dropped is None and step.kept == tuple(range(1, step.T + 1)) for step in steps[:8])
+    assert [(s.T, s.dropped, s.r, s.c, s.p) for s in steps[7:]] == FIG4
+    assert steps[11].kept == (2, 4, 6, 8, 9, 10, 11, 12)
+    assert steps[15].kept == steps[16].kept == (2, 4, 6, 8, 10, 12, 14, 16)
+    assert steps[17].kept == (4, 6, 8, 10, 12, 14, 16, 18)
+
+
+@pytest.mark.parametrize("T", [8, 9, 13, 16, 17, 18])
+def test_fig4_is_what_the_server_receives(T: int) -> None:
+    """The steps come from one long run watched from inside; a run that ends at T delivers the same messages."""
+    (gaps,) = afr_theorems.gaps_of("afr", 8, [T])
+    assert tuple(np.cumsum(gaps)[:-1]) == afr_fig4.steps(8, 18)[T - 1].kept
+
+
+# -------------------- Fig. 5
+
+
+@pytest.mark.parametrize(("policy", "mean"), [("afr", 0.98598), ("drop-oldest", 0.47050)])
+@pytest.mark.slow
+def test_fig5_mean_over_the_oracle(policy: str, mean: float) -> None:
+    assert afr_fig5.mean_score(policy, 8, 9, 399) == pytest.approx(mean, abs=5e-6)
+
+
+def gained(T: int) -> tuple[float, float]:
+    """H - 1 of AFR and of oracle-ideal, L = 8, V(d) = 1 - 0.618^d."""
+    v = qoi.exponential(0.618)
+    (ours,) = afr_fig5.gained("afr", [Interruption(law="fixed", t_max=T, value=v).episode(T)], 8, v)
+    return float(ours), oracle.ideal(8, T, v)
+
+
+@pytest.mark.parametrize("T", [17, 35, 71])
+def test_fig5_afr_equals_the_ideal_where_its_gaps_are_equal(T: int) -> None:
+    ours, ideal = gained(T)
+    assert ours == pytest.approx(ideal, rel=1e-13)
+    # by hand: 9 gaps of (T + 1) / 9
+    assert ours == pytest.approx(9 * (1 - 0.618 ** ((T + 1) // 9)), rel=1e-13)
+
+
+@pytest.mark.parametrize("T", [18, 36, 72])
+def test_fig5_afr_is_below_the_ideal_one_message_later(T: int) -> None:
+    ours, ideal = gained(T)
+    assert ours < 0.97 * ideal
+
+
+def test_fig5_information_is_not_monotone_in_T() -> None:
+    assert gained(35)[0] == pytest.approx(7.687, abs=5e-4)
+    assert gained(36)[0] == pytest.approx(7.340, abs=5e-4)
+
+
+def test_fig5_random_is_repeatable_and_batched_in_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    interruption = Interruption(law="fixed", t_max=20)
+    whole = afr_fig5.gained_at_random(interruption, 20, 8, 7, np.random.default_rng(1))
+    monkeypatch.setattr(afr_fig5, "BATCH", 3)
+    parts = afr_fig5.gained_at_random(interruption, 20, 8, 7, np.random.default_rng(1))
+    assert len(whole) == 7 and len(set(whole)) > 1
+    assert whole.tolist() == parts.tolist()
+
+
+# -------------------- Eq. 9
+
+
+@pytest.mark.parametrize(("L", "T"), [(1, 4), (3, 9), (8, 20)])
+def test_random_keeps_each_message_as_eq_9_says(L: int, T: int) -> None:
+    """P{i kept at T} = (L / (L + 1))^min(T - i + 1, T - L): it survives each of the full arrivals that it meets."""
+    runs = 20_000 if JIT else 200
+    rng = np.random.default_rng(7)
+    episode = Interruption(law="fixed", t_max=T).episode(T)
+    done = sender.run(policies.get("random"), [episode.with_luck(rng) for _ in range(runs)], L, qoi.exponential())
+    kept = (np.array(done.batch.fates["dropped_us"]) == NEVER).mean(axis=0)
+    assert kept[0] == kept[T + 1] == 1
+    for i in range(1, T + 1):
+        expected = (L / (L + 1)) ** min(T - i + 1, T - L)
+        standard_error = math.sqrt(expected * (1 - expected) / runs)
+        # 4.5 standard errors: the seed is fixed, so it can't fail by chance later
+        assert abs(kept[i] - expected) < 4.5 * standard_error, (i, kept[i], expected)
+
+
+# -------------------- Theorems 1-3
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> Value:
+    """Concave, non-decreasing, V(0) = 0, at most 1: slopes sorted from steep to flat, scaled to end at 1 or below."""
+    steps = draw(st.lists(st.integers(1, 40), min_size=1, max_size=6))
+    slopes = sorted(draw(st.lists(st.integers(1, 1000), min_size=len(steps), max_size=len(steps))), reverse=True)
+    d = np.concatenate([[0], np.cumsum(steps)]).astype(np.float64)
+    levels = np.concatenate([[0], np.cumsum(np.array(steps) * slopes)])
+    return qoi.tabulated(d.tolist(), (levels / levels[-1] * draw(st.floats(0.05, 1))).tolist())
+
+
+VALUES = st.one_of(
+    st.floats(0.05, 0.995).map(qoi.exponential),
+    st.floats(0.5, 200).map(qoi.saturating),
+    tables(),
+)
+
+
+@given(L=st.integers(1, 40), T=st.integers(1, 500), v=VALUES)
+def test_theorems_for_any_L_T_and_V(L: int, T: int, v: Value) -> None:
+    (gaps,) = afr_theorems.gaps_of("afr", L, [T])
+    assert gaps.sum() == T + 1 and len(gaps) == min(L, T) + 1
+    afr = sum(v(float(g)) for g in gaps)
+    integer, ideal = oracle.integer(L, T, v), oracle.ideal(L, T, v)
+    # 1: the oracles bound AFR
+    assert afr <= integer * (1 + 1e-12)
+    assert integer <= ideal * (1 + 1e-12)
+    # 2: the paper's bound, the sharper one, and the exact worst over every V
+    assert afr_theorems.bound(L) == pytest.approx(2 * (math.sqrt(2) - 1) * L / (L + 1))
+    assert afr_theorems.bound(L) < afr_theorems.sharper_bound(L) < 1
+    worst = afr_theorems.worst_ratio(gaps)
+    assert afr / ideal >= worst - 1e-9
+    assert worst >= afr_theorems.sharper_bound(L) - 1e-12
+    # 3: gaps of r and 2r, and a shorter one at the edge
+    assert afr_theorems.even_enough(gaps)
+    assert set(gaps[:-1]) <= {min(gaps[:-1]), 2 * min(gaps[:-1])}
+
+
+@given(L=st.integers(1, 20), k=st.integers(0, 4), v=VALUES)
+def test_afr_is_ideal_where_T_plus_1_is_L_plus_1_times_a_power_of_2(L: int, k: int, v: Value) -> None:
+    T = (L + 1) * 2**k - 1
+    (gaps,) = afr_theorems.gaps_of("afr", L, [T])
+    assert gaps.tolist() == [2**k] * (L + 1)
+    assert sum(v(float(g)) for g in gaps) == pytest.approx(oracle.ideal(L, T, v), rel=1e-12)
+
+
+@given(L=st.integers(1, 12), T=st.integers(2, 200))
+def test_the_worst_ratio_is_met_by_a_saturating_V(L: int, T: int) -> None:
+    assume(T > L)
+    (gaps,) = afr_theorems.gaps_of("afr", L, [T])
+    v = qoi.saturating((T + 1) / (L + 1))
+    ours = sum(v(float(g)) for g in gaps) / oracle.ideal(L, T, v)
+    assert ours == pytest.approx(afr_theorems.worst_ratio(gaps), rel=1e-12)
+
+
+def test_a_worst_ratio_worked_by_hand() -> None:
+    """L = 1, T = 2: AFR keeps message 2, gaps 2 and 1, mean 1.5: (1 + 1 / 1.5) / 2 = 5 / 6."""
+    (gaps,) = afr_theorems.gaps_of("afr", 1, [2])
+    assert gaps.tolist() == [2, 1]
+    assert afr_theorems.worst_ratio(gaps) == pytest.approx(5 / 6)
+
+
+def test_the_grid_has_no_violation() -> None:
+    text = afr_theorems.report(5, 80).text
+    assert text.count(" 0 violations") == text.count("violations") == 5
+
+
+def test_properties_can_fail() -> None:
+    """Drop Oldest leaves one gap of T - L + 1, far more than twice the others."""
+    (gaps,) = afr_theorems.gaps_of("drop-oldest", 8, [30])
+    assert not afr_theorems.even_enough(gaps)
+    assert afr_theorems.worst_ratio(gaps) < afr_theorems.bound(8)
+
+
+# -------------------- Fig. 9
+
+
+@pytest.mark.parametrize("name", ["afr", "drop-oldest", "random", "orbbuf"])
+def test_the_timed_loop_makes_the_policys_own_decisions(name: str) -> None:
+    policy = policies.get(name)
+    buffer, arrivals = afr_fig9.full_queue(8, 30)
+    assert buffer.slots["seq"].tolist() == list(range(1, 9))
+    assert arrivals["seq"].tolist() == list(range(9, 39))
+    start, memory = policy.new_memory(2)
+    looped = afr_fig9.compiled_loop()(buffer, arrivals, memory, start, policy.compiled[0], 2)
+    memory = policy.new_memory()[0]
+    called = sum(policy.compiled[0](buffer, arrivals[k], memory) for k in range(30))
+    assert looped == 2 * called

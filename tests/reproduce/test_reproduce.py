@@ -1,0 +1,80 @@
+"""The door to the figures: names, options, files."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.reproduce import FIGURES, run
+
+SMALL: dict[str, dict[str, Any]] = {
+    "afr-fig4": {},
+    "afr-fig5": {"runs": 50 if JIT else 3, "last_T": 40 if JIT else 18},
+    "afr-theorems": {"max_capacity": 4, "last_T": 40},
+    "afr-fig9": {"decisions": 1000, "calls": 100},
+}
+"""Options that keep each figure short; a new figure must add its own."""
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_saves_its_numbers_and_its_figure(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    if not JIT:
+        from bufgym.reproduce import afr_fig5
+
+        monkeypatch.setattr(afr_fig5, "MEAN_OVER", (9, 20))
+    text = run(name, tmp_path / "new", **SMALL[name])
+    assert "paper" in text
+    table = tmp_path / "new" / f"{name}.csv"
+    figure = tmp_path / "new" / f"{name}.png"
+    assert str(table) in text and str(figure) in text
+    with table.open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    assert len(rows) >= 4
+    assert all(len(row) == len(header) for row in rows)
+    assert figure.read_bytes().startswith(PNG)
+
+
+def test_without_a_folder_it_saves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "Fig. 4" in run("afr-fig4")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_matplotlib_the_numbers_still_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)  # None there makes the import fail
+    text = run("afr-fig4", tmp_path)
+    assert "10 of 10 drops" in text
+    assert "bufgym[plot]" in text
+    assert [path.name for path in tmp_path.iterdir()] == ["afr-fig4.csv"]
+
+
+def test_unknown_names_and_options_list_the_known() -> None:
+    with pytest.raises(BufgymError, match="unknown figure 'afr-fig99'; known: afr-fig4, afr-fig5"):
+        run("afr-fig99")
+    with pytest.raises(BufgymError, match="afr-fig5: no option 'rums'; it has: runs, last_T, seed"):
+        run("afr-fig5", rums=3)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("afr-fig4", {"last_T": 7}),
+        ("afr-fig5", {"runs": 1}),
+        ("afr-fig5", {"last_T": 0}),
+        ("afr-theorems", {"max_capacity": 0}),
+        ("afr-fig9", {"calls": 0}),
+    ],
+)
+def test_unusable_options_are_refused(name: str, options: dict[str, int]) -> None:
+    with pytest.raises(BufgymError, match=r"must be|need"):
+        run(name, **options)
