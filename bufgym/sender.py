@@ -472,6 +472,9 @@ class Senders:
     def load(self, i: int, episode: Episode) -> None:
         """Begin ``episode`` at sender ``i``: empty buffer, idle socket, nothing arrived."""
         link = episode.link
+        if len(episode.arrivals) > self.batch.arrivals.shape[1]:
+            most = self.batch.arrivals.shape[1]
+            raise BufgymError(f"episode of {len(episode.arrivals)} messages: these senders have room for {most}")
         first_knot, last_knot, after = self._knots.place(link.trace)
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)

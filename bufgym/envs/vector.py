@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import Rows, Shown
+from bufgym.envs.rows import DELIVERED, RETAINED, Rows, Shown
 from bufgym.envs.single import Observation, SenderEnv
 from bufgym.errors import BufgymError
 from bufgym.scenario import Scenario
@@ -69,7 +69,11 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         )
         self.num_envs = int(num_envs)
         self.max_episode_steps = max_episode_steps
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            known = ", ".join(repr(mode.value) for mode in AutoresetMode)
+            raise BufgymError(f"autoreset_mode = {autoreset_mode!r}: must be one of {known}") from None
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
         self.single_observation_space = self.rows.observation_space
@@ -94,6 +98,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         mask = np.asarray(options.get("reset_mask", self._every_row), np.bool_)
         if mask.shape != (self.num_envs,):
             raise BufgymError(f"options['reset_mask'] has shape {mask.shape}: must be ({self.num_envs},)")
+        if any(self.rows.senders.episodes[i] is None for i in np.flatnonzero(~mask)):
+            raise gym.error.ResetNeeded("options['reset_mask'] leaves out rows that have no episode yet")
         self._turn_page(keep=True)
         chosen = np.flatnonzero(mask)
         for i in chosen.tolist():
@@ -101,7 +107,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
                 self.rows.seed(i, seeding.np_random(seeds[i])[0])
         self.rows.reset(chosen, options.get("episodes"))
         self._steps[mask] = 0
-        self._done[mask] = False
+        self._done = self._done & ~mask  # a new array: the last step may have handed out this one
         return self._observation(), self._info(terms=False)
 
     def step(
@@ -127,11 +133,13 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             rows.shown.terms[self._done] = 0.0
             self._steps[self._done] = 0
         shown = rows.shown
-        rewards = shown.terms @ rows.weights
+        # Written out as in the single environment: a matrix product may round differently.
+        weights, terms = rows.weights, shown.terms
+        rewards = weights[DELIVERED] * terms[:, DELIVERED] + weights[RETAINED] * terms[:, RETAINED]
         terminated = shown.ended & ~self._done if restart else shown.ended.copy()
         truncated = np.zeros(self.num_envs, np.bool_)
         if self.max_episode_steps is not None:
-            truncated = (self._steps >= self.max_episode_steps) & ~terminated
+            truncated = self._steps >= self.max_episode_steps  # as Gymnasium's TimeLimit: also where it ends anyway
         self._done = terminated | truncated
         info: dict[str, Any] = {}
         if self._done.any():
@@ -166,9 +174,10 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             return report if ended.any() else {}
         if not ended.any():
             report = {}
-        final = {name: np.where(done[:, None], array, 0) for name, array in self._observation().items()}
-        for name in tuple(final):
-            final[f"_{name}"] = done
+        # One observation for each row that ended, None for the others, as in Gymnasium's SyncVectorEnv.
+        final: NDArray[Any] = np.full(self.num_envs, None, object)
+        for i in np.flatnonzero(done):
+            final[i] = rows.observation(rows.shown.slots[i].copy(), rows.shown.context[i].copy())
         mask = np.where(done[:, None], rows.shown.mask, False)
         last = self._info() | {"action_mask": mask, "_action_mask": done, "_impossible": done, "_reward_terms": done}
         last["impossible"] = np.where(done, last["impossible"], 0)

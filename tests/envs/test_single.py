@@ -1,0 +1,354 @@
+"""The single environment: Gymnasium's own checks, rewards worked by hand, masks, conservation, observations."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import bufgym
+from bufgym import qoi
+from bufgym.buffer import UNLIMITED_BYTES, Buffer, motion_gaps, time_gaps
+from bufgym.envs import SenderEnv
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.link import Link
+from bufgym.observe import CONTEXT_FIELDS, FIELDS, SLOT_FIELDS
+from bufgym.scenario import Episode, Interruption, Scenario, Uplink, messages
+from bufgym.sender import Batch, view
+from bufgym.traces import Trace, drive_motion
+
+FADING = Trace.steps([(0.4, 9e6), (0.5, 0), (0.6, 2e6)])
+DYING = Trace.steps([(0.4, 9e6), (0.3, 1e6)], after="stop")
+
+SCENARIOS: dict[str, Scenario] = {
+    "interruption": Interruption(t_max=25),
+    "fading": Uplink(traces=(FADING,), jitter=0.8, size_cv=0.7, duration_s=2.0),
+    "moving": Uplink(traces=(FADING,), motion=(drive_motion(3, 30),), duration_s=2.0, value=qoi.saturating(0.2)),
+    "dying": Uplink(traces=(DYING,), duration_s=2.0, random_offset=False),
+}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "arrival": {},
+    "overflow": {"decide_at": "overflow"},
+    "bytes": {"max_bytes": 600_000},
+    "overflow-bytes": {"decide_at": "overflow", "max_bytes": 600_000},
+}
+EPISODES = 4 if JIT else 1
+
+
+def make(scenario: str, variant: str, capacity: int = 4, **more: Any) -> SenderEnv:
+    return SenderEnv(SCENARIOS[scenario], capacity, **VARIANTS[variant], **more)
+
+
+def seen(env: SenderEnv) -> tuple[Buffer, Any]:
+    """The Buffer and the newcomer as a policy of plain Python gets them."""
+    batch = Batch(*(a.view(np.recarray) if a.dtype.names else a for a in env.rows.senders.batch))
+    return getattr(view, "py_func", view)(batch, 0), batch.arrivals[0, batch.senders[0].next]
+
+
+def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
+
+
+# --- Gymnasium -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
+def test_gymnasium_finds_nothing_to_complain_about(env_id: str) -> None:
+    check_env(gym.make(env_id, **({} if JIT else _smaller(env_id))).unwrapped)
+
+
+def _smaller(env_id: str) -> dict[str, Any]:
+    return {"t_max": 20} if "Interruption" in env_id else {"duration_s": 1.0}
+
+
+@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
+def test_same_seed_same_episode(env_id: str) -> None:
+    """And the episodes that follow without a seed are the same, too; another seed gives another."""
+
+    def play(seed: int) -> list[Any]:
+        env = gym.make(env_id, **_smaller(env_id))
+        rng = np.random.default_rng(seed)
+        record = []
+        for k in range(3):
+            obs, info = env.reset(seed=seed if k == 0 else None)
+            ended = False
+            while not ended:
+                obs, reward, ended, _, info = env.step(int(rng.integers(10)))
+                record.append((reward, info["action_mask"].tolist(), {key: obs[key].tolist() for key in obs}))
+        return record
+
+    assert play(5) == play(5)
+    assert play(5) != play(6)
+
+
+def test_an_id_that_names_its_module() -> None:
+    env = gym.make("bufgym:bufgym/Uplink-v0", capacity=3)
+    assert env.action_space == gym.spaces.Discrete(5)
+    observation, info = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert info["action_mask"].shape == (5,)
+
+
+def test_fields_choose_what_is_observed() -> None:
+    env, everything = make("fading", "arrival", fields=["drain", "loss"]), make("fading", "arrival")
+    assert set(env.observation_space) == {"loss", "drain"}
+    few, all_of_it = env.reset(seed=3)[0], everything.reset(seed=3)[0]
+    assert set(few) == {"loss", "drain"}
+    assert set(all_of_it) == {field.name for field in FIELDS}
+    assert same(few, {name: all_of_it[name] for name in few})
+    assert env.observation_space["loss"].shape == (5,)
+    assert env.observation_space["drain"].shape == (1,)
+
+
+# --- rewards ---------------------------------------------------------------------------------------------------------
+
+
+def test_rewards_worked_by_hand() -> None:
+    """L = 2, T = 4. Message 0 is in transmission; 1 and 2 are accepted; 3 evicts one of them; 4 is rejected; 5 follows.
+
+    Delivered are 0, 1 or 2, 3, 5: H = 1 + V(1) + V(2) + V(2) in both cases.
+    """
+    v1, v2 = 1 - 0.618, 1 - 0.618**2
+    for slot in (0, 1):
+        env = SenderEnv(Interruption(law="fixed", t_max=4), 2)
+        env.reset(seed=0)
+        paid = []
+        for action in (3, 3, slot, 2):
+            _, reward, ended, truncated, info = env.step(action)
+            paid.append((info["reward_terms"]["retained"], info["reward_terms"]["delivered"]))
+            assert reward == info["reward_terms"]["retained"]
+            assert not truncated
+        assert ended
+        expected = [(v1, 0), (v1, 0), (v2 - v1, 0), (v2, v1 + v2 + v2)]
+        np.testing.assert_allclose(paid, expected, atol=1e-15)
+        assert info["qoi"] == pytest.approx(1 + v1 + 2 * v2)
+        assert (info["arrived"], info["delivered"], info["dropped"], info["impossible"]) == (6, 4, 2, 0)
+
+
+def test_rejecting_all_and_weighted_rewards() -> None:
+    """T = 3, all rejected: 0 and 4 are delivered, V(4) is paid by the last step, at half and twice its worth."""
+    env = SenderEnv(Interruption(law="fixed", t_max=3), 2, reward={"delivered": 2.0, "retained": 0.5})
+    env.reset(seed=0)
+    paid = [env.step(2)[1] for _ in range(3)]
+    assert paid == [0, 0, pytest.approx(2.5 * (1 - 0.618**4))]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_every_step_of_random_play(scenario: str, variant: str) -> None:
+    """Conservation, masks, bounds and sums of rewards under actions of which many are impossible."""
+    env, rng = make(scenario, variant), np.random.default_rng(1)
+    L, most = env.rows.capacity, VARIANTS[variant].get("max_bytes", UNLIMITED_BYTES)
+    for k in range(EPISODES):
+        observation, info = env.reset(seed=7 if k == 0 else None)
+        ended, total, impossible = False, np.zeros(2), 0
+        while not ended:
+            assert env.observation_space.contains(observation)
+            sender = env.rows.senders.batch.senders[0]
+            if sender["waiting"]:
+                buffer, arrival = seen(env)
+                room = most - buffer.backlog_bytes - arrival.size_bytes
+                allowed = [k < len(buffer.slots) and room + buffer.slots[k].size_bytes >= 0 for k in range(L)]
+                allowed += [True, len(buffer.slots) < L and room >= 0]
+                assert info["action_mask"].tolist() == allowed
+                assert env.action_masks().tolist() == allowed
+                assert variant == "arrival" or variant == "bytes" or not allowed[L + 1]
+            else:
+                allowed = [True] * (L + 2)  # an episode that asks for nothing: whatever is said counts for nothing
+            action = int(rng.integers(L + 2))
+            impossible += not allowed[action]
+            observation, reward, ended, truncated, info = env.step(action)
+            assert not truncated
+            terms = info["reward_terms"]
+            total += terms["delivered"], terms["retained"]
+            assert reward == terms["retained"]
+            assert info["impossible"] == impossible
+            sender, fates = env.rows.senders.batch.senders[0], env.rows.senders.batch.fates[0]
+            arrived = int(sender["next"])
+            dropped = int((fates["dropped_us"][:arrived] >= 0).sum())
+            crossed = int((fates["crossed_us"][:arrived] >= 0).sum())
+            assert arrived == crossed + sender["busy"] + sender["occupancy"] + dropped
+            assert (crossed, dropped) == (sender["crossed"], sender["rejected"] + sender["evicted"])
+            assert 0 <= sender["backlog_bytes"] <= most
+            assert 0 <= sender["occupancy"] <= L
+        assert info["arrived"] == arrived == len(env.rows.senders.episodes[0].arrivals)
+        assert (info["delivered"], info["dropped"]) == (crossed, dropped)
+        np.testing.assert_allclose(total, max(0.0, info["qoi"] - 1), atol=1e-9)
+        # H by its definition, from what crossed.
+        x = env.rows.senders.episodes[0].arrivals["x"][: len(fates)][fates["crossed_us"][:arrived] >= 0]
+        assert info["qoi"] == pytest.approx(env.rows.scenario.value.information(np.sort(x)))
+    if scenario == "dying":
+        assert sender["occupancy"] + sender["busy"] > 0  # stranded, and still all sums hold
+
+
+def test_an_episode_that_asks_for_no_decision_ends_with_the_first_step() -> None:
+    env = SenderEnv(Interruption(law="fixed", t_max=3), 8, decide_at="overflow")
+    observation, info = env.reset(seed=0)
+    assert info["action_mask"].tolist() == [False] * 8 + [True, False]
+    assert not any(array.any() for array in observation.values())
+    _, reward, ended, _, info = env.step(0)
+    assert ended
+    assert (info["delivered"], info["dropped"], info["impossible"]) == (5, 0, 0)
+    assert reward == pytest.approx(4 * (1 - 0.618))
+    assert info["qoi"] == pytest.approx(1 + 4 * (1 - 0.618))
+
+
+@pytest.mark.parametrize("variant", ["arrival", "bytes"])
+def test_an_impossible_action_does_what_a_queue_does(variant: str) -> None:
+    env, queue, rng = make("fading", variant), make("fading", variant), np.random.default_rng(0)
+    (_, info), _ = env.reset(seed=2), queue.reset(seed=2)
+    ended, impossible = False, 0
+    while not ended:
+        mask = info["action_mask"]
+        action = int(rng.choice(np.flatnonzero(~mask) if rng.random() < 0.5 and not mask.all() else np.arange(6)))
+        instead = action if mask[action] else 5 if mask[5] else 4
+        impossible += action != instead or not mask[action]
+        observation, reward, ended, _, info = env.step(action)
+        as_queue, reward_there, _, _, there = queue.step(instead)
+        assert same(observation, as_queue)
+        assert reward == reward_there
+        assert (info["impossible"], there["impossible"]) == (impossible, 0)
+    assert impossible > 5
+
+
+# --- observations ----------------------------------------------------------------------------------------------------
+
+
+def twin(buffer: Buffer, arrival: Any, V: qoi.Value) -> dict[str, list[float]]:
+    """The observation once more, field by field from its definition."""
+    gaps_us, gaps_x = getattr(time_gaps, "py_func", time_gaps), getattr(motion_gaps, "py_func", motion_gaps)
+
+    def per(g: float, r: float) -> float:
+        return float(g / (g + r)) if g > 0 else 0.0
+
+    L, s = buffer.capacity, len(buffer.slots)
+    even_us, even_x = (arrival.arrival_us - buffer.taken_us) / (L + 1), (arrival.x - buffer.taken_x) / (L + 1)
+    sizes = [*(slot.size_bytes for slot in buffer.slots), arrival.size_bytes]
+    fields: dict[str, list[float]] = {field.name: [] for field in SLOT_FIELDS}
+    for k in [*range(s), *[None] * (L - s), s]:
+        if k is None:
+            values = [0.0] * len(SLOT_FIELDS)
+        else:
+            (a_us, b_us), (a, b) = gaps_us(buffer, arrival, k), gaps_x(buffer, arrival, k)
+            # Nothing is lost with the very first message of all: it has no gap before it yet.
+            first = buffer.taken == 0 and k == 0
+            values = [
+                1.0,
+                (k + 1) / (s + 1),
+                per(a_us, even_us),
+                per(a_us + b_us, 2 * even_us),
+                per(a, even_x),
+                per(a + b, 2 * even_x),
+                0.0 if first else V(a) + V(b) - V(a + b),
+                per(sizes[k], sum(sizes) / (s + 1)),
+            ]
+        for field, number in zip(SLOT_FIELDS, values, strict=True):
+            fields[field.name].append(number)
+    stalled_by = (L + 1) * buffer.period_us
+    context = [
+        s / L,
+        buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0,
+        per(arrival.arrival_us - buffer.previous_us, even_us),
+        per(arrival.x - buffer.previous_x, even_x),
+        float(buffer.busy),
+        buffer.left_fraction,
+        per(buffer.stalled_us, stalled_by),
+        per(buffer.departures, 1.0),
+        per(buffer.drain, 1.0),
+    ]
+    return fields | {field.name: [number] for field, number in zip(CONTEXT_FIELDS, context, strict=True)}
+
+
+@pytest.mark.parametrize("variant", ["arrival", "overflow-bytes"])
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_observation_equals_its_definition(scenario: str, variant: str) -> None:
+    env, rng = make(scenario, variant), np.random.default_rng(4)
+    compared = 0
+    for k in range(EPISODES):
+        observation, info = env.reset(seed=11 if k == 0 else None)
+        ended = not env.rows.senders.batch.senders["waiting"][0]
+        while not ended:
+            buffer, arrival = seen(env)
+            expected = twin(buffer, arrival, env.rows.scenario.value)
+            assert observation.keys() == expected.keys()
+            for name, numbers in expected.items():
+                np.testing.assert_allclose(observation[name], numbers, rtol=1e-6, atol=1e-6, err_msg=name)
+                assert all(0 <= number <= 1 for number in observation[name]), name
+            compared += 1
+            # Keep the buffer long: accept where possible, else mostly evict.
+            action = 5 if info["action_mask"][5] else int(rng.choice(np.flatnonzero(info["action_mask"])))
+            observation, _, ended, _, info = env.step(action)
+    assert compared > 5
+
+
+def test_observation_bounds_hold_where_nothing_moves_and_all_comes_at_once() -> None:
+    """Arrivals at one moment, x that stands still: every reference length is 0."""
+    arrivals = messages(np.zeros(9, np.int64), 1000, np.zeros(9))
+    episode = Episode(arrivals, Link(Trace.steps([(1.0, 0), (1.0, 1e6)])))
+    env = SenderEnv(Interruption(t_max=25), 3)
+    observation, _ = env.reset(seed=0, options={"episode": episode})
+    ended = False
+    while not ended:
+        assert env.observation_space.contains(observation)
+        observation, _, ended, _, info = env.step(4)
+    assert info["arrived"] == 9
+    assert info["qoi"] == 1.0
+
+
+# --- wrong use -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"capacity": 0}, "capacity = 0"),
+        ({"capacity": -1}, "capacity = -1"),
+        ({"capacity": 2.5}, "capacity = 2.5"),
+        ({"capacity": True}, "capacity = True"),
+        ({"scenario": "moon"}, "unknown scenario 'moon'"),
+        ({"reward": "fame"}, "unknown term 'fame'"),
+        ({"reward": {"delivered": math.nan}}, "finite"),
+        ({"fields": ["smell"]}, "unknown field 'smell'"),
+        ({"fields": []}, "at least one field"),
+        ({"duration_s": math.nan}, "duration_s = nan"),
+        ({"decide_at": "noon"}, "decide_at = 'noon'"),
+        ({"max_bytes": 0}, "max_bytes = 0"),
+        ({"colour": "red"}, "no parameter 'colour'"),
+        ({"render_mode": "human"}, "render_mode = 'human'"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments: dict[str, Any], says: str) -> None:
+    with pytest.raises(BufgymError) as caught:
+        SenderEnv(**arguments)
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("action", [-1, 6, 10**9])
+def test_an_action_out_of_range(action: int) -> None:
+    env = make("fading", "arrival")
+    env.reset(seed=0)
+    with pytest.raises(BufgymError, match=rf"action = {action}: must lie in 0\.\.5"):
+        env.step(action)
+
+
+def test_a_step_before_the_reset() -> None:
+    with pytest.raises(gym.error.ResetNeeded):
+        make("fading", "arrival").step(0)
+
+
+def test_a_given_episode_that_is_too_long() -> None:
+    episode = Interruption(t_max=30).episode(30)
+    with pytest.raises(BufgymError, match="32 messages: these senders have room for 27"):
+        make("interruption", "arrival").reset(options={"episode": episode})
+
+
+def test_a_given_episode_is_played() -> None:
+    env = make("interruption", "arrival")
+    env.reset(options={"episode": SCENARIOS["interruption"].episode(3)})  # type: ignore[attr-defined]
+    steps = [env.step(4) for _ in range(3)]
+    assert [step[2] for step in steps] == [False, False, True]

@@ -1,0 +1,307 @@
+"""The batched environment: row i is the single environment with row i's seed, bit for bit, in Gymnasium's own forms."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList, FlattenObservation, RecordEpisodeStatistics
+
+import bufgym
+from bufgym import qoi
+from bufgym.envs import SenderEnv, SenderVectorEnv
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.scenario import Interruption, Scenario, Uplink
+from bufgym.traces import Trace
+
+FADING = Trace.steps([(0.4, 9e6), (0.5, 0), (0.6, 2e6)])
+DYING = Trace.steps([(0.4, 9e6), (0.3, 1e6)], after="stop")
+
+CASES: dict[str, tuple[Scenario, dict[str, Any]]] = {
+    "interruption": (Interruption(t_max=25), {}),
+    "fading": (Uplink(traces=(FADING,), jitter=0.8, size_cv=0.7, duration_s=1.0), {"max_bytes": 600_000}),
+    "dying": (
+        Uplink(traces=(DYING,), duration_s=0.8, value=qoi.saturating(3.0)),
+        {"decide_at": "overflow", "reward": {"delivered": 0.3, "retained": 0.7}},
+    ),
+}
+L, N = 4, 3
+STEPS = 150 if JIT else 70
+
+
+def vector(case: str, **more: Any) -> SenderVectorEnv:
+    scenario, arguments = CASES[case]
+    return SenderVectorEnv(N, scenario, L, **arguments, **more)
+
+
+def single(case: str) -> SenderEnv:
+    scenario, arguments = CASES[case]
+    return SenderEnv(scenario, L, **arguments)
+
+
+def row(info: dict[str, Any], i: int) -> dict[str, Any]:
+    """Row ``i`` of a vector environment's info, where ``_key`` says who has ``key``."""
+    mine: dict[str, Any] = {}
+    for key, column in info.items():
+        if not key.startswith("_") and info[f"_{key}"][i]:
+            mine[key] = row(column, i) if isinstance(column, dict) else column[i]
+    return mine
+
+
+def assert_same(a: Any, b: Any) -> None:
+    """Equal to the last bit, dictionaries by key."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_same(a[key], b[key])
+    elif isinstance(a, np.ndarray) and a.dtype == object:
+        for mine, other in zip(a, b, strict=True):
+            assert_same(mine, other)
+    else:
+        np.testing.assert_array_equal(a, b, strict=isinstance(a, np.ndarray) and isinstance(b, np.ndarray))
+
+
+def pick(batch: dict[str, Any], i: int) -> dict[str, Any]:
+    return {name: array[i] for name, array in batch.items()}
+
+
+def actions_of(rng: np.random.Generator, masks: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Half of them possible for sure, the others at random."""
+    possible = [int(rng.choice(np.flatnonzero(mask))) for mask in masks]
+    return np.where(rng.random(len(masks)) < 0.5, possible, rng.integers(L + 2, size=len(masks)))
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("case", CASES)
+def test_row_i_is_the_single_environment_with_seed_s_plus_i(case: str, mode: str) -> None:
+    envs, alone = vector(case, autoreset_mode=mode), [single(case) for _ in range(N)]
+    observations, infos = envs.reset(seed=40)
+    for i, env in enumerate(alone):
+        observation, info = env.reset(seed=40 + i)
+        assert_same(pick(observations, i), observation)
+        assert_same(row(infos, i), info)
+    rng, over, episodes = np.random.default_rng(0), [False] * N, 0
+    for _ in range(STEPS):
+        actions = actions_of(rng, envs.action_masks())
+        observations, rewards, terminated, truncated, infos = envs.step(actions)
+        assert not truncated.any()
+        for i, env in enumerate(alone):
+            told = row(infos, i)
+            if over[i]:  # NEXT_STEP: this step was the reset
+                observation, info = env.reset()
+                reward, over[i] = 0.0, False
+                assert told.pop("reward_terms") == {"delivered": 0, "retained": 0}
+            else:
+                observation, reward, over[i], _, info = env.step(actions[i])
+            assert rewards[i] == reward
+            assert terminated[i] == over[i]
+            episodes += over[i]
+            if over[i] and mode == "SameStep":
+                assert_same(told.pop("final_info"), info)
+                assert_same(told.pop("final_obs"), observation)
+                assert_same(told.pop("reward_terms"), info["reward_terms"])
+                observation, info = env.reset()
+                over[i] = False
+            assert_same(told, info)
+            assert_same(pick(observations, i), observation)
+            assert_same(envs.action_masks()[i], env.action_masks())
+    assert episodes > N
+
+
+@pytest.mark.parametrize("limit", [None, 4])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("case", CASES)
+def test_equal_to_gymnasiums_vector_of_single_environments(case: str, mode: AutoresetMode, limit: int | None) -> None:
+    def one() -> gym.Env[Any, Any]:
+        return single(case) if limit is None else gym.wrappers.TimeLimit(single(case), limit)
+
+    envs = vector(case, autoreset_mode=mode, max_episode_steps=limit)
+    sync = SyncVectorEnv([one] * N, autoreset_mode=mode)
+    assert envs.observation_space == sync.observation_space
+    assert envs.action_space == sync.action_space
+    assert envs.single_observation_space == sync.single_observation_space
+    assert envs.metadata["autoreset_mode"] == sync.metadata["autoreset_mode"]
+    assert_same(envs.reset(seed=8)[0], sync.reset(seed=8)[0])
+    rng, cut = np.random.default_rng(1), 0
+    for _ in range(STEPS):
+        actions = actions_of(rng, envs.action_masks())
+        ours, theirs = envs.step(actions), sync.step(actions)
+        assert_same(ours[0], theirs[0])
+        for a, b in zip(ours[1:3], theirs[1:3], strict=True):
+            assert_same(a, b)
+        assert_same(ours[3], theirs[3])
+        cut += int(ours[3].sum())
+        assert ("final_obs" in ours[4]) == ("final_obs" in theirs[4])
+        if "final_obs" in ours[4]:
+            assert ours[4]["final_obs"].dtype == theirs[4]["final_obs"].dtype == object
+        for i in range(N):
+            mine, expected = row(ours[4], i), row(theirs[4], i)
+            if "reward_terms" not in expected:
+                mine.pop("reward_terms")  # ours are told in a step that resets as well
+            assert_same(mine, expected)
+    assert (cut > 0) == (limit is not None)
+
+
+@pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
+@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
+def test_make_vec(env_id: str, mode: str) -> None:
+    smaller: dict[str, Any] = {"t_max": 20} if "Interruption" in env_id else {"duration_s": 1.0}
+    envs = gym.make_vec(env_id, num_envs=N, vectorization_mode=mode, capacity=3, **smaller)
+    assert envs.num_envs == N
+    assert envs.single_action_space == gym.spaces.Discrete(5)
+    observations, _ = envs.reset(seed=2)
+    assert envs.observation_space.contains(observations)
+    for _ in range(30):
+        observations, rewards, terminated, truncated, infos = envs.step(envs.action_space.sample())
+        assert envs.observation_space.contains(observations)
+        assert rewards.shape == terminated.shape == truncated.shape == (N,)
+        assert infos["action_mask"].shape == (N, 5)
+    envs.close()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_make_vec_cuts_episodes_off(mode: str) -> None:
+    envs = gym.make_vec(
+        "bufgym/Interruption-v0",
+        num_envs=2,
+        vectorization_mode="vector_entry_point",
+        max_episode_steps=5,
+        law="fixed",
+        t_max=20,
+        autoreset_mode=mode,
+    )
+    envs.reset(seed=0)
+    cut = [envs.step(np.array([8, 8]))[3].all() for _ in range(17)]
+    if mode == "SameStep":
+        assert np.flatnonzero(cut).tolist() == [4, 9, 14]
+    else:  # each reset takes a step of its own
+        assert np.flatnonzero(cut).tolist() == [4, 10, 16]
+
+
+def test_autoreset_by_hand() -> None:
+    envs = SenderVectorEnv(2, "interruption", L, law="fixed", t_max=3, autoreset_mode="Disabled")
+    alone = [SenderEnv("interruption", L, law="fixed", t_max=3) for _ in range(2)]
+    episodes = [Interruption(t_max=3).episode(1), Interruption(t_max=3).episode(3)]
+    envs.reset(seed=0, options={"episodes": episodes})
+    for i in range(2):
+        alone[i].reset(seed=i, options={"episode": episodes[i]})
+    _, _, terminated, _, info = envs.step(np.array([L + 1, L + 1]))
+    alone[1].step(L + 1)
+    assert terminated.tolist() == [True, False]
+    assert info["_qoi"].tolist() == [True, False]
+    with pytest.raises(gym.error.ResetNeeded, match="reset_mask"):
+        envs.step(np.array([0, 0]))
+    observations, infos = envs.reset(options={"reset_mask": terminated})
+    assert_same(pick(observations, 0), alone[0].reset()[0])
+    for _ in range(2):  # row 1 goes on where it was
+        observations, rewards, terminated, _, infos = envs.step(np.array([L, 0]))
+        for i, action in ((0, L), (1, 0)):
+            observation, reward, ended, _, info = alone[i].step(action)
+            assert_same(pick(observations, i), observation)
+            assert (rewards[i], terminated[i]) == (reward, ended)
+    assert terminated.tolist() == [False, True]
+    assert infos["arrived"][1] == 5
+
+
+def test_a_first_reset_may_leave_out_no_row() -> None:
+    envs = vector("interruption")
+    with pytest.raises(gym.error.ResetNeeded, match="no episode yet"):
+        envs.reset(options={"reset_mask": np.array([False, True, True])})
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_arrays_handed_out_are_never_written_again(mode: str) -> None:
+    envs = vector("fading", autoreset_mode=mode, max_episode_steps=9)
+    rng = np.random.default_rng(0)
+    held: list[Any] = [envs.reset(seed=3)]
+    copies = [copy.deepcopy(held[0])]
+
+    def keep(step: Any) -> None:
+        held.append(step)
+        copies.append(copy.deepcopy(step))
+
+    for k in range(50):
+        masks = envs.action_masks()
+        keep(masks)
+        keep(envs.step(actions_of(rng, masks)))
+        done = held[-1][2] | held[-1][3]
+        if mode == "Disabled" and done.any():
+            keep(envs.reset(options={"reset_mask": done}))
+        elif k % 20 == 19:
+            keep(envs.reset())
+    for before, now in zip(copies, held, strict=True):
+        for a, b in zip(before, now, strict=True):
+            assert_same(a, b)
+
+
+def test_arrays_that_nobody_holds_are_used_again() -> None:
+    envs = vector("fading")
+    envs.reset(seed=0)
+    for _ in range(60):
+        step = envs.step(np.full(N, L))
+    assert len(envs._pool) <= 4
+    assert step[1].shape == (N,)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_gymnasiums_wrappers_understand_the_infos(mode: str) -> None:
+    """Those that accept the mode: in Gymnasium 1.4 some refuse SAME_STEP altogether."""
+    envs: Any = vector("interruption", autoreset_mode=mode)
+    if mode == "NextStep":
+        envs = RecordEpisodeStatistics(FlattenObservation(envs))
+    envs = DictInfoToList(envs)
+    envs.reset(seed=0)
+    finished = 0
+    for _ in range(60):
+        observations, _, _, _, infos = envs.step(np.full(N, L))
+        assert envs.observation_space.contains(observations)
+        for info in infos:
+            ended = info.get("final_info", info)
+            if "arrived" in ended:
+                finished += 1
+                assert mode == "NextStep" or envs.single_observation_space.contains(info["final_obs"])
+                assert mode == "SameStep" or info["episode"]["r"] == pytest.approx(max(0, info["qoi"] - 1))
+    assert finished > N
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"num_envs": 0}, "num_envs = 0"),
+        ({"num_envs": 1.5}, "num_envs = 1.5"),
+        ({"capacity": 0}, "capacity = 0"),
+        ({"scenario": "moon"}, "unknown scenario"),
+        ({"reward": "fame"}, "unknown term"),
+        ({"fields": ["smell"]}, "unknown field"),
+        ({"decide_at": "noon"}, "decide_at"),
+        ({"autoreset_mode": "Sometimes"}, "autoreset_mode = 'Sometimes'"),
+        ({"max_episode_steps": 0}, "max_episode_steps = 0"),
+        ({"render_mode": "human"}, "render_mode = 'human'"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments: dict[str, Any], says: str) -> None:
+    with pytest.raises(BufgymError) as caught:
+        SenderVectorEnv(**arguments)
+    assert says in str(caught.value)
+
+
+def test_wrong_calls_are_named() -> None:
+    envs = vector("interruption")
+    with pytest.raises(gym.error.ResetNeeded):
+        envs.step(np.zeros(N, np.int64))
+    with pytest.raises(BufgymError, match="2 seeds for 3"):
+        envs.reset(seed=[1, 2])
+    with pytest.raises(BufgymError, match="reset_mask"):
+        envs.reset(options={"reset_mask": np.array([True])})
+    envs.reset(seed=[1, None, 3])
+    with pytest.raises(BufgymError, match=r"actions\[2\] = 6: must lie in 0\.\.5"):
+        envs.step(np.array([0, 5, 6]))
+    with pytest.raises(BufgymError, match=r"actions\[1\] = -1"):
+        envs.step(np.array([0, -1, 6]))
+    with pytest.raises(BufgymError, match="shape"):
+        envs.step(np.zeros(N + 1, np.int64))
