@@ -1,0 +1,220 @@
+"""How fast it goes: each figure with its definition and the target that bufgym sets itself, all from one run.
+
+Every figure is the best of several repeats: other work on the machine can only slow a repeat down. Everything runs in
+one thread. Actions are drawn beforehand, uniform among the possible ones, by playing the same seeded episodes once;
+so the timed loop holds nothing but the environment's own work, its resets included.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import policies
+from bufgym import scenario as scenarios
+from bufgym.benchmark.run import draw, replaced
+from bufgym.kernel import JIT
+from bufgym.sender import Senders
+
+ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
+POLICIES = ("afr", "drop-oldest", "random", "min-gap")
+SEED = 1
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measured figure."""
+
+    name: str
+    value: float
+    unit: str
+    target: float | None
+    definition: str
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured. The defaults take about half a minute."""
+
+    capacity: int = 16
+    """L, messages."""
+    batch: int = 1024
+    """Environments in a batch."""
+    steps: int = 1000
+    """Steps of the native batch."""
+    sync_steps: int = 30
+    """Steps of Gymnasium's SyncVectorEnv."""
+    single_steps: int = 20_000
+    """Steps of the single environment."""
+    episodes: int = 1000
+    """Episodes of a fixed-policy rollout."""
+    repeats: int = 3
+
+
+def measure(sizes: Sizes | None = None) -> list[Figure]:
+    """Measure everything."""
+    sizes = sizes or Sizes()
+    return [*_batches(sizes), *_singles(sizes), *_rollouts(sizes)]
+
+
+def best_s(repeats: int, prepare: Callable[[], Any], work: Callable[[], Any]) -> float:
+    """Shortest time of ``work``, s, over so many repeats; ``prepare`` runs before each, untimed."""
+    times = []
+    for _ in range(repeats):
+        prepare()
+        begin = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def random_actions(mask: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.int64]:
+    """One possible action a row, uniform; ``mask`` is bool[n, L + 2]."""
+    return np.asarray(np.argmax(rng.random(mask.shape) * mask, axis=1), np.int64)
+
+
+def record(vector: Any, steps: int) -> tuple[NDArray[np.int64], int]:
+    """(actions int64[steps, n] for ``reset(seed=SEED)``, how many of them are decisions and not resets)."""
+    rng = np.random.default_rng(SEED)
+    _, info = vector.reset(seed=SEED)
+    actions = np.zeros((steps, vector.num_envs), np.int64)
+    done = np.zeros(vector.num_envs, np.bool_)
+    decisions = 0
+    for k in range(steps):
+        actions[k] = random_actions(info["action_mask"], rng)
+        decisions += int((~done).sum())  # a row that has ended spends its next step on its reset
+        _, _, terminated, truncated, info = vector.step(actions[k])
+        done = terminated | truncated
+    return actions, decisions
+
+
+def _play(vector: Any, actions: NDArray[np.int64]) -> None:
+    for row in actions:
+        vector.step(row)
+
+
+def _batch_rate(id: str, mode: str, steps: int, sizes: Sizes) -> float:
+    """Decisions a second of one kind of vector environment."""
+    vector: Any = gym.make_vec(id, sizes.batch, vectorization_mode=mode, capacity=sizes.capacity)
+    try:
+        actions, decisions = record(vector, steps)
+        return decisions / best_s(sizes.repeats, lambda: vector.reset(seed=SEED), lambda: _play(vector, actions))
+    finally:
+        vector.close()
+
+
+def _batches(sizes: Sizes) -> Iterable[Figure]:
+    of = f"n = {sizes.batch}, L = {sizes.capacity}, all observation fields, resets in the time"
+    for id in ENVIRONMENTS:
+        native = _batch_rate(id, "vector_entry_point", sizes.steps, sizes)
+        sync = _batch_rate(id, "sync", sizes.sync_steps, sizes)
+        kind = "gym.make_vec(vectorization_mode="
+        yield Figure(
+            f"native batch, {id}", native, "steps/s", 3e6, f"decisions a second of {kind}'vector_entry_point'), {of}"
+        )
+        yield Figure(f"SyncVectorEnv, {id}", sync, "steps/s", None, f"decisions a second of {kind}'sync'), {of}")
+        yield Figure(f"native / SyncVectorEnv, {id}", native / sync, "times", 50.0, "the ratio of these two")
+
+
+def _single_rate(id: str, sizes: Sizes) -> float:
+    """Calls of Env.step a second."""
+    env: Any = gym.make(id, capacity=sizes.capacity).unwrapped
+    rng = np.random.default_rng(SEED)
+    actions = []
+    _, info = env.reset(seed=SEED)
+    for _ in range(sizes.single_steps):
+        actions.append(int(random_actions(info["action_mask"][None], rng)[0]))
+        _, _, ended, _, info = env.step(actions[-1])
+        if ended:
+            _, info = env.reset()
+
+    def play() -> None:
+        for action in actions:
+            if env.step(action)[2]:
+                env.reset()
+
+    return len(actions) / best_s(sizes.repeats, lambda: env.reset(seed=SEED), play)
+
+
+def _singles(sizes: Sizes) -> Iterable[Figure]:
+    of = f"L = {sizes.capacity}, all observation fields, resets in the time"
+    for id in ENVIRONMENTS:
+        rate = _single_rate(id, sizes)
+        yield Figure(
+            f"single environment, {id}", rate, "steps/s", 1e5, f"calls of Env.step a second, without wrappers, {of}"
+        )
+
+
+def _rollouts(sizes: Sizes) -> Iterable[Figure]:
+    scenario = scenarios.get("lte")
+    episodes = [draw(scenario, seed) for seed in range(sizes.episodes)]
+    arrivals = sum(len(episode.arrivals) for episode in episodes)
+    senders = Senders(len(episodes), sizes.capacity, scenario.value, max_messages=scenario.max_messages)
+
+    def load() -> None:
+        for i, episode in enumerate(episodes):
+            senders.load(i, episode)
+
+    for name in POLICIES:
+        run = functools.partial(senders.run, policies.get(name))
+        load()
+        run()  # compiled, or loaded from disk, before the clock starts
+        seconds = best_s(sizes.repeats, load, run)
+        yield Figure(
+            f"rollout, {name}",
+            arrivals / seconds,
+            "arrivals/s",
+            2e7,
+            f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {sizes.capacity};"
+            " drawing, loading and scoring them not in the time",
+        )
+
+
+def human(number: float) -> str:
+    """Three digits and a prefix: 3.14 M, 120 k, 57.3."""
+    for size, prefix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if number >= size:
+            return f"{number / size:.3g}{prefix}"
+    return f"{number:.3g}"
+
+
+def report(figures: list[Figure], repeats: int) -> str:
+    """Figures beside their targets, then what each is."""
+    lines = [(figure.name, f"{human(figure.value)} {figure.unit}", _target(figure)) for figure in figures]
+    widths = [max(len(line[c]) for line in lines) for c in range(3)]
+    out = [f"{name:<{widths[0]}}  {value:>{widths[1]}}  {target}".rstrip() for name, value, target in lines]
+    out += ["", f"Best of {repeats} repeats each, one thread. Actions drawn beforehand among the possible ones."]
+    if not JIT:
+        out.append("Compilation is off (NUMBA_DISABLE_JIT): these figures say nothing about bufgym's speed.")
+    definitions = dict.fromkeys(f"{figure.name.split(',')[0]}: {figure.definition}" for figure in figures)
+    return "\n".join([*out, *(f"- {line}" for line in definitions)])
+
+
+def _target(figure: Figure) -> str:
+    return "" if figure.target is None else f"(target {human(figure.target)} {figure.unit})"
+
+
+def write_json(figures: list[Figure], sizes: Sizes, path: Path) -> None:
+    """Figures, sizes and what they were measured on."""
+    about = {
+        "versions": {name: version(name) for name in ("bufgym", "numpy", "numba", "gymnasium")},
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "processors": os.cpu_count(),
+        "compiled": JIT,
+    }
+    made = {**about, "sizes": asdict(sizes), "figures": [asdict(figure) for figure in figures]}
+    with replaced(path) as temporary:
+        temporary.write_text(json.dumps(made, indent=2) + "\n", encoding="utf-8")

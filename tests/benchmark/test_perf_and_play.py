@@ -1,0 +1,93 @@
+"""The speed report at tiny sizes, and a policy as the player of an environment."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import bufgym.envs  # noqa: F401  (registers)
+from bufgym import policies
+from bufgym.benchmark import perf
+from bufgym.benchmark.play import Player
+from bufgym.benchmark.run import draw, run
+from bufgym.errors import BufgymError
+from bufgym.policies import Policy
+from bufgym.scenario import Interruption, Uplink
+from bufgym.traces import Trace
+
+TINY = perf.Sizes(3, 2, 12, 4, 10, 1, 1)
+
+
+def test_every_figure_is_a_number_with_its_definition(tmp_path: Path) -> None:
+    figures = perf.measure(TINY)
+    assert all(math.isfinite(figure.value) and figure.value > 0 and figure.definition for figure in figures)
+    assert sum(figure.target is not None for figure in figures) == len(figures) - 2
+    text = perf.report(figures, TINY.repeats)
+    for figure in figures:
+        assert figure.name in text and figure.definition in text
+    perf.write_json(figures, TINY, tmp_path / "perf.json")
+    read = json.loads((tmp_path / "perf.json").read_text())
+    assert [figure["name"] for figure in read["figures"]] == [figure.name for figure in figures]
+
+
+def test_recorded_actions_are_possible_when_played_again() -> None:
+    envs: Any = gym.make_vec(
+        "bufgym/Interruption-v0", 4, vectorization_mode="vector_entry_point", capacity=2, law="fixed", t_max=6
+    )
+    actions, decisions = perf.record(envs, 14)
+    # 6 decisions and a reset, twice.
+    assert decisions == 4 * 12
+    envs.reset(seed=perf.SEED)
+    for row in actions:
+        _, _, _, _, info = envs.step(row)
+        assert not info["impossible"].any()
+
+
+def test_random_actions_are_those_of_the_mask() -> None:
+    mask = np.array([[False, True, False], [True, True, True]])
+    drawn = [perf.random_actions(mask, np.random.default_rng(seed)) for seed in range(40)]
+    assert {int(d[0]) for d in drawn} == {1}
+    assert {int(d[1]) for d in drawn} == {0, 1, 2}
+
+
+@pytest.mark.parametrize(("number", "text"), [(3.14159e6, "3.14 M"), (120_000, "120 k"), (57.31, "57.3"), (2e9, "2 G")])
+def test_human(number: float, text: str) -> None:
+    assert perf.human(number) == text
+
+
+@pytest.mark.parametrize("name", list(policies.names()))
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        Interruption(t_max=40),
+        Uplink(traces=(Trace.steps([(1.0, 900_000), (0.7, 0)], name="t"),), rate_hz=20, duration_s=5),
+    ],
+    ids=["interruption", "uplink"],
+)
+def test_a_player_in_the_environment_does_what_the_benchmark_does(name: str, scenario: Any) -> None:
+    policy = policies.get(name)
+    env: Any = gym.make("bufgym/Uplink-v0", scenario=scenario, capacity=3).unwrapped
+    player = Player(policy)
+    for row in run([policy], scenario, [3], 2):
+        env.reset(options={"episode": draw(scenario, row["seed"])})
+        player.begin()
+        ended, info = False, {}
+        while not ended:
+            _, _, ended, _, info = env.step(player.action(env.rows.senders))
+        assert info["delivered"] == row["delivered"]
+        assert info["qoi"] == pytest.approx(row["qoi"])
+    with pytest.raises(BufgymError, match="no decision is due"):
+        player.action(env.rows.senders)
+
+
+def test_a_player_refuses_a_decision_that_means_nothing() -> None:
+    env: Any = gym.make("bufgym/Interruption-v0", capacity=3).unwrapped
+    env.reset(seed=0)
+    with pytest.raises(BufgymError, match="policy odd: decision 3"):
+        Player(Policy("odd", lambda buffer, arrival, memory: 3)).action(env.rows.senders)

@@ -1,0 +1,61 @@
+"""The table, worked by hand."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from bufgym.benchmark import table
+
+
+def row(policy: str, capacity: int, qoi: float, **more: Any) -> dict[str, Any]:
+    rest = dict.fromkeys([column.key for column in table.COLUMNS], 1.0)
+    return {**rest, "policy": policy, "capacity": capacity, "qoi": qoi, "regret": None, "impossible": 0, **more}
+
+
+ROWS = [
+    row("b", 5, 2.0, delivered=3, mean_sojourn_s=0.5),
+    row("b", 5, 4.0, delivered=4, mean_sojourn_s=math.nan),
+    row("a", 5, 6.0),
+    row("a", 2, 1.0),
+    row("c", 2, 1.0, impossible=3),
+]
+
+
+def test_means_leave_out_what_is_missing_and_come_best_first() -> None:
+    entries = table.means(ROWS)
+    assert [(e["capacity"], e["policy"], e["qoi"]) for e in entries] == [
+        (2, "a", 1.0),
+        (2, "c", 1.0),
+        (5, "a", 6.0),
+        (5, "b", 3.0),
+    ]
+    assert entries[3]["delivered"] == 3.5
+    assert entries[3]["mean_sojourn_s"] == 0.5
+    assert math.isnan(entries[3]["regret"])
+
+
+def test_plain_text_is_aligned_and_says_what_was_impossible() -> None:
+    lines = table.plain(ROWS).split("\n")
+    assert lines[0].split()[:4] == ["policy", "L", "QoI", "delivered"]
+    assert lines[3] == ""  # between capacities
+    body = [line for line in lines[:6] if line]
+    assert len({len(line) for line in body}) == 1
+    assert body[-1].split()[:4] == ["b", "5", "3.000", "3.5"]
+    assert lines[-1] == "note: c gave 3 impossible decisions"
+    assert "regret" not in lines[0]
+
+
+def test_regret_is_shown_where_there_is_one() -> None:
+    text = table.plain([row("a", 1, 2.0, regret=0.125), row("b", 1, 1.0, mean_sojourn_s=math.nan)])
+    head, a, b = text.split("\n")
+    assert "regret" in head
+    assert "12.50%" in a
+    assert b.split().count("-") == 2
+
+
+def test_markdown() -> None:
+    lines = table.markdown([row("a", 1, 2.0)]).split("\n")
+    assert lines[0].startswith("| policy | L | QoI | delivered |")
+    assert lines[1].count("---:") == lines[0].count("|") - 2
+    assert lines[2] == "| a | 1 | 2.000 | 1.0 | 1.0 | 1.000 | 1.000 | 1.000 | 1.000 | 1.000 | 1.000 |"
