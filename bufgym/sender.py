@@ -339,9 +339,8 @@ def view(batch: Batch, i: int) -> Buffer:
     taken_us, taken_x = sent.arrival_us, sent.x
     if sender.taken == 0:
         taken_us, taken_x = sender.previous_us, sender.previous_x
-    left_bytes = 0
-    left_fraction = 0.0
-    if sender.busy == 1:
+    left_bytes = sent.size_bytes if sender.busy == 1 else 0
+    if sender.busy == 1 and sender.taken_at_us < sender.now_us:
         reached, sender.segment_now = position_at(
             batch.knot_us,
             batch.knot_bytes,
@@ -351,8 +350,7 @@ def view(batch: Batch, i: int) -> Buffer:
             sender.segment_now,
             sender.now_us + sender.offset_us,
         )
-        left_bytes = min(sent.size_bytes, max(0, sender.position - reached))
-        left_fraction = left_bytes / sent.size_bytes
+        left_bytes = min(left_bytes, max(0, sender.position - reached))
     return Buffer(
         batch.slots[i, first : first + occupancy],
         capacity,
@@ -365,7 +363,7 @@ def view(batch: Batch, i: int) -> Buffer:
         sender.previous_x,
         sender.busy,
         left_bytes,
-        left_fraction,
+        left_bytes / sent.size_bytes if sender.busy == 1 else 0.0,
         sender.now_us - sender.taken_at_us,
         sender.period_us,
         sender.departures,

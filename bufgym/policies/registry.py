@@ -123,7 +123,7 @@ def register(
 
     ``compile=True`` promises that Numba can compile it; else it runs as ordinary Python wherever policies run.
     """
-    if name in _REGISTRY and _REGISTRY[name].source:
+    if name in _REGISTRY and _REGISTRY[name].on_arrival.__module__.startswith("bufgym."):
         raise BufgymError(f"policy {name!r}: a built-in policy has this name")
     if not name or any(c in ":,= \t\n" for c in name):
         raise BufgymError(f"policy {name!r}: a name must be non-empty, without spaces, ':', ',' or '='")
