@@ -1,0 +1,112 @@
+"""The networks: a plain one over all numbers at once, and one that scores each slot with the same small network.
+
+Scoring slots one by one builds in what the problem has: what a message is worth depends on its neighbours (the slot's
+own features) and on the link (the context), not on the number of its slot. One set of weights serves every L.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import Tensor, nn
+
+# Most of what meets a queue with room should join it; exploration that drops messages at random learns little.
+ACCEPT_BIAS = 2.0
+
+
+def field_names(space: spaces.Dict) -> tuple[list[str], list[str]]:
+    """(slot fields, context fields) of a bufgym observation: L + 1 >= 2 entries, and one entry."""
+    slots = [name for name, box in space.items() if (box.shape or (1,))[0] > 1]
+    return slots, [name for name in space if name not in slots]
+
+
+class SlotFeatures(BaseFeaturesExtractor):
+    """[n, (L + 1) x (slot fields + context fields)]: each slot's features, with the context beside each."""
+
+    def __init__(self, observation_space: spaces.Dict) -> None:
+        self.slot_fields, self.context_fields = field_names(observation_space)
+        if not self.slot_fields:
+            raise ValueError("scoring slots needs at least one slot field among the observed fields")
+        self.slots = (observation_space[self.slot_fields[0]].shape or (0,))[0]
+        self.per_slot = len(self.slot_fields) + len(self.context_fields)
+        super().__init__(observation_space, self.slots * self.per_slot)
+
+    def forward(self, observation: dict[str, Tensor]) -> Tensor:
+        slots = torch.stack([observation[name] for name in self.slot_fields], dim=-1)
+        if self.context_fields:
+            context = torch.cat([observation[name] for name in self.context_fields], dim=-1)
+            slots = torch.cat([slots, context[:, None, :].expand(-1, self.slots, -1)], dim=-1)
+        return slots.flatten(1)
+
+
+class SlotScorer(nn.Module):
+    """Logits of all L + 2 actions, and the latent that the value is read from."""
+
+    def __init__(self, slots: int, per_slot: int, width: int) -> None:
+        super().__init__()
+        self.shape = (slots, per_slot)
+        self.latent_dim_pi, self.latent_dim_vf = slots + 1, width
+        self.score = _perceptron(per_slot, width, 1)
+        """Slot -> logit of dropping it; the last slot is the newcomer, so its logit is that of rejecting."""
+        self.accept = _perceptron(per_slot, width, 1, bias=ACCEPT_BIAS)
+        """The newcomer's features -> logit of accepting it."""
+        self.worth = nn.Sequential(nn.Linear(per_slot, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+        self.critic = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU())
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        return self.forward_actor(features), self.forward_critic(features)
+
+    def forward_actor(self, features: Tensor) -> Tensor:
+        slots = features.reshape(-1, *self.shape)
+        return torch.cat([self.score(slots).squeeze(-1), self.accept(slots[:, -1])], dim=1)
+
+    def forward_critic(self, features: Tensor) -> Tensor:
+        latent = self.worth(features.reshape(-1, *self.shape))
+        # The mean over slots, occupied or not, keeps the width independent of L.
+        result: Tensor = self.critic(torch.cat([latent.mean(dim=1), latent[:, -1]], dim=1))
+        return result
+
+
+def _perceptron(inputs: int, width: int, outputs: int, bias: float = 0.0) -> nn.Sequential:
+    """Two hidden layers, and outputs that begin close to ``bias``."""
+    last = nn.Linear(width, outputs)
+    nn.init.uniform_(last.weight, -0.1 / width**0.5, 0.1 / width**0.5)
+    nn.init.constant_(last.bias, bias)
+    return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), last)
+
+
+class SlotPolicy(MaskableMultiInputActorCriticPolicy):
+    """MaskablePPO's actor and critic made of a ``SlotScorer``."""
+
+    def __init__(self, *args: Any, width: int = 32, **kwargs: Any) -> None:
+        self.width = width
+        kwargs.setdefault("features_extractor_class", SlotFeatures)
+        # Layers are initialised here as torch does; the library's orthogonal scheme would undo the accept bias.
+        kwargs["ortho_init"] = False
+        super().__init__(*args, **kwargs)
+
+    def _build_mlp_extractor(self) -> None:
+        features = self.features_extractor
+        assert isinstance(features, SlotFeatures)
+        self.mlp_extractor = SlotScorer(features.slots, features.per_slot, self.width)  # type: ignore[assignment]
+
+    def _build(self, lr_schedule: Any) -> None:
+        super()._build(lr_schedule)
+        # The scorer's outputs are the logits already. The optimizer is made anew without the layer that goes.
+        self.action_net = nn.Identity()
+        settings = {"lr": lr_schedule(1), **self.optimizer_kwargs}
+        self.optimizer = self.optimizer_class(self.parameters(), **settings)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {"width": self.width}
+
+
+def policy_of(network: str, width: int) -> tuple[Any, dict[str, Any]]:
+    """(policy class, its arguments) for "slots" or "plain"."""
+    if network == "slots":
+        return SlotPolicy, {"width": width}
+    return MaskableMultiInputActorCriticPolicy, {"net_arch": [2 * width, 2 * width], "activation_fn": nn.ReLU}

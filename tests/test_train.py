@@ -1,0 +1,172 @@
+"""Training end to end with tiny settings: what it leaves behind, and that a killed run goes on."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+for extra in ("sb3_contrib", "tqdm", "tensorboard", "matplotlib"):
+    pytest.importorskip(extra, reason="the extras [train] and [plot] are not installed")
+
+import train  # noqa: E402  (these need the extras)
+from agents import evaluate, training  # noqa: E402
+from bufgym.policies import registry  # noqa: E402
+
+REPO = Path(__file__).resolve().parent.parent
+TINY = train.Arguments(
+    name="tiny",
+    steps=512,
+    capacity=3,
+    duration_s=1.0,
+    width=8,
+    num_envs=4,
+    n_steps=32,
+    batch_size=64,
+    epochs=1,
+    checkpoint_every=128,
+    episodes=3,
+)
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def curve_of(folder: Path) -> list[int]:
+    """The steps at which the learning curve has rows."""
+    with (folder / "curve.csv").open(newline="", encoding="utf-8") as file:
+        return [int(row["steps"]) for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize("env", ["bufgym/Uplink-v0", "bufgym/Interruption-v0"])
+def test_a_run_leaves_its_results(env: str, capsys: pytest.CaptureFixture[str]) -> None:
+    train.main(dataclasses.replace(TINY, env=env, steps=128, network="plain" if "Inter" in env else "slots"))
+    folder = Path("runs/tiny")
+    results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    names = [row["policy"] for row in results["scores"]]
+    assert sorted(names) == sorted([*registry.names(), "agent (seed 0)"])
+    qoi = [row["qoi"] for row in results["scores"]]
+    assert qoi == sorted(qoi, reverse=True)
+    assert all(row["arrived"] == pytest.approx(row["delivered"] + row["dropped"]) for row in results["scores"])
+    assert len({row["arrived"] for row in results["scores"]}) == 1  # all met the same episodes
+    assert all(row["impossible"] == 0 for row in results["scores"] if row["policy"].startswith("agent"))
+    assert results["settings"]["env"] == env
+    assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "model.zip").exists()
+    assert list((folder / "seed-0" / "tensorboard").glob("events*"))
+    printed = capsys.readouterr().out
+    assert "drop-oldest" in printed
+    assert "agent (seed 0)" in printed
+
+
+def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = training.prepare(TINY)
+
+    class KilledError(Exception):
+        """Stands for what ends a process in the middle of training."""
+
+    def dies_half_way(self: training.Curve) -> None:
+        row(self)
+        if self.num_timesteps >= 384:
+            raise KilledError
+
+    row = training.Curve._on_rollout_end
+    with monkeypatch.context() as patch, pytest.raises(KilledError):
+        patch.setattr(training.Curve, "_on_rollout_end", dies_half_way)
+        training.train_seed(TINY, folder, 0)
+    home = folder / "seed-0"
+    # The third rollout was collected, but not learnt from: it does not count.
+    assert [path.stem for path in training.checkpoints(home)] == ["000000000128", "000000000256"]
+    assert curve_of(home) == [128, 256, 384]
+    before = training.MaskablePPO.load(training.checkpoints(home)[-1])
+
+    again = dataclasses.replace(TINY, resume=True)
+    assert training.prepare(again) == folder
+    run = training.train_seed(again, folder, 0)
+    assert curve_of(home) == [128, 256, 384, 512]
+    assert run.seconds > 0
+    after = training.MaskablePPO.load(run.model)
+    assert (before.num_timesteps, after.num_timesteps) == (256, 512)
+    # The optimizer went on counting, two gradient steps an update, and the learning rate on falling.
+    counts = [int(state["step"]) for state in after.policy.optimizer.state_dict()["state"].values()]
+    assert set(counts) == {8}
+    assert after.policy.optimizer.param_groups[0]["lr"] < before.policy.optimizer.param_groups[0]["lr"]
+    # Once more: there is nothing left to do.
+    assert training.train_seed(again, folder, 0).curve == run.curve
+
+
+def test_a_run_is_not_overwritten_or_mixed_with_another() -> None:
+    unnamed = dataclasses.replace(TINY, name="")
+    assert training.prepare(unnamed) == Path("runs/train-1")
+    assert training.prepare(unnamed) == Path("runs/train-2")
+    assert training.prepare(dataclasses.replace(unnamed, resume=True)) == Path("runs/train-2")
+    training.prepare(TINY)
+    with pytest.raises(SystemExit, match="exists"):
+        training.prepare(TINY)
+    with pytest.raises(SystemExit, match="capacity was 3, now 4"):
+        training.prepare(dataclasses.replace(TINY, resume=True, capacity=4))
+    with pytest.raises(SystemExit, match="no run"):
+        training.prepare(dataclasses.replace(TINY, resume=True, name="other"))
+
+
+def test_held_out_traces_are_never_trained_on() -> None:
+    training_world, test_world = evaluate.worlds(TINY)
+    trained = {trace.name for trace in training_world.traces}  # type: ignore[attr-defined]
+    tested = {trace.name for trace in test_world.traces}  # type: ignore[attr-defined]
+    assert len(tested) == 2
+    assert trained
+    assert not trained & tested
+
+
+@pytest.mark.parametrize("decide_at", ["arrival", "overflow"])
+def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: str) -> None:
+    """The agent's road (observations, actions, rows) and the policies' own are the same simulation."""
+    _, world = evaluate.worlds(TINY)
+    episodes = evaluate.held_out(world, 5)
+
+    class DropOldest:
+        """Accepts where that is possible, else evicts slot 0."""
+
+        def predict(self, observation: object, *, deterministic: bool = False, action_masks: object = None) -> object:
+            masks = np.asarray(action_masks)
+            return np.where(masks[:, -1], TINY.capacity + 1, np.where(masks[:, 0], 0, TINY.capacity)), None
+
+    agent = evaluate.run_agent(DropOldest(), episodes, world, TINY.capacity, decide_at)  # type: ignore[arg-type]
+    assert agent == evaluate.run_fixed(episodes, world, TINY.capacity)["drop-oldest"]
+    assert any(outcome.dropped for outcome in agent)
+
+
+@pytest.mark.slow
+def test_a_process_killed_for_good_goes_on_and_a_second_seed_joins(tmp_path: Path) -> None:
+    command = [sys.executable, str(REPO / "train.py")]
+    settings = {**dataclasses.asdict(TINY), "steps": 1_280}
+    for name, value in settings.items():
+        if name not in ("resume", "seeds"):
+            command += [f"--{name.replace('_', '-')}", str(value)]
+    environment = {**os.environ, "PYTHONPATH": str(REPO)}
+    first = subprocess.Popen(command, env=environment, start_new_session=True, stdout=subprocess.DEVNULL)
+    homes = [tmp_path / "runs" / "tiny" / f"seed-{seed}" for seed in (0, 1)]
+    deadline = time.monotonic() + 60
+    while not training.checkpoints(homes[0]) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.wait()
+    assert training.checkpoints(homes[0])
+    assert not (tmp_path / "runs" / "tiny" / "results.json").exists()
+    again = [*command, "--resume", "--seeds", "2"]
+    subprocess.run(again, env=environment, check=True, stdout=subprocess.DEVNULL, timeout=120)
+    results = json.loads((tmp_path / "runs" / "tiny" / "results.json").read_text(encoding="utf-8"))
+    assert results["seeds"] == [0, 1]
+    for home in homes:
+        assert curve_of(home) == list(range(128, 1_281, 128))

@@ -1,0 +1,74 @@
+"""Train an agent and compare it with the fixed policies: ``python train.py``, or ``--help`` for all settings.
+
+Results are in runs/NAME/. After a kill, the same command with ``--resume`` goes on from the last checkpoint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Train a MaskablePPO agent on a bufgym environment and evaluate it on held-out episodes."""
+
+    env: str = "bufgym/Uplink-v0"
+    """Gymnasium id."""
+    name: str = ""
+    """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
+    resume: bool = False
+    """Go on from the run's last checkpoint."""
+    seeds: int = 1
+    """Train this many agents, each in a process of its own."""
+    seed: int = 0
+    """The first seed."""
+    steps: int = 1_500_000
+    """Decisions to learn from, for each seed."""
+    capacity: int = 8
+    """L, messages."""
+    size_bytes: int = 500_000
+    """Mean message size (uplink only); 500 kB at 30 Hz is 1.5 times what the shipped traces carry."""
+    duration_s: float = 30.0
+    """Length of an episode (uplink only)."""
+    decide_at: Literal["overflow", "arrival"] = "overflow"
+    """When the agent is asked: only when the buffer is full, or at every arrival."""
+    reward: Literal["retained", "delivered"] = "retained"
+    network: Literal["slots", "plain"] = "slots"
+    """One small network for every slot, or one over all numbers at once."""
+    width: int = 32
+    """Hidden units a layer."""
+    num_envs: int = 256
+    n_steps: int = 128
+    """Steps in each environment between updates."""
+    batch_size: int = 4096
+    epochs: int = 4
+    """Passes over each batch of experience."""
+    learning_rate: float = 2e-3
+    """At the start; falls linearly to 0."""
+    gamma: float = 0.9
+    """``retained`` pays at once what a decision costs, so a short sight suffices and keeps the noise of motion out."""
+    gae_lambda: float = 0.9
+    entropy: float = 0.0
+    """Weight of the entropy bonus."""
+    checkpoint_every: int = 250_000
+    """Steps."""
+    episodes: int = 200
+    """Held-out episodes in the evaluation."""
+
+
+def main(arguments: Arguments | None = None) -> None:
+    """Train, evaluate, report."""
+    if arguments is None:
+        import tyro
+
+        arguments = tyro.cli(Arguments)
+    from agents import report, training  # not before the arguments are known to be good: torch takes seconds to load
+
+    folder = training.prepare(arguments)
+    runs = training.train_all(arguments, folder)
+    report.evaluate_and_report(arguments, folder, runs)
+
+
+if __name__ == "__main__":
+    main()
