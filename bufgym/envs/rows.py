@@ -131,6 +131,8 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64
 def reward_weights(reward: str | Mapping[str, float]) -> NDArray[np.float64]:
     """float64[reward terms] from one term's name or from weights by name."""
     names = [term.name for term in REWARD_TERMS]
+    if not isinstance(reward, str | Mapping):
+        raise BufgymError(f"reward = {reward!r}: must be the name of a term ({', '.join(names)}) or weights by name")
     given = {reward: 1.0} if isinstance(reward, str) else dict(reward)
     for name, weight in given.items():
         if name not in names:

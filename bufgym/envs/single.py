@@ -79,6 +79,9 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         super().reset(seed=seed)
         if seed is not None or self.rows.streams[0] is None:
             self.rows.seed(0, self.np_random)
+        for name in options or {}:
+            if name != "episode":
+                raise BufgymError(f"options[{name!r}]: unknown; known: episode")
         self.rows.reset(_ROW, [(options or {}).get("episode")])
         return self._observation(), {"action_mask": self.action_masks(), "impossible": 0}
 

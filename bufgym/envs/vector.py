@@ -89,6 +89,9 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         options = options or {}
+        for name in options:
+            if name not in ("reset_mask", "episodes"):
+                raise BufgymError(f"options[{name!r}]: unknown; known: reset_mask (bool[n]), episodes (one a row)")
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):
             self._np_random, self._np_random_seed = seeding.np_random(int(seeds))
