@@ -1,0 +1,130 @@
+"""Random episodes for the tests, each in two forms: for the package and for its slow twins in ``naive``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import naive
+import numpy as np
+from hypothesis import strategies as st
+
+from bufgym import qoi
+from bufgym.link import Link
+from bufgym.policies import Policy
+from bufgym.scenario import Episode, messages
+from bufgym.sender import NEVER, Senders
+from bufgym.traces import Trace
+
+
+@dataclass
+class Case:
+    """One episode, its limits, and the same for the twin."""
+
+    episode: Episode
+    twin_messages: list[dict[str, Any]]
+    knots: list[tuple[int, int]]
+    capacity: int
+    max_bytes: int | None
+    decide_at: str
+
+    def senders(self, v: qoi.Value) -> Senders:
+        n = len(self.episode.arrivals)
+        limits = {"max_bytes": self.max_bytes, "decide_at": self.decide_at}
+        senders = Senders(1, self.capacity, v, max_messages=n, **limits)
+        senders.load(0, self.episode)
+        return senders
+
+    def run(self, policy: Policy, v: qoi.Value) -> Senders:
+        senders = self.senders(v)
+        senders.run(policy)
+        return senders
+
+    def run_twin(self, policy: naive.Policy) -> naive.Sender:
+        link = naive.Link(self.knots, self.episode.link.trace.after, self.episode.link.offset_us)
+        sender = naive.Sender(link, policy, self.capacity, self.max_bytes, self.decide_at)
+        return sender.run(self.twin_messages, self.episode.first_decision, self.episode.last_decision)
+
+
+@st.composite
+def traces(draw: st.DrawFn) -> tuple[list[tuple[int, int]], str]:
+    """Knots with outages among them, and what follows the end."""
+    steps = st.tuples(st.integers(1_000, 60_000), st.one_of(st.just(0), st.integers(500, 20_000)))
+    after = draw(st.sampled_from(["loop", "hold", "stop"]))
+    knots = [(0, 0)]
+    for us, carried in draw(st.lists(steps, min_size=1, max_size=6)):
+        knots.append((knots[-1][0] + us, knots[-1][1] + carried))
+    if after == "loop" and knots[-1][1] == 0:
+        knots.append((knots[-1][0] + 5_000, 2_000))
+    return knots, after
+
+
+def trace(knots: list[tuple[int, int]], after: str) -> Trace:
+    us, size = zip(*knots, strict=True)
+    return Trace("random", np.array(us, np.int64), np.array(size, np.int64), after=after)
+
+
+@st.composite
+def cases(draw: st.DrawFn, max_bytes: bool = True, max_messages: int = 40) -> Case:
+    """Arrivals with equal times among them, sizes around 2 kB, coordinates in eighths, so that their sums are exact."""
+    n = draw(st.integers(1, max_messages))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    step_us = rng.choice([0, 1, 700, 5_000], n) + rng.integers(0, 3_000, n) * rng.integers(0, 2, n)
+    arrivals = messages(
+        np.cumsum(step_us),
+        rng.integers(1, draw(st.sampled_from([2, 4_000])), n),
+        np.cumsum(rng.integers(0, 5, n)) / 8,
+    )
+    arrivals["luck"] = rng.random(n)
+    arrivals["topic"] = rng.integers(0, 3, n)
+    knots, after = draw(traces())
+    link = Link(trace(knots, after), draw(st.integers(0, 3 * knots[-1][0])), draw(st.integers(0, 30_000)))
+    first = draw(st.sampled_from([0, 0, 3]))
+    last = draw(st.sampled_from([2**31, n // 2]))
+    return Case(
+        Episode(arrivals, link, first, last),
+        [
+            {"seq": k, "us": int(a["arrival_us"]), "bytes": int(a["size_bytes"]), "x": float(a["x"]), "luck": a["luck"]}
+            for k, a in enumerate(np.asarray(arrivals))
+        ],
+        knots,
+        draw(st.integers(1, 6)),
+        draw(st.one_of(st.none(), st.integers(1_000, 15_000))) if max_bytes else None,
+        draw(st.sampled_from(["arrival", "overflow"])),
+    )
+
+
+VALUES = st.one_of(
+    st.floats(0.05, 0.99).map(qoi.exponential),
+    st.floats(0.1, 30).map(qoi.saturating),
+    st.lists(st.floats(0.01, 1), min_size=1, max_size=5).map(
+        # Slopes that fall, at whole distances: concave; divided by their sum: at most 1.
+        lambda s: qoi.tabulated(
+            range(len(s) + 1), np.minimum(1, np.concatenate([[0], np.cumsum(sorted(s)[::-1])]) / sum(s))
+        )
+    ),
+)
+
+
+def fates(senders: Senders, i: int = 0) -> dict[str, dict[int, int]]:
+    """{"taken_us": {sequence number: time}, ...}, of what happened at all."""
+    rows = np.asarray(senders.batch.fates[i])[: int(senders.batch.senders[i]["arrivals"])]
+    return {
+        name: {k: int(us) for k, us in enumerate(rows[name]) if us != NEVER}
+        for name in ("taken_us", "crossed_us", "dropped_us")
+    }
+
+
+def order(senders: Senders, i: int = 0) -> list[int]:
+    """Sequence numbers in the order in which the link carried them."""
+    return senders.batch.order[i, : senders.batch.senders[i]["crossed"]].tolist()
+
+
+def same(a: Senders, b: Senders) -> bool:
+    """Whether both batches ended with the same fates and the same information, bit for bit."""
+    rows, others = np.asarray(a.batch.senders), np.asarray(b.batch.senders)
+    return bool(
+        (np.asarray(a.batch.fates) == np.asarray(b.batch.fates)).all()
+        and (a.batch.order == b.batch.order).all()
+        and all((rows[f] == others[f]).all() for f in ("delivered_gain", "retained_gain", "evicted", "rejected"))
+    )

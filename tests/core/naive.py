@@ -1,0 +1,312 @@
+"""Slow, obvious twins of the compiled kernels: lists, dictionaries and fractions, written from the model's description.
+
+Nothing here calls a kernel, and nothing here is clever. A twin and its kernel must agree exactly.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from fractions import Fraction
+
+ACCEPT, REJECT = "accept", "reject"
+
+
+# --- quantity of information -----------------------------------------------------------------------------------------
+
+
+def exponential(base):
+    return lambda d: 1 - math.exp(d * math.log(base))
+
+
+def saturating(distance):
+    return lambda d: min(1.0, d / distance)
+
+
+def information(v, x):
+    """H = 1 + sum of V(x_i - x_{i-1}); nothing received, nothing known."""
+    if not x:
+        return 0.0
+    return 1 + sum(v(b - a) for a, b in itertools.pairwise(x))
+
+
+# --- the link --------------------------------------------------------------------------------------------------------
+
+
+class Link:
+    """Capacity over time as a list of (us, bytes) knots, with exact fractions between them."""
+
+    def __init__(self, knots, after, offset_us=0):
+        self.knots, self.after, self.offset_us = knots, after, offset_us
+
+    def pieces(self):
+        """(start us, bytes then, end us, bytes then) of every straight piece, for as long as the link carries any."""
+        pieces = [(*a, *b) for a, b in itertools.pairwise(self.knots)]
+        yield from pieces
+        duration, total = self.knots[-1]
+        if self.after == "loop":
+            for lap in itertools.count(1):
+                for t0, b0, t1, b1 in pieces:
+                    yield lap * duration + t0, lap * total + b0, lap * duration + t1, lap * total + b1
+        if self.after == "hold":
+            t0, b0, t1, b1 = pieces[-1]
+            for _ in itertools.count() if b1 > b0 else ():
+                t0, b0, t1, b1 = t1, b1, 2 * t1 - t0, 2 * b1 - b0
+                yield t0, b0, t1, b1
+
+    def bytes_by(self, t_us):
+        """C at the sender's time t, a fraction."""
+        t = t_us + self.offset_us
+        for t0, b0, t1, b1 in self.pieces():
+            if t <= t1:
+                return b0 + Fraction((b1 - b0) * (t - t0), t1 - t0)
+        return Fraction(b1)  # it has stopped for good
+
+    def first_time(self, position):
+        """The first whole microsecond at which that many bytes could have crossed; None for never."""
+        for t0, b0, t1, b1 in self.pieces():
+            if position <= b1:
+                exact = t0 + Fraction((position - b0) * (t1 - t0), b1 - b0)
+                return math.ceil(exact) - self.offset_us
+        return None
+
+
+# --- the sender ------------------------------------------------------------------------------------------------------
+
+
+class Sender:
+    """One sender, event by event. Messages are dictionaries: seq, us, bytes, x, luck."""
+
+    def __init__(self, link, policy, capacity, max_bytes=None, decide_at="arrival"):
+        self.link, self.policy, self.capacity = link, policy, capacity
+        self.max_bytes = math.inf if max_bytes is None else max_bytes
+        self.decide_at = decide_at
+        self.queue = []
+        self.sending = None  # the message in transmission, outside the buffer
+        self.finish = None  # when its last byte will have crossed; None: never
+        self.position = 0  # bytes of the link used up when it has
+        self.last_taken = None
+        self.previous = None  # the arrival before this one, kept or not
+        self.taken, self.crossed, self.dropped, self.order = {}, {}, {}, []
+        self.rejected = self.evicted = self.impossible = 0
+
+    def run(self, messages, first_decision=0, last_decision=math.inf):
+        for message in messages:
+            # (1) all that the link finishes up to and including now leaves, and successors start
+            self.advance(message["us"])
+            # (2) the policy decides
+            fits = self.fits(self.queue, message)
+            asked = first_decision <= message["seq"] <= last_decision
+            if asked and self.decide_at == "overflow":
+                asked = not fits
+            decision = ACCEPT
+            if asked:
+                previous = self.previous if self.previous is not None else message
+                last_taken = self.last_taken if self.last_taken is not None else previous
+                decision = self.policy.decide(list(self.queue), message, self.capacity, last_taken, previous)
+            self.carry_out(decision, message)
+            self.previous = message
+            # (3) an idle socket takes the head at once
+            if self.sending is None and self.queue:
+                self.take_head(message["us"], math.floor(self.link.bytes_by(message["us"])))
+        # the buffer drains
+        self.advance(math.inf)
+        return self
+
+    def advance(self, until):
+        while self.sending is not None and self.finish is not None and self.finish <= until:
+            done, now = self.sending["seq"], self.finish
+            self.crossed[done] = now
+            self.order.append(done)
+            self.sending = None
+            if self.queue:
+                self.take_head(now, self.position)
+
+    def take_head(self, now, position):
+        """The socket takes the head; its first byte follows byte ``position`` of the link."""
+        self.sending = self.last_taken = self.queue.pop(0)
+        self.position = position + self.sending["bytes"]
+        self.finish = self.link.first_time(self.position)
+        self.taken[self.sending["seq"]] = now
+        self.policy.departed(self.queue)
+
+    def fits(self, queue, message):
+        enough_bytes = sum(m["bytes"] for m in queue) + message["bytes"] <= self.max_bytes
+        return len(queue) < self.capacity and enough_bytes
+
+    def carry_out(self, decision, message):
+        if decision == REJECT:
+            self.drop(message)
+            self.rejected += 1
+            return
+        if decision != ACCEPT and 0 <= decision < len(self.queue):
+            rest = self.queue[:decision] + self.queue[decision + 1 :]
+            if self.fits(rest, message):
+                self.drop(self.queue[decision], message["us"])
+                self.queue = [*rest, message]
+                self.evicted += 1
+                return
+        # What a queue does: accept where there is room, reject where there is none.
+        fits = self.fits(self.queue, message)
+        if decision != ACCEPT or not fits:
+            self.impossible += 1
+        if fits:
+            self.queue.append(message)
+        else:
+            self.drop(message)
+            self.rejected += 1
+
+    def drop(self, message, now=None):
+        self.dropped[message["seq"]] = message["us"] if now is None else now
+
+
+# --- the policies, from their papers' descriptions -------------------------------------------------------------------
+
+
+class Policy:
+    """``decide`` says what to do with a newcomer; ``departed`` hears what is left after the head went."""
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        return self.full(queue, newcomer, L, last_taken, previous) if len(queue) == L else ACCEPT
+
+    def departed(self, queue):
+        pass
+
+
+class DropOldest(Policy):
+    def full(self, queue, newcomer, L, last_taken, previous):
+        return 0
+
+
+class DropNewest(Policy):
+    def full(self, queue, newcomer, L, last_taken, previous):
+        return REJECT
+
+
+class ReplaceNewest(Policy):
+    def full(self, queue, newcomer, L, last_taken, previous):
+        return L - 1
+
+
+def one_of(candidates, luck):
+    """A candidate, each as likely as the others."""
+    return candidates[math.floor(luck * len(candidates))]
+
+
+class Random(Policy):
+    """The victim is uniform over the queue and the newcomer."""
+
+    def full(self, queue, newcomer, L, last_taken, previous):
+        return one_of([*range(L), REJECT], newcomer["luck"])
+
+
+class Reservoir(Policy):
+    """Algorithm R: the n-th item takes a place of its own with probability L / n."""
+
+    n = 0
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        self.n = max(self.n, len(queue)) + 1  # what came unasked is all there
+        if len(queue) < L:
+            return ACCEPT
+        return one_of([*range(L), *[REJECT] * (self.n - L)], newcomer["luck"])
+
+    def departed(self, queue):
+        self.n = len(queue)
+
+
+class Decimate(Policy):
+    """Arrivals 1, 4, 7, ... enter a queue that drops its oldest."""
+
+    n = 0
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        self.n += 1
+        if self.n not in range(1, self.n + 1, 3):
+            return REJECT
+        return ACCEPT if len(queue) < L else 0
+
+
+class Afr(Policy):
+    """AFR: dropping rate r, counter c, dropping position p."""
+
+    def __init__(self, as_released=True):
+        self.r, self.c, self.p, self.as_released = 1, 0, 0, as_released
+
+    def departed(self, queue):
+        if self.as_released and self.p > 0:
+            self.p -= 1
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        filled = Fraction(len(queue), L)
+        low = filled <= Fraction(2, 3) if self.as_released else filled < Fraction(2, 3)
+        if self.r > 1 and low:
+            self.r //= 2
+            self.c %= self.r
+        self.c += 1
+        if self.c != self.r:
+            return REJECT
+        self.c = 0
+        if len(queue) < L:
+            return ACCEPT
+        victim = self.p
+        self.p += 1
+        if self.p == L:
+            self.r *= 2
+            self.p = 0
+        return victim
+
+
+class MinGap(Policy):
+    """Drop what leaves the smallest gap between its neighbours, ties to the oldest; the next step is like the last."""
+
+    def __init__(self, key):
+        self.key = key
+
+    def gaps(self, queue, newcomer, last_taken, previous):
+        """The merged gap that each queued message, and last the newcomer, would leave."""
+        at = [m[self.key] for m in [last_taken, *queue, newcomer]]
+        at.append(at[-1] + at[-1] - previous[self.key])
+        return [after - before for before, after in zip(at, at[2:], strict=False)]
+
+    def full(self, queue, newcomer, L, last_taken, previous):
+        gaps = self.gaps(queue, newcomer, last_taken, previous)
+        victim = gaps.index(min(gaps))
+        return victim if victim < L else REJECT
+
+
+class OrbBuf(Policy):
+    """Drop the message with the most similar queued neighbours, the first of equals; where none has two: the tail."""
+
+    def __init__(self, v):
+        self.v = v
+
+    def full(self, queue, newcomer, L, last_taken, previous):
+        similar = [1 - self.v(c["x"] - a["x"]) for a, c in zip(queue, queue[2:], strict=False)]
+        return 1 + similar.index(max(similar)) if similar else L - 1
+
+
+class Anything(Policy):
+    """A policy that decides at random, impossible decisions included: -2 accept, -1 reject, 0 .. L + 1 a slot."""
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        return one_of([ACCEPT, REJECT, *range(L + 2)], newcomer["luck"])
+
+
+def policy(name, v):
+    """The twin of the built-in policy of that name."""
+    makers = {
+        "drop-oldest": DropOldest,
+        "drop-newest": DropNewest,
+        "replace-newest": ReplaceNewest,
+        "random": Random,
+        "reservoir": Reservoir,
+        "decimate": Decimate,
+        "afr": Afr,
+        "afr-paper": lambda: Afr(as_released=False),
+        "min-gap": lambda: MinGap("us"),
+        "min-motion-gap": lambda: MinGap("x"),
+        "orbbuf": lambda: OrbBuf(v),
+        "test-anything": Anything,
+    }
+    return makers[name]()

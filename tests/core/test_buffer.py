@@ -1,0 +1,86 @@
+"""The bounded buffer: an array row against a list, and the gaps between what it holds."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from cases import VALUES
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bufgym import qoi
+from bufgym.buffer import MESSAGE, Buffer, arrival_gain, evict, loss, motion_gaps, push, row_width, time_gaps
+from bufgym.kernel import records
+
+
+@given(st.integers(1, 6), st.lists(st.one_of(st.none(), st.integers(-1, 5)), max_size=80))
+def test_agrees_with_a_list(L, actions):
+    """None: push (evicting the head when full); -1: the socket takes the head; k: evict slot k."""
+    slots = records((2, row_width(L)), MESSAGE)
+    first, queue, sent, pushed = 1, [], 0, 0
+    for action in actions:
+        if action is None:
+            if len(queue) == L:
+                first = evict(slots, 1, first, L, 0)
+                queue.pop(0)
+            pushed += 1
+            arrival = records(1, MESSAGE)
+            arrival["seq"] = pushed
+            first = push(slots, 1, first, len(queue), arrival[0])
+            queue.append(pushed)
+        elif action == -1 and queue:
+            first, sent = first + 1, queue.pop(0)
+        elif 0 <= action < len(queue):
+            first = evict(slots, 1, first, len(queue), action)
+            queue.pop(action)
+        # The message taken last stands before the head, and the neighbouring row is untouched.
+        assert slots["seq"][1, first - 1 : first + len(queue)].tolist() == [sent, *queue]
+    assert (slots["seq"][0] == 0).all()
+
+
+def buffer(times_us, x, v=None, *, taken_us=0, taken_x=0.0, previous_us=0, previous_x=0.0, taken=1):
+    """A buffer that holds messages with these arrival times and coordinates."""
+    slots = records(len(times_us), MESSAGE)
+    slots["arrival_us"], slots["x"] = times_us, x
+    others = dict.fromkeys(Buffer._fields, 0)
+    others.update(slots=slots, capacity=len(x), v=(v or qoi.exponential(0.5)).array, taken=taken)
+    others.update(taken_us=taken_us, taken_x=taken_x, previous_us=previous_us, previous_x=previous_x)
+    others.update(left_fraction=0.0, period_us=0.0, drain=0.0)
+    return Buffer(**others)
+
+
+def message(us, x):
+    made = records(1, MESSAGE)
+    made["arrival_us"], made["x"] = us, x
+    return made[0]
+
+
+def test_gaps_by_hand():
+    # Sent: at 0. Queued: at 10 and 30. The newcomer comes at 60; the arrival before it came at 45 and was rejected.
+    held = buffer([10, 30], [1.0, 1.5], previous_us=45, previous_x=3.0)
+    newcomer = message(60, 5.0)
+    assert [time_gaps(held, newcomer, k) for k in range(3)] == [(10, 20), (20, 30), (30, 15)]
+    assert [motion_gaps(held, newcomer, k) for k in range(3)] == [(1.0, 0.5), (0.5, 3.5), (3.5, 2.0)]
+    # V = 1 - 0.5^d: slot 0 loses V(1) + V(0.5) - V(1.5) = (1 - 0.5^1)(1 - 0.5^0.5)
+    assert loss(held, newcomer, 0) == pytest.approx(0.5 * (1 - 0.5**0.5))
+    assert arrival_gain(held, newcomer) == 1 - 0.5**3.5
+
+
+def test_gain_of_a_newcomer_to_an_empty_buffer():
+    assert arrival_gain(buffer([], [], taken_x=2.0), message(9, 3.0)) == 0.5
+    assert arrival_gain(buffer([], [], taken=0), message(9, 3.0)) == 0  # the very first message is the 1 in H
+
+
+@given(VALUES, st.lists(st.integers(0, 9), min_size=3, max_size=9), st.integers(0, 9))
+def test_gaps_and_losses_agree_with_a_list(v, steps, back):
+    at = np.cumsum(steps).tolist()
+    previous = max(at[-2], at[-1] - back)
+    held = buffer(at[1:-1], at[1:-1], v, taken_us=at[0], taken_x=at[0], previous_us=previous, previous_x=previous)
+    newcomer = message(at[-1], at[-1])
+    gaps = [b - a for a, b in pairwise([*at, 2 * at[-1] - previous])]
+    for k in range(len(at) - 1):
+        assert time_gaps(held, newcomer, k) == motion_gaps(held, newcomer, k) == (gaps[k], gaps[k + 1])
+        lost = v(gaps[k]) + v(gaps[k + 1]) - v(gaps[k] + gaps[k + 1])
+        assert loss(held, newcomer, k) == pytest.approx(lost, abs=1e-12)

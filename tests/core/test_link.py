@@ -1,0 +1,95 @@
+"""The link: when bytes cross, worked by hand and against exact fractions."""
+
+from __future__ import annotations
+
+import naive
+import numpy as np
+import pytest
+from cases import trace, traces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bufgym.errors import BufgymError
+from bufgym.link import FOREVER, Knots, Link, position_at, segment, time_of
+
+# 1000 bytes in the first 10 ms, nothing for 10 ms, then 3000 bytes in 10 ms: 0.1, 0 and 0.3 bytes a microsecond.
+KNOTS = [(0, 0), (10_000, 1_000), (20_000, 1_000), (30_000, 4_000)]
+
+
+def kernels(knots, after):
+    store = Knots()
+    store.place(trace([(0, 0), (7, 9)], "stop"))  # so that this trace does not begin at knot 0
+    first, last, code = store.place(trace(knots, after))
+    where = (store.us, store.bytes, first, last, code, first)
+    return lambda t: position_at(*where, t)[0], lambda position: time_of(*where, position)[0]
+
+
+def test_inside_the_trace():
+    carried, first_time = kernels(KNOTS, "stop")
+    assert carried(0) == 0
+    assert carried(15) == 1  # 1.5 bytes, rounded down
+    assert carried(10_000) == carried(19_999) == 1_000  # the outage
+    assert carried(25_000) == 2_500
+    assert first_time(1) == 10  # 0.1 bytes a microsecond
+    assert first_time(1_000) == 10_000  # the last byte before the outage
+    assert first_time(1_001) == 20_004  # 1 byte at 0.3 a microsecond: 3.33 us, so the 4th
+    assert first_time(4_000) == 30_000
+
+
+def test_after_the_end():
+    carried, first_time = kernels(KNOTS, "loop")
+    assert carried(30_000 + 15_000) == 4_000 + 1_000
+    assert first_time(8_000) == 60_000  # the very end of the second lap
+    assert first_time(8_001) == 60_010
+    carried, first_time = kernels(KNOTS, "hold")
+    assert carried(40_000) == 4_000 + 3_000
+    assert first_time(4_000 + 3_001) == 40_004
+    carried, first_time = kernels(KNOTS, "stop")
+    assert carried(10**9) == 4_000
+    assert first_time(4_001) == FOREVER
+    # Holding a rate of 0 carries nothing either.
+    assert kernels([*KNOTS, (31_000, 4_000)], "hold")[1](4_001) == FOREVER
+
+
+@given(traces(), st.integers(0, 400_000), st.integers(1, 60_000))
+def test_agrees_with_fractions(case, t_us, position):
+    knots, after = case
+    carried, first_time = kernels(knots, after)
+    twin = naive.Link(knots, after)
+    assert carried(t_us) == int(twin.bytes_by(t_us))
+    at = twin.first_time(position)
+    assert first_time(position) == (FOREVER if at is None else at)
+    if at is not None:
+        # The first microsecond at which that many bytes could have crossed, and no later one.
+        assert carried(at) >= position > (carried(at - 1) if at > 0 else 0)
+
+
+@given(traces(), st.integers(0, 5), st.integers(0, 10**6))
+def test_a_hint_changes_nothing(case, hint, point):
+    us = np.array([t for t, _ in case[0]])
+    last = len(us) - 1
+    point %= us[-1]
+    assert segment(us, 0, last, min(hint, last - 1), point) == segment(us, 0, last, 0, point)
+    k = segment(us, 0, last, 0, point)
+    assert us[k] <= point < us[k + 1]
+
+
+def test_nothing_is_lost_to_rounding():
+    # 3 bytes in 7 us: messages of 1 byte end at ceil(7/3), ceil(14/3), 7, ... and after 3 million of them at 7 s.
+    _, first_time = kernels([(0, 0), (7, 3)], "loop")
+    assert [first_time(k) for k in range(1, 7)] == [3, 5, 7, 10, 12, 14]
+    assert first_time(3_000_000) == 7_000_000
+
+
+def test_traces_are_stored_once():
+    store, a, b = Knots(), trace(KNOTS, "loop"), trace([(0, 0), (5, 5)], "hold")
+    assert store.place(a) == (0, 3, 0)
+    assert store.place(b) == (4, 5, 1)
+    assert store.place(a) == (0, 3, 0)
+    assert len(store.us) == len(store.bytes) == 6
+
+
+@pytest.mark.parametrize("name", ["offset_us", "propagation_us"])
+def test_errors(name):
+    with pytest.raises(BufgymError, match=f"{name} = -1: must be >= 0"):
+        Link(trace(KNOTS, "loop"), **{name: -1})

@@ -1,0 +1,80 @@
+"""The oracle: best of all subsets, and never beaten."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+from cases import VALUES
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bufgym import policies, qoi
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.oracle import ideal, integer
+from bufgym.scenario import Interruption
+from bufgym.sender import run
+
+# The number of examples is set where one of them is hundreds of runs.
+FEW = settings(max_examples=12 if JIT else 3)
+
+
+def test_by_hand():
+    v = qoi.exponential(0.5)
+    # L = 1, T = 2: keep 1 or 2 of 0, 1, 2, 3: gaps 1 and 2, V = 1/2 + 3/4.
+    assert integer(1, 2, v) == 1.25
+    # As if the gaps could be 1.5 and 1.5.
+    assert ideal(1, 2, v) == pytest.approx(2 * (1 - 0.5**1.5))
+    # With room for all, nothing is lost: T + 1 gaps of 1.
+    assert integer(5, 3, v) == ideal(5, 3, v) == 4 * 0.5
+    assert integer(1, 0, v) == 0.5
+
+
+@given(VALUES, st.integers(1, 5), st.integers(0, 10))
+def test_is_the_best_of_all_subsets(v, L, T):
+    best = max(
+        math.fsum(np.vectorize(v)(np.diff([0, *kept, T + 1]))) for kept in combinations(range(1, T + 1), min(L, T))
+    )
+    assert integer(L, T, v) == pytest.approx(best, abs=1e-12)
+    assert ideal(L, T, v) >= best - 1e-12
+
+
+def test_they_meet_where_gaps_come_out_even():
+    v = qoi.exponential()
+    # L = 8: nine gaps. T + 1 = 18, 36, 72 are 9 times 2, 4, 8; 19 is not.
+    for T in (17, 35, 71):
+        assert integer(8, T, v) == pytest.approx(ideal(8, T, v), abs=1e-12)
+    assert integer(8, 18, v) < ideal(8, 18, v) - 1e-4
+
+
+LENGTHS = range(1, 121) if JIT else (1, 2, 9, 17, 36)
+CAPACITIES = range(1, 13) if JIT else (1, 3, 8)
+
+
+@FEW
+@given(VALUES)
+def test_no_policy_beats_it(v):
+    for L in CAPACITIES:
+        best = np.array([integer(L, T, v) for T in LENGTHS])
+        for name in policies.names():
+            senders = run(policies.get(name), EPISODES, L, v)
+            gained = senders.batch.senders["delivered_gain"]
+            assert (gained <= best + 1e-9).all(), (name, L)
+            # With room for all, whoever keeps all that fits gains as much.
+            if name not in ("decimate",):
+                fits = np.array(LENGTHS) <= L
+                assert gained[fits] == pytest.approx(best[fits], abs=1e-9)
+
+
+SCENARIO = Interruption(t_max=max(LENGTHS))
+EPISODES = [SCENARIO.episode(T).with_luck(np.random.default_rng(T)) for T in LENGTHS]
+
+
+@pytest.mark.parametrize(("L", "T"), [(0, 5), (3, -1)])
+def test_errors(L, T):
+    for truth in (ideal, integer):
+        with pytest.raises(BufgymError, match=f"oracle: L = {L}, T = {T}: need L >= 1 and T >= 0"):
+            truth(L, T, qoi.exponential())

@@ -1,0 +1,248 @@
+"""Scenarios: every draw keeps to its parameters, and two policies meet the same episode."""
+
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+from cases import fates, trace
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bufgym import policies, scenario
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.scenario import LAWS, SCENARIOS, Interruption, Streams, Uplink, messages
+from bufgym.sender import run
+from bufgym.traces import Motion
+
+STEADY = trace([(0, 0), (1_000_000, 5_000_000)], "loop")
+FADING = trace([(0, 0), (500_000, 4_000_000), (900_000, 4_000_000), (1_000_000, 4_100_000)], "loop")
+WALK = Motion("walk", np.array([0, 400_000, 1_000_000], np.int64), np.array([0.0, 0.0, 1.5]))
+
+
+# --- one interruption ------------------------------------------------------------------------------------------------
+
+
+@given(st.sampled_from(LAWS), st.integers(1, 50), st.integers(0, 100), st.floats(0, 200), st.integers(0, 2**32))
+def test_lengths_keep_their_bounds(law, t_min, more, mean, seed):
+    drawn = Interruption(law=law, t_min=t_min, t_max=t_min + more, t_mean=t_min + mean)
+    rng = np.random.default_rng(seed)
+    lengths = {drawn.draw_length(rng) for _ in range(50)}
+    assert min(lengths) >= t_min and max(lengths) <= t_min + more
+    if law == "fixed":
+        assert lengths == {t_min + more}
+
+
+def test_laws():
+    rng = np.random.default_rng(1)
+    n = 20_000 if JIT else 4_000
+
+    def lengths(**parameters):
+        drawn = Interruption(**parameters)
+        return np.array([drawn.draw_length(rng) for _ in range(n)])
+
+    # Uniform on 3..7: each of five with 1/5.
+    counts = np.bincount(lengths(law="uniform", t_min=3, t_max=7), minlength=8)[3:] / n
+    assert counts == pytest.approx([0.2] * 5, abs=5 * np.sqrt(0.16 / n))
+    # Log-uniform on 1..3: ln 2, ln 3/2, ln 4/3 of ln 4, that is 0.5, 0.292, 0.208.
+    counts = np.bincount(lengths(law="log-uniform", t_min=1, t_max=3), minlength=4)[1:] / n
+    assert counts == pytest.approx(np.log([2, 3 / 2, 4 / 3]) / np.log(4), abs=5 * np.sqrt(0.25 / n))
+    # Geometric from 5 on with mean 15: standard deviation sqrt(11 x 10).
+    mean = lengths(law="geometric", t_min=5, t_max=10**6, t_mean=15).mean()
+    assert mean == pytest.approx(15, abs=5 * np.sqrt(110 / n))
+
+
+@pytest.mark.parametrize("T", [1, 2, 9, 40])
+def test_an_interruption_is_one(T):
+    # Message 0 is on the link when it stops, 1..T meet the policy, then all that is kept is sent, and T + 1 after it.
+    made = Interruption(t_max=40, rate_hz=30)
+    asked = []
+
+    def note(buffer, arrival, memory):
+        asked.append((int(arrival.seq), buffer.busy, buffer.left_bytes))
+        return policies.ACCEPT
+
+    senders = run(policies.Policy("note", note), [made.episode(T)], 50, made.value)
+    assert asked == [(k, 1, 230_000) for k in range(1, T + 1)]
+    crossed_us = fates(senders)["crossed_us"]
+    assert len(crossed_us) == T + 2
+    resumes_us = T * 33_333 + 33_333 // 2
+    assert all(resumes_us < crossed_us[k] <= resumes_us + 1 for k in range(T + 1))
+    assert 0 < crossed_us[T + 1] - (T + 1) * 33_333 <= 1
+
+
+def test_lengths_outside():
+    for T in (0, 41):
+        with pytest.raises(BufgymError, match=f"T = {T}: must lie between 1 and t_max = 40"):
+            Interruption(t_max=40).episode(T)
+
+
+# --- a stream over a link --------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0, 1), st.floats(1, 200), st.floats(0, 3), st.booleans(), st.integers(0, 2**32))
+def test_uplink_draws_are_well_formed(jitter, rate_hz, size_cv, random_offset, seed):
+    drawn = Uplink(
+        traces=(STEADY, FADING),
+        motion=(WALK,),
+        rate_hz=rate_hz,
+        jitter=jitter,
+        size_cv=size_cv,
+        duration_s=3,
+        random_offset=random_offset,
+    )
+    episode = drawn.draw(Streams.seeded(seed))
+    arrivals = episode.arrivals
+    n = len(arrivals)
+    assert n == drawn.max_messages == round(3 * rate_hz)
+    assert arrivals["seq"].tolist() == list(range(n))
+    assert arrivals["arrival_us"][0] == 0
+    assert (np.diff(arrivals["arrival_us"]) >= 0).all()
+    # Each at most one jitter away from its turn, and so is the first, from which time counts.
+    away = arrivals["arrival_us"] * rate_hz / 1e6 - np.arange(n)
+    assert np.abs(away).max() <= jitter + 2e-6 * rate_hz
+    assert arrivals["size_bytes"].min() >= 1
+    assert arrivals["x"][0] == 0 and (np.diff(arrivals["x"]) >= 0).all()
+    assert 0 <= episode.link.offset_us < 1_000_000
+    if not random_offset:
+        assert episode.link.offset_us == 0
+        assert arrivals["x"] == pytest.approx(WALK.at(arrivals["arrival_us"]))
+
+
+def test_sizes():
+    drawn = Uplink(traces=(STEADY,), size_bytes=100_000, size_cv=0.5, rate_hz=1000, duration_s=20)
+    size = drawn.draw(Streams.seeded(3)).arrivals["size_bytes"]
+    # 20,000 draws: the mean is known to 0.5 / sqrt(20000) = 0.35 %, the coefficient of variation to about 1 %.
+    assert size.mean() == pytest.approx(100_000, rel=0.015)
+    assert size.std() / size.mean() == pytest.approx(0.5, rel=0.05)
+    equal = Uplink(traces=(STEADY,), size_bytes=100_000).draw(Streams.seeded(3)).arrivals["size_bytes"]
+    assert (equal == 100_000).all()
+
+
+def test_without_motion_x_is_the_frame_index():
+    assert Uplink(traces=(STEADY,), duration_s=1).draw(Streams.seeded(0)).arrivals["x"].tolist() == list(range(30))
+
+
+def test_scale():
+    drawn = Uplink(traces=(STEADY,), scale=(0.5, 2.0), duration_s=0.1)
+    seen = {drawn.draw(Streams.seeded(seed)).link.trace.total_bytes for seed in range(20)}
+    assert seen == {2_500_000, 10_000_000}
+
+
+# --- chance ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_same_seed_same_episode(name):
+    made = scenario.get(name)
+    a, b, c = (made.draw(Streams.seeded(seed)) for seed in (5, 5, 6))
+    assert (a.arrivals == b.arrivals).all()
+    assert a.link == b.link
+    assert len(a.arrivals) <= made.max_messages
+    assert a.link != c.link
+
+
+def test_streams_are_separate():
+    made = Uplink(traces=(STEADY, FADING), size_cv=0.3, duration_s=1)
+    plain, spent = Streams.seeded(9), Streams.seeded(9)
+    # Whatever a policy draws, or another link is drawn with, the workload stays; and the other way round.
+    spent.policy.random(100)
+    spent.link.random(100)
+    a, b = made.draw(plain), made.draw(spent)
+    assert (a.arrivals == b.arrivals).all()
+    assert a.link != b.link
+    spent = Streams.seeded(9)
+    spent.arrival.random(100)
+    b = made.draw(spent)
+    assert (a.arrivals != b.arrivals).any()
+    assert a.link == b.link
+    # No two streams are alike.
+    assert len({stream.random() for stream in Streams.seeded(9)}) == 3
+
+
+def test_luck():
+    episode = Interruption().episode(20)
+    lucky, again, other = (episode.with_luck(np.random.default_rng(s)) for s in (1, 1, 2))
+    assert (lucky.arrivals["luck"] == again.arrivals["luck"]).all()
+    assert (lucky.arrivals["luck"] != other.arrivals["luck"]).all()
+    assert (episode.arrivals["luck"] == 0).all()  # the drawn episode itself is shared and stays as it was
+    assert (lucky.arrivals["arrival_us"] == episode.arrivals["arrival_us"]).all()
+
+
+# --- errors ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("parameters", "rule"),
+    [
+        ({"law": "normal"}, "law = 'normal': must be one of fixed, uniform, log-uniform, geometric"),
+        ({"t_min": 0}, "t_min = 0, t_max = 400"),
+        ({"t_min": 9, "t_max": 8}, "t_min = 9, t_max = 8"),
+        ({"t_mean": 0.5}, "t_mean = 0.5: must be at least t_min = 1"),
+        ({"rate_hz": 0}, "rate_hz = 0: must be a number > 0"),
+        ({"rate_hz": float("nan")}, "rate_hz = nan"),
+        ({"rate_hz": "30"}, "rate_hz = '30'"),
+        ({"size_bytes": -1}, "size_bytes = -1"),
+        ({"value": 0.618}, "value = 0.618: must be a bufgym.qoi Value"),
+    ],
+)
+def test_bad_interruptions(parameters, rule):
+    with pytest.raises(BufgymError, match=rule):
+        Interruption(**parameters)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "rule"),
+    [
+        ({"traces": ()}, "traces: an uplink needs at least one"),
+        ({"scale": (1.0, 0.0)}, r"scale = \(1.0, 0.0\): every factor"),
+        ({"scale": ()}, r"scale = \(\)"),
+        ({"jitter": 1.5}, "jitter = 1.5: must lie between 0 and 1"),
+        ({"jitter": float("nan")}, "jitter = nan"),
+        ({"size_cv": -0.1}, "size_cv = -0.1: must lie between 0 and 10"),
+        ({"duration_s": 0.001}, "rate_hz x duration_s = 0 messages"),
+        ({"propagation_us": -5}, "propagation_us = -5: must be a whole number >= 0"),
+        ({"propagation_us": 0.5}, "propagation_us = 0.5"),
+        ({"rate_hz": float("inf")}, "rate_hz = inf"),
+    ],
+)
+def test_bad_uplinks(parameters, rule):
+    with pytest.raises(BufgymError, match=rule):
+        Uplink(**{"traces": (STEADY,), **parameters})
+
+
+@pytest.mark.parametrize(
+    ("columns", "rule"),
+    [
+        (([], 5), "at least one message"),
+        (([0, 2, 1], 5), "must be >= 0 and must not decrease"),
+        (([-1, 2], 5), "must be >= 0 and must not decrease"),
+        (([0, 1], [5, 0]), "message size 0 bytes: must be >= 1"),
+        (([0, 1], 5, [1.0, 0.5]), "coordinates x must be finite numbers and must not decrease"),
+        (([0, 1], 5, [0.0, float("nan")]), "coordinates x must be finite"),
+    ],
+)
+def test_bad_messages(columns, rule):
+    with pytest.raises(BufgymError, match=rule):
+        messages(*(np.array(c) if isinstance(c, list) else c for c in columns))
+
+
+def test_get():
+    assert scenario.get("interruption", t_max=7).t_max == 7
+    assert scenario.get("lte") is scenario.get("lte")
+    made = Interruption()
+    assert scenario.get(made) is made
+    with pytest.raises(BufgymError, match="unknown scenario 'moon'; known: interruption, lte"):
+        scenario.get("moon")
+    with pytest.raises(BufgymError, match="Interruption: no parameter 'speed'; it has: "):
+        scenario.get("interruption", speed=3)
+    with pytest.raises(BufgymError, match="seed = -1"):
+        Streams.seeded(-1)
+
+
+def test_parameters_are_frozen():
+    for made in (Interruption(), Uplink(traces=(STEADY,))):
+        with pytest.raises(FrozenInstanceError):
+            made.rate_hz = 5

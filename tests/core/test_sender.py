@@ -1,0 +1,269 @@
+"""The sender: every event worked by hand once, then against the event-by-event twin, with nothing lost on the way."""
+
+from __future__ import annotations
+
+import naive
+import numpy as np
+import pytest
+from cases import VALUES, Case, cases, fates, order, trace
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bufgym import policies, qoi
+from bufgym.buffer import ACCEPT, REJECT
+from bufgym.errors import BufgymError
+from bufgym.link import Link
+from bufgym.metrics import outcome
+from bufgym.scenario import Episode, messages
+from bufgym.sender import DECISION, DEPARTURE, END, NEVER, Senders, can_evict, decide, has_room, next_event, run
+
+V = qoi.exponential(0.5)
+MS = 1_000
+
+
+def anything(buffer, arrival, memory):
+    """Decides at random, impossible decisions included."""
+    return int(arrival.luck * (buffer.capacity + 4)) - 2
+
+
+# The twin draws from [accept, reject, 0, 1, ..., L + 1]; ACCEPT is -2 and REJECT is -1, so floor(luck x (L + 4)) - 2.
+assert (ACCEPT, REJECT) == (-2, -1)
+ANYTHING = policies.Policy("test-anything", anything, compile=True)
+POLICIES = {**{name: policies.get(name) for name in policies.names()}, "test-anything": ANYTHING}
+
+
+def line(times_ms, *, capacity=2, after="loop", sizes=1_000, knots=((0, 0), (1_000 * MS, 1_000_000)), **limits):
+    """A sender on a link of 1 MB/s, so that a message of 1000 bytes takes 1 ms."""
+    arrivals = messages(np.array(times_ms, np.int64) * MS, np.asarray(sizes, np.int64))
+    senders = Senders(1, capacity, V, max_messages=len(arrivals), **limits)
+    senders.load(0, Episode(arrivals, Link(trace(list(knots), after))))
+    return senders
+
+
+def test_order_of_things_at_an_arrival():
+    # Message 0 crosses from 0 to 1 ms. At 1 ms exactly, message 1 arrives: message 0 leaves first, the socket is idle,
+    # so message 1 is taken at once. Message 2 arrives at the same time and waits its turn.
+    senders = line([0, 1, 1])
+    senders.run(policies.get("drop-oldest"))
+    assert fates(senders) == {
+        "taken_us": {0: 0, 1: 1 * MS, 2: 2 * MS},
+        "crossed_us": {0: 1 * MS, 1: 2 * MS, 2: 3 * MS},
+        "dropped_us": {},
+    }
+
+
+def test_a_departure_makes_room_for_the_arrival_at_its_instant():
+    # L = 1. At 1 ms the socket takes message 1, so message 2, which arrives then, finds room: nothing is dropped.
+    senders = line([0, 0, 1], capacity=1)
+    senders.run(policies.get("drop-newest"))
+    assert fates(senders)["dropped_us"] == {}
+    # Half a millisecond earlier it does not.
+    arrivals = messages(np.array([0, 0, 999]), 1_000)
+    senders = run(policies.get("drop-newest"), [Episode(arrivals, Link(trace([(0, 0), (1_000, 1_000)], "loop")))], 1, V)
+    assert fates(senders)["dropped_us"] == {2: 999}
+
+
+def test_the_message_in_transmission_cannot_be_dropped():
+    # All arrive at once: 0 goes out, 1 and 2 fill the queue, then 3 evicts 1 and 4 evicts 2.
+    senders = line([0, 0, 0, 0, 0])
+    senders.run(policies.get("drop-oldest"))
+    assert order(senders) == [0, 3, 4]
+    assert fates(senders)["dropped_us"] == {1: 0, 2: 0}
+    # H = 1 + V(3) + V(1) = 1 + 7/8 + 1/2
+    assert outcome(senders, 0).qoi == 2.375
+
+
+def test_a_link_that_stops_keeps_what_it_has():
+    # 2500 bytes, then nothing ever: message 2 stays in transmission, message 3 in the buffer.
+    senders = line([0, 0, 0, 1], knots=((0, 0), (2_500, 2_500)), after="stop")
+    senders.run(policies.get("drop-oldest"))
+    result = outcome(senders, 0)
+    assert (result.arrived, result.delivered, result.in_transmission, result.buffered, result.dropped) == (
+        4,
+        2,
+        1,
+        1,
+        0,
+    )
+    assert fates(senders)["taken_us"] == {0: 0, 1: 1 * MS, 2: 2 * MS}
+
+
+def test_start_offset():
+    # The link rests for 5 ms; starting 3 ms into the trace, the first message waits 2 ms and crosses in 1.
+    arrivals = messages(np.array([0]), 1_000)
+    link = Link(trace([(0, 0), (5 * MS, 0), (10 * MS, 5_000)], "hold"), offset_us=3 * MS, propagation_us=7)
+    senders = run(policies.get("drop-oldest"), [Episode(arrivals, link)], 1, V)
+    assert fates(senders)["crossed_us"] == {0: 3 * MS}
+
+
+def test_bytes_limit():
+    # B = 2500: message 0 is in transmission, outside the buffer. 1 and 2 (1000 each) fit; 3 (1000) does not, though
+    # L = 5: the oldest goes. 4 (3000) cannot fit whatever goes: drop-oldest's answer is impossible, it is rejected.
+    senders = line([0, 0, 0, 0, 0], capacity=5, sizes=[1_000, 1_000, 1_000, 1_000, 3_000], max_bytes=2_500)
+    asked = []
+    while (event := next_event(senders.batch, 0)) != END:
+        if event == DECISION:
+            seq, room = int(senders.batch.senders[0]["next"]), has_room(senders.batch, 0)
+            asked.append((seq, room, [k for k in range(5) if can_evict(senders.batch, 0, k)]))
+            decide(senders.batch, 0, ACCEPT if room else 0)
+    # (arrival, is there room, which slots would make room)
+    assert asked == [(0, True, []), (1, True, []), (2, True, [0]), (3, False, [0, 1]), (4, False, [])]
+    assert order(senders) == [0, 2, 3]
+    assert outcome(senders, 0).impossible == 1
+
+
+@pytest.mark.parametrize(("decide_at", "asked"), [("arrival", [0, 1, 2, 3, 4]), ("overflow", [3, 4])])
+def test_decide_at(decide_at, asked):
+    seen = []
+
+    def note(buffer, arrival, memory):
+        seen.append(int(arrival.seq))
+        return ACCEPT if len(buffer.slots) < buffer.capacity else 0
+
+    line([0, 0, 0, 0, 0], decide_at=decide_at).run(policies.Policy("note", note))
+    assert seen == asked
+
+
+def test_what_the_policy_sees():
+    views = []
+
+    def note(buffer, arrival, memory):
+        views.append(buffer._replace(slots=buffer.slots["seq"].tolist()))
+        return ACCEPT
+
+    line([0, 0, 4, 4], sizes=[8_000, 500, 700, 1], capacity=3).run(policies.Policy("note", note))
+    last = views[3]
+    assert last.slots == [1, 2]
+    assert (last.capacity, last.backlog_bytes, last.taken, last.taken_x, last.busy) == (3, 1_200, 1, 0.0, 1)
+    # Message 0 has had 4 of its 8 ms; the arrival before this one came at 4 ms with x = 2.
+    assert (last.left_bytes, last.left_fraction, last.stalled_us) == (4_000, 0.5, 4 * MS)
+    assert (last.previous_us, last.previous_x, last.departures) == (4 * MS, 2.0, 0)
+    assert (views[0].busy, views[0].left_bytes, views[1].departures) == (0, 0, 1)
+
+
+def agree(case: Case, name: str, v: qoi.Value) -> None:
+    """The kernel and the twin made the same run."""
+    ours, twin = case.run(POLICIES[name], v), case.run_twin(naive.policy(name, v))
+    assert fates(ours) == {"taken_us": twin.taken, "crossed_us": twin.crossed, "dropped_us": twin.dropped}
+    assert order(ours) == twin.order
+    sender, result = ours.batch.senders[0], outcome(ours, 0)
+    assert (sender["rejected"], sender["evicted"]) == (twin.rejected, twin.evicted)
+    assert (sender["taken"], sender["crossed"]) == (len(twin.taken), len(twin.crossed))
+    assert sender["backlog_bytes"] == sum(m["bytes"] for m in twin.queue)
+    assert result.impossible == twin.impossible
+    assert (result.arrived, result.delivered) == (len(case.twin_messages), len(twin.order))
+    assert (result.dropped, result.in_transmission) == (len(twin.dropped), int(twin.sending is not None))
+    assert result.buffered == len(twin.queue)
+    x = [case.twin_messages[k]["x"] for k in twin.order]
+    assert result.qoi == naive.information(v, x)
+    # What was credited message by message is H; what is kept or sent is H of all of it.
+    assert (sender["delivered_gain"] + 1 if x else 0) == pytest.approx(result.qoi, abs=1e-12)
+    kept = x + [m["x"] for m in ([twin.sending] if twin.sending else []) + twin.queue]
+    assert (sender["retained_gain"] + 1 if kept else 0) == pytest.approx(naive.information(v, kept), abs=1e-9)
+
+
+@given(cases(), VALUES)
+def test_agrees_with_twin_under_every_policy(case, v):
+    for name in POLICIES:
+        agree(case, name, v)
+
+
+@given(cases(max_messages=120), VALUES)
+def test_agrees_with_twin_on_any_decisions(case, v):
+    agree(case, "test-anything", v)
+
+
+@given(cases(), st.randoms(use_true_random=False))
+def test_conservation_after_every_event(case, chance):
+    senders = case.senders(V)
+    batch = senders.batch
+    sender = batch.senders[0]
+    before_us = 0
+    while True:
+        event = next_event(batch, 0)
+        conserve(case, senders)
+        assert sender["now_us"] >= before_us
+        before_us = sender["now_us"]
+        if event == END:
+            break
+        if event == DEPARTURE:
+            assert sender["busy"] == 1
+        else:
+            possible = [REJECT, *[k for k in range(case.capacity) if can_evict(batch, 0, k)]]
+            if has_room(batch, 0):
+                possible.append(ACCEPT)
+            assert decide(batch, 0, chance.choice(possible))
+            conserve(case, senders)
+    assert sender["next"] == len(case.twin_messages)
+    assert next_event(batch, 0) == END  # and stays there
+
+
+def conserve(case: Case, senders: Senders) -> None:
+    """arrived = delivered + in transmission + buffered + dropped, in all and per topic; limits and sums hold."""
+    sender = senders.batch.senders[0]
+    arrived, first, queued = int(sender["next"]), int(sender["first"]), int(sender["occupancy"])
+    if case.decide_at == "arrival" and case.episode.first_decision == 0 and case.episode.last_decision > arrived:
+        assert sender["impossible"] == 0
+    assert arrived == sender["crossed"] + sender["busy"] + queued + sender["rejected"] + sender["evicted"]
+    rows = np.asarray(senders.batch.fates[0])[:arrived]
+    topic = np.asarray(case.episode.arrivals)["topic"][:arrived]
+    slots = np.asarray(senders.batch.slots[0])[first : first + queued]
+    dropped, crossed = rows["dropped_us"] != NEVER, rows["crossed_us"] != NEVER
+    sending = (rows["taken_us"] != NEVER) & ~crossed
+    assert sending.sum() == sender["busy"]
+    for k in range(3):
+        of = topic == k
+        assert (
+            of.sum() == (dropped & of).sum() + (crossed & of).sum() + (sending & of).sum() + (slots["topic"] == k).sum()
+        )
+    # Oldest first, none twice, none of those that left.
+    assert (np.diff(slots["seq"]) > 0).all()
+    assert not (dropped | crossed | sending)[slots["seq"]].any()
+    assert queued <= case.capacity
+    assert sender["backlog_bytes"] == slots["size_bytes"].sum() <= (case.max_bytes or 2**62)
+
+
+def test_rows_of_a_batch_do_not_meet():
+    episodes = [Episode(messages(np.arange(40) * (3 + k) * 100, 900 + k), LINKS[k % 2]) for k in range(6)]
+    together = run(policies.get("afr"), episodes, 4, V)
+    for k, episode in enumerate(episodes):
+        alone = run(policies.get("afr"), [episode], 4, V)
+        assert fates(alone) == fates(together, k)
+        assert order(alone) == order(together, k)
+
+
+LINKS = [
+    Link(trace([(0, 0), (5_000, 4_000), (9_000, 4_000)], "loop"), 1_000),
+    Link(trace([(0, 0), (2_000, 0), (3_000, 3_000)], "hold")),
+]
+
+
+def test_loading_again_forgets_the_last_episode():
+    long = Episode(messages(np.arange(30) * 300, 800), LINKS[0])
+    short = Episode(messages(np.arange(7) * 200, 500), LINKS[1])
+    senders = Senders(1, 3, V, max_messages=30)
+    senders.load(0, long)
+    senders.run(policies.get("min-gap"))
+    senders.load(0, short)
+    senders.run(policies.get("min-gap"))
+    assert fates(senders) == fates(run(policies.get("min-gap"), [short], 3, V))
+
+
+@pytest.mark.parametrize(
+    ("given_", "rule"),
+    [
+        ({"capacity": 0}, "capacity = 0: L must be a whole number from 1"),
+        ({"capacity": 2.0}, "capacity = 2.0"),
+        ({"capacity": True}, "capacity = True"),
+        ({"max_bytes": 0}, "max_bytes = 0: B must be"),
+        ({"decide_at": "departure"}, "decide_at = 'departure': must be 'arrival' or 'overflow'"),
+    ],
+)
+def test_errors(given_, rule):
+    with pytest.raises(BufgymError, match=rule):
+        Senders(1, **{"capacity": 2, "v": V, "max_messages": 3, **given_})
+
+
+def test_no_episode():
+    with pytest.raises(BufgymError, match="no episode to run"):
+        run(policies.get("afr"), [], 2, V)
