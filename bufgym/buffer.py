@@ -51,7 +51,7 @@ class Buffer(NamedTuple):
     taken: int
     """How many messages the socket has taken so far (delivered, or in transmission)."""
     taken_us: int
-    """Arrival time of the message that the socket took last, us; that of this arrival while there was none."""
+    """Arrival time of the message that the socket took last, us; that of the previous arrival while there was none."""
     taken_x: float
     """Coordinate of the message that the socket took last."""
     previous_us: int

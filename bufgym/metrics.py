@@ -40,7 +40,7 @@ class Outcome:
     peak_age_s: float
     """The same just before each receipt that lowers it, mean over these, s."""
     max_age_s: float
-    """The largest of these, s."""
+    """The largest age just before any receipt, s."""
     impossible: int
     """Decisions that could not be carried out as given."""
 

@@ -77,8 +77,11 @@ class Value:
         return float(value(self.array, float(d)))
 
     def information(self, x: Sequence[float] | NDArray[np.float64]) -> float:
-        """H of messages received with these coordinates (Eq. 2)."""
-        return float(information(self.array, np.ascontiguousarray(x, np.float64)))
+        """H of messages received with these coordinates, which must be finite and must not decrease (Eq. 2)."""
+        coordinates = np.ascontiguousarray(x, np.float64)
+        if not (np.isfinite(coordinates).all() and (np.diff(coordinates) >= 0).all()):
+            raise BufgymError("H: the coordinates must be finite numbers and must not decrease")
+        return float(information(self.array, coordinates))
 
 
 def _checked(name: str, array: list[float], distances: NDArray[np.float64]) -> Value:

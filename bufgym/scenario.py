@@ -103,6 +103,9 @@ def _messages(
 
 # --- one interruption ------------------------------------------------------------------------------------------------
 
+MAX_RATE_HZ = 100_000
+"""Arrivals are counted in whole microseconds: ten to a period at least."""
+
 LAWS = ("fixed", "uniform", "log-uniform", "geometric")
 
 
@@ -127,11 +130,15 @@ class Interruption:
     def __post_init__(self) -> None:
         if self.law not in LAWS:
             raise BufgymError(f"law = {self.law!r}: must be one of {', '.join(LAWS)}")
+        for name in ("t_min", "t_max", "size_bytes"):
+            object.__setattr__(self, name, _natural(name, getattr(self, name)))
         if not 1 <= self.t_min <= self.t_max <= 10**6:
             raise BufgymError(f"t_min = {self.t_min}, t_max = {self.t_max}: need 1 <= t_min <= t_max <= 1000000")
+        _positive(self, "rate_hz", "size_bytes", "t_mean")
+        if self.rate_hz > MAX_RATE_HZ:
+            raise BufgymError(f"rate_hz = {self.rate_hz}: must be at most {MAX_RATE_HZ}")
         if not self.t_mean >= self.t_min:
             raise BufgymError(f"t_mean = {self.t_mean}: must be at least t_min = {self.t_min}")
-        _positive(self, "rate_hz", "size_bytes")
         _value(self)
 
     @property
@@ -216,16 +223,31 @@ class Uplink:
     value: Value = field(default_factory=lambda: qoi.exponential(math.exp(-1)))
 
     def __post_init__(self) -> None:
-        for name in ("traces", "motion", "scale"):
+        for name, kind, what in (
+            ("traces", Trace, "a bufgym.traces Trace"),
+            ("motion", Motion, "a bufgym.traces Motion"),
+            ("scale", int | float, "a number > 0"),
+        ):
             given = getattr(self, name)
-            if not isinstance(given, tuple):
-                object.__setattr__(self, name, tuple(given) if isinstance(given, Sequence) else (given,))
+            if isinstance(given, str) or not isinstance(given, Sequence):
+                given = (given,)
+            for item in given:
+                if not isinstance(item, kind):
+                    raise BufgymError(f"{name}: {item!r} is not {what}")
+            object.__setattr__(self, name, tuple(given))
         if not self.traces:
             raise BufgymError("traces: an uplink needs at least one bandwidth trace")
         if not self.scale or not all(math.isfinite(s) and s > 0 for s in self.scale):
             raise BufgymError(f"scale = {self.scale}: every factor must be a number > 0")
         _positive(self, "rate_hz", "size_bytes", "duration_s")
         _natural("propagation_us", self.propagation_us)
+        if self.size_bytes < 1:
+            raise BufgymError(f"size_bytes = {self.size_bytes}: must be at least 1")
+        if self.rate_hz > MAX_RATE_HZ:
+            raise BufgymError(f"rate_hz = {self.rate_hz}: must be at most {MAX_RATE_HZ}")
+        for name in ("jitter", "size_cv"):
+            if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), int | float):
+                raise BufgymError(f"{name} = {getattr(self, name)!r}: must be a number")
         if not 0 <= self.jitter <= 1:
             raise BufgymError(f"jitter = {self.jitter}: must lie between 0 and 1 (of a period)")
         if not 0 <= self.size_cv <= 10:

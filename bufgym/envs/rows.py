@@ -37,6 +37,8 @@ from bufgym.sender import (
 
 DELIVERED, RETAINED = range(len(REWARD_TERMS))
 
+_AHEAD = 8
+
 
 class Shown(NamedTuple):
     """What n rows show after a step; rows of these arrays are written by the kernels."""
@@ -111,12 +113,18 @@ def begin_rows(batch: Batch, rows: NDArray[np.int64], paid: NDArray[np.float64],
 
 
 @kernel
-def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64], shown: Shown) -> None:
+def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64], shown: Shown) -> int:
     """One decision in every row. ``paid``: float64[n, reward terms], what earlier steps have paid out.
 
     A row without a decision due (its episode asked for none) just ends.
     """
+    # Every row's messages lie in memory of their own. Reading a later row's next one now, for nothing but a sum that
+    # nobody needs, brings it near while this row is worked on.
+    touched = 0
     for i in range(len(actions)):
+        later = min(i + _AHEAD, len(actions) - 1)
+        soon = min(batch.senders[later].next + 1, batch.arrivals.shape[1] - 1)
+        touched += batch.arrivals[later, soon].arrival_us + batch.fates[later, soon].dropped_us
         sender = batch.senders[i]
         if sender.waiting == 1:
             decide(batch, i, decision_of(actions[i], sender.capacity))
@@ -126,6 +134,7 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64
         paid[i, DELIVERED] = sender.delivered_gain
         paid[i, RETAINED] = sender.retained_gain
         show(batch, i, shown)
+    return touched
 
 
 def reward_weights(reward: str | Mapping[str, float]) -> NDArray[np.float64]:

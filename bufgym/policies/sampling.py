@@ -46,8 +46,9 @@ EVERY, COUNT = range(2)
     compile=True,
 )
 def decimate(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """Fixed decimation: one arrival in `every` enters the queue, which loses its head when full."""
+    """Fixed decimation: of the arrivals it is asked about, one in `every` is queued; the head goes when full."""
+    n, every = memory[COUNT], memory[EVERY]
     memory[COUNT] += 1
-    if (memory[COUNT] - 1) % memory[EVERY] != 0:
+    if n > 0 and n // every == (n - 1) // every:
         return REJECT
     return ACCEPT if len(buffer.slots) < buffer.capacity else 0

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from bufgym import policies, qoi
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
+from bufgym.link import Link
 from bufgym.metrics import outcome
 from bufgym.policies import ACCEPT, REJECT, afr, register, registry
-from bufgym.scenario import Interruption, Streams, Uplink
+from bufgym.scenario import Episode, Interruption, Streams, Uplink, messages
 from bufgym.sender import Senders, run
 from bufgym.traces import Trace
 
@@ -355,3 +356,15 @@ def test_policies_meet_the_same_episodes(seed):
             result = outcome(senders, i)
             assert result.arrived == 120 == result.delivered + result.dropped
             assert order(senders, i) == sorted(order(senders, i))  # first in, first out
+
+
+@pytest.mark.parametrize(
+    ("every", "kept"), [(2, [0, 2, 4, 6, 8]), (3, [0, 3, 6, 9]), (2.5, [0, 3, 5, 8]), (1, list(range(10)))]
+)
+def test_decimate_keeps_one_in_every(every: float, kept: list[int]) -> None:
+    """10 arrivals at an open link: whatever is accepted is sent; one in 2.5 alternates between steps of 3 and 2."""
+    arrivals = messages(np.arange(10, dtype=np.int64) * 1_000_000, 1)
+    episode = Episode(arrivals, Link(Trace.constant(1e6, 20)))
+    senders = run(policies.get(f"decimate:every={every}"), [episode], 4, qoi.exponential())
+    assert senders.batch.order[0, : len(kept)].tolist() == kept
+    assert int(senders.batch.senders["crossed"][0]) == len(kept)

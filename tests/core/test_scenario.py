@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import FrozenInstanceError
 
 import numpy as np
@@ -15,7 +17,7 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.scenario import LAWS, SCENARIOS, Interruption, Streams, Uplink, messages
 from bufgym.sender import run
-from bufgym.traces import Motion
+from bufgym.traces import Motion, Trace
 
 STEADY = trace([(0, 0), (1_000_000, 5_000_000)], "loop")
 FADING = trace([(0, 0), (500_000, 4_000_000), (900_000, 4_000_000), (1_000_000, 4_100_000)], "loop")
@@ -246,3 +248,20 @@ def test_parameters_are_frozen():
     for made in (Interruption(), Uplink(traces=(STEADY,))):
         with pytest.raises(FrozenInstanceError):
             made.rate_hz = 5
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: Interruption(t_min=1.5), "t_min = 1.5"),  # type: ignore[arg-type]
+        (lambda: Interruption(t_max=9.5), "t_max = 9.5"),  # type: ignore[arg-type]
+        (lambda: Interruption(rate_hz=3e6), "rate_hz = 3000000.0"),
+        (lambda: Uplink(traces="lte-a"), "traces: 'lte-a'"),  # type: ignore[arg-type]
+        (lambda: Uplink(traces=(Trace.constant(1e6, 1),), scale="2"), "scale: '2'"),  # type: ignore[arg-type]
+        (lambda: Uplink(traces=(Trace.constant(1e6, 1),), jitter="a"), "jitter = 'a'"),  # type: ignore[arg-type]
+        (lambda: Uplink(traces=(Trace.constant(1e6, 1),), size_bytes=0), "size_bytes = 0"),
+    ],
+)
+def test_a_parameter_of_the_wrong_kind_is_named(make: Callable[[], object], named: str) -> None:
+    with pytest.raises(BufgymError, match=re.escape(named)):
+        make()
