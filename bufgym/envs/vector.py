@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -223,7 +223,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             rows.shown = rows.new_shown()
             self._pool.append(rows.shown)
         if keep and rows.shown is not before:
-            for new, old in zip(rows.shown, before, strict=True):
+            for new, old in zip(cast(Any, rows.shown), before, strict=True):
                 new[...] = old
 
 
