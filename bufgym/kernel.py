@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numba.extending
 import numpy as np
 from numpy.typing import NDArray
 
@@ -88,3 +89,32 @@ def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Zeroed records whose fields read as attributes (``a[i].field``) in kernels, compiled or not."""
     zeros = np.zeros(shape, dtype)
     return zeros if JIT else zeros.view(np.recarray)
+
+
+def _prefetch(typing_context: Any, array: Any, i: Any, k: Any) -> Any:
+    """LLVM's prefetch of the place where ``array[i, k]`` lies (a Numba intrinsic: a signature and its code)."""
+    from llvmlite import ir
+    from numba.core import cgutils
+
+    code: Any = cgutils
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = signature.args[0]
+        view = context.make_array(kind)(context, builder, arguments[0])
+        place = code.get_item_pointer(context, builder, kind, view, list(arguments[1:]), wraparound=False)
+        number, byte = ir.IntType(32), ir.IntType(8).as_pointer()
+        hint = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        function = code.get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")
+        # 1: it will be written; 3: keep it near; 1: data, not code
+        builder.call(function, [builder.bitcast(place, byte), number(1), number(3), number(1)])
+        return context.get_dummy_value()
+
+    return numba.types.void(array, i, k), generate
+
+
+def _no_prefetch(array: NDArray[Any], i: int, k: int) -> None:
+    """Nothing to do where nothing is compiled."""
+
+
+prefetch: Any = cast(Any, numba.extending).intrinsic(_prefetch) if JIT else _no_prefetch
+"""``prefetch(array, i, k)`` asks the processor to fetch ``array[i, k]`` into its cache, without waiting for it."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bufgym import scenario as scenarios
 from bufgym.buffer import ACCEPT, REJECT, UNLIMITED_BYTES
 from bufgym.errors import BufgymError
-from bufgym.kernel import kernel
+from bufgym.kernel import kernel, prefetch
 from bufgym.link import FOREVER
 from bufgym.observe import CONTEXT_FIELDS, FIELDS, REWARD_TERMS, SLOT_FIELDS, observe_context, observe_slots
 from bufgym.scenario import Episode, Scenario, Streams
@@ -38,6 +38,7 @@ from bufgym.sender import (
 DELIVERED, RETAINED = range(len(REWARD_TERMS))
 
 _AHEAD = 8
+"""Rows: far enough for the memory to answer in time, near enough for the answer to be still there."""
 
 
 class Shown(NamedTuple):
@@ -113,18 +114,17 @@ def begin_rows(batch: Batch, rows: NDArray[np.int64], paid: NDArray[np.float64],
 
 
 @kernel
-def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64], shown: Shown) -> int:
+def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64], shown: Shown) -> None:
     """One decision in every row. ``paid``: float64[n, reward terms], what earlier steps have paid out.
 
     A row without a decision due (its episode asked for none) just ends.
     """
-    # Every row's messages lie in memory of their own. Reading a later row's next one now, for nothing but a sum that
-    # nobody needs, brings it near while this row is worked on.
-    touched = 0
     for i in range(len(actions)):
+        # Every row's messages lie in memory of their own: fetch a later row's next one while this row is worked on.
         later = min(i + _AHEAD, len(actions) - 1)
         soon = min(batch.senders[later].next + 1, batch.arrivals.shape[1] - 1)
-        touched += batch.arrivals[later, soon].arrival_us + batch.fates[later, soon].dropped_us
+        prefetch(batch.arrivals, later, soon)
+        prefetch(batch.fates, later, soon)
         sender = batch.senders[i]
         if sender.waiting == 1:
             decide(batch, i, decision_of(actions[i], sender.capacity))
@@ -134,7 +134,6 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64
         paid[i, DELIVERED] = sender.delivered_gain
         paid[i, RETAINED] = sender.retained_gain
         show(batch, i, shown)
-    return touched
 
 
 def reward_weights(reward: str | Mapping[str, float]) -> NDArray[np.float64]:
