@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 import bufgym  # noqa: F401  (registers the environments)
 from bufgym import scenario as scenarios
+from bufgym.benchmark.run import draw
 from bufgym.envs import SenderVectorEnv
 from bufgym.metrics import Outcome, outcome
 from bufgym.policies import registry
-from bufgym.scenario import Episode, Scenario, Streams, Uplink
+from bufgym.scenario import Episode, Scenario, Uplink
 from bufgym.sender import run
 
 if TYPE_CHECKING:
@@ -47,11 +48,7 @@ def worlds(arguments: Arguments) -> tuple[Scenario, Scenario]:
 
 def held_out(world: Scenario, episodes: int) -> list[Episode]:
     """Episodes that no training run sees, with luck for policies that randomise."""
-    drawn = []
-    for i in range(episodes):
-        streams = Streams.seeded(HELD_OUT_SEED + i)
-        drawn.append(world.draw(streams).with_luck(streams.policy))
-    return drawn
+    return [draw(world, HELD_OUT_SEED + i) for i in range(episodes)]
 
 
 def run_agent(

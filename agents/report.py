@@ -15,6 +15,7 @@ from sb3_contrib import MaskablePPO
 
 from agents.evaluate import held_out, run_agent, run_fixed, summarise, worlds
 from agents.training import Run
+from bufgym.benchmark.table import aligned
 
 if TYPE_CHECKING:
     from train import Arguments
@@ -74,11 +75,7 @@ def table(rows: Sequence[dict[str, Any]], agent: str) -> str:
         lines.append(
             [row["policy"], *(format(row[name] * factor, spec) for _, name, factor, spec in COLUMNS), difference]
         )
-    widths = [max(len(line[c]) for line in lines) for c in range(len(lines[0]))]
-    return "\n".join(
-        "  ".join([line[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(line[1:], widths[1:], strict=True))])
-        for line in lines
-    )
+    return "\n".join(aligned(lines))
 
 
 def export(model: MaskablePPO, folder: Path) -> None:

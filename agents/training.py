@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 from agents.evaluate import worlds
 from agents.network import policy_of
+from bufgym.benchmark.run import replaced
 from bufgym.errors import BufgymError
 from bufgym.sb3 import GymVecEnv, make_vec_env
 
@@ -99,9 +100,8 @@ def checkpoints(folder: Path) -> list[Path]:
 def save(model: MaskablePPO, path: Path) -> None:
     """Whole or not at all: a kill while writing leaves no broken file under this name."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(".tmp")
-    model.save(unfinished)
-    os.replace(unfinished, path)
+    with replaced(path) as unfinished:
+        model.save(unfinished)
 
 
 # --- training --------------------------------------------------------------------------------------------------------

@@ -134,9 +134,8 @@ class Interruption:
             object.__setattr__(self, name, _natural(name, getattr(self, name)))
         if not 1 <= self.t_min <= self.t_max <= 10**6:
             raise BufgymError(f"t_min = {self.t_min}, t_max = {self.t_max}: need 1 <= t_min <= t_max <= 1000000")
-        _positive(self, "rate_hz", "size_bytes", "t_mean")
-        if self.rate_hz > MAX_RATE_HZ:
-            raise BufgymError(f"rate_hz = {self.rate_hz}: must be at most {MAX_RATE_HZ}")
+        _positive(self, "size_bytes", "t_mean")
+        _rate(self.rate_hz)
         if not self.t_mean >= self.t_min:
             raise BufgymError(f"t_mean = {self.t_mean}: must be at least t_min = {self.t_min}")
         _value(self)
@@ -239,14 +238,13 @@ class Uplink:
             raise BufgymError("traces: an uplink needs at least one bandwidth trace")
         if not self.scale or not all(math.isfinite(s) and s > 0 for s in self.scale):
             raise BufgymError(f"scale = {self.scale}: every factor must be a number > 0")
-        _positive(self, "rate_hz", "size_bytes", "duration_s")
+        _positive(self, "size_bytes", "duration_s")
+        _rate(self.rate_hz)
         _natural("propagation_us", self.propagation_us)
         if self.size_bytes < 1:
             raise BufgymError(f"size_bytes = {self.size_bytes}: must be at least 1")
-        if self.rate_hz > MAX_RATE_HZ:
-            raise BufgymError(f"rate_hz = {self.rate_hz}: must be at most {MAX_RATE_HZ}")
         for name in ("jitter", "size_cv"):
-            if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), int | float):
+            if not _is_number(getattr(self, name)):
                 raise BufgymError(f"{name} = {getattr(self, name)!r}: must be a number")
         if not 0 <= self.jitter <= 1:
             raise BufgymError(f"jitter = {self.jitter}: must lie between 0 and 1 (of a period)")
@@ -327,11 +325,22 @@ def get(spec: str | Scenario, **overrides: Any) -> Scenario:
 
 def _positive(scenario: object, *names: str) -> None:
     for name in names:
-        number = getattr(scenario, name)
-        if isinstance(number, bool) or not isinstance(number, int | float | np.number):
-            raise BufgymError(f"{name} = {number!r}: must be a number > 0")
-        if not (math.isfinite(number) and number > 0):
-            raise BufgymError(f"{name} = {number}: must be a number > 0")
+        _above_0(name, getattr(scenario, name))
+
+
+def _above_0(name: str, number: Any) -> None:
+    if not (_is_number(number) and math.isfinite(number) and number > 0):
+        raise BufgymError(f"{name} = {number!r}: must be a number > 0")
+
+
+def _rate(rate_hz: Any) -> None:
+    _above_0("rate_hz", rate_hz)
+    if rate_hz > MAX_RATE_HZ:
+        raise BufgymError(f"rate_hz = {rate_hz}: must be at most {MAX_RATE_HZ}")
+
+
+def _is_number(given: Any) -> bool:
+    return isinstance(given, int | float | np.number) and not isinstance(given, bool)
 
 
 def _natural(name: str, number: Any) -> int:

@@ -495,19 +495,26 @@ class Senders:
             python_rollout(self.batch, memory, policy)
 
 
+def named(batch: Batch) -> Batch:
+    """The same memory, as records whose fields read as attributes in plain Python too."""
+    return Batch(*(cast(Any, a.view(np.recarray) if a.dtype.names else a) for a in batch))
+
+
+python_view = getattr(view, "py_func", view)
+"""``view`` for Python callers, over a ``named`` batch: the compiled kernel must not hand its arrays to Python."""
+
+
 def python_rollout(batch: Batch, memory: NDArray[np.float64], policy: Policy) -> None:
     """``rollout`` for a policy that is ordinary Python: the transition stays compiled, views are made in Python."""
-    # The same memory, as records whose fields read as attributes.
-    seen = Batch(*(cast(Any, a.view(np.recarray) if a.dtype.names else a) for a in batch))
-    look = getattr(view, "py_func", view)
+    seen = named(batch)
     for i in range(len(batch.senders)):
         event = next_event(batch, i)
         while event != END:
             if event == DECISION:
                 arrival = seen.arrivals[i, seen.senders[i].next]
-                decide(batch, i, int(policy.on_arrival(look(seen, i), arrival, memory[i])))
+                decide(batch, i, int(policy.on_arrival(python_view(seen, i), arrival, memory[i])))
             elif policy.hears_departures:
-                policy.on_departure(look(seen, i), memory[i])
+                policy.on_departure(python_view(seen, i), memory[i])
             event = next_event(batch, i)
         credit(batch, i, FOREVER)
 

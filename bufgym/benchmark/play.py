@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from bufgym.buffer import ACCEPT, REJECT
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
-from bufgym.sender import Batch, Senders, view
-
-# The view is built by its Python source: a compiled kernel would hand out records without named attributes.
-_look = getattr(view, "py_func", view)
+from bufgym.sender import Senders, named, python_view
 
 
 class Player:
@@ -34,13 +29,11 @@ class Player:
 
     def action(self, senders: Senders, i: int = 0) -> int:
         """The action for sender ``i``, whose decision is due: 0..L-1 evict, L reject, L + 1 accept."""
-        # The same memory, as records whose fields read as attributes.
-        arrays: Any = (a.view(np.recarray) if a.dtype.names else a for a in senders.batch)
-        batch: Any = Batch(*arrays)
+        batch = named(senders.batch)
         sender = batch.senders[i]
         if sender.waiting != 1:
             raise BufgymError(f"sender {i}: no decision is due")
-        seen = _look(batch, i)
+        seen = python_view(batch, i)
         memory = self._memory[i]
         if self.policy.hears_departures:
             for _ in range(int(sender.taken - self._taken[i])):

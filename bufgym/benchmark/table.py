@@ -72,15 +72,23 @@ def _mean(numbers: Sequence[float | None]) -> float:
 
 def plain(rows: Rows) -> str:
     """Aligned text, an empty line between capacities."""
-    lines = _cells(rows)
+    cells = _cells(rows)
+    out = []
+    for k, line in enumerate(aligned(cells)):
+        if k > 1 and cells[k][1] != cells[k - 1][1]:
+            out.append("")
+        out.append(line)
+    return "\n".join([*out, *_notes(rows)])
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Rows of cells as lines of text: the first column to the left, the others to the right."""
     widths = [max(len(line[c]) for line in lines) for c in range(len(lines[0]))]
     out = []
-    for k, line in enumerate(lines):
-        if k > 1 and line[1] != lines[k - 1][1]:
-            out.append("")
+    for line in lines:
         padded = [cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True)]
         out.append("  ".join([line[0].ljust(widths[0]), *padded]).rstrip())
-    return "\n".join([*out, *_notes(rows)])
+    return out
 
 
 def markdown(rows: Rows) -> str:
