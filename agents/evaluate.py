@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import bufgym  # noqa: F401  (registers the environments)
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
+from bufgym.benchmark.score import paired_difference
 from bufgym.envs import SenderVectorEnv
 from bufgym.metrics import Outcome, outcome
 from bufgym.policies import registry
@@ -78,16 +79,13 @@ def run_fixed(episodes: Sequence[Episode], world: Scenario, capacity: int) -> di
 def summarise(results: Mapping[str, Sequence[Outcome]], agent: str, resamples: int = 2000) -> list[dict[str, Any]]:
     """One row a policy, best QoI first: means over the episodes, and QoI minus the agent's with its 95 % interval.
 
-    The interval is a paired bootstrap over episodes: policies meet the same ones, so what an episode is worth to
-    everybody cancels.
+    The interval is ``score.paired_difference``'s: policies meet the same episodes, so what one is worth to everybody
+    cancels.
     """
-    rng = np.random.default_rng(0)
-    reference = np.array([o.qoi for o in results[agent]])
-    drawn = rng.integers(len(reference), size=(resamples, len(reference)))
+    reference = [o.qoi for o in results[agent]]
     rows = []
     for name, outcomes in results.items():
         means = {f.name: float(np.nanmean([getattr(o, f.name) for o in outcomes])) for f in fields(Outcome)}
-        difference = np.array([o.qoi for o in outcomes]) - reference
-        low, high = np.percentile(difference[drawn].mean(axis=1), [2.5, 97.5]).tolist()
-        rows.append({"policy": name, **means, "minus_agent": float(difference.mean()), "minus_agent_95": [low, high]})
+        minus, low, high = paired_difference([o.qoi for o in outcomes], reference, resamples=resamples)
+        rows.append({"policy": name, **means, "minus_agent": minus, "minus_agent_95": [low, high]})
     return sorted(rows, key=lambda row: -row["qoi"])

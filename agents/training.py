@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from agents.evaluate import worlds
 from agents.network import policy_of
-from bufgym.benchmark.run import replaced
+from bufgym.benchmark.rows import replaced
 from bufgym.errors import BufgymError
 from bufgym.sb3 import GymVecEnv, make_vec_env
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.errors import BufgymError
 from bufgym.kernel import kernel
 from bufgym.qoi import merging_loss, value
 
@@ -32,6 +33,15 @@ MESSAGE = np.dtype(
 REJECT, ACCEPT = -1, -2
 
 UNLIMITED_BYTES = 2**62
+MAX_CAPACITY = 10**6
+
+
+def check_limits(capacity: int, max_bytes: int | None) -> None:
+    """An error unless these can be L, messages, and B, bytes (None for no limit)."""
+    if isinstance(capacity, bool) or not isinstance(capacity, int | np.integer) or not 1 <= capacity <= MAX_CAPACITY:
+        raise BufgymError(f"capacity = {capacity!r}: L must be a whole number from 1 to {MAX_CAPACITY}")
+    if max_bytes is not None and not (isinstance(max_bytes, int | np.integer) and 1 <= max_bytes < UNLIMITED_BYTES):
+        raise BufgymError(f"max_bytes = {max_bytes!r}: B must be a whole number >= 1, or None for no limit")
 
 
 class Buffer(NamedTuple):
@@ -48,6 +58,8 @@ class Buffer(NamedTuple):
     """B, bytes; UNLIMITED_BYTES where only L counts."""
     backlog_bytes: int
     """Bytes queued."""
+    now_us: int
+    """The robot's clock, us."""
     taken: int
     """How many messages the socket has taken so far (delivered, or in transmission)."""
     taken_us: int

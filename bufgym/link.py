@@ -40,6 +40,19 @@ class Link:
             if getattr(self, name) < 0:
                 raise BufgymError(f"link on {self.trace.name}: {name} = {getattr(self, name)}: must be >= 0")
 
+    def carried_by(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]:
+        """C at each of these times, which must not decrease: bytes, rounded down, as ``position_at`` has it."""
+        by = np.empty(len(t_us), np.int64)
+        _positions(self.trace.time_us, self.trace.cumulative_bytes, _AFTER[self.trace.after], t_us + self.offset_us, by)
+        return by
+
+    @property
+    def carries_bytes(self) -> int:
+        """The position that no message can pass: the link's last byte, or FOREVER where it never stops."""
+        carried = self.trace.cumulative_bytes
+        ends = self.trace.after == "stop" or (self.trace.after == "hold" and carried[-1] == carried[-2])
+        return int(carried[-1]) if ends else FOREVER
+
 
 class Knots:
     """The knots of several traces in two flat arrays, as kernels read them; each trace is stored once."""
@@ -117,3 +130,13 @@ def time_of(
     k = segment(size, first, last, hint, wanted - 1)  # size[k] < wanted <= size[k + 1]
     need, carried = wanted - size[k], size[k + 1] - size[k]
     return laps * duration + us[k] + -(-need * (us[k + 1] - us[k]) // carried), k
+
+
+@kernel
+def _positions(
+    us: NDArray[np.int64], size: NDArray[np.int64], after: int, t_us: NDArray[np.int64], by: NDArray[np.int64]
+) -> None:
+    """``by[k]`` = C(t_us[k])."""
+    hint = 0
+    for k in range(len(t_us)):
+        by[k], hint = position_at(us, size, 0, len(us) - 1, after, hint, t_us[k])

@@ -41,6 +41,8 @@ class Outcome:
     """The same just before each receipt that lowers it, mean over these, s."""
     max_age_s: float
     """The largest age just before any receipt, s."""
+    peak_backlog_bytes: int
+    """Bytes queued at most; one that goes straight to an idle socket passes through the queue as well."""
     impossible: int
     """Decisions that could not be carried out as given."""
 
@@ -80,6 +82,7 @@ def outcome(senders: Senders, i: int) -> Outcome:
         mean_age_s=mean_age,
         peak_age_s=peak_age,
         max_age_s=max_age,
+        peak_backlog_bytes=int(sender["peak_backlog_bytes"]),
         impossible=int(sender["impossible"]),
     )
 

@@ -126,6 +126,8 @@ class Interruption:
     rate_hz: float = 30.0
     size_bytes: int = 230_000
     value: Value = field(default_factory=qoi.exponential)
+    lengths: tuple[int, ...] = ()
+    """If any are given: T is drawn again until it is one of these."""
 
     def __post_init__(self) -> None:
         if self.law not in LAWS:
@@ -139,6 +141,14 @@ class Interruption:
         if not self.t_mean >= self.t_min:
             raise BufgymError(f"t_mean = {self.t_mean}: must be at least t_min = {self.t_min}")
         _value(self)
+        object.__setattr__(self, "lengths", tuple(_natural("lengths", T) for T in self.lengths))
+        shortest = self.t_max if self.law == "fixed" else self.t_min
+        if self.lengths and not any(shortest <= T <= self.t_max for T in self._allowed):
+            raise BufgymError(f"lengths = {self.lengths}: none lies between {shortest} and t_max = {self.t_max}")
+
+    @functools.cached_property
+    def _allowed(self) -> frozenset[int]:
+        return frozenset(self.lengths)
 
     @property
     def max_messages(self) -> int:
@@ -151,6 +161,12 @@ class Interruption:
 
     def draw_length(self, rng: np.random.Generator) -> int:
         """T, messages."""
+        while True:
+            T = self._drawn_length(rng)
+            if not self.lengths or T in self._allowed:
+                return T
+
+    def _drawn_length(self, rng: np.random.Generator) -> int:
         if self.law == "fixed":
             return self.t_max
         if self.law == "uniform":
@@ -218,6 +234,8 @@ class Uplink:
     duration_s: float = 30.0
     scale: tuple[float, ...] = (1.0,)
     random_offset: bool = True
+    link_offset_s: tuple[float, float] | None = None
+    """Where on the trace an episode begins, at random from..to, s; None: anywhere."""
     propagation_us: int = 20_000
     value: Value = field(default_factory=lambda: qoi.exponential(math.exp(-1)))
 
@@ -250,6 +268,10 @@ class Uplink:
             raise BufgymError(f"jitter = {self.jitter}: must lie between 0 and 1 (of a period)")
         if not 0 <= self.size_cv <= 10:
             raise BufgymError(f"size_cv = {self.size_cv}: must lie between 0 and 10")
+        if self.link_offset_s is not None and not (
+            len(self.link_offset_s) == 2 and 0 <= self.link_offset_s[0] <= self.link_offset_s[1] < math.inf
+        ):
+            raise BufgymError(f"link_offset_s = {self.link_offset_s}: must be (from, to) with 0 <= from <= to, s")
         if not 1 <= self.max_messages <= 10**7:
             raise BufgymError(f"rate_hz x duration_s = {self.max_messages} messages: must lie between 1 and 10000000")
         _value(self)
@@ -282,7 +304,10 @@ class Uplink:
             x = motion.at(arrival_us + start)
             x -= x[0]
         trace = self._links[int(streams.link.integers(len(self._links)))]
-        offset = int(streams.link.integers(trace.duration_us)) if self.random_offset else 0
+        offset = 0
+        if self.random_offset:
+            first, last = self.link_offset_s or (0.0, trace.duration_us / 1e6)
+            offset = int(streams.link.integers(round(first * 1e6), max(round(last * 1e6), 1 + round(first * 1e6))))
         return Episode(_messages(arrival_us, size, x), Link(trace, offset, int(self.propagation_us)))
 
 

@@ -6,7 +6,8 @@ drains. Nothing sent is lost (TCP); the message in transmission is outside the b
 
 ``next_event`` moves one sender to the next thing that somebody must hear of: the socket took a message (DEPARTURE), an
 arrival asks for a decision (DECISION), or it is over (END). ``decide`` carries a decision out. Environments, rollouts
-and benchmarks are loops around these two.
+and benchmarks are loops around these two. Queue disciplines that drop at the head, such as CoDel, are asked there too
+(DEQUEUE, ``answer_dequeue``).
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from bufgym.buffer import (
     REJECT,
     UNLIMITED_BYTES,
     Buffer,
+    check_limits,
     evict,
     push,
     row_width,
@@ -36,9 +38,7 @@ from bufgym.policies.registry import Policy, runs_compiled, signatures
 from bufgym.qoi import Value, value
 from bufgym.scenario import Episode
 
-END, DEPARTURE, DECISION = range(3)
-
-MAX_CAPACITY = 10**6
+END, DEPARTURE, DECISION, DEQUEUE = range(4)
 
 SENDER = np.dtype(
     [
@@ -46,6 +46,7 @@ SENDER = np.dtype(
         ("capacity", np.int64),  # L, messages
         ("max_bytes", np.int64),  # B, bytes
         ("ask_when_full", np.int64),  # 1: only an arrival that finds no room asks for a decision
+        ("ask_at_dequeue", np.int64),  # 1: the policy may drop the head before the socket takes it
         # its episode
         ("arrivals", np.int64),  # messages in all
         ("first_decision", np.int64),
@@ -65,6 +66,8 @@ SENDER = np.dtype(
         ("backlog_bytes", np.int64),
         # its socket
         ("busy", np.int64),
+        ("cleared", np.int64),  # 1: the head may go; nobody need be asked again
+        ("follows", np.int64),  # 1: the head follows the message before it without a pause
         ("position", np.int64),  # bytes of the trace used up when the message in transmission has crossed
         ("finish_us", np.int64),
         ("segment_now", np.int64),  # where on the trace the clock and the socket were last looked up
@@ -76,6 +79,7 @@ SENDER = np.dtype(
         ("rejected", np.int64),
         ("evicted", np.int64),
         ("impossible", np.int64),  # decisions that could not be carried out as given
+        ("peak_backlog_bytes", np.int64),  # queued at most
         # what the policy may know of its own past
         ("previous_us", np.int64),
         ("previous_x", np.float64),
@@ -154,8 +158,9 @@ def load_row(
     sender.first = 1
     sender.now_us, sender.next, sender.waiting, sender.occupancy, sender.backlog_bytes = 0, 0, 0, 0, 0
     sender.busy, sender.position, sender.finish_us = 0, 0, 0
+    sender.ask_at_dequeue, sender.cleared, sender.follows = 0, 0, 0
     sender.taken, sender.crossed, sender.credited = 0, 0, 0
-    sender.rejected, sender.evicted, sender.impossible = 0, 0, 0
+    sender.rejected, sender.evicted, sender.impossible, sender.peak_backlog_bytes = 0, 0, 0, 0
     sender.previous_us, sender.taken_at_us, sender.departures = 0, 0, 0
     sender.previous_x, sender.period_us, sender.drain = 0.0, 0.0, 0.0
     sender.delivered_gain, sender.retained_gain = 0.0, 0.0
@@ -219,7 +224,10 @@ def next_event(batch: Batch, i: int) -> int:
     sender = batch.senders[i]
     while True:
         if sender.busy == 0 and sender.occupancy > 0:
-            take_head(batch, i, sender.now_us, True)
+            if sender.ask_at_dequeue > sender.cleared:
+                return DEQUEUE
+            take_head(batch, i, sender.now_us, sender.follows == 0)
+            sender.cleared, sender.follows = 0, 0
             return DEPARTURE
         more = sender.next < sender.arrivals
         arrives_us = batch.arrivals[i, sender.next].arrival_us if more else FOREVER - 1
@@ -232,8 +240,7 @@ def next_event(batch: Batch, i: int) -> int:
             sender.now_us = sender.finish_us
             sender.busy = 0
             if sender.occupancy > 0:
-                take_head(batch, i, sender.now_us, False)
-                return DEPARTURE
+                sender.follows = 1
             continue
         if not more:
             return END
@@ -301,6 +308,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         sender.first = push(batch.slots, i, sender.first, sender.occupancy, arrival)
         sender.occupancy += 1
         sender.backlog_bytes += arrival.size_bytes
+        sender.peak_backlog_bytes = max(sender.peak_backlog_bytes, sender.backlog_bytes)
     else:
         fate.dropped_us = sender.now_us
         sender.rejected += 1
@@ -331,6 +339,19 @@ def remove(batch: Batch, i: int, k: int) -> None:
 
 
 @kernel
+def answer_dequeue(batch: Batch, i: int, drop: bool) -> None:
+    """The policy's answer to DEQUEUE: drop the head, or let the socket take it."""
+    sender = batch.senders[i]
+    if not drop:
+        sender.cleared = 1
+        return
+    remove(batch, i, 0)
+    sender.evicted += 1
+    if sender.occupancy == 0:
+        sender.follows = 0  # nobody follows: the link goes idle
+
+
+@kernel
 def view(batch: Batch, i: int) -> Buffer:
     """What the policy of sender ``i`` may see now."""
     sender = batch.senders[i]
@@ -356,6 +377,7 @@ def view(batch: Batch, i: int) -> Buffer:
         capacity,
         sender.max_bytes,
         sender.backlog_bytes,
+        sender.now_us,
         sender.taken,
         taken_us,
         taken_x,
@@ -382,7 +404,12 @@ def arrival_of(batch: Batch, i: int) -> Any:
 
 
 def rollout(
-    batch: Batch, memory: NDArray[np.float64], on_arrival: Any, on_departure: Any, hears_departures: bool
+    batch: Batch,
+    memory: NDArray[np.float64],
+    on_arrival: Any,
+    on_departure: Any,
+    on_dequeue: Any,
+    hears_departures: bool,
 ) -> None:
     """Run every sender of the batch to its end under one policy; ``memory`` is float64[n, entries]."""
     for i in range(len(batch.senders)):
@@ -390,6 +417,8 @@ def rollout(
         while event != END:
             if event == DECISION:
                 decide(batch, i, on_arrival(view(batch, i), arrival_of(batch, i), memory[i]))
+            elif event == DEQUEUE:
+                answer_dequeue(batch, i, on_dequeue(view(batch, i), memory[i]))
             elif hears_departures:
                 on_departure(view(batch, i), memory[i])
             event = next_event(batch, i)
@@ -399,7 +428,7 @@ def rollout(
 @functools.cache
 def compiled_rollout() -> Any:
     """``rollout`` compiled once for every policy (policies arrive as values of one function type)."""
-    arrival, departure = signatures()
+    arrival, departure, dequeue = signatures()
     array, int_ = numba.types.Array, numba.types.int64
     record = {name: numba.from_dtype(dtype) for name, dtype in (("s", SENDER), ("m", MESSAGE), ("f", FATE))}
     ints = array(int_, 1, "C")
@@ -419,7 +448,8 @@ def compiled_rollout() -> Any:
     function = numba.types.FunctionType
     memory = array(numba.types.float64, 2, "C")
     return compile_for(
-        numba.types.void(batch, memory, function(arrival), function(departure), numba.types.boolean), rollout
+        numba.types.void(batch, memory, function(arrival), function(departure), function(dequeue), numba.types.boolean),
+        rollout,
     )
 
 
@@ -437,14 +467,7 @@ class Senders:
         decide_at: str = "arrival",
     ) -> None:
         """n senders with room for L = ``capacity`` messages (and B = ``max_bytes`` bytes), without episodes yet."""
-        if (
-            isinstance(capacity, bool)
-            or not isinstance(capacity, int | np.integer)
-            or not 1 <= capacity <= MAX_CAPACITY
-        ):
-            raise BufgymError(f"capacity = {capacity!r}: L must be a whole number from 1 to {MAX_CAPACITY}")
-        if max_bytes is not None and not (isinstance(max_bytes, int | np.integer) and 1 <= max_bytes < UNLIMITED_BYTES):
-            raise BufgymError(f"max_bytes = {max_bytes!r}: B must be a whole number >= 1, or None for no limit")
+        check_limits(capacity, max_bytes)
         if decide_at not in ("arrival", "overflow"):
             raise BufgymError(f"decide_at = {decide_at!r}: must be 'arrival' or 'overflow'")
         self.capacity = int(capacity)
@@ -486,13 +509,31 @@ class Senders:
             (first_knot, last_knot, after, link.offset_us, link.propagation_us),
         )
 
+    def new_memory(self, policy: Policy, i: int) -> NDArray[np.float64]:
+        """Fresh memory of ``policy`` for the episode of sender ``i``, float64[entries]."""
+        memory: NDArray[np.float64] = policy.new_memory()[0]
+        if policy.foresee is not None:
+            memory = policy.foresee(self.episodes[i], self.capacity, self.max_bytes, self.value)
+        return memory
+
     def run(self, policy: Policy, memory: NDArray[np.float64] | None = None) -> None:
         """Run every loaded sender to its end under ``policy``; ``memory``: float64[n, entries], fresh by default."""
-        memory = policy.new_memory(len(self)) if memory is None else memory
+        if memory is None:
+            rows = range(len(self)) if policy.foresee is not None else ()
+            memory = padded([self.new_memory(policy, i) for i in rows]) if rows else policy.new_memory(len(self))
+        self.batch.senders["ask_at_dequeue"] = policy.drops_at_dequeue
         if runs_compiled(policy):
             compiled_rollout()(self.batch, memory, *policy.compiled, policy.hears_departures)
         else:
             python_rollout(self.batch, memory, policy)
+
+
+def padded(rows: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
+    """Rows of different lengths as one array, filled up with zeros."""
+    made = np.zeros((len(rows), max(map(len, rows))))
+    for i, row in enumerate(rows):
+        made[i, : len(row)] = row
+    return made
 
 
 def named(batch: Batch) -> Batch:
@@ -513,6 +554,8 @@ def python_rollout(batch: Batch, memory: NDArray[np.float64], policy: Policy) ->
             if event == DECISION:
                 arrival = seen.arrivals[i, seen.senders[i].next]
                 decide(batch, i, int(policy.on_arrival(python_view(seen, i), arrival, memory[i])))
+            elif event == DEQUEUE:
+                answer_dequeue(batch, i, bool(policy.on_dequeue(python_view(seen, i), memory[i])))
             elif policy.hears_departures:
                 policy.on_departure(python_view(seen, i), memory[i])
             event = next_event(batch, i)
@@ -527,13 +570,15 @@ def run(
     *,
     max_bytes: int | None = None,
     decide_at: str = "arrival",
+    memory: NDArray[np.float64] | None = None,
 ) -> Senders:
-    """The senders after ``policy`` met each of ``episodes``, one sender each."""
+    """The senders after ``policy`` met each of ``episodes``, one sender each; an unbounded policy has L = all."""
     if not episodes:
         raise BufgymError("no episode to run")
     longest = max(len(episode.arrivals) for episode in episodes)
+    capacity = longest if policy.unbounded else capacity
     senders = Senders(len(episodes), capacity, v, max_messages=longest, max_bytes=max_bytes, decide_at=decide_at)
     for i, episode in enumerate(episodes):
         senders.load(i, episode)
-    senders.run(policy)
+    senders.run(policy, memory)
     return senders

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from bufgym import __version__, cli, policies, traces
-from bufgym.benchmark.run import read_rows
+from bufgym.benchmark.rows import read_rows
 from bufgym.cli import main, split_policies
 from bufgym.kernel import JIT
 

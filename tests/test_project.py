@@ -27,6 +27,7 @@ ROOMS = [
     "observe",
     "policies",
     "scenario",
+    "suites",
     "sender",
     "metrics",
     "oracle",

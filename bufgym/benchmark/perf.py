@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark.run import draw, replaced
+from bufgym.benchmark.rows import replaced
+from bufgym.benchmark.run import draw
 from bufgym.kernel import JIT
 from bufgym.sender import Senders
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bufgym.buffer import ACCEPT, REJECT
 from bufgym.errors import BufgymError
@@ -14,17 +15,21 @@ class Player:
     """Owns a policy's memory for each of ``n`` senders and turns its decisions into an environment's actions.
 
     The policy hears of departures just before its next decision, as often as there were some, and sees the buffer as
-    it is then. Luck is that of the episode (see ``Episode.with_luck``).
+    it is then. Luck is that of the episode (see ``Episode.with_luck``). An environment asks at arrivals only: a policy
+    that drops at dequeue as well, or whose queue is unbounded, can't play in it.
     """
 
     def __init__(self, policy: Policy, n: int = 1) -> None:
+        if policy.drops_at_dequeue or policy.unbounded:
+            what = "drops at dequeue" if policy.drops_at_dequeue else "has an unbounded queue"
+            raise BufgymError(f"policy {policy.name} {what}: it can be benchmarked, but not play in an environment")
         self.policy = policy
-        self._memory = policy.new_memory(n)
+        self._memory: list[NDArray[np.float64] | None] = [None] * n
         self._taken = np.zeros(n, np.int64)
 
     def begin(self, i: int = 0) -> None:
         """Forget everything about sender ``i``: a new episode begins there."""
-        self._memory[i] = self.policy.new_memory()[0]
+        self._memory[i] = None
         self._taken[i] = 0
 
     def action(self, senders: Senders, i: int = 0) -> int:
@@ -35,6 +40,8 @@ class Player:
             raise BufgymError(f"sender {i}: no decision is due")
         seen = python_view(batch, i)
         memory = self._memory[i]
+        if memory is None:
+            memory = self._memory[i] = senders.new_memory(self.policy, i)
         if self.policy.hears_departures:
             for _ in range(int(sender.taken - self._taken[i])):
                 self.policy.on_departure(seen, memory)

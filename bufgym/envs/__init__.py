@@ -1,5 +1,6 @@
-"""The Gymnasium environments; importing ``bufgym`` registers them."""
+"""Gymnasium environments: a single sender, and n of them as one native batch."""
 
+from bufgym import oracle  # noqa: F401  (registers the clairvoyant, so that it can play here)
 from bufgym.envs.single import SenderEnv
 from bufgym.envs.vector import SenderVectorEnv
 

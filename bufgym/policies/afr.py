@@ -24,13 +24,16 @@ MEMORY = {"r": 1.0, "c": 0.0, "p": 0.0}
 
 
 @kernel
-def thin(r: float, c: float, p: float, s: int, L: int, memory: NDArray[np.float64]) -> int:
-    """The part that code and text share, after r was halved or not: count, and evict at p when full."""
+def thin(r: float, c: float, p: float, gap: float, s: int, L: int, memory: NDArray[np.float64]) -> int:
+    """The part that code and text share, after r was halved or not: count, and evict at p when full.
+
+    ``gap``: arrivals until the next one is kept; r in AFR (``checkpointing.py`` has another).
+    """
     c += 1
-    if c != r:
+    if c < gap:
         memory[R], memory[C], memory[P] = r, c, p
         return REJECT  # even when there is room: the rate has been lowered to one in r
-    c = 0.0
+    c = (c - gap) % 1.0  # 0 in AFR; where a gap is no whole number, its fraction is carried on
     decision = ACCEPT
     if s == L:
         decision = int(p)
@@ -56,7 +59,7 @@ def afr(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     if r > 1 and 3 * s <= 2 * L:
         r = r / 2
         c = c % r
-    return thin(r, c, p, s, L, memory)
+    return thin(r, c, p, r, s, L, memory)
 
 
 @register("afr-paper", memory=MEMORY, source="AFR paper, Sec. III (literal text)", compile=True)
@@ -67,4 +70,4 @@ def afr_paper(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     if r > 1 and 3 * s < 2 * L:
         r = r / 2
         c = c % r
-    return thin(r, c, p, s, L, memory)
+    return thin(r, c, p, r, s, L, memory)

@@ -8,25 +8,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.buffer import ACCEPT, REJECT, Buffer
+from bufgym.kernel import kernel
 from bufgym.policies.registry import register
+
+
+@kernel
+def keep_last(s: int, depth: float) -> int:
+    """Keep the newest ``depth`` messages: where so many are among the s queued, the head goes."""
+    return ACCEPT if s < depth else 0
+
+
+@kernel
+def keep_first(s: int, L: int) -> int:
+    """Keep the s messages that are queued: the newcomer enters where there is room."""
+    return ACCEPT if s < L else REJECT
 
 
 @register("drop-oldest", source="ROS 1 roscpp subscriber link; ROS 2 / DDS KEEP_LAST", compile=True)
 def drop_oldest(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """ROS: a full queue loses its head."""
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
+    return keep_last(len(buffer.slots), buffer.capacity)
 
 
 @register("drop-newest", source="drop tail; DDS KEEP_ALL, best effort", compile=True)
 def drop_newest(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """Drop tail: a full queue rejects the newcomer."""
-    return ACCEPT if len(buffer.slots) < buffer.capacity else REJECT
+    return keep_first(len(buffer.slots), buffer.capacity)
 
 
 @register("replace-newest", source="replace tail", compile=True)
 def replace_newest(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """Replace tail: the newcomer overwrites the newest queued message."""
     return ACCEPT if len(buffer.slots) < buffer.capacity else buffer.capacity - 1
+
+
+@register("latest-only", source="mailbox of one message, as KEEP_LAST(1), the default depth of DDS", compile=True)
+def latest_only(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """A queue of one: the newest replaces what waits."""
+    return keep_last(len(buffer.slots), 1)
 
 
 @register("random", source="AFR paper, Eq. 9", compile=True)

@@ -11,9 +11,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, Buffer, motion_gaps, time_gaps
+from bufgym.buffer import ACCEPT, REJECT, Buffer, arrival_gain, loss, motion_gaps, time_gaps
+from bufgym.kernel import kernel
 from bufgym.policies.registry import register
 from bufgym.qoi import value
+
+
+@kernel
+def smallest_time_gap(buffer: Buffer, arrival: Any, slots: int) -> int:
+    """The first of so many slots that would leave the smallest merged time gap, oldest first."""
+    victim, smallest = 0, np.inf
+    for k in range(slots):
+        before, after = time_gaps(buffer, arrival, k)
+        if before + after < smallest:
+            victim, smallest = k, float(before + after)
+    return victim
 
 
 @register("min-gap", source="online checkpointing, smallest merged gap", compile=True)
@@ -22,12 +34,29 @@ def min_gap(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     s = len(buffer.slots)
     if s < buffer.capacity:
         return ACCEPT
-    victim, smallest = 0, np.inf
-    for k in range(s + 1):
-        before, after = time_gaps(buffer, arrival, k)
-        if before + after < smallest:
-            victim, smallest = k, float(before + after)
+    victim = smallest_time_gap(buffer, arrival, s + 1)
     return victim if victim < s else REJECT
+
+
+@register(
+    "even-reject",
+    memory={"beta": 1.3},
+    parameters=("beta",),
+    source="online checkpointing, a newcomer too close to the tail goes first (own rule; beta 1.2 to 1.39)",
+    compile=True,
+)
+def even_reject(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """A full queue rejects a newcomer nearer than beta even gaps T / (L + 1) to the tail, else as min-gap.
+
+    T is the time since the message that the socket took last arrived: what L messages have to divide evenly.
+    """
+    beta, L, s = memory[0], buffer.capacity, len(buffer.slots)
+    if s < L:
+        return ACCEPT
+    T = arrival.arrival_us - buffer.taken_us
+    if arrival.arrival_us - buffer.slots[s - 1].arrival_us < beta * T / (L + 1):
+        return REJECT
+    return smallest_time_gap(buffer, arrival, s)
 
 
 @register("min-motion-gap", source="as min-gap, on the robot's odometry", compile=True)
@@ -60,3 +89,21 @@ def orbbuf(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
         if similar > most_similar:
             victim, most_similar = k, similar
     return victim
+
+
+@register("greedy-qoi", source="one-step greedy, as a warning", compile=True)
+def greedy_qoi(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """A full queue does what leaves the most information this very moment: a trap.
+
+    Rejecting adds nothing; evicting slot k adds the newcomer's gain less the loss of k. Once the gaps are even,
+    replacing the tail costs least, arrival after arrival: the old prefix stays, nothing of what follows it is kept.
+    """
+    if len(buffer.slots) < buffer.capacity:
+        return ACCEPT
+    decision, most = REJECT, 0.0
+    for k in range(len(buffer.slots)):
+        # For the tail the loss counts its gap to the newcomer too: together V(a + b) - V(a).
+        added = arrival_gain(buffer, arrival) - loss(buffer, arrival, k)
+        if added > most:
+            decision, most = k, added
+    return decision

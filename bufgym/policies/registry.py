@@ -1,7 +1,8 @@
 """The one registry of drop policies, by name.
 
 A policy is a plain function ``on_arrival(buffer, arrival, memory) -> decision`` and, where it keeps score of what
-leaves, ``on_departure(buffer, memory)``. ``buffer`` is ``bufgym.buffer.Buffer``; ``arrival`` a MESSAGE record;
+leaves, ``on_departure(buffer, memory)``; a queue discipline that drops at the head as well, as CoDel does, has
+``on_dequeue(buffer, memory) -> drop it?``. ``buffer`` is ``bufgym.buffer.Buffer``; ``arrival`` a MESSAGE record;
 ``memory`` a float64 array of the policy's own, laid out and initialised as its registration says; the decision a slot
 to evict for the newcomer (0 = oldest), REJECT or ACCEPT. ``arrival.luck`` is a uniform draw in [0, 1) for policies that
 randomise, so the functions themselves are deterministic.
@@ -38,10 +39,17 @@ from bufgym.kernel import compile_for
 
 OnArrival = Callable[[Buffer, Any, NDArray[np.float64]], int]
 OnDeparture = Callable[[Buffer, NDArray[np.float64]], None]
+OnDequeue = Callable[[Buffer, NDArray[np.float64]], bool]
+Foresee = Callable[[Any, int, int, Any], NDArray[np.float64]]
 
 
 def _nothing(buffer: Buffer, memory: NDArray[np.float64]) -> None:
     """The departure hook of a policy that keeps no score of departures."""
+
+
+def _keep(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
+    """The dequeue hook of a policy that drops nothing there."""
+    return False
 
 
 @dataclass(frozen=True)
@@ -51,16 +59,39 @@ class Policy:
     name: str
     on_arrival: OnArrival
     on_departure: OnDeparture = _nothing
+    on_dequeue: OnDequeue = _keep
+    """Whether to drop the head that the socket is about to take; asked again about the next one if so."""
     memory: Mapping[str, float] = field(default_factory=dict)
     """Names and initial values of the memory's entries; those in ``parameters`` are its settings."""
     parameters: tuple[str, ...] = ()
     source: str = ""
     compile: bool = False
+    unbounded: bool = False
+    """Whether its queue grows without limit, whatever L is; no bound for L messages holds for it."""
+    foresee: Foresee | None = None
+    """(episode, L, B, V) -> memory: for policies that know what is coming, which no robot does."""
 
     @property
     def hears_departures(self) -> bool:
         """Whether departures change what it remembers."""
         return self.on_departure is not _nothing
+
+    @property
+    def drops_at_dequeue(self) -> bool:
+        """Whether it is asked about each head before the socket takes it."""
+        return self.on_dequeue is not _keep
+
+    @property
+    def unranked_because(self) -> str:
+        """Why it does not compete with the others; empty if it does."""
+        if self.unbounded:
+            return "its queue is unbounded"
+        return "it knows the future" if self.foresee is not None else ""
+
+    @property
+    def ranked(self) -> bool:
+        """Whether it plays by the rules: L messages at most, nothing known beforehand."""
+        return not self.unranked_because
 
     @property
     def summary(self) -> str:
@@ -87,15 +118,19 @@ class Policy:
         return replace(self, name=f"{self.name}:{label}", memory=memory)
 
     @functools.cached_property
-    def compiled(self) -> tuple[OnArrival, OnDeparture]:
-        """Both functions compiled for one signature each, so that one rollout kernel serves every policy."""
-        arrival, departure = signatures()
-        return compile_for(arrival, self.on_arrival), compile_for(departure, self.on_departure)
+    def compiled(self) -> tuple[OnArrival, OnDeparture, OnDequeue]:
+        """Its functions compiled for one signature each, so that one rollout kernel serves every policy."""
+        arrival, departure, dequeue = signatures()
+        return (
+            compile_for(arrival, self.on_arrival),
+            compile_for(departure, self.on_departure),
+            compile_for(dequeue, self.on_dequeue),
+        )
 
 
 @functools.cache
-def signatures() -> tuple[Any, Any]:
-    """Numba types of ``on_arrival`` and ``on_departure``."""
+def signatures() -> tuple[Any, Any, Any]:
+    """Numba types of ``on_arrival``, ``on_departure`` and ``on_dequeue``."""
     message = numba.from_dtype(MESSAGE)
     int_, real = numba.types.int64, numba.types.float64
     reals = numba.types.Array(real, 1, "C")
@@ -104,7 +139,7 @@ def signatures() -> tuple[Any, Any]:
     view = cast(Any, numba.types).NamedTuple(
         tuple(types.get(name, real if name in reals_of else int_) for name in Buffer._fields), Buffer
     )
-    return int_(view, message, reals), numba.types.void(view, reals)
+    return int_(view, message, reals), numba.types.void(view, reals), numba.types.boolean(view, reals)
 
 
 _REGISTRY: dict[str, Policy] = {}
@@ -116,8 +151,11 @@ def register(
     memory: Mapping[str, float] | None = None,
     parameters: tuple[str, ...] = (),
     on_departure: OnDeparture = _nothing,
+    on_dequeue: OnDequeue = _keep,
     source: str = "",
     compile: bool = False,
+    unbounded: bool = False,
+    foresee: Foresee | None = None,
 ) -> Callable[[OnArrival], OnArrival]:
     """Register the decorated function as the policy ``name``; it comes back unchanged.
 
@@ -134,7 +172,18 @@ def register(
     def add(on_arrival: OnArrival) -> OnArrival:
         if not callable(on_arrival):
             raise BufgymError(f"policy {name!r}: {on_arrival!r} is not a function")
-        _REGISTRY[name] = Policy(name, on_arrival, on_departure, dict(memory or {}), parameters, source, compile)
+        _REGISTRY[name] = Policy(
+            name,
+            on_arrival,
+            on_departure,
+            on_dequeue,
+            dict(memory or {}),
+            parameters,
+            source,
+            compile,
+            unbounded,
+            foresee,
+        )
         return on_arrival
 
     return add

@@ -1,4 +1,4 @@
-"""Policies that sample the stream and do not look at what it holds."""
+"""Policies that sample the stream and do not look at what the queue holds."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.buffer import ACCEPT, REJECT, Buffer
+from bufgym.policies.classic import keep_last
 from bufgym.policies.registry import register
 
 SEEN = 0
@@ -51,4 +52,20 @@ def decimate(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     memory[COUNT] += 1
     if n > 0 and n // every == (n - 1) // every:
         return REJECT
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
+    return keep_last(len(buffer.slots), buffer.capacity)
+
+
+@register(
+    "keyframe",
+    memory={"step": 0.05},
+    parameters=("step",),
+    source="motion keyframes, a threshold on distance or angle (Dong et al.)",
+    compile=True,
+)
+def keyframe(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Motion keyframes: accepts what is `step` in x beyond the keyframe before it; the head goes when full."""
+    s, step = len(buffer.slots), memory[0]
+    last_x = buffer.slots[s - 1].x if s > 0 else buffer.taken_x  # the tail is never dropped before the head
+    if s + buffer.taken > 0 and arrival.x - last_x < step:
+        return REJECT
+    return keep_last(s, buffer.capacity)

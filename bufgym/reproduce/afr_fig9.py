@@ -54,7 +54,7 @@ def decide_often(
 @functools.cache
 def compiled_loop() -> Any:
     """``decide_often`` compiled once for every policy, as the rollout is."""
-    arrival, _ = signatures()
+    arrival, *_ = signatures()
     view, message, reals = arrival.args
     messages = numba.types.Array(message, 1, "C")
     int_ = numba.types.int64

@@ -21,6 +21,10 @@ from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
 from bufgym.traces import Trace
 
+PLAYABLE = [
+    name for name in policies.names() if not (policies.get(name).drops_at_dequeue or policies.get(name).unbounded)
+]
+
 TINY = perf.Sizes(3, 2, 12, 4, 10, 1, 1)
 
 
@@ -61,7 +65,7 @@ def test_human(number: float, text: str) -> None:
     assert perf.human(number) == text
 
 
-@pytest.mark.parametrize("name", list(policies.names()))
+@pytest.mark.parametrize("name", PLAYABLE)
 @pytest.mark.parametrize(
     "scenario",
     [
@@ -91,3 +95,9 @@ def test_a_player_refuses_a_decision_that_means_nothing() -> None:
     env.reset(seed=0)
     with pytest.raises(BufgymError, match="policy odd: decision 3"):
         Player(Policy("odd", lambda buffer, arrival, memory: 3)).action(env.rows.senders)
+
+
+@pytest.mark.parametrize(("name", "why"), [("codel", "drops at dequeue"), ("rosbridge", "has an unbounded queue")])
+def test_what_an_environment_cannot_ask_is_said(name: str, why: str) -> None:
+    with pytest.raises(BufgymError, match=f"policy {name} {why}"):
+        Player(policies.get(name))

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from bufgym import oracle, policies, qoi
 from bufgym.benchmark import run
+from bufgym.benchmark.rows import COLUMNS
 from bufgym.errors import BufgymError
-from bufgym.metrics import METRICS
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
 from bufgym.traces import Trace
@@ -71,28 +68,41 @@ def test_every_trace_is_a_cell_even_under_one_name() -> None:
     assert all(len(cell.traces) == 1 for _, cell in parts if isinstance(cell, Uplink))
 
 
-def test_an_interruption_has_an_oracle_and_a_regret() -> None:
-    """T = 3, L = 1, V = min(1, d / 4): of 1, 2, 3 one is kept, and message 4 comes after.
+def test_an_interruption_has_a_bound_and_a_regret() -> None:
+    """T = 3, L = 1: message 0 is sent, of 1, 2, 3 one is kept, and message 4 comes after.
 
-    drop-oldest keeps 3: H = 1 + 3/4 + 1/4 = 2. The oracle gains 2/4 + 2/4 = 1 as well: V is linear here, regret 0.
-    With V = min(1, d / 2) drop-oldest gains 1 + 1/2, the oracle 1 + 1: regret 1/4.
+    V = min(1, d / 4): drop-oldest keeps 3, H = 1 + 3/4 + 1/4 = 2, the clairvoyant 1 + 2/4 + 2/4 as well: regret 0.
+    V = min(1, d / 2): drop-oldest 1 + 1 + 1/2, the clairvoyant 1 + 1 + 1: regret (3 - 2.5) / 3.
     """
-    for distance, regret in ((4, 0.0), (2, 0.25)):
+    for distance, best, regret in ((4, 2.0, 0.0), (2, 3.0, 1 / 6)):
         v = qoi.saturating(distance)
         scenario = Interruption(law="fixed", t_max=3, value=v)
-        (row,) = run.run([policies.get("drop-oldest")], scenario, [1], 1)
-        assert tuple(row) == run.COLUMNS
-        assert row["trace"] == "interruption"
-        assert row["oracle"] == oracle.integer(1, 3, v)
+        (row,) = run.run([policies.get("drop-oldest")], scenario, [1], 1, label="short")
+        assert tuple(row) == COLUMNS
+        assert (row["scenario"], row["trace"]) == ("short", "interruption")
+        assert row["clairvoyant"] == best == 1 + oracle.integer(1, 3, v)
+        assert row["certified"] is True
         assert row["regret"] == pytest.approx(regret)
         assert (row["arrived"], row["delivered"], row["dropped"]) == (5, 3, 2)
 
 
-def test_no_oracle_where_there_is_none() -> None:
-    (row,) = run.run([policies.get("afr")], replace(UPLINK, traces=(FAST,)), [2], 1)
-    assert row["oracle"] is None and row["regret"] is None
-    limited = run.run([policies.get("afr")], Interruption(t_max=5), [2], 1, max_bytes=300_000)
-    assert limited[0]["regret"] is None
+def test_bounds_that_are_not_asked_for_or_do_not_hold() -> None:
+    (row,) = run.run([policies.get("afr")], replace(UPLINK, traces=(FAST,)), [2], 1, bound=False)
+    assert row["clairvoyant"] is None and row["certified"] is None and row["regret"] is None
+    (free,) = run.run([policies.get("rosbridge")], replace(UPLINK, traces=(SLOW,)), [2], 1)
+    assert free["clairvoyant"] > 0 and free["regret"] is None  # L does not bind it
+    assert free["dropped"] == 0 and free["peak_backlog_bytes"] > 2 * 100_000
+    dead = replace(UPLINK, traces=(Trace.steps([(1.0, 1), (1.0, 0)], name="dead", after="stop"),))
+    (nothing,) = run.run([policies.get("afr")], dead, [2], 1)
+    assert (nothing["qoi"], nothing["clairvoyant"], nothing["regret"]) == (0, 0, 0)
+
+
+def test_where_only_a_full_buffer_asks_the_bound_is_an_upper_one() -> None:
+    asked = run.run([policies.get("clairvoyant")], replace(UPLINK, traces=(SLOW,)), [2], 3)
+    assert all(row["certified"] and row["regret"] == pytest.approx(0, abs=1e-12) for row in asked)
+    rows = run.run([policies.get("drop-oldest")], replace(UPLINK, traces=(SLOW,)), [2], 3, decide_at="overflow")
+    assert not any(row["certified"] for row in rows)
+    assert [row["clairvoyant"] for row in rows] == [row["clairvoyant"] for row in asked]
 
 
 @pytest.mark.parametrize(
@@ -112,53 +122,3 @@ def test_bad_arguments_are_named(change: dict[str, Any], message: str) -> None:
     chosen = [policies.get(name) for name in given.pop("policies")]
     with pytest.raises(BufgymError, match=message):
         run.run(chosen, UPLINK, **given)
-
-
-# -------------------- files
-
-
-def rows_of_both_kinds() -> list[run.Row]:
-    nothing_delivered = replace(UPLINK, traces=(Trace.steps([(1.0, 1), (1.0, 0)], name="dead", after="stop"),))
-    return [
-        *run.run([policies.get("afr"), policies.get("decimate:every=2")], Interruption(t_max=9), [1, 2], 2),
-        *run.run([policies.get("random")], nothing_delivered, [2], 1),
-    ]
-
-
-@pytest.mark.parametrize("ending", ["csv", "parquet"])
-def test_rows_survive_a_file(tmp_path: Path, ending: str) -> None:
-    if ending == "parquet":
-        pytest.importorskip("pyarrow")
-    rows = rows_of_both_kinds()
-    assert math.isnan(rows[-1]["mean_sojourn_s"]) and rows[-1]["regret"] is None
-    path = run.write_rows(rows, tmp_path / f"rows.{ending}")
-    again = run.read_rows(path)
-    assert [list(row) for row in again] == [list(row) for row in rows]
-    for row, same in zip(rows, again, strict=True):
-        for name, number in row.items():
-            assert type(same[name]) is type(number), name
-            np.testing.assert_equal(same[name], number)
-    assert [p.name for p in tmp_path.iterdir()] == [path.name]  # nothing temporary stays
-
-
-def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
-    target = tmp_path / "rows.csv"
-    run.write_rows(rows_of_both_kinds()[:1], target)
-    before = target.read_bytes()
-    with pytest.raises(ValueError, match="fields not in fieldnames"):
-        run.write_rows([{"policy": "a"}, {"policy": "a", "surprise": 1}], target)
-    assert target.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [target]
-
-
-def test_unknown_endings_and_broken_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(BufgymError, match=r"rows\.txt"):
-        run.write_rows([], tmp_path / "rows.txt")
-    broken = tmp_path / "broken.csv"
-    broken.write_text("policy,qoi\nafr,many\n")
-    with pytest.raises(BufgymError, match=r"line 2: qoi = 'many'"):
-        run.read_rows(broken)
-
-
-def test_metrics_are_all_in_the_columns() -> None:
-    assert set(METRICS) < set(run.COLUMNS)

@@ -9,7 +9,10 @@ import itertools
 import math
 from fractions import Fraction
 
-ACCEPT, REJECT = "accept", "reject"
+from naive_policies import policy
+from naive_queues import ACCEPT, REJECT, Policy
+
+__all__ = ["ACCEPT", "REJECT", "Link", "Policy", "Sender", "exponential", "information", "policy", "saturating"]
 
 
 # --- quantity of information -----------------------------------------------------------------------------------------
@@ -79,6 +82,7 @@ class Sender:
 
     def __init__(self, link, policy, capacity, max_bytes=None, decide_at="arrival"):
         self.link, self.policy, self.capacity = link, policy, capacity
+        policy.sender = self
         self.max_bytes = math.inf if max_bytes is None else max_bytes
         self.decide_at = decide_at
         self.queue = []
@@ -124,11 +128,25 @@ class Sender:
 
     def take_head(self, now, position):
         """The socket takes the head; its first byte follows byte ``position`` of the link."""
+        for _ in range(self.policy.unwanted(list(self.queue), now)):
+            self.drop(self.queue.pop(0), now)
+            self.evicted += 1
+        if not self.queue:
+            return
         self.sending = self.last_taken = self.queue.pop(0)
         self.position = position + self.sending["bytes"]
         self.finish = self.link.first_time(self.position)
         self.taken[self.sending["seq"]] = now
         self.policy.departed(self.queue)
+
+    def left_bytes(self, now):
+        """Bytes of the message in transmission that have not crossed by now."""
+        if self.sending is None:
+            return 0
+        size = self.sending["bytes"]
+        if self.taken[self.sending["seq"]] == now:
+            return size
+        return min(size, max(0, self.position - math.floor(self.link.bytes_by(now))))
 
     def fits(self, queue, message):
         enough_bytes = sum(m["bytes"] for m in queue) + message["bytes"] <= self.max_bytes
@@ -158,155 +176,3 @@ class Sender:
 
     def drop(self, message, now=None):
         self.dropped[message["seq"]] = message["us"] if now is None else now
-
-
-# --- the policies, from their papers' descriptions -------------------------------------------------------------------
-
-
-class Policy:
-    """``decide`` says what to do with a newcomer; ``departed`` hears what is left after the head went."""
-
-    def decide(self, queue, newcomer, L, last_taken, previous):
-        return self.full(queue, newcomer, L, last_taken, previous) if len(queue) == L else ACCEPT
-
-    def departed(self, queue):
-        pass
-
-
-class DropOldest(Policy):
-    def full(self, queue, newcomer, L, last_taken, previous):
-        return 0
-
-
-class DropNewest(Policy):
-    def full(self, queue, newcomer, L, last_taken, previous):
-        return REJECT
-
-
-class ReplaceNewest(Policy):
-    def full(self, queue, newcomer, L, last_taken, previous):
-        return L - 1
-
-
-def one_of(candidates, luck):
-    """A candidate, each as likely as the others."""
-    return candidates[math.floor(luck * len(candidates))]
-
-
-class Random(Policy):
-    """The victim is uniform over the queue and the newcomer."""
-
-    def full(self, queue, newcomer, L, last_taken, previous):
-        return one_of([*range(L), REJECT], newcomer["luck"])
-
-
-class Reservoir(Policy):
-    """Algorithm R: the n-th item takes a place of its own with probability L / n."""
-
-    n = 0
-
-    def decide(self, queue, newcomer, L, last_taken, previous):
-        self.n = max(self.n, len(queue)) + 1  # what came unasked is all there
-        if len(queue) < L:
-            return ACCEPT
-        return one_of([*range(L), *[REJECT] * (self.n - L)], newcomer["luck"])
-
-    def departed(self, queue):
-        self.n = len(queue)
-
-
-class Decimate(Policy):
-    """Arrivals 1, 4, 7, ... enter a queue that drops its oldest."""
-
-    n = 0
-
-    def decide(self, queue, newcomer, L, last_taken, previous):
-        self.n += 1
-        if self.n not in range(1, self.n + 1, 3):
-            return REJECT
-        return ACCEPT if len(queue) < L else 0
-
-
-class Afr(Policy):
-    """AFR: dropping rate r, counter c, dropping position p."""
-
-    def __init__(self, as_released=True):
-        self.r, self.c, self.p, self.as_released = 1, 0, 0, as_released
-
-    def departed(self, queue):
-        if self.as_released and self.p > 0:
-            self.p -= 1
-
-    def decide(self, queue, newcomer, L, last_taken, previous):
-        filled = Fraction(len(queue), L)
-        low = filled <= Fraction(2, 3) if self.as_released else filled < Fraction(2, 3)
-        if self.r > 1 and low:
-            self.r //= 2
-            self.c %= self.r
-        self.c += 1
-        if self.c != self.r:
-            return REJECT
-        self.c = 0
-        if len(queue) < L:
-            return ACCEPT
-        victim = self.p
-        self.p += 1
-        if self.p == L:
-            self.r *= 2
-            self.p = 0
-        return victim
-
-
-class MinGap(Policy):
-    """Drop what leaves the smallest gap between its neighbours, ties to the oldest; the next step is like the last."""
-
-    def __init__(self, key):
-        self.key = key
-
-    def gaps(self, queue, newcomer, last_taken, previous):
-        """The merged gap that each queued message, and last the newcomer, would leave."""
-        at = [m[self.key] for m in [last_taken, *queue, newcomer]]
-        at.append(at[-1] + at[-1] - previous[self.key])
-        return [after - before for before, after in zip(at, at[2:], strict=False)]
-
-    def full(self, queue, newcomer, L, last_taken, previous):
-        gaps = self.gaps(queue, newcomer, last_taken, previous)
-        victim = gaps.index(min(gaps))
-        return victim if victim < L else REJECT
-
-
-class OrbBuf(Policy):
-    """Drop the message with the most similar queued neighbours, the first of equals; where none has two: the tail."""
-
-    def __init__(self, v):
-        self.v = v
-
-    def full(self, queue, newcomer, L, last_taken, previous):
-        similar = [1 - self.v(c["x"] - a["x"]) for a, c in zip(queue, queue[2:], strict=False)]
-        return 1 + similar.index(max(similar)) if similar else L - 1
-
-
-class Anything(Policy):
-    """A policy that decides at random, impossible decisions included: -2 accept, -1 reject, 0 .. L + 1 a slot."""
-
-    def decide(self, queue, newcomer, L, last_taken, previous):
-        return one_of([ACCEPT, REJECT, *range(L + 2)], newcomer["luck"])
-
-
-def policy(name, v):
-    """The twin of the built-in policy of that name."""
-    makers = {
-        "drop-oldest": DropOldest,
-        "drop-newest": DropNewest,
-        "replace-newest": ReplaceNewest,
-        "random": Random,
-        "reservoir": Reservoir,
-        "decimate": Decimate,
-        "afr": Afr,
-        "afr-paper": lambda: Afr(as_released=False),
-        "min-gap": lambda: MinGap("us"),
-        "min-motion-gap": lambda: MinGap("x"),
-        "orbbuf": lambda: OrbBuf(v),
-        "test-anything": Anything,
-    }
-    return makers[name]()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import naive
 import numpy as np
 import pytest
-from cases import VALUES, Case, cases, fates, order, trace
+from cases import VALUES, Case, cases, fates, order, same, trace
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,7 +17,20 @@ from bufgym.errors import BufgymError
 from bufgym.link import Link
 from bufgym.metrics import outcome
 from bufgym.scenario import Episode, messages
-from bufgym.sender import DECISION, DEPARTURE, END, NEVER, Senders, can_evict, decide, has_room, next_event, run
+from bufgym.sender import (
+    DECISION,
+    DEPARTURE,
+    DEQUEUE,
+    END,
+    NEVER,
+    Senders,
+    answer_dequeue,
+    can_evict,
+    decide,
+    has_room,
+    next_event,
+    run,
+)
 
 V = qoi.exponential(0.5)
 MS = 1_000
@@ -29,7 +44,7 @@ def anything(buffer, arrival, memory):
 # The twin draws from [accept, reject, 0, 1, ..., L + 1]; ACCEPT is -2 and REJECT is -1, so floor(luck x (L + 4)) - 2.
 assert (ACCEPT, REJECT) == (-2, -1)
 ANYTHING = policies.Policy("test-anything", anything, compile=True)
-POLICIES = {**{name: policies.get(name) for name in policies.names()}, "test-anything": ANYTHING}
+POLICIES = {p.name: p for p in (*map(policies.get, policies.names()), ANYTHING) if p.foresee is None}
 
 
 def line(times_ms, *, capacity=2, after="loop", sizes=1_000, knots=((0, 0), (1_000 * MS, 1_000_000)), **limits):
@@ -141,6 +156,137 @@ def test_what_the_policy_sees():
     assert (views[0].busy, views[0].left_bytes, views[1].departures) == (0, 0, 1)
 
 
+# --- dropping at the head --------------------------------------------------------------------------------------------
+
+
+def take_all(buffer, arrival, memory):
+    """Accepts what fits and drops the oldest where nothing does."""
+    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
+
+
+def every_second(buffer, memory):
+    memory[0] += 1
+    return memory[0] % 2 == 0
+
+
+def stale(buffer, memory):
+    """Drops what has waited for more than 2 ms."""
+    return buffer.now_us - buffer.slots[0].arrival_us > 2_000
+
+
+def unlucky(buffer, memory):
+    return buffer.slots[0].luck < 0.4
+
+
+def head_dropper(on_dequeue, on_arrival=take_all, compiled=True):
+    return policies.Policy("test-head", on_arrival, on_dequeue=on_dequeue, memory={"heads": 0.0}, compile=compiled)
+
+
+COMPILED_OR_NOT = pytest.mark.parametrize("compiled", [True, False])
+
+
+@COMPILED_OR_NOT
+def test_every_second_head_is_dropped(compiled):
+    # The heads are asked about in turn: 0 goes out at 0 ms, 1 is dropped at 1 ms and 2 goes out, 3 is dropped at 2 ms.
+    senders = line([0, 0, 0, 0, 0], capacity=5)
+    senders.run(head_dropper(every_second, compiled=compiled))
+    assert fates(senders) == {
+        "taken_us": {0: 0, 2: 1 * MS, 4: 2 * MS},
+        "crossed_us": {0: 1 * MS, 2: 2 * MS, 4: 3 * MS},
+        "dropped_us": {1: 1 * MS, 3: 2 * MS},
+    }
+    result = outcome(senders, 0)
+    # H = 1 + V(2) + V(2)
+    assert (result.qoi, result.dropped, result.delivered, result.impossible) == (2.5, 2, 3, 0)
+    assert (senders.batch.senders[0]["evicted"], senders.batch.senders[0]["retained_gain"]) == (2, 1.5)
+
+
+@COMPILED_OR_NOT
+def test_a_link_without_heads_goes_idle(compiled):
+    # Message 0 takes 5 ms. By then 1 and 2 have waited for 5 and 4 ms: both go, 3 (1 ms) is taken. Message 4 finds an
+    # idle link at 10 ms. (x is the frame index: H = 1 + V(3) + V(1).)
+    senders = line([0, 0, 1, 4, 10], capacity=5, sizes=[5_000, 1_000, 1_000, 1_000, 1_000])
+    senders.run(head_dropper(stale, compiled=compiled))
+    assert fates(senders) == {
+        "taken_us": {0: 0, 3: 5 * MS, 4: 10 * MS},
+        "crossed_us": {0: 5 * MS, 3: 6 * MS, 4: 11 * MS},
+        "dropped_us": {1: 5 * MS, 2: 5 * MS},
+    }
+    assert outcome(senders, 0).qoi == 2.375
+
+
+@COMPILED_OR_NOT
+def test_the_bytes_after_a_dropped_head_follow_without_a_pause(compiled):
+    # 700 bytes a microsecond. Message 0 ends at byte 1000, which crosses in 1.43 us: at 2 us. Then 1 is dropped;
+    # 2 follows at byte 1000, not at the 1400 of 2 us: its last byte, 2000, crosses at 3 us and not at 4.
+    fast = Link(trace([(0, 0), (10, 7_000)], "loop"))
+    episode = Episode(messages(np.array([0, 0, 0]), 1_000), fast)
+    senders = run(head_dropper(every_second, compiled=compiled), [episode], 5, V)
+    assert fates(senders)["crossed_us"] == {0: 2, 2: 3}
+    # Where nothing follows, the link rests, and the next message begins when it arrives: 2 at 2 us, byte 1400.
+    episode = Episode(messages(np.array([0, 0, 2]), 1_000), fast)
+    senders = run(head_dropper(every_second, compiled=compiled), [episode], 5, V)
+    assert fates(senders) == {"taken_us": {0: 0, 2: 2}, "crossed_us": {0: 2, 2: 4}, "dropped_us": {1: 2}}
+
+
+@COMPILED_OR_NOT
+def test_every_head_is_dropped(compiled):
+    # Nothing is ever sent: each message goes as it comes, and nothing is known.
+    senders = line([0, 0, 3], capacity=1)
+    senders.run(head_dropper(lambda buffer, memory: True, compiled=compiled))
+    assert fates(senders) == {"taken_us": {}, "crossed_us": {}, "dropped_us": {0: 0, 1: 0, 2: 3 * MS}}
+    assert (outcome(senders, 0).qoi, senders.batch.senders[0]["retained_gain"]) == (0.0, 0.0)
+
+
+def test_what_the_policy_sees_at_the_head():
+    seen = []
+
+    def note(buffer, memory):
+        seen.append((buffer.now_us, buffer.slots["seq"].tolist(), buffer.busy, buffer.left_bytes, buffer.taken))
+        return bool(buffer.slots[0].seq == 1)
+
+    line([0, 0, 0], capacity=5).run(head_dropper(note, compiled=False))
+    assert seen == [(0, [0], 0, 0, 0), (1 * MS, [1, 2], 0, 0, 1), (1 * MS, [2], 0, 0, 1)]
+
+
+def test_peak_backlog():
+    # 0 is in transmission. 1 and 2 wait: 5000 bytes, the most of all, as 3 (500) takes the place of 1 (2000).
+    senders = line([0, 0, 0, 0], sizes=[1_000, 2_000, 3_000, 500])
+    senders.run(policies.get("drop-oldest"))
+    assert outcome(senders, 0).peak_backlog_bytes == 5_000
+    # At 1 ms 1 is dropped at the head and 2 is taken. So 3, which comes at 2 ms, waits alone: no more than 5000 yet.
+    senders = line([0, 0, 0, 2], sizes=[1_000, 2_000, 3_000, 4_000])
+    senders.run(head_dropper(every_second))
+    assert outcome(senders, 0).peak_backlog_bytes == 5_000
+    assert senders.batch.senders[0]["backlog_bytes"] == 0
+
+
+HEAD_DROPPERS = st.sampled_from([every_second, stale, unlucky]).map(lambda drop: head_dropper(drop, anything))
+
+
+@given(cases(), VALUES, HEAD_DROPPERS)
+def test_head_droppers_run_the_same_compiled_or_not(case, v, policy):
+    assert same(case.run(policy, v), case.run(replace(policy, compile=False), v))
+
+
+@given(cases(), HEAD_DROPPERS)
+def test_what_is_dropped_at_the_head_might_never_have_come(case, policy):
+    # The link serves the rest as if the dropped messages had been rejected at once.
+    ours = fates(case.run(policy, V))
+
+    class Reject(naive.Policy):
+        def decide(self, queue, newcomer, L, last_taken, previous):
+            return naive.REJECT if newcomer["seq"] in ours["dropped_us"] else naive.ACCEPT
+
+    everyone_asks = replace(case.episode, first_decision=0, last_decision=2**31)
+    twin = replace(case, episode=everyone_asks, decide_at="arrival").run_twin(Reject())
+    assert (ours["taken_us"], ours["crossed_us"]) == (twin.taken, twin.crossed)
+    assert ours["dropped_us"].keys() == twin.dropped.keys()
+
+
+# --- against the twin ------------------------------------------------------------------------------------------------
+
+
 def agree(case: Case, name: str, v: qoi.Value) -> None:
     """The kernel and the twin made the same run."""
     ours, twin = case.run(POLICIES[name], v), case.run_twin(naive.policy(name, v))
@@ -173,10 +319,11 @@ def test_agrees_with_twin_on_any_decisions(case, v):
     agree(case, "test-anything", v)
 
 
-@given(cases(), st.randoms(use_true_random=False))
-def test_conservation_after_every_event(case, chance):
+@given(cases(), st.randoms(use_true_random=False), st.booleans())
+def test_conservation_after_every_event(case, chance, drops_at_dequeue):
     senders = case.senders(V)
     batch = senders.batch
+    batch.senders["ask_at_dequeue"] = drops_at_dequeue
     sender = batch.senders[0]
     before_us = 0
     while True:
@@ -188,6 +335,10 @@ def test_conservation_after_every_event(case, chance):
             break
         if event == DEPARTURE:
             assert sender["busy"] == 1
+        elif event == DEQUEUE:
+            assert drops_at_dequeue and sender["busy"] == 0 and sender["occupancy"] > 0
+            answer_dequeue(batch, 0, chance.random() < 0.5)
+            conserve(case, senders)
         else:
             possible = [REJECT, *[k for k in range(case.capacity) if can_evict(batch, 0, k)]]
             if has_room(batch, 0):

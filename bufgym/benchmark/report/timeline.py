@@ -1,0 +1,140 @@
+"""One episode, message by message: the link's capacity above, and under it one lane a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from bufgym.benchmark.report import style
+from bufgym.benchmark.report.charts import Chart, Context
+from bufgym.benchmark.report.style import Figure
+
+DROPPED, IN_GAP, KEPT, LEFT = 0, 1, 2, 3
+"""What became of a message: dropped; dropped within the longest gap; delivered; still queued at the end."""
+
+COLOURS = ("var(--lane)", "var(--gap)", "var(--kept)", "var(--axis)")
+
+
+def timeline(context: Context) -> Chart | None:
+    """The chart; None where the run left no timeline."""
+    found = context.run.timeline
+    if found is None:
+        return None
+    alt = "Capacity of the link over time, and for each policy which messages were delivered and which were dropped"
+    return Chart("timeline", alt, [], {(): [_figure(found)]})
+
+
+def longest_gap(x: Sequence[float], received: Sequence[int]) -> tuple[int, int] | None:
+    """(from, to): the two messages received one after the other that are furthest apart in x; None with fewer than two.
+
+    The first such pair where several are.
+    """
+    pairs = list(pairwise(received))
+    return max(pairs, key=lambda pair: x[pair[1]] - x[pair[0]]) if pairs else None
+
+
+def fates(messages: int, lane: Mapping[str, Any], gap: tuple[int, int] | None) -> list[int]:
+    """What became of each message, in the order of their arrival."""
+    found = np.full(messages, LEFT)
+    dropped = [entry[0] for entry in lane["dropped"]]
+    found[dropped] = DROPPED
+    if gap is not None:
+        within = [seq for seq in dropped if gap[0] < seq < gap[1]]
+        found[within] = IN_GAP
+    found[[entry[0] for entry in lane["received"]]] = KEPT
+    return [int(fate) for fate in found]
+
+
+def _figure(found: Mapping[str, Any]) -> Figure:
+    at, x = found["arrival_s"], found["x"]
+    names = sorted(found["policies"], key=lambda name: found["policies"][name]["qoi"])  # the best lane is on top
+    rows, hover, notes = [], [], []
+    for name in names:
+        lane = found["policies"][name]
+        gap = longest_gap(x, [entry[0] for entry in lane["received"]])
+        rows.append(fates(len(at), lane, gap))
+        hover.append(_hover(at, lane))
+        cells = [f"{lane['qoi']:.1f}", "–", "–"]
+        if gap is not None:
+            cells[1:] = f"{x[gap[1]] - x[gap[0]]:.2f}", f"{at[gap[1]] - at[gap[0]]:.1f}"
+        notes += _columns(cells, y=style.text(name), yref="y2")
+    notes += _columns(["QoI", "gap, x", "gap, s"], y=1, yref="y2 domain", yanchor="bottom")
+    lanes = 19 * len(names)
+    height = 150 + 46 + lanes + 54
+    # Shares of the height for the two parts, link and lanes.
+    inside = height - 16 - 44
+    layout = style.layout(height, annotations=notes, bargap=0)
+    layout["margin"] = {**layout["margin"], "r": 146}
+    layout["xaxis"] = style.axis("time, s", anchor="y2", range=[at[0], at[-1]])
+    layout["yaxis"] = style.axis("Mbit/s", domain=[(lanes + 46) / inside, 1], rangemode="tozero", nticks=4)
+    layout["yaxis2"] = style.axis(domain=[0, lanes / inside], showgrid=False, ticks="", showline=False, type="category")
+    layout["yaxis2"]["fixedrange"] = True
+    return {"data": [*_link(found), _lanes(at, names, rows, hover)], "layout": layout}
+
+
+def _columns(cells: Sequence[str], **place: Any) -> list[dict[str, Any]]:
+    """Numbers to the right of the lanes, one below the other."""
+    ends = (44, 92, 140)
+    right = {"x": 1, "xref": "paper", "xanchor": "right", **place}
+    return [style.note(cell, xshift=end, **right) for cell, end in zip(cells, ends, strict=True)]
+
+
+def _hover(at: Sequence[float], lane: Mapping[str, Any]) -> list[str]:
+    words = ["still queued at the end"] * len(at)
+    for seq, when in lane["dropped"]:
+        words[seq] = f"dropped {when:.2f} s"
+    for seq, taken, crossed in lane["received"]:
+        words[seq] = f"sent {taken:.2f} s, delivered {crossed:.2f} s"
+    return words
+
+
+def _link(found: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Capacity as a filled step curve, demand as a dashed line, Mbit/s."""
+    times = list(found["rate"]["t_s"])
+    rates = [rate * 8e-6 for rate in found["rate"]["bytes_per_s"]]
+    curve = {
+        "type": "scatter",
+        "mode": "lines",
+        "x": [style.rounded(t) for t in times],
+        "y": [style.rounded(rate) for rate in rates],
+        "line": {"shape": "hv", "width": 1, "color": "var(--link)"},
+        "fill": "tozeroy",
+        "fillcolor": "var(--link-fill)",
+        "hovertemplate": "link %{y:.2f} Mbit/s at %{x:.1f} s<extra></extra>",
+    }
+    demand = found.get("demand_bytes_per_s")
+    if demand is None or not times:
+        return [curve]
+    ends = [found["arrival_s"][0], found["arrival_s"][-1]]
+    dashed = {
+        "type": "scatter",
+        "mode": "lines",
+        "x": ends,
+        "y": [style.rounded(demand * 8e-6)] * 2,
+        "line": {"dash": "dash", "width": 1.5, "color": "var(--vermillion)"},
+        "hovertemplate": "demand %{y:.2f} Mbit/s<extra></extra>",
+    }
+    return [curve, dashed]
+
+
+def _lanes(at: Sequence[float], names: list[str], rows: list[list[int]], hover: list[list[str]]) -> dict[str, Any]:
+    """One image for all lanes: thousands of messages stay light."""
+    shades = [[edge, colour] for k, colour in enumerate(COLOURS) for edge in (k / 4, (k + 1) / 4)]
+    return {
+        "type": "heatmap",
+        "x": [style.rounded(t) for t in at],
+        "y": [style.text(name) for name in names],
+        "z": rows,
+        "text": hover,
+        "zmin": -0.5,
+        "zmax": 3.5,
+        "colorscale": shades,
+        "showscale": False,
+        "ygap": 3,
+        "xaxis": "x",
+        "yaxis": "y2",
+        "hovertemplate": "<b>%{y}</b>, arrived at %{x:.2f} s<br>%{text}<extra></extra>",
+    }

@@ -1,0 +1,148 @@
+"""Rows in files: CSV or Parquet, written whole or not at all, read back to the last bit."""
+
+from __future__ import annotations
+
+import csv
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from bufgym.errors import BufgymError
+from bufgym.metrics import METRICS
+
+Row = dict[str, Any]
+
+COLUMNS = ("scenario", "trace", "seed", "policy", "capacity", *METRICS, "clairvoyant", "certified", "regret")
+"""What a row has, in this order.
+
+``clairvoyant`` is the best possible H of this episode at this capacity, ``certified`` whether that is exact (else an
+upper bound), ``regret`` = 1 - H / clairvoyant. They are None where the bound was not asked for; ``regret`` also for a
+policy that is not bound by L.
+"""
+
+TEXT = ("scenario", "policy", "trace")
+WHOLE = (
+    "capacity",
+    "seed",
+    "training_seed",
+    "arrived",
+    "delivered",
+    "dropped",
+    "in_transmission",
+    "buffered",
+    "peak_backlog_bytes",
+    "impossible",
+)
+YES_NO = ("certified",)
+
+
+def write_rows(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]) -> Path:
+    """Write rows to a ``.csv`` or ``.parquet`` file, whole or not at all; None is an empty cell (CSV) or null."""
+    target = Path(path)
+    if target.suffix not in (".csv", ".parquet"):
+        raise BufgymError(f"{target}: rows are written to .csv or .parquet files")
+    if target.suffix == ".parquet":
+        pyarrow, parquet = _pyarrow()
+        columns = list(rows[0]) if rows else list(COLUMNS)
+        schema = pyarrow.schema([(name, _arrow_type(pyarrow, name)) for name in columns])
+        made = pyarrow.Table.from_pylist([dict(row) for row in rows], schema=schema)
+        with replaced(target) as temporary:
+            parquet.write_table(made, temporary, write_page_checksum=True)
+        return target
+    with replaced(target) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
+        # Floats are written so that they read back to the last bit.
+        writer = csv.DictWriter(file, list(rows[0]) if rows else list(COLUMNS), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    return target
+
+
+def read_rows(path: str | os.PathLike[str]) -> list[Row]:
+    """The rows that ``write_rows`` wrote."""
+    source = Path(path)
+    if source.suffix == ".parquet":
+        return _read_parquet(source)
+    with open(source, encoding="utf-8", newline="") as file:
+        # What a line has too much comes under the name None, what it lacks as the value None.
+        reader = csv.DictReader(file, strict=True)
+        try:
+            lines = [(reader.line_num, line) for line in reader]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise BufgymError(f"{source}: no rows that can be read: {error}") from None
+    for number, line in lines:
+        if None in line or None in line.values():
+            raise BufgymError(f"{source}, line {number}: must have {len(reader.fieldnames or ())} cells, as line 1 has")
+    return [{name: _parsed(source, number, name, text) for name, text in line.items()} for number, line in lines]
+
+
+def _read_parquet(source: Path) -> list[Row]:
+    _, parquet = _pyarrow()
+    try:
+        # pyarrow looks at a page's checksum only if asked.
+        rows: list[Row] = parquet.read_table(source, page_checksum_verification=True).to_pylist()
+    except Exception as error:  # pyarrow's own errors are OSErrors and ValueErrors of many kinds
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # no such file, no permission
+        raise BufgymError(f"{source}: no rows that can be read: {str(error).splitlines()[0]}") from None
+    return rows
+
+
+def _parsed(path: Path, line: int, name: str, text: str) -> Any:
+    if name in TEXT:
+        return text
+    if text == "":
+        return None
+    if name in YES_NO:
+        if text not in ("True", "False"):
+            raise BufgymError(f"{path}, line {line}: {name} = {text!r}: must be True or False")
+        return text == "True"
+    try:
+        return int(text) if name in WHOLE else float(text)
+    except ValueError:
+        raise BufgymError(f"{path}, line {line}: {name} = {text!r}: must be a number") from None
+
+
+@contextmanager
+def replaced(target: Path) -> Iterator[Path]:
+    """A temporary file beside ``target`` to write to; it takes the target's place when all went well."""
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        # mkstemp makes a file that only its owner may read; a result is as readable as any other new file.
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def has_pyarrow() -> bool:
+    """Whether Parquet files can be written here."""
+    try:
+        _pyarrow()
+    except BufgymError:
+        return False
+    return True
+
+
+def _pyarrow() -> tuple[Any, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise BufgymError('Parquet files need pyarrow: pip install "bufgym[bench]" (or write .csv)') from None
+    return pyarrow, pyarrow.parquet
+
+
+def _arrow_type(pyarrow: Any, name: str) -> Any:
+    if name in TEXT:
+        return pyarrow.string()
+    if name in YES_NO:
+        return pyarrow.bool_()
+    return pyarrow.int64() if name in WHOLE else pyarrow.float64()

@@ -1,0 +1,368 @@
+"""What the rows of a benchmark say: scores between Drop Oldest (0) and the clairvoyant (1), ranks, and intervals.
+
+A *cell* is (scenario, capacity); an *episode* of it is (trace, seed). Every policy has met the same episodes, at every
+capacity of the scenario (common random numbers), so policies are compared episode by episode.
+
+Every interval is a paired percentile bootstrap over episodes (Efron and Tibshirani 1993, chapter 13): the episodes of
+a scenario are drawn with replacement, the same draw for all its capacities and all policies, and the statistic is
+computed again. A policy trained several times has its training seeds drawn as well, before the episodes. The draws
+follow from the seed and the names alone: neither the order of the rows nor the company of other policies changes an
+interval. It speaks of fresh episodes on the traces at hand, not of traces nobody has seen.
+
+Interquartile mean and probability of improvement are those of Agarwal et al. (NeurIPS 2021) and their library rliable.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bufgym.benchmark import episodes
+from bufgym.benchmark.episodes import TIE, Cell, Numbers, Table
+from bufgym.errors import BufgymError
+
+BITES = 0.01
+"""A cell bites, and counts, where the baseline's regret is at least this: elsewhere there is nothing to be gained."""
+
+
+class Interval(NamedTuple):
+    """A statistic and its bootstrap interval; all NaN where it is undefined."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class CellScore:
+    """One policy in one cell."""
+
+    scenario: str
+    capacity: int
+    """L, messages."""
+    policy: str
+    episodes: int
+    qoi: Interval
+    """Mean H."""
+    score: Interval
+    """See ``normalised_score``; NaN where a clairvoyant H is missing, or the baseline is already that good."""
+    regret: Interval
+    """See ``regret``; NaN where a clairvoyant H is missing."""
+    difference: Interval
+    """Mean H minus the reference's, paired; NaN without a reference."""
+    bites: bool
+    """Whether the cell counts in the standings."""
+    exact: bool
+    """Whether every clairvoyant H is certified to be exact, not just a bound."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One policy over all biting cells; NaN where there is none. Which cells bite is settled once, not per resample."""
+
+    policy: str
+    score: Interval
+    """Mean of its scores in the biting cells."""
+    iqm: Interval
+    """Interquartile mean of its scores on (biting cell, trace), each computed on sums over seeds. Pairs on which
+    nothing can be gained have no score and are left out; in a resample a pair weighs as often as it was drawn."""
+    regret: Interval
+    """Mean of its regrets in the biting cells."""
+    improvement: Interval
+    """Paired probability of improvement over the reference: the share of episodes with H above the reference's, plus
+    half of those with the same H, mean over the biting cells."""
+    cells: int
+    """How many cells bite."""
+    ranked: bool
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What ``scores`` makes of the rows."""
+
+    standings: list[Standing]
+    """Ranked policies first, best score first."""
+    cells: list[CellScore]
+    """By scenario, capacity, policy."""
+    baseline: str
+    reference: str
+    confidence: float
+    resamples: int
+
+
+# --- the statistics --------------------------------------------------------------------------------------------------
+
+
+def normalised_score(h: Numbers, base: Numbers, best: Numbers) -> Numbers:
+    """(sum H - sum H_baseline) / (sum H_clairvoyant - sum H_baseline), from the three sums; not clipped.
+
+    0 is the baseline (Drop Oldest: what ROS does), 1 the clairvoyant; NaN where the baseline leaves nothing to gain.
+    """
+    return _ratio(h - base, best - base, best - base > TIE * np.abs(best))
+
+
+def regret(h: Numbers, best: Numbers) -> Numbers:
+    """1 - sum H / sum H_clairvoyant, from the two sums; NaN where the clairvoyant's is 0 or unknown."""
+    return 1 - _ratio(h, best, best > 0)
+
+
+def interquartile_mean(x: ArrayLike) -> float:
+    """Mean of what is left of n numbers without the floor(n / 4) smallest and largest (``trim_mean(x, 0.25)`` in
+    SciPy, as in rliable). NaN counts as missing; NaN for nothing."""
+    values = np.ravel(np.asarray(x, np.float64))[np.newaxis]
+    return float(_interquartile_means(values, np.ones_like(values))[0])
+
+
+def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
+    """Mean over tasks of P(X > Y) + P(X = Y) / 2 over all pairs of runs (Mann-Whitney's U / nm): the unpaired form.
+
+    Args:
+        x: [runs] on one task, or [runs, tasks].
+        y: the same of what is improved upon; it may have another number of runs.
+
+    Returns:
+        In [0, 1]; NaN for no runs, no tasks or a NaN among them.
+    """
+    xs, ys = (np.asarray(given, np.float64) for given in (x, y))
+    xs, ys = (given[:, np.newaxis] if given.ndim == 1 else given for given in (xs, ys))
+    if xs.ndim != 2 or ys.ndim != 2 or xs.shape[1] != ys.shape[1]:
+        raise BufgymError(f"shapes {np.shape(x)} and {np.shape(y)}: must be [runs] or [runs, tasks], of the same tasks")
+    if not (xs.size and ys.size) or np.isnan(xs).any() or np.isnan(ys).any():
+        return math.nan
+    shares = []
+    for k in range(xs.shape[1]):
+        task = np.sort(ys[:, k])
+        # How many are below x, and how many are not above it: their mean counts a tie as one half.
+        twice = np.searchsorted(task, xs[:, k], "left") + np.searchsorted(task, xs[:, k], "right")
+        shares.append(twice.mean() / (2 * len(task)))
+    return float(np.mean(shares))
+
+
+def paired_difference(
+    h: ArrayLike, h_ref: ArrayLike, *, resamples: int = 2000, confidence: float = 0.95, seed: int = 0
+) -> Interval:
+    """Mean of H - H_ref over the episodes that both met, in the same order; NaN for none."""
+    ours, theirs = (np.asarray(given, np.float64) for given in (h, h_ref))
+    if ours.ndim != 1 or ours.shape != theirs.shape:
+        raise BufgymError(f"shapes {ours.shape} and {theirs.shape}: must be one H an episode, of the same episodes")
+    _check(resamples, confidence)
+    if not len(ours):
+        return Interval(math.nan, math.nan, math.nan)
+    weights = _weights(len(ours), resamples, np.random.default_rng(seed))
+    return _interval(weights @ (ours - theirs) / len(ours), confidence)
+
+
+def scores(
+    rows: Sequence[Mapping[str, Any]],
+    *,
+    unranked: Collection[str] = (),
+    baseline: str = "drop-oldest",
+    reference: str = "afr",
+    resamples: int = 2000,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> Scores:
+    """Scores of every policy in every cell, and the standings over the cells that bite.
+
+    Args:
+        rows: from ``bufgym.benchmark.run``. Those of a trained agent may carry a "training_seed": the H of an episode
+            is then the mean over its training seeds.
+        unranked: policies that are shown but not ranked (such as an unbounded queue, or the clairvoyant).
+        baseline: whose score is 0.
+        reference: what improvements and differences are over; NaN where no row is of that policy.
+        resamples: of the bootstrap.
+        confidence: of the intervals, such as 0.95.
+        seed: of the draws.
+
+    Raises:
+        BufgymError: for no rows, incomplete or duplicate ones, a cell without the baseline, policies that have not
+            met the same episodes (or whose rows do not agree on the clairvoyant).
+    """
+    _check(resamples, confidence)
+    table = episodes.read(rows, baseline)
+    drawn = {name: _weights(len(e), resamples, _stream(seed, name)) for name, e in table.episodes.items()}
+    base = _resampled(table, baseline, resamples, seed)
+    grounds = {cell: _ground(table, cell, base[cell], drawn[cell[0]]) for cell in table.cells}
+    theirs: dict[Cell, Numbers] = {}
+    if reference in table.training_seeds:
+        theirs = _resampled(table, reference, resamples, seed)
+    interval = partial(_interval, confidence=confidence)
+    cell_scores, standings = [], []
+    for policy in table.training_seeds:
+        here = {
+            cell: _statistics(h, theirs.get(cell), grounds[cell])
+            for cell, h in _resampled(table, policy, resamples, seed).items()
+        }
+        if policy in table.unbounded:
+            here = {cell: s.without_bound() for cell, s in here.items()}
+        for cell, s in here.items():
+            made = CellScore(
+                scenario=cell[0],
+                capacity=cell[1],
+                policy=policy,
+                episodes=len(table.episodes[cell[0]]),
+                qoi=interval(s.qoi),
+                score=interval(s.score),
+                regret=interval(s.regret),
+                difference=interval(s.difference),
+                bites=grounds[cell].bites,
+                exact=table.exact[cell],
+            )
+            cell_scores.append(made)
+        biting = [cell for cell in here if grounds[cell].bites]
+        overall = _overall([here[cell] for cell in biting], [grounds[cell] for cell in biting])
+        score, iqm, regrets, improvement = map(interval, overall)
+        standings.append(Standing(policy, score, iqm, regrets, improvement, len(biting), policy not in unranked))
+    cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
+    standings.sort(key=lambda s: (not s.ranked, math.isnan(s.score.value), -s.score.value, s.policy))
+    return Scores(standings, cell_scores, baseline, reference, confidence, resamples)
+
+
+# --- resampling: row 0 is always the sample itself, the others are its resamples --------------------------------------
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """What the statistics of every policy in one cell are computed from."""
+
+    weights: Numbers
+    """[1 + resamples, episodes]: how often each episode was drawn."""
+    starts: NDArray[np.intp]
+    """[traces]: each one's first episode."""
+    base: Numbers
+    """[1 + resamples, traces]: sum H of the baseline."""
+    best: Numbers
+    """The same of the clairvoyant; NaN where unknown."""
+    bites: bool
+
+    def sums(self, h: Numbers) -> Numbers:
+        """[1 + resamples, traces]: sum H over the episodes drawn, from h[1 or 1 + resamples, episodes]."""
+        return np.asarray(np.add.reduceat(self.weights * h, self.starts, axis=1))
+
+
+def _ground(table: Table, cell: Cell, baseline: Numbers, weights: Numbers) -> _Ground:
+    traces = [trace for trace, _ in table.episodes[cell[0]]]
+    starts = np.unique(traces, return_index=True)[1]
+    base, best = (
+        np.asarray(np.add.reduceat(weights * h, starts, axis=1)) for h in (baseline, table.best[cell][np.newaxis])
+    )
+    bites = bool(regret(base[:1].sum(axis=1), best[:1].sum(axis=1))[0] >= BITES)
+    return _Ground(weights, starts, base, best, bites)
+
+
+class _Statistics(NamedTuple):
+    """One policy in one cell, [1 + resamples] each but for ``by_trace``."""
+
+    qoi: Numbers
+    score: Numbers
+    regret: Numbers
+    difference: Numbers
+    improvement: Numbers
+    by_trace: Numbers
+    """[1 + resamples, traces]: scores."""
+
+    def without_bound(self) -> _Statistics:
+        """The same for a policy that the clairvoyant's L does not bind: no score, no regret."""
+        none = {name: np.full_like(getattr(self, name), np.nan) for name in ("score", "regret", "by_trace")}
+        return self._replace(**none)
+
+
+def _statistics(h: Numbers, h_ref: Numbers | None, ground: _Ground) -> _Statistics:
+    sums = ground.sums(h)
+    total, base, best = sums.sum(axis=1), ground.base.sum(axis=1), ground.best.sum(axis=1)
+    episodes = ground.weights.shape[1]
+    difference = improvement = np.full(len(total), np.nan)
+    if h_ref is not None:
+        minus = h - h_ref
+        tied = np.abs(minus) <= TIE * np.abs(h_ref)
+        better = np.where(tied, 0.5, minus > 0)
+        difference, improvement = (ground.sums(each).sum(axis=1) / episodes for each in (minus, better))
+    return _Statistics(
+        qoi=total / episodes,
+        score=normalised_score(total, base, best),
+        regret=regret(total, best),
+        difference=difference,
+        improvement=improvement,
+        by_trace=normalised_score(sums, ground.base, ground.best),
+    )
+
+
+def _overall(cells: list[_Statistics], grounds: list[_Ground]) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+    """(score, IQM, regret, improvement) over the biting cells, [1 + resamples] each."""
+    if not cells:
+        none = np.full(1, np.nan)
+        return none, none, none, none
+    values = np.hstack([s.by_trace for s in cells])
+    weights = np.hstack([np.add.reduceat(g.weights, g.starts, axis=1) for g in grounds])
+    iqm = _interquartile_means(values, weights / weights[0])
+    score, regrets, improvement = (
+        np.mean([getattr(s, name) for s in cells], axis=0) for name in ("score", "regret", "improvement")
+    )
+    return score, iqm, regrets, improvement
+
+
+def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:
+    """[n] from [n, tasks]: the interquartile mean of each row, a task counting ``weights`` times. Row 0 sets the share
+    that is cut off at either end; NaN weighs nothing."""
+    unknown = np.isnan(values)
+    values, weights = (np.where(unknown, 0.0, given) for given in (values, weights))
+    order = np.argsort(values, axis=1)
+    values, weights = (np.take_along_axis(given, order, axis=1) for given in (values, weights))
+    tasks = np.count_nonzero(weights[0])
+    until = np.cumsum(weights, axis=1)
+    all_of_it = weights.sum(axis=1, keepdims=True)
+    cut = all_of_it * (tasks // 4) / max(tasks, 1)
+    kept = np.clip(np.minimum(until, all_of_it - cut) - np.maximum(until - weights, cut), 0, None)
+    left = kept.sum(axis=1)
+    return _ratio((kept * values).sum(axis=1), left, left > 0)
+
+
+def _resampled(table: Table, policy: str, resamples: int, seed: int) -> dict[Cell, Numbers]:
+    """H of each episode by cell, [1, episodes], or its means over the training seeds drawn, [1 + resamples, episodes].
+
+    An agent's training seed is the same agent in every cell: one draw serves all.
+    """
+    trained = len(table.training_seeds[policy])
+    if trained == 1:
+        return {cell: table.qoi[policy, cell] for cell in table.cells}
+    weights = _weights(trained, resamples, _stream(seed, f"training of {policy}")) / trained
+    return {cell: weights @ table.qoi[policy, cell] for cell in table.cells}
+
+
+def _stream(seed: int, label: str) -> np.random.Generator:
+    return np.random.default_rng([seed, zlib.crc32(label.encode())])
+
+
+def _weights(n: int, resamples: int, rng: np.random.Generator) -> Numbers:
+    """[1 + resamples, n]: 1 each, then how often each of n is drawn in n draws with replacement."""
+    drawn = rng.multinomial(n, np.full(n, 1 / n), size=resamples)
+    return np.vstack([np.ones((1, n)), drawn])
+
+
+def _interval(numbers: Numbers, confidence: float) -> Interval:
+    """The percentile interval; resamples in which the statistic is undefined are left out."""
+    drawn = numbers[1:][~np.isnan(numbers[1:])]
+    if np.isnan(numbers[0]) or not len(drawn):
+        return Interval(math.nan, math.nan, math.nan)
+    low, high = np.percentile(drawn, [50 * (1 - confidence), 50 * (1 + confidence)]).tolist()
+    return Interval(float(numbers[0]), low, high)
+
+
+def _ratio(above: Numbers, below: Numbers, defined: NDArray[np.bool_]) -> Numbers:
+    made: Numbers = np.divide(above, below, out=np.full(below.shape, np.nan), where=defined)
+    return made
+
+
+def _check(resamples: int, confidence: float) -> None:
+    if resamples < 1:
+        raise BufgymError(f"resamples = {resamples}: must be >= 1")
+    if not 0 < confidence < 1:
+        raise BufgymError(f"confidence = {confidence}: must be above 0 and below 1")

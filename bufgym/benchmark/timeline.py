@@ -1,0 +1,65 @@
+"""One episode in full, for the report: what each policy delivered and dropped on the very same link."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from bufgym.benchmark.rows import Row
+from bufgym.benchmark.run import best, draw, met
+from bufgym.policies import Policy
+from bufgym.scenario import Scenario
+from bufgym.sender import NEVER
+
+_BASELINE = "drop-oldest"
+_STEP_S = 0.25
+"""The capacity curve is drawn in steps of so many seconds."""
+
+
+def choose(rows: Sequence[Row]) -> Row | None:
+    """The row of the episode to show: at the middle capacity, the one that costs Drop Oldest most over a real link."""
+    capacities = sorted({row["capacity"] for row in rows})
+    middle = capacities[len(capacities) // 2]
+    shown = [
+        row for row in rows if row["policy"] == _BASELINE and row["capacity"] == middle and row["regret"] is not None
+    ]
+    return max(shown, key=lambda row: (row["regret"], row["scenario"], row["trace"], row["seed"]), default=None)
+
+
+def timeline(policies: Sequence[Policy], scenario: Scenario, shown: Row) -> dict[str, Any]:
+    """The episode of that row under every policy; times in s, rates in bytes/s."""
+    episode = draw(scenario, shown["seed"])
+    capacity = shown["capacity"]
+    plan = best(episode, capacity, scenario)
+    arrivals = np.asarray(episode.arrivals)
+    told: dict[str, Any] = {}
+    last_us = int(arrivals["arrival_us"][-1])
+    for policy in policies:
+        senders = met(policy, [episode], capacity, scenario, [plan])
+        fates = np.asarray(senders.batch.fates[0])[: len(arrivals)]
+        qoi = 1.0 + float(senders.batch.senders[0]["delivered_gain"]) if (fates["crossed_us"] != NEVER).any() else 0.0
+        received = np.flatnonzero(fates["crossed_us"] != NEVER)
+        dropped = np.flatnonzero(fates["dropped_us"] != NEVER)
+        told[policy.name] = {
+            "qoi": qoi,
+            "regret": None if policy.unbounded or plan.qoi == 0 else 1 - qoi / plan.qoi,
+            "received": [
+                [int(k), int(fates["taken_us"][k]) / 1e6, int(fates["crossed_us"][k]) / 1e6] for k in received
+            ],
+            "dropped": [[int(k), int(fates["dropped_us"][k]) / 1e6] for k in dropped],
+        }
+        if policy.ranked and len(received):
+            last_us = max(last_us, int(fates["crossed_us"][received].max()))
+    edges_us = np.arange(0, last_us + round(2e6 * _STEP_S), round(1e6 * _STEP_S))
+    carried = np.diff(episode.link.carried_by(edges_us))
+    offered_s = max(1, int(arrivals["arrival_us"][-1])) / 1e6
+    return {
+        **{key: shown[key] for key in ("scenario", "capacity", "trace", "seed")},
+        "arrival_s": (arrivals["arrival_us"] / 1e6).tolist(),
+        "x": arrivals["x"].tolist(),
+        "rate": {"t_s": (edges_us[:-1] / 1e6).tolist(), "bytes_per_s": (carried / _STEP_S).tolist()},
+        "demand_bytes_per_s": float(arrivals["size_bytes"][:-1].sum() / offered_s),
+        "policies": told,
+    }

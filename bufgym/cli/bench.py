@@ -1,0 +1,135 @@
+"""``bufgym bench``: policies side by side on the same episodes."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import tempfile
+from pathlib import Path
+
+from bufgym.cli.options import Commands, capacities, command, count, load_policies, policy_file, split_policies
+from bufgym.cli.scenarios import scenario, scenario_options
+from bufgym.errors import BufgymError
+
+
+def add(commands: Commands) -> None:
+    bench = command(commands, "bench", _bench, "run policies side by side on the same episodes")
+    option = bench.add_argument_group("a suite: frozen episodes, scored, with a report").add_argument
+    option("--suite", metavar="NAME", help="which ('bufgym list suites'); --out DIR keeps it, a second call resumes it")
+    option("--split", default="test", metavar="S", help="train, validation or test (default: test)")
+    option("--data", metavar="DIR", help="folder of recordings, for suites over real links")
+    option("--jobs", type=int, default=-1, metavar="N", help="processes side by side (default: one a core)")
+    option("--backend", default="loky", metavar="B", help="loky (default), threading, sequential, ray or dask")
+    option("--address", metavar="A", help="head of the Ray or Dask cluster (default: one on this machine)")
+    who = bench.add_argument_group("who runs")
+    option = who.add_argument
+    option("--policies", metavar="A,B:x=1,C", help="policies, with settings as in decimate:every=2 (default: all)")
+    option("--capacity", type=capacities, metavar="L,...", help="capacities L, messages (default: 8, or the suite's)")
+    option("--max-bytes", type=count, metavar="B", help="also at most B bytes queued (default: no limit)")
+    option("--decide-at", choices=("arrival", "overflow"), default="arrival", help="ask at every arrival, or when full")
+    option("--seeds", type=count, metavar="N", help="episodes a trace (default: 10, or the suite's)")
+    policy_file(who)
+    scenario_options(bench)
+    option = bench.add_argument_group("where results go").add_argument
+    option("--out", metavar="DIR", help="write rows.parquet (rows.csv without pyarrow) and table.md there")
+    option("--format", choices=("csv", "parquet"), help="format of the rows")
+
+
+def _bench(options: argparse.Namespace) -> None:
+    from bufgym import policies
+    from bufgym.benchmark import rows as files
+    from bufgym.benchmark import run, table
+
+    load_policies(options.policy_file)
+    specs = split_policies(options.policies) if options.policies is not None else list(policies.names())
+    if options.format == "parquet" and options.out is not None and not files.has_pyarrow():
+        raise BufgymError('--format parquet needs pyarrow: pip install "bufgym[bench]" (or --format csv)')
+    if options.suite is not None:
+        _suite(options, specs)
+        return
+    for name, default in (("split", "test"), ("data", None), ("jobs", -1), ("backend", "loky"), ("address", None)):
+        if getattr(options, name) != default:
+            raise BufgymError(f"--{name} needs --suite")
+    options.capacity, options.seeds = options.capacity or [8], options.seeds or 10
+    chosen = [policies.get(spec) for spec in specs]
+    form = options.format or ("parquet" if files.has_pyarrow() else "csv")
+    meets, about = scenario(options)
+    if options.out is not None:
+        # Before the long work, so that a folder that cannot be made is known at once.
+        Path(options.out).mkdir(parents=True, exist_ok=True)
+    rows = run.run(
+        chosen,
+        meets,
+        options.capacity,
+        options.seeds,
+        max_bytes=options.max_bytes,
+        decide_at=options.decide_at,
+        progress=True,
+    )
+    print(f"{about}\n\n{table.plain(rows)}")
+    if options.out is not None:
+        written = files.write_rows(rows, Path(options.out) / f"rows.{form}")
+        target = Path(options.out) / "table.md"
+        with files.replaced(target) as temporary:
+            temporary.write_text(f"{about}\n\n{table.markdown(rows)}\n", encoding="utf-8")
+        print(f"\n{len(rows)} rows in {written}, this table in {target}")
+
+
+_NOT_WITH_SUITE = (
+    "max_bytes", "trace", "motion", "fps", "bytes", "size_cv", "seconds", "jitter", "scale", "value", "law", "t_min",
+    "t_max", "t_mean",
+)  # fmt: skip
+"""A suite is frozen: these are its own."""
+
+
+def _suite(options: argparse.Namespace, specs: list[str]) -> None:
+    from bufgym.benchmark import campaign, report
+
+    for name in _NOT_WITH_SUITE:
+        if getattr(options, name) is not None:
+            raise BufgymError(f"--{name.replace('_', '-')} cannot go with --suite: a suite's episodes are frozen")
+    if options.interruption or options.decide_at != "arrival":
+        raise BufgymError("--interruption and --decide-at cannot go with --suite: a suite's episodes are frozen")
+    plan = campaign.Plan(
+        options.suite,
+        tuple(specs),
+        options.split,
+        tuple(options.capacity or ()),
+        options.seeds,
+        options.data,
+        options.policy_file,
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        out = Path(scratch) / "run" if options.out is None else Path(options.out)
+        rows = campaign.campaign(
+            plan,
+            out,
+            jobs=options.jobs,
+            backend=options.backend,
+            address=options.address,
+            command=_command(options),
+            form=options.format,
+            load=load_policies,
+        )
+        print(report.plain(out))
+    if options.out is not None:
+        print(f"\n{len(rows)} rows in {out}; bufgym report {out} makes a page of them")
+
+
+def _command(options: argparse.Namespace) -> str:
+    """The command that runs this again."""
+    words = ["bufgym bench --suite", options.suite]
+    for name, default in (
+        ("split", "test"),
+        ("policies", None),
+        ("capacity", None),
+        ("seeds", None),
+        ("policy_file", None),
+        ("data", None),
+        ("out", None),
+    ):
+        given = getattr(options, name)
+        if given != default:
+            text = ",".join(map(str, given)) if isinstance(given, list) else str(given)
+            words.append(f"--{name.replace('_', '-')} {shlex.quote(text)}")
+    return " ".join(words)

@@ -1,0 +1,118 @@
+"""``bufgym list``: what there is."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+from bufgym.cli.options import Commands, columns, command, load_policies, policy_file
+
+
+def add(commands: Commands) -> None:
+    listing = command(commands, "list", _list, "what there is: environments, scenarios, policies and more")
+    listing.add_argument("what", nargs="?", choices=KINDS, metavar="KIND", help=f"only one of: {', '.join(KINDS)}")
+    policy_file(listing)
+
+
+def _list(options: argparse.Namespace) -> None:
+    load_policies(options.policy_file)
+    sections = [f"{kind}\n{_LISTS[kind]()}" for kind in KINDS if options.what in (None, kind)]
+    print("\n\n".join(sections))
+
+
+def environments() -> dict[str, str]:
+    """Id -> scenario of every environment that bufgym has registered with Gymnasium."""
+    import gymnasium
+
+    specs = [spec for spec in gymnasium.registry.values() if spec.namespace == "bufgym"]
+    return {spec.id: str(spec.kwargs.get("scenario", "")) for spec in specs}
+
+
+def _list_environments() -> str:
+    from bufgym.scenario import SCENARIOS
+
+    def what(scenario: str) -> str:
+        return SCENARIOS[scenario][1] if scenario in SCENARIOS else ""
+
+    return columns([(id, f"scenario {scenario}", what(scenario)) for id, scenario in sorted(environments().items())])
+
+
+def _list_scenarios() -> str:
+    from bufgym.scenario import SCENARIOS
+
+    return columns([(name, meaning) for name, (_, meaning) in SCENARIOS.items()])
+
+
+def _list_suites() -> str:
+    from bufgym.suites import SUITES
+
+    return columns(
+        [(suite.name, suite.about + (f"; needs {suite.needs}" if suite.needs else "")) for suite in SUITES.values()]
+    )
+
+
+def _list_policies() -> str:
+    from bufgym import oracle, policies  # noqa: F401  (the oracle registers the clairvoyant)
+
+    lines = []
+    width = max(map(len, policies.names()))
+    for name in policies.names():
+        policy = policies.get(name)
+        lines.append(f"  {name:<{width}}  {policy.summary}".rstrip())
+        settings = ", ".join(f"{setting}={policy.memory[setting]:g}" for setting in policy.parameters)
+        if settings:
+            lines.append(f"  {'':<{width}}  settings: {settings}")
+        lines.append(f"  {'':<{width}}  from: {policy.source or 'a policy file'}")
+    return "\n".join(lines)
+
+
+def _list_values() -> str:
+    from bufgym import qoi
+
+    return columns(
+        [
+            ("exponential:BASE", _first_line(qoi.exponential)),
+            ("saturating:DISTANCE", _first_line(qoi.saturating)),
+            ("(Python only)", f"bufgym.qoi.tabulated: {_first_line(qoi.tabulated)}"),
+        ]
+    )
+
+
+def _first_line(function: Any) -> str:
+    return (function.__doc__ or "").strip().split("\n")[0]
+
+
+def _list_rewards() -> str:
+    from bufgym.observe import REWARD_TERMS
+
+    return columns([(term.name, term.unit, term.meaning) for term in REWARD_TERMS])
+
+
+def _list_observations() -> str:
+    from bufgym.observe import FIELDS
+
+    return columns([(f.name, f.per, f.group, f.unit, f.meaning) for f in FIELDS])
+
+
+def _list_traces() -> str:
+    from bufgym.traces import shipped
+
+    kinds = {"lte": "bandwidth, synthetic LTE", "drive": "motion of a driving robot, synthetic"}
+    found = shipped()
+    return columns([(name, kinds.get(name.split("-")[0], "")) for name in found]) if found else "  none found"
+
+
+_LISTS: dict[str, Callable[[], str]] = {
+    "environments": _list_environments,
+    "scenarios": _list_scenarios,
+    "suites": _list_suites,
+    "policies": _list_policies,
+    "values": _list_values,
+    "rewards": _list_rewards,
+    "observations": _list_observations,
+    "traces": _list_traces,
+}
+
+KINDS = tuple(_LISTS)
+"""What ``list`` can be asked for, in the order it shows."""

@@ -1,0 +1,142 @@
+"""What the commands' options share: the parser, the types of options, policies of the user's own, columns to print."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NoReturn, TypeAlias
+
+from bufgym.errors import BufgymError
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaints are raised as BufgymError, like every other mistake of the caller's."""
+
+    def error(self, message: str) -> NoReturn:
+        raise BufgymError(f"{message} (see {self.prog} --help)")
+
+
+Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
+"""What ``add_subparsers`` returns: where commands are added."""
+
+
+def command(commands: Commands, name: str, function: Callable[[argparse.Namespace], None], help: str) -> Parser:
+    """Add the command ``name``, which calls ``function`` with its options; its own parser, to add them to."""
+    made = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
+    made.set_defaults(command=function)
+    return made
+
+
+# --- types of options ------------------------------------------------------------------------------------------------
+
+
+def number(text: str) -> float:
+    """A finite number."""
+    try:
+        found = float(text)
+    except ValueError:
+        found = math.nan
+    if not math.isfinite(found):
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a finite number")
+    return found
+
+
+def positive(text: str) -> float:
+    """A number > 0."""
+    found = number(text)
+    if found <= 0:
+        raise argparse.ArgumentTypeError(f"{text}: must be a number > 0")
+    return found
+
+
+def least_0(text: str) -> float:
+    """A number >= 0."""
+    found = number(text)
+    if found < 0:
+        raise argparse.ArgumentTypeError(f"{text}: must be a number >= 0")
+    return found
+
+
+def count(text: str) -> int:
+    """A whole number >= 1."""
+    found = natural(text)
+    if found < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number >= 1")
+    return found
+
+
+def natural(text: str) -> int:
+    """A whole number >= 0."""
+    try:
+        found = int(text)
+    except ValueError:
+        found = -1
+    if found < 0:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number >= 0")
+    return found
+
+
+def capacities(text: str) -> list[int]:
+    """Whole numbers >= 1, no two alike: ``"4,8,16"``."""
+    numbers = [count(part) for part in text.split(",")]
+    for each in numbers:
+        if numbers.count(each) > 1:
+            raise argparse.ArgumentTypeError(f"{text}: {each} is given more than once")
+    return numbers
+
+
+def split_policies(text: str) -> list[str]:
+    """``"afr,decimate:every=2,random"`` -> its three policies; a setting belongs to the policy before it."""
+    specs: list[str] = []
+    for part in text.split(","):
+        if "=" in part and ":" not in part and specs:
+            specs[-1] += f",{part}"
+        else:
+            specs.append(part.strip())
+    return specs
+
+
+# --- a user's own policies -------------------------------------------------------------------------------------------
+
+
+def policy_file(parser: argparse._ActionsContainer) -> None:
+    """Add the option ``--policy-file``; ``load_policies`` runs the file."""
+    parser.add_argument(
+        "--policy-file",
+        metavar="FILE.py",
+        help="a Python file that registers policies of your own; its code is run, so use only files you trust",
+    )
+
+
+def load_policies(path: str | None) -> None:
+    """Run the user's Python file, which registers policies."""
+    if path is None:
+        return
+    import importlib.util
+
+    if not Path(path).is_file():
+        raise BufgymError(f"{path}: no such file (--policy-file)")
+    spec = importlib.util.spec_from_file_location(f"bufgym_policy_file_{Path(path).stem}", path)
+    if spec is None or spec.loader is None:
+        raise BufgymError(f"{path}: must be a Python file, named .py")
+    module = importlib.util.module_from_spec(spec)
+    # Compiled functions are pickled by their module's name.
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise BufgymError(f"{path}, line {error.lineno}: {error.msg}") from None
+
+
+# --- output ----------------------------------------------------------------------------------------------------------
+
+
+def columns(lines: Sequence[Sequence[str]]) -> str:
+    """Left-aligned columns, indented; the last is not padded."""
+    widths = [max((len(line[c]) for line in lines), default=0) for c in range(max(map(len, lines), default=0))]
+    return "\n".join(
+        "  " + "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
+    )

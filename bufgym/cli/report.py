@@ -1,0 +1,19 @@
+"""``bufgym report``: the page of a suite's run."""
+
+from __future__ import annotations
+
+import argparse
+
+from bufgym.cli.options import Commands, command
+
+
+def add(commands: Commands) -> None:
+    made = command(commands, "report", _report, "the page of a suite's run: one HTML file that works offline")
+    made.add_argument("folder", metavar="DIR", help="what bench --suite wrote with --out")
+    made.add_argument("--markdown", action="store_true", help="print tables for a README instead")
+
+
+def _report(options: argparse.Namespace) -> None:
+    from bufgym.benchmark import report
+
+    print(report.markdown(options.folder) if options.markdown else f"wrote {report.write(options.folder)}")

@@ -1,0 +1,148 @@
+"""The clairvoyant: the best QoI that any policy could reach on an episode, knowing the whole link and workload.
+
+Let C(t) be the bytes that the link can carry by time t, c_i = C(arrival time of message i), b_i its size. A policy is,
+in hindsight, the set of messages that it sent. Message i of that set begins at byte s_i = max(c_i, e) of the link and
+ends at e_i = s_i + b_i, where e is the end of the message sent before it: the socket is serial and never idle while
+something waits. Whatever else arrives may as well be rejected at once, which keeps the queue shortest. With equal
+sizes b, the queue (message i included) then holds ceil((s_i - c_i) / b) messages after arrival i, so i finds room if
+and only if
+
+    s_i - c_i <= L b.
+
+``labels.py`` finds the best set under that condition. With unequal sizes the room left depends on which messages wait;
+the condition is relaxed to one that every set within L messages and B bytes keeps, and the result is an upper bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
+from bufgym.kernel import kernel
+from bufgym.oracle import labels
+from bufgym.policies.registry import register
+from bufgym.qoi import Value
+from bufgym.scenario import Episode
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the clairvoyant would do with one episode."""
+
+    qoi: float
+    """The best H: no policy with this L and B reaches more."""
+    kept: NDArray[np.bool_]
+    """[messages]: what to accept; the rest is rejected at its arrival."""
+    certified: bool
+    """Whether a sender that asks at every arrival, and does so, reaches ``qoi``; if not, that is an upper bound."""
+
+
+def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | None = None) -> Plan:
+    """The best plan for one episode under L = ``capacity`` messages and B = ``max_bytes`` bytes.
+
+    Exact for equal sizes where every arrival asks for a decision; an upper bound otherwise (see ``Plan.certified``).
+    """
+    check_limits(capacity, max_bytes)
+    arrivals = np.asarray(episode.arrivals)
+    n = len(arrivals)
+    capacity = min(capacity, n)
+    c = episode.link.carried_by(arrivals["arrival_us"])
+    size, x = np.ascontiguousarray(arrivals["size_bytes"]), np.ascontiguousarray(arrivals["x"])
+    most_bytes = UNLIMITED_BYTES if max_bytes is None else max_bytes
+    limit = np.empty(n, np.int64)
+    if (size == size[0]).all():
+        room = min(capacity, most_bytes // int(size[0]))
+        limit[:] = room * size[0] if room else labels.NEVER
+    else:
+        _relaxed_limits(c, size, capacity, most_bytes, np.empty(n, np.int64), np.empty(capacity, np.int64), limit)
+    sent, gain = labels.best(c, size, limit, x, v.array, episode.link.carries_bytes)
+    kept = np.zeros(n, np.bool_)
+    kept[sent] = True
+    qoi = 1.0 + gain if len(sent) else 0.0
+    reached = v.information(x[sent]) >= qoi - 1e-9
+    fits = bool(_fits(c[sent], size[sent], capacity, most_bytes, np.empty(len(sent), np.int64)))
+    # An arrival that asks nobody is accepted where there is room.
+    unasked = ~kept
+    unasked[episode.first_decision : episode.last_decision + 1] = False
+    return Plan(qoi, kept, reached and fits and not unasked.any())
+
+
+@kernel
+def _relaxed_limits(
+    c: NDArray[np.int64],
+    size: NDArray[np.int64],
+    capacity: int,
+    max_bytes: int,
+    reach: NDArray[np.int64],
+    largest: NDArray[np.int64],
+    limit: NDArray[np.int64],
+) -> None:
+    """``limit[i]``: message i finds no room if it would have to wait for more bytes than this.
+
+    Before i wait what is left of the message in transmission and at most L - 1 queued ones: together no more than
+    the L largest of those that can still be on their way, and no more than B less i besides the one in transmission.
+    ``reach`` and ``largest`` are room to work in, int64[messages] and int64[L].
+    """
+    for i in range(len(c)):
+        held = 0  # so many of ``largest``, in falling order
+        for j in range(i - 1, -1, -1):
+            if reach[j] <= c[i]:
+                break  # neither j nor what came before it can still be on its way
+            if limit[j] < 0 or c[j] + limit[j] + size[j] <= c[i]:
+                continue
+            k = held
+            while k > 0 and largest[k - 1] < size[j]:
+                if k < capacity:
+                    largest[k] = largest[k - 1]
+                k -= 1
+            if k < capacity:
+                largest[k] = size[j]
+                held = min(held + 1, capacity)
+        limit[i] = 0
+        for k in range(held):
+            limit[i] += largest[k]
+        if held > 0:
+            limit[i] = min(limit[i], largest[0] + max_bytes - size[i])
+        if size[i] > max_bytes:
+            limit[i] = labels.NEVER
+        reach[i] = max(reach[i - 1] if i > 0 else 0, c[i] + limit[i] + size[i])
+
+
+@kernel
+def _fits(
+    c: NDArray[np.int64], size: NDArray[np.int64], capacity: int, max_bytes: int, leaves: NDArray[np.int64]
+) -> bool:
+    """Whether a sender has room for each of these messages, if nothing else arrives.
+
+    ``leaves[k]``: message k is queued until the link has carried so many bytes.
+    """
+    head, backlog, e = 0, 0, 0
+    for k in range(len(c)):
+        while head < k and leaves[head] <= c[k]:
+            backlog -= size[head]
+            head += 1
+        if k - head + 1 > capacity or backlog + size[k] > max_bytes:
+            return False
+        backlog += size[k]
+        leaves[k] = e
+        e = max(c[k], e) + size[k]
+    return True
+
+
+# --- as a policy -----------------------------------------------------------------------------------------------------
+
+
+def foresee(episode: Episode, capacity: int, max_bytes: int, v: Value) -> NDArray[np.float64]:
+    """The plan as a policy's memory: 1 for each message to keep."""
+    limit = None if max_bytes >= UNLIMITED_BYTES else max_bytes
+    return clairvoyant(episode, capacity, v, max_bytes=limit).kept.astype(np.float64)
+
+
+@register("clairvoyant", foresee=foresee, source="bufgym.oracle.clairvoyant", compile=True)
+def follow(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Knows the whole link and workload beforehand: the bound that no other policy passes."""
+    return ACCEPT if memory[arrival.seq] > 0 else REJECT

@@ -1,0 +1,310 @@
+"""The dynamic programme behind the clairvoyant: which messages to send for the most information.
+
+Message i may be sent after message j, which ends at byte e of the link, if s = max(e, c_i) leaves s - c_i <= limit_i;
+it then ends at s + size_i and adds V(x_i - x_j). A *label* (end, gain) at message i is a way to send i last. One label
+is dropped for another at the same message that ends no later and has gained no less: whatever can follow the first can
+follow the second. Nothing that could matter is lost, so the best label of all is the optimum.
+
+Two observations keep the labels few.
+
+*Idle time is never worth leaving out a message.* If some m between j and i would have crossed before i arrives, the
+way j, m, i ends where j, i ends and has gained no less: V(a) + V(b) >= V(a + b). So only such j count after which
+nothing else could have been sent in time.
+
+*Bounds.* With ends rounded down to a grid, the labels at a message are a fixed array, filled backwards in one sweep:
+``future``, an upper bound of what can still be gained. A label whose gain and future together stay below what is
+known to be reachable leads nowhere. What is reachable is first assumed to lie close to the upper bound; only if
+nothing is found there, one looks further down, at last from a plan that ``future`` itself has led to.
+
+Messages of unequal sizes end anywhere, and labels no longer meet: there ``future`` on a fine grid is the answer itself,
+an upper bound.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.kernel import kernel
+from bufgym.qoi import value
+
+NEVER = -1
+"""As a limit: the message never finds room."""
+
+GRID, FINE_GRID = 16, 256
+"""Grid steps to a mean message, where labels follow and where they do not."""
+
+MAX_CELLS = 1 << 23
+"""Entries of ``future`` at most (8 bytes each); a coarser grid then does."""
+
+SHARES = (1 / 16, 1 / 4, 1.0)
+"""How far below the upper bound to look for the optimum: shares of the way down to a plan that is known."""
+
+LABELS = 1 << 14
+"""Room for so many labels at first; where it does not suffice, for twice as many."""
+
+_ROUNDING = 1e-9
+"""The bounds add the same numbers in another order."""
+
+
+class Problem(NamedTuple):
+    """One episode as the kernels read it; arrays over messages."""
+
+    c: NDArray[np.int64]
+    """Bytes that the link can have carried when the message arrives."""
+    size: NDArray[np.int64]
+    limit: NDArray[np.int64]
+    """Bytes that it can wait for at most, or NEVER."""
+    x: NDArray[np.float64]
+    v: NDArray[np.float64]
+    ends: int
+    """The link's last byte."""
+    between: NDArray[np.int64]
+    """The last message before it that could have crossed before it arrives; -1: none."""
+    idle: NDArray[np.int64]
+    """After a message before ``between`` that ends by this byte, ``between`` could be sent and cross in time."""
+    grid: int
+    """Bytes to a grid step."""
+    future: NDArray[np.float64]
+    """[messages, steps]: no plan gains more after message i, if that ends at byte (c_i // grid + k) * grid or later."""
+
+
+def best(
+    c: NDArray[np.int64],
+    size: NDArray[np.int64],
+    limit: NDArray[np.int64],
+    x: NDArray[np.float64],
+    v: NDArray[np.float64],
+    ends: int,
+) -> tuple[NDArray[np.int64], float]:
+    """(messages of the best plan in order, its gain: H - 1); with unequal sizes a good plan and an upper bound."""
+    n = len(c)
+    equal = bool((size == size[0]).all())
+    furthest = max(0, int((limit + size).max()))
+    grid = max(1, int(size.mean()) // (GRID if equal else FINE_GRID), furthest * n // MAX_CELLS)
+    work = np.empty((3, n), np.int64)
+    p = Problem(c, size, limit, x, v, ends, work[0], work[1], grid, np.zeros((n, furthest // grid + 2)))
+    find_idle(p)
+    find_future(p)
+    length, low = guided(p, work[2])
+    high = most(p)
+    if not equal:
+        return work[2, :length], high
+    table = Table(n)
+    for share in SHARES:
+        enough = high - share * (high - low)
+        table.fill(p, enough)
+        found, gain = table.plan()
+        if gain >= enough:
+            break
+    return found, gain
+
+
+class Table:
+    """All labels, message by message: those of message i are ``first[i] : first[i + 1]``, by rising end and gain."""
+
+    def __init__(self, messages: int) -> None:
+        self.first = np.zeros(messages + 1, np.int64)
+        self.latest = np.zeros(messages + 1, np.int64)
+        self.end = np.empty(LABELS, np.int64)
+        self.gain = np.empty(LABELS, np.float64)
+        self.parent = np.empty(LABELS, np.int64)
+
+    def fill(self, p: Problem, enough: float) -> None:
+        """Find all labels that can lead to a gain of ``enough``."""
+        i = 0
+        while True:
+            i = extend(p, enough, i, self.first, self.latest, self.end, self.gain, self.parent)
+            if i == len(p.c):
+                return
+            room = 2 * len(self.end)
+            self.end, self.parent = np.resize(self.end, room), np.resize(self.parent, room)
+            self.gain = np.resize(self.gain, room)
+
+    def plan(self) -> tuple[NDArray[np.int64], float]:
+        """(messages on the way to the best label, the last of equals, its gain); none and 0 if nothing can be sent."""
+        count = int(self.first[-1])
+        if count == 0:
+            return np.zeros(0, np.int64), 0.0
+        # Of equals the last one: it may have sent more messages than the others.
+        label = count - 1 - int(np.argmax(self.gain[:count][::-1]))
+        gain, way = float(self.gain[label]), []
+        while label >= 0:
+            way.append(label)
+            label = int(self.parent[label])
+        return np.searchsorted(self.first, np.array(way[::-1]), side="right") - 1, gain
+
+
+# --- bounds ----------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def find_idle(p: Problem) -> None:
+    """Fill ``between`` and ``idle``."""
+    for i in range(len(p.c)):
+        m = i - 1
+        while m >= 0 and (p.limit[m] < 0 or p.c[m] + p.size[m] > p.c[i]):
+            m -= 1
+        p.between[i] = m
+        p.idle[i] = min(p.c[i] - p.size[m], p.c[m] + p.limit[m]) if m >= 0 else -1
+
+
+@kernel
+def find_future(p: Problem) -> None:
+    """Fill ``future`` (zeros so far), from the last message back."""
+    n, steps = p.future.shape
+    for i in range(n - 1, -1, -1):
+        step_i, reach = p.c[i] // p.grid, p.c[i] + p.limit[i] + p.size[i]
+        top = min(steps, reach // p.grid - step_i + 1)
+        for j in range(i + 1, n):
+            low = 0
+            if p.between[j] > i:
+                if p.idle[j] >= reach:
+                    break  # every further message as well would be preceded by ``between``
+                low = max(0, p.idle[j] // p.grid - step_i)
+            if p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
+                continue
+            added = value(p.v, p.x[j] - p.x[i])
+            # Ends before c_j: the link is idle, and j begins when it arrives.
+            split = -(-p.c[j] // p.grid) - step_i
+            w = added + p.future[j, (p.c[j] + p.size[j]) // p.grid - p.c[j] // p.grid]
+            for k in range(low, min(split, top)):
+                p.future[i, k] = max(p.future[i, k], w)
+            # Later ends: j begins there.
+            last = min(p.c[j] + p.limit[j], p.ends - p.size[j]) // p.grid - step_i
+            shift = step_i + p.size[j] // p.grid - p.c[j] // p.grid
+            for k in range(max(low, split), min(top, last + 1)):
+                p.future[i, k] = max(p.future[i, k], added + p.future[j, k + shift])
+
+
+@kernel
+def after(p: Problem, i: int, e: int) -> float:
+    """``future`` of message i that ends at byte e."""
+    return float(p.future[i, e // p.grid - p.c[i] // p.grid])
+
+
+@kernel
+def most(p: Problem) -> float:
+    """No plan gains more than this."""
+    gain = 0.0
+    for i in range(len(p.c)):
+        if p.limit[i] >= 0 and p.c[i] + p.size[i] <= p.ends:
+            gain = max(gain, after(p, i, p.c[i] + p.size[i]))
+    return gain
+
+
+@kernel
+def guided(p: Problem, plan: NDArray[np.int64]) -> tuple[int, float]:
+    """(length, gain) of one good plan, whose next message is always the one that looks best by ``future``."""
+    i, e, gain, length = -1, 0, 0.0, 0
+    while True:
+        best_look, chosen, chosen_e, chosen_gain = -1.0, -1, 0, 0.0
+        for j in range(i + 1, len(p.c)):
+            if i >= 0 and p.between[j] > i and p.idle[j] >= e:
+                break
+            s = max(e, p.c[j])
+            if s - p.c[j] > p.limit[j] or s + p.size[j] > p.ends:
+                continue
+            added = value(p.v, p.x[j] - p.x[i]) if i >= 0 else 0.0
+            look = added + after(p, j, s + p.size[j])
+            if look > best_look:
+                best_look, chosen, chosen_e, chosen_gain = look, j, s + p.size[j], added
+        if chosen < 0:
+            return length, gain
+        plan[length] = chosen
+        length += 1
+        i, e = chosen, chosen_e
+        gain += chosen_gain
+
+
+# --- labels ----------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def extend(
+    p: Problem,
+    enough: float,
+    begin: int,
+    first: NDArray[np.int64],
+    latest: NDArray[np.int64],
+    end: NDArray[np.int64],
+    gain: NDArray[np.float64],
+    parent: NDArray[np.int64],
+) -> int:
+    """Find the labels of messages ``begin``, begin + 1, ...; return the one at which the room ran out, or n.
+
+    ``latest[j]``: the latest end of any label at messages before j.
+    """
+    room, enough = len(end), enough - _ROUNDING
+    for i in range(begin, len(p.c)):
+        at = stop = first[i]
+        c_i, limit = p.c[i], min(p.limit[i], p.ends - p.size[i] - p.c[i])
+        if stop + 2 > room:
+            return i
+        if limit >= 0 and after(p, i, c_i + p.size[i]) >= enough:
+            end[stop], gain[stop], parent[stop] = c_i + p.size[i], 0.0, -1
+            stop += 1
+        for j in range(i - 1, -1, -1):
+            too_early = p.idle[i] if j < p.between[i] else -1
+            if limit < 0 or latest[j + 1] <= too_early:
+                break
+            added = -1.0
+            for k in range(first[j + 1] - 1, first[j] - 1, -1):
+                if end[k] <= too_early:
+                    break
+                s = max(end[k], c_i)
+                if s - c_i > limit:
+                    continue
+                if added < 0:
+                    added = value(p.v, p.x[i] - p.x[j])
+                if gain[k] + added + after(p, i, s + p.size[i]) >= enough:
+                    stop = insert(at, stop, end, gain, parent, s + p.size[i], gain[k] + added, k)
+                    if stop == room:
+                        return i
+                if s == c_i:
+                    break  # earlier ends of j do not help i to begin earlier, and have gained less
+        first[i + 1] = stop
+        latest[i + 1] = max(latest[i], end[stop - 1] if stop > at else 0)
+    return len(p.c)
+
+
+@kernel
+def insert(
+    at: int,
+    stop: int,
+    end: NDArray[np.int64],
+    gain: NDArray[np.float64],
+    parent: NDArray[np.int64],
+    e: int,
+    g: float,
+    label: int,
+) -> int:
+    """Put (e, g) among the labels ``at..stop``, unless one is better, and drop those that it beats: the new stop.
+
+    Of two that are the same the newcomer stays: its way there began with an older message.
+    """
+    low, high = at, stop
+    while low < high:  # the first that ends later than e
+        middle = (low + high) // 2
+        if end[middle] <= e:
+            low = middle + 1
+        else:
+            high = middle
+    if low > at and (gain[low - 1] > g or (gain[low - 1] == g and end[low - 1] < e)):
+        return stop
+    if low > at and end[low - 1] == e:
+        low -= 1
+    beaten = low
+    while beaten < stop and gain[beaten] <= g:
+        beaten += 1
+    moved = low + 1 - beaten
+    if moved > 0:
+        for k in range(stop, low, -1):
+            end[k], gain[k], parent[k] = end[k - 1], gain[k - 1], parent[k - 1]
+    elif moved < 0:
+        for k in range(beaten, stop):
+            end[k + moved], gain[k + moved], parent[k + moved] = end[k], gain[k], parent[k]
+    end[low], gain[low], parent[low] = e, g, label
+    return stop + moved

@@ -1,0 +1,242 @@
+"""The online optimum: the best that any policy can do in one interruption whose length T it does not know.
+
+The model is ``bufgym.scenario.Interruption``: message 0 is sent before, messages 1..T arrive one a period, T + 1 is
+sent after; at most L are kept meanwhile. T has a known law; a policy learns only, arrival by arrival, that T is not
+smaller. The optimum is exact, by dynamic programming backwards over the sets of kept messages.
+
+Two facts keep it small. First, an arrival that finds room is best accepted: V is concave, so more messages never inform
+less, and whoever keeps a superset can imitate every later decision. So only full queues need a decision, L of the
+messages 1..t after t arrivals. Second, sets are numbered in colexicographic order (combinatorial number system): the
+set p_1 < ... < p_L is number C(p_1 - 1, 1) + ... + C(p_L - 1, L), whatever t is. The sets without message t + 1 come
+before those with it, so the values after t arrivals overwrite those after t + 1 where they stand, and the decision on
+message t + 1 is numbered like the set of L + 1 messages of which one must go.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bufgym.buffer import ACCEPT, REJECT, Buffer
+from bufgym.errors import BufgymError
+from bufgym.kernel import kernel
+from bufgym.oracle.interruption import integer
+from bufgym.policies.gaps import min_gap
+from bufgym.policies.registry import Policy
+from bufgym.qoi import Value
+from bufgym.scenario import Interruption
+
+OBJECTIVES = ("ratio", "qoi")
+
+# Binomial coefficients above this belong to no state that fits into memory.
+_MOST = 2**61
+
+
+def law(scenario: Interruption) -> NDArray[np.float64]:
+    """P(T = t) for t = 0..t_max (shape [t_max + 1]), exactly as ``scenario.draw_length`` draws T."""
+    if not isinstance(scenario, Interruption):
+        raise BufgymError(f"law: {scenario!r} is not an Interruption")
+    t_min, t_max = scenario.t_min, scenario.t_max
+    p = np.zeros(t_max + 1)
+    t = np.arange(t_min, t_max + 1)
+    if scenario.law == "fixed":
+        p[t_max] = 1.0
+    elif scenario.law == "uniform":
+        p[t] = 1 / len(t)
+    elif scenario.law == "log-uniform":
+        p[t] = np.log1p(1 / t) / math.log((t_max + 1) / t_min)
+    else:
+        stays = 1 - 1 / (scenario.t_mean - t_min + 1)
+        p[t] = (1 - stays) * stays ** (t - t_min)
+        p[t_max] = stays ** (t_max - t_min)  # all that is cut off
+    if scenario.lengths:
+        p[[T for T in range(t_max + 1) if T not in scenario.lengths]] = 0.0
+        p /= p.sum()
+    return p
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineOptimum:
+    """The best mean over T that a policy can reach without knowing T, and the decisions that reach it."""
+
+    capacity: int
+    """L, messages."""
+    value_function: Value
+    probabilities: NDArray[np.float64]
+    """P(T = t), t = 0..t_max, the longest possible length."""
+    objective: str
+    value: float
+    """The optimum: mean of (H - 1) / ``oracle.integer`` for "ratio", of H - 1 for "qoi" (H counts message 0)."""
+    decisions: NDArray[Any] = field(repr=False)
+    """[C(t_max, L + 1)], by number of the set of L + 1 messages: which of them goes (0 = oldest, L = newcomer)."""
+
+    @property
+    def t_max(self) -> int:
+        """The longest interruption that the law allows, messages."""
+        return len(self.probabilities) - 1
+
+    def decision(self, positions: Sequence[int]) -> int:
+        """What to do when the last of ``positions``, 1 <= p_1 < ... <= t_max, arrives and the others are queued.
+
+        A position counts arrivals: message p is the p-th of the interruption. Returns a slot to evict (0 = oldest),
+        REJECT, or ACCEPT where there is room.
+        """
+        if not self._knows(positions):
+            raise BufgymError(
+                f"positions {list(positions)}: must be 1 to {self.capacity + 1} rising numbers from 1 to {self.t_max}"
+            )
+        if len(positions) <= self.capacity:
+            return ACCEPT
+        slot = int(self.decisions[sum(math.comb(p - 1, k) for k, p in enumerate(positions, 1))])
+        return slot if slot < self.capacity else REJECT
+
+    def _knows(self, positions: Sequence[int]) -> bool:
+        rising = all(a < b for a, b in itertools.pairwise(positions))
+        return rising and 0 < len(positions) <= self.capacity + 1 and 1 <= positions[0] and positions[-1] <= self.t_max
+
+    def policy(self) -> Policy:
+        """The optimum as a policy of that L, for the simulator and the environments; it runs uncompiled.
+
+        A message's position is its arrival time after that of the message the socket took last, in periods (their
+        running mean), rounded. Sequence numbers would do in ``Interruption`` alone: times also fit a link that stops
+        in mid-stream. A full queue that the table lacks (an arrival after t_max, two messages in one period) is left
+        to min-gap. Another L than it was made for is an error.
+        """
+        return Policy(f"online-optimum:L={self.capacity}", self._on_arrival, source="dynamic programme, exact")
+
+    def _on_arrival(self, buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+        """A full queue drops what the exact dynamic programme over the unknown length T drops."""
+        if buffer.capacity != self.capacity:
+            raise BufgymError(f"online-optimum: made for L = {self.capacity}, but the buffer has L = {buffer.capacity}")
+        if len(buffer.slots) < self.capacity:
+            return ACCEPT
+        if buffer.period_us > 0:
+            times_us = [*buffer.slots["arrival_us"].tolist(), int(arrival.arrival_us)]
+            positions = [round((us - int(buffer.taken_us)) / float(buffer.period_us)) for us in times_us]
+            if self._knows(positions):
+                return self.decision(positions)
+        return min_gap(buffer, arrival, memory)
+
+
+def online_optimum(
+    capacity: int,
+    probabilities: ArrayLike,
+    v: Value,
+    *,
+    objective: str = "ratio",
+    max_states: int = 50_000_000,
+) -> OnlineOptimum:
+    """Solve for L = ``capacity`` and P(T = t), t = 0, 1, ... (such as ``law(scenario)``).
+
+    ``objective``: "ratio" for the mean of (H - 1) / ``oracle.integer``, "qoi" for the mean of H - 1. There are
+    C(t_max + 1, L + 1) states, at most 9 bytes each; more than ``max_states`` are refused.
+    """
+    if isinstance(capacity, bool) or not isinstance(capacity, int | np.integer) or capacity < 1:
+        raise BufgymError(f"capacity = {capacity!r}: L must be a whole number >= 1")
+    if not isinstance(v, Value):
+        raise BufgymError(f"v = {v!r}: must be a bufgym.qoi Value, such as qoi.exponential(0.618)")
+    if objective not in OBJECTIVES:
+        raise BufgymError(f"objective = {objective!r}: must be one of {', '.join(OBJECTIVES)}")
+    L, p = int(capacity), _checked(probabilities)
+    t_max = len(p) - 1
+    _check_states(L, t_max, max_states)
+    weight = p / [integer(L, t, v) for t in range(t_max + 1)] if objective == "ratio" else p
+    gain = np.array([v(d) for d in range(t_max + 2)])
+    value = math.fsum(weight[t] * (t + 1) * gain[1] for t in range(min(L, t_max + 1)))  # room for all
+    decisions = np.zeros(math.comb(t_max, L + 1), np.min_scalar_type(L))
+    if t_max >= L:
+        best = np.empty(math.comb(t_max, L))
+        _solve(gain, weight, _binomials(t_max, L), np.zeros(L + 2, np.int64), best, decisions)
+        value += best[0]  # of messages 1..L
+    for array in (p, decisions):
+        array.flags.writeable = False
+    return OnlineOptimum(L, v, p, objective, float(value), decisions)
+
+
+@kernel
+def _solve(
+    gain: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    binomial: NDArray[np.int64],
+    kept: NDArray[np.int64],
+    best: NDArray[np.float64],
+    decisions: NDArray[Any],
+) -> None:
+    """Fill ``best`` and ``decisions`` backwards from t_max arrivals to L; ties drop the oldest.
+
+    ``gain``: V(0..t_max + 1); ``weight``: what T = t counts; ``binomial[n, k]`` = C(n, k); ``kept``: int64[L + 2],
+    work space for message 0, the queued ones, and the one sent after. ``best[r]``: what is still to be expected with
+    the queued set number r, times the probability of having come so far.
+    """
+    t_max, L = len(weight) - 1, len(kept) - 2
+    for t in range(t_max, L - 1, -1):
+        for k in range(L + 1):
+            kept[k] = k
+        kept[L + 1] = t + 1
+        for r in range(binomial[t, L]):
+            gained = 0.0
+            for k in range(L + 1):
+                gained += gain[kept[k + 1] - kept[k]]
+            later = 0.0
+            if t < t_max:
+                # The number of the next set, with message t + 1: those behind the evicted move up a place.
+                evicted = binomial[t, L]
+                for k in range(2, L + 1):
+                    evicted += binomial[kept[k] - 1, k - 1]
+                later, slot = best[evicted], 0
+                for k in range(1, L):
+                    evicted += binomial[kept[k] - 1, k] - binomial[kept[k + 1] - 1, k]
+                    if best[evicted] > later:
+                        later, slot = best[evicted], k
+                if best[r] > later:
+                    later, slot = best[r], L
+                decisions[binomial[t, L + 1] + r] = slot
+            best[r] = weight[t] * gained + later
+            # The next set in colexicographic order.
+            k = 1
+            while k < L and kept[k] + 1 == kept[k + 1]:
+                kept[k] = k
+                k += 1
+            kept[k] += 1
+
+
+def _binomials(t_max: int, L: int) -> NDArray[np.int64]:
+    """C(n, k), int64[t_max + 1, L + 2]."""
+    table = np.zeros((t_max + 1, L + 2), np.int64)
+    table[:, 0] = 1
+    for n in range(1, t_max + 1):
+        table[n, 1:] = np.minimum(_MOST, table[n - 1, 1:] + table[n - 1, :-1])
+    return table
+
+
+def _checked(probabilities: ArrayLike) -> NDArray[np.float64]:
+    """A copy without the lengths at its end that cannot happen."""
+    try:
+        p = np.array(probabilities, np.float64)
+    except (TypeError, ValueError):
+        raise BufgymError(f"probabilities = {probabilities!r}: must be numbers P(T = 0), P(T = 1), ...") from None
+    if p.ndim != 1 or len(p) == 0:
+        raise BufgymError(f"probabilities of shape {p.shape}: must be a list P(T = 0), P(T = 1), ... of at least one")
+    wrong = np.flatnonzero(~(np.isfinite(p) & (p >= 0)))
+    if len(wrong):
+        raise BufgymError(f"probabilities: P(T = {wrong[0]}) = {p[wrong[0]]:g}: must be a number >= 0")
+    total = math.fsum(p)
+    if abs(total - 1) > 1e-9:
+        raise BufgymError(f"probabilities add up to {total:.12g}: must add up to 1")
+    return p[: np.flatnonzero(p)[-1] + 1].copy()
+
+
+def _check_states(L: int, t_max: int, max_states: int) -> None:
+    if t_max < L:
+        return
+    # By logarithms first: the exact number can have a hundred thousand digits.
+    log10 = (math.lgamma(t_max + 2) - math.lgamma(L + 2) - math.lgamma(t_max - L + 1)) / math.log(10)
+    if log10 > 18 or math.comb(t_max + 1, L + 1) > max_states:
+        states = f"about 10^{log10:.0f}" if log10 > 18 else str(math.comb(t_max + 1, L + 1))
+        raise BufgymError(f"online optimum: L = {L}, T up to {t_max}: {states} states: max_states = {max_states}")

@@ -1,0 +1,116 @@
+"""What robots' middleware does today: ROS, DDS, Zenoh, Foxglove and rosbridge, by their settings' own names.
+
+Most keep the newest or reject the newcomer, as `drop-oldest` and `drop-newest` do; they have names of their own here so
+that a table can be read by those who run them. None knows what a message is worth.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.buffer import ACCEPT, REJECT, Buffer
+from bufgym.policies.classic import keep_first, keep_last
+from bufgym.policies.registry import register
+
+
+@register(
+    "ros-keep-last",
+    memory={"depth": 10.0},
+    parameters=("depth",),
+    source="ROS 2 QoS history KEEP_LAST(depth), default 10",
+    compile=True,
+)
+def ros_keep_last(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """ROS 2 KEEP_LAST: the oldest unsent message goes when `depth` wait (at most L)."""
+    return keep_last(len(buffer.slots), min(memory[0], buffer.capacity))
+
+
+@register("dds-keep-all", source="DDS QoS HISTORY KEEP_ALL with best-effort RELIABILITY", compile=True)
+def dds_keep_all(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """DDS KEEP_ALL, best effort: a full queue rejects the newcomer; reliable would block the publisher instead."""
+    return keep_first(len(buffer.slots), buffer.capacity)
+
+
+def expired(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
+    """Whether the head has outlived its lifespan; those behind it are younger."""
+    return bool(buffer.now_us - buffer.slots[0].arrival_us > 1e6 * memory[0])
+
+
+@register(
+    "lifespan",
+    memory={"lifespan_s": 0.5},
+    parameters=("lifespan_s",),
+    on_dequeue=expired,
+    source="DDS QoS LIFESPAN",
+    compile=True,
+)
+def lifespan(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """DDS LIFESPAN: nothing older than `lifespan_s` is sent; the head goes when full.
+
+    DDS removes a message when it expires, here it goes when it would be sent: until then it is the next to go anyway.
+    """
+    return keep_last(len(buffer.slots), buffer.capacity)
+
+
+@register(
+    "time-filter",
+    memory={"separation_s": 0.1},
+    parameters=("separation_s",),
+    source="DDS QoS TIME_BASED_FILTER, minimum_separation",
+    compile=True,
+)
+def time_filter(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """DDS TIME_BASED_FILTER: accepts at most one message in `separation_s`; the head goes when full."""
+    s, separation_us = len(buffer.slots), 1e6 * memory[0]
+    last_us = buffer.slots[s - 1].arrival_us if s > 0 else buffer.taken_us  # the tail is never dropped before the head
+    if s + buffer.taken > 0 and arrival.arrival_us - last_us < separation_us:
+        return REJECT
+    return keep_last(s, buffer.capacity)
+
+
+@register("zenoh-drop", source="Zenoh congestion control DROP", compile=True)
+def zenoh_drop(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Zenoh DROP: put drops the newcomer when full; the 1 ms that it waits for room first is left out."""
+    return keep_first(len(buffer.slots), buffer.capacity)
+
+
+@register("zenoh-ring", source="Zenoh RingChannel(L)", compile=True)
+def zenoh_ring(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Zenoh RingChannel: keeps the newest L."""
+    return keep_last(len(buffer.slots), buffer.capacity)
+
+
+@register(
+    "foxglove-sdk",
+    memory={"depth": 1024.0},
+    parameters=("depth",),
+    source="foxglove-sdk, message backlog of a client, default 1024",
+    compile=True,
+)
+def foxglove_sdk(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Foxglove SDK: a client's oldest message goes when `depth` wait (at most L)."""
+    return keep_last(len(buffer.slots), min(memory[0], buffer.capacity))
+
+
+@register(
+    "foxglove-backlog",
+    memory={"limit_mb": 10.0},
+    parameters=("limit_mb",),
+    source="ros-foxglove-bridge, send_buffer_limit, default 10 MB",
+    compile=True,
+)
+def foxglove_backlog(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """ros-foxglove-bridge: drops the newcomer when all bytes not yet sent, with it, reach `limit_mb`, or none fits."""
+    buffered_bytes = buffer.backlog_bytes + buffer.left_bytes
+    if buffered_bytes + arrival.size_bytes >= 1e6 * memory[0]:
+        return REJECT
+    return keep_first(len(buffer.slots), buffer.capacity)
+
+
+@register("rosbridge", unbounded=True, source="rosbridge_server, unbounded outgoing queue", compile=True)
+def rosbridge(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """rosbridge: accepts everything, however long the queue grows."""
+    return ACCEPT

@@ -1,0 +1,380 @@
+"""The statistics of a benchmark, by hand: scores, interquartile mean, improvement, paired bootstrap intervals."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import random
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bufgym.benchmark import score
+from bufgym.benchmark.score import CellScore, Interval, Scores, Standing
+from bufgym.errors import BufgymError
+
+
+def rows_of(
+    h: Mapping[str, Sequence[float]],
+    best: Sequence[float | None],
+    *,
+    scenario: str = "lte",
+    capacity: int = 4,
+    traces: Sequence[str] = (),
+    **more: Any,
+) -> list[dict[str, Any]]:
+    """One cell: H by policy and episode, clairvoyant H by episode; seeds count up within one trace unless named."""
+    return [
+        {
+            "scenario": scenario,
+            "trace": traces[i] if traces else "t",
+            "seed": i,
+            "capacity": capacity,
+            "policy": policy,
+            "qoi": qoi,
+            "clairvoyant": best[i],
+            "certified": True,
+            **more,
+        }
+        for policy, values in h.items()
+        for i, qoi in enumerate(values)
+    ]
+
+
+def cell_of(made: Scores, policy: str, scenario: str = "lte", capacity: int = 4) -> CellScore:
+    (found,) = (c for c in made.cells if (c.policy, c.scenario, c.capacity) == (policy, scenario, capacity))
+    return found
+
+
+def standing_of(made: Scores, policy: str) -> Standing:
+    (found,) = (s for s in made.standings if s.policy == policy)
+    return found
+
+
+def width(interval: Interval) -> float:
+    return interval.high - interval.low
+
+
+TWO_CELLS = [
+    *rows_of({"drop-oldest": [10, 20], "afr": [12, 22], "mine": [14, 21]}, [14, 24]),
+    *rows_of({"drop-oldest": [5, 5], "afr": [6, 6], "mine": [6, 8]}, [10, 10], capacity=2),
+]
+"""Sums at L = 4: 30, 34, 35, clairvoyant 38. At L = 2: 10, 12, 14, clairvoyant 20."""
+
+
+def test_scores_by_hand() -> None:
+    made = score.scores(TWO_CELLS)
+    # L = 4: (35 - 30) / (38 - 30) and 1 - 35 / 38; L = 2: (14 - 10) / (20 - 10) and 1 - 14 / 20.
+    mine = cell_of(made, "mine")
+    assert mine.score.value == pytest.approx(5 / 8)
+    assert mine.regret.value == pytest.approx(3 / 38)
+    assert mine.qoi.value == pytest.approx(17.5)
+    assert mine.difference.value == pytest.approx(0.5)  # (2 - 1) / 2
+    assert (mine.episodes, mine.bites, mine.exact) == (2, True, True)
+    assert cell_of(made, "mine", capacity=2).score.value == pytest.approx(0.4)
+    overall = standing_of(made, "mine")
+    assert overall.score.value == pytest.approx((5 / 8 + 4 / 10) / 2)
+    assert overall.regret.value == pytest.approx((3 / 38 + 6 / 20) / 2)
+    # L = 4: one better, one worse; L = 2: one equal, one better.
+    assert overall.improvement.value == pytest.approx((1 / 2 + 3 / 4) / 2)
+    assert overall.cells == 2
+    assert [(s.policy, s.ranked) for s in made.standings] == [("mine", True), ("afr", True), ("drop-oldest", True)]
+    assert [(c.capacity, c.policy) for c in made.cells[:4]] == [
+        (2, "afr"),
+        (2, "drop-oldest"),
+        (2, "mine"),
+        (4, "afr"),
+    ]
+
+
+def test_the_scale_is_fixed_at_both_ends_and_open_beyond() -> None:
+    """Whatever is drawn: Drop Oldest scores 0, the clairvoyant 1, and an unbounded queue may pass it."""
+    best = [14, 24, 9]
+    made = score.scores(
+        rows_of({"drop-oldest": [10, 20, 7], "clairvoyant": best, "rosbridge": [16, 26, 11]}, best),
+        unranked=["clairvoyant", "rosbridge", "not there"],
+    )
+    assert standing_of(made, "drop-oldest").score == (0, 0, 0)
+    assert standing_of(made, "clairvoyant").score == pytest.approx((1, 1, 1))
+    assert standing_of(made, "clairvoyant").regret == pytest.approx((0, 0, 0))
+    assert standing_of(made, "rosbridge").score.low > 1
+    # Shown after those that are ranked, however good.
+    assert [(s.policy, s.ranked) for s in made.standings] == [
+        ("drop-oldest", True),
+        ("rosbridge", False),
+        ("clairvoyant", False),
+    ]
+
+
+def test_a_cell_that_does_not_bite_is_shown_and_not_scored() -> None:
+    """At L = 9 Drop Oldest's regret is 1 / 200 < 1 %; at L = 8 it is 2 / 200."""
+    quiet = rows_of({"drop-oldest": [99.5, 99.5], "afr": [99, 99], "mine": [9, 9]}, [100, 100], capacity=9)
+    made = score.scores([*TWO_CELLS, *quiet])
+    assert not cell_of(made, "mine", capacity=9).bites
+    assert cell_of(made, "mine", capacity=9).score.value == pytest.approx(-181)
+    assert made.standings == score.scores(TWO_CELLS).standings
+    edge = rows_of({"drop-oldest": [99, 99], "afr": [99, 99], "mine": [99, 100]}, [100, 100], capacity=8)
+    made = score.scores([*TWO_CELLS, *edge])
+    assert cell_of(made, "afr", capacity=8).bites
+    assert standing_of(made, "mine").cells == 3
+
+
+def test_where_nothing_bites_there_are_no_standings() -> None:
+    """No clairvoyant at all, one missing episode of it, or Drop Oldest as good as the clairvoyant."""
+    h = {"drop-oldest": [10, 20], "afr": [10, 20]}
+    for best in ([None, None], [14, None], [10, 20]):
+        made = score.scores(rows_of(h, best))
+        cell = cell_of(made, "afr")
+        assert not cell.bites
+        assert all(math.isnan(number) for number in cell.score)
+        assert all(math.isnan(number) for number in cell.regret) == (None in best)
+        assert cell.qoi.value == 15
+        overall = standing_of(made, "afr")
+        assert overall.cells == 0
+        for name in ("score", "iqm", "regret", "improvement"):
+            assert all(math.isnan(number) for number in getattr(overall, name))
+    assert not cell_of(score.scores(rows_of(h, [14, 24], certified=False)), "afr").exact
+
+
+def test_interquartile_mean_by_hand() -> None:
+    assert score.interquartile_mean([100, 2, 3, -50]) == 2.5
+    assert score.interquartile_mean([1, 2, 6]) == 3  # floor(3 / 4) = 0 are cut
+    assert score.interquartile_mean([9, 1, 2, 3, 4, 5, 0]) == pytest.approx(3)  # 1 is cut at either end
+    assert score.interquartile_mean([100, 2, math.nan, 3, -50]) == 2.5
+    assert math.isnan(score.interquartile_mean([]))
+    assert math.isnan(score.interquartile_mean([math.nan]))
+
+
+def test_interquartile_mean_is_scipys() -> None:
+    stats = pytest.importorskip("scipy.stats")
+    rng = np.random.default_rng(0)
+    for n in range(1, 40):
+        x = rng.normal(size=n).round(1)
+        assert score.interquartile_mean(x) == pytest.approx(stats.trim_mean(x, 0.25))
+
+
+def test_the_interquartile_mean_of_traces_by_hand() -> None:
+    """Base 0 and clairvoyant 10 an episode: scores of the traces a..d are 0.1, 0.2, 0.4 and 0.9, of e 0/0.
+
+    c's two episodes count as one task: (3 + 5) / 20 = 0.4. The middle half: (0.2 + 0.4) / 2.
+    """
+    h = {"drop-oldest": [0, 0, 0, 0, 0, 7], "mine": [1, 2, 3, 5, 9, 7]}
+    rows = rows_of(h, [10, 10, 10, 10, 10, 7], traces=["a", "b", "c", "c", "d", "e"])
+    made = score.scores(rows)
+    assert standing_of(made, "mine").iqm.value == pytest.approx(0.3)
+    assert standing_of(made, "mine").score.value == pytest.approx(20 / 50)
+
+
+def test_a_resampled_trace_weighs_as_often_as_it_was_drawn() -> None:
+    """[1, 2, 3, 10] where 10 was drawn thrice and 1 once: a quarter of the weight 4 goes at either end."""
+    values = np.array([[1.0, 2.0, 3.0, 10.0]] * 3)
+    weights = np.array([[1.0, 1, 1, 1], [1, 0, 0, 3], [0, 2, 2, 0]])
+    assert score._interquartile_means(values, weights) == pytest.approx([2.5, 10, 2.5])
+    # One episode a trace: as wide as it is when episodes are drawn one by one, computed the slow way.
+    rng = np.random.default_rng(1)
+    h = rng.uniform(0, 10, 40)
+    traces = [f"{i:02}" for i in range(40)]
+    made = standing_of(score.scores(rows_of({"drop-oldest": [0] * 40, "mine": h}, [10] * 40, traces=traces)), "mine")
+    naive = [score.interquartile_mean(rng.choice(h / 10, 40)) for _ in range(2000)]
+    assert made.iqm.value == pytest.approx(score.interquartile_mean(h / 10))
+    assert (made.iqm.low, made.iqm.high) == pytest.approx(np.percentile(naive, [2.5, 97.5]), abs=0.02)
+
+
+# rliable itself asks for versions of other packages that current pandas rules out: hence numbers worked by hand, and
+# the test statistic that it is made of.
+def test_probability_of_improvement_by_hand() -> None:
+    """x = 1, 3, 5 over y = 2, 3: pairs (1, .) lose both, (3, .) win and tie, (5, .) win both: 3.5 of 6."""
+    assert score.probability_of_improvement([1, 3, 5], [2, 3]) == pytest.approx(3.5 / 6)
+    assert score.probability_of_improvement([2, 3], [1, 3, 5]) == pytest.approx(2.5 / 6)
+    # A second task in which x always wins: the mean over tasks.
+    assert score.probability_of_improvement([[1, 9], [3, 9], [5, 9]], [[2, 8], [3, 8]]) == pytest.approx(9.5 / 12)
+    assert math.isnan(score.probability_of_improvement([], [1]))
+    assert math.isnan(score.probability_of_improvement([1], [math.nan]))
+    with pytest.raises(BufgymError, match=r"shapes \(1, 2\) and \(1, 3\)"):
+        score.probability_of_improvement([[1, 2]], [[1, 2, 3]])
+
+
+def test_probability_of_improvement_is_mann_whitneys() -> None:
+    stats = pytest.importorskip("scipy.stats")
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, 9, (30, 4)), rng.integers(0, 8, (20, 4))
+    by_task = [stats.mannwhitneyu(x[:, k], y[:, k]).statistic / 600 for k in range(4)]
+    assert score.probability_of_improvement(x, y) == pytest.approx(np.mean(by_task))
+
+
+def test_equal_but_for_rounding_is_a_tie() -> None:
+    rows = rows_of({"drop-oldest": [0.1], "afr": [0.1 + 0.2], "mine": [0.3]}, [1])
+    assert standing_of(score.scores(rows), "mine").improvement == (0.5, 0.5, 0.5)
+
+
+def test_episodes_that_are_all_alike_leave_no_doubt() -> None:
+    made = score.scores(rows_of({"drop-oldest": [5.0] * 9, "afr": [7.0] * 9}, [9.0] * 9))
+    overall = standing_of(made, "afr")
+    assert overall.score == pytest.approx((0.5, 0.5, 0.5))
+    assert overall.regret == pytest.approx((2 / 9, 2 / 9, 2 / 9))
+    assert overall.iqm == pytest.approx((0.5, 0.5, 0.5))
+    assert overall.improvement == (0.5, 0.5, 0.5)
+    assert cell_of(made, "afr").difference == (0, 0, 0)
+
+
+def noisy(n: int, seed: int = 0, shared: float = 5.0) -> dict[str, Any]:
+    """The parts of a cell in which Drop Oldest has b, AFR about b + 1 and the clairvoyant b + 2 in every episode."""
+    rng = np.random.default_rng(seed)
+    b = rng.normal(20, shared, n)
+    return {"h": {"drop-oldest": b, "afr": b + 1 + rng.normal(0, 0.5, n)}, "best": list(b + 2)}
+
+
+def test_intervals_hold_their_value_and_shrink_with_the_square_root() -> None:
+    intervals = [
+        standing_of(score.scores(rows_of(**noisy(n)), confidence=confidence), "afr").score
+        for n, confidence in ((25, 0.95), (400, 0.95), (400, 0.5))
+    ]
+    assert all(low < value < high for value, low, high in intervals)
+    few, many, half = map(width, intervals)
+    assert 2.5 < few / many < 6.5  # 4 but for luck
+    assert many / half == pytest.approx(1.96 / 0.674, rel=0.15)
+
+
+def test_the_interval_holds_the_truth_as_often_as_it_says() -> None:
+    """300 experiments of 40 normal differences of mean 1: 95 % but for what a bootstrap of 40 lacks, and luck."""
+    rng = np.random.default_rng(3)
+    held = 0
+    for k in range(300):
+        ours, theirs = rng.normal(1, 2, 40), np.zeros(40)
+        _, low, high = score.paired_difference(ours, theirs, resamples=500, seed=k)
+        held += low <= 1 <= high
+    assert 0.89 < held / 300 < 0.98
+
+
+def test_the_interval_of_a_score_holds_the_truth_too() -> None:
+    """The score of AFR in ``noisy`` is 1/2."""
+    held = 0
+    for k in range(100):
+        _, low, high = cell_of(score.scores(rows_of(**noisy(30, seed=k)), resamples=300, seed=k), "afr").score
+        held += low <= 0.5 <= high
+    assert 0.84 < held / 100 <= 0.99
+
+
+def test_a_difference_of_two_means_by_hand() -> None:
+    assert score.paired_difference([3, 5], [1, 4]).value == 1.5
+    assert score.paired_difference([4, 5], [1, 2]) == (3, 3, 3)
+    assert all(math.isnan(number) for number in score.paired_difference([], []))
+    with pytest.raises(BufgymError, match=r"shapes \(2,\) and \(1,\)"):
+        score.paired_difference([1, 2], [1])
+
+
+def test_what_an_episode_is_worth_to_everybody_cancels() -> None:
+    """Adding a constant per episode to all policies moves neither differences nor improvements nor scores."""
+    calm, wild = noisy(50, shared=0.0), noisy(50, shared=0.0)
+    worth = np.random.default_rng(9).normal(0, 3, 50)
+    wild["h"] = {policy: values + worth for policy, values in wild["h"].items()}
+    wild["best"] = [b + w for b, w in zip(wild["best"], worth, strict=True)]
+    one, other = (score.scores(rows_of(**cell), reference="drop-oldest") for cell in (calm, wild))
+    assert cell_of(one, "afr").difference == pytest.approx(cell_of(other, "afr").difference)
+    assert cell_of(one, "afr").score == pytest.approx(cell_of(other, "afr").score)
+    assert standing_of(one, "afr").improvement == standing_of(other, "afr").improvement
+    assert width(cell_of(other, "afr").qoi) > 3 * width(cell_of(one, "afr").qoi)  # means do move
+    assert width(cell_of(other, "afr").difference) < 0.5 * width(cell_of(other, "afr").qoi)
+
+
+def test_all_capacities_of_a_scenario_share_their_draws() -> None:
+    """Two capacities with the same H are one cell twice, two scenarios are two: the mean of two varies less."""
+    cell = noisy(60)
+    once = standing_of(score.scores(rows_of(**cell)), "afr").score
+    twice = [*rows_of(**cell), *rows_of(**cell, capacity=8)]
+    assert standing_of(score.scores(twice), "afr").score == pytest.approx(once)
+    apart = [*rows_of(**cell), *rows_of(**cell, scenario="other")]
+    assert width(standing_of(score.scores(apart), "afr").score) == pytest.approx(width(once) / math.sqrt(2), rel=0.15)
+
+
+def test_neither_order_nor_company_matters() -> None:
+    rows = [
+        *rows_of(**noisy(20), traces=["b", "a"] * 10),
+        *rows_of(**noisy(15, seed=1), scenario="wifi"),
+    ]
+    made = score.scores(rows)
+    shuffled = random.Random(0).sample(rows, len(rows))
+    assert score.scores(shuffled) == made
+    assert score.scores(rows, seed=1) != made
+    third = [{**row, "policy": "third"} for row in rows if row["policy"] == "afr"]
+    assert standing_of(score.scores([*third, *rows]), "afr") == standing_of(made, "afr")
+
+
+def test_training_seeds_widen_the_interval() -> None:
+    """Agents 1, 2, 3 that gain 0.5, 1 and 1.5 of 2: on average the same as one that always gains 1."""
+    cell = noisy(100)
+    b = cell["h"]["drop-oldest"]
+    noise = cell["h"]["afr"] - b - 1
+    rows = rows_of(**cell)
+    rows += [r for k in (1, 2, 3) for r in rows_of({"agent": b + k / 2 + noise}, cell["best"], training_seed=k)]
+    made = score.scores(rows)
+    agent, afr = standing_of(made, "agent"), standing_of(made, "afr")
+    assert agent.score.value == pytest.approx(afr.score.value)
+    assert agent.improvement.value == 0.5
+    # Three draws of 1/4, 1/2, 3/4 have a mean of 1/4 or 3/4 once in 27 each: 3.7 % > 2.5 %.
+    assert agent.score[1:] == pytest.approx((0.25, 0.75), abs=0.1)
+    assert width(agent.score) > 5 * width(afr.score)
+    assert width(agent.improvement) == 1
+    # One training seed is nothing to draw from, and a policy's own rows are not touched by others'.
+    single = [dict(row, training_seed=7) if row["policy"] == "afr" else row for row in rows_of(**cell)]
+    assert standing_of(score.scores(single), "afr") == standing_of(score.scores(rows_of(**cell)), "afr") == afr
+    # As a reference, the agent is its own equal in every draw.
+    self_compared = score.scores(rows, reference="agent")
+    assert standing_of(self_compared, "agent").improvement == pytest.approx((0.5, 0.5, 0.5))
+
+
+def test_without_a_reference_there_is_no_improvement() -> None:
+    made = score.scores(TWO_CELLS, reference="nobody")
+    assert all(math.isnan(number) for number in standing_of(made, "mine").improvement)
+    assert all(math.isnan(number) for number in cell_of(made, "mine").difference)
+    assert standing_of(made, "mine").score == standing_of(score.scores(TWO_CELLS), "mine").score
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([], "no rows"),
+        ([{"trace": "t", "seed": 0}], "rows[0]: no scenario"),
+        ([*TWO_CELLS, {**TWO_CELLS[0], "qoi": None}], "rows[12]: no qoi"),
+        ([*TWO_CELLS, TWO_CELLS[0]], "drop-oldest at lte, L = 4, trace t, seed 0: more than one row"),
+        (TWO_CELLS[2:], "lte, L = 4: no row of the baseline 'drop-oldest'"),
+        (TWO_CELLS[:6] + TWO_CELLS[8:], "lte, L = 2: no row of the baseline 'drop-oldest'"),
+        (TWO_CELLS[:3] + TWO_CELLS[4:], "afr at lte, L = 4, trace t, seed 1: no row"),
+        (TWO_CELLS[:10], "mine at lte, L = 2, trace t, seed 0: no row"),
+        (
+            [*TWO_CELLS, {**TWO_CELLS[4], "training_seed": 3}],
+            "mine, training seed 3 at lte, L = 2, trace t, seed 0: no row",
+        ),
+        (
+            [*TWO_CELLS[:-1], {**TWO_CELLS[-1], "clairvoyant": 10.5}],
+            "mine at lte, L = 2, trace t, seed 1: clairvoyant = 10.5, but 10.0 for drop-oldest",
+        ),
+    ],
+)
+def test_rows_that_do_not_fit_together(rows: list[dict[str, Any]], message: str) -> None:
+    with pytest.raises(BufgymError, match=re.escape(message)):
+        score.scores(rows)
+
+
+def test_rows_that_lack_the_clairvoyant_alone_still_fit() -> None:
+    rows = [dict(row, clairvoyant=None) if row["policy"] == "mine" else row for row in TWO_CELLS]
+    assert score.scores(rows) == score.scores(TWO_CELLS)
+
+
+@pytest.mark.parametrize("wrong", [{"resamples": 0}, {"confidence": 1.0}, {"confidence": 95}])
+def test_wrong_settings(wrong: dict[str, Any]) -> None:
+    (name,) = wrong
+    with pytest.raises(BufgymError, match=name):
+        score.scores(TWO_CELLS, **wrong)
+    with pytest.raises(BufgymError, match=name):
+        score.paired_difference([1], [2], **wrong)
+
+
+def test_results_cannot_be_changed() -> None:
+    made = score.scores(TWO_CELLS)
+    for thing in (made, made.cells[0], made.standings[0]):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            thing.policy = "other"  # type: ignore[union-attr]

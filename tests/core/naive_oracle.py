@@ -1,0 +1,96 @@
+"""The best H of all decision sequences, by trying every one on the plain-Python sender of ``naive``."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import math
+
+import naive
+
+
+class Link(naive.Link):
+    """The same link, which remembers what it was asked."""
+
+    def __init__(self, *described):
+        super().__init__(*described)
+        self.bytes_by = functools.cache(super().bytes_by)
+        self.first_time = functools.cache(super().first_time)
+
+
+class Chosen(naive.Policy):
+    """Does as it is told, one decision ahead."""
+
+    decision = None
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        return self.decision
+
+
+def fork(sender):
+    """A copy whose future does not touch this one's."""
+    twin = copy.copy(sender)
+    for name, held in vars(sender).items():
+        if isinstance(held, list | dict):
+            setattr(twin, name, held.copy())
+    return twin
+
+
+def best(link, messages, capacity, v, max_bytes=None, decide_at="arrival", first_decision=0, last_decision=math.inf):
+    """The highest H that any sequence of decisions reaches, each slot to evict, REJECT and ACCEPT tried at each."""
+    x, known = [m["x"] for m in messages], {}
+    policy = Chosen()
+
+    def options(sender, message):
+        fits = sender.fits(sender.queue, message)
+        asked = first_decision <= message["seq"] <= last_decision
+        if not asked or (fits and decide_at == "overflow"):
+            return [naive.ACCEPT]
+        slots = range(len(sender.queue))
+        can = [k for k in slots if sender.fits(sender.queue[:k] + sender.queue[k + 1 :], message)]
+        return [naive.REJECT, *([naive.ACCEPT] if fits else []), *can]
+
+    def added(before, after):
+        """What the messages received since then have added to H."""
+        return naive.information(v, [x[k] for k in after]) - naive.information(v, [x[k] for k in before])
+
+    def from_here(sender, n):
+        """The most that H can still grow once ``n`` messages have been decided on."""
+        state = (n, *(m["seq"] for m in sender.queue), None, sender.sending and sender.sending["seq"], sender.position)
+        state = (*state, sender.order[-1] if sender.order else None)
+        if state not in known:
+            known[state] = decided(sender, n)
+        return known[state]
+
+    def decided(sender, n):
+        before = list(sender.order)
+        sender = fork(sender)
+        if n == len(messages):
+            sender.advance(math.inf)
+            return added(before, sender.order)
+        message = messages[n]
+        sender.advance(message["us"])
+        most = -math.inf
+        for decision in options(sender, message):
+            after, policy.decision = fork(sender), decision
+            after.carry_out(decision, message)
+            after.previous = message
+            if after.sending is None and after.queue:
+                after.take_head(message["us"], math.floor(link.bytes_by(message["us"])))
+            most = max(most, from_here(after, n + 1))
+        return added(before, sender.order) + most
+
+    return from_here(naive.Sender(link, policy, capacity, max_bytes, decide_at), 0)
+
+
+def best_by_bytes(c, size, limit, x, v, ends):
+    """The highest H - 1 under the rules of ``bufgym.oracle.labels``: of all ways to send i last and end at byte e."""
+    ways = {}
+    for i in range(len(c)):
+        here = {c[i] + size[i]: 0.0} if limit[i] >= 0 else {}
+        for (j, e), gain in ways.items():
+            begin = max(e, c[i])
+            if begin - c[i] <= limit[i]:
+                here[begin + size[i]] = max(here.get(begin + size[i], 0.0), gain + v(x[i] - x[j]))
+        ways |= {(i, e): gain for e, gain in here.items() if e <= ends}
+    return max(ways.values(), default=0.0)

@@ -1,0 +1,237 @@
+"""Slow, obvious twins of the policies, written from their papers' descriptions: lists and dictionaries, no kernels."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+from naive_queues import (
+    ACCEPT,
+    REJECT,
+    Codel,
+    DropNewest,
+    DropOldest,
+    FoxgloveBacklog,
+    KeepLast,
+    Lifespan,
+    Policy,
+    Random,
+    Red,
+    ReplaceNewest,
+    Rosbridge,
+    Spaced,
+    one_of,
+)
+
+
+class Reservoir(Policy):
+    """Algorithm R: the n-th item takes a place of its own with probability L / n."""
+
+    n = 0
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        self.n = max(self.n, len(queue)) + 1  # what came unasked is all there
+        if len(queue) < L:
+            return ACCEPT
+        return one_of([*range(L), *[REJECT] * (self.n - L)], newcomer["luck"])
+
+    def departed(self, queue):
+        self.n = len(queue)
+
+
+class Decimate(Policy):
+    """Arrivals 1, 4, 7, ... enter a queue that drops its oldest."""
+
+    n = 0
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        self.n += 1
+        if self.n not in range(1, self.n + 1, 3):
+            return REJECT
+        return ACCEPT if len(queue) < L else 0
+
+
+class Afr(Policy):
+    """AFR: dropping rate r, counter c, dropping position p."""
+
+    def __init__(self, as_released=True):
+        self.r, self.c, self.p, self.as_released = 1, 0, 0, as_released
+
+    def departed(self, queue):
+        if self.as_released and self.p > 0:
+            self.p -= 1
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        filled = Fraction(len(queue), L)
+        low = filled <= Fraction(2, 3) if self.as_released else filled < Fraction(2, 3)
+        if self.r > 1 and low:
+            self.r //= 2
+            self.c %= self.gap(L)
+        return self.count(queue, L)
+
+    def gap(self, L):
+        return self.r
+
+    def count(self, queue, L):
+        self.c += 1
+        if self.c < self.gap(L):
+            return REJECT
+        self.c = math.fmod(self.c - self.gap(L), 1)
+        if len(queue) < L:
+            return ACCEPT
+        victim = self.p
+        self.p += 1
+        if self.p == L:
+            self.r *= 2
+            self.p = 0
+        return victim
+
+
+class MinGap(Policy):
+    """Drop what leaves the smallest gap between its neighbours, ties to the oldest; the next step is like the last."""
+
+    def __init__(self, key):
+        self.key = key
+
+    def gaps(self, queue, newcomer, last_taken, previous):
+        """The merged gap that each queued message, and last the newcomer, would leave."""
+        at = [m[self.key] for m in [last_taken, *queue, newcomer]]
+        at.append(at[-1] + at[-1] - previous[self.key])
+        return [after - before for before, after in zip(at, at[2:], strict=False)]
+
+    def full(self, queue, newcomer, L, last_taken, previous):
+        gaps = self.gaps(queue, newcomer, last_taken, previous)
+        victim = gaps.index(min(gaps))
+        return victim if victim < L else REJECT
+
+
+class OrbBuf(Policy):
+    """Drop the message with the most similar queued neighbours, the first of equals; where none has two: the tail."""
+
+    def __init__(self, v):
+        self.v = v
+
+    def full(self, queue, newcomer, L, last_taken, previous):
+        similar = [1 - self.v(c["x"] - a["x"]) for a, c in zip(queue, queue[2:], strict=False)]
+        return 1 + similar.index(max(similar)) if similar else L - 1
+
+
+class LinearAlpha(Afr):
+    """AFR with kept message i at time L (i / L)^alpha; while nothing is lowered, what finds room is kept."""
+
+    def __init__(self, alpha=1.302):
+        super().__init__()
+        self.alpha = alpha
+
+    def gap(self, L):
+        a = self.alpha
+        return float(self.r) ** a * float(L) ** (1 - a) * (float(L + self.p + 1) ** a - float(L + self.p) ** a)
+
+    def count(self, queue, L):
+        if self.r == 1 and len(queue) < L:
+            self.c = 0
+            return ACCEPT
+        return super().count(queue, L)
+
+
+class EvenReject(MinGap):
+    """A newcomer within beta even gaps of the tail goes, else the smallest gap between two neighbours closes."""
+
+    def __init__(self, beta=1.3):
+        super().__init__("us")
+        self.beta = beta
+
+    def full(self, queue, newcomer, L, last_taken, previous):
+        even = self.beta * (newcomer["us"] - last_taken["us"]) / (L + 1)
+        if newcomer["us"] - queue[-1]["us"] < even:
+            return REJECT
+        gaps = self.gaps(queue, newcomer, last_taken, previous)[:L]
+        return gaps.index(min(gaps))
+
+
+class Steady(Policy):
+    """Of the numbers m, 2m, 4m, ... (m odd) the last few are kept: s + 1 if m = 1, else s - floor(log2 m)."""
+
+    first = 0
+
+    def place(self, n, L):
+        """Two numbers want the same place if they have this in common; None: not kept."""
+        s = math.floor(math.log2(L))
+        h = max(h for h in range(n.bit_length()) if n % 2**h == 0)
+        m = n // 2**h
+        width = s + 1 if m == 1 else s - math.floor(math.log2(m))
+        return (m, h % width) if width > 0 else None
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        if not queue:
+            self.first = newcomer["seq"]
+        places = [self.place(m["seq"] - self.first + 1, L) for m in [*queue, newcomer]]
+        wanted = places.pop()
+        if wanted is None:
+            return REJECT
+        if wanted in places:
+            return places.index(wanted)
+        return ACCEPT if len(queue) < L else 0
+
+
+class GreedyQoi(Policy):
+    """The first of the slots whose eviction for the newcomer adds most; reject if none adds anything."""
+
+    def __init__(self, v):
+        self.v = v
+
+    def loss(self, a, b):
+        if "exponential" in self.v.name:
+            return self.v(a) * self.v(b)  # equal, and rounded as in the kernel
+        return self.v(a) + self.v(b) - self.v(a + b)
+
+    def full(self, queue, newcomer, L, last_taken, previous):
+        x = [m["x"] for m in [last_taken, *queue, newcomer]]
+        gain = self.v(x[-1] - x[-2])
+        added = [gain - self.loss(b - a, c - b) for a, b, c in zip(x, x[1:], x[2:], strict=False)]
+        return added.index(max(added)) if max(added) > 0 else REJECT
+
+
+class Anything(Policy):
+    """A policy that decides at random, impossible decisions included: -2 accept, -1 reject, 0 .. L + 1 a slot."""
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        return one_of([ACCEPT, REJECT, *range(L + 2)], newcomer["luck"])
+
+
+def policy(spec, v):
+    """The twin of the built-in policy of that name, with settings as in ``decimate:every=2``."""
+    makers = {
+        "drop-oldest": DropOldest,
+        "drop-newest": DropNewest,
+        "replace-newest": ReplaceNewest,
+        "latest-only": lambda: KeepLast(1),
+        "random": Random,
+        "reservoir": Reservoir,
+        "decimate": Decimate,
+        "keyframe": lambda step=0.05: Spaced("x", step),
+        "afr": Afr,
+        "afr-paper": lambda: Afr(as_released=False),
+        "linear-alpha": LinearAlpha,
+        "steady": Steady,
+        "min-gap": lambda: MinGap("us"),
+        "min-motion-gap": lambda: MinGap("x"),
+        "even-reject": EvenReject,
+        "orbbuf": lambda: OrbBuf(v),
+        "greedy-qoi": lambda: GreedyQoi(v),
+        "ros-keep-last": lambda depth=10: KeepLast(depth),
+        "dds-keep-all": DropNewest,
+        "lifespan": Lifespan,
+        "time-filter": lambda separation_s=0.1: Spaced("us", separation_s * 1e6),
+        "zenoh-drop": DropNewest,
+        "zenoh-ring": KeepLast,
+        "foxglove-sdk": lambda depth=1024: KeepLast(depth),
+        "foxglove-backlog": FoxgloveBacklog,
+        "rosbridge": Rosbridge,
+        "codel": Codel,
+        "red": Red,
+        "test-anything": Anything,
+    }
+    name, _, settings = spec.partition(":")
+    pairs = [setting.split("=") for setting in settings.split(",") if setting]
+    return makers[name](**{key: float(number) for key, number in pairs})

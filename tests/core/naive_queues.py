@@ -1,0 +1,179 @@
+"""Slow, obvious twins of what middleware and networks do; ``naive_policies`` has the others."""
+
+from __future__ import annotations
+
+import math
+
+ACCEPT, REJECT = "accept", "reject"
+
+
+class Policy:
+    """``decide`` says what to do with a newcomer; ``departed`` hears what is left after the head went."""
+
+    sender = None  # whose policy it is
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        return self.full(queue, newcomer, L, last_taken, previous) if len(queue) == L else ACCEPT
+
+    def departed(self, queue):
+        pass
+
+    def unwanted(self, queue, now):
+        """How many heads are to be dropped before the socket takes one."""
+        return 0
+
+
+class DropOldest(Policy):
+    def full(self, queue, newcomer, L, last_taken, previous):
+        return 0
+
+
+class DropNewest(Policy):
+    def full(self, queue, newcomer, L, last_taken, previous):
+        return REJECT
+
+
+class ReplaceNewest(Policy):
+    def full(self, queue, newcomer, L, last_taken, previous):
+        return L - 1
+
+
+def one_of(candidates, luck):
+    """A candidate, each as likely as the others."""
+    return candidates[math.floor(luck * len(candidates))]
+
+
+class Random(Policy):
+    """The victim is uniform over the queue and the newcomer."""
+
+    def full(self, queue, newcomer, L, last_taken, previous):
+        return one_of([*range(L), REJECT], newcomer["luck"])
+
+
+class KeepLast(Policy):
+    """The newest ``depth`` are kept, or L if that is fewer."""
+
+    def __init__(self, depth=math.inf):
+        self.depth = depth
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        return 0 if len(queue) >= self.depth or len(queue) == L else ACCEPT
+
+
+class Lifespan(KeepLast):
+    """Heads older than this are not sent."""
+
+    def __init__(self, lifespan_s=0.5):
+        super().__init__()
+        self.lifespan_us = lifespan_s * 1e6
+
+    def unwanted(self, queue, now):
+        return sum(now - m["us"] > self.lifespan_us for m in queue)
+
+
+class Spaced(KeepLast):
+    """At least so far in ``key`` beyond the message accepted before it."""
+
+    def __init__(self, key, distance):
+        super().__init__()
+        self.key, self.distance = key, distance
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        accepted = [*([last_taken] if self.sender.taken else []), *queue]
+        if accepted and newcomer[self.key] - accepted[-1][self.key] < self.distance:
+            return REJECT
+        return super().decide(queue, newcomer, L, last_taken, previous)
+
+
+class FoxgloveBacklog(Policy):
+    """All bytes that have not left yet, with the newcomer's, stay below the limit."""
+
+    def __init__(self, limit_mb=10):
+        self.limit = limit_mb * 1e6
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        waiting = sum(m["bytes"] for m in queue) + self.sender.left_bytes(newcomer["us"])
+        if waiting + newcomer["bytes"] >= self.limit or len(queue) == L:
+            return REJECT
+        return ACCEPT
+
+
+class Rosbridge(Policy):
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        return ACCEPT
+
+
+class Codel(DropNewest):
+    """RFC 8289, 5.5 and 5.6, with its loop as it stands there; times in us, 0 for none."""
+
+    def __init__(self, target_ms=5, interval_ms=100):
+        self.target, self.interval = target_ms * 1e3, interval_ms * 1e3
+        self.first_above = self.drop_next = self.count = self.lastcount = self.maxpacket = 0
+        self.dropping = False
+
+    def dodequeue(self, queue, now):
+        if not queue:
+            self.first_above = 0
+            return False
+        packet = queue.pop(0)
+        self.maxpacket = max(self.maxpacket, packet["bytes"])
+        if now - packet["us"] < self.target or sum(m["bytes"] for m in queue) <= self.maxpacket:
+            self.first_above = 0
+            return False
+        if self.first_above == 0:
+            self.first_above = now + self.interval
+            return False
+        return now >= self.first_above
+
+    def control_law(self, t):
+        return t + self.interval / math.sqrt(self.count)
+
+    def unwanted(self, queue, now):
+        drops = 0
+        ok = self.dodequeue(queue, now)
+        if self.dropping:
+            if not ok:
+                self.dropping = False
+            while self.dropping and now >= self.drop_next:
+                drops += 1
+                self.count += 1
+                if self.dodequeue(queue, now):
+                    self.drop_next = self.control_law(self.drop_next)
+                else:
+                    self.dropping = False
+        elif ok:
+            drops += 1
+            self.dodequeue(queue, now)
+            self.dropping = True
+            delta = self.count - self.lastcount
+            self.count = 1
+            if delta > 1 and now - self.drop_next < 16 * self.interval:
+                self.count = delta
+            self.drop_next = self.control_law(now)
+            self.lastcount = self.count
+        return drops
+
+
+class Red(Policy):
+    """Floyd and Jacobson 1993, Fig. 2, without idle times."""
+
+    def __init__(self, min_th=0.25, max_th=0.75, max_p=0.1, weight=0.2):
+        self.min_th, self.max_th, self.max_p, self.weight = min_th, max_th, max_p, weight
+        self.average, self.count = 0, -1
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        self.average += self.weight * (len(queue) - self.average)
+        filled = self.average / L
+        if self.min_th <= filled < self.max_th:
+            self.count += 1
+            p = self.max_p * (filled - self.min_th) / (self.max_th - self.min_th)
+            # luck < p / (1 - count p), or certain where that is no probability
+            if newcomer["luck"] * (1 - self.count * p) < p:
+                self.count = 0
+                return REJECT
+        elif filled >= self.max_th:
+            self.count = 0
+            return REJECT
+        else:
+            self.count = -1
+        return REJECT if len(queue) == L else ACCEPT

@@ -1,0 +1,324 @@
+"""The clairvoyant: as good as the best of all decision sequences, and never beaten."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import naive_oracle
+import numpy as np
+import pytest
+from cases import VALUES, Case, cases, trace, traces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bufgym import policies, qoi, scenario
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.link import Link
+from bufgym.metrics import outcome
+from bufgym.oracle import clairvoyant, integer, labels
+from bufgym.scenario import Episode, Interruption, messages
+from bufgym.sender import run
+
+V = qoi.exponential(0.5)
+EXACT = 1e-9
+
+
+def tries(compiled: int, uncompiled: int) -> settings:
+    """So many examples: one of them costs from a millisecond to a second."""
+    return settings(max_examples=compiled if JIT else uncompiled)
+
+
+def line(times, *, sizes=10, x=None, knots=((0, 0), (1_000, 1_000)), after="loop", **decisions) -> Episode:
+    """Messages on a link of one byte a microsecond, so that one of 10 bytes takes 10 us."""
+    x = None if x is None else np.array(x, float)
+    return Episode(messages(np.array(times), np.asarray(sizes), x), Link(trace(list(knots), after)), **decisions)
+
+
+# --- by hand ---------------------------------------------------------------------------------------------------------
+
+
+def test_by_hand():
+    # L = 1. Message 0 crosses until 10. Of 1, 2 and 3, which arrive meanwhile, one can wait; the others are lost.
+    plan = clairvoyant(line([0, 1, 2, 3]), 1, V)
+    # 0 and 3 leave a gap of 3 and nothing after it: V(3) = 7/8. 0 and 1: V(1) = 1/2.
+    assert plan.qoi == 1.875
+    assert plan.kept.tolist() == [True, False, False, True]
+    assert plan.certified
+    # L = 2: gaps of 1 + 2 or 2 + 1, 1/2 + 3/4.
+    assert clairvoyant(line([0, 1, 2, 3]), 2, V).qoi == 2.25
+
+
+def test_it_gives_up_the_first_message_for_better_ones():
+    # The link rests until 100. What it took at 0 cannot be dropped any more, unless it was never accepted: x = 0 and
+    # x = 0 are the same picture, so the clairvoyant sends the second of them or neither is missed.
+    episode = line([0, 1, 2], x=[0, 0, 5], knots=((0, 0), (100, 0), (200, 100)), after="stop", sizes=60)
+    # 100 bytes carry one message of 60: every plan has H = 1.
+    assert clairvoyant(episode, 2, V).qoi == 1
+    # 120 bytes carry two: 0 or 1, and then 2: 1 + V(5).
+    episode = line([0, 1, 2], x=[0, 0, 5], knots=((0, 0), (100, 0), (200, 120)), after="stop", sizes=60)
+    assert clairvoyant(episode, 2, V).qoi == 1 + V(5)
+
+
+def test_one_message():
+    plan = clairvoyant(line([0]), 1, V)
+    assert (plan.qoi, plan.kept.tolist(), plan.certified) == (1.0, [True], True)
+
+
+def test_nothing_can_be_delivered():
+    stopped = clairvoyant(line([0, 5, 9], knots=((0, 0), (100, 9)), after="stop"), 3, V)
+    assert (stopped.qoi, stopped.kept.any()) == (0.0, False)
+    # Nor ever, where every message is larger than B.
+    crowded = clairvoyant(line([0, 5, 9]), 3, V, max_bytes=9)
+    assert (crowded.qoi, crowded.kept.any()) == (0.0, False)
+    assert clairvoyant(line([0, 5, 9], sizes=[10, 20, 30]), 3, V, max_bytes=9).qoi == 0.0
+
+
+def test_a_message_larger_than_the_buffer_takes_nobodys_place():
+    # B = 50 has no room for message 1. So nothing comes between 0 and 2: 1 + V(2).
+    plan = clairvoyant(line([0, 20, 1_000], sizes=[10, 100, 10]), 2, V, max_bytes=50)
+    assert (plan.qoi, plan.kept.tolist(), plan.certified) == (1.75, [True, False, True], True)
+
+
+@pytest.mark.parametrize(
+    ("capacity", "max_bytes", "message"),
+    [(0, None, "capacity = 0: L must be"), (-1, None, "capacity = -1: L must be"), (2, 0, "max_bytes = 0: B must be")],
+)
+def test_errors(capacity, max_bytes, message):
+    with pytest.raises(BufgymError, match=message):
+        clairvoyant(line([0]), capacity, V, max_bytes=max_bytes)
+
+
+# --- against every sequence of decisions -----------------------------------------------------------------------------
+
+
+@st.composite
+def small(draw: st.DrawFn, equal: bool, windows: bool = False) -> Case:
+    """A few messages that get in each other's way: equal times, outages, scenes that stand still."""
+    n = draw(st.integers(1, 7))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    us = np.cumsum(rng.choice([0, 1, 900, 2_000, 9_000], n))
+    unit = draw(st.sampled_from([1, 2, 1_200, 4_001]))
+    size = np.full(n, unit) if equal else rng.integers(1, 6, n) * unit
+    kind = draw(st.sampled_from(["eighths", "real", "still"]))
+    x = np.cumsum({"eighths": rng.integers(0, 9, n) / 8, "real": 2 * rng.random(n), "still": np.zeros(n)}[kind])
+    if unit <= 2:  # a few bytes in all: every rounding of C counts
+        pieces = int(rng.integers(1, 5))
+        us_at, bytes_at = np.cumsum(rng.integers(1, 3_000, pieces)), np.cumsum(rng.integers(0, 4, pieces))
+        knots = [(0, 0), *zip(us_at.tolist(), bytes_at.tolist(), strict=True)]
+        after = draw(st.sampled_from(["loop", "hold", "stop"]))
+        if knots[-1][1] == 0:
+            knots.append((knots[-1][0] + 1_500, 2))
+    else:
+        knots, after = draw(traces())
+    episode = Episode(messages(us, size, x), Link(trace(knots, after), int(rng.integers(0, 3 * knots[-1][0]))))
+    if windows:
+        episode = replace(episode, first_decision=int(rng.integers(0, 3)), last_decision=int(rng.integers(0, n + 1)))
+    twins = [{"seq": k, "us": int(us[k]), "bytes": int(size[k]), "x": float(x[k]), "luck": 0.0} for k in range(n)]
+    max_bytes = draw(st.sampled_from([None, None, unit, 2 * unit, 7 * unit, 3 * unit - 1]))
+    decide_at = draw(st.sampled_from(["arrival", "overflow"])) if windows else "arrival"
+    return Case(episode, twins, knots, draw(st.integers(1, 3)), max_bytes or None, decide_at)
+
+
+def best_of_all(case: Case, v: qoi.Value) -> float:
+    link = naive_oracle.Link(case.knots, case.episode.link.trace.after, case.episode.link.offset_us)
+    window = (case.episode.first_decision, case.episode.last_decision)
+    return naive_oracle.best(link, case.twin_messages, case.capacity, v, case.max_bytes, case.decide_at, *window)
+
+
+def plan_of(case: Case, v: qoi.Value):
+    return clairvoyant(case.episode, case.capacity, v, max_bytes=case.max_bytes)
+
+
+def played(case: Case, v: qoi.Value) -> float:
+    """H of the plan in the sender."""
+    return outcome(case.run(policies.get("clairvoyant"), v), 0).qoi
+
+
+@tries(500, 30)
+@given(small(equal=True), VALUES)
+def test_is_the_best_of_all_decisions(case, v):
+    plan = plan_of(case, v)
+    assert plan.qoi == pytest.approx(best_of_all(case, v), abs=EXACT)
+    assert plan.certified
+    assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
+
+
+@tries(400, 20)
+@given(small(equal=False), VALUES)
+def test_is_an_upper_bound_where_sizes_differ(case, v):
+    plan, best = plan_of(case, v), best_of_all(case, v)
+    assert plan.qoi >= best - EXACT
+    if plan.certified:
+        assert plan.qoi == pytest.approx(best, abs=EXACT)
+        assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
+
+
+@tries(300, 15)
+@given(st.booleans().flatmap(lambda equal: small(equal, windows=True)), VALUES)
+def test_is_an_upper_bound_where_not_every_arrival_asks(case, v):
+    plan, best = plan_of(case, v), best_of_all(case, v)
+    assert plan.qoi >= best - EXACT
+    if plan.certified and case.decide_at == "arrival":
+        assert plan.qoi == pytest.approx(best, abs=EXACT)
+        assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
+
+
+# --- against the interruption's own truth ----------------------------------------------------------------------------
+
+LENGTHS = (1, 2, 3, 8, 9, 17, 18, 36, 71, 120) if JIT else (1, 2, 9, 17)
+INTERRUPTION = Interruption(t_max=max(LENGTHS))
+
+
+@tries(30, 2)
+@given(VALUES)
+def test_is_the_best_integer_solution_of_an_interruption(v):
+    for T in LENGTHS:
+        for L in (1, 2, 3, 5, 8, 13):
+            plan = clairvoyant(INTERRUPTION.episode(T), L, v)
+            assert plan.qoi - 1 == pytest.approx(integer(L, T, v), abs=EXACT), (L, T)
+            assert plan.certified
+
+
+# --- against the policies --------------------------------------------------------------------------------------------
+
+
+def no_policy_beats(episodes: list[Episode], L: int, v: qoi.Value, **limits) -> None:
+    byte_limit = {key: limits[key] for key in limits if key == "max_bytes"}
+    bounds = {L: [clairvoyant(episode, L, v, **byte_limit).qoi for episode in episodes]}
+    for name in policies.names():
+        policy = policies.get(name)
+        senders = run(policy, episodes, L, v, **limits)
+        if senders.capacity not in bounds:  # a queue without limit
+            bounds[senders.capacity] = [clairvoyant(e, senders.capacity, v, **byte_limit).qoi for e in episodes]
+        for i, bound in enumerate(bounds[senders.capacity]):
+            assert outcome(senders, i).qoi <= bound + EXACT, name
+
+
+def drop_half(buffer, memory):
+    """Drops every second head before the socket takes it."""
+    memory[0] += 1
+    return memory[0] % 2 == 0
+
+
+def drop_oldest(buffer, arrival, memory):
+    return -2 if len(buffer.slots) < buffer.capacity else 0
+
+
+@tries(80, 3)
+@given(cases(), VALUES)
+def test_no_policy_beats_it(case, v):
+    no_policy_beats([case.episode], case.capacity, v, max_bytes=case.max_bytes, decide_at=case.decide_at)
+    halving = policies.Policy("test-halving", drop_oldest, on_dequeue=drop_half, memory={"heads": 0.0}, compile=True)
+    assert outcome(case.run(halving, v), 0).qoi <= plan_of(case, v).qoi + EXACT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cv", [0.0, 0.4])
+def test_no_policy_beats_it_over_lte(cv):
+    lte = scenario.get("lte", duration_s=8.0, size_bytes=500_000, size_cv=cv)
+    streams = scenario.Streams.seeded(7)
+    episodes = [lte.draw(streams).with_luck(streams.policy) for _ in range(4)]
+    plans = [clairvoyant(episode, 8, lte.value) for episode in episodes]
+    # The link is too slow for all, so that there is something to decide.
+    assert any(not plan.kept.all() for plan in plans)
+    assert all(plan.certified for plan in plans) or cv > 0
+    no_policy_beats(episodes, 8, lte.value)
+
+
+# --- how it depends on the link and the buffer -----------------------------------------------------------------------
+
+
+def equal_sizes(case: Case) -> Case:
+    arrivals = case.episode.arrivals.copy()
+    arrivals["size_bytes"] = 1_500
+    return replace(case, episode=replace(case.episode, arrivals=arrivals))
+
+
+@given(cases(), VALUES)
+def test_more_room_is_never_worse(case, v):
+    case = equal_sizes(case)
+    by_capacity = [clairvoyant(case.episode, L, v, max_bytes=case.max_bytes).qoi for L in (1, 2, 3, 5, 8, 40)]
+    assert (np.diff(by_capacity) >= -EXACT).all()
+
+
+@given(cases(), VALUES, st.integers(2, 4))
+def test_a_faster_link_is_never_worse(case, v, scale):
+    # The bytes that wait before a message never grow when the link carries more between any two arrivals, so what
+    # found room finds it still. (floor(k C) grows by at least as much as floor(C), for whole k.)
+    case = equal_sizes(case)
+    link = case.episode.link
+    faster = trace([(us, scale * carried) for us, carried in case.knots], link.trace.after)
+    quick = replace(case.episode, link=replace(link, trace=faster))
+    assert clairvoyant(quick, case.capacity, v).qoi >= clairvoyant(case.episode, case.capacity, v).qoi - EXACT
+
+
+# --- the dynamic programme itself ------------------------------------------------------------------------------------
+
+
+@tries(1_000, 60)
+@given(st.integers(0, 2**32), st.booleans(), VALUES)
+def test_it_is_exact_to_the_byte(seed, equal, v):
+    rng = np.random.default_rng(seed)
+    n, unit = int(rng.integers(1, 13)), int(rng.integers(1, 5))
+    c = np.cumsum(rng.integers(0, 2 * unit + 1, n))
+    size = np.full(n, unit) if equal else rng.integers(1, 2 * unit + 1, n)
+    limit = np.full(n, unit * rng.integers(1, 4)) if equal else rng.choice([labels.NEVER, 0, 1, 3, 9], n)
+    x = np.cumsum(rng.integers(0, 9, n) / 8)
+    ends = int(rng.choice([2**62, c[-1] + rng.integers(-3, 4 * unit)]))
+    problem = [part.tolist() for part in (c, size, limit, x)]
+    # Where sizes differ, the bound on a grid of one byte is the answer itself.
+    assert labels.best(c, size, limit, x, v.array, ends)[1] == pytest.approx(
+        naive_oracle.best_by_bytes(*problem, v, ends), abs=EXACT
+    )
+
+
+def middling(seed: int, n: int):
+    """What ``labels.best`` gets for a random episode of n messages of equal size over a link with outages."""
+    rng = np.random.default_rng(seed)
+    size, L = int(rng.integers(3, 3_000)), int(rng.integers(1, 9))
+    # The link carries a little less than what arrives, in bursts.
+    c = np.cumsum(np.where(rng.random(n) < 0.5, 0, rng.integers(0, 4 * size, n) * rng.uniform(0.3, 1.2)).astype(int))
+    x = np.cumsum(rng.random(n) * rng.integers(0, 2, n))
+    v = [qoi.exponential(0.4), qoi.saturating(1.7), qoi.tabulated([0, 1, 3], [0, 0.6, 1])][seed % 3]
+    ends = int(c[-1]) - size if seed % 4 == 0 else 2**62
+    return c, np.full(n, size), np.full(n, L * size), x, v.array, ends
+
+
+def without_bounds(c, size, limit, x, v, ends) -> float:
+    """The gain of the best of all labels, none left out for leading nowhere."""
+    work, steps = np.empty((2, len(c)), np.int64), (limit + size).max() // 1_000 + 2
+    p = labels.Problem(c, size, limit, x, v, ends, work[0], work[1], 1_000, np.zeros((len(c), steps)))
+    labels.find_idle(p)
+    table = labels.Table(len(c))
+    table.fill(p, -np.inf)
+    return table.plan()[1]
+
+
+MIDDLING = range(24) if JIT else range(2)
+
+
+@pytest.mark.parametrize("grid", [1, 16, 400])
+def test_bounds_lose_nothing(grid, monkeypatch):
+    monkeypatch.setattr(labels, "GRID", grid)
+    for seed in MIDDLING:
+        problem = middling(seed, 60 + 6 * seed if JIT else 25)
+        assert labels.best(*problem)[1] == pytest.approx(without_bounds(*problem), abs=EXACT), seed
+
+
+def test_a_coarse_grid_loses_nothing(monkeypatch):
+    problems = [middling(seed, 60 if JIT else 20) for seed in MIDDLING]
+    fine = [labels.best(*problem)[1] for problem in problems]
+    monkeypatch.setattr(labels, "MAX_CELLS", 64)
+    assert [labels.best(*problem)[1] for problem in problems] == pytest.approx(fine, abs=EXACT)
+
+
+def test_labels_get_more_room_when_they_need_it(monkeypatch):
+    problem = middling(1, 100 if JIT else 25)
+    plan, gain = labels.best(*problem)
+    monkeypatch.setattr(labels, "LABELS", 4)
+    again, same = labels.best(*problem)
+    assert same == gain
+    assert again.tolist() == plan.tolist()
+    # Four labels were too few indeed.
+    assert len(plan) > 4

@@ -1,0 +1,299 @@
+"""The online optimum: against brute force, against every policy, and played."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from cases import VALUES, order, same
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import bufgym.envs  # noqa: F401  (registers)
+from bufgym import policies, qoi
+from bufgym.benchmark.play import Player
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.link import Link
+from bufgym.oracle import integer
+from bufgym.oracle.online import OnlineOptimum, law, online_optimum
+from bufgym.policies import ACCEPT, REJECT, Policy
+from bufgym.scenario import Episode, Interruption, messages
+from bufgym.sender import run
+from bufgym.traces import Trace
+
+V = qoi.exponential(0.618)
+
+
+def uniform(L: int, t_max: int) -> np.ndarray:
+    """T uniform on L + 1..t_max."""
+    return law(Interruption(law="uniform", t_min=L + 1, t_max=t_max))
+
+
+def means(policy: Policy, L: int, probabilities: np.ndarray, v: qoi.Value = V) -> dict[str, float]:
+    """What the simulator makes of a policy: the mean over T of both objectives (message 0 is not counted).
+
+    Luck is the same whatever T is, so a randomised policy too is one deterministic policy that does not know T.
+    """
+    scenario = Interruption(t_max=len(probabilities) - 1)
+    lengths = np.flatnonzero(probabilities)
+    episodes = [scenario.episode(int(T)).with_luck(np.random.default_rng(7)) for T in lengths]
+    gained = np.asarray(run(policy, episodes, L, v).batch.senders["delivered_gain"])
+    best = np.array([integer(L, int(T), v) for T in lengths])
+    p = probabilities[lengths]
+    return {"ratio": float(p @ (gained / best)), "qoi": float(p @ gained)}
+
+
+# --- the law of T ----------------------------------------------------------------------------------------------------
+
+
+def test_laws_by_hand():
+    ln = math.log
+    assert law(Interruption("fixed", t_max=3)).tolist() == [0, 0, 0, 1]
+    assert law(Interruption("uniform", t_min=2, t_max=5)).tolist() == [0, 0, 0.25, 0.25, 0.25, 0.25]
+    # Weights ln((T + 1) / T) over T = 1, 2, 3 add up to ln 4.
+    assert law(Interruption("log-uniform", t_max=3)) == pytest.approx(
+        [0, ln(2) / ln(4), ln(1.5) / ln(4), ln(4 / 3) / ln(4)]
+    )
+    # Mean 4 from 2 on: it ends with probability 1/3 each period; at 4 it is cut off.
+    assert law(Interruption("geometric", t_min=2, t_max=4, t_mean=4)) == pytest.approx([0, 0, 1 / 3, 2 / 9, 4 / 9])
+    assert law(Interruption("geometric", t_min=2, t_max=4, t_mean=2)).tolist() == [0, 0, 1, 0, 0]
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        Interruption("fixed", t_max=9),
+        Interruption("uniform", t_min=3, t_max=9),
+        Interruption("log-uniform", t_min=2, t_max=30),
+        Interruption("geometric", t_min=2, t_max=20, t_mean=9),
+    ],
+    ids=lambda scenario: scenario.law,
+)
+def test_laws_are_those_that_lengths_are_drawn_from(scenario):
+    p, n = law(scenario), 40_000
+    rng = np.random.default_rng(1)
+    drawn = np.bincount([scenario.draw_length(rng) for _ in range(n)], minlength=len(p)) / n
+    assert math.fsum(p) == pytest.approx(1, abs=1e-12)
+    assert (np.abs(drawn - p) <= 4.5 * np.sqrt(p * (1 - p) / n)).all()
+
+
+# --- the optimum -----------------------------------------------------------------------------------------------------
+
+
+def test_by_hand():
+    v = qoi.exponential(0.5)
+    # L = 1, T = 1 or 2 alike. Keep 1 throughout: gaps 1, 1 and then 1, 2. Or 2 for 1: gaps 1, 1 and then 2, 1. A tie:
+    # (1/2 + 1/2 + 1/2 + 3/4) / 2; the oldest goes.
+    made = online_optimum(1, [0, 0.5, 0.5], v, objective="qoi")
+    assert made.value == 1.125
+    assert made.decision([1, 2]) == 0
+    # T = 1, 2, 3 alike. 2 is the best to have at T = 3 (gaps 2, 2), and from 2 on it is kept.
+    made = online_optimum(1, [0, 1 / 3, 1 / 3, 1 / 3], v, objective="qoi")
+    assert made.value == pytest.approx((1 + 1.25 + 1.5) / 3)
+    assert [made.decision([1, 2]), made.decision([2, 3])] == [0, REJECT]
+
+
+@pytest.mark.parametrize(
+    ("L", "t_max", "optimum", "afr"),
+    [
+        (1, 60, 0.98532, 0.96357),
+        (2, 60, 0.98490, 0.95834),
+        (3, 40, 0.98061, 0.95718),
+        (4, 30, 0.98311, 0.96286),
+    ],
+)
+def test_numbers_of_the_design(L, t_max, optimum, afr):
+    p = uniform(L, t_max)
+    assert online_optimum(L, p, V).value == pytest.approx(optimum, abs=5e-6)
+    assert means(policies.get("afr"), L, p)["ratio"] == pytest.approx(afr, abs=5e-6)
+
+
+def all_policies(L: int, p: list[float], v: qoi.Value, objective: str, kept: tuple[int, ...] = (), t: int = 0) -> float:
+    """The best over every way to decide from t arrivals on, with ``kept`` in the queue.
+
+    All that a policy learns is that another message has come: without luck it is one fixed sequence of decisions. This
+    tries every sequence, also those that reject or evict where there is room.
+    """
+    gains = [v(b - a) for a, b in zip((0, *kept), (*kept, t + 1), strict=True)]
+    now = p[t] * math.fsum(gains) / (integer(L, t, v) if objective == "ratio" else 1)
+    if t + 1 == len(p):
+        return now
+    return now + max(all_policies(L, p, v, objective, after, t + 1) for after in choices(L, kept, t + 1))
+
+
+def choices(L: int, kept: tuple[int, ...], t: int) -> set[tuple[int, ...]]:
+    """What can be in the queue once message t has been decided on."""
+    evicting = {(*kept[:k], *kept[k + 1 :], t) for k in range(len(kept))}
+    return {kept, *evicting, *({(*kept, t)} if len(kept) < L else ())}
+
+
+@settings(max_examples=60 if JIT else 12)
+@given(
+    VALUES,
+    st.integers(1, 3),
+    st.lists(st.integers(0, 5), min_size=1, max_size=6).filter(any),
+    st.sampled_from(["ratio", "qoi"]),
+)
+def test_is_the_best_of_all_policies(v, L, weights, objective):
+    p = [w / sum(weights) for w in weights]
+    assert online_optimum(L, p, v, objective=objective).value == pytest.approx(
+        all_policies(L, p, v, objective), abs=1e-12
+    )
+
+
+@settings(max_examples=30 if JIT else 6)
+@given(VALUES, st.integers(1, 3), st.lists(st.integers(0, 5), min_size=2, max_size=7).filter(lambda w: w[-1] > 0))
+def test_decides_for_the_best_in_every_state(v, L, weights):
+    """In those as well that its own decisions never lead to."""
+    p = [w / sum(weights) for w in weights]
+    made = online_optimum(L, p, v)
+    for t in range(1, len(p)):
+        for kept in (kept for s in range(min(L, t - 1) + 1) for kept in combinations(range(1, t), s)):
+            k = made.decision([*kept, t])
+            after = kept if k == REJECT else (*kept, t) if k == ACCEPT else (*kept[:k], *kept[k + 1 :], t)
+            best = max(all_policies(L, p, v, "ratio", others, t) for others in choices(L, kept, t))
+            assert all_policies(L, p, v, "ratio", after, t) == pytest.approx(best, abs=1e-12)
+
+
+@given(VALUES, st.integers(1, 4), st.integers(0, 9))
+def test_a_length_that_is_known_leaves_no_regret(v, L, T):
+    p = np.eye(T + 1)[T]
+    assert online_optimum(L, p, v).value == pytest.approx(1, abs=1e-12)
+    assert online_optimum(L, p, v, objective="qoi").value == pytest.approx(integer(L, T, v), abs=1e-12)
+
+
+def test_many_slots():
+    made = online_optimum(300, np.eye(302)[301], V)
+    assert made.value == pytest.approx(1)
+    # 302 gaps of 1 with one message less: whichever goes, one gap is 2. Ties drop the oldest.
+    assert made.decision(range(1, 302)) == 0
+    assert made.decisions.dtype == np.uint16
+
+
+SCENARIOS = [
+    (1, uniform(1, 30)),
+    (2, law(Interruption("log-uniform", t_max=16))),
+    (3, law(Interruption("geometric", t_max=14, t_mean=8))),
+]
+
+
+@pytest.mark.parametrize("objective", ["ratio", "qoi"])
+@pytest.mark.parametrize(("L", "p"), SCENARIOS)
+def test_no_policy_beats_it_and_it_plays_as_it_promises(L, p, objective):
+    made = online_optimum(L, p, V, objective=objective)
+    assert made.value <= (1 if objective == "ratio" else integer(L, made.t_max, V))
+    for policy in map(policies.get, policies.names()):
+        # Those that keep more than L messages or know T beforehand are no match for it.
+        assert not policy.ranked or means(policy, L, p)[objective] <= made.value + 1e-12, policy.name
+    assert means(made.policy(), L, p)[objective] == pytest.approx(made.value, abs=1e-12)
+
+
+# --- the policy ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def made() -> OnlineOptimum:
+    return online_optimum(3, uniform(3, 16), V)
+
+
+def test_in_an_environment_it_plays_as_it_promises(made):
+    scenario = Interruption(t_max=16, value=V)
+    env: Any = gym.make("bufgym/Uplink-v0", scenario=scenario, capacity=3).unwrapped
+    player = Player(made.policy())
+    mean = 0.0
+    for T in range(4, 17):
+        env.reset(options={"episode": scenario.episode(T)})
+        player.begin()
+        ended, info = False, {}
+        while not ended:
+            _, _, ended, _, info = env.step(player.action(env.rows.senders))
+        mean += made.probabilities[T] * (info["qoi"] - 1) / integer(3, T, V)
+    assert mean == pytest.approx(made.value, abs=1e-12)
+
+
+def test_a_link_that_stops_in_mid_stream_is_an_interruption_from_there_on(made):
+    T, n = 14, 5
+    # Messages 0..4 cross at once; from 45 ms on nothing does, so message 5 is in transmission for the outage.
+    trace = Trace.steps([(0.045, 10**6), (0.01 * T + 0.01, 0), (1.0, 10**6)], name="outage")
+    arrivals = messages(np.arange(n + T + 2) * 10_000, 1)
+    stopped = run(made.policy(), [Episode(arrivals, Link(trace))], 3, V)
+    plain = run(made.policy(), [Interruption(t_max=T).episode(T)], 3, V)
+    assert order(stopped) == [*range(n), *(n + k for k in order(plain))]
+
+
+def test_what_the_table_lacks_is_left_to_min_gap(made):
+    min_gap = policies.get("min-gap")
+    late = [Interruption(t_max=40).episode(T) for T in (4, 16, 17, 40)]
+    # A law that ends at T = L never told it what to drop.
+    empty = online_optimum(3, [0, 0, 0, 1], V)
+    assert same(run(empty.policy(), late, 3, V), run(min_gap, late, 3, V))
+    # Up to t_max the table decides.
+    assert not same(run(made.policy(), late[:2], 3, V), run(min_gap, late[:2], 3, V))
+    # All at one time, so without a period; and two in each.
+    trace = Trace.steps([(0.001, 0), (1.0, 1)], name="blocked")
+    at_once = Episode(messages(np.zeros(12, np.int64), 10), Link(trace))
+    assert same(run(made.policy(), [at_once], 3, V), run(min_gap, [at_once], 3, V))
+    pairs = Episode(messages(np.repeat(np.arange(8), 2) * 10_000, 10), Link(trace))
+    assert run(made.policy(), [pairs], 3, V).batch.senders["impossible"][0] == 0
+
+
+def test_decisions(made):
+    assert made.t_max == 16
+    assert made.decision([1]) == made.decision([2, 9, 16]) == ACCEPT
+    # A newcomer that leaves three slots crowded at one end: one of the crowd goes.
+    assert made.decision([1, 2, 3, 16]) in (0, 1, 2)
+    assert made.policy().name == "online-optimum:L=3"
+    for positions in ([], [0, 1], [3, 3], [4, 2], [2, 17], [1, 2, 3, 4, 5]):
+        with pytest.raises(BufgymError, match="must be 1 to 4 rising numbers from 1 to 16"):
+            made.decision(positions)
+
+
+def test_another_capacity_is_an_error(made):
+    with pytest.raises(BufgymError, match="online-optimum: made for L = 3, but the buffer has L = 2"):
+        run(made.policy(), [Interruption().episode(5)], 2, V)
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"capacity": 0}, "capacity = 0: L must be a whole number >= 1"),
+        ({"capacity": 1.5}, "capacity = 1.5"),
+        ({"probabilities": []}, r"probabilities of shape \(0,\)"),
+        ({"probabilities": [[1.0]]}, r"probabilities of shape \(1, 1\)"),
+        ({"probabilities": "uniform"}, "probabilities = 'uniform': must be numbers"),
+        ({"probabilities": [0.5, -0.25, 0.75]}, r"P\(T = 1\) = -0.25: must be a number >= 0"),
+        ({"probabilities": [0.5, math.nan]}, r"P\(T = 1\) = nan: must be a number >= 0"),
+        ({"probabilities": [0.5, 0.25]}, "probabilities add up to 0.75: must add up to 1"),
+        ({"probabilities": [0.0, 0.0]}, "probabilities add up to 0: must add up to 1"),
+        ({"v": 0.618}, "v = 0.618: must be a bufgym.qoi Value"),
+        ({"objective": "regret"}, "objective = 'regret': must be one of ratio, qoi"),
+        # C(31, 3) = 4495 for L = 2, T up to 30.
+        ({"max_states": 4494}, "L = 2, T up to 30: 4495 states: max_states = 4494"),
+        ({"probabilities": np.eye(5001)[5000], "capacity": 2000}, r"about 10\^\d{4} states: max_states = 50000000"),
+    ],
+)
+def test_errors(given, message):
+    arguments: dict[str, Any] = {"capacity": 2, "probabilities": uniform(2, 30), "v": V, **given}
+    with pytest.raises(BufgymError, match=message):
+        online_optimum(**arguments)
+
+
+def test_a_law_needs_an_interruption():
+    with pytest.raises(BufgymError, match="law: 'uniform' is not an Interruption"):
+        law("uniform")
+
+
+def test_lengths_that_cannot_happen_cost_nothing():
+    p = np.zeros(5000)
+    p[:31] = uniform(2, 30)
+    made = online_optimum(2, p, V, max_states=4495)
+    assert made.t_max == 30
+    assert made.value == online_optimum(2, uniform(2, 30), V).value
