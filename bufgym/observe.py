@@ -100,7 +100,7 @@ def squash(g: float, reference: float) -> float:
 
 
 @kernel
-def squash_row(row: NDArray[np.float32], reference: float) -> None:
+def squash_row(row: NDArray[np.floating[Any]], reference: float) -> None:
     """``squash`` of every entry, in place and in single precision."""
     r = np.float32(max(reference, _TINY))
     for k in range(len(row)):
@@ -108,8 +108,8 @@ def squash_row(row: NDArray[np.float32], reference: float) -> None:
 
 
 @kernel
-def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.float32]) -> None:
-    """Write every CONTEXT_FIELDS value into ``context`` (float32[fields])."""
+def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
+    """Write every CONTEXT_FIELDS value into ``context`` (float[fields])."""
     spread = buffer.capacity + 1
     context[OCCUPANCY] = len(buffer.slots) / buffer.capacity
     context[BACKLOG] = buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0
@@ -124,8 +124,8 @@ def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.float32]) 
 
 
 @kernel
-def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.float32]) -> None:
-    """Write every SLOT_FIELDS value into ``rows`` (float32[fields, L + 1]); empty slots are 0, the newcomer is last.
+def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
+    """Write every SLOT_FIELDS value into ``rows`` (float[fields, L + 1]); empty slots are 0, the newcomer is last.
 
     The gaps are those of ``buffer.time_gaps`` and ``motion_gaps``, the loss that of ``buffer.loss``, found in one walk
     along the queue; the gaps are squashed row by row afterwards.

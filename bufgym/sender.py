@@ -511,7 +511,7 @@ class Senders:
 
     def new_memory(self, policy: Policy, i: int) -> NDArray[np.float64]:
         """Fresh memory of ``policy`` for the episode of sender ``i``, float64[entries]."""
-        memory: NDArray[np.float64] = policy.new_memory()[0]
+        memory: NDArray[np.float64] = policy.new_memory(1, self.capacity)[0]
         if policy.foresee is not None:
             memory = policy.foresee(self.episodes[i], self.capacity, self.max_bytes, self.value)
         return memory
@@ -520,7 +520,11 @@ class Senders:
         """Run every loaded sender to its end under ``policy``; ``memory``: float64[n, entries], fresh by default."""
         if memory is None:
             rows = range(len(self)) if policy.foresee is not None else ()
-            memory = padded([self.new_memory(policy, i) for i in rows]) if rows else policy.new_memory(len(self))
+            memory = (
+                padded([self.new_memory(policy, i) for i in rows])
+                if rows
+                else policy.new_memory(len(self), self.capacity)
+            )
         self.batch.senders["ask_at_dequeue"] = policy.drops_at_dequeue
         if runs_compiled(policy):
             compiled_rollout()(self.batch, memory, *policy.compiled, policy.hears_departures)

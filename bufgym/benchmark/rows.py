@@ -80,13 +80,12 @@ def read_rows(path: str | os.PathLike[str]) -> list[Row]:
 
 def _read_parquet(source: Path) -> list[Row]:
     _, parquet = _pyarrow()
-    try:
-        # pyarrow looks at a page's checksum only if asked.
-        rows: list[Row] = parquet.read_table(source, page_checksum_verification=True).to_pylist()
-    except Exception as error:  # pyarrow's own errors are OSErrors and ValueErrors of many kinds
-        if isinstance(error, OSError) and error.errno is not None:
-            raise  # no such file, no permission
-        raise BufgymError(f"{source}: no rows that can be read: {str(error).splitlines()[0]}") from None
+    with open(source, "rb") as file:
+        try:
+            # pyarrow looks at a page's checksum only if asked.
+            rows: list[Row] = parquet.read_table(file, page_checksum_verification=True).to_pylist()
+        except Exception as error:  # pyarrow's own errors are OSErrors and ValueErrors of many kinds
+            raise BufgymError(f"{source}: no rows that can be read: {str(error).splitlines()[0]}") from None
     return rows
 
 

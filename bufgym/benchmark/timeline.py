@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.run import best, draw, met
+from bufgym.benchmark.run import best, draw, met, row
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
 from bufgym.sender import NEVER
@@ -20,12 +20,14 @@ _STEP_S = 0.25
 
 def choose(rows: Sequence[Row]) -> Row | None:
     """The row of the episode to show: at the middle capacity, the one that costs Drop Oldest most over a real link."""
-    capacities = sorted({row["capacity"] for row in rows})
+    capacities = sorted({each["capacity"] for each in rows})
     middle = capacities[len(capacities) // 2]
     shown = [
-        row for row in rows if row["policy"] == _BASELINE and row["capacity"] == middle and row["regret"] is not None
+        each
+        for each in rows
+        if each["policy"] == _BASELINE and each["capacity"] == middle and each["regret"] is not None
     ]
-    return max(shown, key=lambda row: (row["regret"], row["scenario"], row["trace"], row["seed"]), default=None)
+    return max(shown, key=lambda each: (each["regret"], each["scenario"], each["trace"], each["seed"]), default=None)
 
 
 def timeline(policies: Sequence[Policy], scenario: Scenario, shown: Row) -> dict[str, Any]:
@@ -39,12 +41,12 @@ def timeline(policies: Sequence[Policy], scenario: Scenario, shown: Row) -> dict
     for policy in policies:
         senders = met(policy, [episode], capacity, scenario, [plan])
         fates = np.asarray(senders.batch.fates[0])[: len(arrivals)]
-        qoi = 1.0 + float(senders.batch.senders[0]["delivered_gain"]) if (fates["crossed_us"] != NEVER).any() else 0.0
+        found = row({}, policy, capacity, senders, 0, plan)
         received = np.flatnonzero(fates["crossed_us"] != NEVER)
         dropped = np.flatnonzero(fates["dropped_us"] != NEVER)
         told[policy.name] = {
-            "qoi": qoi,
-            "regret": None if policy.unbounded or plan.qoi == 0 else 1 - qoi / plan.qoi,
+            "qoi": found["qoi"],
+            "regret": found["regret"],
             "received": [
                 [int(k), int(fates["taken_us"][k]) / 1e6, int(fates["crossed_us"][k]) / 1e6] for k in received
             ],

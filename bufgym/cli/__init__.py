@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 
 from bufgym import __version__
-from bufgym.cli import bench, figures, listing, perf, play, report, traces
+from bufgym.cli import bench, figures, leaderboard, listing, perf, play, report, traces, tune
 from bufgym.cli.listing import _LISTS, KINDS, environments
 from bufgym.cli.options import Parser, split_policies
 from bufgym.errors import BufgymError
@@ -60,6 +60,8 @@ def _parser() -> argparse.ArgumentParser:
     listing.add(commands)
     bench.add(commands)
     report.add(commands)
+    tune.add(commands)
+    leaderboard.add(commands)
     traces.add(commands)
     figures.add(commands)
     perf.add(commands)

@@ -23,7 +23,11 @@ def add(commands: Commands) -> None:
     option("--address", metavar="A", help="head of the Ray or Dask cluster (default: one on this machine)")
     who = bench.add_argument_group("who runs")
     option = who.add_argument
-    option("--policies", metavar="A,B:x=1,C", help="policies, with settings as in decimate:every=2 (default: all)")
+    option(
+        "--policies",
+        metavar="A,B:x=1,C",
+        help="policies, with settings as in decimate:every=2 (default: all)",
+    )
     option("--capacity", type=capacities, metavar="L,...", help="capacities L, messages (default: 8, or the suite's)")
     option("--max-bytes", type=count, metavar="B", help="also at most B bytes queued (default: no limit)")
     option("--decide-at", choices=("arrival", "overflow"), default="arrival", help="ask at every arrival, or when full")
@@ -36,12 +40,17 @@ def add(commands: Commands) -> None:
 
 
 def _bench(options: argparse.Namespace) -> None:
-    from bufgym import policies
+    from bufgym import policies, suites
     from bufgym.benchmark import rows as files
-    from bufgym.benchmark import run, table
+    from bufgym.benchmark import run, table, tune
 
     load_policies(options.policy_file)
-    specs = split_policies(options.policies) if options.policies is not None else list(policies.names())
+    if options.policies is not None:
+        specs = split_policies(options.policies)
+    elif options.suite is not None:
+        specs = tune.specs(suites.get(options.suite).name)
+    else:
+        specs = list(policies.names())
     if options.format == "parquet" and options.out is not None and not files.has_pyarrow():
         raise BufgymError('--format parquet needs pyarrow: pip install "bufgym[bench]" (or --format csv)')
     if options.suite is not None:

@@ -70,6 +70,9 @@ class Policy:
     """Whether its queue grows without limit, whatever L is; no bound for L messages holds for it."""
     foresee: Foresee | None = None
     """(episode, L, B, V) -> memory: for policies that know what is coming, which no robot does."""
+    work: tuple[int, int] = (0, 0)
+    """Room to work in behind the memory's entries: so many numbers, and so many more for each of L + 1 candidates."""
+    about: str = ""
 
     @property
     def hears_departures(self) -> bool:
@@ -95,13 +98,14 @@ class Policy:
 
     @property
     def summary(self) -> str:
-        """First line of the function's docstring."""
-        return (inspect.getdoc(self.on_arrival) or "").split("\n")[0]
+        """What it does: the first line of the function's docstring, unless ``about`` says it."""
+        return self.about or (inspect.getdoc(self.on_arrival) or "").split("\n")[0]
 
-    def new_memory(self, senders: int = 1) -> NDArray[np.float64]:
-        """Fresh memory for so many senders, float64[senders, entries]."""
+    def new_memory(self, senders: int = 1, capacity: int = 0) -> NDArray[np.float64]:
+        """Fresh memory for so many senders with L = ``capacity``, float64[senders, entries]."""
         start = np.array(list(self.memory.values()) or [0.0], np.float64)
-        return np.tile(start, (senders, 1))
+        room = self.work[0] + self.work[1] * (capacity + 1)
+        return np.tile(np.concatenate([start, np.zeros(room)]), (senders, 1))
 
     def with_parameters(self, **settings: float) -> Policy:
         """This policy with other settings, named accordingly; an error for an unknown name or an unusable number."""

@@ -18,10 +18,20 @@ from bufgym.reproduce.report import Report
 FIGURES: dict[str, str] = {
     "afr-fig4": "AFR paper, Fig. 4: which messages AFR keeps as an interruption grows, L = 8",
     "afr-fig5": "AFR paper, Fig. 5: information gained against the length of the interruption, L = 8",
+    "afr-fig6": "AFR paper, Fig. 6: bandwidth of the 4G log car_0002 against the camera's demand",
+    "afr-fig7-qoi": "AFR paper, Fig. 7, in information: QoI lost against the queue size, over car_0002",
+    "afr-fig8-gap": "AFR paper, Fig. 8, by motion gaps: runs in which tracking would fail, over car_0002",
     "afr-theorems": "AFR paper, Theorems 1-3: AFR against oracle-ideal for every L, T and V",
     "afr-fig9": "AFR paper, Fig. 9: time of one decision of each built-in policy, on this machine",
 }
 """Name -> what it shows, in one line."""
+
+NEEDS_DATA: dict[str, str] = {
+    "afr-fig6": "belgium_4g/csv/report_car_0002.csv",
+    "afr-fig7-qoi": "belgium_4g/csv/report_car_0002.csv and tum_rgbd/*.groundtruth.txt.gz",
+    "afr-fig8-gap": "belgium_4g/csv/report_car_0002.csv and tum_rgbd/*.groundtruth.txt.gz",
+}
+"""Figures over recordings -> what the folder given as their option ``data`` must hold."""
 
 
 def run(name: str, out: Path | None = None, **options: Any) -> str:

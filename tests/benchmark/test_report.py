@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from bufgym.benchmark import report
 from bufgym.benchmark import folder as inputs
+from bufgym.benchmark import report
 from bufgym.benchmark.report import style, timeline
 from bufgym.benchmark.rows import write_rows
 from bufgym.errors import BufgymError

@@ -16,6 +16,12 @@ from bufgym.reproduce import FIGURES, run
 SMALL: dict[str, dict[str, Any]] = {
     "afr-fig4": {},
     "afr-fig5": {"runs": 50 if JIT else 3, "last_T": 40 if JIT else 18},
+    "afr-fig6": {"trace": "lte-synthetic-0"},
+    "afr-fig7-qoi": {"trace": "lte-synthetic-0", "motion": ["drive-0"], "frames": 40, "capacities": (2, 4), "runs": 2},
+    "afr-fig8-gap": {
+        **{"trace": "lte-synthetic-0", "motion": ["drive-0"], "frames": 40, "capacities": (2, 4)},
+        **{"runs": 2, "more_runs": 3},
+    },
     "afr-theorems": {"max_capacity": 4, "last_T": 40},
     "afr-fig9": {"decisions": 1000, "calls": 100},
 }

@@ -45,12 +45,13 @@ def ranking(run: Run, scores: Scores) -> list[Place]:
         ]
         if standing.policy == scores.reference:
             numbers[-1] = (Interval(math.nan, math.nan, math.nan), style.score)
-        values = [_pair(interval, write) for interval, write in numbers]
+        values = [pair(interval, write) for interval, write in numbers]
         places.append(Place(len(places) + 1 if known else None, standing.policy, values, reason))
     return places
 
 
-def _pair(interval: Interval, write: Callable[[float], str]) -> tuple[str, str]:
+def pair(interval: Interval, write: Callable[[float], str]) -> tuple[str, str]:
+    """(value, interval in brackets) as text; a dash and nothing where there is no value."""
     if math.isnan(interval.value):
         return "–", ""
     low, high = write(interval.low), write(interval.high)
@@ -110,7 +111,7 @@ def markdown(run: Run, scores: Scores) -> str:
         rank = "–" if place.rank is None else str(place.rank)
         values = [" ".join(filter(None, pair)) for pair in place.values]
         lines.append([rank, _plain(place.policy) + (f" ({place.reason})" if place.reason else ""), *values])
-    out = ["```", run.manifest["command"], "```", "", *_table(names, lines, left=2)]
+    out = ["```", run.manifest["command"], "```", "", *markdown_table(names, lines, left=2)]
     heat = heat_map(scores)
     for scenario, sizes in heat.columns:
         head = ["policy", *(f"L = {size}{_marks(heat, scenario, size)}" for size in sizes)]
@@ -118,7 +119,7 @@ def markdown(run: Run, scores: Scores) -> str:
             [_plain(policy), *(style.score(cell.score.value) for cell in cells if cell.scenario == scenario)]
             for policy, cells in heat.lines
         ]
-        out += ["", f"Score, {_plain(scenario)}:", "", *_table(head, lines, left=1)]
+        out += ["", f"Score, {_plain(scenario)}:", "", *markdown_table(head, lines, left=1)]
     notes = []
     if heat.flat:
         notes.append("\\* Drop Oldest loses under 1 % there: nothing to be gained, not counted in the ranking.")
@@ -137,6 +138,7 @@ def _plain(name: str) -> str:
     return style.text(name).replace("|", "\\|").replace("*", "\\*")
 
 
-def _table(head: Sequence[str], lines: Sequence[Sequence[str]], *, left: int) -> list[str]:
+def markdown_table(head: Sequence[str], lines: Sequence[Sequence[str]], *, left: int) -> list[str]:
+    """Lines of a Markdown table: ``left`` columns to the left, the others to the right."""
     rule = "|" + "---|" * left + "---:|" * (len(head) - left)
     return ["| " + " | ".join(head) + " |", rule, *("| " + " | ".join(line) + " |" for line in lines)]

@@ -1,0 +1,42 @@
+"""``bufgym reproduce``: the papers' figures and tables again."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bufgym.cli.options import Commands, columns, command
+from bufgym.errors import BufgymError
+
+
+def add(commands: Commands) -> None:
+    reproduce = command(commands, "reproduce", _reproduce, "figures and tables of the papers, our number beside theirs")
+    reproduce.add_argument("names", nargs="*", metavar="NAME", help="which; 'all' for all; none lists them")
+    reproduce.add_argument("--data", metavar="DIR", help="folder of recordings, for the figures that need one")
+    reproduce.add_argument("--out", default="reproduced", metavar="DIR", help="where pictures go (%(default)s)")
+
+
+def _reproduce(options: argparse.Namespace) -> None:
+    from bufgym import reproduce
+
+    if not options.names:
+        print("figures (bufgym reproduce NAME..., or all)\n" + columns(list(reproduce.FIGURES.items())))
+        return
+    for name in options.names:
+        if name != "all" and name not in reproduce.FIGURES:
+            raise BufgymError(f"unknown figure {name!r}; known: all, {', '.join(reproduce.FIGURES)}")
+    names = list(reproduce.FIGURES) if "all" in options.names else list(dict.fromkeys(options.names))
+    data = None if options.data is None else Path(options.data)
+    if data is not None and not data.is_dir():
+        raise BufgymError(f"{data}: no such folder (--data)")
+    out = Path(options.out)
+    out.mkdir(parents=True, exist_ok=True)
+    for k, name in enumerate(names):
+        needs = reproduce.NEEDS_DATA.get(name)
+        if needs is None:
+            text = reproduce.run(name, out)
+        elif data is None and name not in options.names:
+            text = f"{name}: left out; it needs a folder of recordings (--data DIR) with {needs}"
+        else:
+            text = reproduce.run(name, out, data=data)
+        print(("\n" if k else "") + text, flush=True)

@@ -1,0 +1,42 @@
+"""``bufgym leaderboard`` and ``bufgym validate``: a file of results that anybody can check."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bufgym.cli.options import Commands, command
+
+DEFAULT = "docs/leaderboard.csv"
+
+
+def add(commands: Commands) -> None:
+    make = command(commands, "leaderboard", _leaderboard, "run suites and write the leaderboard, CSV and Markdown")
+    make.add_argument("suites", nargs="*", metavar="SUITE", help="which (default: all that need no recordings)")
+    check = command(commands, "validate", _validate, "run one row of the leaderboard again and compare")
+    check.add_argument("row", metavar="SUITE/POLICY", help="which row")
+    for made in (make, check):
+        made.add_argument("--file", default=DEFAULT, metavar="FILE.csv", help="the leaderboard (%(default)s)")
+        made.add_argument("--data", metavar="DIR", help="folder of recordings, for suites over real links")
+        made.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes side by side (one a core)")
+
+
+def _leaderboard(options: argparse.Namespace) -> None:
+    from bufgym import suites
+    from bufgym.benchmark import leaderboard, tune
+
+    names = options.suites or [name for name, suite in suites.SUITES.items() if not suite.needs or options.data]
+    specs = {suites.get(name).name: tune.specs(name) for name in names}
+    made = leaderboard.make(Path(options.file), names, specs, data=options.data, jobs=options.jobs)
+    print(f"{len(made)} rows in {options.file}, as Markdown in {Path(options.file).with_suffix('.md')}")
+
+
+def _validate(options: argparse.Namespace) -> None:
+    from bufgym.benchmark import leaderboard
+
+    entry = leaderboard.find(Path(options.file), options.row)
+    again = leaderboard.validate(entry, data=options.data, jobs=options.jobs)
+    print(f"{entry.name}: holds")
+    for what in ("score", "regret"):
+        low, stated, high = (getattr(entry, what + end) for end in ("_low", "", "_high"))
+        print(f"  {what}: {getattr(again, what):.6f} now, {stated:.6f} [{low:.6f}, {high:.6f}] in {options.file}")

@@ -1,0 +1,103 @@
+"""The leaderboard: what a row says, that it can be made again, and that a row which no longer holds is found out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bufgym import policies, suites
+from bufgym.benchmark import leaderboard
+from bufgym.benchmark.leaderboard import Entry
+from bufgym.cli import main
+from bufgym.errors import BufgymError
+from bufgym.scenario import Interruption
+from bufgym.suites import Setting, Suite
+
+REPO = Path(__file__).resolve().parents[2]
+
+TINY = Suite(
+    "tiny-v1",
+    "a few interruptions",
+    lambda split, data: {"all": Setting(Interruption(t_max=60), "T up to 60")},
+    capacities=(4, 8),
+    seeds=6,
+)
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(suites.SUITES, "tiny-v1", TINY)
+    suites._settings.cache_clear()
+
+
+def made(path: Path) -> list[Entry]:
+    return leaderboard.make(path, ["tiny-v1"], {"tiny-v1": ["afr", "min-gap", "clairvoyant", "rosbridge"]}, jobs=1)
+
+
+def test_a_file_says_who_is_first_and_how_to_see_it_again(tiny: None, tmp_path: Path) -> None:
+    entries = made(tmp_path / "board.csv")
+    assert {e.policy: e.rank for e in entries} == {
+        "min-gap": 1,
+        "afr": 2,
+        "drop-oldest": 3,
+        "clairvoyant": 0,
+        "rosbridge": 0,
+    }
+    by_name = {e.policy: e for e in entries}
+    assert by_name["drop-oldest"].score == 0 and by_name["clairvoyant"].score == 1
+    assert math.isnan(by_name["rosbridge"].score)
+    assert by_name["afr"].command == "bufgym bench --suite tiny-v1 --policies afr"
+    again = leaderboard.read(tmp_path / "board.csv")
+    assert list(again) == [e.name for e in entries]
+    assert again["tiny-v1/afr"] == by_name["afr"]
+    text = (tmp_path / "board.md").read_text()
+    assert (
+        "## tiny-v1" in text and "| 1 | min-gap |" in text and "`bufgym bench --suite tiny-v1 --policies afr`" in text
+    )
+
+
+def test_a_row_is_run_again_and_one_that_has_changed_is_refused(tiny: None, tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "board.csv"
+    made(path)
+    assert main(["validate", "tiny-v1/afr", "--file", str(path), "--jobs", "1"]) == 0
+    assert "tiny-v1/afr: holds" in capsys.readouterr().out
+    entry = leaderboard.find(path, "tiny-v1/afr")
+    assert leaderboard.validate(entry, jobs=1) == entry  # the very same numbers
+    better = replace(entry, score=entry.score + 0.2, score_low=entry.score + 0.1, score_high=entry.score + 0.3)
+    with pytest.raises(BufgymError, match=r"tiny-v1/afr: score is .* outside"):
+        leaderboard.validate(better, jobs=1)
+
+
+def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "board.csv"
+    path.write_text("suite,policy\na,b\n")
+    with pytest.raises(BufgymError, match=r"board\.csv.*must have the columns"):
+        leaderboard.read(path)
+    leaderboard.write([], path)
+    with path.open("a") as file:
+        file.write("s,p,many" + ",1" * 9 + ",c\n")
+    with pytest.raises(BufgymError, match=r"board\.csv.*many.*must be a number"):
+        leaderboard.read(path)
+    assert main(["validate", "lte-v1/nobody", "--file", str(REPO / "docs" / "leaderboard.csv")]) == 2
+    assert "no row 'lte-v1/nobody'" in capsys.readouterr().err
+    assert main(["leaderboard", "no-suite", "--file", str(path)]) == 2
+    with pytest.raises(BufgymError, match=r"written to a \.csv file"):
+        leaderboard.write([], tmp_path / "board.txt")
+
+
+def test_the_published_rows_are_of_known_suites_and_policies() -> None:
+    entries = leaderboard.read(REPO / "docs" / "leaderboard.csv")
+    for entry in entries.values():
+        assert entry.suite in suites.SUITES
+        assert policies.get(entry.policy).name == entry.policy
+        assert entry.command == leaderboard.command(entry.suite, entry.policy)
+
+
+@pytest.mark.slow
+def test_a_published_row_holds() -> None:
+    entry = leaderboard.find(REPO / "docs" / "leaderboard.csv", "sustained-v1/min-motion-gap")
+    assert leaderboard.validate(entry, jobs=1).score == pytest.approx(entry.score, abs=1e-12)

@@ -1,0 +1,227 @@
+"""Tuning on validation episodes: the best setting of a suite that is worked out by hand, chance, ties, bad input."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bufgym import policies, qoi, suites
+from bufgym.benchmark import tune
+from bufgym.benchmark.tune import Choice
+from bufgym.cli import tune as tune_command
+from bufgym.cli.options import Parser
+from bufgym.errors import BufgymError
+from bufgym.scenario import Interruption
+
+LENGTHS = {"tiny-twelve": 12, "tiny-nine": 9}
+"""T of each suite, L = 2. Of messages 1..T, `decimate:every=k` accepts 1, 1 + k, 1 + 2k, ... and keeps the last two.
+
+T = 12: every=4 keeps 5 and 9, and with 0 and 13 at the ends no gaps are more even than 5, 4, 4.
+T = 9: every=3, the default, keeps 4 and 7, with gaps of 4, 3, 3."""
+
+
+@pytest.fixture(autouse=True)
+def splits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """The splits asked for, of two tiny suites; results go to a file of the test's own."""
+    asked: list[str] = []
+
+    def suite(name: str, T: int) -> suites.Suite:
+        def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
+            asked.append(split)
+            return {"one": suites.Setting(Interruption(law="fixed", t_max=T, value=qoi.exponential(0.9)), f"T = {T}")}
+
+        return suites.Suite(name, "two episodes", build, capacities=(2,), seeds=2)
+
+    for name, T in LENGTHS.items():
+        monkeypatch.setitem(suites.SUITES, name, suite(name, T))
+    monkeypatch.setattr(tune, "FILE", tmp_path / "tuned.json")
+    suites._settings.cache_clear()
+    yield asked
+    suites._settings.cache_clear()
+
+
+def cli(*words: str) -> None:
+    """``bufgym tune ...``."""
+    parser = Parser(prog="bufgym")
+    tune_command.add(parser.add_subparsers(required=True))
+    options = parser.parse_args(["tune", *words])
+    options.command(options)
+
+
+# --- the search ------------------------------------------------------------------------------------------------------
+
+
+def test_the_best_setting_of_a_suite_worked_out_by_hand(splits: list[str]) -> None:
+    (choice,) = tune.tune("tiny-twelve", ["decimate"], jobs=1)
+    assert choice.default.spec == "decimate"
+    assert choice.best.spec == choice.chosen.spec == "decimate:every=4"
+    assert choice.best.score.value == pytest.approx(1)
+    assert choice.best.regret.value == pytest.approx(0, abs=1e-12)
+    # The default keeps 7 and 10, Drop Oldest 11 and 12, the clairvoyant 5 and 9; V(d) = 1 - 0.9^d.
+    default, oldest, most = (sum(1 - 0.9**d for d in gaps) for gaps in ((7, 3, 3), (11, 1, 1), (5, 4, 4)))
+    assert choice.default.score.value == pytest.approx((default - oldest) / (most - oldest))
+    assert choice.best.gain.value == pytest.approx(1 - choice.default.score.value)
+    assert set(splits) == {"validation"}
+
+
+def test_a_default_that_is_best_is_kept() -> None:
+    (choice,) = tune.tune("tiny-nine", ["decimate"], jobs=1)
+    assert choice.default.score.value == pytest.approx(1)
+    assert choice.chosen is choice.best is choice.default
+
+
+def test_the_default_is_kept_on_ties() -> None:
+    """T = 12 at 30 Hz is over after 0.4 s: lifespans of 0.5 s (the default) and more are one and the same."""
+    (choice,) = tune.tune("tiny-twelve", ["lifespan"], jobs=1)
+    same = [tried for tried in choice.tried if tried.score.value == pytest.approx(choice.default.score.value)]
+    assert {tried.spec for tried in same} >= {"lifespan", "lifespan:lifespan_s=1", "lifespan:lifespan_s=20"}
+    assert choice.chosen is choice.default
+
+
+def test_test_episodes_are_refused_before_any_is_drawn(splits: list[str]) -> None:
+    with pytest.raises(BufgymError, match=r"split = 'test': .* never chosen on test episodes"):
+        tune.tune("tiny-twelve", ["decimate"], split="test", jobs=1)
+    assert splits == []
+
+
+@pytest.mark.parametrize(
+    ("suite", "names", "more", "message"),
+    [
+        ("tiny-twelve", ["nobody"], {}, "policy 'nobody': no grid"),
+        ("tiny-twelve", ["afr"], {}, "policy 'afr': no grid"),
+        ("tiny-twelve", ["decimate:every=2"], {}, "policy 'decimate:every=2': no grid"),
+        ("tiny-twelve", ["ros-keep-last"], {}, "ros-keep-last: is not tuned: it stands for ROS 2"),
+        ("nowhere-v1", ["decimate"], {}, "unknown suite 'nowhere-v1'"),
+        ("tiny-twelve", ["decimate"], {"split": "tomorrow"}, "split = 'tomorrow'"),
+        ("tiny-twelve", ["decimate"], {"seeds": 0}, "seeds = 0"),
+    ],
+)
+def test_what_cannot_be_tuned(suite: str, names: list[str], more: dict[str, Any], message: str) -> None:
+    with pytest.raises(BufgymError, match=message):
+        tune.tune(suite, names, jobs=1, **more)
+
+
+def test_every_built_in_policy_with_parameters_is_tuned_or_says_why_not() -> None:
+    built_in = [policies.get(name) for name in policies.names()]
+    with_parameters = {p.name for p in built_in if p.parameters and p.on_arrival.__module__.startswith("bufgym.")}
+    assert with_parameters == set(tune.GRIDS) | set(tune.FIXED)
+    assert not set(tune.GRIDS) & set(tune.FIXED)
+
+
+@pytest.mark.parametrize("name", tune.GRIDS)
+def test_a_grid_begins_with_the_default_and_repeats_nothing(name: str) -> None:
+    specs = tune.settings(name)
+    assert specs[0] == name
+    memories = [tuple(policies.get(spec).memory.items()) for spec in specs]
+    assert len(set(memories)) == len(specs) > 1
+
+
+# --- the comparison, on rows made by hand ----------------------------------------------------------------------------
+
+
+def compared(base: Sequence[float], default: Sequence[float], other: Sequence[float], best: float) -> Choice:
+    rows = [
+        {"scenario": "s", "capacity": 2, "trace": "t", "seed": i, "policy": name, "qoi": float(h), "clairvoyant": best}
+        for name, values in (("drop-oldest", base), ("p", default), ("p:a=1", other))
+        for i, h in enumerate(values)
+    ]
+    return tune.compare("p", rows, ["p", "p:a=1"])
+
+
+def test_the_gain_is_the_paired_difference_of_the_scores() -> None:
+    """Every episode gains 1 of the 10 that can be gained: whatever is drawn, 0.1, though the scores themselves vary."""
+    choice = compared([10, 10, 10, 10], [11, 15, 12, 18], [12, 16, 13, 19], 20)
+    assert choice.default.score.value == pytest.approx((1 + 5 + 2 + 8) / 40)
+    assert choice.tried[1].score.value == pytest.approx(choice.default.score.value + 0.1)
+    assert choice.tried[1].gain == pytest.approx((0.1, 0.1, 0.1))
+    assert choice.default.gain == pytest.approx((0, 0, 0), abs=1e-12)
+    assert choice.chosen.spec == "p:a=1"
+
+
+def test_a_gain_that_may_be_chance_is_none() -> None:
+    choice = compared([10] * 4, [15] * 4, [18, 13, 18, 13], 20)  # +3, -2, +3, -2
+    assert choice.best.spec == "p:a=1"
+    assert choice.best.gain.value == pytest.approx(0.05)
+    assert choice.best.gain.low < 0 < choice.best.gain.high
+    assert choice.chosen is choice.default
+
+
+def test_where_no_cell_bites_regrets_are_compared() -> None:
+    """Drop Oldest loses 0.5 %: no scores. Of 200, the default gets 180 and the other setting 190."""
+    choice = compared([199, 199], [180, 180], [190, 190], 200)
+    assert math.isnan(choice.best.score.value)
+    assert [tried.regret.value for tried in choice.tried] == pytest.approx([0.1, 0.05])
+    assert choice.chosen.spec == "p:a=1"
+    assert choice.chosen.gain == pytest.approx((0.05, 0.05, 0.05))
+    assert compared([199, 199], [190, 190], [180, 180], 200).chosen.spec == "p"
+
+
+# --- what was found --------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_what_bench_then_reads(capsys: pytest.CaptureFixture[str]) -> None:
+    cli("tiny-twelve", "--policies", "decimate,lifespan", "--jobs", "1", "--seeds", "3", "--write")
+    shown = capsys.readouterr().out
+    assert "best, chosen" in shown and "default, best, chosen" in shown
+    entry = tune.read()["tiny-twelve"]["decimate"]
+    assert entry["setting"] == "decimate:every=4"
+    assert entry["score"] == pytest.approx(1) and entry["score"] > entry["default_score"]
+    assert entry["split"] == "validation"
+    assert entry["command"] == "bufgym tune tiny-twelve --policies decimate,lifespan --seeds 3 --write"
+    assert tune.tuned("tiny-twelve") == ["decimate:every=4"]  # lifespan stays at its default
+    assert tune.specs("tiny-twelve") == [*policies.names(), "decimate:every=4"]
+
+
+def test_a_second_suite_leaves_the_first_alone() -> None:
+    cli("tiny-twelve", "--policies", "decimate", "--jobs", "1", "--write")
+    cli("tiny-nine", "--policies", "decimate", "--jobs", "1", "--write")
+    assert [tune.tuned(name) for name in LENGTHS] == [["decimate:every=4"], []]
+    assert tune.tuned("lte-v1") == []
+
+
+def test_nothing_is_written_unasked() -> None:
+    cli("tiny-twelve", "--policies", "decimate", "--jobs", "1")
+    assert not tune.FILE.exists()
+    with pytest.raises(BufgymError, match="never chosen on test episodes"):
+        cli("tiny-twelve", "--split", "test", "--write")
+    assert not tune.FILE.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"{", "line 1: must be JSON"),
+        (b"\xff", "must be UTF-8"),
+        (b"[]", "must be a JSON object of suites"),
+        (b'{"lte-v1": []}', "must be a JSON object of suites"),
+        (b'{"lte-v1": {"decimate": 3}}', r"lte-v1.decimate.setting = '': must be a setting of that policy"),
+        (b'{"lte-v1": {"decimate": {"setting": "afr"}}}', r"lte-v1.decimate.setting = afr: must be a setting of that"),
+        (b'{"lte-v1": {"decimate": {"setting": "decimate:pace=2"}}}', "lte-v1.decimate: .* no parameter 'pace'"),
+        (b'{"lte-v1": {"nobody": {"setting": "nobody:a=2"}}}', "lte-v1.nobody: unknown policy 'nobody'"),
+    ],
+)
+def test_a_broken_file_is_named(text: bytes, message: str) -> None:
+    tune.FILE.write_bytes(text)
+    with pytest.raises(BufgymError, match=f"{tune.FILE.name}.*{message}"):
+        tune.specs("lte-v1")
+
+
+def test_what_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tune, "FILE", Path(tune.__file__).with_name("tuned.json"))
+    shipped = tune.read()
+    assert shipped
+    for suite, entries in shipped.items():
+        assert suite in suites.SUITES
+        specs = tune.specs(suite)
+        assert len(set(specs)) == len(specs)
+        for policy, entry in entries.items():
+            assert entry["setting"] in tune.settings(policy)
+            assert entry["split"] == "validation"
+            assert entry["command"].startswith(f"bufgym tune {suite}") and entry["command"].endswith("--write")
+            assert (entry["setting"] == policy) == (entry["setting"] not in tune.tuned(suite))
+    assert json.dumps(shipped, indent=1, sort_keys=True) + "\n" == tune.FILE.read_text(encoding="utf-8")
