@@ -16,13 +16,13 @@ import os
 import shutil
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bufgym import __version__, policies, suites
-from bufgym.benchmark import timeline
+from bufgym.benchmark import cluster, timeline
+from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.folder import FORMAT, read_manifest
 from bufgym.benchmark.rows import COLUMNS, Row, has_pyarrow, read_rows, replaced, write_rows
 from bufgym.benchmark.run import bar, run
@@ -31,8 +31,6 @@ from bufgym.scenario import Scenario, Uplink
 
 BASELINE = "drop-oldest"
 """Always among the policies: the normalised score is measured from it."""
-
-BACKENDS = ("loky", "threading", "sequential", "ray", "dask")
 
 _SEEDS_A_TRACE = 1000
 """Episode s of trace k has the seed 1000 k + s: no two traces of a scenario share an episode's chance."""
@@ -250,7 +248,7 @@ _SAME = ("format", "bufgym", "suite", "split", "policies", "policy_file", "capac
 def _form(out: Path) -> str:
     """That of the rows which are there already, else the best that can be written."""
     held = {file.suffix for pattern in ("rows.*", "parts/*") for file in out.glob(pattern)}
-    return "parquet" if has_pyarrow() and held != {".csv"} else "csv"
+    return "csv" if not has_pyarrow() or (".csv" in held and ".parquet" not in held) else "parquet"
 
 
 def _claim(out: Path, wanted: dict[str, Any]) -> None:
@@ -311,54 +309,14 @@ def _spread(
         for k, unit in enumerate(work):
             yield k, run_unit(unit)
         return
-    joblib = _imported("joblib", "bench")
     if backend == "threading":
         load = None  # this process has run the policy file
     failed: list[Exception] = []
-    calls = (
-        joblib.delayed(_attempt)(k, u, load) for k, u in itertools.takewhile(lambda _: not failed, enumerate(work))
-    )
-    with _cluster(backend, address):
-        # joblib's Ray backend hands results over only when all are there: a few units at a time.
-        ray = backend == "ray"
-        at_once = 4 * joblib.effective_n_jobs(jobs) if ray else len(work)
-        for _ in range(0, len(work), at_once):
-            some = itertools.islice(calls, at_once)
-            for k, found in joblib.Parallel(n_jobs=jobs, return_as="list" if ray else "generator_unordered")(some):
-                if isinstance(found, Exception):
-                    failed.append(found)
-                else:
-                    yield k, found
+    calls = ((_attempt, (k, u, load)) for k, u in itertools.takewhile(lambda _: not failed, enumerate(work)))
+    for k, found in cluster.spread(calls, len(work), jobs, backend, address):
+        if isinstance(found, Exception):
+            failed.append(found)
+        else:
+            yield k, found
     if failed:
         raise failed[0]
-
-
-@contextmanager
-def _cluster(backend: str, address: str | None) -> Iterator[None]:
-    """joblib's backend of that name, connected."""
-    joblib = _imported("joblib", "bench")
-    with nullcontext() if backend != "dask" else _dask_client(address):
-        if backend == "ray":
-            ray = _imported("ray", "ray")
-            register_ray = _imported("ray.util.joblib", "ray").register_ray
-            if not ray.is_initialized():
-                ray.init(address=address, log_to_driver=False)
-            register_ray()
-        with joblib.parallel_config(backend=backend):
-            yield
-
-
-def _dask_client(address: str | None) -> Any:
-    distributed = _imported("distributed", "dask")
-    if address is not None:
-        return distributed.Client(address)
-    return distributed.Client(processes=True, threads_per_worker=1, dashboard_address=None)
-
-
-def _imported(module: str, extra: str) -> Any:
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise BufgymError(f'{module} is missing: pip install "bufgym[{extra}]"') from None

@@ -1,0 +1,60 @@
+"""Where a benchmark runs: processes or threads of this machine, or a Ray or Dask cluster, all through joblib."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext
+from typing import Any
+
+from bufgym.errors import BufgymError
+
+BACKENDS = ("loky", "threading", "sequential", "ray", "dask")
+
+
+def spread(
+    calls: Iterable[tuple[Any, tuple[Any, ...]]], count: int, jobs: int, backend: str, address: str | None
+) -> Iterator[Any]:
+    """The results of these (function, arguments), ``count`` at most, in the order in which they become ready.
+
+    ``address``: of the head of the Ray or Dask cluster; None: one on this machine, begun and ended here.
+    """
+    joblib = _imported("joblib", "bench")
+    wrapped = (joblib.delayed(function)(*arguments) for function, arguments in calls)
+    with _connected(backend, address):
+        # joblib's Ray backend hands results over only when all are there: a few at a time.
+        ray = backend == "ray"
+        at_once = 4 * joblib.effective_n_jobs(jobs) if ray else count
+        for _ in range(0, count, at_once):
+            some = itertools.islice(wrapped, at_once)
+            yield from joblib.Parallel(n_jobs=jobs, return_as="list" if ray else "generator_unordered")(some)
+
+
+@contextmanager
+def _connected(backend: str, address: str | None) -> Iterator[None]:
+    """joblib's backend of that name, connected."""
+    joblib = _imported("joblib", "bench")
+    with nullcontext() if backend != "dask" else _dask_client(address):
+        if backend == "ray":
+            ray = _imported("ray", "ray")
+            register_ray = _imported("ray.util.joblib", "ray").register_ray
+            if not ray.is_initialized():
+                ray.init(address=address, log_to_driver=False)
+            register_ray()
+        with joblib.parallel_config(backend=backend):
+            yield
+
+
+def _dask_client(address: str | None) -> Any:
+    distributed = _imported("distributed", "dask")
+    if address is not None:
+        return distributed.Client(address)
+    return distributed.Client(processes=True, threads_per_worker=1, dashboard_address=None)
+
+
+def _imported(module: str, extra: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise BufgymError(f'{module} is missing: pip install "bufgym[{extra}]"') from None
