@@ -426,13 +426,12 @@ def rollout(
 
 
 @functools.cache
-def compiled_rollout() -> Any:
-    """``rollout`` compiled once for every policy (policies arrive as values of one function type)."""
-    arrival, departure, dequeue = signatures()
+def batch_type() -> Any:
+    """Numba's type of a ``Batch``."""
     array, int_ = numba.types.Array, numba.types.int64
     record = {name: numba.from_dtype(dtype) for name, dtype in (("s", SENDER), ("m", MESSAGE), ("f", FATE))}
     ints = array(int_, 1, "C")
-    batch = cast(Any, numba.types).NamedTuple(
+    return cast(Any, numba.types).NamedTuple(
         (
             array(record["s"], 1, "C"),
             array(record["m"], 2, "C"),
@@ -445,10 +444,18 @@ def compiled_rollout() -> Any:
         ),
         Batch,
     )
+
+
+@functools.cache
+def compiled_rollout() -> Any:
+    """``rollout`` compiled once for every policy (policies arrive as values of one function type)."""
+    arrival, departure, dequeue = signatures()
     function = numba.types.FunctionType
-    memory = array(numba.types.float64, 2, "C")
+    memory = numba.types.Array(numba.types.float64, 2, "C")
     return compile_for(
-        numba.types.void(batch, memory, function(arrival), function(departure), function(dequeue), numba.types.boolean),
+        numba.types.void(
+            batch_type(), memory, function(arrival), function(departure), function(dequeue), numba.types.boolean
+        ),
         rollout,
     )
 

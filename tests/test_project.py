@@ -19,6 +19,7 @@ REPO = Path(__file__).resolve().parent.parent
 
 ROOMS = [
     "errors",
+    "files",
     "kernel",
     "qoi",
     "buffer",

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import os
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bufgym.errors import BufgymError
+from bufgym.files import replaced as replaced  # others take it from here
 from bufgym.metrics import METRICS
 
 Row = dict[str, Any]
@@ -102,23 +101,6 @@ def _parsed(path: Path, line: int, name: str, text: str) -> Any:
         return int(text) if name in WHOLE else float(text)
     except ValueError:
         raise BufgymError(f"{path}, line {line}: {name} = {text!r}: must be a number") from None
-
-
-@contextmanager
-def replaced(target: Path) -> Iterator[Path]:
-    """A temporary file beside ``target`` to write to; it takes the target's place when all went well."""
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        # mkstemp makes a file that only its owner may read; a result is as readable as any other new file.
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def has_pyarrow() -> bool:

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 
 from bufgym import __version__
-from bufgym.cli import bench, figures, leaderboard, listing, perf, play, report, traces, tune
+from bufgym.cli import bench, export, figures, leaderboard, listing, perf, play, report, traces, tune
 from bufgym.cli.listing import _LISTS, KINDS, environments
 from bufgym.cli.options import Parser, split_policies
 from bufgym.errors import BufgymError
@@ -66,6 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     figures.add(commands)
     perf.add(commands)
     play.add(commands)
+    export.add(commands)
     return parser
 
 

@@ -146,7 +146,8 @@ def signatures() -> tuple[Any, Any, Any]:
     return int_(view, message, reals), numba.types.void(view, reals), numba.types.boolean(view, reals)
 
 
-_REGISTRY: dict[str, Policy] = {}
+_REGISTRY: dict[str, Policy | Callable[[], Policy]] = {}
+"""By name: a policy, or what makes it when it is first asked for."""
 
 
 def register(
@@ -165,7 +166,8 @@ def register(
 
     ``compile=True`` promises that Numba can compile it; else it runs as ordinary Python wherever policies run.
     """
-    if name in _REGISTRY and _REGISTRY[name].on_arrival.__module__.startswith("bufgym."):
+    known = _REGISTRY.get(name)
+    if known and (not isinstance(known, Policy) or known.on_arrival.__module__.startswith("bufgym.")):
         raise BufgymError(f"policy {name!r}: a built-in policy has this name")
     if not name or any(c in ":,= \t\n" for c in name):
         raise BufgymError(f"policy {name!r}: a name must be non-empty, without spaces, ':', ',' or '='")
@@ -193,6 +195,11 @@ def register(
     return add
 
 
+def register_later(name: str, make: Callable[[], Policy]) -> None:
+    """Register a policy that is made when it is first asked for; a name that is taken stays as it is."""
+    _REGISTRY.setdefault(name, make)
+
+
 def names() -> Iterator[str]:
     """All registered names, in the order of their registration."""
     return iter(tuple(_REGISTRY))
@@ -212,7 +219,10 @@ def get(spec: str | Policy) -> Policy:
             numbers[key.strip()] = float(number)
         except ValueError:
             raise BufgymError(f"policy {spec!r}: {setting!r} is not of the form parameter=number") from None
-    return _REGISTRY[name].with_parameters(**numbers)
+    found = _REGISTRY[name]
+    if not isinstance(found, Policy):
+        found = _REGISTRY[name] = found()
+    return found.with_parameters(**numbers)
 
 
 def runs_compiled(policy: Policy) -> bool:

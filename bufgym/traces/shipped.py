@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
+from bufgym import files
 from bufgym.errors import TraceError, where
 from bufgym.traces.files import StrPath
 from bufgym.traces.motion import Motion, read_motion
@@ -19,14 +19,7 @@ def shipped() -> dict[str, Path]:
     A wheel carries them inside the package; a checkout has them in its top-level `traces/`. Empty if neither
     is there.
     """
-    checkout = Path(__file__).resolve().parents[2]
-    for folder in (Path(str(resources.files("bufgym"))) / "data" / "traces", checkout / "traces"):
-        # A folder with an __init__.py is somebody's package called "traces", next to an installed bufgym.
-        if folder.is_dir() and not (folder / "__init__.py").exists():
-            files = sorted(folder.glob("*.csv"))
-            if files:
-                return {path.stem: path for path in files}
-    return {}
+    return files.shipped("traces", "traces", "*.csv")
 
 
 def load(name_or_path: StrPath, format: str | None = None, after: After = "loop") -> Trace:

@@ -83,7 +83,8 @@ def test_each_says_what_it_is(name):
     policy = policies.get(name)
     assert policy.name == name
     assert policy.summary.endswith(".") or len(policy.summary) > 20
-    assert policy.new_memory(3).shape == (3, max(1, len(policy.memory)))
+    room = policy.work[0] + policy.work[1] * (7 + 1)
+    assert policy.new_memory(3, 7).shape == (3, max(1, len(policy.memory)) + room)
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -44,7 +44,10 @@ def anything(buffer, arrival, memory):
 # The twin draws from [accept, reject, 0, 1, ..., L + 1]; ACCEPT is -2 and REJECT is -1, so floor(luck x (L + 4)) - 2.
 assert (ACCEPT, REJECT) == (-2, -1)
 ANYTHING = policies.Policy("test-anything", anything, compile=True)
-POLICIES = {p.name: p for p in (*map(policies.get, policies.names()), ANYTHING) if p.foresee is None}
+POLICIES = {
+    p.name: p for p in (*map(policies.get, policies.names()), ANYTHING) if p.foresee is None and not any(p.work)
+}
+"""All but the learned ones, whose twin is in ``test_learned``."""
 
 
 def line(times_ms, *, capacity=2, after="loop", sizes=1_000, knots=((0, 0), (1_000 * MS, 1_000_000)), **limits):

@@ -1,0 +1,295 @@
+"""Learned policies decide as their weights say: against a slow twin, a fixed policy, and the network they came from."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from cases import VALUES, cases, fates, same
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bufgym import policies, qoi
+from bufgym import scenario as scenarios
+from bufgym.benchmark.run import draw
+from bufgym.buffer import ACCEPT, REJECT
+from bufgym.cli import export as command
+from bufgym.cli.options import Parser
+from bufgym.envs import SenderVectorEnv
+from bufgym.envs.rows import decision_of
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.metrics import outcome
+from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS, observe_context, observe_slots
+from bufgym.policies import learned
+from bufgym.policies import weights as weights_file
+from bufgym.policies.learned import NAMES, Network, Weights
+from bufgym.policies.registry import Policy
+from bufgym.scenario import Interruption
+from bufgym.sender import named, python_view, run
+
+V = qoi.exponential(0.618)
+SLOT_NAMES = [field.name for field in SLOT_FIELDS]
+CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS]
+
+
+def network(rng, inputs, widths):
+    """A network whose every number is random."""
+
+    def some(*shape):
+        return rng.normal(0, 1, shape).astype(np.float32)
+
+    layers, last = [], inputs
+    for width in widths:
+        layers.append((some(last, width), some(width)))
+        last = width
+    return Network(some(inputs), some(1), tuple(layers), some(last if widths else 0))
+
+
+@st.composite
+def weights(draw):
+    """Any fields in any order; no, one or two hidden layers."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    fields = tuple(draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True)))
+    widths = draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)]))
+    return Weights(fields, network(rng, len(fields), widths), network(rng, len(fields), widths))
+
+
+# --- the twin --------------------------------------------------------------------------------------------------------
+
+
+def score(net, f):
+    """The formula of the module's text, number by number."""
+    h = f
+    for weight, bias in net.layers:
+        sums = [math.fsum(each * float(w) for each, w in zip(h, weight[:, o], strict=True)) for o in range(len(bias))]
+        h = [max(0.0, total + float(b)) for total, b in zip(sums, bias, strict=True)]
+    out = math.fsum(float(w) * each for w, each in zip(net.out, h, strict=True)) if net.layers else 0.0
+    return out + math.fsum(float(s) * each for s, each in zip(net.skip, f, strict=True)) + float(net.bias[0])
+
+
+def twin(made):
+    """A policy that decides by these weights: every candidate is scored, the best is searched for afterwards."""
+
+    def on_arrival(buffer, arrival, memory):
+        s, L = len(buffer.slots), buffer.capacity
+        slots, context = np.zeros((len(SLOT_NAMES), L + 1)), np.zeros(len(CONTEXT_NAMES))
+        observe_slots(buffer, arrival, slots)
+        observe_context(buffer, arrival, context)
+
+        def features(k):
+            seen = dict(zip(SLOT_NAMES, slots[:, k], strict=True)) | dict(zip(CONTEXT_NAMES, context, strict=True))
+            return [float(seen[name]) for name in made.fields]
+
+        queued = [int(slot.size_bytes) for slot in buffer.slots]
+        choices = [(score(made.drop, features(k)), k) for k in range(s) if fits(buffer, arrival, queued[k])]
+        choices.append((score(made.drop, features(L)), REJECT))
+        best = max(value for value, _ in choices)
+        if s < L and fits(buffer, arrival, 0) and score(made.accept, features(L)) >= best:
+            return ACCEPT
+        return next(decision for value, decision in choices if value == best)
+
+    return Policy("twin", on_arrival)
+
+
+def fits(buffer, arrival, freed):
+    return buffer.backlog_bytes - freed + arrival.size_bytes <= buffer.max_bytes
+
+
+@given(cases(max_messages=80), VALUES, weights(), st.integers(1, 40))
+@settings(max_examples=150 if JIT else 20)
+def test_decides_as_its_twin_compiled_and_not(case, v, made, capacity):
+    case = replace(case, capacity=capacity)
+    policy = learned.policy("random-weights", made)
+    ours = case.run(policy, v)
+    assert same(ours, case.run(twin(made), v))
+    assert same(ours, case.run(replace(policy, compile=False), v))
+    if case.episode.first_decision == 0 and case.episode.last_decision > len(case.twin_messages):
+        assert int(ours.batch.senders["impossible"][0]) == 0
+
+
+def test_the_twin_counts_as_one_does_by_hand():
+    # h = relu(2 * 3 - 1, -4 * 3 + 1) = (5, 0); score = 10 * 5 + 100 * 0 + 7 * 3 + 0.5
+    weight, bias = np.float32([[2, -4]]), np.float32([-1, 1])
+    net = Network(np.float32([7]), np.float32([0.5]), ((weight, bias),), np.float32([10, 100]))
+    assert score(net, [3.0]) == 71.5
+    # A second layer: relu(5 * 1 + 0 * 9 + 2) = 7; score = -3 * 7 + 7 * 3 + 0.5
+    second = (np.float32([[1], [9]]), np.float32([2]))
+    assert score(replace(net, layers=(*net.layers, second), out=np.float32([-3])), [3.0]) == 0.5
+
+
+# --- what is promised ------------------------------------------------------------------------------------------------
+
+
+def start(fields, seen):
+    """No hidden layer: the smallest value of one field goes, and whatever finds room is accepted."""
+    made = learned.random_weights(fields, (), np.random.default_rng(0))
+    made.drop.skip[fields.index(seen)] = -10
+    made.accept.bias[0] = 5
+    return learned.policy("linear", made)
+
+
+@pytest.mark.parametrize(("field", "fixed"), [("motion_merged", "min-motion-gap"), ("time_merged", "min-gap")])
+@given(case=cases(max_bytes=False, max_messages=80), v=VALUES)
+def test_a_linear_scorer_of_merged_gaps_is_the_fixed_policy(field, fixed, case, v):
+    linear = start(("rank", field, "drain"), field)
+    assert same(case.run(linear, v), case.run(policies.get(fixed), v))
+
+
+@given(cases(), VALUES, weights())
+@settings(max_examples=50 if JIT else 10)
+def test_what_the_memory_held_before_does_not_matter(case, v, made):
+    policy = learned.policy("random-weights", made)
+    memory = policy.new_memory(1, case.capacity)
+    memory[0, len(policy.memory) :] = np.nan
+    senders = case.senders(v)
+    senders.run(policy, memory)
+    assert same(senders, case.run(policy, v))
+    senders = case.senders(v)
+    senders.run(policy, memory)  # once more, with what the episode left
+    assert same(senders, case.run(policy, v))
+
+
+def test_one_set_of_weights_serves_every_capacity():
+    policy = start(("motion_merged",), "motion_merged")
+    episode = Interruption(t_max=100).episode(100)
+    for L in (1, 2, 8, 40):
+        ours, fixed = (run(each, [episode], L, V) for each in (policy, policies.get("min-motion-gap")))
+        assert fates(ours) == fates(fixed)
+        assert len(fates(ours)["dropped_us"]) == 100 - L
+
+
+def test_bytes_that_fit_exactly_are_room():
+    """With B for three messages and L = 8, three are queued; then one goes for each that comes."""
+    episode = Interruption(t_max=10).episode(10)
+    (size,) = set(episode.arrivals["size_bytes"].tolist())
+    senders = run(start(("time_merged",), "time_merged"), [episode], 8, V, max_bytes=3 * size)
+    (sender,) = senders.batch.senders
+    assert (sender["peak_backlog_bytes"], sender["impossible"]) == (3 * size, 0)
+    assert sender["evicted"] > 0
+    assert len(fates(senders)["dropped_us"]) == 10 - 3
+
+
+# --- from a trained agent --------------------------------------------------------------------------------------------
+
+
+def exported(*words):
+    """``bufgym export`` with these words."""
+    parser = Parser(prog="bufgym")
+    command.add(parser.add_subparsers(required=True))
+    options: argparse.Namespace = parser.parse_args(["export", *map(str, words)])
+    options.command(options)
+
+
+CAPACITY, WIDTH = 5, 8
+WORLD = replace(scenarios.get("lte"), duration_s=10.0, size_bytes=500_000)
+
+
+def untrained(tmp_path, network="slots"):
+    """A model with random weights, saved as training leaves it; skips where training's extra is not installed."""
+    for extra in ("sb3_contrib", "tqdm", "tensorboard"):
+        pytest.importorskip(extra, reason="the extra [train] is not installed")
+    import torch
+    from sb3_contrib import MaskablePPO
+
+    from agents.network import policy_of
+    from bufgym.sb3 import make_vec_env
+
+    env = make_vec_env("bufgym/Uplink-v0", 2, scenario=WORLD, capacity=CAPACITY, decide_at="arrival")
+    policy, its_settings = policy_of(network, WIDTH)
+    model = MaskablePPO(policy, env, n_steps=8, batch_size=16, policy_kwargs=its_settings, device="cpu")
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    model.save(tmp_path / "model.zip")
+    return model
+
+
+@pytest.mark.slow
+def test_an_exported_agent_decides_as_it_did(tmp_path):
+    """Single precision there, double here: only candidates whose scores are all but equal may change places."""
+    model = untrained(tmp_path)
+    from agents.evaluate import run_agent
+
+    exported(tmp_path / "model.zip", tmp_path / "agent.safetensors", "--name", "tiny-agent", "--about", "Random.")
+    policy = policies.load(tmp_path / "agent.safetensors")
+    assert (policy.name, policy.summary) == ("tiny-agent", "Random.")
+
+    L, episodes = CAPACITY, [draw(WORLD, seed) for seed in range(12)]
+    envs = SenderVectorEnv(len(episodes), WORLD, L, decide_at="arrival")
+    envs.reset(options={"episodes": episodes})
+    rows, memory = envs.rows, policy.new_memory(1, L)[0]
+    met, differ, taken = 0, 0, set()
+    while not rows.shown.ended.all():
+        observation = rows.observation(rows.shown.slots, rows.shown.context)
+        actions, _ = model.predict(observation, deterministic=True, action_masks=rows.shown.mask)
+        batch = named(rows.senders.batch)
+        for i in np.flatnonzero(~rows.shown.ended):
+            arrival = batch.arrivals[i, batch.senders[i].next]
+            decision = policy.on_arrival(python_view(batch, i), arrival, memory)
+            met, differ = met + 1, differ + (decision != decision_of(actions[i], L))
+            taken.add(decision)
+        rows.step(np.asarray(actions, np.int64))
+    assert met > 3_000
+    assert len(taken) >= 4  # not one answer to everything
+    assert differ <= 0.001 * met
+
+    by_agent = run_agent(model, episodes, WORLD, L, "arrival")
+    assert by_agent == [outcome(rows.senders, i) for i in range(len(episodes))]
+    ours = run(policy, episodes, L, WORLD.value)
+    changed = sum(outcome(ours, i) != by_agent[i] for i in range(len(episodes)))
+    assert changed <= differ  # an episode goes another way only where a decision did
+
+
+def test_export_notes_what_the_run_was(tmp_path):
+    untrained(tmp_path)
+    from train import Arguments
+
+    arguments = Arguments(capacity=5, duration_s=10.0, decide_at="arrival")
+    run_folder = tmp_path / "runs" / "tiny"
+    home = run_folder / "seed-3"
+    home.mkdir(parents=True)
+    (tmp_path / "model.zip").rename(home / "model.zip")
+    exported(home / "model.zip", tmp_path / "alone.safetensors", "--name", "alone")
+    assert "training" not in weights_file.read(tmp_path / "alone.safetensors")[1]
+
+    (run_folder / "settings.json").write_text(json.dumps(asdict(arguments)), encoding="utf-8")
+    exported(home / "model.zip", tmp_path / "one.safetensors", "--name", "one")
+    made, metadata = weights_file.read(tmp_path / "one.safetensors")
+    assert metadata["training"].startswith("python train.py --capacity 5 --duration-s 10.0 --decide-at arrival")
+    assert metadata["seeds"] == [3]
+    assert made.widths == (8, 8)
+    assert set(made.fields) == set(NAMES)
+
+    (home / "model.zip").rename(run_folder / "model.zip")
+    scores = [{"policy": "agent (seed 3)", "qoi": 9.5}, {"policy": "drop-oldest", "qoi": 7.25}]
+    results = {"agent": "agent (seed 3)", "scores": scores, "held_out": {"episodes": 2, "traces": ["lte-synthetic-7"]}}
+    (run_folder / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    exported(run_folder / "model.zip", tmp_path / "best.safetensors", "--name", "best")
+    metadata = weights_file.read(tmp_path / "best.safetensors")[1]
+    assert metadata["seeds"] == [3]
+    assert metadata["scores"] == {"qoi": 9.5, "drop-oldest": 7.25, "held_out": results["held_out"]}
+
+
+def test_what_is_no_slot_scorer_is_not_exported(tmp_path):
+    untrained(tmp_path, network="plain")
+    out = tmp_path / "out.safetensors"
+    with pytest.raises(BufgymError, match="only an agent that scores slots"):
+        exported(tmp_path / "model.zip", out, "--name", "plain")
+    with pytest.raises(BufgymError, match="no such file"):
+        exported(tmp_path / "other.zip", out, "--name", "none")
+    (tmp_path / "text.zip").write_text("hello", encoding="utf-8")
+    with pytest.raises(BufgymError, match=r"text\.zip: no model of MaskablePPO"):
+        exported(tmp_path / "text.zip", out, "--name", "text")
+    assert not out.exists()
+
+
+def test_export_says_when_there_is_no_checkout(tmp_path, monkeypatch):
+    monkeypatch.setattr(command, "__file__", str(tmp_path / "bufgym" / "cli" / "export.py"))
+    with pytest.raises(BufgymError, match="needs a checkout"):
+        exported("model.zip", "out.safetensors", "--name", "any")
