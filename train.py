@@ -11,10 +11,19 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Arguments:
-    """Train a MaskablePPO agent on a bufgym environment and evaluate it on held-out episodes."""
+    """Train an agent on a bufgym environment, or on a whole suite, and evaluate it on held-out episodes."""
 
     env: str = "bufgym/Uplink-v0"
     """Gymnasium id."""
+    suite: str = ""
+    """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
+    validation split, and report on its test split; the agent is asked at every arrival."""
+    data: str = ""
+    """Folder of recordings, for suites that need one."""
+    capacities: str = ""
+    """L of a suite's episodes, such as 5,10,25; by default the suite's own."""
+    algo: Literal["maskable-ppo", "ppo", "dqn"] = "maskable-ppo"
+    """PPO with action masks, PPO without, or double DQN with them."""
     name: str = ""
     """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
     resume: bool = False
@@ -26,7 +35,7 @@ class Arguments:
     steps: int = 1_500_000
     """Decisions to learn from, for each seed."""
     capacity: int = 8
-    """L, messages."""
+    """L, messages (without a suite)."""
     size_bytes: int = 500_000
     """Mean message size (uplink only); 500 kB at 30 Hz is 1.5 times what the shipped traces carry."""
     duration_s: float = 30.0
@@ -53,8 +62,14 @@ class Arguments:
     """Weight of the entropy bonus."""
     checkpoint_every: int = 250_000
     """Steps."""
+    validate_every: int = 250_000
+    """Steps (with a suite)."""
+    validation_episodes: int = 300
+    """About so many in each validation, over all scenarios and capacities."""
+    test_seeds: int = 0
+    """Test episodes on each trace of a suite; 0: as many as the suite says."""
     episodes: int = 200
-    """Held-out episodes in the evaluation."""
+    """Held-out episodes in the evaluation (without a suite)."""
 
 
 def main(arguments: Arguments | None = None) -> None:
@@ -64,10 +79,14 @@ def main(arguments: Arguments | None = None) -> None:
 
         arguments = tyro.cli(Arguments)
     from agents import report, training  # not before the arguments are known to be good: torch takes seconds to load
+    from bufgym.errors import BufgymError
 
-    folder = training.prepare(arguments)
-    runs = training.train_all(arguments, folder)
-    report.evaluate_and_report(arguments, folder, runs)
+    try:
+        folder = training.prepare(arguments)
+        runs = training.train_all(arguments, folder)
+        (report.report_suite if arguments.suite else report.evaluate_and_report)(arguments, folder, runs)
+    except BufgymError as error:
+        raise SystemExit(f"error: {error}") from None
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from gymnasium import spaces
 from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
+from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
@@ -44,30 +45,61 @@ class SlotFeatures(BaseFeaturesExtractor):
 
 
 class SlotScorer(nn.Module):
-    """Logits of all L + 2 actions, and the latent that the value is read from."""
+    """Logits of all L + 2 actions, and the latent that the value is read from.
 
-    def __init__(self, slots: int, per_slot: int, width: int) -> None:
+    Args:
+        features: says how the numbers lie.
+        width: of the hidden layers.
+        masked: empty slots are never chosen, so they are not scored. Their logits are 0, for the mask to take away.
+        accept_bias: what the logit of accepting begins with.
+    """
+
+    def __init__(
+        self, features: SlotFeatures, width: int, masked: bool = True, accept_bias: float = ACCEPT_BIAS
+    ) -> None:
         super().__init__()
-        self.shape = (slots, per_slot)
+        slots, inputs = features.slots, features.per_slot
+        self.shape = (slots, inputs)
         self.latent_dim_pi, self.latent_dim_vf = slots + 1, width
-        self.score = _perceptron(per_slot, width, 1)
+        self.occupied = features.slot_fields.index("occupied") if "occupied" in features.slot_fields else None
+        self.masked = masked and self.occupied is not None
+        self.score = _perceptron(inputs, width, 1)
         """Slot -> logit of dropping it; the last slot is the newcomer, so its logit is that of rejecting."""
-        self.accept = _perceptron(per_slot, width, 1, bias=ACCEPT_BIAS)
+        self.accept = _perceptron(inputs, width, 1, bias=accept_bias)
         """The newcomer's features -> logit of accepting it."""
-        self.worth = nn.Sequential(nn.Linear(per_slot, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+        self.worth = nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
         self.critic = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU())
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        return self.forward_actor(features), self.forward_critic(features)
+        slots, here = self._slots(features)
+        return self._logits(slots, here), self._latent(slots, here)
 
     def forward_actor(self, features: Tensor) -> Tensor:
-        slots = features.reshape(-1, *self.shape)
-        return torch.cat([self.score(slots).squeeze(-1), self.accept(slots[:, -1])], dim=1)
+        return self._logits(*self._slots(features))
 
     def forward_critic(self, features: Tensor) -> Tensor:
-        latent = self.worth(features.reshape(-1, *self.shape))
-        # The mean over slots, occupied or not, keeps the width independent of L.
-        result: Tensor = self.critic(torch.cat([latent.mean(dim=1), latent[:, -1]], dim=1))
+        return self._latent(*self._slots(features))
+
+    def _slots(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """[n, slots, inputs], and [n, slots]: which of them hold a message."""
+        slots = features.reshape(-1, *self.shape)
+        if self.occupied is None:
+            return slots, torch.ones(slots.shape[:2], dtype=torch.bool)
+        return slots, slots[..., self.occupied] > 0
+
+    def _logits(self, slots: Tensor, here: Tensor) -> Tensor:
+        if self.masked:
+            drop = torch.zeros(here.shape).masked_scatter(here, self.score(slots[here]).squeeze(-1))
+        else:
+            drop = self.score(slots).squeeze(-1)
+        return torch.cat([drop, self.accept(slots[:, -1])], dim=1)
+
+    def _latent(self, slots: Tensor, here: Tensor) -> Tensor:
+        """From the mean over messages and from the newcomer: its width is independent of L."""
+        total = torch.zeros(len(slots), self.latent_dim_vf)
+        total = total.index_add(0, here.nonzero()[:, 0], self.worth(slots[here]))
+        mean = total / here.sum(dim=1, keepdim=True).clamp(min=1)
+        result: Tensor = self.critic(torch.cat([mean, self.worth(slots[:, -1])], dim=1))
         return result
 
 
@@ -80,10 +112,11 @@ def _perceptron(inputs: int, width: int, outputs: int, bias: float = 0.0) -> nn.
 
 
 class SlotPolicy(MaskableMultiInputActorCriticPolicy):
-    """MaskablePPO's actor and critic made of a ``SlotScorer``."""
+    """Actor and critic made of a ``SlotScorer``, for MaskablePPO or (``masked=False``) for PPO."""
 
-    def __init__(self, *args: Any, width: int = 32, **kwargs: Any) -> None:
-        self.width = width
+    def __init__(self, *args: Any, width: int = 32, masked: bool = True, **kwargs: Any) -> None:
+        self.width, self.masked = width, masked
+        kwargs.pop("use_sde", None)  # PPO says so to every policy, MaskablePPO to none; actions are discrete
         kwargs.setdefault("features_extractor_class", SlotFeatures)
         # Layers are initialised here as torch does; the library's orthogonal scheme would undo the accept bias.
         kwargs["ortho_init"] = False
@@ -92,7 +125,7 @@ class SlotPolicy(MaskableMultiInputActorCriticPolicy):
     def _build_mlp_extractor(self) -> None:
         features = self.features_extractor
         assert isinstance(features, SlotFeatures)
-        self.mlp_extractor = SlotScorer(features.slots, features.per_slot, self.width)  # type: ignore[assignment]
+        self.mlp_extractor = SlotScorer(features, self.width, self.masked)  # type: ignore[assignment]
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
@@ -102,11 +135,12 @@ class SlotPolicy(MaskableMultiInputActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), **settings)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | {"width": self.width}
+        return super()._get_constructor_parameters() | {"width": self.width, "masked": self.masked}
 
 
-def policy_of(network: str, width: int) -> tuple[Any, dict[str, Any]]:
-    """(policy class, its arguments) for "slots" or "plain"."""
+def policy_of(network: str, width: int, masked: bool = True) -> tuple[Any, dict[str, Any]]:
+    """(actor and critic, their arguments) for "slots" or "plain"."""
     if network == "slots":
-        return SlotPolicy, {"width": width}
-    return MaskableMultiInputActorCriticPolicy, {"net_arch": [2 * width, 2 * width], "activation_fn": nn.ReLU}
+        return SlotPolicy, {"width": width, "masked": masked}
+    plain = MaskableMultiInputActorCriticPolicy if masked else MultiInputActorCriticPolicy
+    return plain, {"net_arch": [2 * width, 2 * width], "activation_fn": nn.ReLU}

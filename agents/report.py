@@ -5,17 +5,22 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import json
+import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from sb3_contrib import MaskablePPO
+from numpy.typing import NDArray
 
 from agents.evaluate import held_out, run_agent, run_fixed, summarise, worlds
-from agents.training import Run
+from agents.training import ALGORITHMS, Run, load, plan
+from agents.trials import Trials
+from bufgym.benchmark.rows import Row, write_rows
+from bufgym.benchmark.score import Interval, Scores, scores
 from bufgym.benchmark.table import aligned
+from bufgym.policies import registry
 
 if TYPE_CHECKING:
     from train import Arguments
@@ -40,7 +45,7 @@ def evaluate_and_report(arguments: Arguments, folder: Path, runs: Sequence[Run])
     # Chosen by its training episodes: choosing by the held-out ones would flatter it.
     best = max(runs, key=lambda run: run.score)
     for run in runs:
-        model = MaskablePPO.load(run.model, device="cpu")
+        model = load(arguments, run)
         results[agent_name(run)] = run_agent(model, episodes, world, arguments.capacity, arguments.decide_at)
         if run is best:
             export(model, folder)
@@ -78,7 +83,7 @@ def table(rows: Sequence[dict[str, Any]], agent: str) -> str:
     return "\n".join(aligned(lines))
 
 
-def export(model: MaskablePPO, folder: Path) -> None:
+def export(model: Any, folder: Path) -> None:
     """The weights as plain numbers: unlike model.zip, reading them never runs code."""
     if importlib.util.find_spec("safetensors") is None:
         return
@@ -91,29 +96,115 @@ def export(model: MaskablePPO, folder: Path) -> None:
 
 def draw(rows: Sequence[dict[str, Any]], runs: Sequence[Run], path: Path) -> None:
     """Learning curves on the left, held-out QoI of every policy on the right."""
+    shown = {row["policy"]: row["qoi"] for row in rows}
+    curves = [np.array(run.curve).reshape(-1, 3)[:, [0, 2]] for run in runs]
+    _figure(
+        path, runs, curves, "QoI H, mean of the latest training episodes", shown, "QoI H, mean", "Held-out episodes"
+    )
+
+
+def _figure(
+    path: Path,
+    runs: Sequence[Run],
+    curves: Sequence[NDArray[Any]],
+    measure: str,
+    reached: Mapping[str, float],
+    unit: str,
+    title: str,
+) -> None:
+    """``curves``: (steps, measure) of each run; ``reached``: best first."""
     if importlib.util.find_spec("matplotlib") is None:
         print("no figure: matplotlib is not installed")
         return
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    figure = Figure(figsize=(11, 4.2 + 0.12 * max(0, len(reached) - 12)), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
-    for run in runs:
-        curve = np.array(run.curve).reshape(-1, 3)
-        left.plot(curve[:, 0] / 1e6, curve[:, 2], label=f"seed {run.seed}")
-    left.set(xlabel="decisions, millions", ylabel="QoI H, mean of the latest episodes", title="Training")
+    for run, curve in zip(runs, curves, strict=True):
+        left.plot(curve[:, 0] / 1e6, curve[:, 1], label=f"seed {run.seed}")
+    left.set(xlabel="decisions, millions", ylabel=measure, title="Training")
     left.grid(alpha=0.3)
     if len(runs) > 1:
         left.legend(frameon=False)
-    shown = rows[::-1]
-    colours = ["tab:orange" if row["policy"].startswith("agent") else "tab:blue" for row in shown]
-    qoi = [row["qoi"] for row in shown]
-    bars = right.barh([row["policy"] for row in shown], qoi, color=colours)
+    names, numbers = list(reached)[::-1], list(reached.values())[::-1]
+    colours = ["tab:orange" if name.startswith("agent") else "tab:blue" for name in names]
+    bars = right.barh(names, numbers, color=colours)
     right.bar_label(bars, fmt="%.3f", padding=3)
-    spread = max(qoi) - min(qoi) or 1.0
-    right.set(xlabel="QoI H, mean (axis does not start at 0)", title="Held-out episodes")
-    right.set_xlim(min(qoi) - 0.15 * spread, max(qoi) + 0.2 * spread)
+    spread = max(numbers) - min(numbers) or 1.0
+    right.set(xlabel=f"{unit} (axis does not start at 0)", title=title)
+    right.set_xlim(min(numbers) - 0.15 * spread, max(numbers) + 0.2 * spread)
     right.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=120)
+
+
+# --- on a suite ------------------------------------------------------------------------------------------------------
+
+
+def report_suite(arguments: Arguments, folder: Path, runs: Sequence[Run]) -> Scores:
+    """All agents and fixed policies on the suite's test split, scored as ``bufgym bench`` does; print and save it.
+
+    The training seeds together are one entry, with intervals over them and over episodes. Nothing is chosen here: each
+    seed's agent, and the one in model.zip, are those that did best on validation.
+    """
+    trials = Trials(
+        plan(arguments, "test", tuple(registry.names()), arguments.test_seeds or None), folder / "test", progress=True
+    )
+    best = max(runs, key=lambda run: run.score)
+    agents = {run.seed: ALGORITHMS[arguments.algo].test(arguments, run, trials) for run in runs}
+    rows: list[Row] = [{**row, "training_seed": None} for row in trials.rows]
+    rows += [row for seed in agents for row in agents[seed]]
+    write_rows(rows, folder / "rows.csv")
+    unranked = [name for name in registry.names() if not registry.get(name).ranked]
+    found = scores(rows, unranked=unranked)
+    print(standings(found))
+    shutil.copyfile(best.model, folder / best.model.name)
+    qoi: dict[str, list[float]] = {}
+    for row in rows:
+        qoi.setdefault(row["policy"], []).append(row["qoi"])
+    qoi |= {f"agent (seed {seed})": [row["qoi"] for row in agents[seed]] for seed in agents}
+    saved = {
+        "settings": dataclasses.asdict(arguments),
+        "seeds": [run.seed for run in runs],
+        "agent": agent_name(best),
+        "training_s": {str(run.seed): run.seconds for run in runs},
+        "validation": {str(run.seed): run.score for run in runs},
+        "held_out": {"suite": arguments.suite, "split": "test", "episodes": len(trials.rows) // len(trials.plan.specs)},
+        "scores": [{"policy": name, "qoi": float(np.mean(numbers))} for name, numbers in qoi.items()],
+        "standings": [dataclasses.asdict(standing) for standing in found.standings],
+        "cells": [dataclasses.asdict(cell) for cell in found.cells],
+    }
+    (folder / "results.json").write_text(json.dumps(saved, indent=2) + "\n", encoding="utf-8")
+    # What is below Drop Oldest is in the table alone: it would squeeze the rest.
+    shown = [s for s in found.standings if s.ranked and (s.score.value >= 0 or s.policy.startswith("agent"))]
+    reached = {s.policy: s.score.value for s in shown}
+    curves = [np.array(run.validation)[:, [0, 2]] for run in runs]
+    _figure(folder / "figure.png", runs, curves, "score on validation", reached, "normalised score", "Test split")
+    seconds = ", ".join(f"{run.seconds:.0f}" for run in runs)
+    print(f"\ntraining took {seconds} s; model, rows, figure and numbers are in {folder}")
+    return found
+
+
+def standings(found: Scores) -> str:
+    """Ranked policies first, best score first, with the intervals of the benchmark."""
+    lines = [["policy", "score", "95 %", "regret", "95 %", "IQM", "P(better than AFR)", "95 %"]]
+    for standing in found.standings:
+        cells = []
+        for interval, spec in ((standing.score, ".3f"), (standing.regret, ".2%")):
+            cells += [_number(interval.value, spec), _span(interval, spec)]
+        better = [_number(standing.improvement.value, ".2f"), _span(standing.improvement, ".2f")]
+        name = standing.policy if standing.ranked else f"{standing.policy} (not ranked)"
+        lines.append([name, *cells, _number(standing.iqm.value, ".3f"), *better])
+    biting = max((standing.cells for standing in found.standings), default=0)
+    total = len({(cell.scenario, cell.capacity) for cell in found.cells})
+    note = f"{biting} of {total} cells (scenario, L) count; score: 0 is {found.baseline}, 1 the clairvoyant"
+    return "\n".join([*aligned(lines), note])
+
+
+def _number(number: float, spec: str) -> str:
+    return "-" if math.isnan(number) else format(number, spec)
+
+
+def _span(interval: Interval, spec: str) -> str:
+    return "" if math.isnan(interval.low) else f"[{interval.low:{spec}}, {interval.high:{spec}}]"

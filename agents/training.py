@@ -1,4 +1,4 @@
-"""Training MaskablePPO: settings, checkpoints, resuming, one process a seed.
+"""Training agents: settings, checkpoints, resuming, one process a seed.
 
 PPO is bound here by its updates, not by the environment (a compiled step of 256 environments costs as much as one
 gradient step on a few hundred decisions). So: large batches, few epochs, a small network, one torch thread a process.
@@ -7,29 +7,33 @@ gradient step on a few hundred decisions). So: large batches, few epochs, a smal
 from __future__ import annotations
 
 import concurrent.futures
-import csv
 import dataclasses
 import json
+import math
 import multiprocessing
 import os
 import shutil
-import sys
-import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
-from tqdm import tqdm
 
-from agents.evaluate import worlds
+from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
+from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
+from agents.evaluate import Agent, worlds
 from agents.network import policy_of
-from bufgym.benchmark.rows import replaced
+from agents.trials import Trials, seeds_for
+from agents.worlds import World, capacities_of, cells
+from bufgym.benchmark.campaign import Plan
+from bufgym.benchmark.rows import Row
 from bufgym.errors import BufgymError
 from bufgym.sb3 import GymVecEnv, make_vec_env
 
@@ -37,20 +41,22 @@ if TYPE_CHECKING:
     from train import Arguments
 
 RUNS = Path("runs")
-FREE = {"name", "resume", "steps", "checkpoint_every", "episodes", "seeds"}
+FREE = {"name", "resume", "steps", "checkpoint_every", "validate_every", "episodes", "seeds"}
 """Arguments that may differ between a run and its resumption."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One seed's finished training."""
+    """One seed's finished training; the agent to keep is in ``model``."""
 
     seed: int
     folder: Path
     seconds: float
     """Time spent training, over all its sessions."""
-    curve: list[tuple[int, float, float]]
+    curve: list[tuple[float, ...]]
     """(steps, seconds, mean QoI of the latest training episodes), a row an update."""
+    validation: list[tuple[float, ...]] = field(default_factory=list)
+    """(steps, seconds, *Verdict), a row a validation; none without a suite."""
 
     @property
     def model(self) -> Path:
@@ -58,9 +64,21 @@ class Run:
 
     @property
     def score(self) -> float:
-        """Mean QoI in the last tenth of training."""
-        last = [qoi for _, _, qoi in self.curve[-max(1, len(self.curve) // 10) :]]
+        """The best on validation, or without a suite the mean QoI in the last tenth of training."""
+        if self.validation:
+            return max(row[2] for row in self.validation)
+        last = [row[2] for row in self.curve[-max(1, len(self.curve) // 10) :]]
         return float(np.mean(last)) if last else float("nan")
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """One way to an agent."""
+
+    train: Callable[[Arguments, Path, int, int], Run]
+    """(arguments, the run's folder, seed, line of its progress bar) -> the finished seed."""
+    test: Callable[[Arguments, Run, Trials], list[Row]]
+    """Its rows on a suite's trials."""
 
 
 # --- the run's folder ------------------------------------------------------------------------------------------------
@@ -71,6 +89,8 @@ def prepare(arguments: Arguments) -> Path:
     folder = RUNS / (arguments.name or _default_name(arguments.resume))
     noted = folder / "settings.json"
     given = dataclasses.asdict(arguments)
+    if arguments.suite:
+        plan(arguments, "validation").checked()  # mistakes are told before anything is made
     if arguments.resume:
         if not noted.exists():
             raise SystemExit(f"--resume: there is no run in {folder}")
@@ -92,34 +112,38 @@ def _default_name(resume: bool) -> str:
     return f"train-{max(taken, default=0) + (0 if resume and taken else 1)}"
 
 
-def checkpoints(folder: Path) -> list[Path]:
-    """A seed's checkpoints, oldest first."""
-    return sorted((folder / "checkpoints").glob("*.zip"))
-
-
-def save(model: MaskablePPO, path: Path) -> None:
-    """Whole or not at all: a kill while writing leaves no broken file under this name."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replaced(path) as unfinished:
-        model.save(unfinished)
-
-
 # --- training --------------------------------------------------------------------------------------------------------
 
 
 def train_all(arguments: Arguments, folder: Path) -> list[Run]:
     """Train every seed, in processes of their own if there are several."""
+    train = ALGORITHMS[arguments.algo].train
     seeds = range(arguments.seed, arguments.seed + arguments.seeds)
     if not seeds:
         raise BufgymError(f"seeds = {arguments.seeds}: must be >= 1")
+    if arguments.suite:
+        validation_of(arguments, folder, progress=True)  # the clairvoyant's bounds are found once for all seeds
     if len(seeds) == 1:
-        return [train_seed(arguments, folder, seeds[0])]
+        return [train(arguments, folder, seeds[0], 0)]
     workers = min(len(seeds), os.cpu_count() or 1)
     # A fresh interpreter each: torch's threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-        jobs = [pool.submit(train_seed, arguments, folder, seed, line) for line, seed in enumerate(seeds)]
+        jobs = [pool.submit(train, arguments, folder, seed, line) for line, seed in enumerate(seeds)]
         return [job.result() for job in jobs]
+
+
+def plan(arguments: Arguments, split: str, specs: tuple[str, ...] = ("afr",), seeds: int | None = None) -> Plan:
+    """What the fixed policies meet on a split of the suite."""
+    capacities, data = capacities_of(arguments.suite, arguments.capacities), arguments.data or None
+    if split == "validation":
+        seeds = seeds_for(arguments.suite, split, capacities, arguments.validation_episodes, data)
+    return Plan(arguments.suite, specs, split, capacities, seeds, data)
+
+
+def validation_of(arguments: Arguments, folder: Path, progress: bool = False) -> Trials:
+    """The fixed set of validation episodes; made once, read from the run's folder afterwards."""
+    return Trials(plan(arguments, "validation"), folder / "validation", progress=progress)
 
 
 def train_seed(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> Run:
@@ -128,26 +152,48 @@ def train_seed(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> 
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
     env = training_env(arguments)
+    kind, new = LEARNERS[arguments.algo]
     saved = checkpoints(home)
-    model = MaskablePPO.load(saved[-1], env=env, device="cpu") if saved else new_model(arguments, env)
+    torch.manual_seed(seed)  # of the first weights
+    model = kind.load(saved[-1], env=env, device="cpu") if saved else new(arguments, env)
     # Every session has luck of its own, told by where it begins: the episodes before a kill do not come again.
     model.set_random_seed(int(np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1)[0]))
     model.set_logger(configure(str(home / "tensorboard"), ["tensorboard"]))
     curve = Curve(home / "curve.csv", model.num_timesteps)
-    progress = Progress(curve, arguments.steps, seed, line)
+    validation = None
+    if arguments.suite:
+        trials, seats = validation_of(arguments, folder), seats_of(arguments)
+        validation = Validation(home, arguments.validate_every, trials, seats, curve, model.num_timesteps)
+    progress = Progress(validation or curve, arguments.steps, seed, line)
     left = arguments.steps - model.num_timesteps
     if left > 0:
+        callbacks = [Checkpoints(home, arguments.checkpoint_every), curve, *filter(None, [validation]), progress]
         # The library counts ``total_timesteps`` from here on when the count is not reset.
-        model.learn(left, [Checkpoints(home, arguments.checkpoint_every), curve, progress], reset_num_timesteps=False)
-        save(model, home / "checkpoints" / f"{model.num_timesteps:012d}.zip")
+        model.learn(left, callbacks, reset_num_timesteps=False)
+        save(model, home)
+    kept = checkpoints(home)[-1]
+    if validation is not None:
+        validation.validate(model)
+        kept = checkpoint(home, int(validation.best()[0]))
     model.logger.close()
     env.close()
-    shutil.copyfile(checkpoints(home)[-1], home / "model.zip")
-    return Run(seed, home, curve.seconds, curve.rows)
+    shutil.copyfile(kept, home / "model.zip")
+    seconds = curve.record.rows[-1][1] if curve.record.rows else 0.0
+    return Run(seed, home, seconds, curve.record.rows, validation.rows if validation else [])
+
+
+def seats_of(arguments: Arguments) -> int:
+    """Slots that the agent of a suite is shown."""
+    return max(capacities_of(arguments.suite, arguments.capacities))
 
 
 def training_env(arguments: Arguments) -> GymVecEnv:
-    """The batch of environments to train on."""
+    """The batch of environments to train on: of one scenario, or of a suite's whole train split."""
+    if arguments.suite:
+        capacities = capacities_of(arguments.suite, arguments.capacities)
+        mixed = cells(arguments.suite, "train", capacities, arguments.data or None)
+        each = math.ceil(arguments.num_envs / len(mixed))
+        return GymVecEnv(World(mixed, [each] * len(mixed), reward=arguments.reward))
     return make_vec_env(
         arguments.env,
         arguments.num_envs,
@@ -158,117 +204,97 @@ def training_env(arguments: Arguments) -> GymVecEnv:
     )
 
 
-def new_model(arguments: Arguments, env: GymVecEnv) -> MaskablePPO:
-    """An untrained agent."""
-    policy, settings = policy_of(arguments.network, arguments.width)
-    return MaskablePPO(
+class UnmaskedPPO(PPO):
+    """PPO that is told of no masks: what is impossible does what a queue does, and the agent has to find out."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+        action_masks: NDArray[np.bool_] | None = None,
+    ) -> tuple[NDArray[Any], Any]:
+        """The policy's action; masks are not looked at."""
+        return super().predict(observation, state, episode_start, deterministic)
+
+
+def new_ppo(arguments: Arguments, env: GymVecEnv) -> MaskablePPO | PPO:
+    """An untrained actor and critic."""
+    masked = arguments.algo == "maskable-ppo"
+    policy, settings = policy_of(arguments.network, arguments.width, masked)
+    return (MaskablePPO if masked else UnmaskedPPO)(
         policy,
         env,
         learning_rate=LinearSchedule(arguments.learning_rate, 0.0, 1.0),
         n_steps=arguments.n_steps,
-        batch_size=min(arguments.batch_size, arguments.n_steps * arguments.num_envs),
+        batch_size=_even(arguments.n_steps * env.num_envs, arguments.batch_size),
         n_epochs=arguments.epochs,
         gamma=arguments.gamma,
         gae_lambda=arguments.gae_lambda,
         ent_coef=arguments.entropy,
-        stats_window_size=arguments.num_envs,
+        stats_window_size=env.num_envs,
         policy_kwargs=settings,
         device="cpu",
     )
 
 
-class Checkpoints(BaseCallback):
-    """Saves the whole learner (weights, optimizer, counters) every so many steps, between updates."""
-
-    def __init__(self, home: Path, every: int) -> None:
-        super().__init__()
-        self.home, self.every = home, every
-        self.last = 0
-
-    def _on_training_start(self) -> None:
-        self.last = self.num_timesteps
-
-    def _on_rollout_start(self) -> None:
-        if self.model.num_timesteps - self.last >= self.every:
-            self.last = self.model.num_timesteps
-            assert isinstance(self.model, MaskablePPO)
-            save(self.model, self.home / "checkpoints" / f"{self.last:012d}.zip")
-
-    def _on_step(self) -> bool:
-        return True
+def _even(decisions: int, most: int) -> int:
+    """The largest batch size up to ``most`` that divides the decisions: no update ends with a noisy rest of a batch."""
+    batches = -(-decisions // most)
+    while decisions % batches:
+        batches += 1
+    return decisions // batches
 
 
-class Curve(BaseCallback):
-    """The learning curve, written to a CSV file as it grows; a resumed run keeps the rows up to its checkpoint."""
+def new_dqn(arguments: Arguments, env: GymVecEnv) -> MaskedDQN:
+    """An untrained Q network. It sees each decision as often as PPO (``epochs`` times), in smaller batches and steps.
 
-    def __init__(self, path: Path, steps: int) -> None:
-        super().__init__()
-        self.path = path
-        self.rows: list[tuple[int, float, float]] = []
-        if path.exists():
-            with path.open(newline="", encoding="utf-8") as file:
-                read = [(int(r["steps"]), float(r["seconds"]), float(r["qoi"])) for r in csv.DictReader(file)]
-            self.rows = [row for row in read if row[0] <= steps]
-        self.seconds_before = self.rows[-1][1] if self.rows else 0.0
-        self.began = time.perf_counter()
-        with path.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([("steps", "seconds", "qoi"), *self.rows])
-
-    @property
-    def seconds(self) -> float:
-        return self.rows[-1][1] if self.rows else 0.0
-
-    def _on_training_start(self) -> None:
-        self.began = time.perf_counter()
-
-    def _on_rollout_end(self) -> None:
-        ended = [episode["r"] for episode in self.model.ep_info_buffer or ()]
-        qoi = 1 + float(np.mean(ended)) if ended else float("nan")
-        row = (self.num_timesteps, round(self.seconds_before + time.perf_counter() - self.began, 3), qoi)
-        self.rows.append(row)
-        with self.path.open("a", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerow(row)
-        self.logger.record("rollout/qoi", qoi)
-
-    def _on_step(self) -> bool:
-        return True
+    Little is explored: a message dropped at random is missing for the rest of the episode.
+    """
+    batch = max(1, arguments.batch_size // 4)
+    steps = max(1, arguments.n_steps // 16)
+    return MaskedDQN(
+        MaskedDQNPolicy,
+        env,
+        learning_rate=LinearSchedule(arguments.learning_rate / 4, 0.0, 1.0),
+        buffer_size=max(REPLAY, env.num_envs),
+        learning_starts=4 * batch,
+        batch_size=batch,
+        gamma=arguments.gamma,
+        train_freq=(steps, "step"),
+        gradient_steps=max(1, arguments.epochs * steps * env.num_envs // batch),
+        target_update_interval=max(8 * batch, env.num_envs),
+        exploration_initial_eps=0.1,
+        exploration_final_eps=0.01,
+        exploration_fraction=0.5,
+        stats_window_size=env.num_envs,
+        policy_kwargs=dqn_policy_of(arguments.network, arguments.width),
+        device="cpu",
+    )
 
 
-class Progress(BaseCallback):
-    """A bar with the time left on a terminal, a plain line every tenth of the way elsewhere."""
+REPLAY = 100_000
+"""Decisions; at 32 slots they take about 250 MB."""
 
-    def __init__(self, curve: Curve, steps: int, seed: int, line: int) -> None:
-        super().__init__()
-        self.curve, self.steps, self.seed, self.line = curve, steps, seed, line
-        self.bar: Any = None
-        self.told = self.first = 0
+LEARNERS: dict[str, tuple[Any, Callable[[Arguments, GymVecEnv], Any]]] = {
+    "maskable-ppo": (MaskablePPO, new_ppo),
+    "ppo": (UnmaskedPPO, new_ppo),
+    "dqn": (MaskedDQN, new_dqn),
+}
+"""Algorithm -> (its class, a new one)."""
 
-    def _on_training_start(self) -> None:
-        self.told = self.first = self.num_timesteps
-        self.bar = tqdm(
-            total=self.steps,
-            initial=self.num_timesteps,
-            desc=f"seed {self.seed}",
-            unit=" steps",
-            unit_scale=True,
-            position=self.line,
-            disable=not sys.stderr.isatty(),
-        )
 
-    def _on_rollout_end(self) -> None:
-        qoi = self.curve.rows[-1][2] if self.curve.rows else float("nan")
-        self.bar.update(self.num_timesteps - self.bar.n)
-        self.bar.set_postfix_str(f"QoI {qoi:.3f}", refresh=False)
-        if self.bar.disable and (self.num_timesteps - self.told) * 10 >= self.steps:
-            self.told = self.num_timesteps
-            spent = time.perf_counter() - self.curve.began
-            left = max(0.0, spent / (self.told - self.first) * (self.steps - self.told))
-            print(
-                f"seed {self.seed}: {self.told:,} of {self.steps:,} steps, QoI {qoi:.3f}, {left:.0f} s left", flush=True
-            )
+def load(arguments: Arguments, run: Run) -> Any:
+    """The agent that the run kept."""
+    torch.set_num_threads(1)  # on batches this small, more only wait for one another
+    return LEARNERS[arguments.algo][0].load(run.model, device="cpu")
 
-    def _on_training_end(self) -> None:
-        self.bar.close()
 
-    def _on_step(self) -> bool:
-        return True
+def _test(arguments: Arguments, run: Run, trials: Trials) -> list[Row]:
+    agent: Agent = load(arguments, run)
+    return trials.rows_of(agent, seats_of(arguments), f"agent ({arguments.algo})", run.seed)
+
+
+ALGORITHMS = {name: Algorithm(train_seed, _test) for name in LEARNERS}
+"""What ``--algo`` can name."""

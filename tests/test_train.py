@@ -20,6 +20,10 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard", "matplotlib"):
 
 import train  # noqa: E402  (these need the extras)
 from agents import evaluate, training  # noqa: E402
+from agents.trials import Trials, Verdict  # noqa: E402
+from bufgym import suites  # noqa: E402
+from bufgym.benchmark.rows import read_rows  # noqa: E402
+from bufgym.errors import BufgymError  # noqa: E402
 from bufgym.policies import registry  # noqa: E402
 
 REPO = Path(__file__).resolve().parent.parent
@@ -36,6 +40,19 @@ TINY = train.Arguments(
     checkpoint_every=128,
     episodes=3,
 )
+SUITE = dataclasses.replace(
+    TINY,
+    suite="interruption-v1",
+    capacities="4,6",
+    num_envs=12,
+    n_steps=32,
+    batch_size=96,
+    steps=1_152,
+    validate_every=384,
+    validation_episodes=60,
+    test_seeds=10,
+)
+"""Three updates of 384 decisions: two rows of each of 3 scenarios x 2 capacities, 32 steps each."""
 
 
 @pytest.fixture(autouse=True)
@@ -147,12 +164,119 @@ def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: str) -> None
     assert any(outcome.dropped for outcome in agent)
 
 
+# --- on a suite ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", list(training.ALGORITHMS))
+def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: pytest.CaptureFixture[str]) -> None:
+    train.main(dataclasses.replace(SUITE, algo=algo))
+    folder = Path("runs/tiny")
+    results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    ranked = [standing["policy"] for standing in results["standings"] if standing["ranked"]]
+    agent = f"agent ({algo})"
+    assert {*registry.names(), agent} == {standing["policy"] for standing in results["standings"]}
+    assert agent in ranked
+    assert {cell["exact"] for cell in results["cells"]} == {True}
+    assert results["held_out"] == {"suite": "interruption-v1", "split": "test", "episodes": 60}
+    # The columns of the benchmark, and the training seed: none for a fixed policy.
+    rows = read_rows(folder / "rows.csv")
+    assert {row["training_seed"] for row in rows if row["policy"] == agent} == {0}
+    assert {row["training_seed"] for row in rows if row["policy"] != agent} == {None}
+    assert {row["scenario"] for row in rows} == set(suites.get("interruption-v1").settings("test"))
+    impossible = sum(row["impossible"] for row in rows if row["policy"] == agent)
+    assert impossible == 0 or algo == "ppo"
+    # Validated before the first update, every 384 steps, and at the end; the agent kept is the one that did best.
+    home = folder / "seed-0"
+    with (home / "validation.csv").open(newline="", encoding="utf-8") as file:
+        validation = {int(row["steps"]): float(row["score"]) for row in csv.DictReader(file)}
+    assert list(validation) == [0, 384, 768, 1152]
+    best = max(validation, key=lambda steps: validation[steps])
+    kept = home / "checkpoints" / f"{best:012d}.zip"
+    assert (folder / "model.zip").read_bytes() == (home / "model.zip").read_bytes() == kept.read_bytes()
+    assert results["validation"] == {"0": max(validation.values())}
+    assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
+    printed = capsys.readouterr().out
+    assert agent in printed
+    assert "cells (scenario, L) count" in printed
+
+
+def weights(arguments: train.Arguments, name: str) -> dict[str, np.ndarray]:
+    """All weights after training."""
+    folder = training.prepare(dataclasses.replace(arguments, name=name))
+    run = training.train_seed(arguments, folder, arguments.seed)
+    return {key: tensor.numpy() for key, tensor in training.load(arguments, run).policy.state_dict().items()}
+
+
+@pytest.mark.parametrize("algo", list(training.LEARNERS))
+def test_the_same_seed_gives_the_same_weights_bit_for_bit(algo: str) -> None:
+    arguments = dataclasses.replace(TINY, algo=algo, steps=256)
+    first, again = weights(arguments, "first"), weights(arguments, "again")
+    assert all((first[key] == again[key]).all() for key in first)
+    other = weights(dataclasses.replace(arguments, seed=1), "other")
+    assert not all((first[key] == other[key]).all() for key in first)
+
+
+@pytest.mark.slow
+def test_on_a_suite_too_the_same_seed_gives_the_same_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    verdicts = iter([0.1, 0.9, 0.3, 0.2] * 2)
+    monkeypatch.setattr(Trials, "verdict", lambda self, agent, seats: Verdict(next(verdicts), 0.0, 1.0))
+    first, again = weights(SUITE, "first"), weights(SUITE, "again")
+    assert all((first[key] == again[key]).all() for key in first)
+    # The second validation was the best: its agent is kept, not the last one.
+    assert training.MaskablePPO.load("runs/first/seed-0/model.zip").num_timesteps == 384
+
+
+@pytest.mark.slow
+def test_a_suites_run_goes_on_with_its_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    verdicts = iter([0.1, 0.9, 0.3, 0.5, 0.4])
+    monkeypatch.setattr(Trials, "verdict", lambda self, agent, seats: Verdict(next(verdicts), 0.0, 1.0))
+    folder = training.prepare(SUITE)
+    run = training.train_seed(dataclasses.replace(SUITE, steps=768), folder, 0)
+    assert [(row[0], row[2]) for row in run.validation] == [(0, 0.1), (384, 0.9), (768, 0.3)]
+    again = training.train_seed(dataclasses.replace(SUITE, resume=True), folder, 0)
+    assert [(row[0], row[2]) for row in again.validation] == [(0, 0.1), (384, 0.9), (768, 0.3), (1152, 0.5)]
+    assert again.score == 0.9
+    assert training.MaskablePPO.load(again.model).num_timesteps == 384
+
+
+def test_dqn_goes_on_with_its_optimizer_and_a_fresh_replay() -> None:
+    arguments = dataclasses.replace(TINY, algo="dqn")
+    folder = training.prepare(arguments)
+    training.train_seed(dataclasses.replace(arguments, steps=256), folder, 0)
+    before = training.MaskedDQN.load(training.checkpoints(folder / "seed-0")[-1])
+    run = training.train_seed(arguments, folder, 0)
+    after = training.load(arguments, run)
+    assert (before.num_timesteps, after.num_timesteps) == (256, 512)
+    counts = [
+        {int(state["step"]) for state in model.policy.optimizer.state_dict()["state"].values()}
+        for model in (before, after)
+    ]
+    assert counts == [{before._n_updates}, {after._n_updates}]
+    assert after._n_updates > before._n_updates > 0
+
+
+def test_batches_divide_the_experience() -> None:
+    assert training._even(32_768, 4_096) == 4_096
+    assert training._even(34_560, 4_096) == 3_840  # nine of them: eight would be too large
+    assert training._even(100, 4_096) == 100
+
+
+def test_mistakes_are_told_before_a_folder_is_made() -> None:
+    for wrong in ({"suite": "no-such"}, {"suite": "lte-v1", "capacities": "0"}, {"suite": "lte-belgium-v1"}):
+        with pytest.raises(BufgymError):
+            training.prepare(dataclasses.replace(TINY, **wrong))
+    assert not Path("runs").exists()
+    with pytest.raises(SystemExit, match="error: unknown suite 'no-such'"):
+        train.main(dataclasses.replace(TINY, suite="no-such"))
+
+
 @pytest.mark.slow
 def test_a_process_killed_for_good_goes_on_and_a_second_seed_joins(tmp_path: Path) -> None:
     command = [sys.executable, str(REPO / "train.py")]
     settings = {**dataclasses.asdict(TINY), "steps": 1_280}
     for name, value in settings.items():
-        if name not in ("resume", "seeds"):
+        if name not in ("resume", "seeds", "suite", "data", "capacities"):
             command += [f"--{name.replace('_', '-')}", str(value)]
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
     first = subprocess.Popen(command, env=environment, start_new_session=True, stdout=subprocess.DEVNULL)

@@ -1,0 +1,125 @@
+"""Double DQN with action masks: stable-baselines3's DQN, but for what it values, how it explores, what it aims at.
+
+Which actions are possible follows from the observation (a slot holds a message; there is room), so no masks are stored:
+the Q network itself gives impossible actions a value that no maximum picks, neither when it acts nor in a target.
+
+Targets are those of van Hasselt, Guez and Silver (2016): the online network chooses the next action, the target network
+values it. Q is the sum of what the state is worth and a score for each slot (after Wang et al., 2016), because the
+difference that one message makes is small beside what is to come whatever one does.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import DQN
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.torch_layers import CombinedExtractor
+from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
+from torch import Tensor, nn
+from torch.nn import functional
+
+from agents.network import SlotFeatures, SlotScorer
+
+IMPOSSIBLE = -1e9
+"""The value of an impossible action."""
+
+
+def possible(observation: Any) -> Tensor:
+    """bool[n, L + 2]: evict where a slot holds a message, reject always, accept where there is room for one more."""
+    held, room = (torch.as_tensor(observation[name]) for name in ("occupied", "occupancy"))
+    return torch.cat([held > 0, room < 1], dim=1)
+
+
+class SlotQ(nn.Module):
+    """Q of all L + 2 actions from a ``SlotScorer``'s two outputs."""
+
+    def __init__(self, features: SlotFeatures, width: int) -> None:
+        super().__init__()
+        self.scorer = SlotScorer(features, width, accept_bias=0.0)
+        self.state = nn.Linear(width, 1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        scores, latent = self.scorer(features)
+        q: Tensor = scores + self.state(latent)
+        return q
+
+
+class MaskedQNetwork(QNetwork):
+    """Q of every action, ``IMPOSSIBLE`` for those that are."""
+
+    def forward(self, obs: Any) -> Tensor:
+        q = super().forward(obs)
+        return torch.where(possible(obs), q, IMPOSSIBLE)
+
+
+class MaskedDQNPolicy(DQNPolicy):
+    """Two ``MaskedQNetwork``: slot by slot with a ``width``, plain layers (``net_arch``) with width 0."""
+
+    def __init__(self, *args: Any, width: int = 32, **kwargs: Any) -> None:
+        self.width = width
+        kwargs.setdefault("features_extractor_class", SlotFeatures if width else CombinedExtractor)
+        super().__init__(*args, **kwargs)
+
+    def make_q_net(self) -> QNetwork:
+        net = MaskedQNetwork(**self._update_features_extractor(self.net_args, features_extractor=None))
+        if isinstance(net.features_extractor, SlotFeatures):
+            net.q_net = SlotQ(net.features_extractor, self.width)  # type: ignore[assignment]
+        return net.to(self.device)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {"width": self.width}
+
+
+def dqn_policy_of(network: str, width: int) -> dict[str, Any]:
+    """``MaskedDQNPolicy``'s arguments for "slots" or "plain"."""
+    return {"width": width} if network == "slots" else {"width": 0, "net_arch": [2 * width, 2 * width]}
+
+
+class MaskedDQN(DQN):
+    """Double DQN that never tries the impossible. A resumed one collects its replay anew."""
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Every environment explores on its own: a possible action at random, all equally likely."""
+        actions, _ = self.policy.predict(self._last_obs, deterministic=True)  # type: ignore[arg-type]
+        can = possible(self._last_obs).numpy()
+        anything = (np.random.random(can.shape) * can).argmax(axis=1)
+        actions = np.where(np.random.random(n_envs) < self.exploration_rate, anything, actions)
+        return actions, actions
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+        action_masks: NDArray[np.bool_] | None = None,
+    ) -> tuple[NDArray[Any], Any]:
+        """The best possible action; the network knows the masks."""
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        losses = []
+        for _ in range(gradient_steps):
+            assert self.replay_buffer is not None
+            met = self.replay_buffer.sample(batch_size)
+            with torch.no_grad():
+                chosen = self.q_net(met.next_observations).argmax(dim=1, keepdim=True)
+                ahead = self.q_net_target(met.next_observations).gather(1, chosen)
+                target = met.rewards + (1 - met.dones) * self.gamma * ahead
+            q = self.q_net(met.observations).gather(1, met.actions.long())
+            loss = functional.smooth_l1_loss(q, target)
+            self.policy.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(self.q_net.parameters(), self.max_grad_norm)
+            self.policy.optimizer.step()
+            losses.append(loss.item())
+        self._n_updates += gradient_steps
+        self.logger.record("train/loss", np.mean(losses))

@@ -1,0 +1,115 @@
+"""A suite's episodes to validate and test agents on, with what the fixed policies and the clairvoyant made of them.
+
+The episodes, and the rows of the fixed policies, are those of ``bufgym bench`` on the same split.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.evaluate import Agent
+from agents.worlds import World, cells
+from bufgym import suites
+from bufgym.benchmark import run as bench
+from bufgym.benchmark.campaign import Plan, campaign, cell, units
+from bufgym.benchmark.rows import Row
+from bufgym.benchmark.score import BITES, normalised_score, regret
+from bufgym.errors import BufgymError
+from bufgym.metrics import outcome
+from bufgym.scenario import Episode
+
+Numbers = NDArray[np.float64]
+
+
+class Verdict(NamedTuple):
+    """What an agent reached on the trials: means over the cells that bite (as ``benchmark.score`` has it)."""
+
+    score: float
+    """0 is Drop Oldest, 1 the clairvoyant."""
+    regret: float
+    over_afr: float
+    """Regret over AFR's regret."""
+
+
+class Trials:
+    """Every episode of the plan's split at every capacity; the rows of its fixed policies lie in ``folder``."""
+
+    def __init__(self, plan: Plan, folder: Path, *, progress: bool = False) -> None:
+        self.plan = plan = plan.checked()
+        jobs = -1 if importlib.util.find_spec("joblib") else 1
+        self.rows = campaign(plan, folder, jobs=jobs, progress=progress)
+        settings = suites.get(plan.suite).settings(plan.split, plan.data)
+        met: dict[str, list[tuple[Row, Episode]]] = {label: [] for label in settings}
+        for unit in units(plan):
+            scenario = cell(settings[unit.label].scenario, unit.trace)
+            trace = bench.cells(scenario)[0][0]
+            for seed in unit.seeds:
+                key = {"scenario": unit.label, "trace": trace, "seed": seed}
+                met[unit.label].append((key, bench.draw(scenario, seed)))
+        self.cells = cells(plan.suite, plan.split, plan.capacities, plan.data)
+        self._sizes = [len(met[c.label]) for c in self.cells]
+        self._keys = [key | {"capacity": c.capacity} for c in self.cells for key, _ in met[c.label]]
+        self._episodes = [episode for c in self.cells for _, episode in met[c.label]]
+        self._fixed = {(*_name(row), row["policy"]): row for row in self.rows}
+
+    def known(self, policy: str, column: str = "qoi") -> Numbers:
+        """[rows]: what the fixed policy has in this column."""
+        return np.array([self._fixed[*_name(key), policy][column] for key in self._keys], np.float64)
+
+    def play(self, agent: Agent, seats: int) -> World:
+        """All episodes to their ends, under the agent's best guess at every decision."""
+        world = World(self.cells, self._sizes, seats)
+        world.load(self._episodes)
+        actions = np.zeros(world.num_envs, np.int64)
+        while (live := ~world.ended()).any():
+            seen = {name: column[live] for name, column in world.observation().items()}
+            actions[live], _ = agent.predict(seen, deterministic=True, action_masks=world.action_masks()[live])
+            world.act(actions)
+        return world
+
+    def verdict(self, agent: Agent, seats: int) -> Verdict:
+        """The agent against Drop Oldest, AFR and the clairvoyant; the plan must have both policies."""
+        world = self.play(agent, seats)
+        h = np.concatenate([rows.summary(slice(None))["qoi"] for rows in world.groups])
+        first = np.cumsum([0, *self._sizes[:-1]])
+        ours, base, afr, best = (
+            np.add.reduceat(given, first)
+            for given in (h, self.known("drop-oldest"), self.known("afr"), self.known("afr", "clairvoyant"))
+        )
+        biting = regret(base, best) >= BITES
+        if not biting.any():
+            raise BufgymError(
+                f"suite {self.plan.suite}, L = {list(self.plan.capacities)}: Drop Oldest cannot be bettered"
+            )
+        ours, base, afr, best = ours[biting], base[biting], afr[biting], best[biting]
+        mine, theirs = float(regret(ours, best).mean()), float(regret(afr, best).mean())
+        return Verdict(float(normalised_score(ours, base, best).mean()), mine, mine / theirs if theirs else np.nan)
+
+    def rows_of(self, agent: Agent, seats: int, name: str, training_seed: int) -> list[Row]:
+        """The agent's rows, as the benchmark has them."""
+        world = self.play(agent, seats)
+        outcomes = [outcome(rows.senders, i) for rows in world.groups for i in range(len(rows))]
+        found = []
+        for key, result in zip(self._keys, outcomes, strict=True):
+            fixed = self._fixed[*_name(key), "drop-oldest"]
+            bound = {"clairvoyant": fixed["clairvoyant"], "certified": fixed["certified"]}
+            bound["regret"] = 1 - result.qoi / bound["clairvoyant"] if bound["clairvoyant"] > 0 else 0.0
+            found.append({**key, "policy": name, **asdict(result), **bound, "training_seed": training_seed})
+        return found
+
+
+def _name(row: Row) -> tuple[str, str, int, int]:
+    return row["scenario"], row["trace"], row["seed"], row["capacity"]
+
+
+def seeds_for(suite: str, split: str, capacities: Sequence[int], episodes: int, data: str | None) -> int:
+    """Seeds a trace, so that all scenarios, traces and capacities together have about so many episodes."""
+    one_seed = sum(len(unit.seeds) for unit in units(Plan(suite, (), split, tuple(capacities), 1, data).checked()))
+    return max(1, round(episodes / (one_seed * len(capacities))))
