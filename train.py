@@ -22,8 +22,12 @@ class Arguments:
     """Folder of recordings, for suites that need one."""
     capacities: str = ""
     """L of a suite's episodes, such as 5,10,25; by default the suite's own."""
-    algo: Literal["maskable-ppo", "ppo", "dqn"] = "maskable-ppo"
-    """PPO with action masks, PPO without, or double DQN with them."""
+    algo: Literal["maskable-ppo", "ppo", "dqn", "evolution"] = "maskable-ppo"
+    """PPO with action masks, PPO without, double DQN with masks, or CMA-ES over whole episodes (suites only)."""
+    sees: Literal["motion", "time"] = "motion"
+    """What an evolved agent sees: odometry as well, or the clock alone."""
+    hidden: int = 4
+    """Hidden units of an evolved agent."""
     name: str = ""
     """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
     resume: bool = False

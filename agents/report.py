@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluate import held_out, run_agent, run_fixed, summarise, worlds
-from agents.training import ALGORITHMS, Run, load, plan
-from agents.trials import Trials
+from agents.training import ALGORITHMS, Run, load
+from agents.trials import Trials, plan
 from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Interval, Scores, scores
 from bufgym.benchmark.table import aligned
@@ -178,7 +178,10 @@ def report_suite(arguments: Arguments, folder: Path, runs: Sequence[Run]) -> Sco
     (folder / "results.json").write_text(json.dumps(saved, indent=2) + "\n", encoding="utf-8")
     # What is below Drop Oldest is in the table alone: it would squeeze the rest.
     shown = [s for s in found.standings if s.ranked and (s.score.value >= 0 or s.policy.startswith("agent"))]
-    reached = {s.policy: s.score.value for s in shown}
+    # Where no cell bites there is nothing to score.
+    reached = {s.policy: s.score.value for s in shown} or {
+        name: float(np.mean(numbers)) for name, numbers in qoi.items()
+    }
     curves = [np.array(run.validation)[:, [0, 2]] for run in runs]
     _figure(folder / "figure.png", runs, curves, "score on validation", reached, "normalised score", "Test split")
     seconds = ", ".join(f"{run.seconds:.0f}" for run in runs)

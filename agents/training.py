@@ -26,15 +26,16 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
+from agents import evolution
 from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluate import Agent, worlds
 from agents.network import policy_of
-from agents.trials import Trials, seeds_for
+from agents.trials import Trials, plan, validation_of
 from agents.worlds import World, capacities_of, cells
-from bufgym.benchmark.campaign import Plan
 from bufgym.benchmark.rows import Row
 from bufgym.errors import BufgymError
+from bufgym.policies import load as load_policy
 from bufgym.sb3 import GymVecEnv, make_vec_env
 
 if TYPE_CHECKING:
@@ -58,9 +59,11 @@ class Run:
     validation: list[tuple[float, ...]] = field(default_factory=list)
     """(steps, seconds, *Verdict), a row a validation; none without a suite."""
 
+    file: str = "model.zip"
+
     @property
     def model(self) -> Path:
-        return self.folder / "model.zip"
+        return self.folder / self.file
 
     @property
     def score(self) -> float:
@@ -131,19 +134,6 @@ def train_all(arguments: Arguments, folder: Path) -> list[Run]:
     with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
         jobs = [pool.submit(train, arguments, folder, seed, line) for line, seed in enumerate(seeds)]
         return [job.result() for job in jobs]
-
-
-def plan(arguments: Arguments, split: str, specs: tuple[str, ...] = ("afr",), seeds: int | None = None) -> Plan:
-    """What the fixed policies meet on a split of the suite."""
-    capacities, data = capacities_of(arguments.suite, arguments.capacities), arguments.data or None
-    if split == "validation":
-        seeds = seeds_for(arguments.suite, split, capacities, arguments.validation_episodes, data)
-    return Plan(arguments.suite, specs, split, capacities, seeds, data)
-
-
-def validation_of(arguments: Arguments, folder: Path, progress: bool = False) -> Trials:
-    """The fixed set of validation episodes; made once, read from the run's folder afterwards."""
-    return Trials(plan(arguments, "validation"), folder / "validation", progress=progress)
 
 
 def train_seed(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> Run:
@@ -296,5 +286,15 @@ def _test(arguments: Arguments, run: Run, trials: Trials) -> list[Row]:
     return trials.rows_of(agent, seats_of(arguments), f"agent ({arguments.algo})", run.seed)
 
 
-ALGORITHMS = {name: Algorithm(train_seed, _test) for name in LEARNERS}
+def _evolve(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> Run:
+    return Run(seed, folder / f"seed-{seed}", *evolution.train(arguments, folder, seed, line), evolution.MODEL)
+
+
+def _test_evolved(arguments: Arguments, run: Run, trials: Trials) -> list[Row]:
+    return trials.rows_under(load_policy(run.model), f"agent ({arguments.algo})", run.seed)
+
+
+ALGORITHMS = {name: Algorithm(train_seed, _test) for name in LEARNERS} | {
+    "evolution": Algorithm(_evolve, _test_evolved)
+}
 """What ``--algo`` can name."""

@@ -9,21 +9,26 @@ import importlib.util
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluate import Agent
-from agents.worlds import World, cells
+from agents.worlds import World, capacities_of, cells
 from bufgym import suites
 from bufgym.benchmark import run as bench
 from bufgym.benchmark.campaign import Plan, campaign, cell, units
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import BITES, normalised_score, regret
 from bufgym.errors import BufgymError
-from bufgym.metrics import outcome
+from bufgym.metrics import Outcome, outcome
+from bufgym.policies import Policy
 from bufgym.scenario import Episode
+from bufgym.sender import run
+
+if TYPE_CHECKING:
+    from train import Arguments
 
 Numbers = NDArray[np.float64]
 
@@ -77,7 +82,22 @@ class Trials:
     def verdict(self, agent: Agent, seats: int) -> Verdict:
         """The agent against Drop Oldest, AFR and the clairvoyant; the plan must have both policies."""
         world = self.play(agent, seats)
-        h = np.concatenate([rows.summary(slice(None))["qoi"] for rows in world.groups])
+        return self._verdict(np.concatenate([rows.summary(slice(None))["qoi"] for rows in world.groups]))
+
+    def verdict_on(self, policy: Policy) -> Verdict:
+        """The same for a policy."""
+        return self._verdict(np.array([result.qoi for result in self._outcomes(policy)]))
+
+    def _outcomes(self, policy: Policy) -> list[Outcome]:
+        """What came of every row under a policy."""
+        ends = np.cumsum(self._sizes).tolist()
+        found = []
+        for at, size, end in zip(self.cells, self._sizes, ends, strict=True):
+            senders = run(policy, self._episodes[end - size : end], at.capacity, at.scenario.value)
+            found += [outcome(senders, i) for i in range(size)]
+        return found
+
+    def _verdict(self, h: Numbers) -> Verdict:
         first = np.cumsum([0, *self._sizes[:-1]])
         ours, base, afr, best = (
             np.add.reduceat(given, first)
@@ -96,6 +116,13 @@ class Trials:
         """The agent's rows, as the benchmark has them."""
         world = self.play(agent, seats)
         outcomes = [outcome(rows.senders, i) for rows in world.groups for i in range(len(rows))]
+        return self._rows(outcomes, name, training_seed)
+
+    def rows_under(self, policy: Policy, name: str, training_seed: int) -> list[Row]:
+        """The rows of a trained policy."""
+        return self._rows(self._outcomes(policy), name, training_seed)
+
+    def _rows(self, outcomes: Sequence[Outcome], name: str, training_seed: int) -> list[Row]:
         found = []
         for key, result in zip(self._keys, outcomes, strict=True):
             fixed = self._fixed[*_name(key), "drop-oldest"]
@@ -113,3 +140,16 @@ def seeds_for(suite: str, split: str, capacities: Sequence[int], episodes: int, 
     """Seeds a trace, so that all scenarios, traces and capacities together have about so many episodes."""
     one_seed = sum(len(unit.seeds) for unit in units(Plan(suite, (), split, tuple(capacities), 1, data).checked()))
     return max(1, round(episodes / (one_seed * len(capacities))))
+
+
+def plan(arguments: Arguments, split: str, specs: tuple[str, ...] = ("afr",), seeds: int | None = None) -> Plan:
+    """What the fixed policies meet on a split of the suite."""
+    capacities, data = capacities_of(arguments.suite, arguments.capacities), arguments.data or None
+    if split == "validation":
+        seeds = seeds_for(arguments.suite, split, capacities, arguments.validation_episodes, data)
+    return Plan(arguments.suite, specs, split, capacities, seeds, data)
+
+
+def validation_of(arguments: Arguments, folder: Path, progress: bool = False) -> Trials:
+    """The fixed set of validation episodes; made once, read from the run's folder afterwards."""
+    return Trials(plan(arguments, "validation"), folder / "validation", progress=progress)

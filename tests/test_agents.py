@@ -19,7 +19,7 @@ import train  # noqa: E402
 from agents import callbacks, training, worlds  # noqa: E402
 from agents.dqn import IMPOSSIBLE, possible  # noqa: E402
 from agents.network import SlotFeatures, SlotScorer  # noqa: E402
-from agents.trials import Trials, seeds_for  # noqa: E402
+from agents.trials import Trials, plan, seeds_for  # noqa: E402
 from bufgym import policies  # noqa: E402
 from bufgym.benchmark.campaign import Plan  # noqa: E402
 from bufgym.benchmark.run import draw  # noqa: E402
@@ -256,7 +256,7 @@ def callbacks_logger() -> Any:
 
 @pytest.mark.slow
 def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: Path) -> None:
-    trials = Trials(training.plan(SUITE, "validation"), tmp_path / "trials")
+    trials = Trials(plan(SUITE, "validation"), tmp_path / "trials")
     assert len(trials.known("afr")) == 60
     verdict = trials.verdict(DropOldest(), 8)
     assert verdict.score == 0
@@ -270,7 +270,7 @@ def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: P
         )
     # A second reading makes nothing anew.
     written = (tmp_path / "trials" / "manifest.json").stat().st_mtime_ns
-    assert (Trials(training.plan(SUITE, "validation"), tmp_path / "trials").known("afr") == trials.known("afr")).all()
+    assert (Trials(plan(SUITE, "validation"), tmp_path / "trials").known("afr") == trials.known("afr")).all()
     assert (tmp_path / "trials" / "manifest.json").stat().st_mtime_ns == written
 
 
