@@ -189,9 +189,12 @@ def train(
         made = from_vector(like, vector)
         verdict = trials.verdict_on(learned.policy("evolved", made))
         if not validations.rows or verdict.score > max(row[2] for row in validations.rows):
-            told = {"name": "evolved", "suite": arguments.suite, "seeds": [seed], "algo": "evolution"}
-            weights.save(home / MODEL, made, told)
+            noted = {"name": "evolved", "suite": arguments.suite, "seeds": [seed], "algo": "evolution"}
+            weights.save(home / MODEL, made, noted)
         validations.append(steps, spent(), *verdict)
+        if not sys.stderr.isatty():
+            told = f"{steps:,} of {arguments.steps:,} steps, regret {verdict.over_afr:.3f} x AFR's on validation"
+            print(f"seed {seed}: {told}", flush=True)
 
     bar = tqdm(
         total=arguments.steps,
