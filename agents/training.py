@@ -82,6 +82,8 @@ class Algorithm:
     """(arguments, the run's folder, seed, line of its progress bar) -> the finished seed."""
     test: Callable[[Arguments, Run, Trials], list[Row]]
     """Its rows on a suite's trials."""
+    model: str = "model.zip"
+    """The file of the agent to keep."""
 
 
 # --- the run's folder ------------------------------------------------------------------------------------------------
@@ -295,6 +297,6 @@ def _test_evolved(arguments: Arguments, run: Run, trials: Trials) -> list[Row]:
 
 
 ALGORITHMS = {name: Algorithm(train_seed, _test) for name in LEARNERS} | {
-    "evolution": Algorithm(_evolve, _test_evolved)
+    "evolution": Algorithm(_evolve, _test_evolved, evolution.MODEL)
 }
 """What ``--algo`` can name."""
