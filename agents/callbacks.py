@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
 from agents.trials import Trials, Verdict
-from bufgym.benchmark.rows import replaced
+from bufgym.files import replaced
 
 
 def checkpoints(home: Path) -> list[Path]:

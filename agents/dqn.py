@@ -22,7 +22,7 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 from torch.nn import functional
 
-from agents.network import SlotFeatures, SlotScorer
+from agents.network import IgnoresMasks, SlotFeatures, SlotScorer
 
 IMPOSSIBLE = -1e9
 """The value of an impossible action."""
@@ -79,29 +79,21 @@ def dqn_policy_of(network: str, width: int) -> dict[str, Any]:
     return {"width": width} if network == "slots" else {"width": 0, "net_arch": [2 * width, 2 * width]}
 
 
-class MaskedDQN(DQN):
-    """Double DQN that never tries the impossible. A resumed one collects its replay anew."""
+class MaskedDQN(IgnoresMasks, DQN):
+    """Double DQN that never tries the impossible, as its network knows the masks.
+
+    A resumed one collects its replay anew.
+    """
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[NDArray[Any], NDArray[Any]]:
         """Every environment explores on its own: a possible action at random, all equally likely."""
-        actions, _ = self.policy.predict(self._last_obs, deterministic=True)  # type: ignore[arg-type]
+        actions, _ = self.policy.predict(self._last_obs, deterministic=True)
         can = possible(self._last_obs).numpy()
         anything = (np.random.random(can.shape) * can).argmax(axis=1)
         actions = np.where(np.random.random(n_envs) < self.exploration_rate, anything, actions)
         return actions, actions
-
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = False,
-        action_masks: NDArray[np.bool_] | None = None,
-    ) -> tuple[NDArray[Any], Any]:
-        """The best possible action; the network knows the masks."""
-        return self.policy.predict(observation, state, episode_start, deterministic)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         self.policy.set_training_mode(True)

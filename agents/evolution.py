@@ -29,7 +29,7 @@ from agents.trials import Verdict, validation_of
 from agents.worlds import Cell, capacities_of, cells
 from bufgym import policies
 from bufgym.benchmark import campaign
-from bufgym.benchmark.run import best, draw
+from bufgym.benchmark.run import best, draw, regret
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
 from bufgym.policies import Policy, learned, weights
@@ -98,7 +98,7 @@ class Ground:
         self.senders.run(policy)
         delivered = self.senders.batch.senders
         got = float((delivered["delivered_gain"] + (delivered["crossed"] > 0)).sum())
-        return 1 - got / self.best
+        return regret(got, self.best)
 
     def over_afr(self, policy: Policy) -> float:
         """The policy's regret over AFR's, WORST at most."""

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
 from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -144,3 +146,21 @@ def policy_of(network: str, width: int, masked: bool = True) -> tuple[Any, dict[
         return SlotPolicy, {"width": width, "masked": masked}
     plain = MaskableMultiInputActorCriticPolicy if masked else MultiInputActorCriticPolicy
     return plain, {"net_arch": [2 * width, 2 * width], "activation_fn": nn.ReLU}
+
+
+class IgnoresMasks:
+    """For a learner of stable-baselines3: takes masks as MaskablePPO does, and leaves the possible to its policy."""
+
+    policy: Any
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+        action_masks: NDArray[np.bool_] | None = None,
+    ) -> tuple[NDArray[Any], Any]:
+        """(actions, state) of the policy; it explores only as far as the policy itself does."""
+        found: tuple[NDArray[Any], Any] = self.policy.predict(observation, state, episode_start, deterministic)
+        return found

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
@@ -30,7 +29,7 @@ from agents import evolution
 from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluate import Agent, worlds
-from agents.network import policy_of
+from agents.network import IgnoresMasks, policy_of
 from agents.trials import Trials, plan, validation_of
 from agents.worlds import World, capacities_of, cells
 from bufgym.benchmark.rows import Row
@@ -196,19 +195,8 @@ def training_env(arguments: Arguments) -> GymVecEnv:
     )
 
 
-class UnmaskedPPO(PPO):
+class UnmaskedPPO(IgnoresMasks, PPO):
     """PPO that is told of no masks: what is impossible does what a queue does, and the agent has to find out."""
-
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = False,
-        action_masks: NDArray[np.bool_] | None = None,
-    ) -> tuple[NDArray[Any], Any]:
-        """The policy's action; masks are not looked at."""
-        return super().predict(observation, state, episode_start, deterministic)
 
 
 def new_ppo(arguments: Arguments, env: GymVecEnv) -> MaskablePPO | PPO:

@@ -20,7 +20,7 @@ from bufgym import suites
 from bufgym.benchmark import run as bench
 from bufgym.benchmark.campaign import Plan, campaign, cell, units
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.score import BITES, normalised_score, regret
+from bufgym.benchmark.score import BASELINE, BITES, normalised_score, regret
 from bufgym.errors import BufgymError
 from bufgym.metrics import Outcome, outcome
 from bufgym.policies import Policy
@@ -101,7 +101,7 @@ class Trials:
         first = np.cumsum([0, *self._sizes[:-1]])
         ours, base, afr, best = (
             np.add.reduceat(given, first)
-            for given in (h, self.known("drop-oldest"), self.known("afr"), self.known("afr", "clairvoyant"))
+            for given in (h, self.known(BASELINE), self.known("afr"), self.known("afr", "clairvoyant"))
         )
         biting = regret(base, best) >= BITES
         if not biting.any():
@@ -125,9 +125,9 @@ class Trials:
     def _rows(self, outcomes: Sequence[Outcome], name: str, training_seed: int) -> list[Row]:
         found = []
         for key, result in zip(self._keys, outcomes, strict=True):
-            fixed = self._fixed[*_name(key), "drop-oldest"]
+            fixed = self._fixed[*_name(key), BASELINE]
             bound = {"clairvoyant": fixed["clairvoyant"], "certified": fixed["certified"]}
-            bound["regret"] = 1 - result.qoi / bound["clairvoyant"] if bound["clairvoyant"] > 0 else 0.0
+            bound["regret"] = bench.regret(result.qoi, bound["clairvoyant"])
             found.append({**key, "policy": name, **asdict(result), **bound, "training_seed": training_seed})
         return found
 

@@ -6,6 +6,8 @@ Anything else that escapes is a bug of bufgym.
 
 from __future__ import annotations
 
+import os
+import traceback
 from os import PathLike
 
 # Longer values are cut in messages: a broken file can hold a line of any length.
@@ -53,3 +55,13 @@ def _shown(value: object) -> str:
     cut = text if len(text) <= _SHOWN_CHARACTERS else text[: _SHOWN_CHARACTERS - 3] + "..."
     plain = cut.isprintable() and cut.isascii() and cut != "" and " " not in cut
     return cut if plain else repr(cut)
+
+
+def line_in(error: Exception, file: str) -> str | None:
+    """Where in that file the error came from ("mine.py, line 3", the innermost line), or None if it was elsewhere."""
+    lines = [
+        line
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if os.path.abspath(frame.f_code.co_filename) == os.path.abspath(file)
+    ]
+    return f"{file}, line {lines[-1]}" if lines else None

@@ -34,10 +34,20 @@ SIZE_BYTES = 230_000
 DEMAND_BYTES_PER_S = RATE_HZ * SIZE_BYTES
 EPISODE_S = 60.0
 
-TIME = qoi.exponential(0.618)
-"""V over frame indices, as in AFR's Fig. 5."""
-MOTION = qoi.exponential(math.exp(-1))
-"""V = 1 - exp(-motion), over fields of view."""
+
+# Made when first asked for: a Value is checked with compiled code, whose loading has no place in ``bufgym list``.
+
+
+@functools.cache
+def time_value() -> Value:
+    """V over frame indices, as in AFR's Fig. 5."""
+    return qoi.exponential(0.618)
+
+
+@functools.cache
+def motion_value() -> Value:
+    """V = 1 - exp(-motion), over fields of view."""
+    return qoi.exponential(math.exp(-1))
 
 
 @dataclass(frozen=True)
@@ -101,11 +111,14 @@ def _both_values(
 ) -> dict[str, Setting]:
     """The same links, once with time-based and once with motion-based QoI."""
     about = f"{RATE_HZ:g} messages/s of {size_bytes / 1000:g} kB for {EPISODE_S:g} s"
-    timed = Uplink(traces=tuple(traces), rate_hz=RATE_HZ, size_bytes=size_bytes, duration_s=EPISODE_S, value=TIME)
+    timed = Uplink(
+        traces=tuple(traces), rate_hz=RATE_HZ, size_bytes=size_bytes, duration_s=EPISODE_S, value=time_value()
+    )
     return {
         f"time{suffix}": Setting(timed, f"{about}; x is the frame index"),
         f"motion{suffix}": Setting(
-            replace(timed, motion=motions, value=MOTION), f"{about}; x is the camera's motion, in fields of view"
+            replace(timed, motion=motions, value=motion_value()),
+            f"{about}; x is the camera's motion, in fields of view",
         ),
     }
 
@@ -137,7 +150,7 @@ def _outage(split: str, data: Path | None) -> dict[str, Setting]:
                 size_bytes=SIZE_BYTES,
                 duration_s=float(outage_s + _AROUND_S),
                 link_offset_s=(0.0, 10.0),
-                value=MOTION,
+                value=motion_value(),
             ),
             f"one blackout of {outage_s} s within {outage_s + _AROUND_S} s; x is the camera's motion",
             float(outage_s),
@@ -179,7 +192,7 @@ def _interruption(split: str, data: Path | None) -> dict[str, Setting]:
     rests = {"train": (0, 1, 2), "validation": (3,), "test": (4,)}[split]
     lengths = tuple(T for T in range(1, 401) if T % 5 in rests)
     values: dict[str, Value] = {
-        "exponential-0.618": TIME,
+        "exponential-0.618": time_value(),
         "exponential-0.9": qoi.exponential(0.9),
         "saturating-8": qoi.saturating(8),
     }

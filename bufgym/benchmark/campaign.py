@@ -12,9 +12,7 @@ import datetime
 import hashlib
 import itertools
 import json
-import os
 import shutil
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,13 +22,12 @@ from bufgym import __version__, policies, suites
 from bufgym.benchmark import cluster, timeline
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.folder import FORMAT, read_manifest
-from bufgym.benchmark.rows import COLUMNS, Row, has_pyarrow, read_rows, replaced, write_rows
-from bufgym.benchmark.run import bar, run
-from bufgym.errors import BufgymError
+from bufgym.benchmark.rows import COLUMNS, Row, has_pyarrow, read_rows, write_rows
+from bufgym.benchmark.run import bar, distinct, run
+from bufgym.benchmark.score import BASELINE
+from bufgym.errors import BufgymError, line_in
+from bufgym.files import replaced
 from bufgym.scenario import Scenario, Uplink
-
-BASELINE = "drop-oldest"
-"""Always among the policies: the normalised score is measured from it."""
 
 _SEEDS_A_TRACE = 1000
 """Episode s of trace k has the seed 1000 k + s: no two traces of a scenario share an episode's chance."""
@@ -65,10 +62,7 @@ class Plan:
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
         specs = list(dict.fromkeys([*self.specs, BASELINE]))
-        names = [policies.get(spec).name for spec in specs]
-        for name in names:
-            if names.count(name) > 1:
-                raise BufgymError(f"policies: {name!r} is given more than once")
+        distinct([policies.get(spec) for spec in specs])
         return replace(self, specs=tuple(specs), capacities=self.capacities or suite.capacities, seeds=seeds)
 
 
@@ -128,14 +122,9 @@ def _attempt(number: int, unit: Unit, load: Callable[[str | None], None] | None)
         return number, error
     except Exception as error:
         # A traceback stays behind in the process; where in the user's own file it was must be said here.
-        lines = [
-            line
-            for frame, line in traceback.walk_tb(error.__traceback__)
-            if os.path.abspath(frame.f_code.co_filename) == os.path.abspath(unit.plan.policy_file or "")
-        ]
-        if not lines:
+        place = line_in(error, unit.plan.policy_file or "")
+        if place is None:
             return number, error
-        place = f"{unit.plan.policy_file}, line {lines[-1]}"
         return number, BufgymError(f"{place}: {type(error).__name__}: {error}")
 
 
@@ -188,7 +177,8 @@ def campaign(
                 advance(1)
         rows = [row for unit, file in zip(todo, files, strict=True) for row in _read(file, unit)]
         write_rows(rows, whole)
-    rows = read_rows(whole)
+    else:
+        rows = read_rows(whole)
     if not (out / "timeline.json").exists():
         shown = timeline.choose(rows)
         if shown is not None:

@@ -13,9 +13,9 @@ from typing import Any
 from bufgym import __version__, suites
 from bufgym.benchmark import campaign, folder
 from bufgym.benchmark.report import style, tables
-from bufgym.benchmark.rows import replaced
 from bufgym.benchmark.score import Interval, Standing, scores
 from bufgym.errors import BufgymError, where
+from bufgym.files import replaced
 
 
 @dataclass(frozen=True)

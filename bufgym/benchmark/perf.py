@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark.rows import replaced
 from bufgym.benchmark.run import draw
+from bufgym.files import replaced
 from bufgym.kernel import JIT
 from bufgym.sender import Senders
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT
+from bufgym.envs.rows import action_of
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
 from bufgym.sender import Senders, named, python_view
@@ -47,11 +47,7 @@ class Player:
                 self.policy.on_departure(seen, memory)
         self._taken[i] = sender.taken
         decision = int(self.policy.on_arrival(seen, batch.arrivals[i, sender.next], memory))
-        if 0 <= decision < senders.capacity:
-            return decision
-        if decision == REJECT:
-            return senders.capacity
-        if decision == ACCEPT:
-            return senders.capacity + 1
-        allowed = f"a slot 0..{senders.capacity - 1}, REJECT or ACCEPT"
-        raise BufgymError(f"policy {self.policy.name}: decision {decision}: must be {allowed}")
+        try:
+            return action_of(decision, senders.capacity)
+        except BufgymError as error:
+            raise BufgymError(f"policy {self.policy.name}: {error}") from None

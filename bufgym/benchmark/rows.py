@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym.errors import BufgymError
-from bufgym.files import replaced as replaced  # others take it from here
+from bufgym.files import replaced
 from bufgym.metrics import METRICS
 
 Row = dict[str, Any]

@@ -74,10 +74,7 @@ def run(
     for what, given in (("policies", policies), ("capacities", capacities), ("seeds", chosen)):
         if not given:
             raise BufgymError(f"{what} = {seeds if what == 'seeds' else list(given)}: need at least one")
-    names = [policy.name for policy in policies]
-    for name in names:
-        if names.count(name) > 1:
-            raise BufgymError(f"policies: {name!r} is given more than once")
+    distinct(policies)
     at_once = max(1, _BATCH_MESSAGES // scenario.max_messages)
     batches = [chosen[k : k + at_once] for k in range(0, len(chosen), at_once)]
     parts = cells(scenario)
@@ -95,6 +92,14 @@ def run(
                             rows.append(row(key, policy, capacity, senders, i, plans[i]))
                         advance(len(batch))
     return rows
+
+
+def distinct(policies: Sequence[Policy]) -> None:
+    """An error if two have one name: their rows could not be told apart."""
+    names = [policy.name for policy in policies]
+    for name in names:
+        if names.count(name) > 1:
+            raise BufgymError(f"policies: {name!r} is given more than once")
 
 
 def best(
@@ -133,11 +138,11 @@ def row(key: Row, policy: Policy, capacity: int, senders: Senders, i: int, plan:
         **asdict(result),
         "clairvoyant": None if plan is None else plan.qoi,
         "certified": None if plan is None else plan.certified,
-        "regret": None if plan is None or policy.unbounded else _regret(result.qoi, plan.qoi),
+        "regret": None if plan is None or policy.unbounded else regret(result.qoi, plan.qoi),
     }
 
 
-def _regret(qoi: float, most: float) -> float:
+def regret(qoi: float, most: float) -> float:
     """1 - H / H of the clairvoyant; 0 where nothing could be delivered at all."""
     return 1 - qoi / most if most > 0 else 0.0
 

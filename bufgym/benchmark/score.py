@@ -28,6 +28,9 @@ from bufgym.benchmark import episodes
 from bufgym.benchmark.episodes import TIE, Cell, Numbers, Table
 from bufgym.errors import BufgymError
 
+BASELINE = "drop-oldest"
+"""What ROS does: its score is 0."""
+
 BITES = 0.01
 """A cell bites, and counts, where the baseline's regret is at least this: elsewhere there is nothing to be gained."""
 
@@ -163,7 +166,7 @@ def scores(
     rows: Sequence[Mapping[str, Any]],
     *,
     unranked: Collection[str] = (),
-    baseline: str = "drop-oldest",
+    baseline: str = BASELINE,
     reference: str = "afr",
     resamples: int = 2000,
     confidence: float = 0.95,

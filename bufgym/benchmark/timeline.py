@@ -9,11 +9,11 @@ import numpy as np
 
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import best, draw, met, row
+from bufgym.benchmark.score import BASELINE
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
 from bufgym.sender import NEVER
 
-_BASELINE = "drop-oldest"
 _STEP_S = 0.25
 """The capacity curve is drawn in steps of so many seconds."""
 
@@ -25,7 +25,7 @@ def choose(rows: Sequence[Row]) -> Row | None:
     shown = [
         each
         for each in rows
-        if each["policy"] == _BASELINE and each["capacity"] == middle and each["regret"] is not None
+        if each["policy"] == BASELINE and each["capacity"] == middle and each["regret"] is not None
     ]
     return max(shown, key=lambda each: (each["regret"], each["scenario"], each["trace"], each["seed"]), default=None)
 

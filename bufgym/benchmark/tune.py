@@ -21,11 +21,12 @@ from typing import Any
 
 from bufgym import __version__, policies
 from bufgym.benchmark import table
-from bufgym.benchmark.campaign import BASELINE, Plan, campaign
+from bufgym.benchmark.campaign import Plan, campaign
 from bufgym.benchmark.episodes import TIE
-from bufgym.benchmark.rows import Row, replaced
-from bufgym.benchmark.score import Interval, Scores, scores
+from bufgym.benchmark.rows import Row
+from bufgym.benchmark.score import BASELINE, Interval, Scores, scores
 from bufgym.errors import BufgymError, where
+from bufgym.files import replaced
 
 FILE = Path(__file__).with_name("tuned.json")
 """What was found: {suite: {policy: {"setting", "score", "default_score", "split", "command", "bufgym", ...}}}."""

@@ -17,7 +17,7 @@ from bufgym import __version__
 from bufgym.cli import bench, export, figures, leaderboard, listing, perf, play, report, traces, tune
 from bufgym.cli.listing import _LISTS, KINDS, environments
 from bufgym.cli.options import Parser, split_policies
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, line_in
 
 __all__ = ["KINDS", "_LISTS", "environments", "main", "split_policies"]
 
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         named = f"{error.filename}: " if error.filename is not None else ""
         return _failed(f"{named}{error.strerror or error}")
     except Exception as error:
-        place = _line_in(error, files)
+        place = next(filter(None, (line_in(error, file) for file in files)), None)
         if place is None and files and _from_numba(error):
             return _failed(f"{files[0]}: a policy with compile=True that Numba cannot compile: {_gist(error)}")
         if place is None:
@@ -78,16 +78,6 @@ def _failed(message: str) -> int:
     return 2
 
 
-def _line_in(error: Exception, files: Sequence[str]) -> str | None:
-    """Where in the user's own file it went wrong ("mine.py, line 3"), or None if it was elsewhere."""
-    found, trail = None, error.__traceback__
-    while trail is not None:
-        name = trail.tb_frame.f_code.co_filename
-        found = next((f"{file}, line {trail.tb_lineno}" for file in files if _same(file, name)), found)
-        trail = trail.tb_next
-    return found
-
-
 def _from_numba(error: Exception) -> bool:
     return type(error).__module__.startswith("numba.")
 
@@ -100,7 +90,3 @@ def _gist(error: Exception) -> str:
     telling = [line for line in lines if not line.startswith(("Failed in", "During:", "File ", "-", "^", "<"))][:1]
     # Written out, the type of a buffer has some twenty fields.
     return re.sub(r"\bBuffer\(.*\)", "Buffer", "; ".join([*telling, *place]))
-
-
-def _same(file: str, name: str) -> bool:
-    return os.path.abspath(file) == os.path.abspath(name)

@@ -10,6 +10,7 @@ from pathlib import Path
 from bufgym.cli.options import Commands, capacities, command, count, load_policies, policy_file, split_policies
 from bufgym.cli.scenarios import scenario, scenario_options
 from bufgym.errors import BufgymError
+from bufgym.files import replaced
 
 
 def add(commands: Commands) -> None:
@@ -79,7 +80,7 @@ def _bench(options: argparse.Namespace) -> None:
     if options.out is not None:
         written = files.write_rows(rows, Path(options.out) / f"rows.{form}")
         target = Path(options.out) / "table.md"
-        with files.replaced(target) as temporary:
+        with replaced(target) as temporary:
             temporary.write_text(f"{about}\n\n{table.markdown(rows)}\n", encoding="utf-8")
         print(f"\n{len(rows)} rows in {written}, this table in {target}")
 

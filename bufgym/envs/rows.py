@@ -64,6 +64,15 @@ def decision_of(action: int, capacity: int) -> int:
     return REJECT if action == capacity else ACCEPT
 
 
+def action_of(decision: int, capacity: int) -> int:
+    """The inverse of ``decision_of``; a BufgymError for what is no decision."""
+    if 0 <= decision < capacity:
+        return decision
+    if decision in (REJECT, ACCEPT):
+        return capacity if decision == REJECT else capacity + 1
+    raise BufgymError(f"decision {decision}: must be a slot 0..{capacity - 1}, REJECT or ACCEPT")
+
+
 @kernel
 def advance(batch: Batch, i: int) -> None:
     """On to the next decision, or to the end and all information counted."""

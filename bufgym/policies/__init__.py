@@ -1,6 +1,8 @@
 """Drop policies by name: ``get("afr")``, ``names()``, ``register`` for your own, ``load`` for a learned one's file."""
 
 import functools
+import os
+from pathlib import Path
 
 from bufgym import files
 from bufgym.buffer import ACCEPT, REJECT
@@ -14,9 +16,22 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     sampling,
 )
 from bufgym.policies.registry import Policy, get, names, register, register_later, runs_compiled
-from bufgym.policies.weights import load, load_shipped
 
 __all__ = ["ACCEPT", "REJECT", "Policy", "get", "load", "names", "register", "runs_compiled"]
 
+
+def load(path: str | os.PathLike[str]) -> Policy:
+    """The learned policy in a file: see ``bufgym.policies.weights.load``."""
+    from bufgym.policies import weights  # not at start-up: few need safetensors
+
+    return weights.load(path)
+
+
+def _load_shipped(name: str, path: Path) -> Policy:
+    from bufgym.policies import weights
+
+    return weights.load_shipped(name, path)
+
+
 for _name, _path in files.shipped("agents", "agents/pretrained", "*.safetensors").items():
-    register_later(_name, functools.partial(load_shipped, _name, _path))
+    register_later(_name, functools.partial(_load_shipped, _name, _path))

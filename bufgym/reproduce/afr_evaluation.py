@@ -24,7 +24,7 @@ from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
 from bufgym.reproduce.report import COLOURS
 from bufgym.scenario import Uplink
-from bufgym.suites import MOTION, RATE_HZ, TIME
+from bufgym.suites import RATE_HZ, motion_value, time_value
 from bufgym.traces import Motion, Trace
 
 PAPER_FRAMES = 794
@@ -79,6 +79,11 @@ def load_camera(name: str, data: Path | None) -> Motion:
     return replace(traces.read_motion(_recording(data, CAMERA.format(name))), name=name)
 
 
+def load_cameras(names: str | Sequence[str], data: Path | None) -> list[Motion]:
+    """One camera by its name, or several."""
+    return [load_camera(name, data) for name in ([names] if isinstance(names, str) else names)]
+
+
 def _recording(data: Path | None, name: str) -> Path:
     if data is None:
         raise BufgymError(f"the AFR paper's evaluation needs a folder of recordings (--data DIR) with {name}")
@@ -131,9 +136,9 @@ def settings(
             duration_s=frames / RATE_HZ,
             scale=(scale,),
             link_offset_s=(0.0, 0.0),
-            value=TIME,
+            value=time_value(),
         )
-        made += [Setting(label, scale, c.name, replace(uplink, motion=(c,), value=MOTION)) for c in cameras]
+        made += [Setting(label, scale, c.name, replace(uplink, motion=(c,), value=motion_value())) for c in cameras]
         if timed:
             made.append(Setting(label, scale, "time", uplink))
     return made

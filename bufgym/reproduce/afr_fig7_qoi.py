@@ -23,7 +23,7 @@ from bufgym.reproduce.afr_evaluation import (
     Setting,
     about,
     column,
-    load_camera,
+    load_cameras,
     load_link,
     runs_of,
     settings,
@@ -57,7 +57,7 @@ def report(
         ceiling_bytes_per_s: a second link is scaled to this best second; None: the recorded link alone.
     """
     link = load_link(trace, data)
-    cameras = [load_camera(name, data) for name in ([motion] if isinstance(motion, str) else motion)]
+    cameras = load_cameras(motion, data)
     shown = settings(
         link,
         cameras,

@@ -27,7 +27,7 @@ from bufgym.reproduce.afr_evaluation import (
     Setting,
     about,
     column,
-    load_camera,
+    load_cameras,
     load_link,
     runs_of,
     settings,
@@ -76,7 +76,7 @@ def report(
     if not 1 <= runs <= more_runs:
         raise BufgymError(f"runs = {runs}, more_runs = {more_runs}: need 1 <= runs <= more_runs")
     link = load_link(trace, data)
-    cameras = [load_camera(name, data) for name in ([motion] if isinstance(motion, str) else motion)]
+    cameras = load_cameras(motion, data)
     shown = settings(
         link,
         cameras,

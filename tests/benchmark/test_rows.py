@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from bufgym.benchmark.rows import COLUMNS, TEXT, WHOLE, YES_NO, Row, read_rows, replaced, write_rows
+from bufgym.benchmark.rows import COLUMNS, TEXT, WHOLE, YES_NO, Row, read_rows, write_rows
 from bufgym.errors import BufgymError
+from bufgym.files import replaced
 
 ENDINGS = ["csv", "parquet"]
 

@@ -15,7 +15,7 @@ from bufgym.errors import BufgymError
 from bufgym.reproduce import NEEDS_DATA, afr_fig6, afr_fig7_qoi, afr_fig8_gap, run
 from bufgym.reproduce import afr_evaluation as common
 from bufgym.reproduce.report import Report
-from bufgym.suites import MOTION
+from bufgym.suites import motion_value
 from bufgym.traces import Motion, Trace, write_csv
 
 SHIPPED: dict[str, Any] = {"trace": "lte-synthetic-0", "motion": ["drive-0"], "frames": 60, "capacities": (3,)}
@@ -46,7 +46,7 @@ def test_the_second_link_has_the_papers_ceiling_within_the_stream() -> None:
         ("x 5.00", "turn", 5.0),
         ("x 5.00", "time", 5.0),
     ]
-    assert made[0].uplink.value == MOTION and made[0].uplink.max_messages == 60
+    assert made[0].uplink.value == motion_value() and made[0].uplink.max_messages == 60
     # 2 MB/s on average of 30 x 200 kB
     assert common.share_carried(link, 60, 200_000) == pytest.approx(1 / 3)
     assert common.share_carried(link, 60, 200_000, 5.0) == pytest.approx(5 / 3)

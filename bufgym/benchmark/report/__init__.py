@@ -11,9 +11,9 @@ from pathlib import Path
 
 from bufgym.benchmark.folder import Run, read
 from bufgym.benchmark.report import page, tables
-from bufgym.benchmark.rows import replaced
 from bufgym.benchmark.score import Scores, scores
 from bufgym.errors import BufgymError
+from bufgym.files import replaced
 
 __all__ = ["markdown", "plain", "write"]
 
