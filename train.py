@@ -67,6 +67,8 @@ class Arguments:
     gae_lambda: float = 0.9
     entropy: float = 0.0
     """Weight of the entropy bonus."""
+    warm_up: int = 0
+    """Decisions for which evolution tries candidates on a quarter of its sampled episodes."""
     checkpoint_every: int = 250_000
     """Steps."""
     validate_every: int = 250_000

@@ -167,7 +167,7 @@ def train(
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
     saved = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
-    ground = yards(arguments, "train", seed)
+    few, all_of_them = (yards(arguments, "train", seed, episodes) for episodes in (EPISODES // 4, EPISODES))
     judges = yards(arguments, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
     like = start(fields_of(arguments), arguments.hidden, np.random.default_rng(seed))
     if saved.exists():
@@ -180,7 +180,6 @@ def train(
             "CMA_diagonal": len(to_vector(like)) > DIAGONAL,
         }
         es, steps, before = cma.CMAEvolutionStrategy(to_vector(like), SIGMA, settings), 0, 0.0
-    decisions = sum(yard.decisions for yard in ground)
     trials = ValidationSet(arguments, folder)
     curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), steps)
     validations = Record(home / "validation.csv", ("steps", "seconds", *Verdict._fields, "over_rivals"), steps)
@@ -213,10 +212,11 @@ def train(
     if not validations.rows:
         validate(es.mean)
     while steps < arguments.steps:
+        ground = few if steps < arguments.warm_up else all_of_them
         vectors = es.ask()
         fitness = [_fitness(learned.policy("evolved", from_vector(like, v)), ground) for v in vectors]
         es.tell(vectors, fitness)
-        steps += decisions * len(vectors)
+        steps += sum(yard.decisions for yard in ground) * len(vectors)
         curve.append(steps, spent(), float(np.min(fitness)))
         if steps - validations.rows[-1][0] >= arguments.validate_every or steps >= arguments.steps:
             validate(es.mean)

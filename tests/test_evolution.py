@@ -134,9 +134,8 @@ def test_a_run_leaves_an_agent_goes_on_after_a_kill_and_repeats(capsys: pytest.C
 
 @pytest.mark.slow
 def test_several_suites_at_once_have_a_table_each(capsys: pytest.CaptureFixture[str]) -> None:
-    both = dataclasses.replace(
-        TINY, suite="interruption-v1,sustained-v1", name="both", sees="time", steps=200_000, hidden=0, capacities="25", test_seeds=1, validation_episodes=200
-    )
+    few = {"capacities": "25", "test_seeds": 1, "validation_episodes": 200, "steps": 200_000}
+    both = dataclasses.replace(TINY, suite="interruption-v1,sustained-v1", name="both", sees="time", hidden=0, **few)
     train.main(both)
     told = capsys.readouterr().out
     for suite in both.suites:
