@@ -1,7 +1,7 @@
 """What each part of an evolved agent is worth: the same training without it, as a page.
 
-``python -m agents.ablation --steps 60000000 --seeds 2 --out docs/ablation.md`` trains every variant, a process a core (a
-finished one is not trained again), and measures the kept agents on the test splits: regret over that of AFR or Drop
+``python -m agents.ablation --steps 60000000 --seeds 2 --out docs/ablation.md`` trains every variant, a process a core
+(a finished one is not trained again), and measures the kept agents on the test splits: regret over that of AFR or Drop
 Oldest, whichever is better (``grounds.Yard``). ``--runs runs/a,runs/b`` adds how those runs learned.
 """
 
@@ -138,7 +138,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "# What each part is worth",
         "",
         "Test splits; regret over that of AFR or Drop Oldest, whichever is better; "
-        f"{options.steps:,} decisions a seed, {options.seeds} seeds. Made by `python -m agents.ablation --steps {options.steps} --seeds {options.seeds}`.",
+        f"{options.steps:,} decisions a seed, {options.seeds} seeds. Made by",
+        f"`python -m agents.ablation --steps {options.steps} --seeds {options.seeds}`.",
         "",
         *table(found, sizes),
         "",
