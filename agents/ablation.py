@@ -115,9 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--runs", default="", help="folders of runs whose learning is shown beside")
     parser.add_argument("--out", type=Path, default=None, help="Markdown file to write; printed otherwise")
     options = parser.parse_args(arguments)
-    given = Arguments(
-        suite=SUITES, algo="evolution", name=options.name, steps=options.steps, warm_up=options.steps // 2
-    )
+    given = Arguments(suite=SUITES, algo="evolution", name=options.name, steps=options.steps)
     given = replace(given, validate_every=options.steps // 4)
     try:
         todo = variants(given)

@@ -50,10 +50,8 @@ MOTION = (
 SEES = {"time": TIME, "motion": MOTION}
 
 POPULATION = 16
-SIGMA = {None: 0.5, False: 1.0, True: 0.5}
-"""First step size, by what is searched (``searched``); the start's weights are of the order of 10."""
-DRAIN = "drain"
-"""The context that is 0 in an interruption: its weights are free to learn what a moving link asks for."""
+SIGMA = 0.5
+"""First step size; the start's weights are of the order of 10."""
 DIAGONAL = 100
 """From so many weights on, a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
 SMALL = (1, 2, 3)
@@ -103,28 +101,22 @@ def start(fields: tuple[str, ...], width: int, rng: np.random.Generator) -> Weig
     return replace(made, mix=np.zeros((len(made.context), len(made.slot)), np.float32))
 
 
-def searched(given: Weights, drained: bool | None = None) -> NDArray[np.bool_]:
+def searched(given: Weights) -> NDArray[np.bool_]:
     """bool[numbers]: those to be searched, in the order of ``numbers``.
 
-    What the context and the bias add to every drop alike, the acceptance can take off; and it stays linear. If
-    ``drained`` is given: what decides on a link that stands still (False), or only what its drain adds to that (True).
+    What the context and the bias add to every drop alike, the acceptance can take off; and it stays linear.
     """
     drop, accept = np.ones(len(given.drop.flat()), np.bool_), np.zeros(len(given.accept.flat()), np.bool_)
     inputs = len(given.fields)
     drop[:inputs] = [name in given.slot for name in given.fields]
     drop[inputs] = False
     accept[: inputs + 1] = True
-    mix = np.ones(_mixing(given).shape, np.bool_)
-    if drained is not None:
-        mix[:] = not drained
-        mix[given.context.index(DRAIN)] = drained
-        drop &= not drained
-    return np.concatenate([drop, accept, mix.reshape(-1)])
+    return np.concatenate([drop, accept, np.ones(_mixing(given).size, np.bool_)])
 
 
-def to_vector(given: Weights, drained: bool | None = None) -> NDArray[np.float64]:
+def to_vector(given: Weights) -> NDArray[np.float64]:
     """The numbers to be searched, in a row."""
-    return numbers(given)[searched(given, drained)]
+    return numbers(given)[searched(given)]
 
 
 def numbers(given: Weights) -> NDArray[np.float64]:
@@ -132,10 +124,10 @@ def numbers(given: Weights) -> NDArray[np.float64]:
     return np.concatenate([given.drop.flat(), given.accept.flat(), _mixing(given).reshape(-1)])
 
 
-def from_vector(like: Weights, vector: NDArray[np.float64], drained: bool | None = None) -> Weights:
+def from_vector(like: Weights, vector: NDArray[np.float64]) -> Weights:
     """The weights that those numbers are; all others are those of ``like``."""
     flat = numbers(like)
-    flat[searched(like, drained)] = vector
+    flat[searched(like)] = vector
     networks = len(like.drop.flat())
     drop, accept, mix = np.split(flat, [networks, 2 * networks])
     mixing = mix.reshape(_mixing(like).shape).astype(np.float32)
@@ -165,22 +157,20 @@ class Search:
 
     like: Weights
     """What is not searched has these numbers."""
-    drained: bool | None
-    """See ``searched``."""
     es: Any
     """pycma's strategy, whose mean is the agent."""
     steps: int = 0
     seconds: float = 0.0
 
     @staticmethod
-    def of(like: Weights, drained: bool | None, seed: int, **before: Any) -> Search:
+    def of(like: Weights, seed: int) -> Search:
         """A new one, around these weights."""
-        begin = to_vector(like, drained)
+        begin = to_vector(like)
         settings = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
-        return Search(like, drained, cma.CMAEvolutionStrategy(begin, SIGMA[drained], settings), **before)
+        return Search(like, cma.CMAEvolutionStrategy(begin, SIGMA, settings))
 
     def weights(self, vector: NDArray[np.float64]) -> Weights:
-        return from_vector(self.like, vector, self.drained)
+        return from_vector(self.like, vector)
 
     @property
     def mean(self) -> Weights:
@@ -201,8 +191,7 @@ def train(
 ) -> tuple[float, list[tuple[float, ...]], list[tuple[float, ...]]]:
     """Evolve one seed until ``arguments.steps`` decisions were rolled out, from its last checkpoint if there is one.
 
-    What did best on validation, by the same measure on other episodes, is kept as ``model.safetensors``. For the first
-    ``arguments.warm_up`` decisions only exact grounds are learned from.
+    What did best on validation, by the same measure on other episodes, is kept as ``model.safetensors``.
 
     Returns:
         Seconds of training, the learning curve (steps, seconds, fitness), and the validations (steps, seconds,
@@ -214,14 +203,10 @@ def train(
     home.mkdir(exist_ok=True)
     saved = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
     everything = yards(arguments, "train", seed)
-    exact = [yard for yard in everything if yard.exact]
     judges = yards(arguments, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
     trials = ValidationSet(arguments, folder)
     like = start(fields_of(arguments), arguments.hidden, np.random.default_rng(seed))
-    two = arguments.warm_up > 0
-    if two and (not exact or DRAIN not in like.context):
-        raise BufgymError(f"warm_up = {arguments.warm_up}: needs a suite of interruptions, and the field {DRAIN}")
-    search = pickle.loads(saved.read_bytes()) if saved.exists() else Search.of(like, False if two else None, seed)
+    search = pickle.loads(saved.read_bytes()) if saved.exists() else Search.of(like, seed)
     curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), search.steps)
     validations = Record(home / "validation.csv", ("steps", "seconds", *Verdict._fields, "over_rivals"), search.steps)
     began = time.perf_counter() - search.seconds
@@ -249,9 +234,7 @@ def train(
     if not validations.rows:
         validate(search.mean)
     while search.steps < arguments.steps:
-        if search.drained is False and search.steps >= arguments.warm_up:
-            search = Search.of(search.mean, True, seed, steps=search.steps)
-        fitness = search.generation(exact if search.drained is False else everything)
+        fitness = search.generation(everything)
         search.seconds = _since(began)
         curve.append(search.steps, search.seconds, fitness)
         if search.steps - validations.rows[-1][0] >= arguments.validate_every or search.steps >= arguments.steps:

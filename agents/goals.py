@@ -23,7 +23,7 @@ from agents.trials import Trials
 from agents.worlds import Cell
 from bufgym import policies, suites
 from bufgym.benchmark.campaign import Plan
-from bufgym.benchmark.score import regret
+from bufgym.benchmark.score import BASELINE, regret
 from bufgym.errors import BufgymError
 from bufgym.oracle import law, online_optimum
 from bufgym.policies import Policy, registry
@@ -104,7 +104,7 @@ def measure(suite: str, agents: Sequence[Policy], folder: Path, data: str | None
     """Agents and ranked fixed policies on the suite's test split; what is fixed is kept in ``folder``."""
     ranked = [name for name in registry.names() if name not in _shipped() and registry.get(name).ranked]
     trials = Trials(
-        Plan(suite, tuple(ranked), "test", suites.get(suite).capacities, seeds, data), folder / "test" / suite
+        Plan(suite, tuple(ranked), "test", suites.get(suite).capacities, seeds, data), folder / "goals" / suite
     )
     keys = [(cell.label, cell.capacity) for cell in trials.cells]
     own = [trials.rows_under(agent, agent.name, seed) for seed, agent in enumerate(agents)]
@@ -146,10 +146,11 @@ def section(found: Found) -> list[str]:
     parts = [(label, [i for i in every if found.cells[i][0] == label]) for label in labels]
     told = ", ".join(f"{label} {found.ratio(found.agents, cells, rng).value:.2f}" for label, cells in parts)
     lines += ["", f"By scenario: {told}.", ""]
-    worst = {rival: found.behind(rival, rng) for rival in found.fixed}
-    behind = [line for lines_of in worst.values() for line in lines_of]
-    lines.append("Nowhere below a fixed policy by more than the interval." if not behind else "Below a fixed policy:")
-    return [*lines, *(f"- {line}" for line in behind), ""]
+    rivals = dict.fromkeys([AFR, BASELINE, best])
+    behind = [line for rival in rivals for line in found.behind(rival, rng)]
+    told = ", ".join(rivals)
+    lines.append(f"Below {told} by more than the interval: {'nowhere.' if not behind else ''}")
+    return [*lines, "", *(f"- {line}" for line in behind), ""]
 
 
 SMALL = ((1, 400), (2, 300), (3, 120), (4, 70))
