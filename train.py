@@ -67,6 +67,9 @@ class Arguments:
     gae_lambda: float = 0.9
     entropy: float = 0.0
     """Weight of the entropy bonus."""
+    warm_up: int = 0
+    """Decisions for which evolution first learns a scorer of its own for links that stand still, from interruptions
+    alone (their mean over T is exact and cheap); afterwards the one for links that move, on all suites."""
     checkpoint_every: int = 250_000
     """Steps."""
     validate_every: int = 250_000

@@ -50,8 +50,8 @@ MOTION = (
 SEES = {"time": TIME, "motion": MOTION}
 
 POPULATION = 16
-SIGMA = 0.5
-"""First step size; the start's weights are of the order of 10."""
+SIGMA = {True: 1.0, False: 0.5}
+"""First step size, for the scorer of a still link or of a moving one; the start's weights are of the order of 10."""
 DIAGONAL = 100
 """From so many weights on, a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
 SMALL = (1, 2, 3)
@@ -131,7 +131,7 @@ def from_vector(like: Weights, vector: NDArray[np.float64]) -> Weights:
     networks = len(like.drop.flat())
     drop, accept, mix = np.split(flat, [networks, 2 * networks])
     mixing = mix.reshape(_mixing(like).shape).astype(np.float32)
-    return Weights(like.fields, _network(like.drop, drop), _network(like.accept, accept), mixing)
+    return Weights(like.fields, _network(like.drop, drop), _network(like.accept, accept), mixing, like.still)
 
 
 def _mixing(given: Weights) -> NDArray[np.float32]:
@@ -157,20 +157,23 @@ class Search:
 
     like: Weights
     """What is not searched has these numbers."""
+    still: bool
+    """Whether a scorer for links that stand still is searched, or the one for all others (or for all)."""
     es: Any
     """pycma's strategy, whose mean is the agent."""
     steps: int = 0
     seconds: float = 0.0
 
     @staticmethod
-    def of(like: Weights, seed: int) -> Search:
+    def of(like: Weights, still: bool, seed: int, **before: Any) -> Search:
         """A new one, around these weights."""
         begin = to_vector(like)
         settings = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
-        return Search(like, cma.CMAEvolutionStrategy(begin, SIGMA, settings))
+        return Search(like, still, cma.CMAEvolutionStrategy(begin, SIGMA[still], settings), **before)
 
     def weights(self, vector: NDArray[np.float64]) -> Weights:
-        return from_vector(self.like, vector)
+        made = from_vector(self.like, vector)
+        return replace(self.like, still=made) if self.still else made
 
     @property
     def mean(self) -> Weights:
@@ -191,7 +194,8 @@ def train(
 ) -> tuple[float, list[tuple[float, ...]], list[tuple[float, ...]]]:
     """Evolve one seed until ``arguments.steps`` decisions were rolled out, from its last checkpoint if there is one.
 
-    What did best on validation, by the same measure on other episodes, is kept as ``model.safetensors``.
+    What did best on validation, by the same measure on other episodes, is kept as ``model.safetensors``. For the first
+    ``arguments.warm_up`` decisions a scorer for links that stand still is learned, from exact grounds.
 
     Returns:
         Seconds of training, the learning curve (steps, seconds, fitness), and the validations (steps, seconds,
@@ -206,7 +210,10 @@ def train(
     judges = yards(arguments, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
     trials = ValidationSet(arguments, folder)
     like = start(fields_of(arguments), arguments.hidden, np.random.default_rng(seed))
-    search = pickle.loads(saved.read_bytes()) if saved.exists() else Search.of(like, seed)
+    exact = [yard for yard in everything if yard.exact]
+    if arguments.warm_up and not exact:
+        raise BufgymError(f"warm_up = {arguments.warm_up}: needs a suite of interruptions")
+    search = pickle.loads(saved.read_bytes()) if saved.exists() else Search.of(like, arguments.warm_up > 0, seed)
     curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), search.steps)
     validations = Record(home / "validation.csv", ("steps", "seconds", *Verdict._fields, "over_rivals"), search.steps)
     began = time.perf_counter() - search.seconds
@@ -234,7 +241,9 @@ def train(
     if not validations.rows:
         validate(search.mean)
     while search.steps < arguments.steps:
-        fitness = search.generation(everything)
+        if search.still and search.steps >= arguments.warm_up:
+            search = Search.of(search.mean, False, seed, steps=search.steps)
+        fitness = search.generation(exact if search.still else everything)
         search.seconds = _since(began)
         curve.append(search.steps, search.seconds, fitness)
         if search.steps - validations.rows[-1][0] >= arguments.validate_every or search.steps >= arguments.steps:

@@ -121,6 +121,11 @@ class Yard:
         self._pools = [[i for i, key in enumerate(keys) if key == wanted] for wanted in dict.fromkeys(keys)]
 
     @property
+    def exact(self) -> bool:
+        """Whether every ground is."""
+        return all(g.exact for g in self.grounds)
+
+    @property
     def decisions(self) -> int:
         """Arrivals that one policy is asked about."""
         return sum(int(g.senders.batch.senders["arrivals"].sum()) for g in self.grounds)

@@ -8,7 +8,10 @@ context's (``bufgym.observe``), so one set of weights serves every L:
 The score is that of dropping the candidate; a second network of the same kind gives the newcomer's score of being
 accepted, which counts where there is room. The highest score is done, ties to the oldest. The context c may also mix in
 how much the candidate's own features s count (``mix`` M): c M s is added to the score of dropping it, so that one
-agent weighs a rank or a gap otherwise on a link that stands still than on one that is merely slow.
+agent weighs a rank or a gap otherwise where V is straight than where it is flat.
+
+A second scorer of the same shape may decide while the link stands *still* (``STILL``): thinning a queue that nothing
+leaves, for how long nobody knows, is another task than keeping step with a slow link.
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
@@ -37,10 +40,14 @@ MAX_BYTES = 1 << 20
 MAX_WIDTH = 256
 
 # Where things lie in the memory.
-INPUTS, CONTEXTS, FIRST, SECOND, ACCEPT_NET, MIX, WORK = range(7)
+INPUTS, CONTEXTS, FIRST, SECOND, ACCEPT_NET, MIX, OTHER, WORK = range(8)
 """Fields read, and how many of them are the context's; widths of the two layers (0: none); where the second network,
-the mixing weights (none if the next begins there) and the room to work in begin."""
-HEADER = 7
+the mixing weights (0: none), the scorer for a link that stands still (0: none) and the room to work in begin."""
+HEADER = 8
+
+STILL = 0.07
+"""The link stands still while its drain (running mean of departures per arrival) is less: from the first arrival of an
+interruption on (1/16), or 41 arrivals after a link that kept up has stopped."""
 
 
 @kernel
@@ -104,11 +111,19 @@ def forward(
 
 def scorer(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """A trained slot scorer."""
+    if memory[OTHER] > 0 and buffer.drain < STILL:
+        return decided(buffer, arrival, memory[int(memory[OTHER]) :])
+    return decided(buffer, arrival, memory)
+
+
+@kernel
+def decided(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """By the scorer that the memory begins with."""
     s, L = len(buffer.slots), buffer.capacity
     n, c, first, second = int(memory[INPUTS]), int(memory[CONTEXTS]), int(memory[FIRST]), int(memory[SECOND])
     accept_net, work = int(memory[ACCEPT_NET]), int(memory[WORK])
     drop_net, mix = HEADER + n, int(memory[MIX])
-    drop, accept = memory[drop_net:accept_net], memory[accept_net:mix]
+    drop, accept = memory[drop_net:accept_net], memory[accept_net:work]
     f = memory[work : work + n]
     skip = memory[work + n : work + 2 * n - c]
     h = memory[work + 2 * n - c : work + 2 * n - c + 2 * first + second]
@@ -122,7 +137,7 @@ def scorer(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     slot = f[c:]
     for i in range(n - c):
         skip[i] = drop[c + i]
-    if mix < work:
+    if mix > 0:
         for j in range(c):
             for i in range(n - c):
                 skip[i] += f[j] * memory[mix + j * (n - c) + i]
@@ -175,6 +190,8 @@ class Weights:
     accept: Network
     mix: NDArray[np.float32] | None = None
     """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
+    still: Weights | None = None
+    """What decides while the link stands still, with the same fields and widths; None: these do."""
 
     @property
     def context(self) -> tuple[str, ...]:
@@ -194,6 +211,13 @@ class Weights:
 
     def memory(self) -> NDArray[np.float64]:
         """The policy's memory, but for the room to work in."""
+        if self.still is None:
+            return self._block()
+        other, alone = self.still._block(), self._block()
+        return np.concatenate([self._block(other=len(alone), behind=len(other)), other])
+
+    def _block(self, other: int = 0, behind: int = 0) -> NDArray[np.float64]:
+        """One scorer; ``other``: where the second one begins, ``behind``: numbers between this one and the room."""
         first, second = self.widths
         context = self.context
         order = [self.fields.index(name) for name in (*context, *self.slot)]
@@ -201,7 +225,8 @@ class Weights:
         mix = (np.zeros(0) if self.mix is None else self.mix).reshape(-1).astype(np.float64)
         accept_net = HEADER + len(self.fields) + len(drop)
         mixing = accept_net + len(accept)
-        head = [len(self.fields), len(context), first, second, accept_net, mixing, mixing + len(mix)]
+        places = [accept_net, mixing if len(mix) else 0, other, mixing + len(mix) + behind]
+        head = [len(self.fields), len(context), first, second, *places]
         numbers = [NAMES.index(self.fields[i]) for i in order]
         read = [number - SLOTS if number >= SLOTS else number for number in numbers]
         return np.concatenate([head, read, drop, accept, mix])

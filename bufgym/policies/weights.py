@@ -22,6 +22,7 @@ import itertools
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
@@ -46,7 +47,9 @@ KEY = "bufgym"
 WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")
 """What ``save`` itself writes into the metadata."""
 MIX = "drop.mix"
-"""The one tensor that a file may lack."""
+"""A tensor that a file may lack."""
+STILL = "still."
+"""Before the names of the second scorer's tensors; a file may lack them all."""
 LAYERS = 2
 """Hidden layers at most."""
 
@@ -117,6 +120,8 @@ def save(path: StrPath, weights: Weights, about: Mapping[str, Any]) -> Path:
 
 
 def _tensors(weights: Weights) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    if weights.still is not None:
+        yield from ((f"{STILL}{name}", tensor) for name, tensor in _tensors(weights.still))
     for prefix, network in (("drop", weights.drop), ("accept", weights.accept)):
         yield f"{prefix}.skip", _plain(network.skip)
         yield f"{prefix}.bias", _plain(network.bias)
@@ -171,8 +176,15 @@ def _parsed(path: StrPath, data: bytes) -> tuple[Weights, dict[str, Any]]:
     if _sha256(metadata["fields"], tensors) != metadata["sha256"]:
         rule = "fields and tensors have another one: the file was changed"
         raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
+    other = {name.removeprefix(STILL): tensor for name, tensor in tensors.items() if name.startswith(STILL)}
+    own = {name: tensor for name, tensor in tensors.items() if not name.startswith(STILL)}
+    made = _weights(metadata["fields"], own)
+    return (replace(made, still=_weights(metadata["fields"], other)) if other else made), metadata
+
+
+def _weights(fields: Sequence[str], tensors: Tensors) -> Weights:
     mix = tensors.pop(MIX).astype(np.float32) if MIX in tensors else None
-    return Weights(tuple(metadata["fields"]), _network("drop", tensors), _network("accept", tensors), mix), metadata
+    return Weights(tuple(fields), _network("drop", tensors), _network("accept", tensors), mix)
 
 
 def _metadata(path: StrPath, data: bytes) -> dict[str, Any]:
@@ -241,9 +253,10 @@ def _checked_tensors(path: StrPath, found: list[tuple[str, dict[str, Any]]], fie
         widths += given[name]
     inputs = len(fields)
     asked = _shapes(inputs, widths)
-    if MIX in given:
-        slots = sum(learned.NAMES.index(name) < learned.SLOTS for name in fields)
-        asked[MIX] = (inputs - slots, slots)
+    if any(name.startswith(STILL) for name in given):
+        asked |= {f"{STILL}{name}": shape for name, shape in asked.items()}
+    slots = sum(learned.NAMES.index(name) < learned.SLOTS for name in fields)
+    asked |= {name: (inputs - slots, slots) for name in (MIX, STILL + MIX) if name in given}
     for name in [*asked, *given]:
         if name not in given:
             refuse(name, "is missing")

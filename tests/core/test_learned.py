@@ -58,7 +58,9 @@ def weights(draw):
     widths = draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)]))
     made = Weights(fields, network(rng, len(fields), widths), network(rng, len(fields), widths))
     mix = rng.normal(0, 1, (len(made.context), len(made.slot))).astype(np.float32)
-    return replace(made, mix=draw(st.sampled_from([None, mix])))
+    other = replace(made, drop=network(rng, len(fields), widths), accept=network(rng, len(fields), widths))
+    made, other = (replace(each, mix=draw(st.sampled_from([None, mix]))) for each in (made, other))
+    return replace(made, still=draw(st.sampled_from([None, other])))
 
 
 # --- the twin --------------------------------------------------------------------------------------------------------
@@ -74,10 +76,11 @@ def score(net, f):
     return out + math.fsum(float(s) * each for s, each in zip(net.skip, f, strict=True)) + float(net.bias[0])
 
 
-def twin(made):
+def twin(whole):
     """A policy that decides by these weights: every candidate is scored, the best is searched for afterwards."""
 
     def on_arrival(buffer, arrival, memory):
+        made = whole.still if whole.still is not None and buffer.drain < 0.07 else whole
         s, L = len(buffer.slots), buffer.capacity
         slots, context = np.zeros((len(SLOT_NAMES), L + 1)), np.zeros(len(CONTEXT_NAMES))
         observe_slots(buffer, arrival, slots)

@@ -334,6 +334,18 @@ def test_mixing_weights_come_back_as_they_were(path):
     assert again.mix.tolist() == [[-1.5]] and (again.memory() == mixed.memory()).all()
 
 
+def test_a_second_scorer_comes_back_too_or_not_at_all(path):
+    both = replace(made(3), still=replace(made(3), mix=np.float32([[2.5]])))
+    weights.save(path, both, ABOUT)
+    again, metadata = weights.read(path)
+    assert again.mix is None and again.still.mix.tolist() == [[2.5]] and again.still.still is None
+    assert (again.memory() == both.memory()).all()
+    tensors = tensors_of(path.read_bytes())
+    del tensors["still.drop.skip"]
+    put(path, tensors, metadata)
+    refused(path, "tensor still.drop.skip is missing")
+
+
 # --- the agents that come with bufgym --------------------------------------------------------------------------------
 
 
