@@ -17,7 +17,8 @@ class Arguments:
     """Gymnasium id."""
     suite: str = ""
     """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
-    validation split, and report on its test split; the agent is asked at every arrival."""
+    validation split, and report on its test split; the agent is asked at every arrival. Several, as in a,b: on all of
+    them at once."""
     data: str = ""
     """Folder of recordings, for suites that need one."""
     capacities: str = ""
@@ -26,8 +27,10 @@ class Arguments:
     """PPO with action masks, PPO without, double DQN with masks, or CMA-ES over whole episodes (suites only)."""
     sees: Literal["motion", "time"] = "motion"
     """What an evolved agent sees: odometry as well, or the clock alone."""
-    hidden: int = 4
-    """Hidden units of an evolved agent."""
+    fields: str = ""
+    """Fields that an evolved agent reads, such as rank,motion_merged,stalled; by default those of --sees."""
+    hidden: int = 0
+    """Hidden units of an evolved agent; with none, its scores are linear in what the context makes of the slots."""
     name: str = ""
     """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
     resume: bool = False
@@ -64,6 +67,8 @@ class Arguments:
     gae_lambda: float = 0.9
     entropy: float = 0.0
     """Weight of the entropy bonus."""
+    warm_up: int = 0
+    """Decisions for which evolution tries candidates on a quarter of its sampled episodes."""
     checkpoint_every: int = 250_000
     """Steps."""
     validate_every: int = 250_000
@@ -74,6 +79,11 @@ class Arguments:
     """Test episodes on each trace of a suite; 0: as many as the suite says."""
     episodes: int = 200
     """Held-out episodes in the evaluation (without a suite)."""
+
+    @property
+    def suites(self) -> tuple[str, ...]:
+        """Those that ``suite`` names."""
+        return tuple(filter(None, self.suite.split(",")))
 
 
 def main(arguments: Arguments | None = None) -> None:
@@ -88,7 +98,7 @@ def main(arguments: Arguments | None = None) -> None:
     try:
         folder = training.prepare(arguments)
         runs = training.train_all(arguments, folder)
-        (report.report_suite if arguments.suite else report.evaluate_and_report)(arguments, folder, runs)
+        (report.report_suites if arguments.suite else report.evaluate_and_report)(arguments, folder, runs)
     except BufgymError as error:
         raise SystemExit(f"error: {error}") from None
 

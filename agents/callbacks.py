@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
-from agents.trials import Trials, Verdict
+from agents.trials import ValidationSet, Verdict
 from bufgym.files import replaced
 
 
@@ -108,7 +108,7 @@ class Curve(Between):
 class Validation(Between):
     """Every so many steps, plays the validation split and saves what did; the best of these is the one to keep."""
 
-    def __init__(self, home: Path, every: int, trials: Trials, seats: int, curve: Curve, steps: int) -> None:
+    def __init__(self, home: Path, every: int, trials: ValidationSet, seats: int, curve: Curve, steps: int) -> None:
         super().__init__()
         self.home, self.every, self.trials, self.seats, self.curve = home, every, trials, seats, curve
         self.record = Record(home / "validation.csv", ("steps", "seconds", *Verdict._fields), steps)
@@ -118,8 +118,8 @@ class Validation(Between):
         return self.record.rows
 
     def best(self) -> tuple[float, ...]:
-        """The row with the highest score; the earliest of several."""
-        return max(self.rows, key=lambda row: row[2])
+        """The row with the least regret over AFR's; the earliest of several."""
+        return min(self.rows, key=lambda row: row[4])
 
     def told(self) -> str:
         """The latest, for people."""

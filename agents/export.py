@@ -1,12 +1,14 @@
 """A trained agent as a file that bufgym decides by without torch: ``bufgym.policies.weights``.
 
-The model is stable-baselines3's zip of a MaskablePPO with ``network.SlotPolicy``. It holds pickles, and reading it can
-run any code: export models of your own alone. ``python -m agents.export MODEL OUT --name N`` is ``bufgym export``.
+The model is an evolved agent's file of weights, which gets its name and its scores, or stable-baselines3's zip of a
+MaskablePPO with ``network.SlotPolicy``. A zip holds pickles, and reading it can run any code: export models of your own
+alone. ``python -m agents.export MODEL OUT --name N`` is ``bufgym export``.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import shlex
 import sys
 from pathlib import Path
@@ -17,8 +19,12 @@ from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 from torch import nn
 
+from agents.grounds import Lengths
 from agents.network import SlotFeatures, SlotScorer
+from agents.worlds import Cell
+from bufgym import suites
 from bufgym.errors import BufgymError
+from bufgym.policies import Policy, learned
 from bufgym.policies import weights as files
 from bufgym.policies.learned import Network, Weights
 from bufgym.policies.weights import StrPath
@@ -30,8 +36,24 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
     Raises:
         BufgymError: ``model`` is no agent that scores slots, or ``out`` cannot be written.
     """
-    notes = {"name": name, "about": about, **training(Path(model))}
-    return files.save(out, weights_of(_loaded(Path(model))), notes)
+    path = Path(model)
+    weights = files.read(path)[0] if path.suffix == ".safetensors" else weights_of(_loaded(path))
+    checked = regrets(learned.policy(name, weights))
+    return files.save(out, weights, {"name": name, "about": about, **training(path), "regret": checked})
+
+
+CHECKED = (4, 8, 16, 32)
+"""L of the regrets that are noted."""
+
+
+def regrets(policy: Policy) -> dict[str, float]:
+    """Its regret, for a test to find again: in each V of interruption-v1's test split, exact; L = 4, 8, 16, 32."""
+    settings = suites.get("interruption-v1").settings("test")
+    return {
+        f"{label}, L = {L}": round(Lengths(Cell(label, setting.scenario, L)).regret(policy), 9)
+        for label, setting in settings.items()
+        for L in CHECKED
+    }
 
 
 def _loaded(path: Path) -> MaskablePPO:
@@ -76,6 +98,8 @@ def training(model: Path) -> dict[str, Any]:
         return {}
     settings = _json(folder / "settings.json")
     notes: dict[str, Any] = {"training": _command(settings), "seeds": _seeds(settings, model)}
+    if folder == model.parent and (by_suite := _scores(folder, settings)):
+        notes["scores"] = by_suite
     results = folder / "results.json"
     if results.is_file() and folder == model.parent:
         found = _json(results)
@@ -84,6 +108,21 @@ def training(model: Path) -> dict[str, Any]:
         notes["seeds"] = [int(agent.removeprefix("agent (seed ").removesuffix(")"))]
         notes["scores"] = {"qoi": rows[agent], "drop-oldest": rows["drop-oldest"], "held_out": found["held_out"]}
     return notes
+
+
+def _scores(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """Of a run on several suites: each one's score with its interval over episodes and all training seeds."""
+    found = {}
+    for suite in settings.get("suite", "").split(","):
+        path = folder / suite / "results.json"
+        if not suite or not path.is_file():
+            continue
+        results = _json(path)
+        agent = next(s for s in results["standings"] if s["policy"] == f"agent ({settings['algo']})")
+        value, low, high = agent["score"]
+        if math.isfinite(value):
+            found[suite] = {"score": value, "interval": [low, high]}
+    return found
 
 
 def _json(path: Path) -> dict[str, Any]:

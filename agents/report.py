@@ -43,7 +43,7 @@ def evaluate_and_report(arguments: Arguments, folder: Path, runs: Sequence[Run])
     episodes = held_out(world, arguments.episodes)
     results = run_fixed(episodes, world, arguments.capacity)
     # Chosen by its training episodes: choosing by the held-out ones would flatter it.
-    best = max(runs, key=lambda run: run.score)
+    best = max(runs, key=lambda run: run.merit)
     for run in runs:
         model = load(arguments, run)
         results[agent_name(run)] = run_agent(model, episodes, world, arguments.capacity, arguments.decide_at)
@@ -142,24 +142,38 @@ def _figure(
 # --- on a suite ------------------------------------------------------------------------------------------------------
 
 
-def report_suite(arguments: Arguments, folder: Path, runs: Sequence[Run]) -> Scores:
+def report_suites(arguments: Arguments, folder: Path, runs: Sequence[Run]) -> dict[str, Scores]:
+    """Each suite's table, in the run's folder or, of several suites, in one of its own; the best agent is kept."""
+    best = max(runs, key=lambda run: run.merit)
+    shutil.copyfile(best.model, folder / best.model.name)
+    several = len(arguments.suites) > 1
+    found = {}
+    for suite in arguments.suites:
+        if several:
+            print(f"\n{suite}")
+        found[suite] = report_suite(arguments, suite, folder, folder / suite if several else folder, runs)
+    seconds = ", ".join(f"{run.seconds:.0f}" for run in runs)
+    print(f"\ntraining took {seconds} s; model, rows, figure and numbers are in {folder}")
+    return found
+
+
+def report_suite(arguments: Arguments, suite: str, folder: Path, home: Path, runs: Sequence[Run]) -> Scores:
     """All agents and fixed policies on the suite's test split, scored as ``bufgym bench`` does; print and save it.
 
     The training seeds together are one entry, with intervals over them and over episodes. Nothing is chosen here: each
     seed's agent, and the one in model.zip, are those that did best on validation.
     """
-    trials = Trials(
-        plan(arguments, "test", tuple(registry.names()), arguments.test_seeds or None), folder / "test", progress=True
-    )
-    best = max(runs, key=lambda run: run.score)
+    test = plan(arguments, suite, "test", tuple(registry.names()), arguments.test_seeds or None)
+    trials = Trials(test, folder / "test" / suite, progress=True)
+    home.mkdir(exist_ok=True)
+    best = max(runs, key=lambda run: run.merit)
     agents = {run.seed: ALGORITHMS[arguments.algo].test(arguments, run, trials) for run in runs}
     rows: list[Row] = [{**row, "training_seed": None} for row in trials.rows]
     rows += [row for seed in agents for row in agents[seed]]
-    write_rows(rows, folder / "rows.csv")
+    write_rows(rows, home / "rows.csv")
     unranked = [name for name in registry.names() if not registry.get(name).ranked]
     found = scores(rows, unranked=unranked)
     print(standings(found))
-    shutil.copyfile(best.model, folder / best.model.name)
     qoi: dict[str, list[float]] = {}
     for row in rows:
         qoi.setdefault(row["policy"], []).append(row["qoi"])
@@ -169,23 +183,22 @@ def report_suite(arguments: Arguments, folder: Path, runs: Sequence[Run]) -> Sco
         "seeds": [run.seed for run in runs],
         "agent": agent_name(best),
         "training_s": {str(run.seed): run.seconds for run in runs},
-        "validation": {str(run.seed): run.score for run in runs},
-        "held_out": {"suite": arguments.suite, "split": "test", "episodes": len(trials.rows) // len(trials.plan.specs)},
+        "validation": {str(run.seed): -run.merit for run in runs},
+        "held_out": {"suite": suite, "split": "test", "episodes": len(trials.rows) // len(trials.plan.specs)},
         "scores": [{"policy": name, "qoi": float(np.mean(numbers))} for name, numbers in qoi.items()],
         "standings": [dataclasses.asdict(standing) for standing in found.standings],
         "cells": [dataclasses.asdict(cell) for cell in found.cells],
     }
-    (folder / "results.json").write_text(json.dumps(saved, indent=2) + "\n", encoding="utf-8")
+    (home / "results.json").write_text(json.dumps(saved, indent=2) + "\n", encoding="utf-8")
     # What is below Drop Oldest is in the table alone: it would squeeze the rest.
     shown = [s for s in found.standings if s.ranked and (s.score.value >= 0 or s.policy.startswith("agent"))]
     # Where no cell bites there is nothing to score.
+    shown = [s for s in shown if math.isfinite(s.score.value)]
     reached = {s.policy: s.score.value for s in shown} or {
         name: float(np.mean(numbers)) for name, numbers in qoi.items()
     }
     curves = [np.array(run.validation)[:, [0, 2]] for run in runs]
-    _figure(folder / "figure.png", runs, curves, "score on validation", reached, "normalised score", "Test split")
-    seconds = ", ".join(f"{run.seconds:.0f}" for run in runs)
-    print(f"\ntraining took {seconds} s; model, rows, figure and numbers are in {folder}")
+    _figure(home / "figure.png", runs, curves, "score on validation", reached, "normalised score", "Test split")
     return found
 
 

@@ -30,7 +30,7 @@ from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoin
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluate import Agent, worlds
 from agents.network import IgnoresMasks, policy_of
-from agents.trials import Trials, plan, validation_of
+from agents.trials import Trials, ValidationSet, plan
 from agents.worlds import World, capacities_of, cells
 from bufgym.benchmark.rows import Row
 from bufgym.errors import BufgymError
@@ -56,7 +56,7 @@ class Run:
     curve: list[tuple[float, ...]]
     """(steps, seconds, mean QoI of the latest training episodes), a row an update."""
     validation: list[tuple[float, ...]] = field(default_factory=list)
-    """(steps, seconds, *Verdict), a row a validation; none without a suite."""
+    """(steps, seconds, *Verdict), a row a validation, with the measure to choose by last; none without a suite."""
 
     file: str = "model.zip"
 
@@ -65,10 +65,11 @@ class Run:
         return self.folder / self.file
 
     @property
-    def score(self) -> float:
-        """The best on validation, or without a suite the mean QoI in the last tenth of training."""
+    def merit(self) -> float:
+        """The more the better: minus the least regret over the rivals' on validation, or without a suite the mean QoI
+        in the last tenth of training."""
         if self.validation:
-            return max(row[2] for row in self.validation)
+            return -min(row[-1] for row in self.validation)
         last = [row[2] for row in self.curve[-max(1, len(self.curve) // 10) :]]
         return float(np.mean(last)) if last else float("nan")
 
@@ -94,7 +95,8 @@ def prepare(arguments: Arguments) -> Path:
     noted = folder / "settings.json"
     given = dataclasses.asdict(arguments)
     if arguments.suite:
-        plan(arguments, "validation").checked()  # mistakes are told before anything is made
+        for suite in arguments.suites:  # mistakes are told before anything is made
+            plan(arguments, suite, "validation").checked()
     if arguments.resume:
         if not noted.exists():
             raise SystemExit(f"--resume: there is no run in {folder}")
@@ -126,7 +128,7 @@ def train_all(arguments: Arguments, folder: Path) -> list[Run]:
     if not seeds:
         raise BufgymError(f"seeds = {arguments.seeds}: must be >= 1")
     if arguments.suite:
-        validation_of(arguments, folder, progress=True)  # the clairvoyant's bounds are found once for all seeds
+        ValidationSet(arguments, folder, progress=True)  # the clairvoyant's bounds are found once for all seeds
     if len(seeds) == 1:
         return [train(arguments, folder, seeds[0], 0)]
     workers = min(len(seeds), os.cpu_count() or 1)
@@ -153,7 +155,7 @@ def train_seed(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> 
     curve = Curve(home / "curve.csv", model.num_timesteps)
     validation = None
     if arguments.suite:
-        trials, seats = validation_of(arguments, folder), seats_of(arguments)
+        trials, seats = ValidationSet(arguments, folder), seats_of(arguments)
         validation = Validation(home, arguments.validate_every, trials, seats, curve, model.num_timesteps)
     progress = Progress(validation or curve, arguments.steps, seed, line)
     left = arguments.steps - model.num_timesteps
@@ -175,14 +177,17 @@ def train_seed(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> 
 
 def seats_of(arguments: Arguments) -> int:
     """Slots that the agent of a suite is shown."""
-    return max(capacities_of(arguments.suite, arguments.capacities))
+    return max(L for suite in arguments.suites for L in capacities_of(suite, arguments.capacities))
 
 
 def training_env(arguments: Arguments) -> GymVecEnv:
-    """The batch of environments to train on: of one scenario, or of a suite's whole train split."""
+    """The batch of environments to train on: of one scenario, or of whole train splits."""
     if arguments.suite:
-        capacities = capacities_of(arguments.suite, arguments.capacities)
-        mixed = cells(arguments.suite, "train", capacities, arguments.data or None)
+        mixed = [
+            cell
+            for suite in arguments.suites
+            for cell in cells(suite, "train", capacities_of(suite, arguments.capacities), arguments.data or None)
+        ]
         each = math.ceil(arguments.num_envs / len(mixed))
         return GymVecEnv(World(mixed, [each] * len(mixed), reward=arguments.reward))
     return make_vec_env(

@@ -6,6 +6,7 @@ The episodes, and the rows of the fixed policies, are those of ``bufgym bench`` 
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -142,14 +143,34 @@ def seeds_for(suite: str, split: str, capacities: Sequence[int], episodes: int, 
     return max(1, round(episodes / (one_seed * len(capacities))))
 
 
-def plan(arguments: Arguments, split: str, specs: tuple[str, ...] = ("afr",), seeds: int | None = None) -> Plan:
-    """What the fixed policies meet on a split of the suite."""
-    capacities, data = capacities_of(arguments.suite, arguments.capacities), arguments.data or None
+def plan(
+    arguments: Arguments, suite: str, split: str, specs: tuple[str, ...] = ("afr",), seeds: int | None = None
+) -> Plan:
+    """What the fixed policies meet on a split of one of the run's suites."""
+    capacities, data = capacities_of(suite, arguments.capacities), arguments.data or None
     if split == "validation":
-        seeds = seeds_for(arguments.suite, split, capacities, arguments.validation_episodes, data)
-    return Plan(arguments.suite, specs, split, capacities, seeds, data)
+        share = math.ceil(arguments.validation_episodes / len(arguments.suites))
+        seeds = seeds_for(suite, split, capacities, share, data)
+    return Plan(suite, specs, split, capacities, seeds, data)
 
 
-def validation_of(arguments: Arguments, folder: Path, progress: bool = False) -> Trials:
-    """The fixed set of validation episodes; made once, read from the run's folder afterwards."""
-    return Trials(plan(arguments, "validation"), folder / "validation", progress=progress)
+class ValidationSet:
+    """The fixed validation episodes of all suites; made once, read from the run's folder afterwards."""
+
+    def __init__(self, arguments: Arguments, folder: Path, progress: bool = False) -> None:
+        self.trials = [
+            Trials(plan(arguments, suite, "validation"), folder / "validation" / suite, progress=progress)
+            for suite in arguments.suites
+        ]
+
+    def verdict(self, agent: Agent, seats: int) -> Verdict:
+        """The agent's, averaged over the suites."""
+        return _mean([trials.verdict(agent, seats) for trials in self.trials])
+
+    def verdict_on(self, policy: Policy) -> Verdict:
+        """The same for a policy."""
+        return _mean([trials.verdict_on(policy) for trials in self.trials])
+
+
+def _mean(verdicts: Sequence[Verdict]) -> Verdict:
+    return Verdict(*np.mean(verdicts, axis=0).tolist())

@@ -47,6 +47,7 @@ SLOT_FIELDS = (
     ),
     Field("loss", "slot", "value", "QoI", "V(a) + V(b) - V(a+b): QoI lost if it alone is dropped now"),
     Field("size", "slot", "queue", "g/(g+r), r = mean queued size", "its bytes"),
+    Field("relative_loss", "slot", "value", "l/(l+r), r = that of an even gap", "the same loss, free of V's scale"),
 )
 CONTEXT_FIELDS = (
     Field("occupancy", "context", "queue", "fraction of L", "messages queued"),
@@ -58,6 +59,8 @@ CONTEXT_FIELDS = (
     Field("stalled", "context", "link", "g/(g+r), r = L + 1 arrival periods", "time since the socket took a message"),
     Field("departures", "context", "link", "n/(n+1)", "messages the socket took since the previous arrival"),
     Field("drain", "context", "link", "g/(g+r), r = 1", "running mean of departures per arrival"),
+    Field("even_value", "context", "value", "QoI", "V of the even motion spacing e"),
+    Field("bend", "context", "value", "fraction", "(2 V(e) - V(2e)) / V(e): 0 where V is straight, 1 where it is flat"),
 )
 FIELDS = SLOT_FIELDS + CONTEXT_FIELDS
 
@@ -70,6 +73,7 @@ MOTION_BEFORE, MOTION_MERGED = _NUMBER["motion_before"], _NUMBER["motion_merged"
 OCCUPANCY, BACKLOG, BUSY, LEFT = (_NUMBER[name] for name in ("occupancy", "backlog", "busy", "left"))
 ARRIVAL_TIME_GAP, ARRIVAL_MOTION_GAP = _NUMBER["arrival_time_gap"], _NUMBER["arrival_motion_gap"]
 STALLED, DEPARTURES, DRAIN = _NUMBER["stalled"], _NUMBER["departures"], _NUMBER["drain"]
+RELATIVE_LOSS, EVEN_VALUE, BEND = _NUMBER["relative_loss"], _NUMBER["even_value"], _NUMBER["bend"]
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,8 @@ It pays at the moment of the decision what the decision costs or gains, and tele
 
 # So that 0 / (0 + reference) is 0 where nothing moved at all.
 _TINY = 1e-30
+# Where V is straight a merger loses nothing but rounding errors, which are not to be told from one another.
+_ROUNDING = 1e-12
 
 
 @kernel
@@ -108,6 +114,14 @@ def squash_row(row: NDArray[np.floating[Any]], reference: float) -> None:
 
 
 @kernel
+def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
+    """V of the even motion spacing, and the QoI lost where two such gaps become one."""
+    even = (arrival.x - buffer.taken_x) / (buffer.capacity + 1)
+    gain = value(buffer.v, even)
+    return gain, merging_loss(buffer.v, even, gain, even, gain)
+
+
+@kernel
 def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
     """Write every CONTEXT_FIELDS value into ``context`` (float[fields])."""
     spread = buffer.capacity + 1
@@ -121,6 +135,8 @@ def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[A
     context[STALLED] = squash(buffer.stalled_us, spread * buffer.period_us)
     context[DEPARTURES] = squash(buffer.departures, 1.0)
     context[DRAIN] = squash(buffer.drain, 1.0)
+    context[EVEN_VALUE], even_loss = even_gap(buffer, arrival)
+    context[BEND] = even_loss / max(context[EVEN_VALUE], _TINY)
 
 
 @kernel
@@ -128,7 +144,7 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
     """Write every SLOT_FIELDS value into ``rows`` (float[fields, L + 1]); empty slots are 0, the newcomer is last.
 
     The gaps are those of ``buffer.time_gaps`` and ``motion_gaps``, the loss that of ``buffer.loss``, found in one walk
-    along the queue; the gaps are squashed row by row afterwards.
+    along the queue; gaps and relative losses are squashed row by row afterwards.
     """
     s, last = len(buffer.slots), buffer.capacity
     per_rank = 1 / (s + 1)
@@ -149,6 +165,7 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
         rows[MOTION_BEFORE, k] = here_x - before_x
         rows[MOTION_MERGED, k] = after_x - before_x
         rows[LOSS, k] = merging_loss(buffer.v, here_x - before_x, gain, after_x - here_x, after_gain)
+        rows[RELATIVE_LOSS, k] = max(rows[LOSS, k], 0.0)
         rows[SIZE, k] = slot.size_bytes
         before_us, before_x = here_us, here_x
     for k in range(s, last):
@@ -162,6 +179,7 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
     rows[MOTION_BEFORE, last] = arrival.x - before_x
     rows[MOTION_MERGED, last] = arrival.x - before_x + step_x
     rows[LOSS, last] = merging_loss(buffer.v, arrival.x - before_x, newcomer_gain, step_x, value(buffer.v, step_x))
+    rows[RELATIVE_LOSS, last] = max(rows[LOSS, last], 0.0)
     rows[SIZE, last] = arrival.size_bytes
     even = 1 / (buffer.capacity + 1)
     even_us, even_x = even * (arrival.arrival_us - buffer.taken_us), even * (arrival.x - buffer.taken_x)
@@ -169,4 +187,5 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
     squash_row(rows[TIME_MERGED], 2 * even_us)
     squash_row(rows[MOTION_BEFORE], even_x)
     squash_row(rows[MOTION_MERGED], 2 * even_x)
+    squash_row(rows[RELATIVE_LOSS], max(even_gap(buffer, arrival)[1], _ROUNDING))
     squash_row(rows[SIZE], (buffer.backlog_bytes + arrival.size_bytes) * per_rank)

@@ -256,7 +256,7 @@ def callbacks_logger() -> Any:
 
 @pytest.mark.slow
 def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: Path) -> None:
-    trials = Trials(plan(SUITE, "validation"), tmp_path / "trials")
+    trials = Trials(plan(SUITE, SUITE.suite, "validation"), tmp_path / "trials")
     assert len(trials.known("afr")) == 60
     verdict = trials.verdict(DropOldest(), 8)
     assert verdict.score == 0
@@ -270,7 +270,8 @@ def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: P
         )
     # A second reading makes nothing anew.
     written = (tmp_path / "trials" / "manifest.json").stat().st_mtime_ns
-    assert (Trials(plan(SUITE, "validation"), tmp_path / "trials").known("afr") == trials.known("afr")).all()
+    again = Trials(plan(SUITE, SUITE.suite, "validation"), tmp_path / "trials")
+    assert (again.known("afr") == trials.known("afr")).all()
     assert (tmp_path / "trials" / "manifest.json").stat().st_mtime_ns == written
 
 

@@ -13,18 +13,21 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard", "cma"):
     pytest.importorskip(extra, reason="the extra [train] is not installed")
 
 import train  # noqa: E402  (these need the extra)
-from agents import evolution, training, worlds  # noqa: E402
+from agents import evolution, grounds, training, worlds  # noqa: E402
 from bufgym import policies  # noqa: E402
+from bufgym.metrics import outcome  # noqa: E402
+from bufgym.oracle import integer, law  # noqa: E402
 from bufgym.policies import learned, weights  # noqa: E402
 from bufgym.scenario import Interruption  # noqa: E402
+from bufgym.sender import run  # noqa: E402
 
 TINY = train.Arguments(
     suite="interruption-v1",
     capacities="4",
     algo="evolution",
     name="tiny",
-    steps=600_000,
-    validate_every=200_000,
+    steps=60_000,
+    validate_every=20_000,
     validation_episodes=30,
     test_seeds=25,
     hidden=2,
@@ -38,25 +41,72 @@ def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize(("sees", "like"), [("motion", "min-motion-gap"), ("time", "min-gap")])
 def test_it_begins_with_the_smallest_merged_gap(sees: str, like: str) -> None:
-    """The regret of the first weights is that of the policy they stand for."""
-    first = learned.policy("first", evolution.start(evolution.SEES[sees], 3, np.random.default_rng(0)))
-    cell = worlds.Cell("short", Interruption(t_max=60), 5)
-    (ground,) = evolution.grounds([cell], seed=1)
-    assert ground.regret(first) == pytest.approx(ground.regret(policies.get(like)), abs=1e-12)
-    assert ground.afr == ground.regret(policies.get("afr")) > 0
-    assert ground.over_afr(policies.get("drop-newest")) == evolution.WORST
+    """Without its leaning towards the new, the regret of the first weights is that of the policy they stand for."""
+    weights = evolution.start(evolution.SEES[sees], 3, np.random.default_rng(0))
+    weights.drop.skip[weights.fields.index("rank")] = 0.0
+    (ground,) = grounds.grounds([SHORT], seed=1)
+    assert ground.regret(learned.policy("first", weights)) == ground.regret(policies.get(like))
 
 
 def test_weights_are_a_vector_and_back() -> None:
-    made = learned.random_weights(evolution.MOTION, (3, 2), np.random.default_rng(0))
+    """Searched are all numbers but those that every drop shares, and the acceptance's hidden layer."""
+    made = evolution.start(evolution.MOTION, 3, np.random.default_rng(0))
+    assert (made.slot, made.context) == (evolution.MOTION[:5], evolution.MOTION[5:])
     vector = evolution.to_vector(made)
-    assert len(vector) == 2 * (14 + 1 + 14 * 3 + 3 + 3 * 2 + 2 + 2)
+    assert len(vector) == 5 + (10 * 3 + 3 + 3) + (10 + 1) + 5 * 5
     again = evolution.from_vector(made, vector)
     assert (evolution.to_vector(again) == vector).all()
     assert (again.memory() == made.memory()).all()
-    changed = vector.copy()
-    changed[0] += 1
-    assert again.drop.skip[0] + 1 == evolution.from_vector(made, changed).drop.skip[0]
+    changed = evolution.from_vector(made, np.arange(len(vector), dtype=float))
+    assert changed.drop.skip.tolist() == [0, 1, 2, 3, 4, *[0] * 5]  # 0: what the context adds to every drop
+    assert changed.mix is not None and changed.mix[-1, -1] == len(vector) - 1
+    assert (changed.accept.layers[0][0] == made.accept.layers[0][0]).all()
+
+
+# --- grounds ---------------------------------------------------------------------------------------------------------
+
+
+SHORT = worlds.Cell("short", Interruption(t_max=40), 5)
+
+
+@pytest.mark.parametrize("name", ["afr", "min-gap", "drop-oldest", "drop-newest", "linear-alpha"])
+def test_one_run_through_the_longest_interruption_is_a_run_through_each(name: str) -> None:
+    (ground,) = grounds.grounds([SHORT], seed=1)
+    assert isinstance(ground, grounds.Lengths) and ground.exact
+    scenario, policy = ground.scenario, policies.get(name)
+    each = [outcome(run(policy, [scenario.episode(T)], 5, scenario.value), 0).qoi for T in range(1, 41)]
+    np.testing.assert_allclose(ground.qoi(policy)[1:], each, rtol=1e-12)
+    best = [1 + integer(5, T, scenario.value) for T in range(1, 41)]
+    share = law(scenario)[1:]
+    assert ground.regret(policy) == pytest.approx(1 - share @ each / (share @ best), abs=1e-12)
+
+
+def test_sampled_grounds_take_traces_in_turn_and_meet_the_same_episodes_again() -> None:
+    given = worlds.cells("sustained-v1", "train", (5, 10))
+    found = grounds.grounds(given[:4], seed=3, episodes=8)
+    assert [ground.cell for ground in found] == given[:4]
+    episodes = [ground.episodes for ground in found if isinstance(ground, grounds.Sampled)]
+    assert [len(drawn) for drawn in episodes] == [2] * 4
+    traces = [episode.link.trace.name for drawn in episodes for episode in drawn]
+    assert len(set(traces)) == 8
+    afr = policies.get("afr")
+    assert found[0].regret(afr) == found[0].regret(afr)
+    assert len(grounds.grounds(given, seed=3, episodes=3)) == 3  # fewer episodes than cells: so many cells
+
+
+def test_a_yard_asks_for_the_better_of_afr_and_drop_oldest() -> None:
+    """As good as the better one on every ground is 1; on exact grounds each counts, the worst most."""
+    cells = [SHORT, SHORT._replace(capacity=9)]
+    yard = grounds.Yard(grounds.grounds(cells, seed=1))
+    afr = policies.get("afr")
+    assert yard.over_rivals(afr) == pytest.approx(1.0)
+    mine = [g.regret(policies.get("min-gap")) / g.regret(afr) for g in yard.grounds]
+    assert yard.over_rivals(policies.get("min-gap")) == pytest.approx(np.sqrt(np.mean(np.square(mine))))
+    assert yard.over_rivals(policies.get("drop-newest")) == grounds.WORST
+    assert yard.decisions == 2 * 42
+
+
+# --- runs ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -80,6 +130,19 @@ def test_a_run_leaves_an_agent_goes_on_after_a_kill_and_repeats(capsys: pytest.C
     training.train_all(rest, training.prepare(rest))
     again, _ = weights.read(folder / "seed-0" / evolution.MODEL)
     assert (again.memory() == whole.memory()).all()
+
+
+@pytest.mark.slow
+def test_several_suites_at_once_have_a_table_each(capsys: pytest.CaptureFixture[str]) -> None:
+    few = {"capacities": "25", "test_seeds": 1, "validation_episodes": 200, "steps": 200_000}
+    both = dataclasses.replace(TINY, suite="interruption-v1,sustained-v1", name="both", sees="time", hidden=0, **few)
+    train.main(both)
+    told = capsys.readouterr().out
+    for suite in both.suites:
+        assert f"\n{suite}\n" in told
+        assert Path(f"runs/both/{suite}/rows.csv").exists()
+    agent, noted = weights.read("runs/both/model.safetensors")
+    assert agent.fields == evolution.TIME and agent.mix is not None and noted["suite"] == both.suite
 
 
 def test_it_needs_a_suite() -> None:

@@ -221,8 +221,8 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(algo: str) -> None:
 
 @pytest.mark.slow
 def test_on_a_suite_too_the_same_seed_gives_the_same_weights(monkeypatch: pytest.MonkeyPatch) -> None:
-    verdicts = iter([0.1, 0.9, 0.3, 0.2] * 2)
-    monkeypatch.setattr(Trials, "verdict", lambda self, agent, seats: Verdict(next(verdicts), 0.0, 1.0))
+    verdicts = iter([0.9, 0.1, 0.7, 0.8] * 2)
+    monkeypatch.setattr(Trials, "verdict", lambda self, agent, seats: Verdict(0.5, 0.0, next(verdicts)))
     first, again = weights(SUITE, "first"), weights(SUITE, "again")
     assert all((first[key] == again[key]).all() for key in first)
     # The second validation was the best: its agent is kept, not the last one.
@@ -231,14 +231,14 @@ def test_on_a_suite_too_the_same_seed_gives_the_same_weights(monkeypatch: pytest
 
 @pytest.mark.slow
 def test_a_suites_run_goes_on_with_its_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    verdicts = iter([0.1, 0.9, 0.3, 0.5, 0.4])
-    monkeypatch.setattr(Trials, "verdict", lambda self, agent, seats: Verdict(next(verdicts), 0.0, 1.0))
+    verdicts = iter([0.9, 0.1, 0.7, 0.5, 0.6])
+    monkeypatch.setattr(Trials, "verdict", lambda self, agent, seats: Verdict(0.5, 0.0, next(verdicts)))
     folder = training.prepare(SUITE)
     run = training.train_seed(dataclasses.replace(SUITE, steps=768), folder, 0)
-    assert [(row[0], row[2]) for row in run.validation] == [(0, 0.1), (384, 0.9), (768, 0.3)]
+    assert [(row[0], row[4]) for row in run.validation] == [(0, 0.9), (384, 0.1), (768, 0.7)]
     again = training.train_seed(dataclasses.replace(SUITE, resume=True), folder, 0)
-    assert [(row[0], row[2]) for row in again.validation] == [(0, 0.1), (384, 0.9), (768, 0.3), (1152, 0.5)]
-    assert again.score == 0.9
+    assert [(row[0], row[4]) for row in again.validation] == [(0, 0.9), (384, 0.1), (768, 0.7), (1152, 0.5)]
+    assert again.merit == -0.1
     assert training.MaskablePPO.load(again.model).num_timesteps == 384
 
 

@@ -13,9 +13,9 @@ from bufgym.errors import BufgymError
 
 def add(commands: Commands) -> None:
     made = command(commands, "export", _export, "a trained agent as a file of weights: small, and read without torch")
-    made.epilog = "MODEL holds pickles, so reading it can run any code: export models of your own alone."
+    made.epilog = "A model.zip holds pickles, so reading it can run any code: export models of your own alone."
     option = made.add_argument
-    option("model", metavar="MODEL", help="model.zip of a run of train.py, with --network slots; one of your own")
+    option("model", metavar="MODEL", help="of a run of train.py: model.safetensors, or model.zip (--network slots)")
     option("out", metavar="OUT", help="file to write, .safetensors")
     option("--name", required=True, metavar="N", help="the policy's name")
     option("--about", default="", metavar="TEXT", help="a sentence: what it was trained for")

@@ -3,12 +3,19 @@
 Message 0 was sent before, message T + 1 is sent after, and L of the T between can be kept: L + 1 gaps that add up to
 T + 1. V is concave, so equal gaps are best. Both numbers count the information gained after message 0, as the paper
 does: they compare with H - 1 of a run.
+
+``by_length`` is what a policy made of every T at once: up to an arrival nothing that it sees depends on T, so the
+longest interruption holds all shorter ones, and one run gives the exact mean over any law of T.
 """
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bufgym.errors import BufgymError
-from bufgym.qoi import Value
+from bufgym.kernel import kernel
+from bufgym.qoi import Value, value
 
 
 def _check(capacity: int, T: int) -> None:
@@ -29,3 +36,37 @@ def integer(capacity: int, T: int, v: Value) -> float:
     gaps = min(capacity, T) + 1
     q, longer = divmod(T + 1, gaps)
     return longer * v(q + 1) + (gaps - longer) * v(q)
+
+
+def by_length(dropped: NDArray[np.int64], v: Value) -> NDArray[np.float64]:
+    """H of each interruption of T = 0..t_max messages (float64[t_max + 1]), from a run through the longest of them.
+
+    ``dropped``, int64[t_max + 2]: with which arrival message 0..t_max + 1 of that run was dropped (1 = the first of the
+    interruption); one after t_max if it never was.
+    """
+    h, kept = np.ones(len(dropped) - 1), np.zeros(len(dropped), np.int64)
+    _by_length(np.ascontiguousarray(dropped, np.int64), v.array, kept, h)
+    return h
+
+
+@kernel
+def _by_length(
+    dropped: NDArray[np.int64], v: NDArray[np.float64], kept: NDArray[np.int64], h: NDArray[np.float64]
+) -> None:
+    held = 0
+    for T in range(len(h)):
+        if T > 0:
+            still = 0
+            for k in range(held):
+                if dropped[kept[k]] > T:
+                    kept[still] = kept[k]
+                    still += 1
+            if dropped[T] > T:
+                kept[still] = T
+                still += 1
+            held = still
+        before = 0
+        for k in range(held):
+            h[T] += value(v, float(kept[k] - before))
+            before = kept[k]
+        h[T] += value(v, float(T + 1 - before))

@@ -6,7 +6,9 @@ context's (``bufgym.observe``), so one set of weights serves every L:
     h = relu(W1 f + b1), then once more if there is a second layer;  score = w h + skip f + b
 
 The score is that of dropping the candidate; a second network of the same kind gives the newcomer's score of being
-accepted, which counts where there is room. The highest score is done, ties to the oldest.
+accepted, which counts where there is room. The highest score is done, ties to the oldest. The context c may also mix in
+how much the candidate's own features s count (``mix`` M): c M s is added to the score of dropping it, so that one
+agent weighs a rank or a gap otherwise on a link that stands still than on one that is merely slow.
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
@@ -35,10 +37,10 @@ MAX_BYTES = 1 << 20
 MAX_WIDTH = 256
 
 # Where things lie in the memory.
-INPUTS, CONTEXTS, FIRST, SECOND, ACCEPT_NET, WORK = range(6)
-"""Fields read, and how many of them are the context's; widths of the two layers (0: none); where the second network
-and the room to work in begin."""
-HEADER = 6
+INPUTS, CONTEXTS, FIRST, SECOND, ACCEPT_NET, MIX, WORK = range(7)
+"""Fields read, and how many of them are the context's; widths of the two layers (0: none); where the second network,
+the mixing weights (none if the next begins there) and the room to work in begin."""
+HEADER = 7
 
 
 @kernel
@@ -61,16 +63,23 @@ def begin(
 
 @kernel
 def forward(
-    net: NDArray[np.float64], slot: NDArray[np.float64], c: int, n: int, first: int, second: int, h: NDArray[np.float64]
+    net: NDArray[np.float64],
+    skip: NDArray[np.float64],
+    slot: NDArray[np.float64],
+    c: int,
+    n: int,
+    first: int,
+    second: int,
+    h: NDArray[np.float64],
 ) -> float:
     """What the candidate's own n - c fields add to ``begin``: the rest of the network.
 
-    ``net``: skip and b; W1 (a row an input) and b1; W2 and b2; w. ``h``: layer 1 from ``begin``, then room for
-    first + second numbers.
+    ``net``: skip and b; W1 (a row an input) and b1; W2 and b2; w. ``skip``: that of the candidate's fields, mixed.
+    ``h``: layer 1 from ``begin``, then room for first + second numbers.
     """
     score = 0.0
-    for i in range(c, n):
-        score += net[i] * slot[i - c]
+    for i in range(n - c):
+        score += skip[i] * slot[i]
     at, width, here = n + 1, first, first
     for o in range(first):
         h[first + o] = h[o]
@@ -98,11 +107,12 @@ def scorer(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     s, L = len(buffer.slots), buffer.capacity
     n, c, first, second = int(memory[INPUTS]), int(memory[CONTEXTS]), int(memory[FIRST]), int(memory[SECOND])
     accept_net, work = int(memory[ACCEPT_NET]), int(memory[WORK])
-    drop_net = HEADER + n
-    drop, accept = memory[drop_net:accept_net], memory[accept_net:work]
+    drop_net, mix = HEADER + n, int(memory[MIX])
+    drop, accept = memory[drop_net:accept_net], memory[accept_net:mix]
     f = memory[work : work + n]
-    h = memory[work + n : work + n + 2 * first + second]
-    at = work + n + 2 * first + second
+    skip = memory[work + n : work + 2 * n - c]
+    h = memory[work + 2 * n - c : work + 2 * n - c + 2 * first + second]
+    at = work + 2 * n - c + 2 * first + second
     seen = memory[at : at + CONTEXT]
     rows = memory[at + CONTEXT : at + CONTEXT + SLOTS * (L + 1)].reshape((SLOTS, L + 1))
     observe_context(buffer, arrival, seen)
@@ -110,6 +120,12 @@ def scorer(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     for i in range(c):
         f[i] = seen[int(memory[HEADER + i])]
     slot = f[c:]
+    for i in range(n - c):
+        skip[i] = drop[c + i]
+    if mix < work:
+        for j in range(c):
+            for i in range(n - c):
+                skip[i] += f[j] * memory[mix + j * (n - c) + i]
     common = begin(drop, f, c, n, first, h)
     free = buffer.max_bytes - buffer.backlog_bytes - arrival.size_bytes
     best, decision = -np.inf, REJECT
@@ -119,13 +135,13 @@ def scorer(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
         k = candidate if candidate < s else L
         for i in range(c, n):
             slot[i - c] = rows[int(memory[HEADER + i]), k]
-        score = common + forward(drop, slot, c, n, first, second, h)
+        score = common + forward(drop, skip, slot, c, n, first, second, h)
         if score > best:
             best, decision = score, candidate if candidate < s else REJECT
     if s < L and free >= 0:
         # slot holds the newcomer's features still
         common = begin(accept, f, c, n, first, h)
-        if common + forward(accept, slot, c, n, first, second, h) >= best:
+        if common + forward(accept, accept[c:n], slot, c, n, first, second, h) >= best:
             decision = ACCEPT
     return decision
 
@@ -157,6 +173,18 @@ class Weights:
     fields: tuple[str, ...]
     drop: Network
     accept: Network
+    mix: NDArray[np.float32] | None = None
+    """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
+
+    @property
+    def context(self) -> tuple[str, ...]:
+        """The fields that are the context's."""
+        return tuple(name for name in self.fields if NAMES.index(name) >= SLOTS)
+
+    @property
+    def slot(self) -> tuple[str, ...]:
+        """The fields that each candidate has of its own."""
+        return tuple(name for name in self.fields if NAMES.index(name) < SLOTS)
 
     @property
     def widths(self) -> tuple[int, int]:
@@ -167,14 +195,16 @@ class Weights:
     def memory(self) -> NDArray[np.float64]:
         """The policy's memory, but for the room to work in."""
         first, second = self.widths
-        context = [i for i, name in enumerate(self.fields) if NAMES.index(name) >= SLOTS]
-        order = [*context, *(i for i in range(len(self.fields)) if i not in context)]
+        context = self.context
+        order = [self.fields.index(name) for name in (*context, *self.slot)]
         drop, accept = self.drop.flat(order), self.accept.flat(order)
+        mix = (np.zeros(0) if self.mix is None else self.mix).reshape(-1).astype(np.float64)
         accept_net = HEADER + len(self.fields) + len(drop)
-        head = [len(self.fields), len(context), first, second, accept_net, accept_net + len(accept)]
+        mixing = accept_net + len(accept)
+        head = [len(self.fields), len(context), first, second, accept_net, mixing, mixing + len(mix)]
         numbers = [NAMES.index(self.fields[i]) for i in order]
         read = [number - SLOTS if number >= SLOTS else number for number in numbers]
-        return np.concatenate([head, read, drop, accept])
+        return np.concatenate([head, read, drop, accept, mix])
 
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
@@ -186,7 +216,7 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
         memory={f"w{i}": float(number) for i, number in enumerate(memory)},
         source=source,
         compile=True,
-        work=(len(weights.fields) + 2 * weights.widths[0] + weights.widths[1] + CONTEXT, SLOTS),
+        work=(2 * len(weights.fields) + 2 * weights.widths[0] + weights.widths[1] + CONTEXT, SLOTS),
         about=summary,
     )
 

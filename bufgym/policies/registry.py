@@ -124,12 +124,20 @@ class Policy:
     @functools.cached_property
     def compiled(self) -> tuple[OnArrival, OnDeparture, OnDequeue]:
         """Its functions compiled for one signature each, so that one rollout kernel serves every policy."""
-        arrival, departure, dequeue = signatures()
-        return (
-            compile_for(arrival, self.on_arrival),
-            compile_for(departure, self.on_departure),
-            compile_for(dequeue, self.on_dequeue),
-        )
+        return _compiled(self.on_arrival, self.on_departure, self.on_dequeue)
+
+
+@functools.lru_cache(maxsize=256)
+def _compiled(
+    on_arrival: OnArrival, on_departure: OnDeparture, on_dequeue: OnDequeue
+) -> tuple[OnArrival, OnDeparture, OnDequeue]:
+    """Once for all policies that share these functions, whatever their parameters or weights."""
+    arrival, departure, dequeue = signatures()
+    return (
+        compile_for(arrival, on_arrival),
+        compile_for(departure, on_departure),
+        compile_for(dequeue, on_dequeue),
+    )
 
 
 @functools.cache

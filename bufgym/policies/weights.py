@@ -45,6 +45,8 @@ KEY = "bufgym"
 """The entry of the header's metadata that holds the JSON text."""
 WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")
 """What ``save`` itself writes into the metadata."""
+MIX = "drop.mix"
+"""The one tensor that a file may lack."""
 LAYERS = 2
 """Hidden layers at most."""
 
@@ -122,6 +124,8 @@ def _tensors(weights: Weights) -> Iterator[tuple[str, NDArray[np.float32]]]:
             yield f"{prefix}.{i}.weight", _plain(weight)
             yield f"{prefix}.{i}.bias", _plain(bias)
         yield f"{prefix}.out", _plain(network.out)
+    if weights.mix is not None:
+        yield MIX, _plain(weights.mix)
 
 
 def _plain(array: NDArray[Any]) -> NDArray[np.float32]:
@@ -163,11 +167,12 @@ def _parsed(path: StrPath, data: bytes) -> tuple[Weights, dict[str, Any]]:
     except safetensors.SafetensorError as error:
         raise BufgymError(f"{path}: no safetensors file, or a broken one: {error}") from None
     metadata = _metadata(path, data)
-    tensors = _checked_tensors(path, found, len(metadata["fields"]))
+    tensors = _checked_tensors(path, found, metadata["fields"])
     if _sha256(metadata["fields"], tensors) != metadata["sha256"]:
         rule = "fields and tensors have another one: the file was changed"
         raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
-    return Weights(tuple(metadata["fields"]), _network("drop", tensors), _network("accept", tensors)), metadata
+    mix = tensors.pop(MIX).astype(np.float32) if MIX in tensors else None
+    return Weights(tuple(metadata["fields"]), _network("drop", tensors), _network("accept", tensors), mix), metadata
 
 
 def _metadata(path: StrPath, data: bytes) -> dict[str, Any]:
@@ -214,7 +219,7 @@ def _no_number(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is no number of JSON's")
 
 
-def _checked_tensors(path: StrPath, found: list[tuple[str, dict[str, Any]]], inputs: int) -> Tensors:
+def _checked_tensors(path: StrPath, found: list[tuple[str, dict[str, Any]]], fields: list[str]) -> Tensors:
     """The tensors by name, each of them float32, finite, and of the shape that the others ask for."""
 
     def refuse(name: str, rule: str, *, what: str = "", value: object = None) -> NoReturn:
@@ -234,7 +239,11 @@ def _checked_tensors(path: StrPath, found: list[tuple[str, dict[str, Any]]], inp
         if len(given[name]) != 1 or not 1 <= given[name][0] <= MAX_WIDTH:
             refuse_shape(name, f"must be one number for each of 1 to {MAX_WIDTH} hidden units")
         widths += given[name]
+    inputs = len(fields)
     asked = _shapes(inputs, widths)
+    if MIX in given:
+        slots = sum(learned.NAMES.index(name) < learned.SLOTS for name in fields)
+        asked[MIX] = (inputs - slots, slots)
     for name in [*asked, *given]:
         if name not in given:
             refuse(name, "is missing")

@@ -56,7 +56,9 @@ def weights(draw):
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     fields = tuple(draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True)))
     widths = draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)]))
-    return Weights(fields, network(rng, len(fields), widths), network(rng, len(fields), widths))
+    made = Weights(fields, network(rng, len(fields), widths), network(rng, len(fields), widths))
+    mix = rng.normal(0, 1, (len(made.context), len(made.slot))).astype(np.float32)
+    return replace(made, mix=draw(st.sampled_from([None, mix])))
 
 
 # --- the twin --------------------------------------------------------------------------------------------------------
@@ -85,9 +87,17 @@ def twin(made):
             seen = dict(zip(SLOT_NAMES, slots[:, k], strict=True)) | dict(zip(CONTEXT_NAMES, context, strict=True))
             return [float(seen[name]) for name in made.fields]
 
+        def drop_score(k):
+            f = dict(zip(made.fields, features(k), strict=True))
+            mixed = 0.0
+            if made.mix is not None:
+                pairs = [(j, i) for j in range(len(made.context)) for i in range(len(made.slot))]
+                mixed = math.fsum(float(made.mix[j, i]) * f[made.context[j]] * f[made.slot[i]] for j, i in pairs)
+            return score(made.drop, features(k)) + mixed
+
         queued = [int(slot.size_bytes) for slot in buffer.slots]
-        choices = [(score(made.drop, features(k)), k) for k in range(s) if fits(buffer, arrival, queued[k])]
-        choices.append((score(made.drop, features(L)), REJECT))
+        choices = [(drop_score(k), k) for k in range(s) if fits(buffer, arrival, queued[k])]
+        choices.append((drop_score(L), REJECT))
         best = max(value for value, _ in choices)
         if s < L and fits(buffer, arrival, 0) and score(made.accept, features(L)) >= best:
             return ACCEPT

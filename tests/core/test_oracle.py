@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from bufgym import policies, qoi
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
-from bufgym.oracle import ideal, integer
+from bufgym.oracle import by_length, ideal, integer
 from bufgym.scenario import Interruption
 from bufgym.sender import run
 
@@ -31,6 +31,14 @@ def test_by_hand():
     # With room for all, nothing is lost: T + 1 gaps of 1.
     assert integer(5, 3, v) == ideal(5, 3, v) == 4 * 0.5
     assert integer(1, 0, v) == 0.5
+
+
+def test_one_run_tells_of_every_shorter_interruption():
+    """Messages 1, 2, 3 arrive, L = 1: the second evicts the first, the third is rejected; message 4 follows."""
+    v = qoi.exponential(0.5)
+    h = by_length(np.array([9, 2, 9, 3, 9]), v)
+    # T = 0: 0, 1. T = 1: 0, 1, 2. T = 2: 0, 2, 3. T = 3: 0, 2, 4.
+    assert h.tolist() == [1 + v(1), 1 + 2 * v(1), 1 + v(2) + v(1), 1 + 2 * v(2)]
 
 
 @given(VALUES, st.integers(1, 5), st.integers(0, 10))

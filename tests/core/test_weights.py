@@ -261,6 +261,8 @@ def test_observations_defined_otherwise_are_told_apart(path, monkeypatch):
         ("drop.skip", np.zeros(3, np.float32), "shape of tensor drop.skip = [3]: must be [2]"),
         ("drop.skip", np.zeros((2, 1), np.float32), "shape of tensor drop.skip = '[2, 1]': must be [2]"),
         ("drop.bias", np.zeros((), np.float32), "shape of tensor drop.bias = []: must be [1]"),
+        ("drop.mix", np.zeros((1, 2), np.float32), "shape of tensor drop.mix = '[1, 2]': must be [1, 1]"),
+        ("accept.mix", np.zeros((1, 1), np.float32), "tensor accept.mix has no place"),
         ("drop.0.bias", np.zeros(0, np.float32), "1 to 256 hidden units"),
         ("drop.0.bias", np.zeros(257, np.float32), "1 to 256 hidden units"),
         ("drop.0.bias", np.zeros((3, 1), np.float32), "1 to 256 hidden units"),
@@ -323,6 +325,13 @@ def test_a_damaged_file_is_read_or_refused_and_nothing_else(data):
     assert [x.tobytes() for x in (read.drop.flat(), read.accept.flat())] == FLAT
     assert read.fields == FIELDS
     learned.policy(metadata["name"], read).new_memory(1, 4)
+
+
+def test_mixing_weights_come_back_as_they_were(path):
+    mixed = replace(made(3), mix=np.float32([[-1.5]]))
+    weights.save(path, mixed, ABOUT)
+    again = weights.read(path)[0]
+    assert again.mix.tolist() == [[-1.5]] and (again.memory() == mixed.memory()).all()
 
 
 # --- the agents that come with bufgym --------------------------------------------------------------------------------

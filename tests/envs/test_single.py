@@ -244,8 +244,9 @@ def twin(buffer: Buffer, arrival: Any, V: qoi.Value) -> dict[str, list[float]]:
                 per(a_us + b_us, 2 * even_us),
                 per(a, even_x),
                 per(a + b, 2 * even_x),
-                0.0 if first else V(a) + V(b) - V(a + b),
+                lost := 0.0 if first else V(a) + V(b) - V(a + b),
                 per(sizes[k], sum(sizes) / (s + 1)),
+                per(lost, max(2 * V(even_x) - V(2 * even_x), 1e-12)),
             ]
         for field, number in zip(SLOT_FIELDS, values, strict=True):
             fields[field.name].append(number)
@@ -260,6 +261,8 @@ def twin(buffer: Buffer, arrival: Any, V: qoi.Value) -> dict[str, list[float]]:
         per(buffer.stalled_us, stalled_by),
         per(buffer.departures, 1.0),
         per(buffer.drain, 1.0),
+        V(even_x),
+        (2 * V(even_x) - V(2 * even_x)) / V(even_x) if even_x > 0 else 0.0,
     ]
     return fields | {field.name: [number] for field, number in zip(CONTEXT_FIELDS, context, strict=True)}
 

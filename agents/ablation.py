@@ -1,0 +1,157 @@
+"""What each part of an evolved agent is worth: the same training without it, as a page.
+
+``python -m agents.ablation --steps 60000000 --seeds 2 --out docs/ablation.md`` trains every variant, a process a core
+(a finished one is not trained again), and measures the kept agents on the test splits: regret over that of AFR or Drop
+Oldest, whichever is better (``grounds.Yard``). ``--runs runs/a,runs/b`` adds how those runs learned.
+"""
+
+from __future__ import annotations
+
+import argparse
+import concurrent.futures
+import csv
+import json
+import multiprocessing
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from agents import evolution
+from agents.grounds import EPISODES
+from agents.training import ALGORITHMS, prepare
+from agents.trials import ValidationSet
+from bufgym import policies
+from bufgym.errors import BufgymError
+from bufgym.policies import weights
+from train import Arguments
+
+SUITES = "interruption-v1,lte-v1,outage-v1,sustained-v1"
+TEST_SEED = 2
+
+WITHOUT = {
+    "everything": (),
+    "without value (loss, relative_loss, even_value, bend)": ("loss", "relative_loss", "even_value", "bend"),
+    "without its curvature (relative_loss, even_value, bend)": ("relative_loss", "even_value", "bend"),
+    "without link (stalled, drain)": ("stalled", "drain"),
+    "without occupancy": ("occupancy",),
+    "without motion_before": ("motion_before",),
+    "without context, so nothing is mixed": ("occupancy", "stalled", "drain", "even_value", "bend"),
+    "rank and motion_merged alone": tuple(name for name in evolution.MOTION if name not in ("rank", "motion_merged")),
+}
+"""Fields left out of ``evolution.MOTION``."""
+HIDDEN = (4, 16)
+"""Hidden units beside the mixing."""
+
+
+def variants(given: Arguments) -> dict[str, Arguments]:
+    """Name -> how to train it."""
+    made = {}
+    for name, left_out in WITHOUT.items():
+        fields = [field for field in evolution.MOTION if field not in left_out]
+        made[name] = replace(given, fields=",".join(fields))
+    made["on time alone (--sees time)"] = replace(given, sees="time")
+    for units in HIDDEN:
+        made[f"{units} hidden units beside the mixing"] = replace(given, hidden=units)
+    return {name: replace(arguments, name=f"{given.name}/{k:02d}") for k, (name, arguments) in enumerate(made.items())}
+
+
+def trained(arguments: Arguments, seed: int) -> list[float]:
+    """Train one variant with one seed, or find what was trained; its measure on the test split of every suite."""
+    folder = Path("runs") / arguments.name
+    result = folder / f"seed-{seed}" / "test.json"
+    if not result.exists():
+        run = ALGORITHMS["evolution"].train(arguments, folder, seed, 0)
+        agent = policies.load(run.model)
+        yards = evolution.yards(arguments, "test", TEST_SEED, 3 * EPISODES)
+        result.write_text(json.dumps([yard.over_rivals(agent) for yard in yards]), encoding="utf-8")
+    found: list[float] = json.loads(result.read_text(encoding="utf-8"))
+    return found
+
+
+def table(found: dict[str, list[list[float]]], sizes: dict[str, int]) -> list[str]:
+    """Markdown: a row a variant, mean over its seeds, and the range of the mean over the suites."""
+    suites = SUITES.split(",")
+    lines = [f"| variant | numbers | {' | '.join(suites)} | mean (seeds) |", "|---" * (len(suites) + 3) + "|"]
+    for name, seeds in found.items():
+        by_suite = " | ".join(f"{number:.2f}" for number in np.mean(seeds, axis=0))
+        means = np.mean(seeds, axis=1)
+        lines.append(
+            f"| {name} | {sizes[name]} | {by_suite} | {means.mean():.3f} ({means.min():.3f}-{means.max():.3f}) |"
+        )
+    return lines
+
+
+MOMENTS_S = (0, 30, 60, 120, 180, 300, 600, 1200)
+
+
+def learning(runs: Sequence[Path]) -> list[str]:
+    """Markdown: the best regret over AFR's on validation after so many seconds, for every seed of these runs."""
+    lines = [
+        f"| run | seed | {' | '.join(f'{s} s' for s in MOMENTS_S)} | at the end |",
+        "|---" * (len(MOMENTS_S) + 3) + "|",
+    ]
+    for run in runs:
+        for path in sorted(run.glob("seed-*/validation.csv")):
+            with path.open(newline="", encoding="utf-8") as file:
+                rows = [(float(row["seconds"]), float(row["over_afr"])) for row in csv.DictReader(file)]
+            cells = []
+            for moment in MOMENTS_S:
+                reached = [over for seconds, over in rows if seconds <= moment + 15]
+                cells.append(f"{min(reached):.2f}" if reached and rows[-1][0] >= moment - 15 else "")
+            end = f"{min(over for _, over in rows):.2f} ({rows[-1][0]:.0f} s)"
+            lines.append(f"| {run.name} | {path.parent.name[5:]} | {' | '.join(cells)} | {end} |")
+    return lines
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="python -m agents.ablation", description=__doc__)
+    parser.add_argument("--name", default="ablation", help="folder under runs/")
+    parser.add_argument("--steps", type=int, default=60_000_000)
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--runs", default="", help="folders of runs whose learning is shown beside")
+    parser.add_argument("--out", type=Path, default=None, help="Markdown file to write; printed otherwise")
+    options = parser.parse_args(arguments)
+    given = Arguments(
+        suite=SUITES, algo="evolution", name=options.name, steps=options.steps, warm_up=options.steps // 2
+    )
+    given = replace(given, validate_every=options.steps // 4)
+    try:
+        todo = variants(given)
+        for chosen in todo.values():
+            if not (Path("runs") / chosen.name).exists():
+                ValidationSet(chosen, prepare(chosen))
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
+            jobs = {name: [pool.submit(trained, a, s) for s in range(options.seeds)] for name, a in todo.items()}
+            found = {name: [job.result() for job in each] for name, each in jobs.items()}
+    except BufgymError as error:
+        raise SystemExit(f"error: {error}") from None
+    sizes = {}
+    for name, chosen in todo.items():
+        kept, _ = weights.read(Path("runs") / chosen.name / "seed-0" / evolution.MODEL)
+        sizes[name] = len(evolution.to_vector(kept))
+    lines = [
+        "# What each part is worth",
+        "",
+        "Test splits; regret over that of AFR or Drop Oldest, whichever is better; "
+        f"{options.steps:,} decisions a seed, {options.seeds} seeds. Made by",
+        f"`python -m agents.ablation --steps {options.steps} --seeds {options.seeds}`.",
+        "",
+        *table(found, sizes),
+        "",
+    ]
+    if options.runs:
+        lines += ["## How they learned", "", "Best regret over AFR's on validation so far.", ""]
+        lines += [*learning([Path(run) for run in options.runs.split(",")]), ""]
+    text = "\n".join(lines)
+    if options.out:
+        options.out.write_text(text, encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

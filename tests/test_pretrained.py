@@ -1,0 +1,78 @@
+"""The agents that come with bufgym: small, named, with their command, and as good as their file says."""
+
+from __future__ import annotations
+
+import pytest
+
+from bufgym import files, policies, qoi, suites
+from bufgym.benchmark.campaign import cell
+from bufgym.benchmark.run import best, draw
+from bufgym.oracle import integer, law
+from bufgym.policies import weights
+from bufgym.scenario import Interruption
+from bufgym.sender import run
+
+SHIPPED = files.shipped("agents", "agents/pretrained", "*.safetensors")
+
+
+def test_there_are_two_one_without_odometry() -> None:
+    assert set(SHIPPED) == {"learned-time", "learned-motion"}
+    assert not {"motion", "value"} & set(groups("learned-time"))
+    assert {"motion", "value"} <= set(groups("learned-motion"))
+
+
+def groups(name: str) -> list[str]:
+    """What it takes to know what the agent reads."""
+    known = {field.name: field.group for field in weights.FIELDS}
+    return [known[field] for field in weights.read(SHIPPED[name])[0].fields]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_its_file_is_small_and_tells_how_it_was_made(name: str) -> None:
+    _, told = weights.read(SHIPPED[name])
+    assert SHIPPED[name].stat().st_size < 8_000
+    assert told["name"] == name and told["about"]
+    assert told["training"].startswith("python train.py --suite ") and told["seeds"]
+    for score in told["scores"].values():
+        low, high = score["interval"]
+        assert low <= score["score"] <= high
+    assert policies.get(name).summary == told["about"]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_its_regret_in_interruptions_is_what_its_file_says(name: str) -> None:
+    """Exactly, over every length of the test split, by other code than that which noted it: a run for each length."""
+    told = weights.read(SHIPPED[name])[1]["regret"]
+    policy, setting = policies.get(name), suites.get("interruption-v1").settings("test")["exponential-0.618"]
+    scenario = setting.scenario
+    assert isinstance(scenario, Interruption)
+    lengths = [T for T in range(scenario.t_max + 1) if law(scenario)[T] > 0]
+    for L in (4, 16):
+        senders = run(policy, [scenario.episode(T) for T in lengths], L, scenario.value)
+        reached = senders.batch.senders["delivered_gain"] + 1
+        share = law(scenario)[lengths]
+        most = share @ [1 + integer(L, T, scenario.value) for T in lengths]
+        assert 1 - share @ reached / most == pytest.approx(told[f"exponential-0.618, L = {L}"], abs=1e-8)
+
+
+def test_motion_is_worth_something_on_fading_links() -> None:
+    """Four test links of lte-v1 with camera motion, L = 15: with odometry < on time alone < AFR's regret."""
+    scenario = suites.get("lte-v1").settings("test")["motion"].scenario
+    episodes = [draw(cell(scenario, trace), seed=1) for trace in range(4)]
+    most = sum(best(episode, 15, scenario).qoi for episode in episodes)
+
+    def regret(name: str) -> float:
+        senders = run(policies.get(name), episodes, 15, scenario.value)
+        return float(1 - (senders.batch.senders["delivered_gain"] + 1).sum() / most)
+
+    assert regret("learned-motion") < regret("afr")
+    assert regret("learned-motion") < regret("learned-time")
+
+
+def test_the_same_weights_serve_a_buffer_nobody_trained_them_for() -> None:
+    """L = 100 and a V of the user's own."""
+    scenario = Interruption(t_max=600, value=qoi.tabulated([0, 3, 10], [0, 0.7, 1]))
+    for name in SHIPPED:
+        senders = run(policies.get(name), [scenario.episode(600)], 100, scenario.value)
+        assert int(senders.batch.senders["crossed"][0]) == 102
+        assert int(senders.batch.senders["impossible"][0]) == 0
