@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bufgym.cli.options import Commands, Parser, columns, command, count, least_0, natural, number, positive
-from bufgym.errors import BufgymError, TraceError, where
+from bufgym.errors import BufgymError
 
 if TYPE_CHECKING:
     from bufgym.traces import Motion, Trace
@@ -232,8 +232,7 @@ def _drive(options: argparse.Namespace) -> None:
 def _frames(options: argparse.Namespace) -> None:
     import numpy as np
 
-    from bufgym.traces import drive_motion, load_motion
-    from bufgym.traces.generate import FrameModel, frame_sizes
+    from bufgym.traces import FrameModel, Workload, drive_motion, frame_sizes, load_motion, write_workload_csv
 
     frames = options.duration * options.rate_hz
     if not 1 <= frames <= 1e7:
@@ -241,10 +240,6 @@ def _frames(options: argparse.Namespace) -> None:
     motion = drive_motion(options.seed, options.duration) if options.motion is None else load_motion(options.motion)
     arrival_us = np.rint(np.arange(int(frames)) * (1e6 / options.rate_hz)).astype(np.int64)
     sizes = frame_sizes(arrival_us, motion, options.seed, FrameModel(base_bytes=options.base))
-    rows = zip(arrival_us.tolist(), sizes.tolist(), motion.at(arrival_us).tolist(), strict=True)
-    lines = [f"{at // 10**6}.{at % 10**6:06d},{size},{x!r}" for at, size, x in rows]
-    try:
-        Path(options.out).write_text("time_s,bytes,x\n" + "\n".join(lines) + "\n", encoding="ascii", newline="\n")
-    except OSError as error:
-        raise TraceError(where(options.out, None, None, f"cannot be written: {error.strerror or error}")) from error
+    x = motion.at(arrival_us)
+    write_workload_csv(Workload("frames", arrival_us, sizes, x=x - x[0]), options.out)
     print(f"wrote {options.out}: {len(sizes)} frames, mean {sizes.mean() / 1e3:.1f} kB")

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from bufgym.traces import Trace
 
 _PICTURES = (".png", ".svg", ".pdf")
-_MEMBER = ".zip:"
 
 
 def add(commands: Commands) -> None:
@@ -47,10 +46,7 @@ def add(commands: Commands) -> None:
 def _load(name: str, options: argparse.Namespace) -> Trace:
     from bufgym import traces
 
-    path = traces.shipped().get(name, Path(name))
-    if not path.exists() and _MEMBER not in name:
-        return traces.load(name)  # which says what names there are
-    return traces.read_trace(str(path), options.format, column=options.column)
+    return traces.load(name, options.format, column=options.column)
 
 
 # --- info ------------------------------------------------------------------------------------------------------------

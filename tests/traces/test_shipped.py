@@ -7,12 +7,14 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bufgym.errors import BufgymError, TraceError
 from bufgym.traces import drive_motion, load, load_motion, shipped, synthetic_lte
 from bufgym.traces.generators import shipped_calls
 
@@ -40,6 +42,7 @@ COMMANDS = """
 list
 trace info lte-synthetic-0
 trace fetch --list
+trace generate link --mode tram --duration 60 -o tram.csv
 bench --seconds 1 --fps 10 --seeds 1 --capacity 2 --policies afr,drop-oldest --format csv --out bench
 """
 
@@ -81,3 +84,19 @@ def test_the_commands_run_offline_from_what_the_wheel_holds(installed: Path, tmp
     listed = done.stdout.split("> trace info")[0]
     assert all(name in listed for name in shipped())
     assert (elsewhere / "bench" / "table.md").is_file()
+
+
+def test_what_reads_as_a_trace_loads(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "logs.zip", "w") as archive:
+        for name in ("bus/a.csv", "bus/b.csv"):
+            archive.writestr(
+                name, "Timestamp,DL_bitrate,UL_bitrate\n2020.01.01_00.00.00,8,16\n2020.01.01_00.00.01,8,16\n"
+            )
+    member = f"{tmp_path / 'logs.zip'}:a.csv"
+    assert load(member, column="UL_bitrate").total_bytes == 2 * load(member).total_bytes > 0
+    with pytest.raises(TraceError, match=r"c\.csv.*must be one of its 2 members"):
+        load(f"{tmp_path / 'logs.zip'}:c.csv")
+    with pytest.raises(TraceError, match=r"no\.zip:a\.csv: no such file, and no shipped trace"):
+        load(f"{tmp_path / 'no.zip'}:a.csv")
+    with pytest.raises(BufgymError, match="format csv has no columns to choose from"):
+        load("lte-synthetic-0", column="UL_bitrate")
