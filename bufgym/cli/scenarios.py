@@ -166,12 +166,13 @@ def _recording(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scena
     x = f"motion, from {_some([_with_gaps(motion) for motion in motions])}" if motions else "motion, as recorded"
     where = f"{options.seeds} random places each" if random_offset else "from the trace's start"
     scaled = f" x {take['scale']:g}" if take["scale"] != 1 else ""
+    shared = "; all topics share one queue" if len(workload.topics) > 1 else ""
     about = [
         workload.source,
         "",
         *workload_lines(workload),
         "",
-        f"Played over {_some([trace.name for trace in made.traces])}{scaled}, {where}; all topics share one queue.",
+        f"Played over {_some([trace.name for trace in made.traces])}{scaled}, {where}{shared}.",
         f"QoI = 1 + sum of V(step in x) over the messages received; V = {made.value.name}.",
         f"x is {f'the {x}, in fields of view' if by_motion else 'the number of the message'}.",
     ]

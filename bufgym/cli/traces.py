@@ -73,8 +73,8 @@ def _info(options: argparse.Namespace) -> None:
 def _validate(options: argparse.Namespace) -> None:
     from bufgym import traces
 
-    failed = 0
-    for name in _with_members(options.files):
+    failed, names = 0, _with_members(options.files)
+    for name in names:
         try:
             trace = _load(name, options)
         except TraceError as error:
@@ -83,6 +83,8 @@ def _validate(options: argparse.Namespace) -> None:
         else:
             found = traces.describe(trace)
             print(f"OK     {trace.source}: {found['duration_s']:.1f} s, mean {found['mean_KBps']:.1f} KB/s")
+    if len(names) > 1:
+        print(f"{len(names) - failed} of {len(names)} files are sound")
     if failed:
         raise SystemExit(1)
 

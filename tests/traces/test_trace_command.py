@@ -51,12 +51,13 @@ def test_info_by_format_and_column_out_of_a_zip(tmp_path: Path, capsys: pytest.C
 def test_validate_tells_sound_files_from_broken_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sound, broken = written(tmp_path, "1\n2\n", "sound.up"), written(tmp_path, "1\nx\n", "broken.up")
     assert main(["trace", "validate", str(sound), "lte-synthetic-0"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["OK", "OK"]
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["OK", "OK", "2"]
     with pytest.raises(SystemExit) as ended:
         main(["trace", "validate", str(sound), str(broken), str(tmp_path / "missing"), str(an_archive(tmp_path))])
     assert ended.value.code == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["OK", "error", "error", "OK", "OK"]  # a zip's members one by one
+    assert [line.split()[0] for line in lines] == ["OK", "error", "error", "OK", "OK", "3"]  # a zip's members one by one
+    assert lines[-1] == "3 of 5 files are sound"
     assert "sound.up (format mahimahi, detected): 0.0 s, mean 1500.0 KB/s" in lines[0]
     assert "broken.up, line 2: time in ms = x: must be a whole number" in lines[1]
     assert "a/nyu.csv (format nyu, detected): 3.0 s" in lines[4]

@@ -73,7 +73,7 @@ def markov_link(
         # math.fsum is exact, so the sum does not depend on how numpy splits it among vector lanes.
         rates = rates * (mean_bytes_per_s * len(rates) / math.fsum(rates.tolist()))
     counts = np.rint(rates).astype(np.int64)
-    source = f"markov_link({mode}, seed={seed}, {duration_s} s)"
+    source = f"markov_link({mode}, seed={seed}, {duration_s:g} s)"
     return Trace.from_intervals(np.full(len(counts), US_PER_S), counts, name=f"{mode}-{seed}", source=source)
 
 
