@@ -68,7 +68,8 @@ class Arguments:
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     warm_up: int = 0
-    """Decisions for which evolution tries candidates on a quarter of its sampled episodes."""
+    """Decisions for which evolution learns from interruptions alone, whose mean over T is exact and cheap; afterwards,
+    what the link's drain changes is learned on all suites."""
     checkpoint_every: int = 250_000
     """Steps."""
     validate_every: int = 250_000

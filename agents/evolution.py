@@ -16,9 +16,9 @@ import pickle
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cma
 import numpy as np
@@ -50,8 +50,10 @@ MOTION = (
 SEES = {"time": TIME, "motion": MOTION}
 
 POPULATION = 16
-SIGMA = 0.5
-"""First step size; the start's weights are of the order of 10."""
+SIGMA = {None: 0.5, False: 1.0, True: 0.5}
+"""First step size, by what is searched (``searched``); the start's weights are of the order of 10."""
+DRAIN = "drain"
+"""The context that is 0 in an interruption: its weights are free to learn what a moving link asks for."""
 DIAGONAL = 100
 """From so many weights on, a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
 SMALL = (1, 2, 3)
@@ -101,22 +103,28 @@ def start(fields: tuple[str, ...], width: int, rng: np.random.Generator) -> Weig
     return replace(made, mix=np.zeros((len(made.context), len(made.slot)), np.float32))
 
 
-def searched(given: Weights) -> NDArray[np.bool_]:
-    """bool[numbers]: those of ``to_vector`` that matter, in the order of ``numbers``.
+def searched(given: Weights, drained: bool | None = None) -> NDArray[np.bool_]:
+    """bool[numbers]: those to be searched, in the order of ``numbers``.
 
-    What the context and the bias add to every drop alike, the acceptance can take off; and it stays linear.
+    What the context and the bias add to every drop alike, the acceptance can take off; and it stays linear. If
+    ``drained`` is given: what decides on a link that stands still (False), or only what its drain adds to that (True).
     """
     drop, accept = np.ones(len(given.drop.flat()), np.bool_), np.zeros(len(given.accept.flat()), np.bool_)
     inputs = len(given.fields)
     drop[:inputs] = [name in given.slot for name in given.fields]
     drop[inputs] = False
     accept[: inputs + 1] = True
-    return np.concatenate([drop, accept, np.ones(_mixing(given).size, np.bool_)])
+    mix = np.ones(_mixing(given).shape, np.bool_)
+    if drained is not None:
+        mix[:] = not drained
+        mix[given.context.index(DRAIN)] = drained
+        drop &= not drained
+    return np.concatenate([drop, accept, mix.reshape(-1)])
 
 
-def to_vector(given: Weights) -> NDArray[np.float64]:
+def to_vector(given: Weights, drained: bool | None = None) -> NDArray[np.float64]:
     """The numbers to be searched, in a row."""
-    return numbers(given)[searched(given)]
+    return numbers(given)[searched(given, drained)]
 
 
 def numbers(given: Weights) -> NDArray[np.float64]:
@@ -124,10 +132,10 @@ def numbers(given: Weights) -> NDArray[np.float64]:
     return np.concatenate([given.drop.flat(), given.accept.flat(), _mixing(given).reshape(-1)])
 
 
-def from_vector(like: Weights, vector: NDArray[np.float64]) -> Weights:
+def from_vector(like: Weights, vector: NDArray[np.float64], drained: bool | None = None) -> Weights:
     """The weights that those numbers are; all others are those of ``like``."""
     flat = numbers(like)
-    flat[searched(like)] = vector
+    flat[searched(like, drained)] = vector
     networks = len(like.drop.flat())
     drop, accept, mix = np.split(flat, [networks, 2 * networks])
     mixing = mix.reshape(_mixing(like).shape).astype(np.float32)
@@ -151,12 +159,50 @@ def _network(like: Network, flat: NDArray[np.float64]) -> Network:
 # --- training --------------------------------------------------------------------------------------------------------
 
 
+@dataclass
+class Search:
+    """Where a seed's evolution stands; what a checkpoint holds."""
+
+    like: Weights
+    """What is not searched has these numbers."""
+    drained: bool | None
+    """See ``searched``."""
+    es: Any
+    """pycma's strategy, whose mean is the agent."""
+    steps: int = 0
+    seconds: float = 0.0
+
+    @staticmethod
+    def of(like: Weights, drained: bool | None, seed: int, **before: Any) -> Search:
+        """A new one, around these weights."""
+        begin = to_vector(like, drained)
+        settings = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
+        return Search(like, drained, cma.CMAEvolutionStrategy(begin, SIGMA[drained], settings), **before)
+
+    def weights(self, vector: NDArray[np.float64]) -> Weights:
+        return from_vector(self.like, vector, self.drained)
+
+    @property
+    def mean(self) -> Weights:
+        """The agent so far."""
+        return self.weights(self.es.mean)
+
+    def generation(self, yards: Sequence[Yard]) -> float:
+        """Ask, try and tell once; the best fitness."""
+        vectors = self.es.ask()
+        fitness = [_fitness(learned.policy("evolved", self.weights(v)), yards) for v in vectors]
+        self.es.tell(vectors, fitness)
+        self.steps += sum(yard.decisions for yard in yards) * len(vectors)
+        return float(np.min(fitness))
+
+
 def train(
     arguments: Arguments, folder: Path, seed: int, line: int = 0
 ) -> tuple[float, list[tuple[float, ...]], list[tuple[float, ...]]]:
     """Evolve one seed until ``arguments.steps`` decisions were rolled out, from its last checkpoint if there is one.
 
-    What did best on validation, by the same measure on other episodes, is kept as ``model.safetensors``.
+    What did best on validation, by the same measure on other episodes, is kept as ``model.safetensors``. For the first
+    ``arguments.warm_up`` decisions only exact grounds are learned from.
 
     Returns:
         Seconds of training, the learning curve (steps, seconds, fitness), and the validations (steps, seconds,
@@ -167,42 +213,33 @@ def train(
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
     saved = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
-    few, all_of_them = (yards(arguments, "train", seed, episodes) for episodes in (EPISODES // 4, EPISODES))
+    everything = yards(arguments, "train", seed)
+    exact = [yard for yard in everything if yard.exact]
     judges = yards(arguments, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
-    like = start(fields_of(arguments), arguments.hidden, np.random.default_rng(seed))
-    if saved.exists():
-        es, steps, before = pickle.loads(saved.read_bytes())
-    else:
-        settings = {
-            "seed": seed + 1,
-            "popsize": POPULATION,
-            "verbose": -9,
-            "CMA_diagonal": len(to_vector(like)) > DIAGONAL,
-        }
-        es, steps, before = cma.CMAEvolutionStrategy(to_vector(like), SIGMA, settings), 0, 0.0
     trials = ValidationSet(arguments, folder)
-    curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), steps)
-    validations = Record(home / "validation.csv", ("steps", "seconds", *Verdict._fields, "over_rivals"), steps)
-    began = time.perf_counter()
+    like = start(fields_of(arguments), arguments.hidden, np.random.default_rng(seed))
+    two = arguments.warm_up > 0
+    if two and (not exact or DRAIN not in like.context):
+        raise BufgymError(f"warm_up = {arguments.warm_up}: needs a suite of interruptions, and the field {DRAIN}")
+    search = pickle.loads(saved.read_bytes()) if saved.exists() else Search.of(like, False if two else None, seed)
+    curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), search.steps)
+    validations = Record(home / "validation.csv", ("steps", "seconds", *Verdict._fields, "over_rivals"), search.steps)
+    began = time.perf_counter() - search.seconds
 
-    def spent() -> float:
-        return float(round(before + time.perf_counter() - began, 3))
-
-    def validate(vector: NDArray[np.float64]) -> None:
-        made = from_vector(like, vector)
+    def validate(made: Weights) -> None:
         policy = learned.policy("evolved", made)
         verdict, reached = trials.verdict_on(policy), _fitness(policy, judges)
         if not validations.rows or reached < min(row[-1] for row in validations.rows):
             noted = {"name": "evolved", "suite": arguments.suite, "seeds": [seed], "algo": "evolution"}
             weights.save(home / MODEL, made, noted)
-        validations.append(steps, spent(), *verdict, reached)
+        validations.append(search.steps, _since(began), *verdict, reached)
         if not sys.stderr.isatty():
-            told = f"{steps:,} of {arguments.steps:,} steps, regret {reached:.3f} x the rivals' on validation"
+            told = f"{search.steps:,} of {arguments.steps:,} steps, regret {reached:.3f} x the rivals' on validation"
             print(f"seed {seed}: {told}", flush=True)
 
     bar = tqdm(
         total=arguments.steps,
-        initial=steps,
+        initial=search.steps,
         desc=f"seed {seed}",
         unit=" steps",
         unit_scale=True,
@@ -210,23 +247,26 @@ def train(
         disable=not sys.stderr.isatty(),
     )
     if not validations.rows:
-        validate(es.mean)
-    while steps < arguments.steps:
-        ground = few if steps < arguments.warm_up else all_of_them
-        vectors = es.ask()
-        fitness = [_fitness(learned.policy("evolved", from_vector(like, v)), ground) for v in vectors]
-        es.tell(vectors, fitness)
-        steps += sum(yard.decisions for yard in ground) * len(vectors)
-        curve.append(steps, spent(), float(np.min(fitness)))
-        if steps - validations.rows[-1][0] >= arguments.validate_every or steps >= arguments.steps:
-            validate(es.mean)
+        validate(search.mean)
+    while search.steps < arguments.steps:
+        if search.drained is False and search.steps >= arguments.warm_up:
+            search = Search.of(search.mean, True, seed, steps=search.steps)
+        fitness = search.generation(exact if search.drained is False else everything)
+        search.seconds = _since(began)
+        curve.append(search.steps, search.seconds, fitness)
+        if search.steps - validations.rows[-1][0] >= arguments.validate_every or search.steps >= arguments.steps:
+            validate(search.mean)
         with replaced(saved) as unfinished:
-            unfinished.write_bytes(pickle.dumps((es, steps, spent())))
-        bar.update(steps - bar.n)
+            unfinished.write_bytes(pickle.dumps(search))
+        bar.update(search.steps - bar.n)
         bar.set_postfix_str(f"regret {validations.rows[-1][-1]:.3f} x the rivals' on validation", refresh=False)
     bar.close()
-    return spent(), curve.rows, validations.rows
+    return search.seconds, curve.rows, validations.rows
 
 
-def _fitness(policy: Policy, ground: Sequence[Yard]) -> float:
-    return float(np.mean([yard.over_rivals(policy) for yard in ground]))
+def _since(began: float) -> float:
+    return float(round(time.perf_counter() - began, 3))
+
+
+def _fitness(policy: Policy, yards: Sequence[Yard]) -> float:
+    return float(np.mean([yard.over_rivals(policy) for yard in yards]))

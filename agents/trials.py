@@ -111,7 +111,7 @@ class Trials:
             )
         ours, base, afr, best = ours[biting], base[biting], afr[biting], best[biting]
         mine, theirs = float(regret(ours, best).mean()), float(regret(afr, best).mean())
-        return Verdict(float(normalised_score(ours, base, best).mean()), mine, mine / theirs if theirs else np.nan)
+        return Verdict(float(normalised_score(ours, base, best).mean()), mine, mine / theirs if theirs else np.inf)
 
     def rows_of(self, agent: Agent, seats: int, name: str, training_seed: int) -> list[Row]:
         """The agent's rows, as the benchmark has them."""
