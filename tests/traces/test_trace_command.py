@@ -56,7 +56,7 @@ def test_validate_tells_sound_files_from_broken_ones(tmp_path: Path, capsys: pyt
         main(["trace", "validate", str(sound), str(broken), str(tmp_path / "missing"), str(an_archive(tmp_path))])
     assert ended.value.code == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["OK", "error", "error", "OK", "OK", "3"]  # a zip's members one by one
+    assert [line.split()[0] for line in lines[:-1]] == ["OK", "error", "error", "OK", "OK"]  # a zip's members, too
     assert lines[-1] == "3 of 5 files are sound"
     assert "sound.up (format mahimahi, detected): 0.0 s, mean 1500.0 KB/s" in lines[0]
     assert "broken.up, line 2: time in ms = x: must be a whole number" in lines[1]
