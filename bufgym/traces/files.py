@@ -1,5 +1,5 @@
-"""Text files from outside, read with suspicion: plain, gzip or a zip's member, bounded in size and line length,
-errors with a line number.
+"""Text files: written whole or not at all, and from outside read with suspicion: plain, gzip or a zip's member, bounded in
+size and line length, errors with a line number.
 
 Every reader of this package gets its lines here, so that a directory, a cut-off download, a binary file or a
 compression bomb ends in the same clear `TraceError` whatever the format. What is beyond these limits is refused:
@@ -12,7 +12,7 @@ from __future__ import annotations
 import gzip
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import IO, Final, NamedTuple
 
 from bufgym.errors import TraceError, where
+from bufgym.files import replaced
 from bufgym.traces.archives import DAMAGED, ZIP_MAGIC, open_member, split_member
 
 StrPath = str | PathLike[str]
@@ -235,6 +236,20 @@ def decoded(path: StrPath, number: int, raw: bytes) -> str:
     except UnicodeDecodeError as error:
         rule = f"must be UTF-8 text (byte {error.start + 1} is not)"
         raise TraceError(where(path, number, raw[:60], rule)) from error
+
+
+def write_text(path: StrPath, *parts: Iterable[str]) -> None:
+    """Write all parts, one after the other, as UTF-8; or no file at all.
+
+    Raises:
+        TraceError: it cannot be written.
+    """
+    try:
+        with replaced(Path(path)) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+            for part in parts:
+                file.writelines(part)
+    except OSError as error:
+        raise TraceError(where(path, None, None, _reason(error, "written"))) from error
 
 
 def _open(path: StrPath, file: Path) -> io.BufferedReader:

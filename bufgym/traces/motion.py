@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bufgym.errors import BufgymError, TraceError, where
-from bufgym.traces.files import Line, StrPath, TextFile
+from bufgym.traces.files import Line, StrPath, TextFile, write_text
 from bufgym.traces.poses import Poses, angles, read_poses, read_rows, seconds
 from bufgym.traces.readers import trace_name
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
@@ -209,16 +209,11 @@ def write_motion_csv(motion: Motion, path: StrPath) -> None:
     Raises:
         TraceError: the file cannot be written.
     """
-    rows = [
+    rows = (
         f"{t // US_PER_S}.{t % US_PER_S:06d}".rstrip("0").rstrip(".") + f",{x!r}\n"
         for t, x in zip(motion.time_us.tolist(), motion.coordinate.tolist(), strict=True)
-    ]
-    try:
-        with open(path, "w", encoding="ascii", newline="\n") as file:
-            file.write(MOTION_HEADER + "\n")
-            file.writelines(rows)
-    except OSError as error:
-        raise TraceError(where(path, None, None, f"cannot be written: {error.strerror or error}")) from error
+    )
+    write_text(path, [MOTION_HEADER + "\n"], rows)
 
 
 def _is_header(text: str) -> bool:

@@ -10,14 +10,12 @@ from __future__ import annotations
 import math
 from array import array
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from bufgym.errors import BufgymError, TraceError, where
-from bufgym.files import replaced
-from bufgym.traces.files import Line, StrPath, TextFile
+from bufgym.traces.files import Line, StrPath, TextFile, write_text
 from bufgym.traces.motion import MAX_COORDINATE
 from bufgym.traces.poses import seconds
 from bufgym.traces.readers import trace_name
@@ -212,8 +210,4 @@ def write_workload_csv(workload: Workload, path: StrPath) -> None:
     if workload.x is not None:
         titles.append("x")
         columns.append([repr(x) for x in workload.x.tolist()])
-    try:
-        with replaced(Path(path)) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-            file.writelines(",".join(row) + "\n" for row in [titles, *zip(*columns, strict=True)])
-    except OSError as error:
-        raise TraceError(where(path, None, None, f"cannot be written: {error.strerror or error}")) from error
+    write_text(path, (",".join(row) + "\n" for row in [titles, *zip(*columns, strict=True)]))

@@ -6,15 +6,13 @@ loses something; `difference` says how much, by reading back what was written.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from bufgym import files
 from bufgym.errors import TraceError, where
-from bufgym.traces.files import StrPath
+from bufgym.traces.files import StrPath, write_text
 from bufgym.traces.mahimahi import PACKET_BYTES
 from bufgym.traces.readers_intervals import MAX_INTERVAL_BYTES
 from bufgym.traces.readers_text import CSV_HEADER
@@ -42,7 +40,7 @@ def write_csv(trace: Trace, path: StrPath) -> None:
         f"{_milliseconds(end_us)},{count},{_milliseconds(length_us)}\n"
         for end_us, count, length_us in zip(ends_us, segment_bytes.tolist(), lengths_us, strict=True)
     )
-    _write(path, [CSV_HEADER + "\n"], lines)
+    write_text(path, [CSV_HEADER + "\n"], lines)
 
 
 def write_mahimahi(trace: Trace, path: StrPath) -> None:
@@ -60,7 +58,7 @@ def write_mahimahi(trace: Trace, path: StrPath) -> None:
     if packets > MAX_PACKETS or trace.duration_us > MAX_DURATION_S * US_PER_S:
         rule = f"the trace must last at most {MAX_DURATION_S} s and hold at most {MAX_PACKETS} packets"
         raise TraceError(where(path, None, None, f"cannot be written: {rule}"))
-    _write(path, _stamps(trace, packets))
+    write_text(path, _stamps(trace, packets))
 
 
 WRITERS: Final[dict[str, Callable[[Trace, StrPath], None]]] = {"csv": write_csv, "mahimahi": write_mahimahi}
@@ -121,16 +119,6 @@ def _crossed_at(trace: Trace, due: Int64Array) -> Int64Array:
     passed, length = due - cumulative[k - 1], time_us[k] - time_us[k - 1]
     # At most (bytes x microseconds) of a segment, which a Trace keeps below 2**62.
     return np.asarray(time_us[k - 1] - (-passed * length) // (cumulative[k] - cumulative[k - 1]), np.int64)
-
-
-def _write(path: StrPath, *parts: Iterable[str]) -> None:
-    """All parts in a row, or no file at all."""
-    try:
-        with files.replaced(Path(path)) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
-            for part in parts:
-                file.writelines(part)
-    except OSError as error:
-        raise TraceError(where(path, None, None, f"cannot be written: {error.strerror or error}")) from error
 
 
 def _milliseconds(time_us: int) -> str:

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from bufgym.errors import BufgymError, TraceError, where
-from bufgym.files import replaced
-from bufgym.traces.files import StrPath
+from bufgym.traces.files import StrPath, write_text
 
 LINKS: Final = Path(__file__).with_name("links.json")
 
@@ -153,11 +152,7 @@ def write_links(links: Mapping[str, LinkParameters], path: StrPath, threshold_by
         "probabilities_of_quantiles": PROBABILITIES,
         "modes": {mode: asdict(link) for mode, link in links.items()},
     }
-    try:
-        with replaced(Path(path)) as temporary:
-            temporary.write_text(_dumped(whole), encoding="ascii")
-    except OSError as error:
-        raise TraceError(where(path, None, None, f"cannot be written: {error.strerror or error}")) from error
+    write_text(path, [_dumped(whole)])
 
 
 def _dumped(whole: Mapping[str, Any]) -> str:
