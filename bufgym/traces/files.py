@@ -1,5 +1,5 @@
-"""Text files: written whole or not at all, and from outside read with suspicion: plain, gzip or a zip's member, bounded in
-size and line length, errors with a line number.
+"""Text files: written whole or not at all; from outside read with suspicion: plain, gzip or a zip's member, bounded
+in size and line length, errors with a line number.
 
 Every reader of this package gets its lines here, so that a directory, a cut-off download, a binary file or a
 compression bomb ends in the same clear `TraceError` whatever the format. What is beyond these limits is refused:
