@@ -12,11 +12,12 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 .DEFAULT_GOAL := help
-.PHONY: help train test format clean
+.PHONY: help train test fuzz format clean
 
 help:
 	@echo "make train    set up if needed, then train an agent        (ARGS=... go to train.py)"
 	@echo "make test     set up if needed, then check everything      (PYTEST_ARGS=... go to pytest)"
+	@echo "make fuzz     set up if needed, then read 100,000 broken link files (nightly)"
 	@echo "make format   set up if needed, then format and fix what can be fixed"
 	@echo "make clean    remove caches and build products; keeps .venv and results"
 	@echo ""
@@ -32,6 +33,10 @@ test: $(READY)
 	$(BIN)/mypy
 	NUMBA_DISABLE_JIT=0 $(PYTEST) $(PYTEST_ARGS)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -m "not slow" $(PYTEST_ARGS)
+
+# For the night: 100,000 broken link files, others every day.
+fuzz: $(READY)
+	BUFGYM_FUZZ=100000 BUFGYM_FUZZ_SEED=$$(date +%Y%m%d) HYPOTHESIS_PROFILE=thorough $(PYTEST) tests/traces/test_fuzz_links.py $(PYTEST_ARGS)
 
 format: $(READY)
 	$(BIN)/ruff format .

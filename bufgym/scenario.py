@@ -23,6 +23,7 @@ from bufgym.kernel import records
 from bufgym.link import Link
 from bufgym.qoi import Value
 from bufgym.traces import Motion, Trace
+from bufgym.traces.workload import Workload
 
 
 class Streams(NamedTuple):
@@ -223,6 +224,9 @@ class Uplink:
     mean ``size_bytes`` and coefficient of variation ``size_cv`` (0: all equal). The link is one of ``traces``, chosen
     at random, times ``scale`` (one of them at random where several are given), from a random offset on. ``motion``:
     recordings that give x, from a random offset on; without one, x is the frame index.
+
+    ``workload``: a robot's recording, played as it is, in place of the stream that ``rate_hz``, ``jitter``,
+    ``size_bytes``, ``size_cv`` and ``duration_s`` describe. All its topics share the queue; it gives x if it has one.
     """
 
     traces: tuple[Trace, ...] = ()
@@ -238,6 +242,7 @@ class Uplink:
     """Where on the trace an episode begins, at random from..to, s; None: anywhere."""
     propagation_us: int = 20_000
     value: Value = field(default_factory=lambda: qoi.exponential(math.exp(-1)))
+    workload: Workload | None = None
 
     def __post_init__(self) -> None:
         for name, kind, what in (
@@ -272,21 +277,39 @@ class Uplink:
             len(self.link_offset_s) == 2 and 0 <= self.link_offset_s[0] <= self.link_offset_s[1] < math.inf
         ):
             raise BufgymError(f"link_offset_s = {self.link_offset_s}: must be (from, to) with 0 <= from <= to, s")
+        if self.workload is not None and not isinstance(self.workload, Workload):
+            raise BufgymError(f"workload: {self.workload!r} is not a bufgym.traces Workload")
+        if self.workload is not None and self.workload.x is not None and self.motion:
+            raise BufgymError(f"motion: workload {self.workload.name!r} has an x of its own")
         if not 1 <= self.max_messages <= 10**7:
             raise BufgymError(f"rate_hz x duration_s = {self.max_messages} messages: must lie between 1 and 10000000")
         _value(self)
 
     @property
     def max_messages(self) -> int:
-        return round(self.rate_hz * self.duration_s)
+        return round(self.rate_hz * self.duration_s) if self.workload is None else len(self.workload)
 
     @functools.cached_property
     def _links(self) -> tuple[Trace, ...]:
         return tuple(trace if s == 1 else trace.scaled(s) for trace in self.traces for s in self.scale)
 
     def draw(self, streams: Streams) -> Episode:
+        arrivals = self._stream(streams.arrival) if self.workload is None else _replayed(self.workload)
+        if self.motion:
+            motion = self.motion[int(streams.arrival.integers(len(self.motion)))]
+            start = int(streams.arrival.integers(motion.time_us[-1])) if self.random_offset else 0
+            x = motion.at(arrivals["arrival_us"] + start)
+            arrivals["x"] = x - x[0]
+        trace = self._links[int(streams.link.integers(len(self._links)))]
+        offset = 0
+        if self.random_offset:
+            first, last = self.link_offset_s or (0.0, trace.duration_us / 1e6)
+            offset = int(streams.link.integers(round(first * 1e6), max(round(last * 1e6), 1 + round(first * 1e6))))
+        return Episode(arrivals, Link(trace, offset, int(self.propagation_us)))
+
+    def _stream(self, rng: np.random.Generator) -> NDArray[Any]:
+        """MESSAGE[n] of the camera, x being the frame index."""
         n, period_us = self.max_messages, 1e6 / self.rate_hz
-        rng = streams.arrival
         moved = np.arange(n, dtype=np.float64)
         if self.jitter:
             moved += self.jitter * rng.random(n)
@@ -297,18 +320,14 @@ class Uplink:
             spread = math.sqrt(math.log1p(self.size_cv**2))
             drawn = self.size_bytes * np.exp(spread * rng.standard_normal(n) - spread**2 / 2)
             size = np.maximum(1, np.rint(drawn)).astype(np.int64)
-        x = None
-        if self.motion:
-            motion = self.motion[int(rng.integers(len(self.motion)))]
-            start = int(rng.integers(motion.time_us[-1])) if self.random_offset else 0
-            x = motion.at(arrival_us + start)
-            x -= x[0]
-        trace = self._links[int(streams.link.integers(len(self._links)))]
-        offset = 0
-        if self.random_offset:
-            first, last = self.link_offset_s or (0.0, trace.duration_us / 1e6)
-            offset = int(streams.link.integers(round(first * 1e6), max(round(last * 1e6), 1 + round(first * 1e6))))
-        return Episode(_messages(arrival_us, size, x), Link(trace, offset, int(self.propagation_us)))
+        return _messages(arrival_us, size, None)
+
+
+def _replayed(workload: Workload) -> NDArray[Any]:
+    """MESSAGE[n] of a recording."""
+    arrivals = _messages(workload.arrival_us, workload.size_bytes, workload.x)
+    arrivals["topic"] = workload.topic
+    return arrivals
 
 
 # --- scenarios by name -----------------------------------------------------------------------------------------------

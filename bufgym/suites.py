@@ -20,7 +20,7 @@ from bufgym import qoi
 from bufgym.errors import BufgymError
 from bufgym.qoi import Value
 from bufgym.scenario import Interruption, Scenario, Uplink
-from bufgym.traces import Motion, Trace, drive_motion, read_motion, read_trace, synthetic_lte
+from bufgym.traces import Motion, Trace, drive_motion, markov_link, read_motion, read_trace, synthetic_lte
 from bufgym.traces.synthetic import LTE_MODES
 
 SPLITS = ("train", "validation", "test")
@@ -123,6 +123,11 @@ def _both_values(
     }
 
 
+def _both_sizes(traces: Sequence[Trace], motions: tuple[Motion, ...]) -> dict[str, Setting]:
+    """Both values, once with AFR's frames and once with large ones."""
+    return _both_values(traces, motions, 230_000, "-230kB") | _both_values(traces, motions, 900_000, "-900kB")
+
+
 def _lte(split: str, data: Path | None) -> dict[str, Setting]:
     """Means of 3, 5, 7 and 9 MB/s around the demand of 6.9 MB/s, in turn; modes likewise."""
     first, modes = _FIRST_SEED[split], list(LTE_MODES)
@@ -131,6 +136,15 @@ def _lte(split: str, data: Path | None) -> dict[str, Setting]:
         for k in range(_TRACES[split])
     ]
     return _both_values(traces, _motions(split))
+
+
+_MOVING = ("foot", "bicycle", "bus", "tram", "train", "car")
+
+
+def _generated(split: str, data: Path | None) -> dict[str, Setting]:
+    """The settings of lte-belgium-v1 over links and motions that are made up; the ways of moving in turn."""
+    traces = [markov_link(_MOVING[k % 6], _FIRST_SEED[split] + k) for k in range(_TRACES[split])]
+    return _both_sizes(traces, _motions(split))
 
 
 OUTAGES_S = (5, 10, 20, 40, 60)
@@ -260,8 +274,7 @@ def _there(path: Path) -> Path:
 def _belgium(split: str, data: Path | None) -> dict[str, Setting]:
     assert data is not None
     traces = [read_trace(_there(data / f"belgium_4g/csv/report_{name}.csv")) for name in _BELGIUM[split]]
-    motions = _tum(split, data)
-    return _both_values(traces, motions, 230_000, "-230kB") | _both_values(traces, motions, 900_000, "-900kB")
+    return _both_sizes(traces, _tum(split, data))
 
 
 _MOST_TRACES = 12
@@ -299,6 +312,7 @@ SUITES = {
         Suite("lte-v1", "30 Hz camera over synthetic LTE links", _lte),
         Suite("outage-v1", "one blackout of 5 to 60 s on a good link", _outage),
         Suite("sustained-v1", "steady links of a quarter, half and three quarters of the demand", _sustained),
+        Suite("generated-v1", "30 Hz camera over links generated like recordings of six ways of moving", _generated),
         Suite(
             "lte-belgium-v1",
             "30 Hz camera over the Belgium 4G logs with TUM RGB-D motion",

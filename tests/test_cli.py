@@ -14,6 +14,7 @@ from bufgym import __version__, cli, policies, traces
 from bufgym.benchmark.rows import read_rows
 from bufgym.cli import main, split_policies
 from bufgym.kernel import JIT
+from bufgym.traces.generators import shipped_calls
 
 QUICK = ["--seconds", "1", "--fps", "10", "--seeds", "2", "--capacity", "2"]
 """A benchmark of a few messages."""
@@ -35,6 +36,7 @@ def test_list_names_everything_there_is(capsys: pytest.CaptureFixture[str]) -> N
     for name in (*policies.names(), *traces.shipped(), *cli.KINDS, "bufgym/Uplink-v0", "lte", "retained", "drain"):
         assert name in text
     assert "every=3" in text
+    assert all(call in text for call in shipped_calls().values())
 
 
 @pytest.mark.parametrize("kind", cli.KINDS)
@@ -46,9 +48,9 @@ def test_list_one_kind(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_list_opens_no_heavy_module() -> None:
+    heavy = ("bufgym.sender", "bufgym.envs", "matplotlib", "pyarrow", "tqdm", "mcap", "rosbags")
     program = (
-        "import sys; from bufgym.cli import main; main(['list']);"
-        "print([m for m in ('bufgym.sender', 'bufgym.envs', 'matplotlib', 'pyarrow', 'tqdm') if m in sys.modules])"
+        f"import sys; from bufgym.cli import main; main(['list']);print([m for m in {heavy!r} if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"

@@ -5,12 +5,19 @@ from __future__ import annotations
 import argparse
 import shlex
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from bufgym.cli.options import Commands, capacities, command, count, load_policies, policy_file, split_policies
 from bufgym.cli.scenarios import scenario, scenario_options
+from bufgym.cli.trace_bags import WORKLOAD_OPTIONS
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
+
+if TYPE_CHECKING:
+    from bufgym.policies import Policy
+    from bufgym.scenario import Scenario
 
 
 def add(commands: Commands) -> None:
@@ -32,12 +39,13 @@ def add(commands: Commands) -> None:
     option("--capacity", type=capacities, metavar="L,...", help="capacities L, messages (default: 8, or the suite's)")
     option("--max-bytes", type=count, metavar="B", help="also at most B bytes queued (default: no limit)")
     option("--decide-at", choices=("arrival", "overflow"), default="arrival", help="ask at every arrival, or when full")
-    option("--seeds", type=count, metavar="N", help="episodes a trace (default: 10, or the suite's)")
+    option("--seeds", type=count, metavar="N", help="episodes a trace (default: 10, or the suite's; a recording: 1)")
     policy_file(who)
     scenario_options(bench)
     option = bench.add_argument_group("where results go").add_argument
     option("--out", metavar="DIR", help="write rows.parquet (rows.csv without pyarrow) and table.md there")
     option("--format", choices=("csv", "parquet"), help="format of the rows")
+    option("--drops", metavar="OUT.csv", help="with --workload: write each message that each policy dropped")
 
 
 def _bench(options: argparse.Namespace) -> None:
@@ -60,7 +68,11 @@ def _bench(options: argparse.Namespace) -> None:
     for name, default in (("split", "test"), ("data", None), ("jobs", -1), ("backend", "loky"), ("address", None)):
         if getattr(options, name) != default:
             raise BufgymError(f"--{name} needs --suite")
-    options.capacity, options.seeds = options.capacity or [8], options.seeds or 10
+    if options.workload is None:
+        options.seeds = options.seeds or 10
+        if options.drops is not None:
+            raise BufgymError("--drops needs --workload")
+    options.capacity = options.capacity or [8]
     chosen = [policies.get(spec) for spec in specs]
     form = options.format or ("parquet" if files.has_pyarrow() else "csv")
     meets, about = scenario(options)
@@ -76,18 +88,58 @@ def _bench(options: argparse.Namespace) -> None:
         decide_at=options.decide_at,
         progress=True,
     )
-    print(f"{about}\n\n{table.plain(rows)}")
+    bound = _bound_notes(rows, meets, options.decide_at) if options.workload is not None else []
+    print("\n".join([f"{about}\n\n{table.plain(rows)}", *bound]))
+    if options.workload is not None:
+        order = dict.fromkeys(entry["policy"] for entry in table.means(rows))
+        _dropped(options, chosen, meets, list(order))
     if options.out is not None:
         written = files.write_rows(rows, Path(options.out) / f"rows.{form}")
         target = Path(options.out) / "table.md"
         with replaced(target) as temporary:
-            temporary.write_text(f"{about}\n\n{table.markdown(rows)}\n", encoding="utf-8")
+            text = "\n".join([f"{about}\n\n{table.markdown(rows)}", *([""] if bound else []), *bound])
+            temporary.write_text(text + "\n", encoding="utf-8")
         print(f"\n{len(rows)} rows in {written}, this table in {target}")
+
+
+def _bound_notes(rows: Sequence[Mapping[str, Any]], meets: Scenario, decide_at: str) -> list[str]:
+    """What the clairvoyant could have had of a recording, and whether that is exact."""
+    sizes = getattr(meets, "workload").size_bytes  # noqa: B009  (only an uplink has one)
+    why = "message sizes differ" if sizes.min() < sizes.max() else f"decisions are asked at {decide_at}"
+    notes = []
+    for capacity in dict.fromkeys(row["capacity"] for row in rows):
+        episodes = {(row["trace"], row["seed"]): row for row in rows if row["capacity"] == capacity}.values()
+        most = sum(row["clairvoyant"] for row in episodes) / len(episodes)
+        exact = all(row["certified"] for row in episodes)
+        what = f"is {most:.3f}" if exact else f"is at most {most:.3f}, an upper bound, as {why}"
+        notes.append(f"note: L = {capacity}: the clairvoyant's QoI {what}; regret is measured against it")
+    if any(row["policy"] == "clairvoyant" and not row["certified"] for row in rows):
+        notes.append("note: the row clairvoyant follows a plan for which there is not always room: less than its bound")
+    return notes
+
+
+def _dropped(options: argparse.Namespace, chosen: Sequence[Policy], meets: Scenario, order: Sequence[str]) -> None:
+    """The messages that were dropped: by topic where there are several (policies in ``order``), each into --drops."""
+    from bufgym.benchmark import drops
+    from bufgym.scenario import Uplink
+
+    assert isinstance(meets, Uplink) and meets.workload is not None
+    several = len(meets.workload.summary()) > 1
+    if not several and options.drops is None:
+        return
+    found = drops.drops(
+        chosen, meets, options.capacity, options.seeds, max_bytes=options.max_bytes, decide_at=options.decide_at
+    )
+    counts = drops.write_drops(found, None if options.drops is None else Path(options.drops))
+    if several and counts:
+        print("\n" + drops.by_topic(counts, meets, order, options.seeds * len(meets.traces)))
+    if options.drops is not None:
+        print(f"\n{counts.total()} dropped messages in {options.drops}")
 
 
 _NOT_WITH_SUITE = (
     "max_bytes", "trace", "motion", "fps", "bytes", "size_cv", "seconds", "jitter", "scale", "value", "law", "t_min",
-    "t_max", "t_mean",
+    "t_max", "t_mean", "workload", "drops", *WORKLOAD_OPTIONS,
 )  # fmt: skip
 """A suite is frozen: these are its own."""
 

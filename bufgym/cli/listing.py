@@ -97,10 +97,12 @@ def _list_observations() -> str:
 
 def _list_traces() -> str:
     from bufgym.traces import shipped
+    from bufgym.traces.generators import shipped_calls
 
     kinds = {"lte": "bandwidth, synthetic LTE", "drive": "motion of a driving robot, synthetic"}
-    found = shipped()
-    return columns([(name, kinds.get(name.split("-")[0], "")) for name in found]) if found else "  none found"
+    calls = shipped_calls()
+    rows = [(name, kinds.get(name.split("-")[0], ""), calls.get(name, "")) for name in shipped()]
+    return columns(rows) if rows else "  none found"
 
 
 _LISTS: dict[str, Callable[[], str]] = {

@@ -8,10 +8,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from bufgym.cli.options import count, least_0, positive
+from bufgym.cli.trace_bags import WORKLOAD_OPTIONS, given, given_motion, refuse_motion, workload_lines, workload_options
 from bufgym.errors import BufgymError
 
 if TYPE_CHECKING:
     from bufgym.scenario import Scenario
+    from bufgym.traces import Motion, Trace
 
 DEFAULTS = {
     "fps": 30.0,
@@ -27,7 +29,8 @@ DEFAULTS = {
 }
 """What holds where an option is not given (fps 1/s, bytes and seconds as named, t_* messages)."""
 
-_UPLINK_ONLY = ("trace", "motion", "seconds", "jitter", "size_cv", "scale")
+_UPLINK_ONLY = ("trace", "motion", "seconds", "jitter", "size_cv", "scale", "workload", *WORKLOAD_OPTIONS)
+_STREAM_ONLY = ("fps", "bytes", "size_cv", "seconds", "jitter")
 _INTERRUPTION_ONLY = ("t_min", "t_max", "t_mean", "law")
 
 
@@ -48,6 +51,10 @@ def scenario_options(parser: argparse.ArgumentParser) -> None:
         help="V of the QoI: exponential:BASE or saturating:DISTANCE"
         " (default: exponential:0.367879 over motion, exponential:0.618 over frame indices)",
     )
+    group = parser.add_argument_group("a recording of a robot in place of the stream")
+    what = "MCAP, ROS 1 bag, rosbag2 (extra 'ros') or CSV; alone, played once from the start of each trace"
+    group.add_argument("--workload", metavar="FILE", help=what)
+    workload_options(group)
     add = parser.add_argument_group("one interruption of unknown length T instead").add_argument
     add("--interruption", action="store_true", help="this scenario, and regret against its oracle")
     add("--law", help="of T: fixed (t-max), uniform, log-uniform, geometric (default: log-uniform)")
@@ -67,7 +74,16 @@ def scenario(options: argparse.Namespace) -> tuple[Scenario, str]:
         name: default if getattr(options, name) is None else getattr(options, name)
         for name, default in DEFAULTS.items()
     }
-    return _interruption(options, take) if options.interruption else _uplink(options, take)
+    if options.interruption:
+        return _interruption(options, take)
+    if options.workload is not None:
+        return _recording(options, take)
+    for name in ("topics", "odom", "bridge_gaps"):
+        if getattr(options, name) is not None:
+            raise BufgymError(f"--{name.replace('_', '-')} needs --workload")
+    if options.motion is None:
+        refuse_motion(options, "needs --motion, or --workload with --odom")
+    return _uplink(options, take)
 
 
 def _interruption(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario, str]:
@@ -93,14 +109,13 @@ def _uplink(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario
     from bufgym.scenario import Uplink
 
     names = traces.shipped()
-    links = options.trace if options.trace is not None else [name for name in names if name.startswith("lte-")]
     motions = options.motion if options.motion is not None else [name for name in names if name.startswith("drive-")]
     if motions == ["none"]:
         motions = []
     default = qoi.exponential(math.exp(-1)) if motions else qoi.exponential()
     made = Uplink(
-        traces=tuple(traces.load(name) for name in links),
-        motion=tuple(traces.load_motion(name) for name in motions),
+        traces=_links(options),
+        motion=tuple(_motion(name, options) for name in motions),
         rate_hz=take["fps"],
         jitter=take["jitter"],
         size_bytes=take["bytes"],
@@ -109,7 +124,7 @@ def _uplink(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario
         scale=(take["scale"],),
         value=qoi.parse(options.value) if options.value is not None else default,
     )
-    recorded = _some([motion.name for motion in made.motion])
+    recorded = _some([_with_gaps(motion) for motion in made.motion])
     over = f"the camera's motion, in fields of view, from {recorded}" if motions else "the frame index"
     scaled = f" x {take['scale']:g}" if take["scale"] != 1 else ""
     about = [
@@ -121,6 +136,77 @@ def _uplink(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario
         " every policy meets the same episodes.",
     ]
     return made, "\n".join(about)
+
+
+def _recording(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario, str]:
+    """A workload as it was recorded; with --seeds, from random places on each trace."""
+    from bufgym import qoi
+    from bufgym.scenario import Uplink
+    from bufgym.traces.recordings import read_workload
+
+    for name in _STREAM_ONLY:
+        if getattr(options, name) is not None:
+            raise BufgymError(f"--{name.replace('_', '-')} cannot go with --workload: a recording has its own")
+    workload = read_workload(options.workload, **given(options))
+    motions = [] if options.motion in (None, ["none"]) else [_motion(name, options) for name in options.motion]
+    if options.odom is None and not motions:
+        refuse_motion(options, "needs --odom or --motion")
+    by_motion = bool(motions) or workload.x is not None
+    default = qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential()
+    random_offset = options.seeds is not None
+    options.seeds = options.seeds or 1
+    made = Uplink(
+        traces=_links(options),
+        motion=tuple(motions),
+        scale=(take["scale"],),
+        random_offset=random_offset,
+        value=qoi.parse(options.value) if options.value is not None else default,
+        workload=workload,
+    )
+    x = f"motion, from {_some([_with_gaps(motion) for motion in motions])}" if motions else "motion, as recorded"
+    where = f"{options.seeds} random places each" if random_offset else "from the trace's start"
+    scaled = f" x {take['scale']:g}" if take["scale"] != 1 else ""
+    shared = "; all topics share one queue" if len(workload.topics) > 1 else ""
+    about = [
+        workload.source,
+        "",
+        *workload_lines(workload),
+        "",
+        f"Played over {_some([trace.name for trace in made.traces])}{scaled}, {where}{shared}.",
+        f"QoI = 1 + sum of V(step in x) over the messages received; V = {made.value.name}.",
+        f"x is {f'the {x}, in fields of view' if by_motion else 'the number of the message'}.",
+    ]
+    return made, "\n".join(about)
+
+
+def _links(options: argparse.Namespace) -> tuple[Trace, ...]:
+    from bufgym import traces
+
+    names = options.trace
+    if names is None:
+        names = [name for name in traces.shipped() if name.startswith("lte-")]
+    return tuple(traces.load(name) for name in names)
+
+
+def _motion(name: str, options: argparse.Namespace) -> Motion:
+    """A motion by its shipped name or from a file, measured as the options say."""
+    from bufgym import traces
+    from bufgym.traces.motion import MOTION_HEADER
+
+    settings = given_motion(options)
+    if not settings:
+        return traces.load_motion(name)
+    motion = traces.read_motion(traces.shipped().get(name, name), **settings)
+    if motion.source.endswith(f"({MOTION_HEADER})"):
+        refuse_motion(options, f"cannot go with {name}, which holds finished coordinates")
+    return motion
+
+
+def _with_gaps(motion: Motion) -> str:
+    """Its name, and how much of it is guessed."""
+    if not motion.gaps:
+        return motion.name
+    return f"{motion.name} (gaps bridged: {len(motion.gaps)}, the longest {motion.longest_gap_s:.1f} s)"
 
 
 def _some(names: Sequence[str]) -> str:

@@ -1,22 +1,55 @@
-"""``bufgym trace``: bandwidth traces described and drawn."""
+"""``bufgym trace``: bandwidth traces described, drawn, checked, converted. Other verbs have modules of their own."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from bufgym.cli import trace_bags, trace_fetch, trace_fit
 from bufgym.cli.options import Commands, columns, command
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, TraceError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from bufgym.traces import Trace
+
+_PICTURES = (".png", ".svg", ".pdf")
 
 
 def add(commands: Commands) -> None:
-    trace = commands.add_parser("trace", help="look at bandwidth traces", description="Look at bandwidth traces.")
+    trace = commands.add_parser(
+        "trace",
+        help="bandwidth traces and recordings: look at them, convert, fit, generate, fetch",
+        description="Bandwidth traces and recordings: look at them, convert, fit, generate, fetch.",
+    )
     verbs = trace.add_subparsers(title="verbs", metavar="VERB", required=True)
     info = command(verbs, "info", _info, "statistics of bandwidth traces")
     plot = command(verbs, "plot", _plot, "draw bandwidth traces (needs the extra 'plot')")
-    for made in (info, plot):
-        made.add_argument("files", nargs="+", metavar="FILE", help="a file or a shipped name")
+    validate = command(
+        verbs, "validate", _validate, "read each file and say whether it is sound; exit code 1 if not all"
+    )
+    convert = command(verbs, "convert", _convert, "write bandwidth traces in another format and say what was lost")
+    for made in (info, plot, validate, convert):
+        made.add_argument("files", nargs="+", metavar="FILE", help="a file, archive.zip:member, or a shipped name")
+        made.add_argument("--format", metavar="NAME", help="the files' format, where it is not to be detected")
+        made.add_argument("--column", metavar="NAME", help="which column of rates, in UCC files (default DL_bitrate)")
     plot.add_argument("--out", required=True, metavar="FILE", help="the picture to write: .png, .svg or .pdf")
+    convert.add_argument("--to", metavar="NAME", help="csv or mahimahi; by default csv where --out ends in .csv")
+    convert.add_argument("--out", required=True, metavar="PATH", help="the file to write; a folder for several files")
+    trace_bags.add(verbs)
+    trace_fit.add(verbs)
+    trace_fetch.add(verbs)
+
+
+def _load(name: str, options: argparse.Namespace) -> Trace:
+    from bufgym import traces
+
+    return traces.load(name, options.format, column=options.column)
+
+
+# --- info ------------------------------------------------------------------------------------------------------------
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -24,7 +57,7 @@ def _info(options: argparse.Namespace) -> None:
 
     blocks = []
     for name in options.files:
-        trace = traces.load(name)
+        trace = _load(name, options)
         lines = [
             (key, f"{number:,.6g}" if number < 1e6 else f"{number:,.0f}")
             for key, number in traces.describe(trace).items()
@@ -34,29 +67,116 @@ def _info(options: argparse.Namespace) -> None:
     print("\n\n".join(blocks))
 
 
+# --- validate --------------------------------------------------------------------------------------------------------
+
+
+def _validate(options: argparse.Namespace) -> None:
+    from bufgym import traces
+
+    failed, names = 0, _with_members(options.files)
+    for name in names:
+        try:
+            trace = _load(name, options)
+        except TraceError as error:
+            failed += 1
+            print(f"error  {' '.join(str(error).split())}")
+        else:
+            found = traces.describe(trace)
+            print(f"OK     {trace.source}: {found['duration_s']:.1f} s, mean {found['mean_KBps']:.1f} KB/s")
+    if len(names) > 1:
+        print(f"{len(names) - failed} of {len(names)} files are sound")
+    if failed:
+        raise SystemExit(1)
+
+
+def _with_members(names: list[str]) -> list[str]:
+    """The names, and in place of each zip archive all of its members."""
+    from bufgym import traces
+
+    found: list[str] = []
+    for name in names:
+        try:
+            inside = traces.members(name) if Path(name).is_file() else []
+        except TraceError:
+            inside = []  # reading it says what is wrong
+        found += [f"{name}:{member}" for member in inside] if len(inside) > 1 else [name]
+    return found
+
+
+# --- convert ---------------------------------------------------------------------------------------------------------
+
+
+def _convert(options: argparse.Namespace) -> None:
+    from bufgym import traces
+
+    out = Path(options.out)
+    to = options.to or ("csv" if out.suffix == ".csv" else None)
+    if to not in traces.WRITERS:
+        said = f"--to {to}" if to else f"--out {out}: does not tell the format; --to"
+        raise BufgymError(f"{said}: must be one of {', '.join(traces.WRITERS)}")
+    for name, target in _targets(options.files, out, to):
+        trace = _load(name, options)
+        traces.WRITERS[to](trace, target)
+        lost = traces.difference(trace, traces.read_trace(target, to))
+        print(f"wrote {target} (format {to}) from {trace.source}: {lost}")
+
+
+def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
+    """What to write to for each file: ``out`` for a single one, else files of their names in the folder ``out``."""
+    if len(names) == 1 and not out.is_dir():
+        if out.exists() and Path(names[0]).exists() and out.samefile(names[0]):
+            raise BufgymError(f"--out {out}: must not be the file that is read")
+        return [(names[0], out)]
+    from bufgym.traces.readers import trace_name
+
+    if not out.is_dir():
+        raise BufgymError(f"--out {out}: must be an existing folder for {len(names)} files")
+    targets = [(name, out / (trace_name(name) + (".csv" if to == "csv" else ".mahimahi"))) for name in names]
+    for name, target in targets:
+        if [each for _, each in targets].count(target) > 1 or target.exists():
+            raise BufgymError(f"{name}: {target} is taken: must be written by itself, with --out FILE")
+    return targets
+
+
+# --- plot ------------------------------------------------------------------------------------------------------------
+
+
 def _plot(options: argparse.Namespace) -> None:
     try:
         from matplotlib.figure import Figure
     except ImportError:
         raise BufgymError('drawing needs matplotlib: pip install "bufgym[plot]"') from None
+    out = Path(options.out)
+    if out.suffix not in _PICTURES:
+        raise BufgymError(f"--out {out}: must end in {', '.join(_PICTURES[:-1])} or {_PICTURES[-1]}")
+    loaded = [_load(name, options) for name in options.files]
+    figure = Figure(figsize=(9, 0.8 + 2 * len(loaded)), layout="constrained")
+    axes = figure.subplots(len(loaded), 1, squeeze=False)[:, 0]
+    for axis, trace in zip(axes, loaded, strict=True):
+        _draw(axis, trace)
+    axes[-1].set_xlabel("time (s)")
+    figure.align_ylabels()
+    figure.savefig(out, dpi=150)
+    print(f"wrote {out}")
+
+
+def _draw(axis: Axes, trace: Trace) -> None:
+    """Rates over time; what is under 500 KB/s is marked in red below the axis's zero."""
     import numpy as np
 
     from bufgym import traces
 
-    out = Path(options.out)
-    if out.suffix not in (".png", ".svg", ".pdf"):
-        raise BufgymError(f"--out {out}: must end in .png, .svg or .pdf")
-    loaded = [traces.load(name) for name in options.files]
-    figure = Figure(figsize=(9, 1.2 + 1.8 * len(loaded)), layout="constrained")
-    axes = figure.subplots(len(loaded), 1, squeeze=False)[:, 0]
-    for axis, trace in zip(axes, loaded, strict=True):
-        lengths_us, rates = trace.samples()
-        edges_s = np.concatenate([[0], np.cumsum(lengths_us)]) / 1e6
-        axis.stairs(rates / 1e6, edges_s, fill=True, alpha=0.6)
-        axis.set_title(trace.name, fontsize="medium", loc="left")
-        axis.set_ylabel("MB/s")
-        axis.set_xlim(0, edges_s[-1])
-        axis.set_ylim(bottom=0)
-    axes[-1].set_xlabel("time (s)")
-    figure.savefig(out)
-    print(f"wrote {out}")
+    lengths_us, rates = trace.samples()
+    edges_s = np.concatenate([[0], np.cumsum(lengths_us)]) / 1e6
+    axis.stairs(rates / 1e6, edges_s, fill=True, color="tab:blue", alpha=0.35)
+    axis.stairs(rates / 1e6, edges_s, color="tab:blue", linewidth=0.6)
+    top = max(float(rates.max()) / 1e6, 0.001) * 1.05
+    low = (rates < 500_000.0).astype(float)
+    axis.stairs(-0.05 * top * low, edges_s, baseline=-0.02 * top * low, fill=True, color="tab:red", linewidth=0)
+    found = traces.describe(trace)
+    told = f"mean {found['mean_KBps'] / 1e3:.3g} MB/s, {found['seconds_below_500KBps']:.4g} s under 500 KB/s (red)"
+    axis.set_title(trace.name, fontsize="medium", loc="left")
+    axis.set_title(told, fontsize="small", loc="right")
+    axis.set_ylabel("MB/s")
+    axis.set_xlim(0, edges_s[-1])
+    axis.set_ylim(-0.07 * top, top)

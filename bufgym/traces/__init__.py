@@ -1,33 +1,77 @@
-"""Bandwidth traces and motion recordings: in from files, out to files, or made up from a seed.
+"""Bandwidth traces, motion recordings and workloads: in from files, out to files, or made up from a seed.
 
 trace = load("lte-synthetic-3")            # shipped with bufgym
 trace = read_trace("TMobile-LTE-short.up.gz")
 trace = Trace.steps([(5, 8e6), (2, 0)])    # 5 s at 8 MB/s, 2 s of nothing
+trace = markov_link("tram", seed=3)        # as recorded in trams
 motion = read_motion("freiburg1_desk.groundtruth.txt.gz")
+workload = read_workload("drive.mcap", topics=["/camera/*"], odom="/odom")
 """
 
+from bufgym.traces.archives import members
+from bufgym.traces.bags import read_bag
+from bufgym.traces.generate import (
+    Corridor,
+    FrameModel,
+    fitted_links,
+    frame_sizes,
+    gilbert_elliott,
+    markov_link,
+    ramp,
+    read_links,
+    roaming,
+    steady,
+    tunnel,
+)
 from bufgym.traces.motion import Motion, motion_from_poses, read_motion, write_motion_csv
+from bufgym.traces.poses import read_poses
 from bufgym.traces.readers import FORMATS, detect_format, read_trace
+from bufgym.traces.recordings import read_workload, workload_from_bag
 from bufgym.traces.shipped import load, load_motion, shipped
-from bufgym.traces.synthetic import drive_motion, outage, synthetic_lte
+from bufgym.traces.synthetic import Driving, drive_motion, outage, synthetic_lte
 from bufgym.traces.trace import Trace, describe
-from bufgym.traces.writers import write_csv
+from bufgym.traces.workload import Workload, read_workload_csv, write_workload_csv
+from bufgym.traces.writers import WRITERS, Difference, difference, write_csv, write_mahimahi
 
 __all__ = [
     "FORMATS",
+    "WRITERS",
+    "Corridor",
+    "Difference",
+    "Driving",
+    "FrameModel",
     "Motion",
     "Trace",
+    "Workload",
     "describe",
     "detect_format",
+    "difference",
     "drive_motion",
+    "fitted_links",
+    "frame_sizes",
+    "gilbert_elliott",
     "load",
     "load_motion",
+    "markov_link",
+    "members",
     "motion_from_poses",
     "outage",
+    "ramp",
+    "read_bag",
+    "read_links",
     "read_motion",
+    "read_poses",
     "read_trace",
+    "read_workload",
+    "read_workload_csv",
+    "roaming",
     "shipped",
+    "steady",
     "synthetic_lte",
+    "tunnel",
+    "workload_from_bag",
     "write_csv",
+    "write_mahimahi",
     "write_motion_csv",
+    "write_workload_csv",
 ]

@@ -20,6 +20,7 @@ __all__ = [
     "SHIPPED_SEEDS_OF_MOTION",
     "drive_motion",
     "outage",
+    "shipped_calls",
     "synthetic_lte",
     "write_shipped",
 ]
@@ -38,6 +39,16 @@ SHIPPED_LTE: Final[tuple[tuple[LteMode, float], ...]] = (
 )
 SHIPPED_SEEDS_OF_MOTION: Final = (0, 1)
 SHIPPED_DURATION_S: Final = 300
+
+
+def shipped_calls() -> dict[str, str]:
+    """Name of each shipped file -> the call, with its seed, that makes it."""
+    links = {
+        f"lte-synthetic-{seed}": f'synthetic_lte({seed}, {SHIPPED_DURATION_S}, {mean / 1e6:g}e6, "{mode}")'
+        for seed, (mode, mean) in enumerate(SHIPPED_LTE)
+    }
+    motions = {f"drive-{seed}": f"drive_motion({seed}, {SHIPPED_DURATION_S})" for seed in SHIPPED_SEEDS_OF_MOTION}
+    return motions | links
 
 
 def write_shipped(folder: StrPath) -> list[Path]:

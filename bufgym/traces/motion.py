@@ -5,16 +5,13 @@ rotation angle / field of view + translation / scene scale. One unit is a view w
 one. It is what a robot's odometry can tell on board, and the scalar over which Quantity of Information is
 counted.
 
-Trajectories come in the TUM format `t tx ty tz qx qy qz qw` (s, m, unit quaternion; J. Sturm et al., "A
-Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012), as ground truth or from any odometry.
-Finished coordinates are kept in CSV files with the header `t_s,motion`.
+Trajectories come in the formats of `poses.py` (TUM, EuRoC, KITTI), as ground truth or from any odometry. Finished
+coordinates are kept in CSV files with the header `t_s,motion`.
 """
 
 from __future__ import annotations
 
 import math
-from array import array
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -22,12 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bufgym.errors import BufgymError, TraceError, where
-from bufgym.traces.files import Line, StrPath, TextFile
+from bufgym.traces.files import Line, StrPath, TextFile, write_text
+from bufgym.traces.poses import Poses, angles, read_poses, read_rows, seconds
 from bufgym.traces.readers import trace_name
-from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Array
-
-# Takes a line apart, given the values of the one before: time as it stands, and values.
-_RowReader = Callable[[Line, list[float] | None], tuple[str, list[float]]]
+from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 
 MOTION_HEADER: Final = "t_s,motion"
 
@@ -41,11 +36,7 @@ DEFAULT_SCENE_SCALE_M: Final = 2.0
 DEFAULT_RATE_HZ: Final = 30.0
 DEFAULT_MAX_GAP_S: Final = 1.0
 
-_MAX_POSITION_M: Final = 1e7
-# Seconds since 1970 until the year 5138; a time in ns is caught by it.
-_MAX_EPOCH_S: Final = 1e11
-_MAX_COORDINATE: Final = 1e9
-_NORM_TOLERANCE: Final = 0.01
+MAX_COORDINATE: Final = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +90,11 @@ class Motion:
         """Coordinate at the end."""
         return float(self.coordinate[-1])
 
+    @property
+    def longest_gap_s(self) -> float:
+        """The longest stretch in `gaps`, s; 0 where there is none."""
+        return max((end - start for start, end in self.gaps), default=0) / US_PER_S
+
     def at(self, time_us: npt.ArrayLike) -> Float64Array:
         """Coordinate at each time (int64 microseconds, any shape), linear between samples.
 
@@ -122,36 +118,38 @@ def read_motion(
     scene_scale_m: float = DEFAULT_SCENE_SCALE_M,
     rate_hz: float = DEFAULT_RATE_HZ,
     max_gap_s: float = DEFAULT_MAX_GAP_S,
+    format: str | None = None,
+    times: StrPath | None = None,
 ) -> Motion:
-    """Read a TUM trajectory or a `t_s,motion` CSV, plain or gzip'd, told apart by the first line.
+    """Read a trajectory (TUM, EuRoC, KITTI) or a `t_s,motion` CSV, plain or gzip'd, told apart by the first line.
 
-    The first time becomes 0. The other arguments are for trajectories (see `motion_from_poses`); a CSV holds
-    finished coordinates, which are taken as they are, less the first.
+    The first time becomes 0. The other arguments are for trajectories (see `motion_from_poses`; `poses.read_poses`
+    for ``format`` and ``times``); a CSV holds finished coordinates, which are taken as they are, less the first.
+    Stretches without a pose are bridged and listed in `Motion.gaps`.
 
     Raises:
-        TraceError: the file cannot be read, or a line breaks a rule: eight finite numbers, positions within
-            10**7 m, a quaternion of unit norm within 1 %, times in seconds that never go back and span at
-            most 10**7 s, two lines at least. The message names the file, the line, the value and the rule.
-        BufgymError: an argument that is not a finite number above 0.
+        TraceError: the file cannot be read, or a line breaks a rule of its format. The message names the file, the
+            line, the value and the rule.
+        BufgymError: an argument that is not a finite number above 0, or a format that does not exist.
     """
     with TextFile(path) as file:
         first = next((line for line in file.lines() if not line.text.startswith("#")), None)
     if first is None:
         raise TraceError(where(path, None, None, "is empty: must hold a trajectory or a motion recording"))
-    if _is_header(first.text):
-        time_us, values = _read_columns(path, _motion_row, skip=first.number)
+    if format is None and times is None and _is_header(first.text):
+        time_us, values = read_rows(path, _motion_row, skip=first.number)
         return Motion(trace_name(path), time_us, values[:, 0] - values[0, 0], f"{path} ({MOTION_HEADER})")
-    time_us, poses = _read_columns(path, _pose_row)
+    poses = read_poses(path, format=format, times=times)
     return motion_from_poses(
-        time_us,
-        poses[:, :3],
-        poses[:, 3:],
+        poses.time_us,
+        poses.position_m,
+        poses.quaternion,
         fov_deg=fov_deg,
         scene_scale_m=scene_scale_m,
         rate_hz=rate_hz,
         max_gap_s=max_gap_s,
         name=trace_name(path),
-        source=f"{path} (TUM trajectory)",
+        source=f"{path} (trajectory, format {poses.format})",
     )
 
 
@@ -193,17 +191,16 @@ def motion_from_poses(
     ):
         if not (math.isfinite(value) and value > 0):
             raise BufgymError(f"{what} = {value}: must be a finite number above 0")
-    between_us = np.diff(time_us)
-    long = np.flatnonzero(between_us > max_gap_s * US_PER_S)
-    gaps = tuple((int(time_us[k]), int(time_us[k + 1])) for k in long)
     unit = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+    poses = Poses(time_us, position_m, unit)
+    gaps = poses.gaps(max_gap_s)
     # A recording at the wanted rate jitters by some percent, and must not be resampled for that.
-    if np.median(between_us) < 0.9 * US_PER_S / rate_hz:
-        time_us, position_m, unit = _resample(time_us, position_m, unit, rate_hz)
-    turned_rad = _angles(unit[:-1], unit[1:])
-    moved_m = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
+    if np.median(np.diff(time_us)) < 0.9 * US_PER_S / rate_hz:
+        poses = poses.resampled(rate_hz)
+    turned_rad = angles(poses.quaternion[:-1], poses.quaternion[1:])
+    moved_m = np.linalg.norm(np.diff(poses.position_m, axis=0), axis=1)
     steps = turned_rad / math.radians(fov_deg) + moved_m / scene_scale_m
-    return Motion(name, time_us, np.append(0.0, np.cumsum(steps)), source, gaps)
+    return Motion(name, poses.time_us, np.append(0.0, np.cumsum(steps)), source, gaps)
 
 
 def write_motion_csv(motion: Motion, path: StrPath) -> None:
@@ -212,107 +209,21 @@ def write_motion_csv(motion: Motion, path: StrPath) -> None:
     Raises:
         TraceError: the file cannot be written.
     """
-    rows = [
+    rows = (
         f"{t // US_PER_S}.{t % US_PER_S:06d}".rstrip("0").rstrip(".") + f",{x!r}\n"
         for t, x in zip(motion.time_us.tolist(), motion.coordinate.tolist(), strict=True)
-    ]
-    try:
-        with open(path, "w", encoding="ascii", newline="\n") as file:
-            file.write(MOTION_HEADER + "\n")
-            file.writelines(rows)
-    except OSError as error:
-        raise TraceError(where(path, None, None, f"cannot be written: {error.strerror or error}")) from error
-
-
-def _resample(
-    time_us: Int64Array, position_m: Float64Array, unit: Float64Array, rate_hz: float
-) -> tuple[Int64Array, Float64Array, Float64Array]:
-    """Poses at multiples of 1 / rate_hz and at the end: int64[m], float64[m, 3], quaternions [m, 4]."""
-    count = int(time_us[-1] * rate_hz / US_PER_S) + 1
-    grid_us = np.rint(np.arange(count) * (US_PER_S / rate_hz)).astype(np.int64)
-    grid_us = np.append(grid_us[grid_us < time_us[-1]], time_us[-1])
-    k = np.clip(np.searchsorted(time_us, grid_us, side="right") - 1, 0, time_us.size - 2)
-    share = ((grid_us - time_us[k]) / (time_us[k + 1] - time_us[k]))[:, None]
-    position = position_m[k] + share * (position_m[k + 1] - position_m[k])
-    return grid_us, position, _slerp(unit[k], unit[k + 1], share)
-
-
-def _slerp(start: Float64Array, end: Float64Array, share: Float64Array) -> Float64Array:
-    """Unit quaternions on the shortest arc from start to end, each float64[m, 4]; share is float64[m, 1]."""
-    cosine = np.sum(start * end, axis=1, keepdims=True)
-    end = np.where(cosine < 0, -end, end)
-    half = 2 * np.arctan2(np.linalg.norm(end - start, axis=1), np.linalg.norm(end + start, axis=1))[:, None]
-    sine = np.sin(half)
-    near = sine < 1e-9  # so close that arc and chord are one
-    safe = np.where(near, 1.0, sine)
-    mixed = np.where(
-        near,
-        (1 - share) * start + share * end,
-        (np.sin((1 - share) * half) * start + np.sin(share * half) * end) / safe,
     )
-    return np.asarray(mixed / np.linalg.norm(mixed, axis=1, keepdims=True), dtype=np.float64)
-
-
-def _angles(a: Float64Array, b: Float64Array) -> Float64Array:
-    """Rotation angle in rad, 0..pi, between unit quaternions float64[m, 4].
-
-    By the half-angle's tangent: an arc cosine would lose the small angles between neighbouring poses.
-    """
-    b = np.where(np.sum(a * b, axis=1, keepdims=True) < 0, -b, b)
-    half = 2 * np.arctan2(np.linalg.norm(b - a, axis=1), np.linalg.norm(b + a, axis=1))
-    return np.asarray(2 * half, dtype=np.float64)
+    write_text(path, [MOTION_HEADER + "\n"], rows)
 
 
 def _is_header(text: str) -> bool:
     return ",".join(cell.strip() for cell in text.split(",")) == MOTION_HEADER
 
 
-def _pose_row(line: Line, previous: list[float] | None) -> tuple[str, list[float]]:
-    """Time, then tx ty tz qx qy qz qw."""
-    cells = line.columns(8)
-    names = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
-    values = [
-        line.decimal(name, text, -_MAX_POSITION_M, _MAX_POSITION_M) for name, text in zip(names, cells[1:], strict=True)
-    ]
-    norm = math.hypot(*values[3:])
-    if abs(norm - 1) > _NORM_TOLERANCE:
-        raise line.error(f"{norm:.6g}", "must be 1 within 1 %", "norm of the quaternion")
-    return cells[0], values
-
-
-def _motion_row(line: Line, previous: list[float] | None) -> tuple[str, list[float]]:
+def _motion_row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
     """Time, then the coordinate, which must not decrease."""
     time, text = line.columns(2, ",")
-    value = line.decimal("motion", text, 0, _MAX_COORDINATE)
+    value = line.decimal("motion", text, 0, MAX_COORDINATE)
     if previous is not None and value < previous[0]:
         raise line.error(text, f"must not be below the line above ({previous[0]!r})", "motion")
-    return time, [value]
-
-
-def _read_columns(path: StrPath, read_row: _RowReader, skip: int = 0) -> tuple[Int64Array, Float64Array]:
-    """Times int64[n] in microseconds from 0, values float64[n, columns], of the lines after number `skip`.
-
-    Of lines with one and the same time (freiburg2_desk has some) the last counts.
-    """
-    times = array("q")
-    rows: list[list[float]] = []
-    with TextFile(path) as file:
-        for line in file.lines():
-            if line.number <= skip or line.text.startswith("#"):
-                continue
-            text, row = read_row(line, rows[-1] if rows else None)
-            time_us = round(line.decimal("time in s", text, 0, _MAX_EPOCH_S) * US_PER_S)
-            if times and time_us < times[-1]:
-                rule = f"must not be before the line above ({times[-1] / US_PER_S:.6f})"
-                raise line.error(text, rule, "time in s")
-            if times and time_us - times[0] > MAX_DURATION_S * US_PER_S:
-                raise line.error(text, f"must be at most {MAX_DURATION_S} s after the first", "time in s")
-            if times and time_us == times[-1]:
-                rows[-1] = row
-                continue
-            times.append(time_us)
-            rows.append(row)
-    if len(times) < 2:
-        raise TraceError(where(path, None, None, f"holds {len(times)} samples: must hold at least 2"))
-    time_array = np.asarray(times, np.int64)
-    return time_array - time_array[0], np.array(rows, np.float64)
+    return time, seconds(line, time), [value]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from bufgym import files
 from bufgym.errors import TraceError, where
+from bufgym.traces.archives import split_member
 from bufgym.traces.files import StrPath
 from bufgym.traces.motion import Motion, read_motion
 from bufgym.traces.readers import read_trace
@@ -22,13 +23,15 @@ def shipped() -> dict[str, Path]:
     return files.shipped("traces", "traces", "*.csv")
 
 
-def load(name_or_path: StrPath, format: str | None = None, after: After = "loop") -> Trace:
-    """A bandwidth trace by its shipped name or from a file; a shipped name goes first.
+def load(
+    name_or_path: StrPath, format: str | None = None, after: After = "loop", *, column: str | None = None
+) -> Trace:
+    """A bandwidth trace by its shipped name or from a file (see `read_trace`); a shipped name goes first.
 
     Raises:
         TraceError: neither a shipped name nor a file (the message lists the names), or a broken file.
     """
-    return read_trace(_resolve(name_or_path), format, after)
+    return read_trace(_resolve(name_or_path), format, after, column=column)
 
 
 def load_motion(name_or_path: StrPath) -> Motion:
@@ -44,7 +47,7 @@ def _resolve(name_or_path: StrPath) -> StrPath:
     known = shipped()
     if isinstance(name_or_path, str) and name_or_path in known:
         return known[name_or_path]
-    if not Path(name_or_path).exists():
+    if not split_member(name_or_path)[0].exists():
         names = ", ".join(known) or "none found"
         raise TraceError(where(name_or_path, None, None, f"no such file, and no shipped trace (known: {names})"))
     return name_or_path

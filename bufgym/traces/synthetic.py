@@ -177,13 +177,47 @@ TURN_DEG_PER_S: Final = (30.0, 60.0)
 TURN_S: Final = (1.0, 4.0)
 STOP_S: Final = (2.0, 8.0)
 # What follows a stretch of driving: a turn in place, a stop, or (otherwise) driving on at another speed.
-_TURN_CHANCE: Final = 0.55
-_STOP_CHANCE: Final = 0.25
+TURN_CHANCE: Final = 0.55
+STOP_CHANCE: Final = 0.25
+
+Limits = tuple[float, float]
 
 _MOTION_STEP_US: Final = 100_000
 
 
-def drive_motion(seed: int, duration_s: float = 300.0) -> Motion:
+@dataclass(frozen=True)
+class Driving:
+    """How a robot drives, by default a small delivery or survey robot; a range is (least, greatest).
+
+    Raises:
+        BufgymError: a range that is not in order within its limits, chances that are not or sum to over 1.
+    """
+
+    cruise_m_per_s: Limits = CRUISE_M_PER_S
+    cruise_turn_deg_per_s: Limits = CRUISE_TURN_DEG_PER_S
+    cruise_s: Limits = CRUISE_S
+    turn_deg_per_s: Limits = TURN_DEG_PER_S
+    turn_s: Limits = TURN_S
+    stop_s: Limits = STOP_S
+    turn_chance: float = TURN_CHANCE
+    stop_chance: float = STOP_CHANCE
+
+    def __post_init__(self) -> None:
+        for name, most in (("cruise_m_per_s", 100.0), ("cruise_turn_deg_per_s", 1e4), ("turn_deg_per_s", 1e4)):
+            self._check(name, 0.0, most)
+        for name in ("cruise_s", "turn_s", "stop_s"):
+            self._check(name, _MOTION_STEP_US / US_PER_S, 1e6)
+        if not (0 <= self.turn_chance <= 1 and 0 <= self.stop_chance <= 1 - self.turn_chance):
+            chances = f"turn_chance = {self.turn_chance}, stop_chance = {self.stop_chance}"
+            raise BufgymError(f"{chances}: must be >= 0 and at most 1 together")
+
+    def _check(self, name: str, least: float, most: float) -> None:
+        low, high = getattr(self, name)
+        if not least <= low <= high <= most:
+            raise BufgymError(f"{name} = ({low}, {high}): must be in order and from {least:g} to {most:g}")
+
+
+def drive_motion(seed: int, duration_s: float = 300.0, driving: Driving | None = None) -> Motion:
     """Motion of a robot that cruises, turns in place and stops, 10 samples a second.
 
     The coordinate is that of `motion.py` with its field of view of 60 degrees and scene scale of 2 m:
@@ -193,45 +227,48 @@ def drive_motion(seed: int, duration_s: float = 300.0) -> Motion:
     Args:
         seed: >= 0.
         duration_s: rounded to whole tenths; 0.1 to 10**6.
+        driving: by default `Driving()`.
 
     Raises:
         BufgymError: an argument out of its range.
     """
+    how = Driving() if driving is None else driving
     if not 0.1 <= duration_s <= 1e6:
         raise BufgymError(f"duration_s = {duration_s}: must be from 0.1 to 1e6")
     random = _random(seed)
     count = round(duration_s * US_PER_S / _MOTION_STEP_US)
     step_s = _MOTION_STEP_US / US_PER_S
     steps: list[int] = []
-    act: Callable[[np.random.Generator], tuple[float, float, float]] = _cruise
+    act: Callable[[np.random.Generator, Driving], tuple[float, float, float]] = _cruise
     while len(steps) < count:
-        speed_m_per_s, turn_deg_per_s, lasts_s = act(random)
+        speed_m_per_s, turn_deg_per_s, lasts_s = act(random, how)
         per_s = speed_m_per_s / DEFAULT_SCENE_SCALE_M + turn_deg_per_s / DEFAULT_FOV_DEG
         steps += [round(per_s * step_s * 1e6)] * max(1, round(lasts_s / step_s))
         next_act = float(random.random())
-        if act is not _cruise or next_act >= _TURN_CHANCE + _STOP_CHANCE:
+        if act is not _cruise or next_act >= how.turn_chance + how.stop_chance:
             act = _cruise
         else:
-            act = _turn if next_act < _TURN_CHANCE else _stop
+            act = _turn if next_act < how.turn_chance else _stop
     millionths = np.append(0, np.cumsum(steps[:count]))
     time_us = np.arange(count + 1, dtype=np.int64) * _MOTION_STEP_US
     return Motion(f"drive-{seed}", time_us, millionths / 1e6, f"drive_motion(seed={seed}, {duration_s:g} s)")
 
 
-def _cruise(random: np.random.Generator) -> tuple[float, float, float]:
+def _cruise(random: np.random.Generator, how: Driving) -> tuple[float, float, float]:
     """Speed in m/s, turn rate in degrees/s, length in s."""
-    return _evenly(random, CRUISE_M_PER_S), _evenly(random, CRUISE_TURN_DEG_PER_S), _evenly(random, CRUISE_S)
+    speed, turn = _evenly(random, how.cruise_m_per_s), _evenly(random, how.cruise_turn_deg_per_s)
+    return speed, turn, _evenly(random, how.cruise_s)
 
 
-def _turn(random: np.random.Generator) -> tuple[float, float, float]:
-    return 0.0, _evenly(random, TURN_DEG_PER_S), _evenly(random, TURN_S)
+def _turn(random: np.random.Generator, how: Driving) -> tuple[float, float, float]:
+    return 0.0, _evenly(random, how.turn_deg_per_s), _evenly(random, how.turn_s)
 
 
-def _stop(random: np.random.Generator) -> tuple[float, float, float]:
-    return 0.0, 0.0, _evenly(random, STOP_S)
+def _stop(random: np.random.Generator, how: Driving) -> tuple[float, float, float]:
+    return 0.0, 0.0, _evenly(random, how.stop_s)
 
 
-def _evenly(random: np.random.Generator, limits: tuple[float, float]) -> float:
+def _evenly(random: np.random.Generator, limits: Limits) -> float:
     return limits[0] + (limits[1] - limits[0]) * float(random.random())
 
 

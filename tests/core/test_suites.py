@@ -23,6 +23,7 @@ PINNED = {
     "lte-v1": "1dffd441e1f65364",
     "outage-v1": "72a3f5dd0a7c1cfc",
     "sustained-v1": "48007a14e04b0270",
+    "generated-v1": "bfa3d1381410f166",
 }
 """SHA-256 of all episodes of the test split. A suite is frozen: whoever wants another makes the next version."""
 
@@ -100,6 +101,16 @@ def test_paper_numbers_and_capacities() -> None:
     for trace in steady.traces:
         share = trace.cumulative_bytes[-1] / (trace.duration_us / 1e6) / (30 * 230_000)
         assert share == pytest.approx(0.5, rel=0.061)
+
+
+def test_generated_links_are_of_all_ways_of_moving() -> None:
+    for split, times in (("train", 4), ("validation", 1), ("test", 2)):
+        built = scenarios("generated-v1", split)
+        assert list(built) == ["time-230kB", "motion-230kB", "time-900kB", "motion-900kB"]
+        for scenario in built.values():
+            assert isinstance(scenario, Uplink) and all(trace.duration_us == 300_000_000 for trace in scenario.traces)
+            modes = [trace.name.rpartition("-")[0] for trace in scenario.traces]
+            assert modes == ["foot", "bicycle", "bus", "tram", "train", "car"] * times
 
 
 def test_interruption_lengths_are_dealt_out_by_their_remainder() -> None:

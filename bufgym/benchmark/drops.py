@@ -1,0 +1,112 @@
+"""What would this policy have dropped of my recording? Each dropped message of each run, one by one and by topic."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bufgym.benchmark.run import cells, draw, met
+from bufgym.benchmark.table import aligned
+from bufgym.errors import BufgymError
+from bufgym.files import replaced
+from bufgym.policies import Policy
+from bufgym.scenario import Uplink
+from bufgym.sender import NEVER
+
+# More topics than this make no readable table; the CSV file has them all.
+_SHOWN_TOPICS = 6
+
+
+class Drop(NamedTuple):
+    """One dropped message; the fields are the columns of the CSV file. Times are s since the recording's first message.
+
+    ``bytes`` as recorded; ``dropped_s`` is the arrival time where it was rejected, later where it was evicted.
+    """
+
+    policy: str
+    capacity: int
+    trace: str
+    seed: int
+    message: int
+    time_s: float
+    topic: str
+    bytes: int
+    x: float
+    dropped_s: float
+
+
+def drops(
+    policies: Sequence[Policy],
+    scenario: Uplink,
+    capacities: Sequence[int],
+    seeds: int,
+    *,
+    max_bytes: int | None = None,
+    decide_at: str = "arrival",
+) -> Iterator[Drop]:
+    """Every message that each policy drops in the runs that ``run.run`` makes of the same arguments, in time order.
+
+    Raises:
+        BufgymError: the scenario plays no recording.
+    """
+    workload = scenario.workload
+    if workload is None:
+        raise BufgymError("drops: the scenario must play a recording (workload=...)")
+    for trace, cell in cells(scenario):
+        for seed in range(seeds):
+            episode = draw(cell, seed)
+            arrivals = np.asarray(episode.arrivals)
+            for capacity in capacities:
+                for policy in policies:
+                    senders = met(policy, [episode], capacity, cell, [None], max_bytes, decide_at)
+                    dropped_us = np.asarray(senders.batch.fates[0])["dropped_us"][: len(arrivals)]
+                    for k in np.flatnonzero(dropped_us != NEVER).tolist():
+                        arrival = arrivals[k]
+                        yield Drop(
+                            policy.name,
+                            capacity,
+                            trace,
+                            seed,
+                            k,
+                            int(arrival["arrival_us"]) / 1e6,
+                            workload.topic_of(k),
+                            int(arrival["size_bytes"]),
+                            float(arrival["x"]),
+                            int(dropped_us[k]) / 1e6,
+                        )
+
+
+def write_drops(found: Iterable[Drop], path: Path | None) -> Counter[tuple[str, int, str]]:
+    """Write them as CSV (nowhere for None), one at a time; how many there were by (policy, capacity, topic)."""
+    counts: Counter[tuple[str, int, str]] = Counter()
+
+    def counted() -> Iterator[Drop]:
+        for drop in found:
+            counts[drop.policy, drop.capacity, drop.topic] += 1
+            yield drop
+
+    if path is None:
+        deque(counted(), maxlen=0)
+        return counts
+    with replaced(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(Drop._fields)
+        writer.writerows(counted())
+    return counts
+
+
+def by_topic(counts: Counter[tuple[str, int, str]], scenario: Uplink, policies: Sequence[str], runs: int) -> str:
+    """A table: the share of each topic's messages that each policy dropped, over ``runs`` episodes a capacity."""
+    assert scenario.workload is not None
+    summary = sorted(scenario.workload.summary(), key=lambda line: (-line.messages, line.topic))[:_SHOWN_TOPICS]
+    lines = [["dropped of", "L", *(line.topic for line in summary)]]
+    for capacity in sorted({capacity for _, capacity, _ in counts}):
+        for policy in policies:
+            shares = [counts[policy, capacity, line.topic] / (runs * line.messages) for line in summary]
+            lines.append([policy, str(capacity), *(f"{share:.1%}" for share in shares)])
+    return "\n".join(aligned(lines))

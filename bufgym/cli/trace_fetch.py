@@ -1,0 +1,150 @@
+"""`bufgym trace fetch`: a public data set into the cache folder."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from bufgym.cli.options import Commands, columns, command
+from bufgym.errors import BufgymError
+
+if TYPE_CHECKING:
+    from bufgym.traces.datasets import Dataset
+    from bufgym.traces.fetch import Fetched
+
+NOT_KNOWN = "not known"
+
+
+def add(commands: Commands) -> None:
+    fetch = command(commands, "fetch", _fetch, "download a public data set of traces, trajectories or recordings")
+    fetch.add_argument("name", nargs="?", metavar="NAME", help="a data set; --list names them")
+    fetch.add_argument("--list", action="store_true", help="name the data sets, or all that is known of NAME")
+    fetch.add_argument("--to", metavar="DIR", help="the folder for data sets, instead of the cache folder")
+    fetch.add_argument(
+        "--from", dest="given", nargs="+", default=(), metavar="FILE", help="files fetched by hand: download nothing"
+    )
+
+
+def _fetch(options: argparse.Namespace) -> None:
+    from bufgym.traces.datasets import datasets
+    from bufgym.traces.fetch import fetch_dataset
+
+    known = datasets()
+    if options.name is None:
+        if not options.list:
+            raise BufgymError("trace fetch: needs the NAME of a data set (--list names them)")
+        print(_overview(list(known.values())))
+        return
+    if options.name not in known:
+        raise BufgymError(f"{options.name}: no such data set: must be one of {', '.join(known)}")
+    dataset = known[options.name]
+    if options.list:
+        print(f"{dataset.name}\n{columns(_about(dataset))}\n{_addresses(dataset)}".rstrip())
+        return
+    bars = _Bars()
+    try:
+        found = fetch_dataset(dataset, options.to, options.given, note=_note, watch=bars.watch)
+    finally:
+        bars.close()
+    print(f"{dataset.name}\n{columns([*_results(found), *_about(dataset)])}")
+
+
+# --- what there is to say ---------------------------------------------------------------------------------------------
+
+
+def _overview(known: list[Dataset]) -> str:
+    from bufgym.traces.fetch import cache_folder
+
+    lines = [("NAME", "FILES", "WITH SHA256", "LICENCE", "HOLDS")]
+    for dataset in known:
+        summed = sum(remote.sha256 is not None for remote in dataset.files)
+        count = str(len(dataset.files) or "by hand")
+        lines.append((dataset.name, count, str(summed), dataset.licence or NOT_KNOWN, dataset.holds))
+    sums = "each sha256 was computed from a copy of the published file; no publisher states one"
+    return f"{columns(lines)}\n\n  {sums}\n  kept in {cache_folder()}"
+
+
+def _about(dataset: Dataset) -> list[tuple[str, str]]:
+    return [
+        ("what", dataset.title),
+        ("holds", dataset.holds),
+        ("format", dataset.format),
+        ("page", dataset.page),
+        ("licence", dataset.licence or NOT_KNOWN),
+        ("please cite", dataset.citation),
+    ]
+
+
+def _addresses(dataset: Dataset) -> str:
+    if not dataset.files:
+        return columns([("address", f"{NOT_KNOWN}: fetch by hand from the page, then --from FILE")])
+    return columns([("file", remote.address, f"sha256 {remote.sha256 or NOT_KNOWN}") for remote in dataset.files])
+
+
+def _results(found: list[Fetched]) -> list[tuple[str, str]]:
+    how = ", ".join(
+        f"{count} {origin}"
+        for origin in ("downloaded", "there already", "given")
+        if (count := sum(each.origin == origin for each in found))
+    )
+    right = sum(each.known for each in found)
+    lines = [("files", how), ("sha256", f"{right} of {len(found)} checked against the known sum")]
+    lines += [("sha256 found", f"{each.sha256}  {each.path.name} (none known)") for each in found if not each.known]
+    first = found[0].path
+    lines.append(("at", str(first if len(found) == 1 else first.parent)))
+    return lines + [("unpacked", str(each.unpacked)) for each in found if each.unpacked is not None]
+
+
+# --- progress ---------------------------------------------------------------------------------------------------------
+
+
+def _note(sentence: str) -> None:
+    print(sentence, file=sys.stderr)
+
+
+class _Bars:
+    """A bar a file where a person looks on and tqdm is there; else a line every 10 seconds and at the end."""
+
+    EVERY_S = 10.0
+
+    def __init__(self) -> None:
+        self._bar: Any = None
+
+    def watch(self, name: str) -> Callable[[int, int | None], None]:
+        self.close()
+        return self._line(name) if not sys.stderr.isatty() else self._tqdm(name)
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    def _tqdm(self, name: str) -> Callable[[int, int | None], None]:
+        try:
+            from tqdm import tqdm
+        except ImportError:
+            return self._line(name)
+        bar = self._bar = tqdm(desc=name, unit="B", unit_scale=True, unit_divisor=1000, leave=False)
+
+        def moved(count: int, total: int | None) -> None:
+            bar.total = total
+            bar.update(count - bar.n)
+            if count == total:
+                bar.refresh()
+
+        return moved
+
+    def _line(self, name: str) -> Callable[[int, int | None], None]:
+        last = time.monotonic()
+
+        def moved(count: int, total: int | None) -> None:
+            nonlocal last
+            now = time.monotonic()
+            if count == total or now - last >= self.EVERY_S:
+                last = now
+                _note(f"{name}: {count:,} bytes" + (f" of {total:,}" if total is not None else ""))
+
+        return moved

@@ -1,0 +1,48 @@
+"""What every generator draws from: uniform doubles of PCG64, and sums of twelve of them for a normal law.
+
+As in `synthetic.py`, so that a seed gives the same bytes on every machine: sums are taken in a stated order,
+products and square roots are exact to the last bit by IEEE 754, and results are rounded to whole bytes. Where
+a logarithm or a power is needed, its last bit may differ between C libraries; the rounding takes that away.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from bufgym.errors import BufgymError
+from bufgym.traces.synthetic import _random as stream
+from bufgym.traces.trace import Float64Array
+
+__all__ = ["NORMAL_UNIFORMS", "checked", "nearly_normal", "second_stream", "stream"]
+
+# Uniforms that make one nearly normal number: the variance of twelve is 1.
+NORMAL_UNIFORMS: Final = 12
+
+
+def second_stream(seed: int) -> np.random.Generator:
+    """A stream that never meets `stream(seed)`: the same generator, 2**127 draws ahead."""
+    stream(seed)  # checks the seed
+    return np.random.Generator(np.random.PCG64(seed).jumped())
+
+
+def nearly_normal(uniforms: Float64Array) -> Float64Array:
+    """float64[n, 12] of uniforms to float64[n] of mean 0 and standard deviation 1, within -6..6."""
+    total = uniforms[:, 0].copy()
+    # Column by column: `sum` may add in another order on another processor.
+    for k in range(1, NORMAL_UNIFORMS):
+        total += uniforms[:, k]
+    return total - 6.0
+
+
+def checked(name: str, value: float, least: float, most: float) -> float:
+    """`value` if it is a number from `least` to `most`.
+
+    Raises:
+        BufgymError: it is not, or not finite.
+    """
+    if not (math.isfinite(value) and least <= value <= most):
+        raise BufgymError(f"{name} = {value}: must be a number from {least:g} to {most:g}")
+    return value

@@ -1,0 +1,191 @@
+"""Readers of what measuring tools wrote: UCC's 4G and 5G CSV (G-NetTrack Pro), NYU-METS (iPerf), Sabre's JSON.
+
+Sources: D. Raca et al., "Beyond Throughput, The Next Generation: a 5G Dataset with Channel and Context Metrics",
+MMSys 2020; L. Mei et al., "Realtime Mobile Bandwidth Prediction using LSTM Neural Networks", PAM 2019;
+K. Spiteri et al., "From Theory to Practice: Improving Bitrate Adaptation in the DASH Reference Player", MMSys 2018.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from datetime import datetime
+from typing import Final, NoReturn
+
+from bufgym.errors import TraceError, where
+from bufgym.traces.files import Line, StrPath, TextFile, is_number
+from bufgym.traces.readers_intervals import Intervals, Knots
+from bufgym.traces.readers_text import MAX_MBIT_PER_S
+from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
+
+UCC_COLUMNS: Final = ("DL_bitrate", "UL_bitrate")
+
+# Samples of "about 1 s" with whole-second stamps: two may share one, the next be some s later.
+MIN_UCC_STEP_S: Final = -2
+MAX_UCC_STEP_S: Final = 5
+
+_MAX_KBIT_PER_S: Final = MAX_MBIT_PER_S * 1000
+_UCC_TIME: Final = "Timestamp"
+_UCC_TIME_FORMAT: Final = "%Y.%m.%d_%H.%M.%S"
+_NYU_BITS: Final = {"bits/sec": 1, "Kbits/sec": 10**3, "Mbits/sec": 10**6, "Gbits/sec": 10**9}
+_SABRE_FIELDS: Final = {"duration_ms": MAX_DURATION_S * 1000, "bandwidth_kbps": _MAX_KBIT_PER_S}
+_SHOWN_CHARACTERS: Final = 40
+_JSON_SPACE: Final = re.compile(r"[ \t\n\r]*")
+
+
+def fits_ucc(text: str) -> bool:
+    """A header with a time and both bitrates among its columns."""
+    return {_UCC_TIME, *UCC_COLUMNS} <= {cell.strip() for cell in text.split(",")}
+
+
+def read_ucc(path: StrPath, column: str = "DL_bitrate") -> Knots:
+    """Each line counts for 1 s at its rate in kbit/s, as in the data set's own figures.
+
+    Its stamps have whole seconds only, two lines often share one, and on their clock a recording lasts up to a tenth
+    longer than it has lines. The note says how long. A stamp more than 2 s before or 5 s after the one above is a gap,
+    and refused.
+    """
+    intervals = Intervals()
+    with TextFile(path) as file:
+        lines = file.lines()
+        header = next(lines, None)
+        columns = ", ".join((_UCC_TIME, *UCC_COLUMNS))
+        if header is None or not fits_ucc(header.text):
+            raise TraceError(
+                where(path, header and header.number, None, f"must begin with a header that names {columns}")
+            )
+        names = [cell.strip() for cell in header.text.split(",")]
+        time_at, rate_at = names.index(_UCC_TIME), names.index(column)
+        first = previous = None
+        for line in lines:
+            cells = line.columns(len(names), ",")
+            time = _stamp(line, cells[time_at])
+            if previous is not None:
+                step_s = (time - previous).total_seconds()
+                if not MIN_UCC_STEP_S <= step_s <= MAX_UCC_STEP_S:
+                    rule = f"must be from {MIN_UCC_STEP_S} to {MAX_UCC_STEP_S} s after the line above"
+                    raise line.error(cells[time_at], rule, _UCC_TIME)
+            first, previous = first or time, time
+            kbit_per_s = line.decimal(column, cells[rate_at], 0, _MAX_KBIT_PER_S)
+            intervals.add(line, US_PER_S, round(kbit_per_s * 125))
+    clock_s = 0 if first is None or previous is None else (previous - first).total_seconds()
+    return intervals.knots(path, f"column {column}, 1 s a line, {clock_s:g} s by its clock")
+
+
+def _stamp(line: Line, text: str) -> datetime:
+    try:
+        return datetime.strptime(text, _UCC_TIME_FORMAT)
+    except ValueError:
+        raise line.error(text, "must be a time as 2019.12.16_13.40.04", _UCC_TIME) from None
+
+
+def fits_nyu(text: str) -> bool:
+    """A number and a unit of iPerf."""
+    cells = [cell.strip() for cell in text.split(",")]
+    return len(cells) == 2 and is_number(cells[0]) and cells[1] in _NYU_BITS
+
+
+def read_nyu(path: StrPath) -> Knots:
+    """Each line is the rate of 1 s, its unit beside it; bytes are rounded to whole ones."""
+    intervals = Intervals()
+    with TextFile(path) as file:
+        for line in file.lines():
+            value, unit = line.columns(2, ",")
+            if unit not in _NYU_BITS:
+                raise line.error(unit, f"must be one of {', '.join(_NYU_BITS)}", "unit")
+            most = MAX_MBIT_PER_S * 10**6 / _NYU_BITS[unit]
+            intervals.add(line, US_PER_S, round(line.decimal(unit, value, 0, most) * _NYU_BITS[unit] / 8))
+    return intervals.knots(path)
+
+
+def fits_sabre(text: str) -> bool:
+    """The opening of a list."""
+    return text.startswith("[")
+
+
+def read_sabre(path: StrPath) -> Knots:
+    """A JSON list of objects with `duration_ms` and `bandwidth_kbps` (1000 bit/s); what else they hold is left aside.
+
+    Sample by sample, so that an error names its line and no more than one is held as objects.
+    """
+    with TextFile(path) as file:
+        text = file.text()
+    intervals = Intervals()
+    for line, sample in _items(path, text):
+        _add_sample(intervals, line, sample)
+    return intervals.knots(path)
+
+
+def _items(path: StrPath, text: str) -> Iterator[tuple[Line, object]]:
+    """What the list holds, one after the other, each with the line where it begins."""
+    decoder = json.JSONDecoder(parse_constant=_no_constant)
+    place = _after(path, text, 0, "[")
+    number, counted = 1, 0
+    more = text[place : place + 1] != "]"
+    while more:
+        number, counted = number + text.count("\n", counted, place), place
+        try:
+            item, end = decoder.raw_decode(text, place)
+        except (ValueError, RecursionError) as error:
+            raise _json_error(path, text, number, error) from error
+        yield Line(path, number, text[place : min(end, place + _SHOWN_CHARACTERS)]), item
+        place = _space(text, end)
+        more = text[place : place + 1] != "]"
+        if more:
+            place = _after(path, text, place, ",")
+    end = _after(path, text, place, "]")
+    if end < len(text):
+        raise _text_error(path, text, end, "must be nothing after the list")
+
+
+def _add_sample(intervals: Intervals, line: Line, sample: object) -> None:
+    if not isinstance(sample, dict):
+        raise line.error(line.text, "must be an object with duration_ms and bandwidth_kbps")
+    values: list[float] = []
+    for field, most in _SABRE_FIELDS.items():
+        if field not in sample:
+            raise line.error(line.text, f"must hold {field}")
+        value = sample[field]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise line.error(line.text, f"{field} must be a number")
+        if not 0 <= value <= most:
+            raise line.error(value, f"must be from 0 to {most:g}", field)
+        values.append(value)
+    length_us = round(values[0] * 1000)
+    if length_us == 0:
+        raise line.error(values[0], "must be above 0", "duration_ms")
+    # kbit/s times microseconds is thousandths of a bit.
+    intervals.add(line, length_us, round(values[1] * length_us / 8000))
+
+
+def _space(text: str, place: int) -> int:
+    """Where the white space at `place` ends."""
+    found = _JSON_SPACE.match(text, place)
+    return place if found is None else found.end()
+
+
+def _after(path: StrPath, text: str, place: int, mark: str) -> int:
+    """Where what follows the mark begins; the mark must come next."""
+    place = _space(text, place)
+    if text[place : place + 1] != mark:
+        raise _text_error(path, text, place, f"must be {mark!r}, for a list of objects")
+    return _space(text, place + 1)
+
+
+def _text_error(path: StrPath, text: str, place: int, rule: str) -> TraceError:
+    shown = text[place : place + _SHOWN_CHARACTERS] or None
+    return TraceError(where(path, 1 + text.count("\n", 0, place), shown, rule))
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a finite number")
+
+
+def _json_error(path: StrPath, text: str, number: int, error: Exception) -> TraceError:
+    if isinstance(error, json.JSONDecodeError):
+        return TraceError(
+            where(path, error.lineno, text[error.pos : error.pos + _SHOWN_CHARACTERS], f"must be JSON ({error.msg})")
+        )
+    told = "nested too deep" if isinstance(error, RecursionError) else str(error).partition(";")[0]
+    return TraceError(where(path, number, None, f"must be JSON ({told})"))

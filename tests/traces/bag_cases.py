@@ -1,0 +1,114 @@
+"""Small recordings written with the libraries that robots' recorders use."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+
+START_NS = 1_700_000_000_000_000_000
+MS = 1_000_000
+
+Entry = tuple[int, str, str, bytes]
+"""Time in ms from START_NS, topic, type, serialised message."""
+
+
+def odometry(x_m: float, yaw_deg: float, store: Any = ROS2, scale: float = 1.0) -> bytes:
+    """nav_msgs/Odometry at (x, 0, 0), turned about z; ``scale``: length of the quaternion."""
+    t = store.types
+    half = math.radians(yaw_deg) / 2
+    stamp = t["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    seq = {"seq": 0} if store is ROS1 else {}
+    vector = t["geometry_msgs/msg/Vector3"]
+    pose = t["geometry_msgs/msg/Pose"](
+        position=t["geometry_msgs/msg/Point"](x=x_m, y=0.0, z=0.0),
+        orientation=t["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=scale * math.sin(half), w=scale * math.cos(half)),
+    )
+    twist = t["geometry_msgs/msg/Twist"](linear=vector(x=0.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
+    message = t["nav_msgs/msg/Odometry"](
+        header=t["std_msgs/msg/Header"](stamp=stamp, frame_id="odom", **seq),
+        child_frame_id="base",
+        pose=t["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+        twist=t["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+    )
+    if store is ROS1:
+        return bytes(store.serialize_ros1(message, "nav_msgs/msg/Odometry"))
+    return bytes(store.serialize_cdr(message, "nav_msgs/msg/Odometry"))
+
+
+def text(content: str, store: Any = ROS2) -> bytes:
+    message = store.types["std_msgs/msg/String"](data=content)
+    if store is ROS1:
+        return bytes(store.serialize_ros1(message, "std_msgs/msg/String"))
+    return bytes(store.serialize_cdr(message, "std_msgs/msg/String"))
+
+
+def drive(store: Any = ROS2) -> list[Entry]:
+    """1 m forward in the first second, then a turn of 90 degrees in the next; a picture every 500 ms."""
+    entries = [
+        (0, "/odom", "nav_msgs/msg/Odometry", odometry(0, 0, store)),
+        (1000, "/odom", "nav_msgs/msg/Odometry", odometry(1, 0, store)),
+        (2000, "/odom", "nav_msgs/msg/Odometry", odometry(1, 90, store)),
+    ]
+    for k in range(5):
+        entries.append((500 * k, "/camera/left", "std_msgs/msg/String", text("x" * (100 * k + 100), store)))
+    entries.append((700, "/status", "std_msgs/msg/String", text("ok", store)))
+    return entries
+
+
+def write_mcap(
+    path: Path, entries: list[Entry], compression: CompressionType = CompressionType.ZSTD, encoding: str = "cdr"
+) -> Path:
+    """An MCAP file with the entries in the order given."""
+    with path.open("wb") as file:
+        writer = McapWriter(file, compression=compression, chunk_size=2048)
+        writer.start(profile="ros2" if encoding == "cdr" else "ros1")
+        channels: dict[str, int] = {}
+        for ms, topic, type, data in entries:
+            if topic not in channels:
+                schema = writer.register_schema(type, "ros2msg", b"")
+                channels[topic] = writer.register_channel(topic, encoding, schema)
+            time_ns = START_NS + ms * MS
+            writer.add_message(channels[topic], log_time=time_ns, publish_time=time_ns, data=data)
+        writer.finish()
+    return path
+
+
+def write_rosbag2(
+    path: Path, entries: list[Entry], storage: StoragePlugin, compression: CompressionMode = CompressionMode.NONE
+) -> Path:
+    """A rosbag2 folder."""
+    writer = Writer2(path, version=8, storage_plugin=storage)
+    if compression != CompressionMode.NONE:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
+        connections = {
+            t: writer.add_connection(t, type, typestore=ROS2) for t, type in {e[1]: e[2] for e in entries}.items()
+        }
+        for ms, topic, _, data in sorted(entries):
+            writer.write(connections[topic], START_NS + ms * MS, data)
+    return path
+
+
+def write_ros1(path: Path, entries: list[Entry], compression: Any = None) -> Path:
+    """A ROS 1 bag."""
+    writer = Writer1(path)
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        connections = {
+            t: writer.add_connection(t, type, typestore=ROS1) for t, type in {e[1]: e[2] for e in entries}.items()
+        }
+        for ms, topic, _, data in sorted(entries):
+            writer.write(connections[topic], START_NS + ms * MS, data)
+    return path

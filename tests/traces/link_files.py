@@ -1,0 +1,32 @@
+"""What the tests of link files share: a file of each format, and small helpers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bufgym.traces import Trace
+
+UCC_HEADER = "Timestamp,Speed,DL_bitrate,UL_bitrate,State\n"
+HEADER = "t_ms,bytes,interval_ms\n"
+
+
+def written(folder: Path, text: str | bytes, name: str = "lte.csv") -> Path:
+    path = folder / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+def knots(trace: Trace) -> list[tuple[int, int]]:
+    return list(zip(trace.time_us.tolist(), trace.cumulative_bytes.tolist(), strict=True))
+
+
+SAMPLES = {
+    "mahimahi": "0\n2\n2\n3\n10\n",
+    "csv": HEADER + "840,1000,840\n1840.5,5000,1000.5\n",
+    "mbit": "10 8\n11\t16\n13 0\n14 4\n",
+    "belgium": "1453112088291 710 51.04 3.72 994124 710\n1453112089290 1709 51.04 3.72 3324168 999\n",
+    "rates": "time_s,bytes_per_s\n10,1000\n12,0\n12.5,4\n",
+    "ucc": UCC_HEADER + "2019.12.16_13.40.04,0,72,20,D\n2019.12.16_13.40.05,0,0,8,I\n",
+    "nyu": "0.5,Mbits/sec\n0,bits/sec\n43.3,Kbits/sec\n",
+    "sabre": '[\n{"duration_ms": 725, "bandwidth_kbps": 36014},\n{"duration_ms": 1000, "bandwidth_kbps": 16}\n]\n',
+}

@@ -1,0 +1,224 @@
+"""The fit finds what the generator was told, and the comparison tells a link from one that is not it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bufgym.cli import trace_fit
+from bufgym.cli.options import Parser
+from bufgym.errors import BufgymError
+from bufgym.traces import Trace, write_csv
+from bufgym.traces.generate import LinkParameters, OutageParameters, fitted_links, markov_link, read_links
+from bufgym.traces.generate.compare import compare, held_out, ks_distance
+from bufgym.traces.generate.fit import autocorrelation, fit_links, mode_of, rates_of, spells
+from bufgym.traces.generate.markov import link_rates
+from bufgym.traces.trace import Float64Array
+
+KNOWN = LinkParameters(
+    recordings=20,
+    seconds=12_000,
+    quantiles_bytes_per_s=(0.6e6, 1e6, 2e6, 2.5e6, 3.2e6, 4e6, 5e6, 6e6, 6.5e6, 7.5e6, 9e6),
+    place_share=0.0,
+    level_share=0.7,
+    level_stay_s=28.0,
+    fast_memory=0.3,
+    outages=OutageParameters(100, 0.5, 5.0, 120.0, 0.5, 3.0, 4.0, (0.0, 0.0, 1e5, 3e5, 4.9e5)),
+)
+
+
+def recordings(link: LinkParameters = KNOWN, first_seed: int = 0) -> list[Float64Array]:
+    return [link_rates(link, first_seed + seed, link.seconds // link.recordings) for seed in range(link.recordings)]
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits that try each memory on some thousand seconds only."""
+    monkeypatch.setattr("bufgym.traces.generate.fit._TRIAL_S", 2_000)
+
+
+def rows_of(values: list[float]) -> list[Float64Array]:
+    return [np.array(values)]
+
+
+def test_the_fit_finds_what_the_generator_was_told() -> None:
+    found = fit_links({"known": recordings()})["known"]
+    assert (found.recordings, found.seconds) == (20, 12_000)
+    # Quantiles within a tenth; those of 5 and 95 % and beyond within a fifth, but for that of 1 %, which few of some
+    # 400 levels reach.
+    wrong = np.abs(np.array(found.quantiles_bytes_per_s) / np.array(KNOWN.quantiles_bytes_per_s) - 1)
+    assert wrong[3:-3].max() < 0.1
+    assert np.delete(wrong, 1).max() < 0.2
+    assert 0.55 <= found.place_share + found.level_share <= 0.85
+    assert 14 <= found.level_stay_s <= 56
+    assert found.fast_memory <= 0.6
+    outages = found.outages
+    assert outages is not None
+    assert outages.spells > 100
+    assert 0.3 <= outages.short_gap_share <= 0.7
+    assert 3 <= outages.short_gap_s <= 9
+    assert 0.4 <= outages.shoulder <= 0.6
+    assert 80 <= outages.long_gap_s <= 180
+    # P(over 3 s) = (1 + 3 / 4)**-3 = 0.19
+    assert abs((1 + 3 / outages.length_scale_s) ** -outages.length_tail - 0.19) < 0.06
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_same_recordings_give_the_same_parameters() -> None:
+    rows = recordings(replace(KNOWN, recordings=4, seconds=1200))
+    assert fit_links({"a": rows}) == fit_links({"a": rows})
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_mode_with_few_outages_borrows_from_the_others() -> None:
+    calm = [np.full(300, 2e6) for _ in range(3)]
+    calm[0][100:102] = 1e5
+    links = fit_links({"calm": calm, "known": recordings()})
+    lent, own = links["known"].outages, links["calm"].outages
+    assert lent is not None and own is not None
+    assert (own.spells, own.borrowed, lent.borrowed) == (1, True, False)
+    assert own.short_gap_share == 0
+    # One outage in 898 s outside of it.
+    assert own.long_gap_s == 898
+
+
+@pytest.mark.usefixtures("quick")
+def test_no_outages() -> None:
+    assert fit_links({"calm": [np.full(300, 2e6)]})["calm"].outages is None
+
+
+@pytest.mark.usefixtures("quick")
+def test_recordings_that_differ_have_a_place() -> None:
+    rows = [row / 2 + 4e6 * (k % 2) for k, row in enumerate(recordings(replace(KNOWN, outages=None)))]
+    assert fit_links({"two": rows})["two"].place_share >= 0.3
+
+
+def test_runs() -> None:
+    starts, ends = spells(np.array([True, False, True, True, False]))
+    assert (starts.tolist(), ends.tolist()) == ([0, 2], [1, 4])
+
+
+def test_autocorrelation_by_hand() -> None:
+    """1, -1, 1, -1 about 0: products at lag 1 are all -1, at lag 2 all 1, the variance is 1; no pair at lag 9."""
+    found, pairs = autocorrelation(rows_of([1.0, -1.0, 1.0, -1.0]), (1, 2, 9))
+    assert found.tolist() == [-1.0, 1.0, 0.0]
+    assert pairs.tolist() == [3, 2, 0]
+
+
+def test_ks_distance_by_hand() -> None:
+    """Of 1, 2 none is above 2; of 2, 3, 4, 5 three are: distance 3/4."""
+    assert ks_distance(np.array([1.0, 2.0]), np.array([2.0, 3.0, 4.0, 5.0])) == 0.75
+    assert ks_distance(np.array([1.0, 2.0]), np.array([1.0, 2.0])) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [
+        ("report_car_0002.csv", "car"),
+        ("logs/wifi_office_231114-151821.txt", "wifi-office"),
+        ("Tram.csv", "tram"),
+        ("report_bus_0001.csv.gz", "bus"),
+    ],
+)
+def test_modes_in_names(name: str, mode: str) -> None:
+    assert mode_of(name) == mode
+
+
+def test_what_the_fit_refuses() -> None:
+    for wrong, says in (
+        ({}, "no recordings"),
+        ({"slow": rows_of([1e5] * 100)}, "mode slow: 0 of 100 s have 500000 bytes/s or more: must be at least 60"),
+        ({"short": rows_of([1e6] * 59)}, "mode short: 59 of 59"),
+        ({"nan": rows_of([float("nan")] * 100)}, "mode nan: rates must be finite"),
+        ({"negative": rows_of([-1.0] * 100)}, "mode negative: rates must be finite and >= 0"),
+    ):
+        with pytest.raises(BufgymError, match=says):
+            fit_links(wrong)
+    with pytest.raises(BufgymError, match=r"0001.csv: its name does not say the mode: give --mode"):
+        mode_of("0001.csv")
+    with pytest.raises(BufgymError, match="low_bytes_per_s = 0"):
+        fit_links({"a": rows_of([1e6] * 100)}, 0)
+
+
+def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory() -> None:
+    small = replace(KNOWN, recordings=5, seconds=1500)
+    rows = recordings(small, first_seed=77)
+    own = {row.name: row.p for row in compare(small, rows, sets=59)}
+    assert sum(p < 0.05 for p in own.values()) <= 2
+    no_memory = replace(small, place_share=0.0, level_share=0.0, fast_memory=0.0, outages=None)
+    other = {row.name: row.p for row in compare(no_memory, rows, sets=59)}
+    for name in ("autocorrelation at 1 s", "autocorrelation at 5 s", "seconds under 500 KB/s, %", "outages an hour"):
+        assert other[name] < 0.05
+    twice = compare(small, [2 * row for row in rows], sets=59)
+    assert {row.name: row.p for row in twice}["KS distance"] < 0.05
+
+
+@pytest.mark.usefixtures("quick")
+def test_halves_of_a_single_recording_are_held_out() -> None:
+    found = held_out("one", [link_rates(KNOWN, 1, 600)], sets=19)
+    assert found.parts == 2
+    assert 0 < found.distance < 1
+
+
+# -------------------- the command
+
+
+def fit(*arguments: str) -> None:
+    parser = Parser(prog="bufgym trace")
+    trace_fit.add(parser.add_subparsers(required=True))
+    options = parser.parse_args(["fit", *arguments])
+    options.command(options)
+
+
+def write_recordings(folder: Path) -> list[str]:
+    files = []
+    for seed in range(3):
+        trace = markov_link("known", seed, 200, links={"known": KNOWN})
+        files.append(str(folder / f"report_known_{seed}.csv"))
+        write_csv(trace, files[-1])
+    return files
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_command_writes_parameters_and_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    files = write_recordings(tmp_path)
+    out, page = tmp_path / "links.json", tmp_path / "page.md"
+    fit(*files, "-o", str(out), "--page", str(page), "--sets", "9")
+    first = (out.read_bytes(), page.read_bytes(), (tmp_path / "figures" / "link-known.svg").read_bytes())
+    fit(*reversed(files), "-o", str(out), "--page", str(page), "--sets", "9")
+    assert first == (out.read_bytes(), page.read_bytes(), (tmp_path / "figures" / "link-known.svg").read_bytes())
+    assert read_links(out)["known"].seconds == 600
+    text = page.read_text()
+    assert "| autocorrelation at 30 s |" in text
+    assert "![known: recordings and generated links](figures/link-known.svg)" in text
+    assert str(tmp_path) not in text + out.read_text()
+    assert "3 recordings" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("quick")
+def test_one_mode_for_all(tmp_path: Path) -> None:
+    fit(*write_recordings(tmp_path), "--mode", "walk", "-o", str(tmp_path / "links.json"))
+    assert list(read_links(tmp_path / "links.json")) == ["walk"]
+
+
+def test_what_the_command_refuses(tmp_path: Path) -> None:
+    with pytest.raises(BufgymError, match=r"--page x.html: must end in .md"):
+        fit("a.csv", "-o", "b.json", "--page", "x.html")
+    write_csv(Trace.constant(1e6, 10), tmp_path / "short_1.csv")
+    with pytest.raises(BufgymError, match="mode short: 10 of 10 s"):
+        fit(str(tmp_path / "short_1.csv"), "-o", str(tmp_path / "b.json"))
+    assert not (tmp_path / "b.json").exists()
+
+
+@pytest.mark.slow
+def test_the_committed_parameters_are_the_fit_of_the_recordings(shared_data: Path) -> None:
+    files = sorted((shared_data / "belgium_4g" / "csv").glob("*.csv"))
+    files += sorted((shared_data / "solis_wifi").glob("wifi_*.txt"))
+    rows: dict[str, list[Float64Array]] = {}
+    for file in files:
+        rows.setdefault(mode_of(file), []).append(rates_of(file))
+    assert fit_links(rows) == fitted_links()

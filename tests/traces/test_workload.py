@@ -1,0 +1,233 @@
+"""Workloads: in and out of CSV files, summed up by topic, and played over a link."""
+
+from __future__ import annotations
+
+import gzip
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from bufgym import oracle, policies, scenario, sender
+from bufgym.benchmark import drops
+from bufgym.errors import BufgymError, TraceError
+from bufgym.traces import Motion, Trace
+from bufgym.traces.recordings import read_workload
+from bufgym.traces.workload import Workload, read_workload_csv, write_workload_csv
+
+CSV = """time_s,bytes,topic,x
+100.5,1000,/camera,2
+101.5,500,/odom,2
+101.5,1000,/camera,2.25
+104.5,1500,/camera,4
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "w.csv"
+    path.write_text(text)
+    return path
+
+
+def test_a_file_in_full(tmp_path: Path) -> None:
+    workload = read_workload(written(tmp_path, CSV))
+    assert (workload.name, workload.topics) == ("w", ("/camera", "/odom"))
+    assert workload.arrival_us.tolist() == [0, 1_000_000, 1_000_000, 4_000_000]
+    assert workload.size_bytes.tolist() == [1000, 500, 1000, 1500]
+    assert [workload.topic_of(k) for k in range(4)] == ["/camera", "/odom", "/camera", "/camera"]
+    assert workload.x is not None and workload.x.tolist() == [0, 0, 0.25, 2]
+    camera, odom = workload.summary()
+    # Two intervals in 4 s; 3500 of 4000 bytes.
+    assert camera == ("/camera", 3, 0.5, 3500, 0.875)
+    assert odom[:2] == ("/odom", 1) and math.isnan(odom.rate_hz) and odom[3:] == (500, 0.125)
+    (tmp_path / "w.csv.gz").write_bytes(gzip.compress(CSV.encode()))
+    assert read_workload_csv(tmp_path / "w.csv.gz").arrival_us.tolist() == workload.arrival_us.tolist()
+
+
+def test_the_least_of_a_file(tmp_path: Path) -> None:
+    workload = read_workload_csv(written(tmp_path, "time_s,bytes\n0,1\n0.000001,2\n"))
+    assert workload.arrival_us.tolist() == [0, 1] and workload.topics == ("",) and workload.x is None
+
+
+def test_some_topics_of_a_file(tmp_path: Path) -> None:
+    """The clock and x begin with the first message chosen."""
+    late = read_workload(written(tmp_path, CSV + "105.5,7,/imu,5\n"), topics=["/odom", "/i*"])
+    assert late.arrival_us.tolist() == [0, 4_000_000] and late.size_bytes.tolist() == [500, 7]
+    assert late.x is not None and late.x.tolist() == [0, 3]
+    assert [late.topic_of(k) for k in range(2)] == ["/odom", "/imu"]
+    with pytest.raises(BufgymError, match=r"no topic '/lidar'; it has: /camera, /odom"):
+        read_workload(written(tmp_path, CSV), topics=["/lidar"])
+    with pytest.raises(BufgymError, match=r"odom = '/odom': needs a recording, and this is none"):
+        read_workload(written(tmp_path, CSV), odom="/odom")
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    messages=st.lists(
+        st.tuples(st.integers(0, 10**9), st.integers(1, 10**10), st.integers(0, 2), st.floats(0, 1e6)), min_size=1
+    ),
+    names=st.booleans(),
+    moves=st.booleans(),
+)
+def test_round_trip_is_exact(
+    tmp_path: Path, messages: list[tuple[int, int, int, float]], names: bool, moves: bool
+) -> None:
+    steps_us, sizes, topics, steps = (np.array(column) for column in zip(*messages, strict=True))
+    moved, time_us = np.cumsum(steps), np.cumsum(steps_us)
+    workload = Workload(
+        "w",
+        time_us - time_us[0],
+        sizes,
+        topics if names else None,
+        ("/a", "/b c", "/ü") if names else ("",),
+        moved - moved[0] if moves else None,
+    )
+    write_workload_csv(workload, tmp_path / "w.csv")
+    again = read_workload_csv(tmp_path / "w.csv")
+    assert again.arrival_us.tolist() == workload.arrival_us.tolist()
+    assert again.size_bytes.tolist() == sizes.tolist()
+    assert [again.topic_of(k) for k in range(len(again))] == [workload.topic_of(k) for k in range(len(again))]
+    assert (again.x is None) == (workload.x is None)
+    if again.x is not None and workload.x is not None:
+        assert again.x.tolist() == workload.x.tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "w.csv: is empty: must begin with the header time_s,bytes"),
+        ("t,bytes\n", "line 1: t,bytes: must be the header time_s,bytes"),
+        ("time_s,bytes\n", "w.csv: holds no message: must hold one at least"),
+        ("time_s,bytes\n1\n", "line 2: 1: must have 2 columns, has 1"),
+        ("time_s,bytes\n1,0\n", "line 2: bytes = 0: must be at least 1"),
+        ("time_s,bytes\n1,1.5\n", "line 2: bytes = 1.5: must be a whole number"),
+        ("time_s,bytes\n1,99999999999\n", "line 2: bytes = 99999999999: must be at most 10000000000"),
+        ("time_s,bytes\n1,1\n0,1\n", "line 3: time_s = 0: must not be before the line above"),
+        ("time_s,bytes\n1,1\n2e7,1\n", "line 3: time_s = 2e7: must be at most 10000000 s after the first"),
+        ("time_s,bytes\nnan,1\n", "line 2: time in s = nan: must be a finite number"),
+        ("time_s,bytes,topic\n1,1,\n", "line 2: topic = '': must not be empty"),
+        ("time_s,bytes,x\n1,1,1\n2,1,0.5\n", "line 3: x = 0.5: must not be below the line above"),
+        ("time_s,bytes,x\n1,1,-1\n", "line 2: x = -1: must be from 0 to"),
+    ],
+)
+def test_broken_files(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(TraceError, match=says):
+        read_workload(written(tmp_path, text))
+
+
+def test_broken_arrays() -> None:
+    time_us, size = np.array([0, 5]), np.array([1, 1])
+    for arguments, says in (
+        ((np.array([1, 5]), size), "arrival_us must begin with 0"),
+        ((np.array([0.0, 5]), size), "arrival_us must be int64"),
+        ((time_us, np.array([1])), "size_bytes must be int64"),
+        ((time_us, np.array([1, 0])), "size_bytes must lie between 1"),
+        ((time_us[:0], size[:0]), "one at least"),
+        ((time_us, size, np.array([0, 1])), "topic must lie between 0 and 0"),
+        ((time_us, size, None, ("",), np.array([0, math.nan])), "x must be finite"),
+        ((time_us, size, None, ("",), np.array([0, -1.0])), "x must be .* not decrease"),
+    ):
+        with pytest.raises(BufgymError, match=f"workload 'w': .*{says}"):
+            Workload("w", *arguments)
+
+
+def test_names_that_a_csv_file_cannot_hold(tmp_path: Path) -> None:
+    for name in ("a,b", " a", "", "a\nb"):
+        workload = Workload("w", np.array([0]), np.array([1]), np.array([0]), (name, "other"))
+        with pytest.raises(BufgymError, match="a name in a CSV file must be printable"):
+            write_workload_csv(workload, tmp_path / "w.csv")
+    with pytest.raises(TraceError, match="cannot be written"):
+        write_workload_csv(Workload("w", np.array([0]), np.array([1])), tmp_path / "nowhere" / "w.csv")
+
+
+# --- played over a link ----------------------------------------------------------------------------------------------
+
+
+def four_seconds_of_nothing() -> Trace:
+    return Trace("outage", np.array([0, 4_000_000, 5_000_000]), np.array([0, 0, 10_000]), "hold")
+
+
+def recorded(sizes: tuple[int, ...] = (1000, 1000, 1000, 1000)) -> Workload:
+    """A message a second, on two topics in turn; the scene moves on in the second and third second only."""
+    time_us = np.arange(4) * 1_000_000
+    x = np.array([0.0, 0.0, 1.0, 2.0])
+    return Workload("drive", time_us, np.array(sizes), np.array([0, 1, 0, 1]), ("/camera", "/odom"), x)
+
+
+def uplink(workload: Workload, **other: object) -> scenario.Uplink:
+    return scenario.Uplink(
+        traces=(four_seconds_of_nothing(),), workload=workload, random_offset=False, propagation_us=0, **other
+    )
+
+
+def test_an_episode_is_the_recording_as_it_is() -> None:
+    meets = uplink(recorded((1, 2, 3, 4)))
+    episode = meets.draw(scenario.Streams.seeded(3))
+    assert meets.max_messages == 4
+    assert episode.arrivals["arrival_us"].tolist() == [0, 1_000_000, 2_000_000, 3_000_000]
+    assert episode.arrivals["size_bytes"].tolist() == [1, 2, 3, 4]
+    assert episode.arrivals["topic"].tolist() == [0, 1, 0, 1]
+    assert episode.arrivals["x"].tolist() == [0, 0, 1, 2]
+    assert episode.link.offset_us == 0
+
+
+def test_what_would_this_policy_have_dropped_of_my_recording() -> None:
+    """L = 1 and nothing crosses for 4 s: message 0 is in transmission, 1 waits, 2 and 3 find the buffer full."""
+    chosen = [policies.get(name) for name in ("drop-oldest", "drop-newest")]
+    found = list(drops.drops(chosen, uplink(recorded()), [1, 2], 1))
+    assert [(d.policy, d.capacity, d.message, d.time_s, d.topic, d.x, d.dropped_s) for d in found] == [
+        ("drop-oldest", 1, 1, 1.0, "/odom", 0.0, 2.0),
+        ("drop-oldest", 1, 2, 2.0, "/camera", 1.0, 3.0),
+        ("drop-newest", 1, 2, 2.0, "/camera", 1.0, 2.0),
+        ("drop-newest", 1, 3, 3.0, "/odom", 2.0, 3.0),
+        ("drop-oldest", 2, 1, 1.0, "/odom", 0.0, 3.0),
+        ("drop-newest", 2, 3, 3.0, "/odom", 2.0, 3.0),
+    ]
+    with pytest.raises(BufgymError, match="must play a recording"):
+        list(drops.drops(chosen, scenario.Uplink(traces=(four_seconds_of_nothing(),)), [1], 1))
+
+
+def test_the_link_takes_each_message_for_its_own_size() -> None:
+    """From 4 s on 10 bytes a ms: 1000 bytes take 100 ms, 3000 take 300."""
+    meets = uplink(recorded((1000, 3000, 1000, 1000)))
+    ran = sender.run(policies.get("drop-newest"), [meets.draw(scenario.Streams.seeded(0))], 3, meets.value)
+    assert np.asarray(ran.batch.fates[0])["crossed_us"].tolist() == [4_100_000, 4_400_000, 4_500_000, 4_600_000]
+
+
+def test_the_clairvoyant_of_a_recording() -> None:
+    """L = 1: message 0 and one more. The last has moved on furthest: 1 + V(2). An upper bound where sizes differ."""
+    meets = uplink(recorded())
+    plan = oracle.clairvoyant(meets.draw(scenario.Streams.seeded(0)), 1, meets.value)
+    assert (plan.qoi, plan.certified) == (pytest.approx(2 - math.exp(-2)), True)
+    meets = uplink(recorded((1000, 900, 1000, 1000)))
+    assert oracle.clairvoyant(meets.draw(scenario.Streams.seeded(0)), 1, meets.value).qoi >= 2 - math.exp(-2) - 1e-12
+
+
+def test_x_from_elsewhere_or_from_the_number() -> None:
+    silent = Workload("w", np.array([0, 500_000, 1_000_000]), np.array([1, 1, 1]))
+    motion = Motion("m", np.array([0, 1_000_000]), np.array([0.0, 3.0]))
+    streams = scenario.Streams.seeded(0)
+    assert uplink(silent).draw(streams).arrivals["x"].tolist() == [0, 1, 2]
+    assert uplink(silent, motion=(motion,)).draw(streams).arrivals["x"].tolist() == [0, 1.5, 3]
+    with pytest.raises(BufgymError, match="workload 'drive' has an x of its own"):
+        uplink(recorded(), motion=(motion,))
+    with pytest.raises(BufgymError, match=r"workload: 'w\.csv' is not a bufgym.traces Workload"):
+        scenario.Uplink(traces=(four_seconds_of_nothing(),), workload="w.csv")
+
+
+def test_an_environment_plays_a_recording() -> None:
+    """Accepting message 0 and rejecting the three others, with L = 1: actions 2 and 1. H = 1."""
+    import gymnasium as gym
+
+    import bufgym  # noqa: F401  (registers the environments)
+
+    env = gym.make("bufgym/Uplink-v0", scenario=uplink(recorded()), capacity=1)
+    env.reset(seed=0)
+    for action in (2, 1, 1, 1):
+        _, _, terminated, _, info = env.step(action)
+    assert terminated
+    assert (info["qoi"], info["arrived"], info["delivered"], info["dropped"]) == (1, 4, 1, 3)
+    env.close()
