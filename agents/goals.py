@@ -23,7 +23,7 @@ from agents.trials import Trials
 from agents.worlds import Cell
 from bufgym import policies, suites
 from bufgym.benchmark.campaign import Plan
-from bufgym.benchmark.score import BASELINE, regret
+from bufgym.benchmark.score import BASELINE, Interval, regret, scores
 from bufgym.errors import BufgymError
 from bufgym.oracle import law, online_optimum
 from bufgym.policies import Policy, registry
@@ -33,6 +33,9 @@ Numbers = NDArray[np.float64]
 
 RESAMPLES = 2000
 AFR = "afr"
+AGENTS = "agents"
+NOTHING = 1e-9
+"""Where AFR's regrets add up to less, a ratio says nothing."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ class Found:
     fixed: dict[str, list[Numbers]]
     agents: list[list[Numbers]]
     """By training seed, then as ``fixed``."""
+    scores: dict[str, Interval]
+    """Of the agents together (AGENTS) and of every fixed policy: 0 is Drop Oldest, 1 the clairvoyant."""
 
     def ratio(self, given: Sequence[list[Numbers]], cells: Sequence[int], rng: np.random.Generator) -> Span:
         """Regret over AFR's in these cells; ``given``: one entry a training seed."""
@@ -70,7 +75,7 @@ class Found:
                 best = self.best[cell][pick].sum()
                 mine += float(np.mean([float(regret(given[s][cell][pick].sum(), best)) for s in seeds]))
                 theirs += float(regret(afr[cell][pick].sum(), best))
-            return mine / theirs if theirs else float("nan")
+            return mine / theirs if theirs > NOTHING else float("nan")
 
         every = range(len(given))
         drawn = []
@@ -107,7 +112,8 @@ def measure(suite: str, agents: Sequence[Policy], folder: Path, data: str | None
         Plan(suite, tuple(ranked), "test", suites.get(suite).capacities, seeds, data), folder / "goals" / suite
     )
     keys = [(cell.label, cell.capacity) for cell in trials.cells]
-    own = [trials.rows_under(agent, agent.name, seed) for seed, agent in enumerate(agents)]
+    own = [trials.rows_under(agent, AGENTS, seed) for seed, agent in enumerate(agents)]
+    found = scores([{**row, "training_seed": None} for row in trials.rows] + [row for rows in own for row in rows])
     at = [[i for i, row in enumerate(own[0]) if (row["scenario"], row["capacity"]) == key] for key in keys]
 
     def split(numbers: Numbers) -> list[Numbers]:
@@ -119,6 +125,7 @@ def measure(suite: str, agents: Sequence[Policy], folder: Path, data: str | None
         split(trials.known(AFR, "clairvoyant")),
         {name: split(trials.known(name)) for name in ranked},
         [split(np.array([row["qoi"] for row in rows], np.float64)) for rows in own],
+        {standing.policy: standing.score for standing in found.standings},
     )
 
 
@@ -146,11 +153,17 @@ def section(found: Found) -> list[str]:
     parts = [(label, [i for i in every if found.cells[i][0] == label]) for label in labels]
     told = ", ".join(f"{label} {found.ratio(found.agents, cells, rng).value:.2f}" for label, cells in parts)
     lines += ["", f"By scenario: {told}.", ""]
+    shown = ", ".join(f"{name} {_score(found.scores[name])}" for name in (AGENTS, best, AFR))
+    lines += [f"Scores (0 is {BASELINE}, 1 the clairvoyant): {shown}.", ""]
     rivals = dict.fromkeys([AFR, BASELINE, best])
     behind = [line for rival in rivals for line in found.behind(rival, rng)]
     told = ", ".join(rivals)
     lines.append(f"Below {told} by more than the interval: {'nowhere.' if not behind else ''}")
     return [*lines, "", *(f"- {line}" for line in behind), ""]
+
+
+def _score(score: Interval) -> str:
+    return f"{score.value:.3f} [{score.low:.3f}, {score.high:.3f}]"
 
 
 SMALL = ((1, 400), (2, 300), (3, 120), (4, 70))
