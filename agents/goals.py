@@ -237,6 +237,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if noted.exists():
             given = json.loads(noted.read_text(encoding="utf-8"))
             lines += [f"Trained on {given['suite']}, {given['steps']:,} decisions a seed.", ""]
+        data = " --data DIR" if options.data else ""
+        lines += [f"Made by `python -m agents.goals runs/{options.run.name} --suites {options.suites}{data}`.", ""]
+        lines += ["The figure is the regret over AFR's, with its 95 % interval over training seeds and episodes.", ""]
         for suite in options.suites.split(","):
             found = measure(suite, agents, options.run, options.data, options.seeds)
             lines += section(found)
