@@ -13,6 +13,7 @@ import csv
 import json
 import multiprocessing
 import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -119,9 +120,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = replace(given, validate_every=options.steps // 4)
     try:
         todo = variants(given)
-        for chosen in todo.values():
+        first, *others = todo.values()
+        solved = Path("runs") / first.name / "validation"
+        if not solved.exists():
+            ValidationSet(first, prepare(first))
+        for chosen in others:  # all meet the same validation episodes, whose bounds are found once
             if not (Path("runs") / chosen.name).exists():
-                ValidationSet(chosen, prepare(chosen))
+                shutil.copytree(solved, prepare(chosen) / "validation")
         context = multiprocessing.get_context("spawn")
         with concurrent.futures.ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
             jobs = {name: [pool.submit(trained, a, s) for s in range(options.seeds)] for name, a in todo.items()}

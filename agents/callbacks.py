@@ -54,6 +54,19 @@ class Record:
             csv.writer(file).writerow(row)
 
 
+def seed_bar(steps: int, done: int, seed: int, line: int) -> Any:
+    """A seed's progress bar, on a terminal alone; ``line``: where it goes."""
+    return tqdm(
+        total=steps,
+        initial=done,
+        desc=f"seed {seed}",
+        unit=" steps",
+        unit_scale=True,
+        position=line,
+        disable=not sys.stderr.isatty(),
+    )
+
+
 class Between(BaseCallback):
     """A callback that asks nothing of single steps."""
 
@@ -153,15 +166,7 @@ class Progress(Between):
     def _on_training_start(self) -> None:
         self.told = self.first = self.num_timesteps
         self.began = time.perf_counter()
-        self.bar = tqdm(
-            total=self.steps,
-            initial=self.num_timesteps,
-            desc=f"seed {self.seed}",
-            unit=" steps",
-            unit_scale=True,
-            position=self.line,
-            disable=not sys.stderr.isatty(),
-        )
+        self.bar = seed_bar(self.steps, self.num_timesteps, self.seed, self.line)
 
     def _on_rollout_end(self) -> None:
         self.bar.update(self.num_timesteps - self.bar.n)

@@ -23,9 +23,8 @@ from typing import TYPE_CHECKING, Any
 import cma
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from agents.callbacks import Record
+from agents.callbacks import Record, seed_bar
 from agents.grounds import EPISODES, Yard, grounds
 from agents.trials import ValidationSet, Verdict
 from agents.worlds import capacities_of, cells
@@ -229,15 +228,7 @@ def train(
             told = f"{search.steps:,} of {arguments.steps:,} steps, regret {reached:.3f} x the rivals' on validation"
             print(f"seed {seed}: {told}", flush=True)
 
-    bar = tqdm(
-        total=arguments.steps,
-        initial=search.steps,
-        desc=f"seed {seed}",
-        unit=" steps",
-        unit_scale=True,
-        position=line,
-        disable=not sys.stderr.isatty(),
-    )
+    bar = seed_bar(arguments.steps, search.steps, seed, line)
     if not validations.rows:
         validate(search.mean)
     while search.steps < arguments.steps:

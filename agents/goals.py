@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from agents.grounds import Lengths
 from agents.trials import Trials
 from agents.worlds import Cell
-from bufgym import policies, suites
+from bufgym import files, policies, suites
 from bufgym.benchmark.campaign import Plan
 from bufgym.benchmark.score import BASELINE, Interval, regret, scores
 from bufgym.errors import BufgymError
@@ -107,7 +107,8 @@ class Found:
 
 def measure(suite: str, agents: Sequence[Policy], folder: Path, data: str | None, seeds: int | None = None) -> Found:
     """Agents and ranked fixed policies on the suite's test split; what is fixed is kept in ``folder``."""
-    ranked = [name for name in registry.names() if name not in _shipped() and registry.get(name).ranked]
+    shipped = files.shipped("agents", "agents/pretrained", "*.safetensors")
+    ranked = [name for name in registry.names() if name not in shipped and registry.get(name).ranked]
     trials = Trials(
         Plan(suite, tuple(ranked), "test", suites.get(suite).capacities, seeds, data), folder / "goals" / suite
     )
@@ -127,10 +128,6 @@ def measure(suite: str, agents: Sequence[Policy], folder: Path, data: str | None
         [split(np.array([row["qoi"] for row in rows], np.float64)) for rows in own],
         {standing.policy: standing.score for standing in found.standings},
     )
-
-
-def _shipped() -> tuple[str, ...]:
-    return tuple(name for name in registry.names() if name.startswith("learned-"))
 
 
 # --- the page --------------------------------------------------------------------------------------------------------
