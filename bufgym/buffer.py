@@ -29,8 +29,42 @@ MESSAGE = np.dtype(
     align=True,
 )
 
+TOPIC = np.dtype(
+    [
+        # what the topic is (see ``bufgym.topics.Topic``)
+        ("priority", np.float64),
+        ("weight", np.float64),  # of its H in the weighted sum
+        ("period_us", np.int64),  # rate limit: at most one message a period; 0 for none
+        ("limit", np.int64),  # messages of it in the buffer at most
+        ("no_drop", np.int64),  # 1: may not be dropped
+        ("deadline_us", np.int64),  # a message is late when it is older than this at the server
+        ("v_start", np.int64),  # where its V begins in the array of all V
+        # what the sender knows of its past
+        ("queued", np.int64),  # messages in the buffer
+        ("arrived", np.int64),
+        ("kept_us", np.int64),  # arrival time of the message enqueued last
+        ("previous_us", np.int64),  # arrival time of its arrival before the one at hand, kept or not
+        ("previous_x", np.float64),
+        ("step_us", np.int64),  # time between its last two arrivals
+        ("step_x", np.float64),
+        ("taken", np.int64),  # messages the socket took
+        ("taken_us", np.int64),  # arrival time of the one taken last
+        ("taken_x", np.float64),
+        ("sent_us", np.int64),  # when the socket took it
+        # what the server has of it
+        ("received", np.int64),
+        ("newest_us", np.int64),  # arrival time of the newest received
+        ("aged_us", np.int64),  # until when its age has been counted
+        # room for whoever walks along the queue
+        ("mark", np.int64),
+    ],
+    align=True,
+)
+
 # A policy's decision is the slot to evict for the newcomer (0 = oldest), or one of these.
 REJECT, ACCEPT = -1, -2
+# A scheduler's choice is the slot to send, or to send nothing until the next arrival or pong.
+HOLD = -1
 
 UNLIMITED_BYTES = 2**62
 MAX_CAPACITY = 10**6
@@ -85,7 +119,14 @@ class Buffer(NamedTuple):
     drain: float
     """Running mean of departures per arrival: 1 = the link keeps up, 0 = it stands still."""
     v: NDArray[np.float64]
-    """The value function, for ``qoi.value(buffer.v, distance)``."""
+    """The value function, for ``qoi.value(buffer.v, distance)``; with several topics that of each from its
+    ``v_start`` on."""
+    topics: NDArray[Any]
+    """TOPIC[topics]; a sender that knows one topic only keeps its settings there and nothing else."""
+    window: int
+    """n_T: messages that may be sent and not yet answered by a pong."""
+    in_flight: int
+    """Messages sent and not yet answered by a pong (without pongs: not yet across)."""
 
 
 @kernel
@@ -117,22 +158,63 @@ def row_width(capacity: int) -> int:
 
 
 @kernel
+def before(buffer: Buffer, k: int, topic: int) -> int:
+    """The slot kept before slot ``k`` on the same topic, -1 where there is none."""
+    j = k - 1
+    if len(buffer.topics) > 1:
+        while j >= 0 and buffer.slots[j].topic != topic:
+            j -= 1
+    return j
+
+
+@kernel
+def after(buffer: Buffer, k: int, topic: int) -> int:
+    """The slot kept after slot ``k`` on the same topic, ``len(buffer.slots)`` where there is none."""
+    j = k + 1
+    if len(buffer.topics) > 1:
+        while j < len(buffer.slots) and buffer.slots[j].topic != topic:
+            j += 1
+    return j
+
+
+@kernel
+def is_first(buffer: Buffer, k: int) -> bool:
+    """Whether slot ``k`` is the oldest of its topic: a topic's messages are sent in order."""
+    return before(buffer, k, buffer.slots[k].topic) < 0
+
+
+@kernel
+def topic_arrives(buffer: Buffer, arrival: Any, topic: int) -> bool:
+    """Whether the arrival at hand is what follows a topic's queued messages."""
+    return len(buffer.topics) == 1 or arrival.topic == topic
+
+
+@kernel
 def time_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int]:
-    """Time from slot ``k`` back to the message kept before it and on to the one kept after it, us.
+    """Time from slot ``k`` back to the message kept before it on its topic and on to the one kept after it, us.
 
     The newcomer is slot ``len(buffer.slots)``. What follows it has not come yet: one more step like the last is
-    expected, so its second gap is the time since the previous arrival.
+    expected, so its second gap is the time since the previous arrival. So it is for the last of another topic.
     """
     s = len(buffer.slots)
     here = arrival.arrival_us if k == s else buffer.slots[k].arrival_us
-    before = buffer.taken_us if k == 0 else buffer.slots[k - 1].arrival_us
-    if k == s:
-        after = arrival.arrival_us + (arrival.arrival_us - buffer.previous_us)
-    elif k == s - 1:
-        after = arrival.arrival_us
+    topic = arrival.topic if k == s else buffer.slots[k].topic
+    j = before(buffer, k, topic)
+    if j >= 0:
+        since = buffer.slots[j].arrival_us
     else:
-        after = buffer.slots[k + 1].arrival_us
-    return here - before, after - here
+        since = buffer.taken_us if len(buffer.topics) == 1 else buffer.topics[topic].taken_us
+    if k == s:
+        previous = buffer.previous_us if len(buffer.topics) == 1 else buffer.topics[topic].previous_us
+        return here - since, here - previous
+    j = after(buffer, k, topic)
+    if j < s:
+        until = buffer.slots[j].arrival_us
+    elif topic_arrives(buffer, arrival, topic):
+        until = arrival.arrival_us
+    else:
+        until = max(here, buffer.topics[topic].previous_us) + buffer.topics[topic].step_us
+    return here - since, until - here
 
 
 @kernel
@@ -140,26 +222,48 @@ def motion_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
     """The same as ``time_gaps`` in the coordinate x: what the scene moved before slot ``k`` and after it."""
     s = len(buffer.slots)
     here = arrival.x if k == s else buffer.slots[k].x
-    before = buffer.taken_x if k == 0 else buffer.slots[k - 1].x
-    if k == s:
-        after = arrival.x + (arrival.x - buffer.previous_x)
-    elif k == s - 1:
-        after = arrival.x
+    topic = arrival.topic if k == s else buffer.slots[k].topic
+    j = before(buffer, k, topic)
+    if j >= 0:
+        since = buffer.slots[j].x
     else:
-        after = buffer.slots[k + 1].x
-    return here - before, after - here
+        since = buffer.taken_x if len(buffer.topics) == 1 else buffer.topics[topic].taken_x
+    if k == s:
+        previous = buffer.previous_x if len(buffer.topics) == 1 else buffer.topics[topic].previous_x
+        return here - since, here - previous
+    j = after(buffer, k, topic)
+    if j < s:
+        until = buffer.slots[j].x
+    elif topic_arrives(buffer, arrival, topic):
+        until = arrival.x
+    else:
+        until = max(here, buffer.topics[topic].previous_x) + buffer.topics[topic].step_x
+    return here - since, until - here
 
 
 @kernel
 def arrival_gain(buffer: Buffer, arrival: Any) -> float:
     """V of the newcomer's gap to the message kept before it: what accepting it adds. 0 for the very first message."""
-    if len(buffer.slots) > 0:
-        return value(buffer.v, arrival.x - buffer.slots[len(buffer.slots) - 1].x)
-    return value(buffer.v, arrival.x - buffer.taken_x) if buffer.taken > 0 else 0.0
+    s = len(buffer.slots)
+    if len(buffer.topics) == 1:
+        if s > 0:
+            return value(buffer.v, arrival.x - buffer.slots[s - 1].x)
+        return value(buffer.v, arrival.x - buffer.taken_x) if buffer.taken > 0 else 0.0
+    topic = buffer.topics[arrival.topic]
+    if topic.queued == 0 and topic.taken == 0:
+        return 0.0
+    return float(topic.weight * value(buffer.v[topic.v_start :], motion_gaps(buffer, arrival, s)[0]))
 
 
 @kernel
 def loss(buffer: Buffer, arrival: Any, k: int) -> float:
-    """QoI lost if slot ``k`` went and nothing else: V(a) + V(b) - V(a + b) for its gaps a, b; >= 0 as V is concave."""
+    """QoI lost if slot ``k`` went and nothing else: V(a) + V(b) - V(a + b) for its gaps a, b; >= 0 as V is concave.
+
+    With several topics times the weight of its own.
+    """
     a, b = motion_gaps(buffer, arrival, k)
-    return merging_loss(buffer.v, a, value(buffer.v, a), b, value(buffer.v, b))
+    if len(buffer.topics) == 1:
+        return merging_loss(buffer.v, a, value(buffer.v, a), b, value(buffer.v, b))
+    topic = buffer.topics[arrival.topic if k == len(buffer.slots) else buffer.slots[k].topic]
+    v = buffer.v[topic.v_start :]
+    return float(topic.weight * merging_loss(v, a, value(v, a), b, value(v, b)))

@@ -51,6 +51,10 @@ class Episode:
     """Arrivals before this one are sent without asking a policy."""
     last_decision: int = 2**31
     """Arrivals after this one, likewise."""
+    window: int = 1
+    """n_T: messages in flight (sent, and not yet answered by a pong) at most."""
+    pong_us: int = 0
+    """From the moment when a message's last byte has crossed to its pong, us; 0: nobody waits for pongs."""
 
     # Luck is not drawn with the rest: an agent in an environment has chance of its own.
 

@@ -23,6 +23,7 @@ ROOMS = [
     "kernel",
     "qoi",
     "buffer",
+    "topics",
     "traces",
     "link",
     "observe",

@@ -2,10 +2,10 @@
 
 A policy is a plain function ``on_arrival(buffer, arrival, memory) -> decision`` and, where it keeps score of what
 leaves, ``on_departure(buffer, memory)``; a queue discipline that drops at the head as well, as CoDel does, has
-``on_dequeue(buffer, memory) -> drop it?``. ``buffer`` is ``bufgym.buffer.Buffer``; ``arrival`` a MESSAGE record;
-``memory`` a float64 array of the policy's own, laid out and initialised as its registration says; the decision a slot
-to evict for the newcomer (0 = oldest), REJECT or ACCEPT. ``arrival.luck`` is a uniform draw in [0, 1) for policies that
-randomise, so the functions themselves are deterministic.
+``on_dequeue(buffer, memory) -> drop it?``; a scheduler ``on_send(buffer, memory) -> slot or HOLD``. ``buffer`` is
+``bufgym.buffer.Buffer``; ``arrival`` a MESSAGE record; ``memory`` a float64 array of the policy's own, laid out and
+initialised as its registration says; the decision a slot to evict for the newcomer (0 = oldest), REJECT or ACCEPT.
+``arrival.luck`` is a uniform draw in [0, 1) for policies that randomise, so the functions themselves are deterministic.
 
     from bufgym.policies import ACCEPT, register
 
@@ -33,13 +33,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import MESSAGE, Buffer
+from bufgym.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.errors import BufgymError
 from bufgym.kernel import compile_for
 
 OnArrival = Callable[[Buffer, Any, NDArray[np.float64]], int]
 OnDeparture = Callable[[Buffer, NDArray[np.float64]], None]
 OnDequeue = Callable[[Buffer, NDArray[np.float64]], bool]
+OnSend = Callable[[Buffer, NDArray[np.float64]], int]
 Foresee = Callable[[Any, int, int, Any], NDArray[np.float64]]
 
 
@@ -52,6 +53,27 @@ def _keep(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
     return False
 
 
+def _send_head(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+    """The scheduler of a policy that has none: first in, first out."""
+    return 0
+
+
+@dataclass(frozen=True)
+class Client:
+    """How the program around a policy sends, where that is not the policy's to decide."""
+
+    encoding: str = ""
+    """Which of an episode's encodings its messages have; empty for their own sizes."""
+    awaits_pongs: bool = True
+    """Whether it keeps to the scenario's in-flight window n_T; else the socket takes whenever the link is free."""
+    limit_at_send: bool = False
+    """Whether rate limits hold messages back at the socket, keeping the latest, instead of dropping at arrival."""
+    flush_no_drop: bool = False
+    """Whether no_drop messages are sent even when the window is full."""
+    copies: bool = False
+    """Whether it sends one copy of every message to each consumer."""
+
+
 @dataclass(frozen=True)
 class Policy:
     """One drop policy: what decides, what it remembers, where it comes from."""
@@ -61,6 +83,8 @@ class Policy:
     on_departure: OnDeparture = _nothing
     on_dequeue: OnDequeue = _keep
     """Whether to drop the head that the socket is about to take; asked again about the next one if so."""
+    on_send: OnSend = _send_head
+    """Which slot the free socket takes, or HOLD: a scheduler."""
     memory: Mapping[str, float] = field(default_factory=dict)
     """Names and initial values of the memory's entries; those in ``parameters`` are its settings."""
     parameters: tuple[str, ...] = ()
@@ -73,6 +97,12 @@ class Policy:
     work: tuple[int, int] = (0, 0)
     """Room to work in behind the memory's entries: so many numbers, and so many more for each of L + 1 candidates."""
     about: str = ""
+    client: Client = Client()
+
+    @property
+    def schedules(self) -> bool:
+        """Whether it chooses which message goes next."""
+        return self.on_send is not _send_head
 
     @property
     def hears_departures(self) -> bool:
@@ -122,36 +152,46 @@ class Policy:
         return replace(self, name=f"{self.name}:{label}", memory=memory)
 
     @functools.cached_property
-    def compiled(self) -> tuple[OnArrival, OnDeparture, OnDequeue]:
+    def compiled(self) -> tuple[OnArrival, OnDeparture, OnDequeue, OnSend]:
         """Its functions compiled for one signature each, so that one rollout kernel serves every policy."""
-        return _compiled(self.on_arrival, self.on_departure, self.on_dequeue)
+        return _compiled(self.on_arrival, self.on_departure, self.on_dequeue, self.on_send)
 
 
 @functools.lru_cache(maxsize=256)
 def _compiled(
-    on_arrival: OnArrival, on_departure: OnDeparture, on_dequeue: OnDequeue
-) -> tuple[OnArrival, OnDeparture, OnDequeue]:
+    on_arrival: OnArrival, on_departure: OnDeparture, on_dequeue: OnDequeue, on_send: OnSend
+) -> tuple[OnArrival, OnDeparture, OnDequeue, OnSend]:
     """Once for all policies that share these functions, whatever their parameters or weights."""
-    arrival, departure, dequeue = signatures()
+    arrival, departure, dequeue, send = signatures()
     return (
         compile_for(arrival, on_arrival),
         compile_for(departure, on_departure),
         compile_for(dequeue, on_dequeue),
+        compile_for(send, on_send),
     )
 
 
 @functools.cache
-def signatures() -> tuple[Any, Any, Any]:
-    """Numba types of ``on_arrival``, ``on_departure`` and ``on_dequeue``."""
-    message = numba.from_dtype(MESSAGE)
+def signatures() -> tuple[Any, Any, Any, Any]:
+    """Numba types of ``on_arrival``, ``on_departure``, ``on_dequeue`` and ``on_send``."""
+    message, topic = numba.from_dtype(MESSAGE), numba.from_dtype(TOPIC)
     int_, real = numba.types.int64, numba.types.float64
     reals = numba.types.Array(real, 1, "C")
-    types = {"slots": numba.types.Array(message, 1, "C"), "v": numba.types.Array(real, 1, "C", readonly=True)}
+    types = {
+        "slots": numba.types.Array(message, 1, "C"),
+        "v": numba.types.Array(real, 1, "C", readonly=True),
+        "topics": numba.types.Array(topic, 1, "C"),
+    }
     reals_of = {"taken_x", "previous_x", "left_fraction", "period_us", "drain"}
     view = cast(Any, numba.types).NamedTuple(
         tuple(types.get(name, real if name in reals_of else int_) for name in Buffer._fields), Buffer
     )
-    return int_(view, message, reals), numba.types.void(view, reals), numba.types.boolean(view, reals)
+    return (
+        int_(view, message, reals),
+        numba.types.void(view, reals),
+        numba.types.boolean(view, reals),
+        int_(view, reals),
+    )
 
 
 _REGISTRY: dict[str, Policy | Callable[[], Policy]] = {}
@@ -165,10 +205,12 @@ def register(
     parameters: tuple[str, ...] = (),
     on_departure: OnDeparture = _nothing,
     on_dequeue: OnDequeue = _keep,
+    on_send: OnSend = _send_head,
     source: str = "",
     compile: bool = False,
     unbounded: bool = False,
     foresee: Foresee | None = None,
+    client: Client | None = None,
 ) -> Callable[[OnArrival], OnArrival]:
     """Register the decorated function as the policy ``name``; it comes back unchanged.
 
@@ -191,12 +233,14 @@ def register(
             on_arrival,
             on_departure,
             on_dequeue,
+            on_send,
             dict(memory or {}),
             parameters,
             source,
             compile,
             unbounded,
             foresee,
+            client=client or Client(),
         )
         return on_arrival
 

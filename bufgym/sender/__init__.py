@@ -1,0 +1,90 @@
+"""The sender: one transition function for a batch of senders, and the main loop for a fixed policy.
+
+Order of things at an arrival at time t: (1) everything the link finishes up to and including t leaves, and successors
+start; (2) the policy decides; (3) if the socket is idle it takes the head at once. After the last arrival the buffer
+drains. Nothing sent is lost (TCP); the message in transmission is outside the buffer.
+
+``next_event`` moves one sender to the next thing that somebody must hear of: the socket took a message (DEPARTURE), an
+arrival asks for a decision (DECISION), or it is over (END). ``decide`` carries a decision out. Environments, rollouts
+and benchmarks are loops around these two. Queue disciplines that drop at the head, such as CoDel, are asked there too
+(DEQUEUE, ``answer_dequeue``), and a scheduler chooses what the free socket takes (SEND, ``answer_send``).
+
+The socket takes a message while fewer than n_T are in flight: sent and not yet answered by a pong, which comes a round
+trip after the last byte has crossed. With n_T = 1 and no delay that is a socket that is free as soon as the link is.
+"""
+
+from bufgym.sender.rules import age_until
+from bufgym.sender.senders import Senders, compiled_rollout, padded, python_rollout, python_view, rollout, run
+from bufgym.sender.state import (
+    DECISION,
+    DEPARTURE,
+    DEQUEUE,
+    END,
+    FATE,
+    NEVER,
+    SEND,
+    SENDER,
+    Batch,
+    batch_type,
+    named,
+)
+from bufgym.sender.transition import (
+    ARRIVAL_WAITS,
+    SOCKET_WAITS,
+    answer_dequeue,
+    answer_send,
+    arrival_of,
+    arrive,
+    can_evict,
+    can_hold,
+    can_reject,
+    can_send,
+    credit,
+    cross,
+    decide,
+    has_room,
+    next_event,
+    take,
+    transmit,
+    view,
+)
+
+__all__ = [
+    "ARRIVAL_WAITS",
+    "DECISION",
+    "DEPARTURE",
+    "DEQUEUE",
+    "END",
+    "FATE",
+    "NEVER",
+    "SEND",
+    "SENDER",
+    "SOCKET_WAITS",
+    "Batch",
+    "Senders",
+    "age_until",
+    "answer_dequeue",
+    "answer_send",
+    "arrival_of",
+    "arrive",
+    "batch_type",
+    "can_evict",
+    "can_hold",
+    "can_reject",
+    "can_send",
+    "compiled_rollout",
+    "credit",
+    "cross",
+    "decide",
+    "has_room",
+    "named",
+    "next_event",
+    "padded",
+    "python_rollout",
+    "python_view",
+    "rollout",
+    "run",
+    "take",
+    "transmit",
+    "view",
+]

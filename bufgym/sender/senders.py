@@ -1,0 +1,215 @@
+"""Senders that hold episodes, and the main loop for a fixed policy."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.buffer import MESSAGE, TOPIC, UNLIMITED_BYTES, check_limits, row_width
+from bufgym.errors import BufgymError
+from bufgym.kernel import compile_for, records
+from bufgym.link import FOREVER, Knots
+from bufgym.policies.registry import Policy, runs_compiled, signatures
+from bufgym.qoi import Value
+from bufgym.scenario import Episode
+from bufgym.sender.state import DECISION, DEQUEUE, END, FATE, SEND, SENDER, Batch, batch_type, named
+from bufgym.sender.transition import (
+    answer_dequeue,
+    answer_send,
+    arrival_of,
+    credit,
+    decide,
+    load_row,
+    next_event,
+    view,
+)
+from bufgym.topics import Topic, check_topics, topic_table
+
+
+def rollout(
+    batch: Batch,
+    memory: NDArray[np.float64],
+    on_arrival: Any,
+    on_departure: Any,
+    on_dequeue: Any,
+    on_send: Any,
+    hears_departures: bool,
+) -> None:
+    """Run every sender of the batch to its end under one policy; ``memory`` is float64[n, entries]."""
+    for i in range(len(batch.senders)):
+        event = next_event(batch, i)
+        while event != END:
+            if event == DECISION:
+                decide(batch, i, on_arrival(view(batch, i), arrival_of(batch, i), memory[i]))
+            elif event == DEQUEUE:
+                answer_dequeue(batch, i, on_dequeue(view(batch, i), memory[i]))
+            elif event == SEND:
+                answer_send(batch, i, on_send(view(batch, i), memory[i]))
+            elif hears_departures:
+                on_departure(view(batch, i), memory[i])
+            event = next_event(batch, i)
+        credit(batch, i, FOREVER)
+
+
+@functools.cache
+def compiled_rollout() -> Any:
+    """``rollout`` compiled once for every policy (policies arrive as values of one function type)."""
+    functions = tuple(numba.types.FunctionType(signature) for signature in signatures())
+    memory = numba.types.Array(numba.types.float64, 2, "C")
+    return compile_for(numba.types.void(batch_type(), memory, *functions, numba.types.boolean), rollout)
+
+
+class Senders:
+    """A batch of n senders that share L, B and V, each with an episode of its own."""
+
+    def __init__(
+        self,
+        n: int,
+        capacity: int,
+        v: Value,
+        *,
+        max_messages: int,
+        max_bytes: int | None = None,
+        decide_at: str = "arrival",
+        topics: Sequence[Topic] = (),
+    ) -> None:
+        """n senders with room for L = ``capacity`` messages (and B = ``max_bytes`` bytes), without episodes yet.
+
+        ``topics``: the rules of each topic, by the topic numbers of the messages; none for one queue without rules.
+        """
+        check_limits(capacity, max_bytes)
+        if decide_at not in ("arrival", "overflow"):
+            raise BufgymError(f"decide_at = {decide_at!r}: must be 'arrival' or 'overflow'")
+        self.capacity = int(capacity)
+        self.max_bytes = UNLIMITED_BYTES if max_bytes is None else int(max_bytes)
+        self.decide_at = decide_at
+        self.value = v
+        self.topics = check_topics(topics)
+        self._topic_table, values = topic_table(self.topics, self.capacity, v)
+        self.episodes: list[Episode | None] = [None] * n
+        self._knots = Knots()
+        self.batch = Batch(
+            records(n, SENDER),
+            records((n, row_width(self.capacity)), MESSAGE),
+            records((n, max_messages), MESSAGE),
+            records((n, max_messages), FATE),
+            np.zeros((n, max_messages), np.int64),
+            self._knots.us,
+            self._knots.bytes,
+            values,
+            records((n, len(self._topic_table)), TOPIC),
+        )
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def load(self, i: int, episode: Episode) -> None:
+        """Begin ``episode`` at sender ``i``: empty buffer, idle socket, nothing arrived."""
+        link = episode.link
+        if len(episode.arrivals) > self.batch.arrivals.shape[1]:
+            most = self.batch.arrivals.shape[1]
+            raise BufgymError(f"episode of {len(episode.arrivals)} messages: these senders have room for {most}")
+        if self.topics and episode.arrivals["topic"].max() >= len(self.topics):
+            unknown = episode.arrivals["topic"].max()
+            raise BufgymError(f"episode: unknown topic {unknown}; the senders know {len(self.topics)}, from 0 on")
+        first_knot, last_knot, after = self._knots.place(link.trace)
+        if self._knots.us is not self.batch.knot_us:
+            self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
+        self.episodes[i] = episode
+        load_row(
+            self.batch,
+            i,
+            episode.arrivals,
+            self._topic_table,
+            (self.capacity, self.max_bytes, int(self.decide_at == "overflow")),
+            (episode.first_decision, episode.last_decision),
+            (first_knot, last_knot, after, link.offset_us, link.propagation_us),
+            (episode.window, episode.pong_us),
+        )
+
+    def new_memory(self, policy: Policy, i: int) -> NDArray[np.float64]:
+        """Fresh memory of ``policy`` for the episode of sender ``i``, float64[entries]."""
+        memory: NDArray[np.float64] = policy.new_memory(1, self.capacity)[0]
+        if policy.foresee is not None:
+            memory = policy.foresee(self.episodes[i], self.capacity, self.max_bytes, self.value)
+        return memory
+
+    def run(self, policy: Policy, memory: NDArray[np.float64] | None = None) -> None:
+        """Run every loaded sender to its end under ``policy``; ``memory``: float64[n, entries], fresh by default."""
+        if memory is None:
+            rows = range(len(self)) if policy.foresee is not None else ()
+            memory = (
+                padded([self.new_memory(policy, i) for i in rows])
+                if rows
+                else policy.new_memory(len(self), self.capacity)
+            )
+        senders = self.batch.senders
+        senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
+        senders["limit_at_send"], senders["flush_no_drop"] = policy.client.limit_at_send, policy.client.flush_no_drop
+        if not policy.client.awaits_pongs:
+            senders["window"], senders["pong_us"] = 1, 0
+        if runs_compiled(policy):
+            compiled_rollout()(self.batch, memory, *policy.compiled, policy.hears_departures)
+        else:
+            python_rollout(self.batch, memory, policy)
+
+
+def padded(rows: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
+    """Rows of different lengths as one array, filled up with zeros."""
+    made = np.zeros((len(rows), max(map(len, rows))))
+    for i, row in enumerate(rows):
+        made[i, : len(row)] = row
+    return made
+
+
+python_view = getattr(view, "py_func", view)
+"""``view`` for Python callers, over a ``named`` batch: the compiled kernel must not hand its arrays to Python."""
+
+
+def python_rollout(batch: Batch, memory: NDArray[np.float64], policy: Policy) -> None:
+    """``rollout`` for a policy that is ordinary Python: the transition stays compiled, views are made in Python."""
+    seen = named(batch)
+    for i in range(len(batch.senders)):
+        event = next_event(batch, i)
+        while event != END:
+            if event == DECISION:
+                arrival = seen.arrivals[i, seen.senders[i].next]
+                decide(batch, i, int(policy.on_arrival(python_view(seen, i), arrival, memory[i])))
+            elif event == DEQUEUE:
+                answer_dequeue(batch, i, bool(policy.on_dequeue(python_view(seen, i), memory[i])))
+            elif event == SEND:
+                answer_send(batch, i, int(policy.on_send(python_view(seen, i), memory[i])))
+            elif policy.hears_departures:
+                policy.on_departure(python_view(seen, i), memory[i])
+            event = next_event(batch, i)
+        credit(batch, i, FOREVER)
+
+
+def run(
+    policy: Policy,
+    episodes: Sequence[Episode],
+    capacity: int,
+    v: Value,
+    *,
+    max_bytes: int | None = None,
+    decide_at: str = "arrival",
+    memory: NDArray[np.float64] | None = None,
+    topics: Sequence[Topic] = (),
+) -> Senders:
+    """The senders after ``policy`` met each of ``episodes``, one sender each; an unbounded policy has L = all."""
+    if not episodes:
+        raise BufgymError("no episode to run")
+    longest = max(len(episode.arrivals) for episode in episodes)
+    capacity = longest if policy.unbounded else capacity
+    senders = Senders(
+        len(episodes), capacity, v, max_messages=longest, max_bytes=max_bytes, decide_at=decide_at, topics=topics
+    )
+    for i, episode in enumerate(episodes):
+        senders.load(i, episode)
+    senders.run(policy, memory)
+    return senders
