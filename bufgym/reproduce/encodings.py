@@ -254,7 +254,7 @@ def _table(builder: Any, type_name: str, value: Content, metadata: int = 0) -> i
                 builder.PrependUOffsetTRelative(offset)
             slots.append((4, "UOffsetTRelative", builder.EndVector()))
     builder.StartObject(len(slots))
-    for size in (1, 2, 4, 8):
+    for size in (8, 4, 2, 1):
         for slot in reversed(range(len(slots))):
             bytes_, type_, item = slots[slot]
             if bytes_ != size:
