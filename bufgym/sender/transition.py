@@ -132,9 +132,10 @@ def transmit(batch: Batch, i: int) -> None:
         sender.position,
     )
     due_us = at_us if at_us == FOREVER else at_us - sender.offset_us
-    batch.fates[i, head.seq].due_us = due_us
     if sender.busy == 1:
         sender.finish_us = due_us
+    else:
+        batch.fates[i, head.seq].due_us = due_us
 
 
 @kernel
@@ -159,7 +160,7 @@ def cross(batch: Batch, i: int) -> None:
 def next_pong_us(batch: Batch, i: int) -> int:
     """When the next pong comes for a message that has crossed; FOREVER if none is on its way."""
     sender = batch.senders[i]
-    if sender.pong_us == 0 or sender.ponged == sender.crossed:
+    if sender.ponged == sender.crossed:
         return FOREVER
     return int(batch.fates[i, batch.order[i, sender.ponged]].crossed_us + sender.pong_us)
 
@@ -216,11 +217,11 @@ def next_event(batch: Batch, i: int) -> int:
         sender.follows = 0
         more = sender.next < sender.arrivals
         arrives_us = batch.arrivals[i, sender.next].arrival_us if more else FOREVER - 1
-        pong_us = next_pong_us(batch, i)
+        pong_us = next_pong_us(batch, i) if sender.pong_us > 0 else FOREVER
         if sender.busy > 0 and sender.finish_us <= arrives_us and sender.finish_us < pong_us:
             cross(batch, i)
             continue
-        if pong_us <= arrives_us:
+        if sender.pong_us > 0 and pong_us <= arrives_us:
             sender.now_us = pong_us
             sender.ponged += 1
             sender.held = 0
