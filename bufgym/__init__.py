@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 ENVIRONMENTS = {
     "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)"),
     "bufgym/Uplink-v0": ("lte", "a camera stream over bandwidth traces"),
+    "bufgym/Topics-v0": ("topics", "many topics over one uplink: what to drop, and what to send next (Robofleet)"),
 }
 """id -> (scenario, what it is)"""
 
@@ -23,5 +24,5 @@ for _id, (_scenario, _) in ENVIRONMENTS.items():
             _id,
             entry_point="bufgym.envs:SenderEnv",
             vector_entry_point="bufgym.envs:SenderVectorEnv",
-            kwargs={"scenario": _scenario},
+            kwargs={"scenario": _scenario, **({"capacity": 32} if _scenario == "topics" else {})},
         )

@@ -19,12 +19,12 @@ class Outcome:
     """One finished run of one sender."""
 
     qoi: float
-    """H = 1 + sum of V over the messages received; 0 if none was."""
+    """H = 1 + sum of V over the messages received; 0 if none was. With several topics the weighted sum of theirs."""
     arrived: int
     delivered: int
     dropped: int
     in_transmission: int
-    """1 where the link stopped for good with a message on it."""
+    """1 where the link stopped for good with a message on it; with n_T > 1 perhaps more."""
     buffered: int
     """Still queued at the end, likewise."""
     longest_gap: float
@@ -69,7 +69,7 @@ def outcome(senders: Senders, i: int) -> Outcome:
     mean_age, peak_age, max_age = ages_s(crossed_us + sender["propagation_us"], got["arrival_us"])
     none = float("nan")
     return Outcome(
-        qoi=senders.value.information(got["x"]),
+        qoi=weighted_qoi(senders, i, got) if senders.topics else senders.value.information(got["x"]),
         arrived=int(sender["next"]),
         delivered=len(got),
         dropped=int((fates["dropped_us"] != NEVER).sum()),
@@ -85,6 +85,97 @@ def outcome(senders: Senders, i: int) -> Outcome:
         peak_backlog_bytes=int(sender["peak_backlog_bytes"]),
         impossible=int(sender["impossible"]),
     )
+
+
+@dataclass(frozen=True)
+class TopicOutcome:
+    """What became of one topic in one finished run."""
+
+    topic: str
+    qoi: float
+    """Its own H, without its weight."""
+    arrived: int
+    delivered: int
+    limited: int
+    """Dropped because they came sooner than the rate limit allows."""
+    lost: int
+    """Dropped otherwise."""
+    buffered: int
+    """Still queued or on the way at the end."""
+    bytes_delivered: int
+    mean_sojourn_s: float
+    """From arrival at the sender until it reached the server, propagation included; NaN if none did."""
+    p95_sojourn_s: float
+    mean_age_s: float
+    """Age of information at the server, mean over time from the topic's first arrival to the episode's last."""
+    peak_age_s: float
+    """The largest age in that time."""
+    late: int
+    """Delivered after their deadline."""
+
+
+def topic_outcomes(senders: Senders, i: int) -> list[TopicOutcome]:
+    """The statistics of each topic of sender ``i``'s run, in the order of its topics."""
+    sender = np.asarray(senders.batch.senders)[i]
+    arrivals = np.asarray(senders.batch.arrivals[i])[: sender["arrivals"]]
+    fates = np.asarray(senders.batch.fates[i])[: sender["arrivals"]]
+    got = received(senders, i)
+    until_us = int(arrivals["arrival_us"][-1])
+    made = []
+    for k, topic in enumerate(senders.topics):
+        of_it = arrivals["topic"] == k
+        mine = got[got["topic"] == k]
+        dropped = of_it & (fates["dropped_us"] != NEVER)
+        limited = int((dropped & (fates["limited"] == 1)).sum())
+        at_us = fates["crossed_us"][mine["seq"]] + sender["propagation_us"]
+        sojourn_s = (at_us - mine["arrival_us"]) / 1e6
+        first_us = int(arrivals["arrival_us"][of_it][0]) if of_it.any() else until_us
+        mean_age, peak_age = ages_between_s(at_us, mine["arrival_us"], first_us, until_us)
+        none = float("nan")
+        made.append(
+            TopicOutcome(
+                topic=topic.name,
+                qoi=(topic.value or senders.value).information(mine["x"]),
+                arrived=int(of_it.sum()),
+                delivered=len(mine),
+                limited=limited,
+                lost=int(dropped.sum()) - limited,
+                buffered=int(of_it.sum() - dropped.sum()) - len(mine),
+                bytes_delivered=int(mine["size_bytes"].sum()),
+                mean_sojourn_s=float(sojourn_s.mean()) if len(mine) else none,
+                p95_sojourn_s=float(np.percentile(sojourn_s, 95)) if len(mine) else none,
+                mean_age_s=mean_age,
+                peak_age_s=peak_age,
+                late=int((sojourn_s > topic.deadline_s).sum()) if topic.deadline_s is not None else 0,
+            )
+        )
+    return made
+
+
+def weighted_qoi(senders: Senders, i: int, got: NDArray[Any]) -> float:
+    """H of several topics: the sum of weight x H of each over the messages ``got``."""
+    total = 0.0
+    for k, topic in enumerate(senders.topics):
+        total += topic.share * (topic.value or senders.value).information(got["x"][got["topic"] == k])
+    return total
+
+
+def ages_between_s(
+    received_us: NDArray[np.int64], arrival_us: NDArray[np.int64], from_us: int, until_us: int
+) -> tuple[float, float]:
+    """(mean, largest) age of information from ``from_us`` to ``until_us``, s; at the beginning it is 0.
+
+    ``received_us`` must not decrease. NaN where that time has no length.
+    """
+    if until_us <= from_us:
+        return (float("nan"),) * 2
+    known = received_us < until_us
+    begins_us = np.concatenate([[from_us], received_us[known]])
+    ends_us = np.concatenate([received_us[known], [until_us]])
+    newest_us = np.maximum.accumulate(np.concatenate([[from_us], arrival_us[known]]))
+    low_us, high_us = begins_us - newest_us, ends_us - newest_us
+    mean_us = ((low_us + high_us) / 2 * (ends_us - begins_us)).sum() / (until_us - from_us)
+    return float(mean_us) / 1e6, float(high_us.max()) / 1e6
 
 
 def ages_s(received_us: NDArray[np.int64], arrival_us: NDArray[np.int64]) -> tuple[float, float, float]:

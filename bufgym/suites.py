@@ -16,10 +16,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from bufgym import qoi
 from bufgym.errors import BufgymError
 from bufgym.qoi import Value
-from bufgym.scenario import Interruption, Scenario, Uplink
+from bufgym.scenario import Client, Interruption, Scenario, Uplink, robofleet_example
 from bufgym.traces import Motion, Trace, drive_motion, markov_link, read_motion, read_trace, synthetic_lte
 from bufgym.traces.synthetic import LTE_MODES
 
@@ -84,14 +86,15 @@ class Suite:
 
 @functools.lru_cache(maxsize=16)
 def _settings(name: str, split: str, data: Path | None) -> dict[str, Setting]:
-    return SUITES[name].build(split, data)
+    return get(name).build(split, data)
 
 
 def get(name: str) -> Suite:
     """The suite of that name."""
-    if name not in SUITES:
-        raise BufgymError(f"unknown suite {name!r}; known: {', '.join(SUITES)}")
-    return SUITES[name]
+    known = SUITES | TOPIC_SUITES
+    if name not in known:
+        raise BufgymError(f"unknown suite {name!r}; known: {', '.join(known)}")
+    return known[name]
 
 
 # --- made-up links ---------------------------------------------------------------------------------------------------
@@ -219,6 +222,46 @@ def _interruption(split: str, data: Path | None) -> dict[str, Setting]:
     }
 
 
+# --- many topics -----------------------------------------------------------------------------------------------------
+
+_DROPOUT_S = (3.0, 20.0)
+_BETWEEN_DROPOUTS_S = 45.0
+
+
+def _with_dropouts(trace: Trace, seed: int) -> Trace:
+    """The same link, but it stands still now and then: dropouts of 3 to 20 s, one in 45 s on average."""
+    rng = np.random.default_rng(seed)
+    lengths_us, rates = trace.samples()
+    steps: list[tuple[float, float]] = []
+    left_s = float(rng.exponential(_BETWEEN_DROPOUTS_S))
+    for us, rate in zip(lengths_us, rates, strict=True):
+        steps.append((float(us) / 1e6, float(rate)))
+        left_s -= float(us) / 1e6
+        if left_s <= 0:
+            steps.append((float(np.exp(rng.uniform(*np.log(_DROPOUT_S)))), 0.0))
+            left_s = float(rng.exponential(_BETWEEN_DROPOUTS_S))
+    return Trace.steps(steps, name=f"{trace.name}-dropouts")
+
+
+CLIENT_MEANS = {"scarce": 0.5e6, "half": 1.2e6, "ample": 2.5e6}
+"""Bytes/s of the link while it is up; the example client wants 2.8 MB/s once rates are limited."""
+
+
+def _topics(split: str, data: Path | None) -> dict[str, Setting]:
+    """Robofleet's example client over LTE links with dropouts, at three mean capacities."""
+    first, modes = _FIRST_SEED[split], list(LTE_MODES)
+    settings = {}
+    for number, (label, mean) in enumerate(CLIENT_MEANS.items()):
+        seeds = [first + 100 * number + k for k in range(_TRACES[split] // 2)]
+        links = [
+            _with_dropouts(synthetic_lte(seed, mean_bytes_per_s=mean, mode=modes[k % 3]), seed)
+            for k, seed in enumerate(seeds)
+        ]
+        client = Client(robofleet_example(), tuple(links), _motions(split), duration_s=EPISODE_S)
+        settings[label] = Setting(client, f"Robofleet's example client over LTE with dropouts, {mean / 1e6:g} MB/s")
+    return settings
+
+
 # --- recordings ------------------------------------------------------------------------------------------------------
 
 _TUM = {
@@ -339,3 +382,11 @@ SUITES = {
         ),
     )
 }
+
+TOPIC_SUITES = {
+    suite.name: suite
+    for suite in (
+        Suite("topics-v1", "Robofleet's example client, 8 topics, over LTE with dropouts", _topics, capacities=(32,)),
+    )
+}
+"""Suites whose episodes have several topics: another benchmark (``bufgym topics``), as no clairvoyant is known there."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -98,6 +98,15 @@ def check_topics(topics: Sequence[Topic]) -> tuple[Topic, ...]:
     if len(topics) > MAX_TOPICS:
         raise BufgymError(f"{len(topics)} topics: must be at most {MAX_TOPICS}")
     return tuple(topics)
+
+
+def copies_of(topics: Sequence[Topic], consumers: int) -> list[Topic]:
+    """The topics of a client that sends one copy to each consumer; together they weigh as much as before."""
+    return [
+        replace(topic, name=f"{topic.name} to {c + 1}", weight=topic.share / consumers)
+        for c in range(consumers)
+        for topic in topics
+    ]
 
 
 def check_window(window: Any) -> int:

@@ -15,19 +15,38 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym import scenario as scenarios
-from bufgym.buffer import ACCEPT, REJECT, UNLIMITED_BYTES
+from bufgym.buffer import ACCEPT, HOLD, REJECT, UNLIMITED_BYTES
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel, prefetch
 from bufgym.link import FOREVER
-from bufgym.observe import CONTEXT_FIELDS, FIELDS, REWARD_TERMS, SLOT_FIELDS, observe_context, observe_slots
+from bufgym.observe import (
+    CONTEXT_FIELDS,
+    REWARD_TERMS,
+    SLOT_FIELDS,
+    TOPIC_CONTEXT_FIELDS,
+    TOPIC_REWARD_TERMS,
+    TOPIC_SLOT_FIELDS,
+    RewardTerm,
+    observe_context,
+    observe_slots,
+    observe_topic_context,
+    observe_topic_slots,
+)
 from bufgym.scenario import Episode, Scenario, Streams
 from bufgym.sender import (
-    DECISION,
+    ARRIVAL_WAITS,
     DEPARTURE,
+    END,
+    SOCKET_WAITS,
     Batch,
     Senders,
+    age_until,
+    answer_send,
     arrival_of,
     can_evict,
+    can_hold,
+    can_reject,
+    can_send,
     credit,
     decide,
     has_room,
@@ -35,7 +54,7 @@ from bufgym.sender import (
     view,
 )
 
-DELIVERED, RETAINED = range(len(REWARD_TERMS))
+DELIVERED, RETAINED, AGE, LATE = range(len(REWARD_TERMS) + len(TOPIC_REWARD_TERMS))
 
 _AHEAD = 8
 """Rows: far enough for the memory to answer in time, near enough for the answer to be still there."""
@@ -45,7 +64,7 @@ class Shown(NamedTuple):
     """What n rows show after a step; rows of these arrays are written by the kernels."""
 
     slots: NDArray[np.float32]
-    """[n, slot fields, L + 1]"""
+    """[n, slot fields, L + 1]: those of ``SLOT_FIELDS``, then with several topics those of ``TOPIC_SLOT_FIELDS``."""
     context: NDArray[np.float32]
     """[n, context fields]"""
     mask: NDArray[np.bool_]
@@ -80,12 +99,15 @@ def advance(batch: Batch, i: int) -> None:
     event = next_event(batch, i)
     while event == DEPARTURE:
         event = next_event(batch, i)
-    if event == DECISION:
-        credit(batch, i, sender.now_us)
-    else:
+    if event == END:
         credit(batch, i, FOREVER)
         # What a dead link never carried was not retained after all.
         sender.retained_gain = sender.delivered_gain
+    else:
+        credit(batch, i, sender.now_us)
+    if sender.topics > 1:
+        for topic in range(sender.topics):
+            age_until(batch, i, topic, FOREVER if event == END else sender.now_us)
 
 
 @kernel
@@ -100,6 +122,9 @@ def show(batch: Batch, i: int, shown: Shown) -> None:
         shown.mask[i, :] = False
         shown.mask[i, capacity] = True
         return
+    if sender.topics > 1:
+        show_topics(batch, i, shown)
+        return
     buffer, arrival = view(batch, i), arrival_of(batch, i)
     observe_slots(buffer, arrival, shown.slots[i])
     observe_context(buffer, arrival, shown.context[i])
@@ -111,6 +136,29 @@ def show(batch: Batch, i: int, shown: Shown) -> None:
         shown.mask[i, sender.occupancy : capacity] = False
     shown.mask[i, capacity] = True
     shown.mask[i, capacity + 1] = has_room(batch, i)
+
+
+@kernel
+def show_topics(batch: Batch, i: int, shown: Shown) -> None:
+    """The same where there are several topics, and the socket may be who asks."""
+    sender = batch.senders[i]
+    capacity = sender.capacity
+    arriving = sender.waiting == ARRIVAL_WAITS
+    # Where the socket asks there is no newcomer; the last arrival stands in and is not read.
+    arrival = batch.arrivals[i, min(sender.next, sender.arrivals - 1)]
+    buffer = view(batch, i)
+    observe_topic_slots(buffer, arrival, arriving, shown.slots[i])
+    observe_topic_context(buffer, arrival, arriving, shown.context[i])
+    if arriving:
+        for k in range(capacity):
+            shown.mask[i, k] = can_evict(batch, i, k)
+        shown.mask[i, capacity] = can_reject(batch, i)
+        shown.mask[i, capacity + 1] = has_room(batch, i)
+    else:
+        for k in range(capacity):
+            shown.mask[i, k] = can_send(batch, i, k)
+        shown.mask[i, capacity] = can_hold(batch, i)
+        shown.mask[i, capacity + 1] = False
 
 
 @kernel
@@ -135,19 +183,31 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64
         prefetch(batch.arrivals, later, soon)
         prefetch(batch.fates, later, soon)
         sender = batch.senders[i]
-        if sender.waiting == 1:
+        if sender.waiting == ARRIVAL_WAITS:
             decide(batch, i, decision_of(actions[i], sender.capacity))
+            advance(batch, i)
+        elif sender.waiting == SOCKET_WAITS:
+            answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
             advance(batch, i)
         shown.terms[i, DELIVERED] = sender.delivered_gain - paid[i, DELIVERED]
         shown.terms[i, RETAINED] = sender.retained_gain - paid[i, RETAINED]
         paid[i, DELIVERED] = sender.delivered_gain
         paid[i, RETAINED] = sender.retained_gain
+        if sender.topics > 1:
+            weight = 0.0
+            for topic in range(sender.topics):
+                weight += batch.topics[i, topic].weight
+            shown.terms[i, AGE] = (paid[i, AGE] - sender.aged) / weight
+            shown.terms[i, LATE] = (paid[i, LATE] - sender.late) / weight
+            paid[i, AGE], paid[i, LATE] = sender.aged, sender.late
         show(batch, i, shown)
 
 
-def reward_weights(reward: str | Mapping[str, float]) -> NDArray[np.float64]:
+def reward_weights(
+    reward: str | Mapping[str, float], terms: Sequence[RewardTerm] = REWARD_TERMS
+) -> NDArray[np.float64]:
     """float64[reward terms] from one term's name or from weights by name."""
-    names = [term.name for term in REWARD_TERMS]
+    names = [term.name for term in terms]
     if not isinstance(reward, str | Mapping):
         raise BufgymError(f"reward = {reward!r}: must be the name of a term ({', '.join(names)}) or weights by name")
     given = {reward: 1.0} if isinstance(reward, str) else dict(reward)
@@ -175,6 +235,7 @@ class Rows:
         parameters: Mapping[str, Any],
     ) -> None:
         self.scenario = scenarios.get(scenario, **parameters)
+        topics = getattr(self.scenario, "topics", ())
         self.senders = Senders(
             n,
             capacity,
@@ -182,28 +243,35 @@ class Rows:
             max_messages=self.scenario.max_messages,
             max_bytes=max_bytes,
             decide_at=decide_at,
+            topics=topics,
         )
         self.capacity = self.senders.capacity
-        self.weights = reward_weights(reward)
-        known = [field.name for field in FIELDS]
+        several = bool(topics)
+        self.terms = REWARD_TERMS + TOPIC_REWARD_TERMS if several else REWARD_TERMS
+        self.weights = reward_weights(reward, self.terms)
+        self.slot_fields = SLOT_FIELDS + TOPIC_SLOT_FIELDS if several else SLOT_FIELDS
+        self.context_fields = CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS if several else CONTEXT_FIELDS
+        self.asks_at_send = int(several)
+        all_fields = self.slot_fields + self.context_fields
+        known = [field.name for field in all_fields]
         for name in fields or ():
             if name not in known:
                 raise BufgymError(f"fields: unknown field {name!r}; known: {', '.join(known)}")
         chosen = known if fields is None else list(fields)
         if not chosen:
             raise BufgymError("fields: choose at least one field to observe")
-        self._slot_keys = [(f.name, i) for i, f in enumerate(SLOT_FIELDS) if f.name in chosen]
-        self._context_keys = [(f.name, i) for i, f in enumerate(CONTEXT_FIELDS) if f.name in chosen]
+        self._slot_keys = [(f.name, i) for i, f in enumerate(self.slot_fields) if f.name in chosen]
+        self._context_keys = [(f.name, i) for i, f in enumerate(self.context_fields) if f.name in chosen]
         self.observation_space = spaces.Dict(
             {
                 f.name: spaces.Box(f.low, f.high, (self.capacity + 1 if f.per == "slot" else 1,), np.float32)
-                for f in FIELDS
+                for f in all_fields
                 if f.name in chosen
             }
         )
         self.action_space = spaces.Discrete(self.capacity + 2)
         self.streams: list[Streams | None] = [None] * n
-        self.paid = np.zeros((n, len(REWARD_TERMS)))
+        self.paid = np.zeros((n, len(self.terms)))
         self.shown = self.new_shown()
 
     def __len__(self) -> int:
@@ -213,10 +281,10 @@ class Rows:
         """Arrays for what a step shows."""
         n, L = len(self), self.capacity
         return Shown(
-            np.zeros((n, len(SLOT_FIELDS), L + 1), np.float32),
-            np.zeros((n, len(CONTEXT_FIELDS)), np.float32),
+            np.zeros((n, len(self.slot_fields), L + 1), np.float32),
+            np.zeros((n, len(self.context_fields)), np.float32),
             np.zeros((n, L + 2), np.bool_),
-            np.zeros((n, len(REWARD_TERMS))),
+            np.zeros((n, len(self.terms))),
             np.zeros(n, np.bool_),
         )
 
@@ -234,6 +302,7 @@ class Rows:
                     self.seed(i, seeding.np_random()[0])
                 episode = draw(cast(Streams, self.streams[i]))
             load(i, episode)
+            self.senders.batch.senders["ask_at_send"][i] = self.asks_at_send
         begin_rows(self.senders.batch, rows, self.paid, self.shown)
 
     def step(self, actions: NDArray[np.int64]) -> None:
@@ -242,10 +311,12 @@ class Rows:
 
     def summary(self, i: Any) -> dict[str, Any]:
         """What the finished episode(s) of row(s) ``i`` came to: qoi and message counts."""
-        sender = self.senders.batch.senders[i]
+        sender, topics = self.senders.batch.senders[i], self.senders.batch.topics[i]
         crossed = sender["crossed"]
+        # The 1 in H = 1 + sum of V, of each topic.
+        first = ((topics["received"] > 0) * topics["weight"]).sum(-1) if self.senders.topics else crossed > 0
         return {
-            "qoi": (crossed > 0) + sender["delivered_gain"],
+            "qoi": first + sender["delivered_gain"],
             "arrived": sender["next"],
             "delivered": crossed,
             "dropped": sender["rejected"] + sender["evicted"],

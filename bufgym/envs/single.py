@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import DELIVERED, RETAINED, Rows
+from bufgym.envs.rows import Rows
 from bufgym.errors import BufgymError
 from bufgym.scenario import Scenario
 
@@ -94,11 +94,13 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self._action[0] = action
         rows.step(self._action)
         terms = rows.shown.terms[0].tolist()
-        reward = self._weights[DELIVERED] * terms[DELIVERED] + self._weights[RETAINED] * terms[RETAINED]
+        reward = 0.0
+        for weight, term in zip(self._weights, terms, strict=True):
+            reward += weight * term
         info = {
             "action_mask": self.action_masks(),
             "impossible": rows.senders.batch.senders["impossible"].item(),
-            "reward_terms": {"delivered": terms[DELIVERED], "retained": terms[RETAINED]},
+            "reward_terms": {term.name: terms[k] for k, term in enumerate(rows.terms)},
         }
         ended = rows.shown.ended.item()
         if ended:

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import DELIVERED, RETAINED, Rows, Shown
+from bufgym.envs.rows import Rows, Shown
 from bufgym.envs.single import Observation, SenderEnv
 from bufgym.errors import BufgymError
 from bufgym.scenario import Scenario
@@ -137,8 +137,9 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             self._steps[self._done] = 0
         shown = rows.shown
         # Written out as in the single environment: a matrix product may round differently.
-        weights, terms = rows.weights, shown.terms
-        rewards = weights[DELIVERED] * terms[:, DELIVERED] + weights[RETAINED] * terms[:, RETAINED]
+        rewards = np.zeros(self.num_envs)
+        for k, weight in enumerate(rows.weights.tolist()):
+            rewards += weight * shown.terms[:, k]
         terminated = shown.ended & ~self._done if restart else shown.ended.copy()
         truncated = np.zeros(self.num_envs, np.bool_)
         if self.max_episode_steps is not None:
@@ -197,12 +198,10 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             "_impossible": everywhere,
         }
         if terms:
-            info["reward_terms"] = {
-                "delivered": shown.terms[:, 0],
-                "_delivered": everywhere,
-                "retained": shown.terms[:, 1],
-                "_retained": everywhere,
-            }
+            info["reward_terms"] = {}
+            for k, term in enumerate(self.rows.terms):
+                info["reward_terms"][term.name] = shown.terms[:, k]
+                info["reward_terms"][f"_{term.name}"] = everywhere
             info["_reward_terms"] = everywhere
         return info
 

@@ -63,12 +63,17 @@ def taken_on_topic(batch: Batch, i: int, message: Any) -> None:
 
 @kernel
 def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
-    """Count the age of a topic's information at the server up to ``until_us``, times its weight."""
+    """Count the age of a topic's information at the server up to ``until_us``, times its weight.
+
+    It begins with the topic's first arrival and ends with the episode's last, whatever a policy does.
+    """
+    sender = batch.senders[i]
     rules = batch.topics[i, topic]
+    until_us = min(until_us, batch.arrivals[i, sender.arrivals - 1].arrival_us)
     if rules.arrived == 0 or until_us <= rules.aged_us:
         return
     from_s, until_s = (rules.aged_us - rules.newest_us) / 1e6, (until_us - rules.newest_us) / 1e6
-    batch.senders[i].aged += rules.weight * (from_s + until_s) / 2 * (until_s - from_s)
+    sender.aged += rules.weight * (from_s + until_s) / 2 * (until_s - from_s)
     rules.aged_us = until_us
 
 

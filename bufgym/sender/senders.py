@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numba
@@ -28,7 +29,7 @@ from bufgym.sender.transition import (
     next_event,
     view,
 )
-from bufgym.topics import Topic, check_topics, topic_table
+from bufgym.topics import Topic, check_topics, check_window, copies_of, topic_table
 
 
 def rollout(
@@ -117,6 +118,9 @@ class Senders:
         if self.topics and episode.arrivals["topic"].max() >= len(self.topics):
             unknown = episode.arrivals["topic"].max()
             raise BufgymError(f"episode: unknown topic {unknown}; the senders know {len(self.topics)}, from 0 on")
+        check_window(episode.window)
+        if episode.pong_us < 0:
+            raise BufgymError(f"pong_us = {episode.pong_us}: must be >= 0")
         first_knot, last_knot, after = self._knots.place(link.trace)
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
@@ -204,8 +208,16 @@ def run(
     """The senders after ``policy`` met each of ``episodes``, one sender each; an unbounded policy has L = all."""
     if not episodes:
         raise BufgymError("no episode to run")
+    if policy.client.encoding:
+        episodes = [episode.encoded(policy.client.encoding) for episode in episodes]
+    if policy.client.copies and topics:
+        copies = max(episode.consumers for episode in episodes)
+        episodes = [episode.copied(len(topics)) for episode in episodes]
+        topics = copies_of(topics, copies)
     longest = max(len(episode.arrivals) for episode in episodes)
-    capacity = longest if policy.unbounded else capacity
+    if policy.unbounded:
+        capacity = longest
+        topics = [replace(topic, limit=None) for topic in topics]
     senders = Senders(
         len(episodes), capacity, v, max_messages=longest, max_bytes=max_bytes, decide_at=decide_at, topics=topics
     )

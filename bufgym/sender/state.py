@@ -84,6 +84,7 @@ FATE = np.dtype(
         ("due_us", np.int64),  # its last byte will cross the link; known once the socket has it
         ("crossed_us", np.int64),  # its last byte crossed the link
         ("dropped_us", np.int64),  # it was evicted or rejected
+        ("limited", np.int64),  # 1: a rate limit dropped it
         ("gain", np.float64),  # V that its delivery adds; it is settled once the socket has taken it
     ],
     align=True,

@@ -52,7 +52,7 @@ def load_row(
     for k in range(len(arrivals)):
         batch.arrivals[i, k] = arrivals[k]
         fate = batch.fates[i, k]
-        fate.taken_us, fate.due_us, fate.crossed_us, fate.dropped_us = NEVER, NEVER, NEVER, NEVER
+        fate.taken_us, fate.due_us, fate.crossed_us, fate.dropped_us, fate.limited = NEVER, NEVER, NEVER, NEVER, 0
     for k in range(len(topics)):
         batch.topics[i, k] = topics[k]
     sender = batch.senders[i]
@@ -338,6 +338,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         sender.peak_backlog_bytes = max(sender.peak_backlog_bytes, sender.backlog_bytes)
     else:
         fate.dropped_us = sender.now_us
+        fate.limited = 1 if decision == LIMITED else 0
         sender.rejected += 1
     if not possible:
         sender.impossible += 1

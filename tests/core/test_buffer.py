@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym import qoi
-from bufgym.buffer import MESSAGE, Buffer, arrival_gain, evict, loss, motion_gaps, push, row_width, time_gaps
+from bufgym.buffer import MESSAGE, TOPIC, Buffer, arrival_gain, evict, loss, motion_gaps, push, row_width, time_gaps
 from bufgym.kernel import records
 
 
@@ -47,7 +47,7 @@ def buffer(times_us, x, v=None, *, taken_us=0, taken_x=0.0, previous_us=0, previ
     others = dict.fromkeys(Buffer._fields, 0)
     others.update(slots=slots, capacity=len(x), v=(v or qoi.exponential(0.5)).array, taken=taken)
     others.update(taken_us=taken_us, taken_x=taken_x, previous_us=previous_us, previous_x=previous_x)
-    others.update(left_fraction=0.0, period_us=0.0, drain=0.0)
+    others.update(left_fraction=0.0, period_us=0.0, drain=0.0, topics=records(1, TOPIC))
     return Buffer(**others)
 
 

@@ -1,0 +1,118 @@
+"""What an agent observes and what it is paid for: one table each, from which spaces, code and docs are made.
+
+Every field is computed from the ``Buffer`` view and the arrival alone, that is from what a robot has on board (its
+buffer, clock, odometry, and what its own socket still holds); nothing comes from the server or the link's future.
+
+Every field lies in [0, 1] and is free of scale. Lengths g (of time, motion, bytes) appear as g / (g + r) with a
+stated reference r, so 0.5 means "as long as the reference". For gaps r is the *even spacing*: the distance from the
+message that the socket took last to the newcomer, divided by L + 1, which is what an even thinning of that stretch
+to L kept messages would leave between neighbours (AFR's aim). So one set of weights serves every L and frame rate.
+
+With several topics a message's neighbours are those of its own topic, the even spacing is the distance from the one
+that the socket took last to the topic's last arrival divided by one more than the topic's queued messages, and values
+are weighted: QoI is in units of the largest weight. Then there are further fields, about topics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Field:
+    """One observed quantity. ``per``: "slot" fields have L + 1 entries, the newcomer last; "context" fields one."""
+
+    name: str
+    per: str
+    group: str
+    """What it takes to know it: queue (counting), time (a clock), motion (odometry), value (V), link (its socket)."""
+    unit: str
+    meaning: str
+    low: float = 0.0
+    high: float = 1.0
+
+
+SLOT_FIELDS = (
+    Field("occupied", "slot", "queue", "flag", "1 where the slot holds a message (the newcomer's always does)"),
+    Field("rank", "slot", "queue", "fraction", "(k + 1) / (s + 1) for slot k of s queued; 1 for the newcomer"),
+    Field("time_before", "slot", "time", "g/(g+r), r = even time spacing", "time since the message kept before it"),
+    Field("time_merged", "slot", "time", "g/(g+r), r = 2 x even time spacing", "time gap left if it is dropped"),
+    Field("motion_before", "slot", "motion", "g/(g+r), r = even motion spacing", "motion since the message before it"),
+    Field(
+        "motion_merged", "slot", "motion", "g/(g+r), r = 2 x even motion spacing", "motion gap left if it is dropped"
+    ),
+    Field("loss", "slot", "value", "QoI", "V(a) + V(b) - V(a+b): QoI lost if it alone is dropped now"),
+    Field("size", "slot", "queue", "g/(g+r), r = mean queued size", "its bytes"),
+    Field("relative_loss", "slot", "value", "l/(l+r), r = that of an even gap", "the same loss, free of V's scale"),
+)
+CONTEXT_FIELDS = (
+    Field("occupancy", "context", "queue", "fraction of L", "messages queued"),
+    Field("backlog", "context", "queue", "fraction of B", "bytes queued; 0 where there is no byte limit"),
+    Field("arrival_time_gap", "context", "time", "g/(g+r), r = even time spacing", "time since the previous arrival"),
+    Field("arrival_motion_gap", "context", "motion", "g/(g+r), r = even motion spacing", "motion since then"),
+    Field("busy", "context", "link", "flag", "1 while a message is in transmission"),
+    Field("left", "context", "link", "fraction", "part of the message in transmission that has not crossed yet"),
+    Field("stalled", "context", "link", "g/(g+r), r = L + 1 arrival periods", "time since the socket took a message"),
+    Field("departures", "context", "link", "n/(n+1)", "messages the socket took since the previous arrival"),
+    Field("drain", "context", "link", "g/(g+r), r = 1", "running mean of departures per arrival"),
+    Field("even_value", "context", "value", "QoI", "V of the even motion spacing e"),
+    Field("bend", "context", "value", "fraction", "(2 V(e) - V(2e)) / V(e): 0 where V is straight, 1 where it is flat"),
+)
+FIELDS = SLOT_FIELDS + CONTEXT_FIELDS
+
+TOPIC_SLOT_FIELDS = (
+    Field("priority", "slot", "topic", "fraction of the highest", "priority of its topic"),
+    Field("weight", "slot", "topic", "fraction of the largest", "weight of its topic in the sum of H"),
+    Field("no_drop", "slot", "topic", "flag", "1 where it may not be dropped"),
+    Field("oldest", "slot", "topic", "flag", "1 where it is the oldest of its topic: the only one that may be sent"),
+    Field("own", "slot", "topic", "flag", "1 where its topic is the newcomer's; 0 when the socket asks"),
+    Field("waited", "slot", "topic", "g/(g+r), r = 1 s", "time since its arrival"),
+    Field("silence", "slot", "topic", "g/(g+r), r = 1 s", "age of what the server may know of its topic"),
+    Field("lateness", "slot", "topic", "g/(g+r), r = its deadline", "time since its arrival; 0 without a deadline"),
+    Field("queued", "slot", "topic", "fraction of L", "messages of its topic in the buffer"),
+    Field("gain", "slot", "topic", "QoI, weighted", "what its delivery adds to H"),
+    Field("gain_per_byte", "slot", "topic", "g/(g+r), r = mean of the queue", "the same for each byte of it"),
+)
+TOPIC_CONTEXT_FIELDS = (
+    Field("socket_asks", "context", "topic", "flag", "1 where the socket asks what to send, 0 at an arrival"),
+    Field("in_flight", "context", "topic", "n/(n+r), r = n_T", "messages sent and not yet answered by a pong"),
+)
+TOPIC_FIELDS = TOPIC_SLOT_FIELDS + TOPIC_CONTEXT_FIELDS
+"""What is observed besides ``FIELDS`` where there are several topics."""
+
+_NUMBER = {field.name: i for i, field in enumerate(SLOT_FIELDS + TOPIC_SLOT_FIELDS)} | {
+    field.name: i for i, field in enumerate(CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS)
+}
+OCCUPIED, RANK, SIZE, LOSS = (_NUMBER[name] for name in ("occupied", "rank", "size", "loss"))
+TIME_BEFORE, TIME_MERGED = _NUMBER["time_before"], _NUMBER["time_merged"]
+MOTION_BEFORE, MOTION_MERGED = _NUMBER["motion_before"], _NUMBER["motion_merged"]
+OCCUPANCY, BACKLOG, BUSY, LEFT = (_NUMBER[name] for name in ("occupancy", "backlog", "busy", "left"))
+ARRIVAL_TIME_GAP, ARRIVAL_MOTION_GAP = _NUMBER["arrival_time_gap"], _NUMBER["arrival_motion_gap"]
+STALLED, DEPARTURES, DRAIN = _NUMBER["stalled"], _NUMBER["departures"], _NUMBER["drain"]
+RELATIVE_LOSS, EVEN_VALUE, BEND = _NUMBER["relative_loss"], _NUMBER["even_value"], _NUMBER["bend"]
+PRIORITY, WEIGHT, NO_DROP, OLDEST, OWN = (_NUMBER[n] for n in ("priority", "weight", "no_drop", "oldest", "own"))
+WAITED, SILENCE, LATENESS, QUEUED = (_NUMBER[name] for name in ("waited", "silence", "lateness", "queued"))
+GAIN, GAIN_PER_BYTE = _NUMBER["gain"], _NUMBER["gain_per_byte"]
+SOCKET_ASKS, IN_FLIGHT = _NUMBER["socket_asks"], _NUMBER["in_flight"]
+
+
+@dataclass(frozen=True)
+class RewardTerm:
+    """One named reward; an env pays a weighted sum of them and reports each by name in ``info``."""
+
+    name: str
+    unit: str
+    meaning: str
+
+
+REWARD_TERMS = (
+    RewardTerm("delivered", "QoI", "V gained when a message arrives at the server; sums to H - 1"),
+    RewardTerm("retained", "QoI", "change of the H that delivering all that is kept would give; sums to H - 1 too"),
+)
+TOPIC_REWARD_TERMS = (
+    RewardTerm("age", "s", "minus the weighted mean age of information at the server, integrated over time"),
+    RewardTerm("late", "messages", "minus the weight of each message that reaches the server after its deadline"),
+)
+"""What an env with several topics can pay for besides; weights are fractions of their sum over the topics."""
+"""``retained`` is ``delivered`` shaped by a potential (Ng, Harada and Russell 1999): the QoI held, not yet delivered.
+It pays at the moment of the decision what the decision costs or gains, and telescopes to the same total."""

@@ -1,0 +1,131 @@
+"""One queue: the fields of ``fields.SLOT_FIELDS`` and ``CONTEXT_FIELDS``, computed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.buffer import UNLIMITED_BYTES, Buffer, arrival_gain
+from bufgym.kernel import kernel
+from bufgym.observe.fields import (
+    ARRIVAL_MOTION_GAP,
+    ARRIVAL_TIME_GAP,
+    BACKLOG,
+    BEND,
+    BUSY,
+    DEPARTURES,
+    DRAIN,
+    EVEN_VALUE,
+    LEFT,
+    LOSS,
+    MOTION_BEFORE,
+    MOTION_MERGED,
+    OCCUPANCY,
+    OCCUPIED,
+    RANK,
+    RELATIVE_LOSS,
+    SIZE,
+    STALLED,
+    TIME_BEFORE,
+    TIME_MERGED,
+)
+from bufgym.qoi import merging_loss, value
+
+# So that 0 / (0 + reference) is 0 where nothing moved at all.
+TINY = 1e-30
+# Where V is straight a merger loses nothing but rounding errors, which are not to be told from one another.
+ROUNDING = 1e-12
+
+
+@kernel
+def squash(g: float, reference: float) -> float:
+    """g / (g + reference), in [0, 1]; 0 where both are 0."""
+    return g / (g + max(reference, TINY))
+
+
+@kernel
+def squash_row(row: NDArray[np.floating[Any]], reference: float) -> None:
+    """``squash`` of every entry, in place and in single precision."""
+    r = np.float32(max(reference, TINY))
+    for k in range(len(row)):
+        row[k] = row[k] / (row[k] + r)
+
+
+@kernel
+def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
+    """V of the even motion spacing, and the QoI lost where two such gaps become one."""
+    even = (arrival.x - buffer.taken_x) / (buffer.capacity + 1)
+    gain = value(buffer.v, even)
+    return gain, merging_loss(buffer.v, even, gain, even, gain)
+
+
+@kernel
+def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
+    """Write every CONTEXT_FIELDS value into ``context`` (float[fields])."""
+    spread = buffer.capacity + 1
+    context[OCCUPANCY] = len(buffer.slots) / buffer.capacity
+    context[BACKLOG] = buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0
+    time_gap, motion_gap = arrival.arrival_us - buffer.previous_us, arrival.x - buffer.previous_x
+    context[ARRIVAL_TIME_GAP] = squash(time_gap, (arrival.arrival_us - buffer.taken_us) / spread)
+    context[ARRIVAL_MOTION_GAP] = squash(motion_gap, (arrival.x - buffer.taken_x) / spread)
+    context[BUSY] = buffer.busy
+    context[LEFT] = buffer.left_fraction
+    context[STALLED] = squash(buffer.stalled_us, spread * buffer.period_us)
+    context[DEPARTURES] = squash(buffer.departures, 1.0)
+    context[DRAIN] = squash(buffer.drain, 1.0)
+    context[EVEN_VALUE], even_loss = even_gap(buffer, arrival)
+    context[BEND] = even_loss / max(context[EVEN_VALUE], TINY)
+
+
+@kernel
+def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
+    """Write every SLOT_FIELDS value into ``rows`` (float[fields, L + 1]); empty slots are 0, the newcomer is last.
+
+    The gaps are those of ``buffer.time_gaps`` and ``motion_gaps``, the loss that of ``buffer.loss``, found in one walk
+    along the queue; gaps and relative losses are squashed row by row afterwards.
+    """
+    s, last = len(buffer.slots), buffer.capacity
+    per_rank = 1 / (s + 1)
+    before_us, before_x = buffer.taken_us, buffer.taken_x
+    newcomer_gain = arrival_gain(buffer, arrival)
+    for k in range(s):
+        slot = buffer.slots[k]
+        here_us, here_x, gain = slot.arrival_us, slot.x, slot.gain
+        if k + 1 < s:
+            after = buffer.slots[k + 1]
+            after_us, after_x, after_gain = after.arrival_us, after.x, after.gain
+        else:
+            after_us, after_x, after_gain = arrival.arrival_us, arrival.x, newcomer_gain
+        rows[OCCUPIED, k] = 1.0
+        rows[RANK, k] = (k + 1) * per_rank
+        rows[TIME_BEFORE, k] = here_us - before_us
+        rows[TIME_MERGED, k] = after_us - before_us
+        rows[MOTION_BEFORE, k] = here_x - before_x
+        rows[MOTION_MERGED, k] = after_x - before_x
+        rows[LOSS, k] = merging_loss(buffer.v, here_x - before_x, gain, after_x - here_x, after_gain)
+        rows[RELATIVE_LOSS, k] = max(rows[LOSS, k], 0.0)
+        rows[SIZE, k] = slot.size_bytes
+        before_us, before_x = here_us, here_x
+    for k in range(s, last):
+        for field in range(len(rows)):
+            rows[field, k] = 0.0
+    step_us, step_x = arrival.arrival_us - buffer.previous_us, arrival.x - buffer.previous_x
+    rows[OCCUPIED, last] = 1.0
+    rows[RANK, last] = 1.0
+    rows[TIME_BEFORE, last] = arrival.arrival_us - before_us
+    rows[TIME_MERGED, last] = arrival.arrival_us - before_us + step_us
+    rows[MOTION_BEFORE, last] = arrival.x - before_x
+    rows[MOTION_MERGED, last] = arrival.x - before_x + step_x
+    rows[LOSS, last] = merging_loss(buffer.v, arrival.x - before_x, newcomer_gain, step_x, value(buffer.v, step_x))
+    rows[RELATIVE_LOSS, last] = max(rows[LOSS, last], 0.0)
+    rows[SIZE, last] = arrival.size_bytes
+    even = 1 / (buffer.capacity + 1)
+    even_us, even_x = even * (arrival.arrival_us - buffer.taken_us), even * (arrival.x - buffer.taken_x)
+    squash_row(rows[TIME_BEFORE], even_us)
+    squash_row(rows[TIME_MERGED], 2 * even_us)
+    squash_row(rows[MOTION_BEFORE], even_x)
+    squash_row(rows[MOTION_MERGED], 2 * even_x)
+    squash_row(rows[RELATIVE_LOSS], max(even_gap(buffer, arrival)[1], ROUNDING))
+    squash_row(rows[SIZE], (buffer.backlog_bytes + arrival.size_bytes) * per_rank)

@@ -1,0 +1,128 @@
+"""One interruption of unknown length: the AFR paper's model."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import qoi
+from bufgym.errors import BufgymError
+from bufgym.link import Link
+from bufgym.qoi import Value
+from bufgym.scenario.checks import check_value, natural, positive, rate
+from bufgym.scenario.episode import Episode, Streams, messages
+from bufgym.topics import Topic
+from bufgym.traces import Trace
+
+LAWS = ("fixed", "uniform", "log-uniform", "geometric")
+
+
+@dataclass(frozen=True)
+class Interruption:
+    """One interruption of unknown length (AFR paper, Sec. III-B).
+
+    Message 0 is in transmission when the link stops; messages 1..T arrive, one a period, and meet the policy; then the
+    link resumes, all that is kept is delivered, and message T + 1 after it. T is hidden and drawn from ``law``:
+    ``fixed`` (t_max), ``uniform`` or ``log-uniform`` on t_min..t_max, ``geometric`` from t_min on with mean
+    ``t_mean``, cut off at t_max.
+    """
+
+    law: str = "log-uniform"
+    t_min: int = 1
+    t_max: int = 400
+    t_mean: float = 100.0
+    rate_hz: float = 30.0
+    size_bytes: int = 230_000
+    value: Value = field(default_factory=qoi.exponential)
+    lengths: tuple[int, ...] = ()
+    """If any are given: T is drawn again until it is one of these."""
+
+    def __post_init__(self) -> None:
+        if self.law not in LAWS:
+            raise BufgymError(f"law = {self.law!r}: must be one of {', '.join(LAWS)}")
+        for name in ("t_min", "t_max", "size_bytes"):
+            object.__setattr__(self, name, natural(name, getattr(self, name)))
+        if not 1 <= self.t_min <= self.t_max <= 10**6:
+            raise BufgymError(f"t_min = {self.t_min}, t_max = {self.t_max}: need 1 <= t_min <= t_max <= 1000000")
+        positive(self, "size_bytes", "t_mean")
+        rate(self.rate_hz)
+        if not self.t_mean >= self.t_min:
+            raise BufgymError(f"t_mean = {self.t_mean}: must be at least t_min = {self.t_min}")
+        check_value(self)
+        object.__setattr__(self, "lengths", tuple(natural("lengths", T) for T in self.lengths))
+        shortest = self.t_max if self.law == "fixed" else self.t_min
+        if self.lengths and not any(shortest <= T <= self.t_max for T in self._allowed):
+            raise BufgymError(f"lengths = {self.lengths}: none lies between {shortest} and t_max = {self.t_max}")
+
+    @functools.cached_property
+    def _allowed(self) -> frozenset[int]:
+        return frozenset(self.lengths)
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        return ()  # one queue
+
+    @property
+    def max_messages(self) -> int:
+        return self.t_max + 2
+
+    @property
+    def period_us(self) -> int:
+        """Time between arrivals, us."""
+        return round(1e6 / self.rate_hz)
+
+    def draw_length(self, rng: np.random.Generator) -> int:
+        """T, messages."""
+        while True:
+            T = self._drawn_length(rng)
+            if not self.lengths or T in self._allowed:
+                return T
+
+    def _drawn_length(self, rng: np.random.Generator) -> int:
+        if self.law == "fixed":
+            return self.t_max
+        if self.law == "uniform":
+            return int(rng.integers(self.t_min, self.t_max, endpoint=True))
+        if self.law == "log-uniform":
+            # Real-valued on [t_min, t_max + 1), so that every T has weight ln((T + 1) / T).
+            return min(self.t_max, int(self.t_min * ((self.t_max + 1) / self.t_min) ** rng.random()))
+        return min(self.t_max, self.t_min - 1 + int(rng.geometric(1 / (self.t_mean - self.t_min + 1))))
+
+    def episode(self, T: int) -> Episode:
+        """The interruption of exactly T messages, 1 <= T <= t_max."""
+        if not 1 <= T <= self.t_max:
+            raise BufgymError(f"T = {T}: must lie between 1 and t_max = {self.t_max}")
+        if T not in self._episodes:
+            resumes_us = self.period_us * T + self.period_us // 2
+            trace = _blocked_then_open(self.period_us * (self.t_max + 1), self.max_messages * self.size_bytes)
+            link = Link(trace, offset_us=int(trace.time_us[1]) - resumes_us)
+            self._episodes[T] = Episode(self._table[: T + 2], link, 1, T)
+        return self._episodes[T]
+
+    def draw(self, streams: Streams) -> Episode:
+        return self.episode(self.draw_length(streams.link))
+
+    @functools.cached_property
+    def _episodes(self) -> dict[int, Episode]:
+        """Those drawn so far: the length is all that differs, so each is made once."""
+        return {}
+
+    @functools.cached_property
+    def _table(self) -> NDArray[Any]:
+        """Messages 0..t_max + 1: every episode is a beginning of this table."""
+        return messages(np.arange(self.max_messages, dtype=np.int64) * self.period_us, int(self.size_bytes))
+
+
+@functools.lru_cache(maxsize=64)
+def _blocked_then_open(blocked_us: int, total_bytes: int) -> Trace:
+    """Nothing for ``blocked_us``, then ``total_bytes`` in one microsecond, again and again."""
+    return Trace(
+        "interruption",
+        np.array([0, blocked_us, blocked_us + 1], np.int64),
+        np.array([0, 0, total_bytes], np.int64),
+        after="hold",
+    )
