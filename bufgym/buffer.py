@@ -55,6 +55,7 @@ TOPIC = np.dtype(
         ("received", np.int64),
         ("newest_us", np.int64),  # arrival time of the newest received
         ("aged_us", np.int64),  # until when its age has been counted
+        ("aged", np.float64),  # its age, integrated over that time, s^2
         # room for whoever walks along the queue
         ("mark", np.int64),
     ],
@@ -97,7 +98,9 @@ class Buffer(NamedTuple):
     taken: int
     """How many messages the socket has taken so far (delivered, or in transmission)."""
     taken_us: int
-    """Arrival time of the message that the socket took last, us; that of the previous arrival while there was none."""
+    """Arrival time of the message that the socket took last, us; while there was none, that of the arrival before all
+    that is queued. At an arrival where there are several topics: the last of the newcomer's topic, as the next three.
+    """
     taken_x: float
     """Coordinate of the message that the socket took last."""
     previous_us: int
@@ -202,11 +205,12 @@ def time_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int]:
     j = before(buffer, k, topic)
     if j >= 0:
         since = buffer.slots[j].arrival_us
+    elif topic_arrives(buffer, arrival, topic):
+        since = buffer.taken_us
     else:
-        since = buffer.taken_us if len(buffer.topics) == 1 else buffer.topics[topic].taken_us
+        since = buffer.topics[topic].taken_us if buffer.topics[topic].taken > 0 else here
     if k == s:
-        previous = buffer.previous_us if len(buffer.topics) == 1 else buffer.topics[topic].previous_us
-        return here - since, here - previous
+        return here - since, here - buffer.previous_us
     j = after(buffer, k, topic)
     if j < s:
         until = buffer.slots[j].arrival_us
@@ -226,11 +230,12 @@ def motion_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
     j = before(buffer, k, topic)
     if j >= 0:
         since = buffer.slots[j].x
+    elif topic_arrives(buffer, arrival, topic):
+        since = buffer.taken_x
     else:
-        since = buffer.taken_x if len(buffer.topics) == 1 else buffer.topics[topic].taken_x
+        since = buffer.topics[topic].taken_x if buffer.topics[topic].taken > 0 else here
     if k == s:
-        previous = buffer.previous_x if len(buffer.topics) == 1 else buffer.topics[topic].previous_x
-        return here - since, here - previous
+        return here - since, here - buffer.previous_x
     j = after(buffer, k, topic)
     if j < s:
         until = buffer.slots[j].x

@@ -389,4 +389,4 @@ TOPIC_SUITES = {
         Suite("topics-v1", "Robofleet's example client, 8 topics, over LTE with dropouts", _topics, capacities=(32,)),
     )
 }
-"""Suites whose episodes have several topics: another benchmark (``bufgym topics``), as no clairvoyant is known there."""
+"""Suites whose episodes have several topics: another benchmark (``bufgym topics``), no clairvoyant is known there."""

@@ -98,6 +98,8 @@ class Policy:
     """Room to work in behind the memory's entries: so many numbers, and so many more for each of L + 1 candidates."""
     about: str = ""
     client: Client = Client()
+    for_topics: bool = False
+    """Whether it is made for several topics; in one queue it says little, and is left out unless it is named."""
 
     @property
     def schedules(self) -> bool:
@@ -211,6 +213,7 @@ def register(
     unbounded: bool = False,
     foresee: Foresee | None = None,
     client: Client | None = None,
+    for_topics: bool = False,
 ) -> Callable[[OnArrival], OnArrival]:
     """Register the decorated function as the policy ``name``; it comes back unchanged.
 
@@ -241,6 +244,7 @@ def register(
             unbounded,
             foresee,
             client=client or Client(),
+            for_topics=for_topics,
         )
         return on_arrival
 

@@ -73,7 +73,9 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
     if rules.arrived == 0 or until_us <= rules.aged_us:
         return
     from_s, until_s = (rules.aged_us - rules.newest_us) / 1e6, (until_us - rules.newest_us) / 1e6
-    sender.aged += rules.weight * (from_s + until_s) / 2 * (until_s - from_s)
+    area = (from_s + until_s) / 2 * (until_s - from_s)
+    rules.aged += area
+    sender.aged += rules.weight * area
     rules.aged_us = until_us
 
 
@@ -122,10 +124,11 @@ def refuge(batch: Batch, i: int) -> int:
 def sendable(batch: Batch, i: int, k: int) -> bool:
     """Whether slot ``k`` may be sent by the window and, where rate limits hold back at the socket, by its own."""
     sender = batch.senders[i]
+    full = sender.taken - sender.ponged >= sender.window
     if sender.topics == 1:
-        return True
+        return not full
     rules = batch.topics[i, batch.slots[i, sender.first + k].topic]
-    if sender.taken - sender.ponged >= sender.window and not (sender.flush_no_drop == 1 and rules.no_drop == 1):
+    if full and not (sender.flush_no_drop == 1 and rules.no_drop == 1):
         return False
     held_back = sender.limit_at_send == 1 and rules.taken > 0 and sender.now_us - rules.sent_us < rules.period_us
     return not held_back

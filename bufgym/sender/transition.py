@@ -28,8 +28,6 @@ _PERIOD_WEIGHT, _DRAIN_WEIGHT = 1 / 8, 1 / 16
 
 ARRIVAL_WAITS, SOCKET_WAITS = 1, 2
 """What a sender may be ``waiting`` for: a decision on its arrival, or the choice of what to send."""
-LIMITED = -3
-"""A decision of nobody's: the rate limit drops the arrival."""
 
 
 @kernel
@@ -210,6 +208,9 @@ def next_event(batch: Batch, i: int) -> int:
             if sender.ask_at_send == 1 and sender.chosen == NEVER:
                 sender.waiting = SOCKET_WAITS
                 return SEND
+            if sender.chosen == NEVER and (sender.limit_at_send == 1 or sender.flush_no_drop == 1):
+                choose(batch, i, oldest_sendable(batch, i))
+                continue
             take(batch, i, max(sender.chosen, 0))
             transmit(batch, i)
             sender.cleared, sender.follows, sender.chosen = 0, 0, NEVER
@@ -250,7 +251,8 @@ def arrive(batch: Batch, i: int) -> bool:
     else:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
     if sender.topics > 1 and sender.limit_at_send == 0 and too_soon(batch, i, arrival.topic):
-        decide(batch, i, LIMITED)
+        batch.fates[i, sender.next].limited = 1
+        decide(batch, i, REJECT)  # which is possible: a no_drop topic has no rate limit
         return False
     asked = sender.first_decision <= sender.next <= sender.last_decision
     if asked and not (sender.ask_when_full == 1 and has_room(batch, i)):
@@ -312,7 +314,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     if decision >= 0 and can_evict(batch, i, decision):
         remove(batch, i, decision)
         sender.evicted += 1
-    elif decision == LIMITED or (decision == REJECT and can_reject(batch, i)):
+    elif decision == REJECT and can_reject(batch, i):
         enqueue = False
     else:
         enqueue = has_room(batch, i)
@@ -338,7 +340,6 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         sender.peak_backlog_bytes = max(sender.peak_backlog_bytes, sender.backlog_bytes)
     else:
         fate.dropped_us = sender.now_us
-        fate.limited = 1 if decision == LIMITED else 0
         sender.rejected += 1
     if not possible:
         sender.impossible += 1
@@ -370,7 +371,9 @@ def remove(batch: Batch, i: int, k: int) -> None:
         merge_on_topic(batch, i, k)
     elif k + 1 < sender.occupancy:
         after = batch.slots[i, sender.first + k + 1]
-        merged = value(batch.v, after.x - batch.slots[i, sender.first + k - 1].x)
+        merged = 0.0
+        if sender.taken > 0 or k > 0:
+            merged = value(batch.v, after.x - batch.slots[i, sender.first + k - 1].x)
         sender.retained_gain += merged - after.gain
         after.gain = merged
     sender.first = evict(batch.slots, i, sender.first, sender.occupancy, k)
@@ -408,9 +411,30 @@ def can_send(batch: Batch, i: int, k: int) -> bool:
 
 @kernel
 def can_hold(batch: Batch, i: int) -> bool:
-    """Whether the socket may wait: only for something that is still to come."""
+    """Whether the socket may wait: for something that is still to come, or because nothing may be sent."""
     sender = batch.senders[i]
-    return bool(sender.next < sender.arrivals or sender.ponged < sender.taken)
+    if sender.next < sender.arrivals or sender.ponged < sender.taken:
+        return True
+    return oldest_sendable(batch, i) == HOLD
+
+
+@kernel
+def oldest_sendable(batch: Batch, i: int) -> int:
+    """The oldest slot that the free socket may take, HOLD if there is none."""
+    for k in range(batch.senders[i].occupancy):
+        if can_send(batch, i, k):
+            return k
+    return HOLD
+
+
+@kernel
+def choose(batch: Batch, i: int, k: int) -> None:
+    """The socket takes slot ``k`` next; HOLD: nothing before the next arrival or pong, and then all is asked anew."""
+    sender = batch.senders[i]
+    if k == HOLD:
+        sender.held, sender.follows, sender.cleared = 1, 0, 0
+    else:
+        sender.chosen = k
 
 
 @kernel
@@ -428,14 +452,8 @@ def answer_send(batch: Batch, i: int, k: int) -> bool:
         possible = can_send(batch, i, k)
     if not possible:
         sender.impossible += 1
-        k = HOLD
-        for j in range(sender.occupancy - 1, -1, -1):
-            if can_send(batch, i, j):
-                k = j
-    if k == HOLD:
-        sender.held, sender.follows = 1, 0
-    else:
-        sender.chosen = k
+        k = oldest_sendable(batch, i)
+    choose(batch, i, k)
     return possible
 
 
@@ -464,6 +482,10 @@ def view(batch: Batch, i: int) -> Buffer:
     previous_us, previous_x = sender.previous_us, sender.previous_x
     if sender.taken == 0:
         taken_us, taken_x = previous_us, previous_x
+        if sender.occupancy > 0:
+            # a scheduler held the first of all back: what was before it counts, not what came later
+            oldest = batch.slots[i, first]
+            taken_us, taken_x = min(taken_us, oldest.arrival_us), min(taken_x, oldest.x)
     if sender.topics > 1 and sender.waiting == ARRIVAL_WAITS:
         # gaps are those of the newcomer's topic
         arrival = batch.arrivals[i, sender.next]
@@ -474,6 +496,11 @@ def view(batch: Batch, i: int) -> Buffer:
         taken_us, taken_x = previous_us, previous_x
         if topic.taken > 0:
             taken_us, taken_x = topic.taken_us, topic.taken_x
+        elif topic.queued > 0:
+            k = first
+            while batch.slots[i, k].topic != arrival.topic:
+                k += 1
+            taken_us, taken_x = batch.slots[i, k].arrival_us, batch.slots[i, k].x
     taken_bytes = socket_bytes(batch, i) if sender.busy > 0 else 0
     left_bytes = taken_bytes
     if sender.busy > 0 and (sender.taken_at_us < sender.now_us or sender.busy > 1):
