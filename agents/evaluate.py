@@ -68,9 +68,9 @@ def run_agent(
 
 
 def run_fixed(episodes: Sequence[Episode], world: Scenario, capacity: int) -> dict[str, list[Outcome]]:
-    """The same for every registered policy, by name."""
+    """The same for every registered policy of one queue, by name."""
     results = {}
-    for name in registry.names():
+    for name in registry.names(for_topics=False):
         senders = run(registry.get(name), episodes, capacity, world.value)
         results[name] = [outcome(senders, i) for i in range(len(episodes))]
     return results

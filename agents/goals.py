@@ -108,7 +108,8 @@ class Found:
 def measure(suite: str, agents: Sequence[Policy], folder: Path, data: str | None, seeds: int | None = None) -> Found:
     """Agents and ranked fixed policies on the suite's test split; what is fixed is kept in ``folder``."""
     shipped = files.shipped("agents", "agents/pretrained", "*.safetensors")
-    ranked = [name for name in registry.names() if name not in shipped and registry.get(name).ranked]
+    fixed = [name for name in registry.names(for_topics=False) if name not in shipped]
+    ranked = [name for name in fixed if registry.get(name).ranked]
     trials = Trials(
         Plan(suite, tuple(ranked), "test", suites.get(suite).capacities, seeds, data), folder / "goals" / suite
     )

@@ -163,7 +163,7 @@ def report_suite(arguments: Arguments, suite: str, folder: Path, home: Path, run
     The training seeds together are one entry, with intervals over them and over episodes. Nothing is chosen here: each
     seed's agent, and the one in model.zip, are those that did best on validation.
     """
-    test = plan(arguments, suite, "test", tuple(registry.names()), arguments.test_seeds or None)
+    test = plan(arguments, suite, "test", tuple(registry.names(for_topics=False)), arguments.test_seeds or None)
     trials = Trials(test, folder / "test" / suite, progress=True)
     home.mkdir(exist_ok=True)
     best = max(runs, key=lambda run: run.merit)

@@ -98,8 +98,8 @@ class Buffer(NamedTuple):
     taken: int
     """How many messages the socket has taken so far (delivered, or in transmission)."""
     taken_us: int
-    """Arrival time of the message that the socket took last, us; while there was none, that of the arrival before all
-    that is queued. At an arrival where there are several topics: the last of the newcomer's topic, as the next three.
+    """Arrival time of the message that the socket took last, us; while there was none, that of the oldest queued, else
+    that of the previous arrival. Of several topics the newcomer's counts, here and in the next three.
     """
     taken_x: float
     """Coordinate of the message that the socket took last."""

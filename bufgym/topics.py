@@ -7,7 +7,6 @@ deadline for those who count late messages.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,6 +21,7 @@ from bufgym.qoi import Value
 
 MAX_TOPICS = 256
 MAX_WINDOW = 10**6
+MAX_NUMBER = 1e12
 NO_DEADLINE_US = 2**62
 
 
@@ -68,9 +68,9 @@ class Topic:
     def _number(self, name: str, number: Any, *, zero: bool) -> None:
         if number is None and name != "priority":
             return
-        usable = isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number)
-        if not usable or number < 0 or (number == 0 and not zero):
-            raise self._wrong(name, number, f"must be a number {'>= 0' if zero else '> 0'}")
+        usable = isinstance(number, int | float) and not isinstance(number, bool) and 0 <= number <= MAX_NUMBER
+        if not usable or (number == 0 and not zero):
+            raise self._wrong(name, number, f"must be a number {'>= 0' if zero else '> 0'}, at most {MAX_NUMBER:g}")
 
     def _wrong(self, name: str, given: Any, rule: str) -> BufgymError:
         return BufgymError(f"topic {self.name!r}: {name} = {given!r}: {rule}")
@@ -78,7 +78,7 @@ class Topic:
     @property
     def period_us(self) -> int:
         """Least time between two messages that are kept, us; 0 without a rate limit."""
-        return round(1e6 / self.rate_limit_hz) if self.rate_limit_hz else 0
+        return round(min(1e6 / self.rate_limit_hz, NO_DEADLINE_US)) if self.rate_limit_hz else 0
 
     @property
     def share(self) -> float:
@@ -114,6 +114,13 @@ def check_window(window: Any) -> int:
     if isinstance(window, bool) or not isinstance(window, int | np.integer) or not 1 <= window <= MAX_WINDOW:
         raise BufgymError(f"window = {window!r}: n_T must be a whole number from 1 to {MAX_WINDOW}")
     return int(window)
+
+
+def check_pong(pong_us: Any) -> int:
+    """The time from a message's crossing to its pong, us, or an error."""
+    if isinstance(pong_us, bool) or not isinstance(pong_us, int | np.integer) or not 0 <= pong_us < NO_DEADLINE_US // 2:
+        raise BufgymError(f"pong_us = {pong_us!r}: must be a whole number >= 0, us")
+    return int(pong_us)
 
 
 def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArray[Any], NDArray[np.float64]]:

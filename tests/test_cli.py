@@ -47,6 +47,14 @@ def test_list_one_kind(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(lines) > 1 and all(line.startswith("  ") for line in lines[1:])
 
 
+def test_list_has_a_group_of_policies_made_for_topics(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", "policies"]) == 0
+    one_queue, topics = capsys.readouterr().out.split("  -- made for several topics side by side --\n")
+    for name in policies.names():
+        part, other = (topics, one_queue) if policies.get(name).for_topics else (one_queue, topics)
+        assert f"\n  {name} " in f"\n{part}" and f"\n  {name} " not in f"\n{other}"
+
+
 def test_list_opens_no_heavy_module() -> None:
     heavy = ("bufgym.sender", "bufgym.envs", "matplotlib", "pyarrow", "tqdm", "mcap", "rosbags")
     program = (
@@ -91,7 +99,7 @@ def test_bench_takes_shipped_traces_and_all_policies_by_default(capsys: pytest.C
     text = capsys.readouterr().out
     assert "8 traces x 2 seeds" in text
     for name in policies.names():
-        assert f"\n{name} " in text
+        assert (f"\n{name} " in text) != policies.get(name).for_topics
 
 
 def test_bench_of_one_interruption_has_regret(capsys: pytest.CaptureFixture[str]) -> None:

@@ -55,15 +55,23 @@ class Plan:
     def checked(self) -> Plan:
         """The same with nothing left open; a mistake in it ends in an error here, before any work."""
         suite = suites.get(self.suite)
+        if suite.name in suites.TOPIC_SUITES:
+            raise BufgymError(f"suite {suite.name} has several topics: bufgym topics --suite {suite.name}")
         suite.settings(self.split, self.data)
-        seeds = suite.seeds if self.seeds is None else self.seeds
-        if not 1 <= seeds <= _SEEDS_A_TRACE:
-            raise BufgymError(f"seeds = {seeds}: must lie between 1 and {_SEEDS_A_TRACE}")
+        seeds = seeds_a_trace(suite, self.seeds)
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
         specs = list(dict.fromkeys([*self.specs, BASELINE]))
         distinct([policies.get(spec) for spec in specs])
         return replace(self, specs=tuple(specs), capacities=self.capacities or suite.capacities, seeds=seeds)
+
+
+def seeds_a_trace(suite: suites.Suite, seeds: int | None) -> int:
+    """So many, or as many as the suite says."""
+    seeds = suite.seeds if seeds is None else seeds
+    if not 1 <= seeds <= _SEEDS_A_TRACE:
+        raise BufgymError(f"seeds = {seeds}: must lie between 1 and {_SEEDS_A_TRACE}")
+    return seeds
 
 
 @dataclass(frozen=True)
@@ -88,10 +96,15 @@ def units(plan: Plan) -> list[Unit]:
     for label, setting in suites.get(plan.suite).settings(plan.split, plan.data).items():
         traces = len(setting.scenario.traces) if isinstance(setting.scenario, Uplink) else 1
         for trace in range(traces):
-            numbers = [_SEEDS_A_TRACE * trace + s for s in range(seeds)]
+            numbers = seeds_of(trace, seeds)
             for k in range(0, seeds, _SEEDS_A_UNIT):
                 made.append(Unit(plan, label, trace, tuple(numbers[k : k + _SEEDS_A_UNIT])))
     return made
+
+
+def seeds_of(trace: int, seeds: int) -> list[int]:
+    """Of so many episodes on the trace of that number."""
+    return [_SEEDS_A_TRACE * trace + s for s in range(seeds)]
 
 
 def cell(scenario: Scenario, trace: int) -> Scenario:

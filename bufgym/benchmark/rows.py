@@ -6,7 +6,7 @@ import csv
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
@@ -38,28 +38,49 @@ WHOLE = (
 YES_NO = ("certified",)
 
 
-def write_rows(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]) -> Path:
-    """Write rows to a ``.csv`` or ``.parquet`` file, whole or not at all; None is an empty cell (CSV) or null."""
+class Layout(NamedTuple):
+    """The columns of one kind of rows, and which of them are no numbers with a fraction."""
+
+    columns: tuple[str, ...] = COLUMNS
+    text: tuple[str, ...] = TEXT
+    whole: tuple[str, ...] = WHOLE
+    yes_no: tuple[str, ...] = YES_NO
+
+
+RUNS = Layout()
+"""One row a run: those of ``bufgym bench``."""
+
+
+def checked_target(path: str | os.PathLike[str]) -> Path:
+    """The path, or an error if rows can't be written to a file of that kind here."""
     target = Path(path)
     if target.suffix not in (".csv", ".parquet"):
         raise BufgymError(f"{target}: rows are written to .csv or .parquet files")
     if target.suffix == ".parquet":
+        _pyarrow()
+    return target
+
+
+def write_rows(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str], layout: Layout = RUNS) -> Path:
+    """Write rows to a ``.csv`` or ``.parquet`` file, whole or not at all; None is an empty cell (CSV) or null."""
+    target = checked_target(path)
+    columns = list(rows[0]) if rows else list(layout.columns)
+    if target.suffix == ".parquet":
         pyarrow, parquet = _pyarrow()
-        columns = list(rows[0]) if rows else list(COLUMNS)
-        schema = pyarrow.schema([(name, _arrow_type(pyarrow, name)) for name in columns])
+        schema = pyarrow.schema([(name, _arrow_type(pyarrow, name, layout)) for name in columns])
         made = pyarrow.Table.from_pylist([dict(row) for row in rows], schema=schema)
         with replaced(target) as temporary:
             parquet.write_table(made, temporary, write_page_checksum=True)
         return target
     with replaced(target) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
         # Floats are written so that they read back to the last bit.
-        writer = csv.DictWriter(file, list(rows[0]) if rows else list(COLUMNS), lineterminator="\n")
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
     return target
 
 
-def read_rows(path: str | os.PathLike[str]) -> list[Row]:
+def read_rows(path: str | os.PathLike[str], layout: Layout = RUNS) -> list[Row]:
     """The rows that ``write_rows`` wrote."""
     source = Path(path)
     if source.suffix == ".parquet":
@@ -74,7 +95,9 @@ def read_rows(path: str | os.PathLike[str]) -> list[Row]:
     for number, line in lines:
         if None in line or None in line.values():
             raise BufgymError(f"{source}, line {number}: must have {len(reader.fieldnames or ())} cells, as line 1 has")
-    return [{name: _parsed(source, number, name, text) for name, text in line.items()} for number, line in lines]
+    return [
+        {name: _parsed(source, number, name, text, layout) for name, text in line.items()} for number, line in lines
+    ]
 
 
 def _read_parquet(source: Path) -> list[Row]:
@@ -88,17 +111,17 @@ def _read_parquet(source: Path) -> list[Row]:
     return rows
 
 
-def _parsed(path: Path, line: int, name: str, text: str) -> Any:
-    if name in TEXT:
+def _parsed(path: Path, line: int, name: str, text: str, layout: Layout) -> Any:
+    if name in layout.text:
         return text
     if text == "":
         return None
-    if name in YES_NO:
+    if name in layout.yes_no:
         if text not in ("True", "False"):
             raise BufgymError(f"{path}, line {line}: {name} = {text!r}: must be True or False")
         return text == "True"
     try:
-        return int(text) if name in WHOLE else float(text)
+        return int(text) if name in layout.whole else float(text)
     except ValueError:
         raise BufgymError(f"{path}, line {line}: {name} = {text!r}: must be a number") from None
 
@@ -121,9 +144,9 @@ def _pyarrow() -> tuple[Any, Any]:
     return pyarrow, pyarrow.parquet
 
 
-def _arrow_type(pyarrow: Any, name: str) -> Any:
-    if name in TEXT:
+def _arrow_type(pyarrow: Any, name: str, layout: Layout) -> Any:
+    if name in layout.text:
         return pyarrow.string()
-    if name in YES_NO:
+    if name in layout.yes_no:
         return pyarrow.bool_()
-    return pyarrow.int64() if name in WHOLE else pyarrow.float64()
+    return pyarrow.int64() if name in layout.whole else pyarrow.float64()

@@ -18,7 +18,7 @@ from bufgym.errors import BufgymError
 from bufgym.metrics import outcome
 from bufgym.oracle import Plan, clairvoyant
 from bufgym.policies import Policy
-from bufgym.scenario import Episode, Interruption, Scenario, Streams, Uplink
+from bufgym.scenario import Client, Episode, Interruption, Scenario, Streams, Uplink
 from bufgym.sender import Senders, padded
 from bufgym.sender import run as run_policy
 
@@ -30,7 +30,7 @@ def cells(scenario: Scenario) -> list[tuple[str, Scenario]]:
     """The scenario split into one cell a trace: (label, scenario). Traces of one name are told apart by a number."""
     if isinstance(scenario, Interruption):
         return [("interruption", scenario)]
-    if not isinstance(scenario, Uplink):
+    if not isinstance(scenario, Uplink | Client):
         return [(type(scenario).__name__.lower(), scenario)]
     labels: list[str] = []
     for trace in scenario.traces:
@@ -70,18 +70,12 @@ def run(
         bound: find the clairvoyant's H for every episode and capacity, and every policy's regret.
         progress: show a bar on stderr, where that is a terminal and tqdm is installed.
     """
-    chosen = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
-    for what, given in (("policies", policies), ("capacities", capacities), ("seeds", chosen)):
-        if not given:
-            raise BufgymError(f"{what} = {seeds if what == 'seeds' else list(given)}: need at least one")
-    distinct(policies)
-    at_once = max(1, _BATCH_MESSAGES // scenario.max_messages)
-    batches = [chosen[k : k + at_once] for k in range(0, len(chosen), at_once)]
+    chosen = checked(policies, capacities, seeds)
     parts = cells(scenario)
     rows: list[Row] = []
     with bar(len(parts) * len(chosen) * len(capacities) * len(policies), progress) as advance:
         for trace, cell in parts:
-            for batch in batches:
+            for batch in batches(chosen, scenario.max_messages):
                 episodes = [draw(cell, seed) for seed in batch]
                 for capacity in capacities:
                     plans = [best(e, capacity, cell, max_bytes, decide_at) if bound else None for e in episodes]
@@ -92,6 +86,22 @@ def run(
                             rows.append(row(key, policy, capacity, senders, i, plans[i]))
                         advance(len(batch))
     return rows
+
+
+def checked(policies: Sequence[Policy], capacities: Sequence[int], seeds: int | Sequence[int]) -> list[int]:
+    """The seeds, so many or these; an error where there is nothing to run, or policies can't be told apart."""
+    chosen = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
+    for what, given in (("policies", policies), ("capacities", capacities), ("seeds", chosen)):
+        if not given:
+            raise BufgymError(f"{what} = {seeds if what == 'seeds' else list(given)}: need at least one")
+    distinct(policies)
+    return chosen
+
+
+def batches(seeds: Sequence[int], messages: int) -> list[Sequence[int]]:
+    """The seeds, as many at a time as fit in memory if each episode has so many messages."""
+    at_once = max(1, _BATCH_MESSAGES // messages)
+    return [seeds[k : k + at_once] for k in range(0, len(seeds), at_once)]
 
 
 def distinct(policies: Sequence[Policy]) -> None:

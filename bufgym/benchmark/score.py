@@ -15,7 +15,6 @@ Interquartile mean and probability of improvement are those of Agarwal et al. (N
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,22 +24,37 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bufgym.benchmark import episodes
+from bufgym.benchmark.bootstrap import (
+    Interval,
+    check_resampling,
+    percentile_interval,
+    ratio,
+    stream,
+    times_drawn,
+)
 from bufgym.benchmark.episodes import TIE, Cell, Numbers, Table
 from bufgym.errors import BufgymError
+
+__all__ = [
+    "BASELINE",
+    "BITES",
+    "CellScore",
+    "Interval",
+    "Scores",
+    "Standing",
+    "interquartile_mean",
+    "normalised_score",
+    "paired_difference",
+    "probability_of_improvement",
+    "regret",
+    "scores",
+]
 
 BASELINE = "drop-oldest"
 """What ROS does: its score is 0."""
 
 BITES = 0.01
 """A cell bites, and counts, where the baseline's regret is at least this: elsewhere there is nothing to be gained."""
-
-
-class Interval(NamedTuple):
-    """A statistic and its bootstrap interval; all NaN where it is undefined."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -108,12 +122,12 @@ def normalised_score(h: Numbers, base: Numbers, best: Numbers) -> Numbers:
 
     0 is the baseline (Drop Oldest: what ROS does), 1 the clairvoyant; NaN where the baseline leaves nothing to gain.
     """
-    return _ratio(h - base, best - base, best - base > TIE * np.abs(best))
+    return ratio(h - base, best - base, best - base > TIE * np.abs(best))
 
 
 def regret(h: Numbers, best: Numbers) -> Numbers:
     """1 - sum H / sum H_clairvoyant, from the two sums; NaN where the clairvoyant's is 0 or unknown."""
-    return 1 - _ratio(h, best, best > 0)
+    return 1 - ratio(h, best, best > 0)
 
 
 def interquartile_mean(x: ArrayLike) -> float:
@@ -155,11 +169,11 @@ def paired_difference(
     ours, theirs = (np.asarray(given, np.float64) for given in (h, h_ref))
     if ours.ndim != 1 or ours.shape != theirs.shape:
         raise BufgymError(f"shapes {ours.shape} and {theirs.shape}: must be one H an episode, of the same episodes")
-    _check(resamples, confidence)
+    check_resampling(resamples, confidence)
     if not len(ours):
         return Interval(math.nan, math.nan, math.nan)
-    weights = _weights(len(ours), resamples, np.random.default_rng(seed))
-    return _interval(weights @ (ours - theirs) / len(ours), confidence)
+    weights = times_drawn(len(ours), resamples, np.random.default_rng(seed))
+    return percentile_interval(weights @ (ours - theirs) / len(ours), confidence)
 
 
 def scores(
@@ -188,15 +202,15 @@ def scores(
         BufgymError: for no rows, incomplete or duplicate ones, a cell without the baseline, policies that have not
             met the same episodes (or whose rows do not agree on the clairvoyant).
     """
-    _check(resamples, confidence)
+    check_resampling(resamples, confidence)
     table = episodes.read(rows, baseline)
-    drawn = {name: _weights(len(e), resamples, _stream(seed, name)) for name, e in table.episodes.items()}
+    drawn = {name: times_drawn(len(e), resamples, stream(seed, name)) for name, e in table.episodes.items()}
     base = _resampled(table, baseline, resamples, seed)
     grounds = {cell: _ground(table, cell, base[cell], drawn[cell[0]]) for cell in table.cells}
     theirs: dict[Cell, Numbers] = {}
     if reference in table.training_seeds:
         theirs = _resampled(table, reference, resamples, seed)
-    interval = partial(_interval, confidence=confidence)
+    interval = partial(percentile_interval, confidence=confidence)
     cell_scores, standings = [], []
     for policy in table.training_seeds:
         here = {
@@ -324,7 +338,7 @@ def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:
     cut = all_of_it * (tasks // 4) / max(tasks, 1)
     kept = np.clip(np.minimum(until, all_of_it - cut) - np.maximum(until - weights, cut), 0, None)
     left = kept.sum(axis=1)
-    return _ratio((kept * values).sum(axis=1), left, left > 0)
+    return ratio((kept * values).sum(axis=1), left, left > 0)
 
 
 def _resampled(table: Table, policy: str, resamples: int, seed: int) -> dict[Cell, Numbers]:
@@ -335,36 +349,5 @@ def _resampled(table: Table, policy: str, resamples: int, seed: int) -> dict[Cel
     trained = len(table.training_seeds[policy])
     if trained == 1:
         return {cell: table.qoi[policy, cell] for cell in table.cells}
-    weights = _weights(trained, resamples, _stream(seed, f"training of {policy}")) / trained
+    weights = times_drawn(trained, resamples, stream(seed, f"training of {policy}")) / trained
     return {cell: weights @ table.qoi[policy, cell] for cell in table.cells}
-
-
-def _stream(seed: int, label: str) -> np.random.Generator:
-    return np.random.default_rng([seed, zlib.crc32(label.encode())])
-
-
-def _weights(n: int, resamples: int, rng: np.random.Generator) -> Numbers:
-    """[1 + resamples, n]: 1 each, then how often each of n is drawn in n draws with replacement."""
-    drawn = rng.multinomial(n, np.full(n, 1 / n), size=resamples)
-    return np.vstack([np.ones((1, n)), drawn])
-
-
-def _interval(numbers: Numbers, confidence: float) -> Interval:
-    """The percentile interval; resamples in which the statistic is undefined are left out."""
-    drawn = numbers[1:][~np.isnan(numbers[1:])]
-    if np.isnan(numbers[0]) or not len(drawn):
-        return Interval(math.nan, math.nan, math.nan)
-    low, high = np.percentile(drawn, [50 * (1 - confidence), 50 * (1 + confidence)]).tolist()
-    return Interval(float(numbers[0]), low, high)
-
-
-def _ratio(above: Numbers, below: Numbers, defined: NDArray[np.bool_]) -> Numbers:
-    made: Numbers = np.divide(above, below, out=np.full(below.shape, np.nan), where=defined)
-    return made
-
-
-def _check(resamples: int, confidence: float) -> None:
-    if resamples < 1:
-        raise BufgymError(f"resamples = {resamples}: must be >= 1")
-    if not 0 < confidence < 1:
-        raise BufgymError(f"confidence = {confidence}: must be above 0 and below 1")

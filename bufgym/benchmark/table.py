@@ -60,12 +60,13 @@ def means(rows: Rows) -> list[dict[str, Any]]:
         entry: dict[str, Any] = {"policy": policy, "capacity": capacity}
         for column in COLUMNS:
             if column.key not in _KEYS:
-                entry[column.key] = _mean([row.get(column.key) for row in group])
+                entry[column.key] = mean([row.get(column.key) for row in group])
         made.append(entry)
     return sorted(made, key=lambda entry: (entry["capacity"], -entry["qoi"], entry["policy"]))
 
 
-def _mean(numbers: Sequence[float | None]) -> float:
+def mean(numbers: Sequence[float | None]) -> float:
+    """Over what is known: None and NaN are left out; NaN for nothing."""
     known = [number for number in numbers if number is not None and not math.isnan(number)]
     return math.fsum(known) / len(known) if known else math.nan
 

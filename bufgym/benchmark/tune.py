@@ -318,5 +318,8 @@ def tuned(suite: str) -> list[str]:
 
 
 def specs(suite: str) -> list[str]:
-    """Who meets a suite unless the caller says otherwise: every policy as its source has it, and the tuned variants."""
-    return [*policies.names(), *tuned(suite)]
+    """Who meets a suite unless the caller says otherwise: every policy as its source has it, and the tuned variants.
+
+    Suites are about one queue: policies made for topics are left out.
+    """
+    return [*policies.names(for_topics=False), *tuned(suite)]

@@ -59,7 +59,7 @@ def _bench(options: argparse.Namespace) -> None:
     elif options.suite is not None:
         specs = tune.specs(suites.get(options.suite).name)
     else:
-        specs = list(policies.names())
+        specs = list(policies.names(for_topics=False))
     if options.format == "parquet" and options.out is not None and not files.has_pyarrow():
         raise BufgymError('--format parquet needs pyarrow: pip install "bufgym[bench]" (or --format csv)')
     if options.suite is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from bufgym.cli.options import Commands, columns, command, load_policies, policy_file
@@ -55,16 +55,23 @@ def _list_suites() -> str:
 def _list_policies() -> str:
     from bufgym import oracle, policies  # noqa: F401  (the oracle registers the clairvoyant)
 
-    lines = []
     width = max(map(len, policies.names()))
-    for name in policies.names():
+    one_queue, schedulers = (_policy_lines(policies.names(for_topics=topics), width) for topics in (False, True))
+    return "\n".join([*one_queue, "  -- made for several topics side by side --", *schedulers])
+
+
+def _policy_lines(names: Iterable[str], width: int) -> list[str]:
+    from bufgym import policies
+
+    lines = []
+    for name in names:
         policy = policies.get(name)
         lines.append(f"  {name:<{width}}  {policy.summary}".rstrip())
         settings = ", ".join(f"{setting}={policy.memory[setting]:g}" for setting in policy.parameters)
         if settings:
             lines.append(f"  {'':<{width}}  settings: {settings}")
         lines.append(f"  {'':<{width}}  from: {policy.source or 'a policy file'}")
-    return "\n".join(lines)
+    return lines
 
 
 def _list_values() -> str:

@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from bufgym import files
-from bufgym.buffer import ACCEPT, REJECT
+from bufgym.buffer import ACCEPT, HOLD, REJECT, after, before, is_first
 from bufgym.policies import (  # noqa: F401  (each registers its policies)
     afr,
     checkpointing,
@@ -13,11 +13,27 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     gaps,
     managed,
     middleware,
+    robofleet,
     sampling,
+    schedulers,
 )
-from bufgym.policies.registry import Policy, get, names, register, register_later, runs_compiled
+from bufgym.policies.registry import Client, Policy, get, names, register, register_later, runs_compiled
 
-__all__ = ["ACCEPT", "REJECT", "Policy", "get", "load", "names", "register", "runs_compiled"]
+__all__ = [
+    "ACCEPT",
+    "HOLD",
+    "REJECT",
+    "Client",
+    "Policy",
+    "after",
+    "before",
+    "get",
+    "is_first",
+    "load",
+    "names",
+    "register",
+    "runs_compiled",
+]
 
 
 def load(path: str | os.PathLike[str]) -> Policy:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bufgym.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first, keep_last
-from bufgym.policies.registry import register
+from bufgym.policies.registry import Client, register
 
 
 @register(
@@ -110,7 +110,13 @@ def foxglove_backlog(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) 
     return keep_first(len(buffer.slots), buffer.capacity)
 
 
-@register("rosbridge", unbounded=True, source="rosbridge_server, unbounded outgoing queue", compile=True)
+@register(
+    "rosbridge",
+    unbounded=True,
+    source="rosbridge_server, unbounded outgoing queue",
+    client=Client(encoding="json", awaits_pongs=False),
+    compile=True,
+)
 def rosbridge(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """rosbridge: accepts everything, however long the queue grows."""
+    """rosbridge: accepts everything, however long the queue grows; JSON, first in, first out, no pongs."""
     return ACCEPT

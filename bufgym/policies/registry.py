@@ -256,9 +256,11 @@ def register_later(name: str, make: Callable[[], Policy]) -> None:
     _REGISTRY.setdefault(name, make)
 
 
-def names() -> Iterator[str]:
-    """All registered names, in the order of their registration."""
-    return iter(tuple(_REGISTRY))
+def names(*, for_topics: bool | None = None) -> Iterator[str]:
+    """All registered names, in the order of their registration; True: those made for topics only, False: the others."""
+    # What is made when it is first asked for is a learned one: not made for topics.
+    made_for_topics = {name for name, known in _REGISTRY.items() if isinstance(known, Policy) and known.for_topics}
+    return iter([name for name in _REGISTRY if for_topics in (None, name in made_for_topics)])
 
 
 def get(spec: str | Policy) -> Policy:

@@ -118,7 +118,8 @@ def report(capacity: int = 8, decisions: int = 1_000_000, calls: int = 20_000) -
         raise BufgymError(f"decisions = {decisions}, calls = {calls}: must be whole numbers >= 1")
     buffer, arrivals = full_queue(capacity, 400)
     # Built-in ones alone: a user's policy names no source.
-    measured = [p for p in map(policies.get, policies.names()) if p.compile and p.source and p.foresee is None]
+    known = map(policies.get, policies.names(for_topics=False))
+    measured = [p for p in known if p.compile and p.source and p.foresee is None]
     rows: list[list[Any]] = []
     for policy in measured:
         inside, (median, p99) = (

@@ -29,7 +29,7 @@ from bufgym.sender.transition import (
     next_event,
     view,
 )
-from bufgym.topics import Topic, check_topics, check_window, copies_of, topic_table
+from bufgym.topics import Topic, check_pong, check_topics, check_window, copies_of, topic_table
 
 
 def rollout(
@@ -115,12 +115,12 @@ class Senders:
         if len(episode.arrivals) > self.batch.arrivals.shape[1]:
             most = self.batch.arrivals.shape[1]
             raise BufgymError(f"episode of {len(episode.arrivals)} messages: these senders have room for {most}")
-        if self.topics and episode.arrivals["topic"].max() >= len(self.topics):
-            unknown = episode.arrivals["topic"].max()
+        numbers = episode.arrivals["topic"]
+        if self.topics and not (numbers.min() >= 0 and numbers.max() < len(self.topics)):
+            unknown = numbers.min() if numbers.min() < 0 else numbers.max()
             raise BufgymError(f"episode: unknown topic {unknown}; the senders know {len(self.topics)}, from 0 on")
         check_window(episode.window)
-        if episode.pong_us < 0:
-            raise BufgymError(f"pong_us = {episode.pong_us}: must be >= 0")
+        check_pong(episode.pong_us)
         first_knot, last_knot, after = self._knots.place(link.trace)
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)

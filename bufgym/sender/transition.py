@@ -483,9 +483,8 @@ def view(batch: Batch, i: int) -> Buffer:
     if sender.taken == 0:
         taken_us, taken_x = previous_us, previous_x
         if sender.occupancy > 0:
-            # a scheduler held the first of all back: what was before it counts, not what came later
-            oldest = batch.slots[i, first]
-            taken_us, taken_x = min(taken_us, oldest.arrival_us), min(taken_x, oldest.x)
+            # a scheduler holds the first of all back
+            taken_us, taken_x = batch.slots[i, first].arrival_us, batch.slots[i, first].x
     if sender.topics > 1 and sender.waiting == ARRIVAL_WAITS:
         # gaps are those of the newcomer's topic
         arrival = batch.arrivals[i, sender.next]

@@ -192,6 +192,20 @@ class GreedyQoi(Policy):
         return added.index(max(added)) if max(added) > 0 else REJECT
 
 
+class OldestThatHelps(Policy):
+    """On one queue, what is made for topics: the oldest whose going makes the newcomer fit; ``depth`` are kept."""
+
+    def __init__(self, depth=math.inf):
+        self.depth = depth
+
+    def decide(self, queue, newcomer, L, last_taken, previous):
+        fits = self.sender.fits
+        helps = [k for k in range(len(queue)) if fits(queue[:k] + queue[k + 1 :], newcomer)]
+        if fits(queue, newcomer) and (len(queue) < self.depth or not helps):
+            return ACCEPT
+        return helps[0] if helps else REJECT
+
+
 class Anything(Policy):
     """A policy that decides at random, impossible decisions included: -2 accept, -1 reject, 0 .. L + 1 a slot."""
 
@@ -230,6 +244,8 @@ def policy(spec, v):
         "rosbridge": Rosbridge,
         "codel": Codel,
         "red": Red,
+        **dict.fromkeys(["fifo", "strict-priority", "age-greedy", "edf", "ros-native"], OldestThatHelps),
+        **dict.fromkeys(["robofleet", "robofleet-released"], lambda: OldestThatHelps(1)),
         "test-anything": Anything,
     }
     name, _, settings = spec.partition(":")

@@ -52,6 +52,13 @@ BUILT_IN = [
     "rosbridge",
     "codel",
     "red",
+    "fifo",
+    "strict-priority",
+    "age-greedy",
+    "edf",
+    "robofleet",
+    "robofleet-released",
+    "ros-native",
 ]
 
 
@@ -324,7 +331,7 @@ def test_parameters():
 @pytest.mark.parametrize(
     ("spec", "rule"),
     [
-        ("fifo", "unknown policy 'fifo'; known: .*afr"),
+        ("lifo", "unknown policy 'lifo'; known: .*afr"),
         ("afr:speed=2", "policy afr: no parameter 'speed'; it has: none"),
         ("decimate:every=0", "policy decimate: every = 0.0: must be a number > 0"),
         ("decimate:every=nan", "every = nan"),

@@ -1,0 +1,283 @@
+"""Learned scheduling: what to drop and what to send of many topics, by CMA-ES over whole episodes.
+
+A candidate is a vector of weights; its fitness compares it with Robofleet's published client on the same episodes: the
+weighted QoI is to be large, the age of information of the topics with the highest priority no larger (``AGE_SHARE``),
+and no ``no_drop`` message may be lost. All candidates of a generation meet the same episodes, the next generation meets
+others; validation episodes say which mean to keep. The search begins at what is greedy: drop what loses the least QoI
+now, send what gains the most a byte.
+
+    python train.py --suite topics-v1 --algo evolution --seeds 5 --steps 12000000 --validate-every 1000000
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import multiprocessing
+import os
+import pickle
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cma
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from bufgym import policies, suites
+from bufgym.benchmark.rows import Row, write_rows
+from bufgym.benchmark.run import draw
+from bufgym.benchmark.topics import ROWS, default_policies, run_parts, suite_parts
+from bufgym.benchmark.topics_summary import plain, summary
+from bufgym.errors import BufgymError
+from bufgym.files import replaced
+from bufgym.link import FOREVER
+from bufgym.policies import Policy, learned_topics, weights
+from bufgym.policies.learned import Network
+from bufgym.policies.learned_topics import TopicWeights
+from bufgym.scenario import Client
+from bufgym.sender import Senders, age_until
+
+if TYPE_CHECKING:
+    from train import Arguments
+
+RIVAL = "robofleet"
+
+CONTEXT = ("occupancy", "stalled", "drain")
+SLOT = (
+    *("rank", "time_merged", "motion_merged", "loss", "relative_loss", "size", "priority", "weight", "no_drop"),
+    *("own", "waited", "silence", "lateness", "queued", "gain", "gain_per_byte"),
+)
+FIELDS = CONTEXT + SLOT
+"""What the agent reads."""
+
+PARTS, EPISODES, EPISODE_S = 8, 2, 30.0
+"""Training episodes come in so many parts, one a generation in turn: so many a setting of the suite, so long."""
+POPULATION, SIGMA, MEMORY = 16, 1.0, 10
+"""Candidates a generation, first step size, generations over which the mean is averaged."""
+AGE_SHARE, AGE_PENALTY = 0.95, 2.0
+"""The age of the first topics is to be this part of the rival's; what is more costs so much."""
+VALIDATION_SEED = 1
+
+MODEL = "model.safetensors"
+
+
+# --- weights as a vector ---------------------------------------------------------------------------------------------
+
+
+def start() -> TopicWeights:
+    """Greedy: drop what loses least, rather old than new; accept with room; send no_drop first, then gain a byte."""
+    drop, accept, send = (Network(_zeros(len(FIELDS)), _zeros(1), (), _zeros(0)) for _ in range(3))
+    for name, number in (("loss", -10.0), ("rank", -0.4)):
+        drop.skip[FIELDS.index(name)] = number
+    accept.bias[0] = 5.0
+    for name, number in (("gain_per_byte", 10.0), ("no_drop", 10.0), ("silence", 2.0)):
+        send.skip[FIELDS.index(name)] = number
+    return TopicWeights(FIELDS, drop, accept, send)
+
+
+def _zeros(n: int) -> NDArray[np.float32]:
+    return np.zeros(n, np.float32)
+
+
+def to_vector(given: TopicWeights) -> NDArray[np.float64]:
+    """The numbers to be searched: what the context adds to every candidate alike decides in ``accept`` alone."""
+    c = len(CONTEXT)
+    parts = [given.drop.skip[c:], given.accept.skip, given.accept.bias, given.send.skip[c:]]
+    return np.concatenate(parts).astype(np.float64)
+
+
+def from_vector(vector: NDArray[np.float64]) -> TopicWeights:
+    """The weights that ``to_vector`` came from."""
+    made, c, n = start(), len(CONTEXT), len(FIELDS)
+    drop, accept, bias, send = np.split(vector.astype(np.float32), np.cumsum([n - c, n, 1]))
+    made.drop.skip[c:], made.accept.skip[:], made.accept.bias[:], made.send.skip[c:] = drop, accept, bias, send
+    return made
+
+
+def policy_of(vector: NDArray[np.float64]) -> Policy:
+    """Who decides by these numbers."""
+    return learned_topics.policy("evolved", from_vector(vector))
+
+
+# --- where candidates are tried --------------------------------------------------------------------------------------
+
+
+class Ground:
+    """Episodes of one client over its traces, and what the rival makes of them."""
+
+    def __init__(self, client: Client, capacity: int, count: int, rng: np.random.Generator) -> None:
+        traces = [client.traces[int(k)] for k in rng.permutation(len(client.traces))]
+        chosen = [traces[k % len(traces)] for k in range(count)]
+        self.client = client
+        self.first = np.array([t.priority == max(o.priority for o in client.topics) for t in client.topics])
+        self.never = np.array([topic.no_drop for topic in client.topics])
+        self.episodes = [draw(replace(client, traces=(trace,)), int(rng.integers(10**6))) for trace in chosen]
+        self.senders = Senders(
+            count, capacity, client.value, max_messages=client.max_messages, topics=client.topics
+        )
+        self.rival = self.reached(policies.get(RIVAL))
+
+    @property
+    def decisions(self) -> int:
+        """About how many a candidate is asked for: one an arrival."""
+        return sum(len(episode.arrivals) for episode in self.episodes)
+
+    def reached(self, policy: Policy) -> tuple[float, float, int]:
+        """(weighted QoI, age of the first topics integrated, s^2, no_drop messages lost), sums over the episodes."""
+        for i, episode in enumerate(self.episodes):
+            self.senders.load(i, episode)
+        self.senders.run(policy)
+        batch, count = self.senders.batch, len(self.client.topics)
+        for i in range(len(self.episodes)):
+            for k in range(count):
+                age_until(batch, i, k, FOREVER)
+        topics = np.asarray(batch.topics)[:, :count]
+        qoi = batch.senders["delivered_gain"].sum() + ((topics["received"] > 0) * topics["weight"]).sum()
+        dropped = np.asarray(batch.fates["dropped_us"]) >= 0
+        lost = sum(
+            int((dropped[i, : len(e.arrivals)] & self.never[e.arrivals["topic"]]).sum())
+            for i, e in enumerate(self.episodes)
+        )
+        return float(qoi), float(topics["aged"][:, self.first].sum()), lost
+
+
+def fitness(policy: Policy, grounds: Sequence[Ground]) -> float:
+    """The less the better: minus the mean of QoI over the rival's, plus what the age is too large, plus what is lost."""
+    total = 0.0
+    for ground in grounds:
+        (qoi, aged, lost), (their_qoi, their_aged, _) = ground.reached(policy), ground.rival
+        total += -qoi / their_qoi + AGE_PENALTY * max(0.0, aged / their_aged - AGE_SHARE) + lost
+    return total / len(grounds)
+
+
+def grounds(suite: str, split: str, seed: int, episodes: int, episode_s: float | None = None) -> list[Ground]:
+    """One ground for each setting of a suite."""
+    rng, found = np.random.default_rng(seed), suites.get(suite)
+    made = []
+    for setting in found.settings(split).values():
+        client = setting.scenario
+        if not isinstance(client, Client):
+            raise BufgymError(f"suite {suite}: has no topics")
+        client = client if episode_s is None else replace(client, duration_s=episode_s)
+        made += [Ground(client, L, episodes, rng) for L in found.capacities]
+    return made
+
+
+# --- training --------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Search:
+    """Where a seed's evolution stands; what a checkpoint holds."""
+
+    es: Any
+    """pycma's strategy."""
+    average: NDArray[np.float64]
+    """Of its latest means: this is the agent."""
+    steps: int = 0
+    generations: int = 0
+    seconds: float = 0.0
+
+
+def wanted(arguments: Arguments) -> bool:
+    """Whether these arguments ask for a scheduler; an error if they ask for more than that."""
+    topics = [suite for suite in arguments.suites if suite in suites.TOPIC_SUITES]
+    if topics and (len(arguments.suites) > 1 or arguments.algo != "evolution"):
+        raise BufgymError(f"suite {topics[0]}: a scheduler learns from one suite alone, by --algo evolution")
+    return bool(topics)
+
+
+def train(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> tuple[float, float]:
+    """Evolve one seed until ``arguments.steps`` decisions were rolled out, from its last checkpoint if there is one.
+
+    What did best on validation is kept as ``model.safetensors``.
+
+    Returns:
+        (fitness on validation, seconds of training).
+    """
+    home = folder / f"seed-{seed}"
+    home.mkdir(exist_ok=True)
+    saved = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
+    suite = arguments.suite
+    yards = [grounds(suite, "train", 1000 * seed + part, EPISODES, EPISODE_S) for part in range(PARTS)]
+    judges = grounds(suite, "validation", VALIDATION_SEED, 12)
+    begin = to_vector(start())
+    if saved.exists():
+        search, best, validated = pickle.loads(saved.read_bytes())
+    else:
+        settings = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9}
+        search, best, validated = Search(cma.CMAEvolutionStrategy(begin, SIGMA, settings), begin), np.inf, -1
+    began = time.perf_counter() - search.seconds
+    bar = tqdm(
+        total=arguments.steps,
+        initial=search.steps,
+        desc=f"seed {seed}",
+        unit=" steps",
+        unit_scale=True,
+        position=line,
+        disable=not sys.stderr.isatty(),
+    )
+    while True:
+        if validated < 0 or search.steps - validated >= arguments.validate_every or search.steps >= arguments.steps:
+            reached, validated = fitness(policy_of(search.average), judges), search.steps
+            if reached < best:
+                best = reached
+                noted = {"name": "evolved", "suite": suite, "seeds": [seed], "algo": "evolution"}
+                weights.save_topics(home / MODEL, from_vector(search.average), noted)
+            with (home / "validation.csv").open("a", encoding="utf-8") as file:
+                file.write(f"{search.steps},{search.seconds:.1f},{reached:.4f}\n")
+            if bar.disable:
+                print(f"seed {seed}: {search.steps:,} of {arguments.steps:,} steps, {reached:.3f}", flush=True)
+        if search.steps >= arguments.steps:
+            break
+        yard = yards[search.generations % PARTS]
+        vectors = search.es.ask()
+        search.es.tell(vectors, [fitness(policy_of(vector), yard) for vector in vectors])
+        search.average = search.average + (search.es.mean - search.average) / MEMORY
+        search.steps += sum(ground.decisions for ground in yard) * len(vectors)
+        search.generations += 1
+        search.seconds = time.perf_counter() - began
+        with replaced(saved) as unfinished:
+            unfinished.write_bytes(pickle.dumps((search, best, validated)))
+        bar.update(search.steps - bar.n)
+    bar.close()
+    return float(best), search.seconds
+
+
+def train_and_report(arguments: Arguments, folder: Path) -> None:
+    """All seeds, each in a process of its own if there are several; then every scheduler on the test split."""
+    seeds = range(arguments.seed, arguments.seed + arguments.seeds)
+    if not seeds:
+        raise BufgymError(f"seeds = {arguments.seeds}: must be >= 1")
+    if len(seeds) == 1:
+        found = [train(arguments, folder, seeds[0])]
+    else:
+        context = multiprocessing.get_context("spawn")
+        workers = min(len(seeds), os.cpu_count() or 1)
+        with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+            jobs = [pool.submit(train, arguments, folder, seed, line) for line, seed in enumerate(seeds)]
+            found = [job.result() for job in jobs]
+    best = int(np.argmin([reached for reached, _ in found]))
+    weights.copy_topics(folder / f"seed-{seeds[best]}" / MODEL, folder / MODEL)
+    rows = test_rows(arguments, folder, list(seeds))
+    write_rows(rows, folder / "rows.csv", ROWS)
+    text = plain(summary(rows))
+    (folder / "results.txt").write_text(text + "\n", encoding="utf-8")
+    print(text)
+    seconds = ", ".join(f"{s:.0f}" for _, s in found)
+    print(f"\ntraining took {seconds} s; best on validation: seed {seeds[best]}; model and rows are in {folder}")
+
+
+def test_rows(arguments: Arguments, folder: Path, seeds: Sequence[int]) -> list[Row]:
+    """Each seed's agent and all schedulers on the suite's test split."""
+    agents = [
+        replace(weights.load(folder / f"seed-{seed}" / MODEL), name=f"agent (seed {seed})") for seed in seeds
+    ]
+    rivals = [policies.get(name) for name in default_policies()]
+    suite = suites.get(arguments.suite)
+    parts = suite_parts(suite, "test", arguments.test_seeds or None)
+    return run_parts([*agents, *rivals], parts, suite.capacities, progress=True)

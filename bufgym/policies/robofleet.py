@@ -1,0 +1,136 @@
+"""Robofleet's client, as published and as released, and native ROS; `rosbridge` is in ``middleware.py``.
+
+Robofleet (Sikand et al. 2021) limits each topic's rate, queues what is ``no_drop``, keeps one slot for any other topic,
+and sends while fewer than n_T messages are on their way: sent, and not yet answered by a pong. The paper lets the topic
+with the largest priority x wait go first. The released scheduler (github ut-amrl/robofleet_client_lib,
+MessageSchedulerLib.hpp) sorts by the same product upwards, so that the smallest goes first.
+
+Robofleet's queue of ``no_drop`` messages knows no limit. Here it has the sender's L, and makes room as the other
+schedulers do. On a sender that knows one topic only, both clients keep one slot, and native ROS drops its oldest.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
+from bufgym.kernel import kernel
+from bufgym.policies.registry import Client, register
+from bufgym.policies.schedulers import fits, make_room, oldest, oldest_of_own, topic_of
+
+
+@kernel
+def overwrite(buffer: Buffer, arrival: Any) -> int:
+    """One slot a topic, overwritten by the newcomer; ``no_drop`` messages are not overwritten but queued."""
+    own = oldest_of_own(buffer, arrival)
+    return own if own != REJECT else make_room(buffer, arrival)
+
+
+@kernel
+def next_no_drop(buffer: Buffer, start: int) -> int:
+    """The oldest ``no_drop`` message from slot ``start`` on, HOLD if there is none."""
+    for k in range(start, len(buffer.slots)):
+        if topic_of(buffer, buffer.slots[k]).no_drop == 1:
+            return k
+    return HOLD
+
+
+@kernel
+def prioritised_wait(buffer: Buffer, k: int) -> float:
+    """Priority x time since slot ``k``'s topic was last sent, us; since time 0 if it never was."""
+    topic = topic_of(buffer, buffer.slots[k])
+    return float(topic.priority * (buffer.now_us - topic.sent_us))
+
+
+def longest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+    """All ``no_drop`` first, in order of arrival; then the largest priority x wait, of equals the first topic."""
+    best = next_no_drop(buffer, 0)
+    if best != HOLD:
+        return best
+    longest = -math.inf
+    for k in range(len(buffer.slots)):
+        if is_first(buffer, k):
+            wait = prioritised_wait(buffer, k)
+            if wait > longest or (wait == longest and buffer.slots[k].topic < buffer.slots[best].topic):
+                best, longest = k, wait
+    return best
+
+
+@register(
+    "robofleet",
+    on_send=longest_wait,
+    for_topics=True,
+    source="Robofleet, Sikand et al. 2021, as published",
+    compile=True,
+)
+def robofleet(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Robofleet as published: one slot a topic, no_drop queued and sent first, then the largest priority x wait."""
+    return overwrite(buffer, arrival)
+
+
+FLUSHING = 0
+
+
+def shortest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+    """One pass of the released scheduler, at an arrival or a pong; of equals the first topic.
+
+    It begins only while fewer than n_T are in flight. Then all ``no_drop`` messages go, however many that makes; after
+    them, for as long as n_T allows, the smallest priority x wait of the topics that their rate limits let go.
+    """
+    full = buffer.in_flight >= buffer.window
+    if not full or memory[FLUSHING] == 1:
+        flushed = next_no_drop(buffer, 0)
+        if flushed != HOLD:
+            memory[FLUSHING] = 0.0 if next_no_drop(buffer, flushed + 1) == HOLD else 1.0
+            return flushed
+    best, shortest = HOLD, math.inf
+    if full:
+        return best
+    for k in range(len(buffer.slots)):
+        topic = topic_of(buffer, buffer.slots[k])
+        held_back = topic.taken > 0 and buffer.now_us - topic.sent_us < topic.period_us
+        if is_first(buffer, k) and not held_back:
+            wait = prioritised_wait(buffer, k)
+            if wait < shortest or (wait == shortest and buffer.slots[k].topic < buffer.slots[best].topic):
+                best, shortest = k, wait
+    return best
+
+
+@register(
+    "robofleet-released",
+    memory={"flushing": 0.0},
+    on_send=shortest_wait,
+    for_topics=True,
+    source="Robofleet, released code (ut-amrl/robofleet_client_lib)",
+    client=Client(limit_at_send=True, flush_no_drop=True),
+    compile=True,
+)
+def robofleet_released(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Robofleet as released: rate limits at the socket, no_drop flushed past n_T, the smallest priority x wait first.
+
+    Not here: the code counts a topic's first wait from its first message instead of time 0, in whole milliseconds, and
+    lets a topic go only later than 1 / rate after the last time, not at it; ping again and reconnect after 2 s.
+    """
+    return overwrite(buffer, arrival)
+
+
+@register(
+    "ros-native",
+    for_topics=True,
+    source="ROS publishers, a queue a topic (queue_size: the topic's limit)",
+    client=Client(encoding="ros", awaits_pongs=False, copies=True),
+    compile=True,
+)
+def ros_native(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Native ROS: each topic drops its oldest, first in, first out, one copy a consumer, nobody waits for pongs.
+
+    Topics have queues of their own in ROS. Where L is too small for all of them, the oldest message of any goes.
+    """
+    if fits(buffer, arrival):
+        return ACCEPT
+    own = oldest_of_own(buffer, arrival)
+    return own if own != REJECT else oldest(buffer, arrival)

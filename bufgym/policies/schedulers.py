@@ -1,0 +1,176 @@
+"""Schedulers for several topics over one uplink: which message the free socket takes, and who makes room for whom.
+
+`fifo`, `strict-priority`, `age-greedy` and `edf` differ in what goes next alone; at an arrival all four follow
+``make_room``. A topic's messages are sent in the order of their arrival, so that the candidates are the oldest queued
+of each topic. On a sender that knows one topic only, each is a queue that drops its oldest.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.buffer import ACCEPT, REJECT, Buffer, is_first
+from bufgym.kernel import kernel
+from bufgym.policies.registry import register
+
+# --- who goes for a newcomer -----------------------------------------------------------------------------------------
+
+
+@kernel
+def topic_of(buffer: Buffer, message: Any) -> Any:
+    """The TOPIC row of a message; a sender that knows one topic only has one row for all."""
+    return buffer.topics[message.topic if len(buffer.topics) > 1 else 0]
+
+
+@kernel
+def same_topic(buffer: Buffer, a: Any, b: Any) -> bool:
+    """Whether two messages share a queue."""
+    return len(buffer.topics) == 1 or a.topic == b.topic
+
+
+@kernel
+def fits(buffer: Buffer, arrival: Any) -> bool:
+    """Whether the newcomer fits without a drop: by messages, by bytes, and by its topic's limit."""
+    topic = topic_of(buffer, arrival)
+    enough_bytes = buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes
+    return bool(len(buffer.slots) < buffer.capacity and enough_bytes and topic.queued < topic.limit)
+
+
+@kernel
+def makes_room(buffer: Buffer, arrival: Any, k: int) -> bool:
+    """Whether slot ``k`` may be dropped and the newcomer fits once it is."""
+    slot, topic = buffer.slots[k], topic_of(buffer, arrival)
+    enough_bytes = buffer.backlog_bytes - slot.size_bytes + arrival.size_bytes <= buffer.max_bytes
+    within_limit = same_topic(buffer, slot, arrival) or topic.queued < topic.limit
+    return bool(topic_of(buffer, slot).no_drop == 0 and enough_bytes and within_limit)
+
+
+@kernel
+def oldest(buffer: Buffer, arrival: Any) -> int:
+    """The oldest message that makes room, REJECT if none does."""
+    for k in range(len(buffer.slots)):
+        if makes_room(buffer, arrival, k):
+            return k
+    return REJECT
+
+
+@kernel
+def oldest_of_own(buffer: Buffer, arrival: Any) -> int:
+    """The oldest message of the newcomer's topic that makes room, REJECT if none does."""
+    for k in range(len(buffer.slots)):
+        if same_topic(buffer, buffer.slots[k], arrival) and makes_room(buffer, arrival, k):
+            return k
+    return REJECT
+
+
+@kernel
+def oldest_of_lowest(buffer: Buffer, arrival: Any) -> int:
+    """The oldest message of the lowest priority that makes room, unless it ranks above the newcomer: then REJECT.
+
+    A ``no_drop`` newcomer enters whatever its priority.
+    """
+    newcomer = topic_of(buffer, arrival)
+    victim, lowest = REJECT, math.inf
+    for k in range(len(buffer.slots)):
+        priority = topic_of(buffer, buffer.slots[k]).priority
+        if priority < lowest and makes_room(buffer, arrival, k):
+            victim, lowest = k, priority
+    return victim if lowest <= newcomer.priority or newcomer.no_drop == 1 else REJECT
+
+
+@kernel
+def make_room(buffer: Buffer, arrival: Any) -> int:
+    """Accept what fits; else the oldest of the newcomer's topic goes, else the oldest of the lowest priority."""
+    if fits(buffer, arrival):
+        return ACCEPT
+    own = oldest_of_own(buffer, arrival)
+    return own if own != REJECT else oldest_of_lowest(buffer, arrival)
+
+
+# --- which message goes next -----------------------------------------------------------------------------------------
+
+
+@register("fifo", for_topics=True, source="first come, first served over all topics", compile=True)
+def fifo(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """First in, first out, whatever the topic; a full queue drops the oldest of the newcomer's topic."""
+    return make_room(buffer, arrival)
+
+
+def highest_priority(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+    """The highest priority; of equals the oldest."""
+    best, highest = 0, -math.inf
+    for k in range(len(buffer.slots)):
+        priority = topic_of(buffer, buffer.slots[k]).priority
+        if priority > highest:
+            best, highest = k, priority
+    return best
+
+
+@register(
+    "strict-priority",
+    on_send=highest_priority,
+    for_topics=True,
+    source="strict priority queueing, as IEEE 802.1Q transmission selection",
+    compile=True,
+)
+def strict_priority(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Highest priority first, first in, first out among equals; low ones starve while high ones keep the link busy."""
+    return make_room(buffer, arrival)
+
+
+def most_aged(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+    """Of the oldest of each topic the one with the largest weight x age; of equals the oldest."""
+    best, most = 0, -math.inf
+    for k in range(len(buffer.slots)):
+        if is_first(buffer, k):
+            slot, topic = buffer.slots[k], topic_of(buffer, buffer.slots[k])
+            newest_us = topic.taken_us if topic.taken > 0 else slot.arrival_us
+            age = topic.weight * (buffer.now_us - newest_us)
+            if age > most:
+                best, most = k, age
+    return best
+
+
+@register(
+    "age-greedy",
+    on_send=most_aged,
+    for_topics=True,
+    source="age of information: Kaul et al. 2012; greedy by weighted age: Kadota et al. 2018",
+    compile=True,
+)
+def age_greedy(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """The topic with the largest weight x age of information first.
+
+    The age of a topic is the time since its newest *sent* message arrived at the sender: the age at the server once all
+    that was sent is there (S. Kaul, R. Yates, M. Gruteser, "Real-time status: how often should one update?", 2012). A
+    topic of which nothing was sent is as old as its oldest queued message. Candidates are the oldest of each topic.
+    That is the greedy policy, which sends where the age is highest, of I. Kadota et al., "Scheduling Policies for
+    Minimizing Age of Information in Broadcast Wireless Networks", 2018, the ages weighted as in their sum.
+    """
+    return make_room(buffer, arrival)
+
+
+def earliest_deadline(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+    """The earliest absolute deadline; of equals, and of those without one, the oldest."""
+    best, earliest_us = 0, 0
+    for k in range(len(buffer.slots)):
+        deadline_us = buffer.slots[k].arrival_us + topic_of(buffer, buffer.slots[k]).deadline_us
+        if k == 0 or deadline_us < earliest_us:
+            best, earliest_us = k, deadline_us
+    return best
+
+
+@register(
+    "edf",
+    on_send=earliest_deadline,
+    for_topics=True,
+    source="earliest deadline first, Liu and Layland 1973",
+    compile=True,
+)
+def edf(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Earliest deadline first: arrival + its topic's deadline; a message that is late already is sent all the same."""
+    return make_room(buffer, arrival)
