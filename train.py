@@ -70,8 +70,8 @@ class Arguments:
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     warm_up: int = 0
-    """Decisions for which evolution first learns a scorer of its own for links that stand still, from the suites of
-    interruptions and blackouts; afterwards the one for all other links, from all suites but the interruptions."""
+    """Decisions for which evolution first learns a scorer of its own for links that stand still, from interruptions
+    alone (their mean over T is exact and cheap); afterwards the one for all other links, from the other suites."""
     checkpoint_every: int = 250_000
     """Steps."""
     validate_every: int = 250_000

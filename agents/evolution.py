@@ -8,7 +8,7 @@ validation episodes say which mean to keep. The optimiser is pycma (Hansen, The 
 arXiv 1604.00772).
 
 With a warm-up, two scorers are learned one after the other: first that for a link that stands still, from interruptions
-and blackouts, then that for all others, from suites of links that move.
+alone (their mean over T is exact and cheap), then that for all other links, from the other suites.
 
 The search begins at what is known to be good: drop what leaves the smallest merged gap, the newer of two rather than
 the older, accept where there is room.
@@ -16,6 +16,7 @@ the older, accept where there is room.
 
 from __future__ import annotations
 
+import functools
 import pickle
 import sys
 import time
@@ -32,7 +33,6 @@ from agents.callbacks import Record, seed_bar
 from agents.grounds import EPISODES, Yard, grounds
 from agents.trials import ValidationSet, Verdict
 from agents.worlds import capacities_of, cells
-from bufgym import suites
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
 from bufgym.policies import Policy, learned, weights
@@ -54,12 +54,15 @@ MOTION = (
 SEES = {"time": TIME, "motion": MOTION}
 
 POPULATION = 16
-SIGMA = {True: 2.0, False: 0.5}
+SIGMA = {True: 2.0, False: 0.3}
 """First step size, for the scorer of a still link or of a moving one; the start's weights are of the order of 10."""
 DIAGONAL = 100
 """From so many weights on, a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
 SMALL = (1, 2, 3)
 """L to learn from besides the suite's own, where a ground is exact and so costs next to nothing."""
+
+MEMORY = 10
+"""Generations over which the strategy's mean is averaged, exponentially."""
 
 PARTS = 8
 """A suite's training episodes come in so many parts, one a generation in turn; interruptions, being exact, in one."""
@@ -73,16 +76,21 @@ MODEL = "model.safetensors"
 
 def yards(arguments: Arguments, split: str, seed: int, episodes: int = EPISODES, parts: int = 1) -> list[Yard]:
     """Grounds of every suite, drawn from ``seed``: ``parts`` times so many episodes, or the exact ones."""
-    made = []
-    for suite in arguments.suites:
-        capacities, data = capacities_of(suite, arguments.capacities), arguments.data or None
-        given = cells(suite, split, capacities, data)
-        if not arguments.capacities:
-            small = [L for L in SMALL if L not in capacities]
-            given += [c for c in cells(suite, split, small, data) if isinstance(c.scenario, Interruption)]
-        sampled = parts if any(isinstance(cell.scenario, Uplink) for cell in given) else 1
-        made.append(Yard(*(grounds(given, seed + 1000 * k, episodes) for k in range(sampled))))
-    return made
+    given = arguments.capacities, arguments.data or None, split, seed, episodes, parts
+    return [_yard(suite, *given) for suite in arguments.suites]
+
+
+@functools.lru_cache(maxsize=32)  # bounds take a minute, and several agents may be made in one process (the ablation)
+def _yard(
+    suite: str, given_capacities: str, data: str | None, split: str, seed: int, episodes: int, parts: int
+) -> Yard:
+    capacities = capacities_of(suite, given_capacities)
+    given = cells(suite, split, capacities, data)
+    if not given_capacities:
+        small = [L for L in SMALL if L not in capacities]
+        given += [c for c in cells(suite, split, small, data) if isinstance(c.scenario, Interruption)]
+    sampled = parts if any(isinstance(cell.scenario, Uplink) for cell in given) else 1
+    return Yard(*(grounds(given, seed + 1000 * k, episodes) for k in range(sampled)))
 
 
 # --- weights as a vector ---------------------------------------------------------------------------------------------
@@ -98,12 +106,6 @@ def fields_of(arguments: Arguments) -> tuple[str, ...]:
             "observation's, each once (bufgym list observations)"
         )
     return fields
-
-
-def stands_still(suite: str) -> bool:
-    """Whether its links do, for long: interruptions, blackouts."""
-    settings = suites.get(suite).settings("train") if not suites.get(suite).needs else {}
-    return any(s.outage_s or isinstance(s.scenario, Interruption) for s in settings.values())
 
 
 def start(fields: tuple[str, ...], width: int, rng: np.random.Generator) -> Weights:
@@ -175,7 +177,9 @@ class Search:
     still: bool
     """Whether the scorer for links that stand still is searched, or the one for all others (or for all)."""
     es: Any
-    """pycma's strategy, whose mean is the agent."""
+    """pycma's strategy."""
+    average: NDArray[np.float64]
+    """Of the strategy's latest means (``MEMORY``), which the luck of single parts moves about: this is the agent."""
     steps: int = 0
     generations: int = 0
     seconds: float = 0.0
@@ -185,7 +189,7 @@ class Search:
         """A new one, around these weights; ``still`` searches those of their second scorer."""
         begin = to_vector(like.still if still and like.still else like)
         settings = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
-        return Search(like, still, cma.CMAEvolutionStrategy(begin, SIGMA[still], settings), **before)
+        return Search(like, still, cma.CMAEvolutionStrategy(begin, SIGMA[still], settings), begin, **before)
 
     def weights(self, vector: NDArray[np.float64]) -> Weights:
         if self.still and self.like.still:
@@ -195,7 +199,7 @@ class Search:
     @property
     def mean(self) -> Weights:
         """The agent so far."""
-        return self.weights(self.es.mean)
+        return self.weights(self.average)
 
     def generation(self, yards: Sequence[Yard]) -> float:
         """Ask, try and tell once; the best fitness."""
@@ -203,6 +207,7 @@ class Search:
         part = self.generations
         fitness = [_fitness(learned.policy("evolved", self.weights(v)), yards, part) for v in vectors]
         self.es.tell(vectors, fitness)
+        self.average = self.average + (self.es.mean - self.average) / MEMORY
         self.steps += sum(yard.decisions(part) for yard in yards) * len(vectors)
         self.generations += 1
         return float(np.min(fitness))
@@ -222,8 +227,6 @@ def train(
     """
     if not arguments.suite:
         raise BufgymError("--algo evolution learns from a suite's episodes: name one (--suite)")
-    if arguments.warm_up and not any(stands_still(suite) for suite in arguments.suites):
-        raise BufgymError(f"warm_up = {arguments.warm_up}: needs a suite of interruptions or blackouts")
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
     saved = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
@@ -234,8 +237,10 @@ def train(
     still, moving = everything, everything
     if warm_up:
         like = replace(like, still=start(like.fields, arguments.still_hidden, np.random.default_rng(seed)))
-        still = [yard for suite, yard in zip(arguments.suites, everything, strict=True) if stands_still(suite)]
+        still = [yard for yard in everything if yard.exact]
         moving = [yard for yard in everything if not yard.exact] or everything
+    if not still:
+        raise BufgymError(f"warm_up = {arguments.warm_up}: needs a suite of interruptions")
     search = pickle.loads(saved.read_bytes()) if saved.exists() else Search.of(like, warm_up, seed)
     curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), search.steps)
     validations = Record(home / "validation.csv", ("steps", "seconds", *Verdict._fields, "over_rivals"), search.steps)

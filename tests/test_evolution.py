@@ -15,7 +15,7 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard", "cma"):
 
 import train  # noqa: E402  (these need the extra)
 from agents import evolution, grounds, training, worlds  # noqa: E402
-from bufgym import policies, suites  # noqa: E402
+from bufgym import policies  # noqa: E402
 from bufgym.metrics import outcome  # noqa: E402
 from bufgym.oracle import integer, law  # noqa: E402
 from bufgym.policies import learned, weights  # noqa: E402
@@ -148,10 +148,6 @@ def test_the_scorer_of_a_still_link_is_searched_alone_with_its_own_hidden_layer(
     assert again.still is made.still and again.drop.skip[2] == 2
 
 
-def test_links_stand_still_in_interruptions_and_blackouts() -> None:
-    assert [s for s in suites.SUITES if evolution.stands_still(s)] == ["interruption-v1", "outage-v1"]
-
-
 # --- runs ------------------------------------------------------------------------------------------------------------
 
 
@@ -190,8 +186,8 @@ def test_a_warm_up_learns_a_second_scorer_first() -> None:
         assert (evolution.to_vector(mean) != evolution.to_vector(begin)).any()
 
 
-def test_a_warm_up_needs_links_that_stand_still() -> None:
-    with pytest.raises(SystemExit, match="needs a suite of interruptions or blackouts"):
+def test_a_warm_up_needs_interruptions() -> None:
+    with pytest.raises(SystemExit, match="needs a suite of interruptions"):
         train.main(dataclasses.replace(TINY, suite="sustained-v1", capacities="25", warm_up=20_000))
 
 
