@@ -1,6 +1,6 @@
 """What each part of an evolved agent is worth: the same training without it, as a page.
 
-``python -m agents.ablation --steps 60000000 --seeds 2 --out docs/ablation.md`` trains every variant, a process a core
+``python -m agents.ablation --steps 40000000 --seeds 2 --out docs/ablation.md`` trains every variant, a process a core
 (a finished one is not trained again), and measures the kept agents on the test splits: regret over that of AFR or Drop
 Oldest, whichever is better (``grounds.Yard``). ``--runs runs/a,runs/b`` adds how those runs of ``train.py`` learned, by
 whatever algorithm, and what more seeds are worth to the evolved ones.
@@ -41,13 +41,11 @@ WITHOUT = {
     "without value (loss, relative_loss, even_value, bend)": ("loss", "relative_loss", "even_value", "bend"),
     "without its curvature (relative_loss, even_value, bend)": ("relative_loss", "even_value", "bend"),
     "without link (stalled, drain)": ("stalled", "drain"),
-    "without occupancy": ("occupancy",),
-    "without motion_before": ("motion_before",),
     "without context, so nothing is mixed": ("occupancy", "stalled", "drain", "even_value", "bend"),
     "rank and motion_merged alone": tuple(name for name in evolution.MOTION if name not in ("rank", "motion_merged")),
 }
 """Fields left out of ``evolution.MOTION``."""
-HIDDEN = ((0, 0), (0, 6), (0, 12), (8, 12))
+HIDDEN = ((0, 0), (0, 6), (8, 12))
 """Hidden units beside the mixing: those of the scorer of links that move, and of links that stand still."""
 
 
@@ -144,13 +142,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m agents.ablation", description=__doc__)
     parser.add_argument("--name", default="ablation", help="folder under runs/")
-    parser.add_argument("--steps", type=int, default=60_000_000)
+    parser.add_argument("--steps", type=int, default=40_000_000)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--runs", default="", help="folders of runs whose learning is shown beside")
     parser.add_argument("--out", type=Path, default=None, help="Markdown file to write; printed otherwise")
     options = parser.parse_args(arguments)
     given = Arguments(suite=SUITES, algo="evolution", name=options.name, steps=options.steps, hidden=4)
-    given = replace(given, validate_every=options.steps // 10, warm_up=options.steps // 2)
+    given = replace(given, validate_every=options.steps // 5, warm_up=options.steps // 2)
     try:
         todo = variants(given)
         first, *others = todo.values()
@@ -170,12 +168,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, chosen in todo.items():
         kept, _ = weights.read(Path("runs") / chosen.name / "seed-0" / evolution.MODEL)
         sizes[name] = sum(len(evolution.to_vector(each)) for each in (kept, kept.still) if each)
+    seen = f" --runs {options.runs}" if options.runs else ""
     lines = [
         "# What each part is worth",
         "",
-        "Test splits; regret over that of AFR or Drop Oldest, whichever is better; "
-        f"{options.steps:,} decisions a seed, {options.seeds} seeds. Made by",
-        f"`python -m agents.ablation --steps {options.steps} --seeds {options.seeds}`.",
+        "Test splits; regret over that of AFR or Drop Oldest, whichever is better. "
+        f"{options.steps:,} decisions a seed, half of them for the scorer of a still link; {options.seeds} seeds, "
+        'whose range is in parentheses: what lies within it is luck. "Everything" has '
+        f"{given.hidden} hidden units where the link moves and {given.still_hidden} where it stands still. Made by",
+        "",
+        f"`python -m agents.ablation --steps {options.steps} --seeds {options.seeds}{seen}`",
         "",
         *table(found, sizes),
         "",

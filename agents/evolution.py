@@ -262,7 +262,8 @@ def train(
         validate(search.mean)
     while search.steps < arguments.steps:
         if search.still and search.steps >= arguments.warm_up:
-            search = Search.of(search.mean, False, seed, steps=search.steps)
+            # From what did best on validation, as a scorer of interruptions alone may come to fail elsewhere.
+            search = Search.of(weights.read(home / MODEL)[0], False, seed, steps=search.steps)
         fitness = search.generation(still if search.still else moving)
         search.seconds = _since(began)
         curve.append(search.steps, search.seconds, fitness)
