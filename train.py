@@ -31,6 +31,8 @@ class Arguments:
     """Fields that an evolved agent reads, such as rank,motion_merged,stalled; by default those of --sees."""
     hidden: int = 0
     """Hidden units of an evolved agent; with none, its scores are linear in what the context makes of the slots."""
+    still_hidden: int = 6
+    """The same for its scorer of links that stand still (``warm_up``)."""
     name: str = ""
     """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
     resume: bool = False
@@ -69,7 +71,7 @@ class Arguments:
     """Weight of the entropy bonus."""
     warm_up: int = 0
     """Decisions for which evolution first learns a scorer of its own for links that stand still, from interruptions
-    alone (their mean over T is exact and cheap); afterwards the one for links that move, on all suites."""
+    alone (their mean over T is exact and cheap); afterwards the one for all other links, from the other suites."""
     checkpoint_every: int = 250_000
     """Steps."""
     validate_every: int = 250_000

@@ -1,8 +1,9 @@
 """What each part of an evolved agent is worth: the same training without it, as a page.
 
-``python -m agents.ablation --steps 60000000 --seeds 2 --out docs/ablation.md`` trains every variant, a process a core
+``python -m agents.ablation --steps 40000000 --seeds 2 --out docs/ablation.md`` trains every variant, a process a core
 (a finished one is not trained again), and measures the kept agents on the test splits: regret over that of AFR or Drop
-Oldest, whichever is better (``grounds.Yard``). ``--runs runs/a,runs/b`` adds how those runs learned.
+Oldest, whichever is better (``grounds.Yard``). ``--runs runs/a,runs/b`` adds how those runs of ``train.py`` learned, by
+whatever algorithm, and what more seeds are worth to the evolved ones.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 import concurrent.futures
 import csv
+import itertools
 import json
 import multiprocessing
 import os
@@ -17,10 +19,12 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from agents import evolution
+from agents.export import command
 from agents.grounds import EPISODES
 from agents.training import ALGORITHMS, prepare
 from agents.trials import ValidationSet
@@ -37,14 +41,12 @@ WITHOUT = {
     "without value (loss, relative_loss, even_value, bend)": ("loss", "relative_loss", "even_value", "bend"),
     "without its curvature (relative_loss, even_value, bend)": ("relative_loss", "even_value", "bend"),
     "without link (stalled, drain)": ("stalled", "drain"),
-    "without occupancy": ("occupancy",),
-    "without motion_before": ("motion_before",),
     "without context, so nothing is mixed": ("occupancy", "stalled", "drain", "even_value", "bend"),
     "rank and motion_merged alone": tuple(name for name in evolution.MOTION if name not in ("rank", "motion_merged")),
 }
 """Fields left out of ``evolution.MOTION``."""
-HIDDEN = (4, 16)
-"""Hidden units beside the mixing."""
+HIDDEN = ((0, 0), (0, 6), (8, 12))
+"""Hidden units beside the mixing: those of the scorer of links that move, and of links that stand still."""
 
 
 def variants(given: Arguments) -> dict[str, Arguments]:
@@ -54,8 +56,10 @@ def variants(given: Arguments) -> dict[str, Arguments]:
         fields = [field for field in evolution.MOTION if field not in left_out]
         made[name] = replace(given, fields=",".join(fields))
     made["on time alone (--sees time)"] = replace(given, sees="time")
-    for units in HIDDEN:
-        made[f"{units} hidden units beside the mixing"] = replace(given, hidden=units)
+    for hidden, still in HIDDEN:
+        units = replace(given, hidden=hidden, still_hidden=still)
+        made[f"{hidden} hidden units where the link moves, {still} where it stands still"] = units
+    made["one scorer for all links"] = replace(given, warm_up=0, hidden=given.still_hidden)
     return {name: replace(arguments, name=f"{given.name}/{k:02d}") for k, (name, arguments) in enumerate(made.items())}
 
 
@@ -85,14 +89,14 @@ def table(found: dict[str, list[list[float]]], sizes: dict[str, int]) -> list[st
     return lines
 
 
-MOMENTS_S = (0, 30, 60, 120, 180, 300, 600, 1200)
+MOMENTS_S = (0, 15, 30, 60, 120, 180)
 
 
 def learning(runs: Sequence[Path]) -> list[str]:
     """Markdown: the best regret over AFR's on validation after so many seconds, for every seed of these runs."""
     lines = [
-        f"| run | seed | {' | '.join(f'{s} s' for s in MOMENTS_S)} | at the end |",
-        "|---" * (len(MOMENTS_S) + 3) + "|",
+        f"| run | algorithm | seed | {' | '.join(f'{s} s' for s in MOMENTS_S)} | at the end |",
+        "|---" * (len(MOMENTS_S) + 4) + "|",
     ]
     for run in runs:
         for path in sorted(run.glob("seed-*/validation.csv")):
@@ -100,10 +104,37 @@ def learning(runs: Sequence[Path]) -> list[str]:
                 rows = [(float(row["seconds"]), float(row["over_afr"])) for row in csv.DictReader(file)]
             cells = []
             for moment in MOMENTS_S:
-                reached = [over for seconds, over in rows if seconds <= moment + 15]
-                cells.append(f"{min(reached):.2f}" if reached and rows[-1][0] >= moment - 15 else "")
+                reached = [over for seconds, over in rows if seconds <= moment + 2]
+                cells.append(f"{min(reached):.2f}" if reached and rows[-1][0] >= moment - 2 else "")
             end = f"{min(over for _, over in rows):.2f} ({rows[-1][0]:.0f} s)"
-            lines.append(f"| {run.name} | {path.parent.name[5:]} | {' | '.join(cells)} | {end} |")
+            algo = _settings(run)["algo"]
+            lines.append(f"| {run.name} | {algo} | {path.parent.name[5:]} | {' | '.join(cells)} | {end} |")
+    return [*lines, "", "```", *(f"{command(_settings(run))} --name {run.name}" for run in runs), "```"]
+
+
+def _settings(run: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((run / "settings.json").read_text(encoding="utf-8"))
+    return found
+
+
+def more_seeds(run: Path) -> list[str]:
+    """Markdown: what the best of n seeds by validation is on the test splits, on average over all choices of n.
+
+    Both as the regret over that of AFR or Drop Oldest, whichever is better, mean over the run's suites.
+    """
+    given = Arguments(**_settings(run))
+    found = []
+    for path in sorted(run.glob("seed-*/validation.csv")):
+        with path.open(newline="", encoding="utf-8") as file:
+            chosen_by = min(float(row["over_rivals"]) for row in csv.DictReader(file))
+        agent = policies.load(path.parent / evolution.MODEL)
+        yards = evolution.yards(given, "test", TEST_SEED, 3 * EPISODES)
+        found.append((chosen_by, float(np.mean([yard.over_rivals(agent) for yard in yards]))))
+    lines = [f"| {run.name}: seeds | validation | test |", "|---|---|---|"]
+    for n in range(1, len(found) + 1):
+        best = [min(some) for some in itertools.combinations(found, n)]
+        validation, test = np.mean(best, axis=0)
+        lines.append(f"| best of {n} | {validation:.3f} | {test:.3f} |")
     return lines
 
 
@@ -111,13 +142,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m agents.ablation", description=__doc__)
     parser.add_argument("--name", default="ablation", help="folder under runs/")
-    parser.add_argument("--steps", type=int, default=60_000_000)
+    parser.add_argument("--steps", type=int, default=40_000_000)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--runs", default="", help="folders of runs whose learning is shown beside")
     parser.add_argument("--out", type=Path, default=None, help="Markdown file to write; printed otherwise")
     options = parser.parse_args(arguments)
-    given = Arguments(suite=SUITES, algo="evolution", name=options.name, steps=options.steps)
-    given = replace(given, validate_every=options.steps // 4)
+    given = Arguments(suite=SUITES, algo="evolution", name=options.name, steps=options.steps, hidden=4)
+    given = replace(given, validate_every=options.steps // 5, warm_up=options.steps // 2)
     try:
         todo = variants(given)
         first, *others = todo.values()
@@ -136,20 +167,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sizes = {}
     for name, chosen in todo.items():
         kept, _ = weights.read(Path("runs") / chosen.name / "seed-0" / evolution.MODEL)
-        sizes[name] = len(evolution.to_vector(kept))
+        sizes[name] = sum(len(evolution.to_vector(each)) for each in (kept, kept.still) if each)
+    seen = f" --runs {options.runs}" if options.runs else ""
     lines = [
         "# What each part is worth",
         "",
-        "Test splits; regret over that of AFR or Drop Oldest, whichever is better; "
-        f"{options.steps:,} decisions a seed, {options.seeds} seeds. Made by",
-        f"`python -m agents.ablation --steps {options.steps} --seeds {options.seeds}`.",
+        "Test splits; regret over that of AFR or Drop Oldest, whichever is better. "
+        f"{options.steps:,} decisions a seed, half of them for the scorer of a still link; {options.seeds} seeds, "
+        'whose range is in parentheses: what lies within it is luck. "Everything" has '
+        f"{given.hidden} hidden units where the link moves and {given.still_hidden} where it stands still. Made by",
+        "",
+        f"`python -m agents.ablation --steps {options.steps} --seeds {options.seeds}{seen}`",
         "",
         *table(found, sizes),
         "",
     ]
     if options.runs:
-        lines += ["## How they learned", "", "Best regret over AFR's on validation so far.", ""]
-        lines += [*learning([Path(run) for run in options.runs.split(",")]), ""]
+        runs = [Path(run) for run in options.runs.split(",")]
+        lines += ["## How they learned", "", "Best regret over AFR's on validation so far, mean over the suites.", ""]
+        lines += [*learning(runs), "", "## What more seeds are worth", ""]
+        for run in runs:
+            if _settings(run)["algo"] == "evolution" and _settings(run)["seeds"] > 2:
+                lines += [*more_seeds(run), ""]
     text = "\n".join(lines)
     if options.out:
         options.out.write_text(text, encoding="utf-8")

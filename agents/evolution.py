@@ -1,10 +1,14 @@
 """Evolution: a slot scorer's weights by CMA-ES over whole episodes, rolled out in compiled code.
 
 PPO learns from decisions one by one and pays for its updates; here a candidate is a vector of weights, its fitness the
-regret over that of AFR or Drop Oldest, whichever is better (``grounds``), averaged over suites. A rollout decides a
-million times a second, so a few minutes suffice. The episodes stay the same throughout: candidates then differ by what
-they decide alone (common random numbers), and validation episodes say when to stop. The optimiser is pycma (Hansen, The
-CMA Evolution Strategy: A Tutorial, arXiv 1604.00772).
+regret over that of AFR or Drop Oldest, whichever is better (``grounds``), averaged over suites. A rollout decides two
+million times a second, so a few minutes suffice. All candidates of a generation meet the same episodes, so that they
+differ by what they decide alone (common random numbers); the next generation meets others of them (``PARTS``), and
+validation episodes say which mean to keep. The optimiser is pycma (Hansen, The CMA Evolution Strategy: A Tutorial,
+arXiv 1604.00772).
+
+With a warm-up, two scorers are learned one after the other: first that for a link that stands still, from interruptions
+alone (their mean over T is exact and cheap), then that for all other links, from the other suites.
 
 The search begins at what is known to be good: drop what leaves the smallest merged gap, the newer of two rather than
 the older, accept where there is room.
@@ -12,6 +16,7 @@ the older, accept where there is room.
 
 from __future__ import annotations
 
+import functools
 import pickle
 import sys
 import time
@@ -32,7 +37,7 @@ from bufgym.errors import BufgymError
 from bufgym.files import replaced
 from bufgym.policies import Policy, learned, weights
 from bufgym.policies.learned import Network, Weights
-from bufgym.scenario import Interruption
+from bufgym.scenario import Interruption, Uplink
 
 if TYPE_CHECKING:
     from train import Arguments
@@ -49,12 +54,19 @@ MOTION = (
 SEES = {"time": TIME, "motion": MOTION}
 
 POPULATION = 16
-SIGMA = {True: 1.0, False: 0.5}
+SIGMA = {True: 2.0, False: 0.3}
 """First step size, for the scorer of a still link or of a moving one; the start's weights are of the order of 10."""
 DIAGONAL = 100
 """From so many weights on, a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
 SMALL = (1, 2, 3)
 """L to learn from besides the suite's own, where a ground is exact and so costs next to nothing."""
+
+MEMORY = 10
+"""Generations over which the strategy's mean is averaged, exponentially."""
+
+PARTS = 8
+"""A suite's training episodes come in so many parts, one a generation in turn; interruptions, being exact, in one."""
+PART_EPISODES = 12
 
 VALIDATION_EPISODES = 3 * EPISODES
 VALIDATION_SEED = 1
@@ -62,17 +74,23 @@ VALIDATION_SEED = 1
 MODEL = "model.safetensors"
 
 
-def yards(arguments: Arguments, split: str, seed: int, episodes: int = EPISODES) -> list[Yard]:
-    """Grounds of every suite, drawn from ``seed``."""
-    made = []
-    for suite in arguments.suites:
-        capacities, data = capacities_of(suite, arguments.capacities), arguments.data or None
-        given = cells(suite, split, capacities, data)
-        if not arguments.capacities:
-            small = [L for L in SMALL if L not in capacities]
-            given += [c for c in cells(suite, split, small, data) if isinstance(c.scenario, Interruption)]
-        made.append(Yard(grounds(given, seed, episodes)))
-    return made
+def yards(arguments: Arguments, split: str, seed: int, episodes: int = EPISODES, parts: int = 1) -> list[Yard]:
+    """Grounds of every suite, drawn from ``seed``: ``parts`` times so many episodes, or the exact ones."""
+    given = arguments.capacities, arguments.data or None, split, seed, episodes, parts
+    return [_yard(suite, *given) for suite in arguments.suites]
+
+
+@functools.lru_cache(maxsize=32)  # bounds take a minute, and several agents may be made in one process (the ablation)
+def _yard(
+    suite: str, given_capacities: str, data: str | None, split: str, seed: int, episodes: int, parts: int
+) -> Yard:
+    capacities = capacities_of(suite, given_capacities)
+    given = cells(suite, split, capacities, data)
+    if not given_capacities:
+        small = [L for L in SMALL if L not in capacities]
+        given += [c for c in cells(suite, split, small, data) if isinstance(c.scenario, Interruption)]
+    sampled = parts if any(isinstance(cell.scenario, Uplink) for cell in given) else 1
+    return Yard(*(grounds(given, seed + 1000 * k, episodes) for k in range(sampled)))
 
 
 # --- weights as a vector ---------------------------------------------------------------------------------------------
@@ -157,34 +175,41 @@ class Search:
     like: Weights
     """What is not searched has these numbers."""
     still: bool
-    """Whether a scorer for links that stand still is searched, or the one for all others (or for all)."""
+    """Whether the scorer for links that stand still is searched, or the one for all others (or for all)."""
     es: Any
-    """pycma's strategy, whose mean is the agent."""
+    """pycma's strategy."""
+    average: NDArray[np.float64]
+    """Of the strategy's latest means (``MEMORY``), which the luck of single parts moves about: this is the agent."""
     steps: int = 0
+    generations: int = 0
     seconds: float = 0.0
 
     @staticmethod
     def of(like: Weights, still: bool, seed: int, **before: Any) -> Search:
-        """A new one, around these weights."""
-        begin = to_vector(like)
+        """A new one, around these weights; ``still`` searches those of their second scorer."""
+        begin = to_vector(like.still if still and like.still else like)
         settings = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
-        return Search(like, still, cma.CMAEvolutionStrategy(begin, SIGMA[still], settings), **before)
+        return Search(like, still, cma.CMAEvolutionStrategy(begin, SIGMA[still], settings), begin, **before)
 
     def weights(self, vector: NDArray[np.float64]) -> Weights:
-        made = from_vector(self.like, vector)
-        return replace(self.like, still=made) if self.still else made
+        if self.still and self.like.still:
+            return replace(self.like, still=from_vector(self.like.still, vector))
+        return from_vector(self.like, vector)
 
     @property
     def mean(self) -> Weights:
         """The agent so far."""
-        return self.weights(self.es.mean)
+        return self.weights(self.average)
 
     def generation(self, yards: Sequence[Yard]) -> float:
         """Ask, try and tell once; the best fitness."""
         vectors = self.es.ask()
-        fitness = [_fitness(learned.policy("evolved", self.weights(v)), yards) for v in vectors]
+        part = self.generations
+        fitness = [_fitness(learned.policy("evolved", self.weights(v)), yards, part) for v in vectors]
         self.es.tell(vectors, fitness)
-        self.steps += sum(yard.decisions for yard in yards) * len(vectors)
+        self.average = self.average + (self.es.mean - self.average) / MEMORY
+        self.steps += sum(yard.decisions(part) for yard in yards) * len(vectors)
+        self.generations += 1
         return float(np.min(fitness))
 
 
@@ -194,7 +219,7 @@ def train(
     """Evolve one seed until ``arguments.steps`` decisions were rolled out, from its last checkpoint if there is one.
 
     What did best on validation, by the same measure on other episodes, is kept as ``model.safetensors``. For the first
-    ``arguments.warm_up`` decisions a scorer for links that stand still is learned, from exact grounds.
+    ``arguments.warm_up`` decisions the scorer for links that stand still is learned.
 
     Returns:
         Seconds of training, the learning curve (steps, seconds, fitness), and the validations (steps, seconds,
@@ -205,14 +230,18 @@ def train(
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
     saved = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
-    everything = yards(arguments, "train", seed)
+    everything = yards(arguments, "train", seed, PART_EPISODES, PARTS)
     judges = yards(arguments, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
     trials = ValidationSet(arguments, folder)
-    like = start(fields_of(arguments), arguments.hidden, np.random.default_rng(seed))
-    exact = [yard for yard in everything if yard.exact]
-    if arguments.warm_up and not exact:
+    like, warm_up = start(fields_of(arguments), arguments.hidden, np.random.default_rng(seed)), arguments.warm_up > 0
+    still, moving = everything, everything
+    if warm_up:
+        like = replace(like, still=start(like.fields, arguments.still_hidden, np.random.default_rng(seed)))
+        still = [yard for yard in everything if yard.exact]
+        moving = [yard for yard in everything if not yard.exact] or everything
+    if not still:
         raise BufgymError(f"warm_up = {arguments.warm_up}: needs a suite of interruptions")
-    search = pickle.loads(saved.read_bytes()) if saved.exists() else Search.of(like, arguments.warm_up > 0, seed)
+    search = pickle.loads(saved.read_bytes()) if saved.exists() else Search.of(like, warm_up, seed)
     curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), search.steps)
     validations = Record(home / "validation.csv", ("steps", "seconds", *Verdict._fields, "over_rivals"), search.steps)
     began = time.perf_counter() - search.seconds
@@ -233,8 +262,9 @@ def train(
         validate(search.mean)
     while search.steps < arguments.steps:
         if search.still and search.steps >= arguments.warm_up:
-            search = Search.of(search.mean, False, seed, steps=search.steps)
-        fitness = search.generation(exact if search.still else everything)
+            # From what did best on validation, as a scorer of interruptions alone may come to fail elsewhere.
+            search = Search.of(weights.read(home / MODEL)[0], False, seed, steps=search.steps)
+        fitness = search.generation(still if search.still else moving)
         search.seconds = _since(began)
         curve.append(search.steps, search.seconds, fitness)
         if search.steps - validations.rows[-1][0] >= arguments.validate_every or search.steps >= arguments.steps:
@@ -251,5 +281,5 @@ def _since(began: float) -> float:
     return float(round(time.perf_counter() - began, 3))
 
 
-def _fitness(policy: Policy, yards: Sequence[Yard]) -> float:
-    return float(np.mean([yard.over_rivals(policy) for yard in yards]))
+def _fitness(policy: Policy, yards: Sequence[Yard], part: int | None = None) -> float:
+    return float(np.mean([yard.over_rivals(policy, part) for yard in yards]))

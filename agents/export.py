@@ -97,7 +97,7 @@ def training(model: Path) -> dict[str, Any]:
     else:
         return {}
     settings = _json(folder / "settings.json")
-    notes: dict[str, Any] = {"training": _command(settings), "seeds": _seeds(settings, model)}
+    notes: dict[str, Any] = {"training": command(settings), "seeds": _seeds(settings, model)}
     if folder == model.parent and (by_suite := _scores(folder, settings)):
         notes["scores"] = by_suite
     results = folder / "results.json"
@@ -139,7 +139,7 @@ def _seeds(settings: dict[str, Any], model: Path) -> list[int]:
     return [int(own)] if own.isdigit() else [settings["seed"] + i for i in range(settings["seeds"])]
 
 
-def _command(settings: dict[str, Any]) -> str:
+def command(settings: dict[str, Any]) -> str:
     """The command that trains it again: settings that are not train.py's own."""
     from train import Arguments
 

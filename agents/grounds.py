@@ -20,7 +20,7 @@ from bufgym.benchmark.run import best, draw, regret
 from bufgym.benchmark.score import BASELINE
 from bufgym.oracle import by_length, integer, law
 from bufgym.policies import Policy
-from bufgym.scenario import Interruption, Uplink
+from bufgym.scenario import Episode, Interruption, Uplink
 from bufgym.sender import Senders
 
 AT_LEAST = 0.003
@@ -57,15 +57,50 @@ class Lengths:
         self.best = float(self.law @ [1 + integer(cell.capacity, T, scenario.value) for T in lengths])
 
     def regret(self, policy: Policy) -> float:
-        return regret(float(self.law @ self.qoi(policy)), self.best)
+        return self.regret_of(self.qoi(policy))
+
+    def regret_of(self, h: NDArray[np.float64]) -> float:
+        """The regret of who reaches these H by T."""
+        return regret(float(self.law @ h), self.best)
 
     def qoi(self, policy: Policy) -> NDArray[np.float64]:
         """H by T, float64[t_max + 1]."""
-        self.senders.load(0, self.scenario.episode(self.scenario.t_max))
+        self.senders.load(0, self.longest())
         self.senders.run(policy)
-        dropped_us = self.senders.batch.fates["dropped_us"][0]
+        return self.by_length(self.senders.batch.fates["dropped_us"][0])
+
+    def longest(self) -> Episode:
+        """The interruption that holds all others."""
+        return self.scenario.episode(self.scenario.t_max)
+
+    def by_length(self, dropped_us: NDArray[np.int64]) -> NDArray[np.float64]:
+        """H by T of who dropped the messages of ``longest`` at these times (< 0: never)."""
         with_arrival = np.rint(dropped_us / self.scenario.period_us).astype(np.int64)
-        return by_length(np.where(dropped_us < 0, self.scenario.max_messages, with_arrival), self.scenario.value)
+        never = self.scenario.max_messages
+        return by_length(np.where(dropped_us < 0, never, with_arrival), self.scenario.value)
+
+
+class SideBySide:
+    """Interruptions of one V and law at many L as rows of one batch: one call of compiled code for all of them."""
+
+    def __init__(self, given: Sequence[Lengths]) -> None:
+        first, self.grounds = given[0].scenario, list(given)
+        widest = max(ground.cell.capacity for ground in given)
+        self.senders = Senders(len(given), widest, first.value, max_messages=first.max_messages)
+        for i, ground in enumerate(given):
+            self.senders.capacity = ground.cell.capacity
+            self.senders.load(i, ground.longest())
+        self.senders.capacity = widest
+        batch = self.senders.batch
+        self._begun = batch.senders.copy(), batch.fates.copy()
+
+    def regrets(self, policy: Policy) -> list[float]:
+        """By ground."""
+        batch = self.senders.batch
+        batch.senders[:], batch.fates[:] = self._begun
+        self.senders.run(policy)
+        dropped_us = batch.fates["dropped_us"]
+        return [ground.regret_of(ground.by_length(row)) for ground, row in zip(self.grounds, dropped_us, strict=True)]
 
 
 class Sampled:
@@ -110,28 +145,54 @@ def grounds(given: Sequence[Cell], seed: int, episodes: int = EPISODES) -> list[
 
 
 class Yard:
-    """The grounds of one suite, and what is to be beaten there: on each the better of AFR and Drop Oldest."""
+    """The grounds of one suite, and what is to be beaten there: on each the better of AFR and Drop Oldest.
 
-    def __init__(self, grounds: Sequence[Ground]) -> None:
-        self.grounds = list(grounds)
+    They may come in parts, each a small sample of the suite: where candidates are tried may then change from generation
+    to generation, so that many episodes cost no more than a few.
+    """
+
+    def __init__(self, *parts: Sequence[Ground]) -> None:
+        self.grounds = [ground for part in parts for ground in part]
+        ends = np.cumsum([len(part) for part in parts]).tolist()
+        self._parts = [range(end - len(part), end) for part, end in zip(parts, ends, strict=True)]
         known = [policies.get(name) for name in ("afr", BASELINE)]
         self.rivals = np.array([max(AT_LEAST, min(g.regret(p) for p in known)) for g in self.grounds])
         # Ratios of single sampled cells would be noise: those of one L and V are pooled. Exact ones each count.
         keys = [(g.cell.capacity, g.cell.scenario.value.name) for g in self.grounds]
-        self._pools = [[i for i, key in enumerate(keys) if key == wanted] for wanted in dict.fromkeys(keys)]
+        kinds = list(dict.fromkeys(keys))
+        self._pool = np.array([kinds.index(key) for key in keys])
+        self._rival = np.array([self.rivals[self._pool == k].mean() for k in range(len(kinds))])
+        exact = [g for g in self.grounds if isinstance(g, Lengths)]
+        laws = dict.fromkeys((g.scenario.value, g.scenario.lengths, g.scenario.t_max) for g in exact)
+        self._rows = [
+            SideBySide([g for g in exact if (g.scenario.value, g.scenario.lengths, g.scenario.t_max) == wanted])
+            for wanted in laws
+        ]
 
     @property
     def exact(self) -> bool:
         """Whether every ground is."""
         return all(g.exact for g in self.grounds)
 
-    @property
-    def decisions(self) -> int:
+    def decisions(self, part: int | None = None) -> int:
         """Arrivals that one policy is asked about."""
-        return sum(int(g.senders.batch.senders["arrivals"].sum()) for g in self.grounds)
+        return sum(int(self.grounds[i].senders.batch.senders["arrivals"].sum()) for i in self._chosen(part))
 
-    def over_rivals(self, policy: Policy) -> float:
-        """Regret over the rival's: root mean square over the cells, so that the worst ones count most."""
-        found = np.array([g.regret(policy) for g in self.grounds])
-        ratios = [min(WORST, found[pool].sum() / self.rivals[pool].sum()) for pool in self._pools]
+    def over_rivals(self, policy: Policy, part: int | None = None) -> float:
+        """Regret over the rival's: root mean square over the cells, so that the worst ones count most.
+
+        ``part``: on this one alone (they are taken in turn), but over the rival's regret on all of them.
+        """
+        chosen = np.array(self._chosen(part))
+        found, pool = self._regrets(policy, chosen), self._pool[chosen]
+        ratios = [min(WORST, found[pool == k].mean() / self._rival[k]) for k in np.unique(pool)]
         return float(np.sqrt(np.mean(np.square(ratios))))
+
+    def _chosen(self, part: int | None) -> Sequence[int]:
+        return range(len(self.grounds)) if part is None else self._parts[part % len(self._parts)]
+
+    def _regrets(self, policy: Policy, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
+        if self.exact:
+            known = {g.cell: r for rows in self._rows for g, r in zip(rows.grounds, rows.regrets(policy), strict=True)}
+            return np.array([known[self.grounds[i].cell] for i in chosen])
+        return np.array([self.grounds[i].regret(policy) for i in chosen])

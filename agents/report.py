@@ -47,8 +47,6 @@ def evaluate_and_report(arguments: Arguments, folder: Path, runs: Sequence[Run])
     for run in runs:
         model = load(arguments, run)
         results[agent_name(run)] = run_agent(model, episodes, world, arguments.capacity, arguments.decide_at)
-        if run is best:
-            export(model, folder)
     shutil.copyfile(best.model, folder / "model.zip")
     rows = summarise(results, agent_name(best))
     print(table(rows, agent_name(best)))
@@ -81,17 +79,6 @@ def table(rows: Sequence[dict[str, Any]], agent: str) -> str:
             [row["policy"], *(format(row[name] * factor, spec) for _, name, factor, spec in COLUMNS), difference]
         )
     return "\n".join(aligned(lines))
-
-
-def export(model: Any, folder: Path) -> None:
-    """The weights as plain numbers: unlike model.zip, reading them never runs code."""
-    if importlib.util.find_spec("safetensors") is None:
-        return
-    from safetensors.numpy import save_file
-
-    weights = {name: np.ascontiguousarray(tensor.numpy()) for name, tensor in model.policy.state_dict().items()}
-    fields = ",".join(getattr(model.observation_space, "spaces", {}))
-    save_file(weights, folder / "weights.safetensors", metadata={"fields": fields})
 
 
 def draw(rows: Sequence[dict[str, Any]], runs: Sequence[Run], path: Path) -> None:
@@ -197,8 +184,10 @@ def report_suite(arguments: Arguments, suite: str, folder: Path, home: Path, run
     reached = {s.policy: s.score.value for s in shown} or {
         name: float(np.mean(numbers)) for name, numbers in qoi.items()
     }
-    curves = [np.array(run.validation)[:, [0, 2]] for run in runs]
-    _figure(home / "figure.png", runs, curves, "score on validation", reached, "normalised score", "Test split")
+    # By the last column the agent was chosen.
+    curves = [np.array(run.validation)[:, [0, -1]] for run in runs]
+    measure = f"regret over {ALGORITHMS[arguments.algo].rival}, on validation"
+    _figure(home / "figure.png", runs, curves, measure, reached, "normalised score", "Test split")
     return found
 
 

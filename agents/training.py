@@ -84,6 +84,8 @@ class Algorithm:
     """Its rows on a suite's trials."""
     model: str = "model.zip"
     """The file of the agent to keep."""
+    rival: str = "AFR's"
+    """Over whose regret its own is on validation, where the agent to keep is chosen by that."""
 
 
 # --- the run's folder ------------------------------------------------------------------------------------------------
@@ -290,6 +292,6 @@ def _test_evolved(arguments: Arguments, run: Run, trials: Trials) -> list[Row]:
 
 
 ALGORITHMS = {name: Algorithm(train_seed, _test) for name in LEARNERS} | {
-    "evolution": Algorithm(_evolve, _test_evolved, evolution.MODEL)
+    "evolution": Algorithm(_evolve, _test_evolved, evolution.MODEL, "that of AFR or Drop Oldest")
 }
 """What ``--algo`` can name."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -102,7 +103,49 @@ def test_a_yard_asks_for_the_better_of_afr_and_drop_oldest() -> None:
     mine = [g.regret(policies.get("min-gap")) / g.regret(afr) for g in yard.grounds]
     assert yard.over_rivals(policies.get("min-gap")) == pytest.approx(np.sqrt(np.mean(np.square(mine))))
     assert yard.over_rivals(policies.get("drop-newest")) == grounds.WORST
-    assert yard.decisions == 2 * 42
+    assert yard.decisions() == 2 * 42
+
+
+def test_interruptions_side_by_side_are_what_each_is_alone() -> None:
+    """Rows of one batch with L of their own, again and again, in two V."""
+    cells = worlds.cells("interruption-v1", "train", (1, 4, 9))[:6]
+    given = [ground for ground in grounds.grounds(cells, seed=1) if isinstance(ground, grounds.Lengths)]
+    assert len(given) == 6
+    for one_v in (given[:3], given[3:]):
+        together = grounds.SideBySide(one_v)
+        for name in ("min-gap", "afr", "min-gap"):
+            assert together.regrets(policies.get(name)) == [g.regret(policies.get(name)) for g in one_v]
+
+
+def test_a_yard_in_parts_asks_for_what_the_rivals_reach_on_all_of_them() -> None:
+    """Two parts with one ground each, of the same L and V: each part's regret over the mean of both rivals'."""
+    cell = worlds.cells("sustained-v1", "train", (10,))[1]
+    parts = [grounds.grounds([cell], seed, episodes=1) for seed in (1, 2)]
+    yard, policy = grounds.Yard(*parts), policies.get("min-gap")
+    mine = [part[0].regret(policy) for part in parts]
+    assert mine[0] != mine[1]
+    rival = yard.rivals.mean()
+    assert yard.over_rivals(policy, 0) == pytest.approx(mine[0] / rival)
+    assert yard.over_rivals(policy, 3) == pytest.approx(mine[1] / rival)  # parts are taken in turn
+    assert yard.over_rivals(policy) == pytest.approx(np.mean(mine) / rival)
+    assert yard.decisions() == yard.decisions(0) + yard.decisions(1)
+
+
+# --- two scorers -----------------------------------------------------------------------------------------------------
+
+
+def test_the_scorer_of_a_still_link_is_searched_alone_with_its_own_hidden_layer() -> None:
+    still = evolution.start(evolution.MOTION, 6, np.random.default_rng(0))
+    whole = dataclasses.replace(evolution.start(evolution.MOTION, 0, np.random.default_rng(0)), still=still)
+    first = evolution.Search.of(whole, True, seed=0)
+    vector = np.arange(len(evolution.to_vector(still)), dtype=float)
+    made = first.weights(vector)
+    assert made.still is not None and made.still.widths == (6, 0) and made.widths == (0, 0)
+    assert (evolution.to_vector(made.still) == vector).all()
+    assert (evolution.to_vector(made) == evolution.to_vector(whole)).all()
+    second = evolution.Search.of(made, False, seed=0)
+    again = second.weights(np.arange(len(evolution.to_vector(whole)), dtype=float))
+    assert again.still is made.still and again.drop.skip[2] == 2
 
 
 # --- runs ------------------------------------------------------------------------------------------------------------
@@ -129,6 +172,23 @@ def test_a_run_leaves_an_agent_goes_on_after_a_kill_and_repeats(capsys: pytest.C
     training.train_all(rest, training.prepare(rest))
     again, _ = weights.read(folder / "seed-0" / evolution.MODEL)
     assert (again.memory() == whole.memory()).all()
+
+
+@pytest.mark.slow
+def test_a_warm_up_learns_a_second_scorer_first() -> None:
+    few = {"capacities": "25", "validation_episodes": 200, "steps": 100_000, "warm_up": 20_000, "still_hidden": 2}
+    both = dataclasses.replace(TINY, suite="interruption-v1,sustained-v1", name="warm", **few)
+    (run,) = training.train_all(both, training.prepare(both))
+    search = pickle.loads((run.folder / "evolution.pkl").read_bytes())
+    agent, first = search.mean, evolution.start(evolution.MOTION, 2, np.random.default_rng(0))
+    assert not search.still and agent.still.widths == (2, 0) and agent.widths == (0, 0)
+    for mean, begin in ((agent.still, first), (agent, search.like)):
+        assert (evolution.to_vector(mean) != evolution.to_vector(begin)).any()
+
+
+def test_a_warm_up_needs_interruptions() -> None:
+    with pytest.raises(SystemExit, match="needs a suite of interruptions"):
+        train.main(dataclasses.replace(TINY, suite="sustained-v1", capacities="25", warm_up=20_000))
 
 
 @pytest.mark.slow

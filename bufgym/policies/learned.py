@@ -10,8 +10,9 @@ accepted, which counts where there is room. The highest score is done, ties to t
 how much the candidate's own features s count (``mix`` M): c M s is added to the score of dropping it, so that one
 agent weighs a rank or a gap otherwise where V is straight than where it is flat.
 
-A second scorer of the same shape may decide while the link stands *still* (``STILL``): thinning a queue that nothing
-leaves, for how long nobody knows, is another task than keeping step with a slow link.
+A second scorer over the same fields, with hidden layers of its own, may decide while the link stands *still*
+(``STILL``): thinning a queue that nothing leaves, for how long nobody knows, is another task than keeping step with a
+slow link.
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
@@ -191,7 +192,7 @@ class Weights:
     mix: NDArray[np.float32] | None = None
     """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
     still: Weights | None = None
-    """What decides while the link stands still, with the same fields and widths; None: these do."""
+    """What decides while the link stands still, with the same fields; None: these do."""
 
     @property
     def context(self) -> tuple[str, ...]:
@@ -208,6 +209,13 @@ class Weights:
         """Of the two hidden layers; 0: none."""
         given = [len(bias) for _, bias in self.drop.layers]
         return (given[0] if given else 0), (given[1] if len(given) > 1 else 0)
+
+    @property
+    def work(self) -> int:
+        """Numbers that a decision needs room for, besides those for each slot."""
+        first, second = self.widths
+        own = 2 * len(self.fields) + 2 * first + second + CONTEXT
+        return own if self.still is None else max(own, self.still.work)
 
     def memory(self) -> NDArray[np.float64]:
         """The policy's memory, but for the room to work in."""
@@ -241,7 +249,7 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
         memory={f"w{i}": float(number) for i, number in enumerate(memory)},
         source=source,
         compile=True,
-        work=(2 * len(weights.fields) + 2 * weights.widths[0] + weights.widths[1] + CONTEXT, SLOTS),
+        work=(weights.work, SLOTS),
         about=summary,
     )
 

@@ -49,7 +49,7 @@ WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")
 MIX = "drop.mix"
 """A tensor that a file may lack."""
 STILL = "still."
-"""Before the names of the second scorer's tensors; a file may lack them all."""
+"""Before the names of the second scorer's tensors, whose hidden layers are its own; a file may lack them all."""
 LAYERS = 2
 """Hidden layers at most."""
 
@@ -241,30 +241,29 @@ def _checked_tensors(path: StrPath, found: list[tuple[str, dict[str, Any]]], fie
         refuse(name, rule, what="shape of ", value=list(given[name]))
 
     given = {name: tuple(info["shape"]) for name, info in found}
-    widths: list[int] = []
-    for i in range(LAYERS):
-        name = f"drop.{i}.bias"
-        if name not in given:
-            if f"drop.{i}.weight" in given:
+    inputs, slots = len(fields), sum(NAMES.index(name) < learned.SLOTS for name in fields)
+    for which in ("", STILL) if any(name.startswith(STILL) for name in given) else ("",):
+        widths: list[int] = []
+        for i in range(LAYERS):
+            name = f"{which}drop.{i}.bias"
+            if name not in given:
+                if f"{which}drop.{i}.weight" in given:
+                    refuse(name, "is missing")
+                break
+            if len(given[name]) != 1 or not 1 <= given[name][0] <= MAX_WIDTH:
+                refuse_shape(name, f"must be one number for each of 1 to {MAX_WIDTH} hidden units")
+            widths += given[name]
+        own = {which + name: shape for name, shape in _shapes(inputs, widths).items()}
+        if which + MIX in given:
+            own[which + MIX] = (inputs - slots, slots)
+        for name in [*own, *given]:
+            if name not in given:
                 refuse(name, "is missing")
-            break
-        if len(given[name]) != 1 or not 1 <= given[name][0] <= MAX_WIDTH:
-            refuse_shape(name, f"must be one number for each of 1 to {MAX_WIDTH} hidden units")
-        widths += given[name]
-    inputs = len(fields)
-    asked = _shapes(inputs, widths)
-    if any(name.startswith(STILL) for name in given):
-        asked |= {f"{STILL}{name}": shape for name, shape in asked.items()}
-    slots = sum(learned.NAMES.index(name) < learned.SLOTS for name in fields)
-    asked |= {name: (inputs - slots, slots) for name in (MIX, STILL + MIX) if name in given}
-    for name in [*asked, *given]:
-        if name not in given:
-            refuse(name, "is missing")
-        if name not in asked:
-            refuse(name, f"has no place in networks of {len(widths)} hidden layers ({LAYERS} at most)")
-    for name, shape in asked.items():
-        if given[name] != shape:
-            refuse_shape(name, f"must be {list(shape)} for {inputs} fields and hidden layers of {widths}")
+            if name not in own and name.startswith(STILL) == bool(which):
+                refuse(name, f"has no place in networks of {len(widths)} hidden layers ({LAYERS} at most)")
+        for name, shape in own.items():
+            if given[name] != shape:
+                refuse_shape(name, f"must be {list(shape)} for {inputs} fields and hidden layers of {widths}")
     tensors: Tensors = {}
     for name, info in found:
         if info["dtype"] != "F32":

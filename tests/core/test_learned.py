@@ -52,13 +52,14 @@ def network(rng, inputs, widths):
 
 @st.composite
 def weights(draw):
-    """Any fields in any order; no, one or two hidden layers."""
+    """Any fields in any order; no, one or two hidden layers, others in the scorer for a link that stands still."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     fields = tuple(draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True)))
-    widths = draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)]))
-    made = Weights(fields, network(rng, len(fields), widths), network(rng, len(fields), widths))
+    made, other = (
+        Weights(fields, network(rng, len(fields), widths), network(rng, len(fields), widths))
+        for widths in (draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)])) for _ in range(2))
+    )
     mix = rng.normal(0, 1, (len(made.context), len(made.slot))).astype(np.float32)
-    other = replace(made, drop=network(rng, len(fields), widths), accept=network(rng, len(fields), widths))
     made, other = (replace(each, mix=draw(st.sampled_from([None, mix]))) for each in (made, other))
     return replace(made, still=draw(st.sampled_from([None, other])))
 

@@ -346,6 +346,35 @@ def test_a_second_scorer_comes_back_too_or_not_at_all(path):
     refused(path, "tensor still.drop.skip is missing")
 
 
+@pytest.mark.parametrize(("widths", "others"), [((), (6,)), ((3,), ()), ((2,), (5, 4))])
+def test_the_second_scorer_has_hidden_layers_of_its_own(path, widths, others):
+    both = replace(made(*widths), still=made(*others, seed=1))
+    weights.save(path, both, ABOUT)
+    again = weights.read(path)[0]
+    assert (len(again.drop.layers), len(again.still.drop.layers)) == (len(widths), len(others))
+    assert (again.memory() == both.memory()).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor", "rule"),
+    [
+        ("still.drop.out", np.zeros(3, np.float32), "shape of tensor still.drop.out = [3]: must be [5]"),
+        ("still.accept.0.weight", np.zeros((2, 3), np.float32), "must be [2, 5] for 2 fields and hidden layers of [5]"),
+        ("still.drop.0.bias", np.zeros(257, np.float32), "1 to 256 hidden units"),
+        ("still.drop.0.bias", None, "tensor still.drop.0.bias is missing"),
+        ("still.drop.1.weight", np.zeros((5, 4), np.float32), "tensor still.drop.1.bias is missing"),
+        ("still.drop.mix", np.zeros((1, 2), np.float32), "shape of tensor still.drop.mix = '[1, 2]': must be [1, 1]"),
+        ("still.still.drop.bias", np.zeros(1, np.float32), "tensor still.still.drop.bias has no place"),
+    ],
+)
+def test_a_second_scorer_that_breaks_a_rule_is_refused(path, name, tensor, rule):
+    weights.save(path, replace(made(3), still=made(5)), ABOUT)
+    tensors, metadata = tensors_of(path.read_bytes()), weights.read(path)[1]
+    tensors = {**tensors, name: tensor} if tensor is not None else {k: v for k, v in tensors.items() if k != name}
+    put(path, tensors, metadata)
+    refused(path, rule)
+
+
 # --- the agents that come with bufgym --------------------------------------------------------------------------------
 
 
