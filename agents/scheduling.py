@@ -2,7 +2,7 @@
 
 A candidate is a vector of weights; its fitness compares it with Robofleet's published client on the same episodes: the
 weighted QoI is to be large, the age of information of the topics with the highest priority no larger (``AGE_SHARE``),
-and no ``no_drop`` message may be lost. All candidates of a generation meet the same episodes, the next generation meets
+that of the others not much larger (``OTHERS_SHARE``), and no ``no_drop`` message may be lost. All candidates of a generation meet the same episodes, the next generation meets
 others; validation episodes say which mean to keep. The search begins at what is greedy: drop what loses the least QoI
 now, send what gains the most a byte.
 
@@ -15,6 +15,7 @@ import concurrent.futures
 import multiprocessing
 import os
 import pickle
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -60,6 +61,8 @@ POPULATION, SIGMA, MEMORY = 16, 1.0, 10
 """Candidates a generation, first step size, generations over which the mean is averaged."""
 AGE_SHARE, AGE_PENALTY = 0.95, 2.0
 """The age of the first topics is to be this part of the rival's; what is more costs so much."""
+OTHERS_SHARE, OTHERS_PENALTY = 1.5, 0.25
+"""The same of all other topics: without it, what weighs little is never sent."""
 VALIDATION_SEED = 1
 
 MODEL = "model.safetensors"
@@ -116,9 +119,7 @@ class Ground:
         self.first = np.array([t.priority == max(o.priority for o in client.topics) for t in client.topics])
         self.never = np.array([topic.no_drop for topic in client.topics])
         self.episodes = [draw(replace(client, traces=(trace,)), int(rng.integers(10**6))) for trace in chosen]
-        self.senders = Senders(
-            count, capacity, client.value, max_messages=client.max_messages, topics=client.topics
-        )
+        self.senders = Senders(count, capacity, client.value, max_messages=client.max_messages, topics=client.topics)
         self.rival = self.reached(policies.get(RIVAL))
 
     @property
@@ -126,8 +127,8 @@ class Ground:
         """About how many a candidate is asked for: one an arrival."""
         return sum(len(episode.arrivals) for episode in self.episodes)
 
-    def reached(self, policy: Policy) -> tuple[float, float, int]:
-        """(weighted QoI, age of the first topics integrated, s^2, no_drop messages lost), sums over the episodes."""
+    def reached(self, policy: Policy) -> tuple[float, float, float, int]:
+        """(weighted QoI, age of the first topics and of the others, integrated, s^2, no_drop messages lost), summed."""
         for i, episode in enumerate(self.episodes):
             self.senders.load(i, episode)
         self.senders.run(policy)
@@ -142,15 +143,17 @@ class Ground:
             int((dropped[i, : len(e.arrivals)] & self.never[e.arrivals["topic"]]).sum())
             for i, e in enumerate(self.episodes)
         )
-        return float(qoi), float(topics["aged"][:, self.first].sum()), lost
+        aged = topics["aged"].sum(0)
+        return float(qoi), float(aged[self.first].sum()), float(aged[~self.first].sum()), lost
 
 
 def fitness(policy: Policy, grounds: Sequence[Ground]) -> float:
-    """The less the better: minus the mean of QoI over the rival's, plus what the age is too large, plus what is lost."""
+    """The less the better: minus the mean of QoI over the rival's, plus what the age is too large, plus losses."""
     total = 0.0
     for ground in grounds:
-        (qoi, aged, lost), (their_qoi, their_aged, _) = ground.reached(policy), ground.rival
-        total += -qoi / their_qoi + AGE_PENALTY * max(0.0, aged / their_aged - AGE_SHARE) + lost
+        (qoi, first, others, lost), theirs = ground.reached(policy), ground.rival
+        total += lost - qoi / theirs[0] + AGE_PENALTY * max(0.0, first / theirs[1] - AGE_SHARE)
+        total += OTHERS_PENALTY * max(0.0, others / max(theirs[2], 1.0) - OTHERS_SHARE)
     return total / len(grounds)
 
 
@@ -227,7 +230,7 @@ def train(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> tuple
             if reached < best:
                 best = reached
                 noted = {"name": "evolved", "suite": suite, "seeds": [seed], "algo": "evolution"}
-                weights.save_topics(home / MODEL, from_vector(search.average), noted)
+                weights.save(home / MODEL, from_vector(search.average), noted)
             with (home / "validation.csv").open("a", encoding="utf-8") as file:
                 file.write(f"{search.steps},{search.seconds:.1f},{reached:.4f}\n")
             if bar.disable:
@@ -262,7 +265,7 @@ def train_and_report(arguments: Arguments, folder: Path) -> None:
             jobs = [pool.submit(train, arguments, folder, seed, line) for line, seed in enumerate(seeds)]
             found = [job.result() for job in jobs]
     best = int(np.argmin([reached for reached, _ in found]))
-    weights.copy_topics(folder / f"seed-{seeds[best]}" / MODEL, folder / MODEL)
+    shutil.copyfile(folder / f"seed-{seeds[best]}" / MODEL, folder / MODEL)
     rows = test_rows(arguments, folder, list(seeds))
     write_rows(rows, folder / "rows.csv", ROWS)
     text = plain(summary(rows))
@@ -274,9 +277,7 @@ def train_and_report(arguments: Arguments, folder: Path) -> None:
 
 def test_rows(arguments: Arguments, folder: Path, seeds: Sequence[int]) -> list[Row]:
     """Each seed's agent and all schedulers on the suite's test split."""
-    agents = [
-        replace(weights.load(folder / f"seed-{seed}" / MODEL), name=f"agent (seed {seed})") for seed in seeds
-    ]
+    agents = [replace(weights.load(folder / f"seed-{seed}" / MODEL), name=f"agent (seed {seed})") for seed in seeds]
     rivals = [policies.get(name) for name in default_policies()]
     suite = suites.get(arguments.suite)
     parts = suite_parts(suite, "test", arguments.test_seeds or None)

@@ -32,6 +32,7 @@ from agents.evaluate import Agent, worlds
 from agents.network import IgnoresMasks, policy_of
 from agents.trials import Trials, ValidationSet, plan
 from agents.worlds import World, capacities_of, cells
+from bufgym import suites
 from bufgym.benchmark.rows import Row
 from bufgym.errors import BufgymError
 from bufgym.policies import load as load_policy
@@ -98,7 +99,8 @@ def prepare(arguments: Arguments) -> Path:
     given = dataclasses.asdict(arguments)
     if arguments.suite:
         for suite in arguments.suites:  # mistakes are told before anything is made
-            plan(arguments, suite, "validation").checked()
+            if suite not in suites.TOPIC_SUITES:
+                plan(arguments, suite, "validation").checked()
     if arguments.resume:
         if not noted.exists():
             raise SystemExit(f"--resume: there is no run in {folder}")

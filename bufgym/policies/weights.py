@@ -2,7 +2,8 @@
 
 The tensors are those of ``learned.Weights``, float32, by name: ``drop.skip`` [inputs], ``drop.bias`` [1], for each
 hidden layer ``drop.0.weight`` [inputs, outputs] and ``drop.0.bias`` [outputs], ``drop.out`` [outputs of the last];
-``accept.*`` likewise. The header's metadata has one entry, ``bufgym``, a JSON object: what the file says of itself.
+``accept.*`` likewise, and ``send.*`` in a scheduler's (``learned_topics``). The header's metadata has one entry,
+``bufgym``, a JSON object: what the file says of itself.
 
     format        number of this format
     name          the policy's
@@ -34,9 +35,10 @@ from safetensors.numpy import save as serialized
 from bufgym import __version__
 from bufgym.errors import BufgymError, where
 from bufgym.files import replaced
-from bufgym.observe import FIELDS
-from bufgym.policies import learned
+from bufgym.observe import FIELDS, TOPIC_FIELDS
+from bufgym.policies import learned, learned_topics
 from bufgym.policies.learned import FORMAT, MAX_BYTES, MAX_WIDTH, NAMES, Network, Weights
+from bufgym.policies.learned_topics import TopicWeights
 from bufgym.policies.registry import Policy
 
 StrPath = str | os.PathLike[str]
@@ -50,13 +52,19 @@ MIX = "drop.mix"
 """A tensor that a file may lack."""
 STILL = "still."
 """Before the names of the second scorer's tensors, whose hidden layers are its own; a file may lack them all."""
-LAYERS = 2
-"""Hidden layers at most."""
+LAYERS = {False: 2, True: 1}
+"""Hidden layers at most; True: of a scheduler."""
+SEND = "send"
+"""The network that a scheduler alone has."""
 
 
-def observation_hash() -> str:
-    """SHA-256 of what the fields are and mean: weights trained on other definitions decide nonsense."""
-    table = [(field.name, field.per, field.unit, field.meaning) for field in FIELDS]
+def observation_hash(topics: bool = False) -> str:
+    """SHA-256 of what the fields are and mean: weights trained on other definitions decide nonsense.
+
+    ``topics``: with the fields that there are with several topics.
+    """
+    fields = FIELDS + TOPIC_FIELDS if topics else FIELDS
+    table = [(field.name, field.per, field.unit, field.meaning) for field in fields]
     return hashlib.sha256(json.dumps(table).encode()).hexdigest()
 
 
@@ -66,9 +74,12 @@ def load(path: StrPath) -> Policy:
     Raises:
         BufgymError: no such file, or one that breaks a rule of the format.
     """
-    weights, metadata = read(path)
+    weights, metadata = read_any(path)
     source = f"{Path(path).name}, sha256 {metadata['sha256'][:12]}"
-    return learned.policy(metadata["name"], weights, metadata.get("about", ""), source)
+    given = metadata["name"], metadata.get("about", ""), source
+    if isinstance(weights, TopicWeights):
+        return learned_topics.policy(given[0], weights, *given[1:])
+    return learned.policy(given[0], weights, *given[1:])
 
 
 def load_shipped(name: str, path: Path) -> Policy:
@@ -82,7 +93,7 @@ def load_shipped(name: str, path: Path) -> Policy:
 # --- writing ---------------------------------------------------------------------------------------------------------
 
 
-def save(path: StrPath, weights: Weights, about: Mapping[str, Any]) -> Path:
+def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any]) -> Path:
     """Write a learned policy, whole or not at all.
 
     Args:
@@ -101,7 +112,7 @@ def save(path: StrPath, weights: Weights, about: Mapping[str, Any]) -> Path:
         "format": FORMAT,
         **about,
         "fields": list(weights.fields),
-        "observation": observation_hash(),
+        "observation": observation_hash(isinstance(weights, TopicWeights)),
         "bufgym": __version__,
         "sha256": _sha256(weights.fields, tensors),
     }
@@ -119,17 +130,20 @@ def save(path: StrPath, weights: Weights, about: Mapping[str, Any]) -> Path:
     return target
 
 
-def _tensors(weights: Weights) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    if weights.still is not None:
+def _tensors(weights: Weights | TopicWeights) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    networks = {"drop": weights.drop, "accept": weights.accept}
+    if isinstance(weights, TopicWeights):
+        networks[SEND] = weights.send
+    elif weights.still is not None:
         yield from ((f"{STILL}{name}", tensor) for name, tensor in _tensors(weights.still))
-    for prefix, network in (("drop", weights.drop), ("accept", weights.accept)):
+    for prefix, network in networks.items():
         yield f"{prefix}.skip", _plain(network.skip)
         yield f"{prefix}.bias", _plain(network.bias)
         for i, (weight, bias) in enumerate(network.layers):
             yield f"{prefix}.{i}.weight", _plain(weight)
             yield f"{prefix}.{i}.bias", _plain(bias)
         yield f"{prefix}.out", _plain(network.out)
-    if weights.mix is not None:
+    if isinstance(weights, Weights) and weights.mix is not None:
         yield MIX, _plain(weights.mix)
 
 
@@ -151,11 +165,19 @@ def _sha256(fields: Sequence[str], tensors: Tensors) -> str:
 
 
 def read(path: StrPath) -> tuple[Weights, dict[str, Any]]:
-    """(weights, metadata) of a file that ``save`` wrote.
+    """(weights, metadata) of a one-queue slot scorer's file that ``save`` wrote.
 
     Raises:
         BufgymError: no such file, or one that breaks a rule of the format.
     """
+    weights, metadata = read_any(path)
+    if isinstance(weights, TopicWeights):
+        raise BufgymError(f"{path}: a scheduler for several topics, not a policy for one queue")
+    return weights, metadata
+
+
+def read_any(path: StrPath) -> tuple[Weights | TopicWeights, dict[str, Any]]:
+    """The same of either kind."""
     try:
         with open(path, "rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -164,18 +186,22 @@ def read(path: StrPath) -> tuple[Weights, dict[str, Any]]:
     return _parsed(path, data)
 
 
-def _parsed(path: StrPath, data: bytes) -> tuple[Weights, dict[str, Any]]:
+def _parsed(path: StrPath, data: bytes) -> tuple[Weights | TopicWeights, dict[str, Any]]:
     if len(data) > MAX_BYTES:
         raise BufgymError(f"{path}: larger than the {MAX_BYTES} bytes that a learned policy may have")
     try:
         found = cast(Any, safetensors).deserialize(data)
     except safetensors.SafetensorError as error:
         raise BufgymError(f"{path}: no safetensors file, or a broken one: {error}") from None
-    metadata = _metadata(path, data)
-    tensors = _checked_tensors(path, found, metadata["fields"])
+    topics = any(name.startswith(f"{SEND}.") for name, _ in found)
+    metadata = _metadata(path, data, topics)
+    tensors = _checked_tensors(path, found, metadata["fields"], topics)
     if _sha256(metadata["fields"], tensors) != metadata["sha256"]:
         rule = "fields and tensors have another one: the file was changed"
         raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
+    if topics:
+        networks = [_network(prefix, tensors) for prefix in ("drop", "accept", SEND)]
+        return TopicWeights(tuple(metadata["fields"]), *networks), metadata
     other = {name.removeprefix(STILL): tensor for name, tensor in tensors.items() if name.startswith(STILL)}
     own = {name: tensor for name, tensor in tensors.items() if not name.startswith(STILL)}
     made = _weights(metadata["fields"], own)
@@ -187,7 +213,7 @@ def _weights(fields: Sequence[str], tensors: Tensors) -> Weights:
     return Weights(tuple(fields), _network("drop", tensors), _network("accept", tensors), mix)
 
 
-def _metadata(path: StrPath, data: bytes) -> dict[str, Any]:
+def _metadata(path: StrPath, data: bytes, topics: bool) -> dict[str, Any]:
     """The JSON object in the header, its rules checked."""
     # 8 bytes: the header's length; then the header, which the library has read without complaint.
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
@@ -214,14 +240,15 @@ def _metadata(path: StrPath, data: bytes) -> dict[str, Any]:
         refuse("name", "must be non-empty, without spaces, ':', ',' or '='")
     if not isinstance(about, str) or not about.isprintable():
         refuse("about", "must be one line of text")
-    if metadata["observation"] != observation_hash():
+    if metadata["observation"] != observation_hash(topics):
         made = f"(bufgym {metadata['bufgym']} wrote it, this is {__version__})"
         refuse("observation", f"trained on other observations than this bufgym's: train it again {made}")
     if not isinstance(fields, list) or not fields:
         refuse("fields", "must be a list of at least one field")
+    names = learned_topics.NAMES if topics else NAMES
     for field in fields:
-        if field not in NAMES:
-            raise BufgymError(where(path, None, field, f"unknown; known: {', '.join(NAMES)}", field="field"))
+        if field not in names:
+            raise BufgymError(where(path, None, field, f"unknown; known: {', '.join(names)}", field="field"))
         if fields.count(field) > 1:
             raise BufgymError(where(path, None, field, "given more than once", field="field"))
     return metadata
@@ -231,7 +258,9 @@ def _no_number(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is no number of JSON's")
 
 
-def _checked_tensors(path: StrPath, found: list[tuple[str, dict[str, Any]]], fields: list[str]) -> Tensors:
+def _checked_tensors(
+    path: StrPath, found: list[tuple[str, dict[str, Any]]], fields: list[str], topics: bool
+) -> Tensors:
     """The tensors by name, each of them float32, finite, and of the shape that the others ask for."""
 
     def refuse(name: str, rule: str, *, what: str = "", value: object = None) -> NoReturn:
@@ -241,10 +270,11 @@ def _checked_tensors(path: StrPath, found: list[tuple[str, dict[str, Any]]], fie
         refuse(name, rule, what="shape of ", value=list(given[name]))
 
     given = {name: tuple(info["shape"]) for name, info in found}
-    inputs, slots = len(fields), sum(NAMES.index(name) < learned.SLOTS for name in fields)
-    for which in ("", STILL) if any(name.startswith(STILL) for name in given) else ("",):
+    inputs = len(fields)
+    networks = ("drop", "accept", SEND) if topics else ("drop", "accept")
+    for which in ("", STILL) if not topics and any(name.startswith(STILL) for name in given) else ("",):
         widths: list[int] = []
-        for i in range(LAYERS):
+        for i in range(LAYERS[topics]):
             name = f"{which}drop.{i}.bias"
             if name not in given:
                 if f"{which}drop.{i}.weight" in given:
@@ -253,14 +283,15 @@ def _checked_tensors(path: StrPath, found: list[tuple[str, dict[str, Any]]], fie
             if len(given[name]) != 1 or not 1 <= given[name][0] <= MAX_WIDTH:
                 refuse_shape(name, f"must be one number for each of 1 to {MAX_WIDTH} hidden units")
             widths += given[name]
-        own = {which + name: shape for name, shape in _shapes(inputs, widths).items()}
-        if which + MIX in given:
+        own = {which + name: shape for name, shape in _shapes(networks, inputs, widths).items()}
+        if which + MIX in given and not topics:
+            slots = sum(NAMES.index(name) < learned.SLOTS for name in fields)
             own[which + MIX] = (inputs - slots, slots)
         for name in [*own, *given]:
             if name not in given:
                 refuse(name, "is missing")
             if name not in own and name.startswith(STILL) == bool(which):
-                refuse(name, f"has no place in networks of {len(widths)} hidden layers ({LAYERS} at most)")
+                refuse(name, f"has no place in networks of {len(widths)} hidden layers ({LAYERS[topics]} at most)")
         for name, shape in own.items():
             if given[name] != shape:
                 refuse_shape(name, f"must be {list(shape)} for {inputs} fields and hidden layers of {widths}")
@@ -274,10 +305,10 @@ def _checked_tensors(path: StrPath, found: list[tuple[str, dict[str, Any]]], fie
     return tensors
 
 
-def _shapes(inputs: int, widths: list[int]) -> dict[str, tuple[int, ...]]:
+def _shapes(networks: Sequence[str], inputs: int, widths: list[int]) -> dict[str, tuple[int, ...]]:
     """Name -> shape of every tensor."""
     shapes: dict[str, tuple[int, ...]] = {}
-    for prefix in ("drop", "accept"):
+    for prefix in networks:
         shapes |= {f"{prefix}.skip": (inputs,), f"{prefix}.bias": (1,)}
         for i, (a, b) in enumerate(itertools.pairwise([inputs, *widths])):
             shapes |= {f"{prefix}.{i}.weight": (a, b), f"{prefix}.{i}.bias": (b,)}
