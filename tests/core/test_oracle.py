@@ -64,7 +64,7 @@ CAPACITIES = range(1, 13) if JIT else (1, 3, 8)
 
 LEAVES_ROOM = (
     *("decimate", "keyframe", "time-filter", "latest-only", "ros-keep-last"),
-    *("steady", "lifespan", "codel", "red"),
+    *("steady", "lifespan", "codel", "red", "robofleet", "robofleet-released"),
 )
 """These drop where others would not yet."""
 

@@ -1,0 +1,419 @@
+"""Schedulers and Robofleet's rivals: each rule worked by hand, then against slow twins; nothing lost on any topic."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import naive_schedulers
+import numpy as np
+import pytest
+from cases import cases, fates, order, same, trace
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from naive_queues import ACCEPT as ACCEPTED
+from naive_queues import REJECT as REJECTED
+
+from bufgym import policies, qoi
+from bufgym.buffer import ACCEPT, HOLD, REJECT
+from bufgym.kernel import JIT
+from bufgym.link import Link
+from bufgym.policies import registry
+from bufgym.scenario import Episode, messages
+from bufgym.sender import NEVER, Senders, run
+from bufgym.topics import Topic
+
+V = qoi.exponential(0.618)
+MS = 1_000
+NAMES = list(naive_schedulers.TWINS)
+ALL = [name for name in policies.names() if policies.get(name).foresee is None]
+
+A, B, C, N = range(4)
+
+
+def played(name, script, topics, *, capacity=8, blocked_ms=100, window=1, pong_ms=0, max_bytes=None):
+    """``script``: "0 A, 10 B" and so on, ms and topic; 1000 bytes each, or as a third word says.
+
+    Nothing crosses for ``blocked_ms``, then 1000 bytes a ms. So message 0, which the socket takes at once, leaves at
+    ``blocked_ms`` + 1, and one a ms after it.
+    """
+    lines = [line.split() for line in script.split(",")]
+    sizes = np.array([int(rest[0]) if rest else 1_000 for _, _, *rest in lines])
+    arrivals = messages(np.array([int(float(line[0]) * MS) for line in lines]), sizes)
+    arrivals["topic"] = ["ABCN".index(line[1]) for line in lines]
+    knots = [(0, 0), (blocked_ms * MS, 0)] if blocked_ms else [(0, 0)]
+    link = Link(trace([*knots, ((blocked_ms + 1_000) * MS, 1_000 * 1_000)], "hold"))
+    episode = Episode(arrivals, link, window=window, pong_us=pong_ms * MS)
+    return run(policies.get(name), [episode], capacity, V, topics=topics, max_bytes=max_bytes)
+
+
+def dropped(senders):
+    """What was dropped, in that order."""
+    return [seq for _, seq in sorted((us, seq) for seq, us in fates(senders)["dropped_us"].items())]
+
+
+def count(senders, what):
+    return int(np.asarray(senders.batch.senders)[0][what])
+
+
+def taken_ms(senders):
+    return {seq: us / MS for seq, us in fates(senders)["taken_us"].items()}
+
+
+def topics(a=1.0, b=2.0, c=3.0, **more):
+    """A, B, C with these priorities (or settings), and N, which may not be dropped."""
+    rules = {
+        name: given if isinstance(given, dict) else {"priority": given}
+        for name, given in zip("ABC", (a, b, c), strict=True)
+    }
+    return [*(Topic(name, **given) for name, given in rules.items()), Topic("N", no_drop=True, **more)]
+
+
+# --- who goes next ---------------------------------------------------------------------------------------------------
+
+
+def test_fifo_takes_them_as_they_come():
+    senders = played("fifo", "0 A, 1 C, 2 B, 3 A, 4 C, 5 N", topics())
+    assert order(senders) == [0, 1, 2, 3, 4, 5]
+    assert taken_ms(senders) == {0: 0, 1: 101, 2: 102, 3: 103, 4: 104, 5: 105}
+
+
+def test_strict_priority():
+    # B and C are equal: first in, first out among them, before all of A.
+    senders = played("strict-priority", "0 A, 1 A, 2 C, 3 A, 4 B, 5 C", topics(1, 2, 2))
+    assert order(senders) == [0, 2, 4, 5, 1, 3]
+    # A starves for as long as one C comes each ms: at 101, 102, 103 there is always one.
+    senders = played("strict-priority", "0 A, 1 A, 2 C, 101.5 C, 102.5 C", topics())
+    assert order(senders) == [0, 2, 3, 4, 1]
+
+
+def test_age_greedy():
+    # At 101 ms: of A 0 was sent, which came at 0: age 101. B was never sent, its oldest came at 10: 91. C: 3 x 31 = 93.
+    # So A's next, 2, which leaves no A. At 102: B 92, C 3 x 32 = 96. Then both of B.
+    weighted = topics({"weight": 1.0}, {"weight": 1.0}, {"weight": 3.0})
+    assert order(played("age-greedy", "0 A, 10 B, 20 A, 30 B, 70 C", weighted)) == [0, 2, 4, 1, 3]
+    # Sending one that came late makes the topic young, whenever it is sent: at 101 B's oldest came at 10, A's newest
+    # sent at 0. At 102 A's newest sent came at 99: age 3. B's oldest came at 10: 92. At 103 B's newest sent came at 10.
+    assert order(played("age-greedy", "0 A, 10 B, 11 B, 99 A, 99 A", weighted)) == [0, 3, 1, 2, 4]
+
+
+def test_age_greedy_takes_the_oldest_of_equals():
+    # Nothing was sent of either, both came at 10.
+    assert order(played("age-greedy", "0 A, 10 C, 10 B", topics(1, 1, 1))) == [0, 1, 2]
+    assert order(played("age-greedy", "0 A, 10 B, 10 C", topics({"weight": 0}, {"weight": 0}, {"weight": 0}))) == [
+        0,
+        1,
+        2,
+    ]
+
+
+def test_edf():
+    # Due: 1 never, 2 at 60, 3 at 70, 4 at 55, 5 at 65. All are late when the link opens, and are sent all the same.
+    timed = topics(1.0, {"deadline_s": 0.05}, {"deadline_s": 0.02})
+    assert order(played("edf", "0 A, 5 A, 10 B, 20 B, 35 C, 45 C", timed)) == [0, 4, 2, 5, 3, 1]
+
+
+# --- who goes for a newcomer -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["fifo", "strict-priority", "age-greedy", "edf"])
+def test_the_common_drop_rule(name):
+    # L = 3. 4 is of B: B's oldest, 2, goes, though A ranks lower.
+    assert dropped(played(name, "0 A, 1 A, 2 B, 3 C, 4 B", topics(), capacity=3)) == [2]
+    # No C is queued: A, the lowest, loses its oldest, 1. Then no A is left: 5 is rejected, for B and C rank above it.
+    assert dropped(played(name, "0 A, 1 A, 2 B, 3 B, 4 C, 5 A", topics(), capacity=3)) == [1, 5]
+    # One of equal rank goes: 2, the oldest of B, for 4 of C.
+    assert dropped(played(name, "0 A, 1 C, 2 B, 3 B, 4 A", topics(2, 2, 3), capacity=3)) == [2]
+    # A limit is met by the topic alone, though there is room.
+    limited = topics(1.0, {"limit": 2})
+    assert dropped(played(name, "0 A, 1 B, 2 B, 3 A, 4 B", limited)) == [1]
+
+
+@pytest.mark.parametrize("name", ["fifo", "strict-priority", "age-greedy", "edf", "robofleet", "robofleet-released"])
+def test_no_drop_makes_its_way(name):
+    # L = 2. N ranks lowest, and yet 3 and 4 take the places of A and B; 5, of C, may not take theirs.
+    senders = played(name, "0 C, 1 B, 2 A, 3 N, 4 N, 5 C", topics(priority=0.5), capacity=2)
+    assert dropped(senders) == [2, 1, 5]
+    # A buffer full of N: the next is lost, for nothing can go, and that shows.
+    senders = played(name, "0 C, 1 N, 2 N, 3 N", topics(), capacity=2)
+    assert dropped(senders) == [3]
+    assert count(senders, "impossible") == 0
+
+
+def test_bytes():
+    # B = 3000 bytes. 4 needs 1000 more than are free: of its own topic 2 (500) would not do, so 3 (2000) goes.
+    senders = played(
+        "fifo", "0 A, 1 A 500, 2 B 500, 3 B 1500, 4 B 1500, 5 A 3000", topics(), max_bytes=3_000, capacity=9
+    )
+    # 1, 2 and 4 are 2500 bytes: none of them alone makes room for 5.
+    assert dropped(senders) == [3, 5]
+    assert count(senders, "impossible") == 0
+
+
+# --- Robofleet -------------------------------------------------------------------------------------------------------
+
+ROBOFLEET = "0 A, 10 B, 20 A, 30 B, 40 N, 50 N"
+
+
+def test_robofleet_as_published():
+    # 3 overwrites 1. When the link is free, N's two go first, then at 103 ms A has 1 x 103 (sent at 0) and B, which
+    # was never sent, 2 x 103: B.
+    senders = played("robofleet", ROBOFLEET, topics(1, 2))
+    assert dropped(senders) == [1]
+    assert order(senders) == [0, 4, 5, 3, 2]
+    assert taken_ms(senders) == {0: 0, 4: 101, 5: 102, 3: 103, 2: 104}
+
+
+def test_robofleet_as_released():
+    # n_T = 1 holds N's first back while 0 is on its way, but at 101 ms both go at once. They are across at 103 ms;
+    # then A goes, whose priority x wait is the smaller.
+    senders = played("robofleet-released", ROBOFLEET, topics(1, 2))
+    assert dropped(senders) == [1]
+    assert order(senders) == [0, 4, 5, 2, 3]
+    assert taken_ms(senders) == {0: 0, 4: 101, 5: 101, 2: 103, 3: 104}
+
+
+def test_robofleet_released_begins_no_pass_while_the_window_is_full():
+    # n_T = 2, pongs 50 ms after crossing, an open link. 0 fills half of the window, and each arrival is a pass
+    # of its own: 1 goes, 2 finds two on their way and waits for 0's pong at 51 ms, when 3 goes with it.
+    senders = played("robofleet-released", "0 A, 1 N, 2 N, 3 N", topics(), blocked_ms=0, window=2, pong_ms=50)
+    assert taken_ms(senders) == {0: 0, 1: 1, 2: 51, 3: 51}
+    # As published, n_T holds for no_drop too: 0's pong comes at 51, 1's at 52.
+    senders = played("robofleet", "0 A, 1 N, 2 N, 3 N", topics(), blocked_ms=0, window=2, pong_ms=50)
+    assert taken_ms(senders) == {0: 0, 1: 1, 2: 51, 3: 52}
+
+
+@pytest.mark.parametrize("name", ["robofleet", "robofleet-released"])
+def test_robofleet_takes_the_first_topic_of_equals(name):
+    # Neither C nor B was sent: both wait since time 0. C came first, B is the first topic.
+    assert order(played(name, "0 A, 1 C, 2 B", topics(0.1, 1, 1)))[1:] == [2, 1]
+
+
+def test_robofleet_waits_count_from_the_last_time_sent():
+    # At 101 ms A (sent at 0) and B (never) wait alike: A, then B. At 103 ms A waits since 101, B since 102, whenever
+    # what now waits of them arrived.
+    assert order(played("robofleet", "0 A, 10 B, 20 A, 102.5 B, 102.6 A", topics(1, 1))) == [0, 2, 1, 4, 3]
+    # 3 overwrites 1, which had waited for its turn at 102 ms.
+    senders = played("robofleet", "0 A, 10 B, 20 A, 101.5 B, 101.6 A", topics(1, 1))
+    assert (order(senders), dropped(senders)) == ([0, 2, 3, 4], [1])
+
+
+def test_rate_limits_at_arrival_and_at_the_socket():
+    # 10 Hz. At arrival: 40 and 80 come too soon after 0; then 160 and 200 after 120. Exactly 100 ms later is not too
+    # soon: 220 is.
+    limited = topics({"rate_limit_hz": 10.0})
+    script = "0 A, 40 A, 80 A, 120 A, 160 A, 200 A, 220 A"
+    senders = played("robofleet", script, limited, blocked_ms=0)
+    assert (order(senders), dropped(senders)) == ([0, 3, 6], [1, 2, 4, 5])
+    # At the socket the latest waits for its time: 2 has overwritten 1, and at 105 something wakes the scheduler: 2
+    # goes, whose priority x wait is 105 against 2 x 105. 3 came at 120, sooner than 205: it is overwritten.
+    senders = played("robofleet-released", "0 A, 40 A, 80 A, 105 B, 120 A, 160 A, 205 A", limited, blocked_ms=0)
+    assert (order(senders), dropped(senders)) == ([0, 2, 3, 6], [1, 4, 5])
+    assert taken_ms(senders) == {0: 0, 2: 105, 3: 106, 6: 205}
+
+
+def test_the_released_client_sleeps_until_an_arrival_or_a_pong():
+    # 1 may go at 100 ms, but nothing happens then; nothing at all is to come, so it stays.
+    senders = played("robofleet-released", "0 A, 40 A", topics({"rate_limit_hz": 10.0}), blocked_ms=0)
+    assert order(senders) == [0]
+    assert count(senders, "occupancy") == 1
+
+
+# --- its rivals ------------------------------------------------------------------------------------------------------
+
+
+def test_native_ros_drops_the_oldest_of_each_queue():
+    # A publisher's queue of 2: 1 goes for 4. First in, first out, whatever the priority.
+    senders = played("ros-native", "0 A, 1 A, 2 A, 3 C, 4 A", topics({"limit": 2}))
+    assert (order(senders), dropped(senders)) == ([0, 2, 3, 4], [1])
+    # Where L = 3 is too small for all queues, the oldest of any goes, whatever its rank; no N does.
+    senders = played("ros-native", "0 A, 1 N, 2 C, 3 B, 4 A", topics(), capacity=3)
+    assert (order(senders), dropped(senders)) == ([0, 1, 3, 4], [2])
+
+
+def test_rosbridge_keeps_everything():
+    senders = played("rosbridge", ", ".join(f"{k} {'ABCN'[k % 4]}" for k in range(40)), topics(), capacity=2)
+    assert order(senders) == list(range(40))
+
+
+@pytest.mark.parametrize("name", ["rosbridge", "ros-native"])
+def test_rivals_do_not_wait_for_pongs(name):
+    # The link is free each ms. Who keeps to n_T = 1 waits for a pong 50 ms after each crossing.
+    settings = {"blocked_ms": 0, "window": 1, "pong_ms": 50}
+    assert taken_ms(played(name, "0 A, 0 B, 0 C", topics(), **settings)) == {0: 0, 1: 1, 2: 2}
+    assert taken_ms(played("fifo", "0 A, 0 B, 0 C", topics(), **settings)) == {0: 0, 1: 51, 2: 102}
+
+
+def test_clients():
+    def client(name):
+        return policies.get(name).client
+
+    assert [name for name in ALL if client(name).limit_at_send or client(name).flush_no_drop] == ["robofleet-released"]
+    assert [name for name in ALL if not client(name).awaits_pongs] == ["rosbridge", "ros-native"]
+    assert {name: client(name).encoding for name in ALL if client(name).encoding} == {
+        "rosbridge": "json",
+        "ros-native": "ros",
+    }
+    assert [name for name in ALL if client(name).copies] == ["ros-native"]
+
+
+def test_made_for_topics():
+    assert sorted(policies.names(for_topics=True)) == sorted(NAMES)
+    assert sorted([*policies.names(for_topics=True), *policies.names(for_topics=False)]) == sorted(policies.names())
+
+
+def test_your_own_can_be_made_for_topics(monkeypatch):
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
+
+    def last_in(buffer, memory):
+        """The oldest of the topic whose message came last."""
+        newest = buffer.slots[len(buffer.slots) - 1].topic
+        return next(k for k, slot in enumerate(buffer.slots) if slot.topic == newest)
+
+    policies.register("lifo", on_send=last_in, for_topics=True)(policies.get("fifo").on_arrival)
+    assert "lifo" in policies.names(for_topics=True) and "lifo" not in policies.names(for_topics=False)
+    assert policies.get("lifo").schedules and not policies.get("drop-oldest").schedules
+    assert order(played("lifo", "0 A, 1 B, 2 A, 3 B", topics())) == [0, 1, 3, 2]
+
+
+# --- against the twins -----------------------------------------------------------------------------------------------
+
+
+@st.composite
+def topics_cases(draw, max_bytes=True):
+    """(case, topics): random episodes of three topics with all that a topic may have."""
+    case = draw(cases(max_bytes=max_bytes))
+    window, pong_us = draw(st.integers(1, 4)), draw(st.sampled_from([0, 0, 2_000, 30_000]))
+    case = replace(case, episode=replace(case.episode, window=window, pong_us=pong_us))
+    made = []
+    for name in "ABC":
+        no_drop = draw(st.booleans())
+        rules = {
+            "priority": draw(st.sampled_from([1.0, 1.0, 2.0, 3.5])),
+            "weight": draw(st.sampled_from([None, 0.0, 1.0, 4.0])),
+            "deadline_s": draw(st.sampled_from([None, 0.001, 0.02])),
+        }
+        if not no_drop:
+            rules["rate_limit_hz"] = draw(st.sampled_from([None, None, 150.0, 2_000.0]))
+            rules["limit"] = draw(st.sampled_from([None, None, 1, 2]))
+        made.append(Topic(name, no_drop=no_drop, **rules))
+    return case, made
+
+
+def run_topics(case, topics, policy):
+    capacity = len(case.twin_messages) if policy.unbounded else case.capacity
+    senders = Senders(
+        1,
+        capacity,
+        V,
+        max_messages=len(case.twin_messages),
+        max_bytes=case.max_bytes,
+        decide_at=case.decide_at,
+        topics=topics,
+    )
+    senders.load(0, case.episode)
+    senders.run(policy)
+    return senders
+
+
+def listed(slots):
+    return [
+        {"seq": int(m.seq), "us": int(m.arrival_us), "bytes": int(m.size_bytes), "topic": int(m.topic)} for m in slots
+    ]
+
+
+def beside_its_twin(name, case, topics):
+    """The policy, each of whose answers is held against its twin's."""
+    policy = policies.get(name)
+    twin = naive_schedulers.TWINS[name](topics, case.capacity, case.max_bytes)
+
+    def on_arrival(buffer, arrival, memory):
+        decision, queue = policy.on_arrival(buffer, arrival, memory), listed(buffer.slots)
+        theirs = twin.decide(queue, listed([arrival])[0])
+        assert theirs == {ACCEPT: ACCEPTED, REJECT: REJECTED}.get(decision, queue[decision] if decision >= 0 else None)
+        return decision
+
+    def on_send(buffer, memory):
+        k, queue = policy.on_send(buffer, memory), listed(buffer.slots)
+        theirs = twin.choose(queue, int(buffer.now_us), int(buffer.in_flight), int(buffer.window))
+        assert theirs == (None if k == HOLD else queue[k])
+        return k
+
+    return replace(policy, on_arrival=on_arrival, on_send=on_send, compile=False)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@given(topics_cases())
+@settings(max_examples=60 if JIT else 8)
+def test_agrees_with_its_twin(name, drawn):
+    case, topics = drawn
+    senders = run_topics(case, topics, beside_its_twin(name, case, topics))
+    # What came of it is what the policy itself does, compiled.
+    assert same(senders, run_topics(case, topics, policies.get(name)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@given(topics_cases())
+@settings(max_examples=60 if JIT else 8)
+def test_every_answer_is_possible(name, drawn):
+    case, topics = drawn
+    # Outside the arrivals that ask a full queue rejects unasked: those are not the policy's.
+    case = replace(case, episode=replace(case.episode, first_decision=0, last_decision=2**31))
+    assert count(run_topics(case, topics, policies.get(name)), "impossible") == 0
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("robofleet")])
+@given(cases(max_bytes=False))
+@settings(max_examples=20 if JIT else 4)
+def test_on_one_queue_they_drop_the_oldest(name, case):
+    assert same(case.run(policies.get(name), V), case.run(policies.get("drop-oldest"), V))
+
+
+@pytest.mark.parametrize("name", ["robofleet", "robofleet-released"])
+@given(cases(max_bytes=False))
+@settings(max_examples=20 if JIT else 4)
+def test_on_one_queue_robofleet_keeps_one_slot(name, case):
+    case = replace(case, decide_at="arrival", episode=replace(case.episode, first_decision=0, last_decision=2**31))
+    assert same(case.run(policies.get(name), V), case.run(policies.get("latest-only"), V))
+
+
+# --- the whole registry, with topics ---------------------------------------------------------------------------------
+
+
+def accounts(senders, topics):
+    """For each topic, how many messages there are of each fate; no message has two."""
+    sender, batch = np.asarray(senders.batch.senders)[0], senders.batch
+    n = int(sender["arrivals"])
+    rows, topic = np.asarray(batch.fates[0])[:n], np.asarray(batch.arrivals[0])["topic"][:n]
+    queued = np.zeros(n, bool)
+    queued[np.asarray(batch.slots[0])["seq"][sender["first"] : sender["first"] + sender["occupancy"]]] = True
+    crossed, lost = rows["crossed_us"] != NEVER, rows["dropped_us"] != NEVER
+    sending = (rows["taken_us"] != NEVER) & ~crossed
+    fate = np.stack([crossed, sending, queued, lost])
+    assert (fate.sum(0) == 1).all()
+    return [fate[:, topic == k].sum(1).tolist() for k in range(len(topics))]
+
+
+@pytest.mark.parametrize("name", ALL)
+@given(topics_cases(max_bytes=False))
+@settings(max_examples=12 if JIT else 2)
+def test_every_policy_runs_on_topics_and_nothing_is_lost(name, drawn):
+    case, topics = drawn
+    senders = run_topics(case, topics, policies.get(name))
+    rows = np.asarray(senders.batch.topics)[0]
+    for k, (delivered, sending, queued, lost) in enumerate(accounts(senders, topics)):
+        assert rows["arrived"][k] == delivered + sending + queued + lost
+        assert rows["taken"][k] == delivered + sending
+        assert rows["queued"][k] == queued
+    assert count(senders, "next") == len(case.twin_messages)
+    no_drop_is_kept_while_others_could_go(senders, topics)
+
+
+def no_drop_is_kept_while_others_could_go(senders, topics):
+    n = int(senders.batch.senders[0]["arrivals"])
+    rows, arrivals = np.asarray(senders.batch.fates[0])[:n], np.asarray(senders.batch.arrivals[0])[:n]
+    free = np.array([not topic.no_drop for topic in topics])[arrivals["topic"]]
+    for lost in np.flatnonzero(~free & (rows["dropped_us"] != NEVER)):
+        at_us = arrivals["arrival_us"][lost]
+        assert rows["dropped_us"][lost] == at_us  # rejected when it came: no_drop is never evicted
+        later = [(rows[field] == NEVER) | (rows[field] > at_us) for field in ("taken_us", "dropped_us")]
+        assert not (free & later[0] & later[1])[:lost].any()
