@@ -3,11 +3,14 @@
 ``ansi`` gives a few lines of text, ``rgb_array`` an image of constant size. Both read the sender's arrays and change
 nothing. The height of the capacity is measured in demand (the bytes that arrive per second): full height is twice the
 demand, so wherever the capacity is below half height, messages must wait or go.
+
+With several topics each has a lane of its own, and a letter by which the queued messages are told apart.
 """
 
 from __future__ import annotations
 
 import itertools
+import string
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -16,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.link import position_at
-from bufgym.sender import Senders
+from bufgym.sender import ARRIVAL_WAITS, SOCKET_WAITS, Senders
 
 DELIVERED, SENDING, QUEUED, DROPPED, NEWCOMER = range(5)
 _NAMES = ("delivered", "in transmission", "queued", "dropped", "newcomer")
@@ -25,8 +28,8 @@ _NAMES = ("delivered", "in transmission", "queued", "dropped", "newcomer")
 _MARKS = "●▶■·?"
 _ANSI = ("32", "34", "33", "31", "1;35")
 _LEVELS = "_▁▂▃▄▅▆▇█"
-_LABEL = 10
-"""Columns that a line's label takes."""
+_LABEL, _TOPIC_LABEL = 10, 16
+"""Columns that a line's label takes; where labels are topics' names."""
 _NARROWEST = 60
 """Fewer columns than this can't hold the counts."""
 
@@ -39,6 +42,9 @@ _BINS = 150
 """Points of the capacity curve."""
 _MOST_BOXES = 64
 """Up to this L every slot is drawn as a box, beyond it as one bar."""
+_MOST_NAMES = 24
+"""So many lanes have room for their topics' names."""
+_LETTERS = string.ascii_letters
 
 
 class _Scene(NamedTuple):
@@ -58,6 +64,14 @@ class _Scene(NamedTuple):
     """Bytes that arrive per second; 0 where that has no meaning (one message)."""
     counts: dict[str, int]
     qoi: float
+    topics: tuple[str, ...]
+    """Names of the topics; none where there is one queue."""
+    asks: str
+    """Who asks for a decision; empty where there is one queue, or nobody does."""
+
+    def letter(self, seq: int) -> str:
+        """What stands for the topic of a message."""
+        return _LETTERS[int(self.arrivals["topic"][seq]) % len(_LETTERS)]
 
 
 def _scene(senders: Senders, i: int) -> _Scene:
@@ -65,7 +79,7 @@ def _scene(senders: Senders, i: int) -> _Scene:
     if episode is None:
         raise gym.error.ResetNeeded("call reset() before render()")
     sender = senders.batch.senders[i]
-    arrived, waiting = int(sender["next"]), int(sender["waiting"])
+    arrived, waiting = int(sender["next"]), int(sender["waiting"] == ARRIVAL_WAITS)
     planned = episode.arrivals
     arrivals = planned[: arrived + waiting]
     met = senders.batch.fates[i, : arrived + waiting]
@@ -81,8 +95,16 @@ def _scene(senders: Senders, i: int) -> _Scene:
     # n messages span n - 1 periods.
     demand = 1e6 * float(planned["size_bytes"][:-1].sum()) / span_us if span_us > 0 else 0.0
     counts = {name: int((fates[:arrived] == fate).sum()) for fate, name in enumerate(_NAMES[:NEWCOMER])}
-    qoi = float(sender["crossed"] > 0) + float(sender["delivered_gain"])
-    return _Scene(int(sender["now_us"]), arrivals, fates, queue, taken, senders.capacity, demand, counts, qoi)
+    names = tuple(topic.name for topic in senders.topics)
+    first_of_all = float(sender["crossed"] > 0)
+    asks = ""
+    if names:
+        rules = senders.batch.topics[i]
+        first_of_all = float(rules["weight"][rules["received"] > 0].sum())
+        asks = {ARRIVAL_WAITS: "an arrival asks", SOCKET_WAITS: "the socket asks"}.get(int(sender["waiting"]), "")
+    qoi = first_of_all + float(sender["delivered_gain"])
+    now_us = int(sender["now_us"])
+    return _Scene(now_us, arrivals, fates, queue, taken, senders.capacity, demand, counts, qoi, names, asks)
 
 
 def _rates(senders: Senders, i: int, edges_us: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -118,27 +140,28 @@ def ansi(senders: Senders, i: int, width: int = 100) -> str:
     """Sender ``i`` as lines of text: counts, link capacity, messages, queue (``width`` >= 60 columns), legend.
 
     One column of the capacity and of the messages is one arrival: its mark below, the link's mean capacity from it to
-    the next one above. The latest arrivals are shown, as many as fit.
+    the next one above. The latest arrivals are shown, as many as fit. With several topics there is a line of messages
+    for each, and the queue is a row of their letters.
     """
     scene = _scene(senders, i)
-    width = max(width, _NARROWEST)
-    shown = slice(max(0, len(scene.fates) - (width - _LABEL)), None)
+    width, label = max(width, _NARROWEST), _TOPIC_LABEL if scene.topics else _LABEL
+    shown = slice(max(0, len(scene.fates) - (width - label)), None)
     counts = scene.counts
     held = f"{counts['in transmission']} in transmission, {len(scene.queue)}/{scene.capacity} queued"
     lines = [
         f"{scene.now_us / 1e6:8.3f} s  {sum(counts.values())} arrived: {counts['delivered']} delivered, "
         + f"{held}, {counts['dropped']} dropped; H = {scene.qoi:.2f}",
-        "capacity".ljust(_LABEL) + _capacity_line(senders, i, scene, shown),
-        "messages".ljust(_LABEL) + _painted((_ANSI[fate], _MARKS[fate]) for fate in scene.fates[shown]),
-        "queue".ljust(_LABEL) + _queue_line(scene, width - _LABEL),
-        " " * _LABEL
+        "capacity".ljust(label) + _capacity_line(senders, i, scene, shown),
+        *_message_lines(scene, shown, label),
+        "queue".ljust(label) + (_topic_queue_line if scene.topics else _queue_line)(scene, width - label),
+        " " * label
         + "  ".join(f"{_mark(fate)} {name}" for fate, name in enumerate(_NAMES))
-        + "  _ empty  "
-        + "\x1b[31m9\x1b[0m missing",
+        + "  _ empty"
+        + (f"  {scene.asks}" if scene.topics else "  \x1b[31m9\x1b[0m missing"),
     ]
     if scene.demand > 0:
         lines.append(
-            " " * _LABEL
+            " " * label
             + f"full height {_speed(2 * scene.demand)}, twice the demand; \x1b[31mred\x1b[0m: below the demand"
         )
     return "\n".join(lines) + "\n"
@@ -155,6 +178,31 @@ def _capacity_line(senders: Senders, i: int, scene: _Scene, shown: slice) -> str
     return _painted(
         ("31" if rate < scene.demand else "36", _LEVELS[height]) for rate, height in zip(rates, heights, strict=True)
     )
+
+
+def _message_lines(scene: _Scene, shown: slice, label: int) -> list[str]:
+    """A mark for each message; a line for each topic."""
+    marks = [(_ANSI[fate], _MARKS[fate]) for fate in scene.fates[shown]]
+    if not scene.topics:
+        return ["messages".ljust(label) + _painted(marks)]
+    numbers = scene.arrivals["topic"][shown].tolist()
+    lines = []
+    for k, name in enumerate(scene.topics):
+        own = [mark if number == k else ("0", " ") for mark, number in zip(marks, numbers, strict=True)]
+        lines.append(f"{_LETTERS[k % len(_LETTERS)]} {name}"[: label - 1].ljust(label) + _painted(own))
+    return lines
+
+
+def _topic_queue_line(scene: _Scene, columns: int) -> str:
+    """The topics' letters: of the message taken last, of the slots, and of the newcomer."""
+    letters = [(_ANSI[int(scene.fates[scene.taken])], scene.letter(scene.taken))] if scene.taken >= 0 else []
+    letters += [(_ANSI[QUEUED], scene.letter(seq)) for seq in scene.queue.tolist()]
+    letters += [("0", "_")] * (scene.capacity - len(scene.queue))
+    last = [(_ANSI[NEWCOMER], scene.letter(-1))] if scene.fates[-1] == NEWCOMER else []
+    room = columns // 2 - len(last)
+    if len(letters) > room:
+        letters = [*letters[: room - 2], ("0", "...")]
+    return " ".join(_painted([mark]) for mark in letters + last)
 
 
 def _queue_line(scene: _Scene, columns: int) -> str:
@@ -198,8 +246,9 @@ def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:
     scene = _scene(senders, i)
     figure = Figure(figsize=(_WIDTH_PX / _DPI, _HEIGHT_PX / _DPI), dpi=_DPI)
     canvas: Any = FigureCanvasAgg(figure)  # its methods have no types
+    ratios = (2, 4.2, 0.9) if scene.topics else (3, 3, 1.1)
     link, timeline, slots = figure.subplots(
-        3, 1, height_ratios=(3, 3, 1.1), gridspec_kw={"left": 0.155, "right": 0.985, "top": 0.93, "bottom": 0.03}
+        3, 1, height_ratios=ratios, gridspec_kw={"left": 0.155, "right": 0.985, "top": 0.93, "bottom": 0.03}
     )
     figure.subplots_adjust(hspace=0.42)
     now_s = scene.now_us / 1e6
@@ -216,7 +265,7 @@ def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
     _draw_link(link, senders, i, scene, start_s)
-    _draw_timeline(timeline, scene)
+    (_draw_lanes if scene.topics else _draw_timeline)(timeline, scene)
     _draw_slots(slots, scene)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba(), np.uint8)[..., :3].copy()
@@ -268,6 +317,42 @@ def _draw_timeline(axes: Any, scene: _Scene) -> None:
     axes.set_xlabel("time of arrival (s)", fontsize=8, labelpad=1)
 
 
+def _draw_lanes(axes: Any, scene: _Scene) -> None:
+    """One lane for each topic: what was dropped below, what waits on the line, what the socket took above."""
+    arrival_s, lanes = scene.arrivals["arrival_us"] / 1e6, len(scene.topics)
+    tall = 190 / lanes  # of a lane, in points, a little less
+    shifts, sizes = (0.2, 0.2, 0.0, -0.24, 0.0), (0.4, 0.4, 0.25, 0.3, 0.3)
+    for fate, (shift, size) in enumerate(zip(shifts, sizes, strict=True)):
+        chosen = scene.fates == fate
+        axes.plot(
+            arrival_s[chosen],
+            -scene.arrivals["topic"][chosen] + shift,
+            linestyle="none",
+            marker="D" if fate == NEWCOMER else "s" if fate == QUEUED else "|",
+            markersize=max(2.0, min(9.0, size * tall)),
+            markeredgewidth=1.2 if fate != SENDING else 2.5,
+            color=_COLOURS[fate],
+            label=_NAMES[fate],
+        )
+    axes.set_ylim(-lanes + 0.4, 0.6)
+    axes.set_yticks(-np.arange(lanes))
+    axes.set_yticklabels(
+        [f"{name[:16]} {_LETTERS[k % len(_LETTERS)]}" for k, name in enumerate(scene.topics)]
+        if lanes <= _MOST_NAMES
+        else [""] * lanes,
+        fontsize=8 if lanes <= _MOST_NAMES // 2 else 6,
+    )
+    axes.set_ylabel("" if lanes <= _MOST_NAMES else f"{lanes} topics", fontsize=9)
+    axes.grid(axis="y", color="#eeeeee")
+    axes.set_axisbelow(True)
+    axes.set_xlabel("time of arrival (s)", fontsize=8, labelpad=1)
+    handles = axes.legend(
+        loc="lower left", bbox_to_anchor=(-0.01, 0.97), ncols=5, frameon=False, fontsize=8, columnspacing=1.2
+    ).legend_handles
+    for handle in handles:
+        handle.set_markersize(6)
+
+
 def _draw_slots(axes: Any, scene: _Scene) -> None:
     """The buffer's slots, head first; between neighbours the number of messages missing there; then the newcomer."""
     from matplotlib.patches import Rectangle
@@ -290,6 +375,13 @@ def _draw_slots(axes: Any, scene: _Scene) -> None:
         axes.add_patch(Rectangle((k + 0.25, 0.15), 0.6, 0.7, facecolor=colour, edgecolor="#999999"))
     if newcomer:
         axes.add_patch(Rectangle((L + 0.65, 0.15), 0.6, 0.7, facecolor=_COLOURS[NEWCOMER], edgecolor="#999999"))
+    if scene.topics:
+        for k, seq in enumerate(seqs):
+            at = k + 0.55 if k < occupancy else L + 0.95
+            axes.text(at, 0.5, scene.letter(seq), ha="center", va="center", fontsize=8 if L <= 32 else 6, color="white")
+        axes.text(L + 0.95, 0.0, scene.asks, ha="right", va="top", fontsize=8, color="#555555")
+        return
+    if newcomer:
         if L <= 16:
             axes.text(L + 0.95, 0.5, "new", ha="center", va="center", fontsize=8, color="white")
     for k, seq in enumerate(seqs):

@@ -197,6 +197,8 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64
             weight = 0.0
             for topic in range(sender.topics):
                 weight += batch.topics[i, topic].weight
+            # Topics that all weigh nothing have paid nothing.
+            weight = weight if weight > 0 else 1.0
             shown.terms[i, AGE] = (paid[i, AGE] - sender.aged) / weight
             shown.terms[i, LATE] = (paid[i, LATE] - sender.late) / weight
             paid[i, AGE], paid[i, LATE] = sender.aged, sender.late

@@ -31,6 +31,15 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     **Reward** one of the terms of ``bufgym.observe.REWARD_TERMS`` or a weighted sum: ``delivered`` and ``retained``
     both add up to H - 1 over an episode (to H where nothing was delivered, H = 0). ``info["reward_terms"]`` has each.
 
+    **Several topics** (a scenario with ``topics``, as of ``bufgym/Topics-v0``): the free socket asks too. Where the
+    field ``socket_asks`` is 1 there is no newcomer: an action 0..L-1 *sends* that slot, which must be the oldest of its
+    topic; L *holds* the socket until the next arrival or pong, as long as one is to come; L + 1 is impossible. An
+    impossible choice sends the oldest message. At an arrival all is as above, but a ``no_drop`` message can be neither
+    evicted nor rejected while something else can make room; if that was tried and the queue is full, the oldest
+    message of the lowest priority goes. Fields of ``bufgym.observe.TOPIC_FIELDS`` and the terms ``age`` and ``late``
+    of ``TOPIC_REWARD_TERMS`` come in addition. H is the weighted sum over the topics, so ``delivered`` and ``retained``
+    add up to H minus the weights of the topics of which anything was received.
+
     **End** ``terminated`` when the episode's last message has left. In the step that ends it, ``info`` also has
     ``qoi`` (H), ``arrived``, ``delivered``, ``dropped``. An episode that asks for no decision (``decide_at="overflow"``
     and never full) ends with the first step, whose action counts for nothing.

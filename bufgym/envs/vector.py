@@ -24,6 +24,8 @@ _ENDED = ("qoi", "arrived", "delivered", "dropped")
 class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     """A batch of ``SenderEnv``: same arguments, same episodes row by row, one compiled step for all rows.
 
+    With several topics some rows may ask what to drop and others what to send: ``socket_asks`` says which.
+
     ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do. ``info`` follows their form
     too: ``info["action_mask"]`` bool[n, L + 2], ``info["impossible"]``, ``info["reward_terms"]``; with SAME_STEP
     autoreset ``info["final_obs"]`` and ``info["final_info"]`` for rows that ended (``info["_final_obs"]`` says which).

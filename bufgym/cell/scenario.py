@@ -1,0 +1,135 @@
+"""What meets the robots of one cell: the same camera on each, every one with its own motion, and one link."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import scenario as scenarios
+from bufgym.errors import BufgymError
+from bufgym.link import Link
+from bufgym.qoi import Value
+from bufgym.scenario import Episode, Streams, Uplink
+
+MAX_ROBOTS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class FleetEpisode:
+    """One drawn episode of a cell; nothing in it is left to chance."""
+
+    arrivals: tuple[NDArray[Any], ...]
+    """MESSAGE[n] of each robot, in order of arrival."""
+    link: Link
+    """The cell's, shared by all."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "arrivals", tuple(self.arrivals))
+        check_robots(self.robots)
+        for i, arrivals in enumerate(self.arrivals):
+            if len(arrivals) == 0:
+                raise BufgymError(f"arrivals of robot {i}: an episode needs at least one message")
+
+    @property
+    def robots(self) -> int:
+        return len(self.arrivals)
+
+    @property
+    def ticks_together(self) -> bool:
+        """Whether all messages of all robots arrive at the same times: one frame tick, one message each."""
+        first = self.arrivals[0]["arrival_us"]
+        return all(np.array_equal(first, arrivals["arrival_us"]) for arrivals in self.arrivals)
+
+    def episode(self, robot: int) -> Episode:
+        """What that robot would meet if it had the cell for itself."""
+        return Episode(self.arrivals[robot], self.link)
+
+    def with_luck(self, rng: np.random.Generator) -> FleetEpisode:
+        """The same episode with fresh luck for randomised policies."""
+        lucky = [self.episode(i).with_luck(rng).arrivals for i in range(self.robots)]
+        return FleetEpisode(tuple(lucky), self.link)
+
+
+@dataclass(frozen=True)
+class FleetScenario:
+    """``robots`` robots in one cell, each with the stream of ``uplink``.
+
+    The cameras tick together: frame k of every robot arrives at the same time (jitter moves the tick, not one robot's
+    frame), so that in an environment one step is one tick. Sizes and motion are each robot's own: a recording chosen
+    at random for each, from a random offset on. The cell is one of ``uplink.traces`` times ``uplink.scale`` times
+    ``robots``: a factor of 1 gives each robot the capacity that ``uplink`` alone would have, on average, so the load
+    is the same for any number of robots. A fleet of one meets the very episodes of ``uplink``.
+    """
+
+    robots: int = 4
+    uplink: Uplink = field(default_factory=lambda: _uplink("lte"))
+
+    def __post_init__(self) -> None:
+        check_robots(self.robots)
+        if not isinstance(self.uplink, Uplink):
+            raise BufgymError(f"uplink: {self.uplink!r} is not a bufgym.scenario Uplink")
+        if self.uplink.workload is not None:
+            raise BufgymError("uplink: a fleet's streams are drawn; it can't play one robot's workload on all of them")
+
+    @staticmethod
+    def of(robots: int, scenario: str | Uplink | FleetScenario = "lte", **parameters: Any) -> FleetScenario:
+        """So many robots with the stream of that scenario, its ``parameters`` changed."""
+        uplink = scenario.uplink if isinstance(scenario, FleetScenario) else scenario
+        return FleetScenario(robots, _uplink(uplink, **parameters))
+
+    @property
+    def value(self) -> Value:
+        """The V that each robot's QoI is measured with."""
+        return self.uplink.value
+
+    @property
+    def max_messages(self) -> int:
+        """No robot has more arrivals than this."""
+        return self.uplink.max_messages
+
+    def draw(self, streams: Streams) -> FleetEpisode:
+        """One episode."""
+        first = self._cell.draw(streams)
+        others = [self._beside(first.arrivals["arrival_us"], streams) for _ in range(1, self.robots)]
+        return FleetEpisode((first.arrivals, *others), first.link)
+
+    def _beside(self, arrival_us: NDArray[np.int64], streams: Streams) -> NDArray[Any]:
+        """MESSAGE[n] of one more robot whose camera ticks at these times."""
+        arrivals = self._stream.draw(streams).arrivals
+        arrivals["arrival_us"] = arrival_us
+        if self.uplink.motion:
+            motion = self.uplink.motion[int(streams.arrival.integers(len(self.uplink.motion)))]
+            start = int(streams.arrival.integers(motion.time_us[-1])) if self.uplink.random_offset else 0
+            x = motion.at(arrival_us + start)
+            arrivals["x"] = x - x[0]
+        return arrivals
+
+    @functools.cached_property
+    def _cell(self) -> Uplink:
+        """The first robot's stream over the link of all."""
+        return replace(self.uplink, scale=tuple(s * self.robots for s in self.uplink.scale))
+
+    @functools.cached_property
+    def _stream(self) -> Uplink:
+        """The sizes of another robot's messages; their times and motion come from elsewhere."""
+        return replace(
+            self.uplink, traces=self.uplink.traces[:1], scale=(1.0,), motion=(), jitter=0, random_offset=False
+        )
+
+
+def _uplink(spec: str | Uplink, **parameters: Any) -> Uplink:
+    found = scenarios.get(spec, **parameters)
+    if not isinstance(found, Uplink):
+        raise BufgymError(f"scenario {spec!r}: a fleet needs an Uplink, whose link goes on; it is {found!r}")
+    return found
+
+
+def check_robots(robots: Any) -> int:
+    """N, or an error."""
+    if isinstance(robots, bool) or not isinstance(robots, int | np.integer) or not 1 <= robots <= MAX_ROBOTS:
+        raise BufgymError(f"robots = {robots!r}: must be a whole number from 1 to {MAX_ROBOTS}")
+    return int(robots)

@@ -1,0 +1,200 @@
+"""``pettingzoo.ParallelEnv``: robots that share one cell, each with a send buffer of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from bufgym.cell import FleetScenario
+from bufgym.envs.fleet_rows import FleetRows, check_reward
+from bufgym.envs.rows import DELIVERED, RETAINED
+from bufgym.errors import BufgymError
+from bufgym.scenario import Uplink
+
+Observation = dict[str, NDArray[Any]]
+Infos = dict[str, dict[str, Any]]
+Spaces = dict[str, spaces.Space[Any]]
+
+_QUEUED, _FREE = "■", "·"
+_WIDEST = 32
+"""Up to this L every slot of the buffer is a sign of its own in a picture."""
+
+
+class FleetEnv(ParallelEnv[str, Observation, int]):
+    """N robots send camera frames through one cell that divides its capacity among those that are sending.
+
+    **A step is one frame tick**: all cameras tick together, so at every step each robot decides about its newcomer at
+    the same moment, knowing nothing of the others' decisions; then the cell carries what it can until the next tick.
+
+    **Agents** ``robot_0`` .. ``robot_{N-1}``, N up to 256; all of them live until the episode's last message has left.
+
+    **Action, observation, end** of each are those of ``SenderEnv``: ``Discrete(L + 2)``; a Dict with one key for each
+    field of ``bufgym.observe``, of what that robot has on board. ``infos[agent]["action_mask"]`` bool[L + 2] says
+    which actions are possible; with ``mask_in_observation`` so does ``observation["action_mask"]``, int8[L + 2].
+    ``state()`` is every field of every robot, for critics that may see them all.
+
+    **Reward** "team": each robot gets the mean over all robots of the ``term`` (or weighted terms) that ``SenderEnv``
+    calls reward; "own": its own. ``infos[agent]["reward_terms"]`` has each robot's own terms in any case.
+
+    **Arguments** ``robots`` N; ``scenario``: the name of an uplink, an ``Uplink`` (what each robot would have if it
+    were alone) or a ``FleetScenario``; ``capacity`` L; ``max_bytes`` B; ``fields``: names to observe; any further
+    argument replaces a parameter of the uplink. ``reset(options={"episode": e})`` plays a given ``FleetEpisode``;
+    PettingZoo lets other options pass.
+    """
+
+    metadata = {"name": "bufgym_fleet_v0", "render_modes": ["ansi"], "is_parallelizable": True, "render_fps": 10}
+
+    def __init__(
+        self,
+        robots: int = 4,
+        scenario: str | Uplink | FleetScenario = "lte",
+        capacity: int = 8,
+        *,
+        max_bytes: int | None = None,
+        reward: str = "team",
+        term: str | Mapping[str, float] = "retained",
+        fields: Sequence[str] | None = None,
+        mask_in_observation: bool = False,
+        render_mode: str | None = None,
+        **parameters: Any,
+    ) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise BufgymError(f"render_mode = {render_mode!r}: must be one of {self.metadata['render_modes']}")
+        self.rows = FleetRows(
+            1,
+            scenario=FleetScenario.of(robots, scenario, **parameters),
+            capacity=capacity,
+            max_bytes=max_bytes,
+            term=term,
+            fields=fields,
+        )
+        self.reward = check_reward(reward)
+        self.mask_in_observation = mask_in_observation
+        self.render_mode = render_mode
+        self.possible_agents = [f"robot_{i}" for i in range(len(self.rows))]
+        self.agents: list[str] = []
+        # PettingZoo's way to seed an agent's actions is to seed its space: each has one of its own.
+        self.observation_spaces: Spaces = {agent: self._space() for agent in self.possible_agents}
+        actions = self.rows.capacity + 2
+        self.action_spaces: Spaces = {agent: spaces.Discrete(actions) for agent in self.possible_agents}
+        self.state_space = spaces.Box(0.0, 1.0, (self._fields().size,), np.float32)
+        self._actions = np.zeros(len(self.rows), np.int64)
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], Infos]:
+        rows = self.rows
+        if seed is not None:
+            rows.seed(0, seeding.np_random(seed)[0])
+        rows.reset(np.arange(len(rows)), [(options or {}).get("episode")])
+        self.agents = list(self.possible_agents)
+        masks = rows.shown.mask.copy()
+        infos = {agent: {"action_mask": masks[i], "impossible": 0} for i, agent in enumerate(self.agents)}
+        return self._observations(masks), infos
+
+    def step(
+        self, actions: Mapping[str, int]
+    ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+        rows, agents = self.rows, self.agents
+        if not agents:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        for i, agent in enumerate(agents):
+            action = actions.get(agent)
+            if action is None:
+                raise BufgymError(f"actions: none for {agent!r}; every robot decides at every tick")
+            if not 0 <= action < rows.capacity + 2:
+                raise BufgymError(f"actions[{agent!r}] = {action}: must lie in 0..{rows.capacity + 1}")
+            self._actions[i] = action
+        rows.step(self._actions)
+        terms, masks = rows.shown.terms, rows.shown.mask.copy()
+        earned = rows.weights[DELIVERED] * terms[:, DELIVERED] + rows.weights[RETAINED] * terms[:, RETAINED]
+        rewards = rows.shared(earned, self.reward).tolist()
+        ended = bool(rows.shown.ended[0])
+        infos = self._infos(masks, terms.tolist(), ended)
+        if ended:
+            self.agents = []
+        return (
+            self._observations(masks),
+            dict(zip(agents, rewards, strict=True)),
+            dict.fromkeys(agents, ended),
+            dict.fromkeys(agents, False),
+            infos,
+        )
+
+    def state(self) -> NDArray[np.float32]:
+        """float32[N x fields]: robot by robot, every slot field, then every context field; chosen or not."""
+        return self._fields().ravel()
+
+    def render(self) -> str | None:
+        """One line a robot: its buffer, what it is sending, and what has become of its messages."""
+        if self.render_mode is None:
+            gym.logger.warn("render() needs a render_mode: parallel_env(..., render_mode='ansi')")
+            return None
+        if self.rows.senders.episodes[0] is None:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        senders = self.rows.senders.batch.senders
+        lines = [f"t = {senders['now_us'].max() / 1e6:.2f} s, {int(senders['busy'].sum())} of {len(senders)} sending"]
+        lines += [self._line(i) for i in range(len(senders))]
+        return "\n".join(lines)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def _line(self, i: int) -> str:
+        sender, told = self.rows.senders.batch.senders[i], self.rows.summary(i)
+        queued, L = int(sender["occupancy"]), self.rows.capacity
+        shown = _QUEUED * queued + _FREE * (L - queued) if L <= _WIDEST else f"{queued}/{L}"
+        sending = "▶" if sender["busy"] else " "
+        counts = f"delivered {told['delivered']:>4}  dropped {told['dropped']:>4}  H {told['qoi']:.2f}"
+        return f"{self.possible_agents[i]:<9} {shown} {sending} {counts}"
+
+    def _space(self) -> spaces.Dict:
+        space = dict(self.rows.observation_space.spaces)
+        if self.mask_in_observation:
+            space["action_mask"] = spaces.Box(0, 1, (self.rows.capacity + 2,), np.int8)
+        return spaces.Dict(space)
+
+    def _observations(self, masks: NDArray[np.bool_]) -> dict[str, Observation]:
+        rows = self.rows
+        slots, context = rows.shown.slots.copy(), rows.shown.context.copy()
+        seen: dict[str, Observation] = {
+            agent: rows.observation(slots[i], context[i]) for i, agent in enumerate(self.possible_agents)
+        }
+        if self.mask_in_observation:
+            as_int8 = masks.astype(np.int8)
+            for i, agent in enumerate(self.possible_agents):
+                seen[agent]["action_mask"] = as_int8[i]
+        return seen
+
+    def _infos(self, masks: NDArray[np.bool_], terms: list[list[float]], ended: bool) -> Infos:
+        impossible = self.rows.senders.batch.senders["impossible"].tolist()
+        infos: Infos = {}
+        for i, agent in enumerate(self.possible_agents):
+            earned = {"delivered": terms[i][DELIVERED], "retained": terms[i][RETAINED]}
+            infos[agent] = {"action_mask": masks[i], "impossible": impossible[i], "reward_terms": earned}
+            if ended:
+                infos[agent] |= {name: number.item() for name, number in self.rows.summary(i).items()}
+        return infos
+
+    def _fields(self) -> NDArray[np.float32]:
+        """[N, slot fields x (L + 1) + context fields]"""
+        shown = self.rows.shown
+        return np.concatenate([shown.slots.reshape(len(self.rows), -1), shown.context], axis=1)
+
+
+def parallel_env(**arguments: Any) -> FleetEnv:
+    """``FleetEnv`` under the name that PettingZoo's tools look for."""
+    return FleetEnv(**arguments)

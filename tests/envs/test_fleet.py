@@ -1,0 +1,316 @@
+"""Fleet environments: PettingZoo's own checks, and that they are the rows and rollouts that are tested elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from bufgym import policies
+from bufgym.cell import FleetEpisode, FleetScenario, run_fleet
+from bufgym.envs import SenderEnv
+from bufgym.errors import BufgymError
+from bufgym.fleet import FleetVecEnv
+from bufgym.link import Link
+from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
+from bufgym.scenario import Streams, messages
+from bufgym.traces import Trace
+
+pytest.importorskip("pettingzoo", reason="the extra [fleet] is not installed")
+
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from bufgym.fleet import FleetEnv, parallel_env
+
+L = 4
+SMALL: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 600_000}
+PARAMETERS = {"duration_s": 2.0, "size_bytes": 600_000}
+
+
+def some_action(mask: np.ndarray, rng: np.random.Generator) -> int:
+    """A possible action, at random."""
+    return int(rng.choice(np.flatnonzero(mask)))
+
+
+def oldest_goes(mask: np.ndarray) -> int:
+    """What drop-oldest does: accept where there is room, else evict slot 0."""
+    return L + 1 if mask[L + 1] else 0
+
+
+@pytest.mark.parametrize("robots", [1, 3])
+@pytest.mark.parametrize("mask_in_observation", [False, True])
+def test_pettingzoo_has_nothing_to_say(robots, mask_in_observation, capsys):
+    def make():
+        return parallel_env(robots=robots, mask_in_observation=mask_in_observation, **SMALL)
+
+    parallel_api_test(make(), num_cycles=70)  # an episode has 60 ticks; a warning is an error here
+    parallel_seed_test(make, num_cycles=20)
+    assert "Passed" in capsys.readouterr().out
+
+
+def test_one_robot_is_the_single_environment():
+    fleet, single = FleetEnv(robots=1, **SMALL), SenderEnv(**SMALL)
+    rng = np.random.default_rng(0)
+    seen, infos = fleet.reset(seed=3)
+    alone, info = single.reset(seed=3)
+    terminated = False
+    while not terminated:
+        assert all(np.array_equal(seen["robot_0"][key], alone[key]) for key in alone)
+        assert np.array_equal(infos["robot_0"]["action_mask"], info["action_mask"])
+        action = some_action(info["action_mask"], rng)
+        seen, rewards, ended, _, infos = fleet.step({"robot_0": action})
+        alone, reward, terminated, _, info = single.step(action)
+        assert rewards == {"robot_0": reward}
+        assert ended == {"robot_0": terminated}
+    assert infos["robot_0"].keys() == info.keys()
+    assert all(infos["robot_0"][name] == info[name] for name in ("qoi", "arrived", "delivered", "dropped"))
+
+
+@pytest.mark.parametrize("reward", ["team", "own"])
+def test_an_episode_is_the_rollout_of_the_same_policy(reward):
+    # All robots decide at once, from what each saw before the others did; the rollout asks one after the other.
+    scenario = FleetScenario.of(5, "lte", **PARAMETERS)
+    episode = scenario.draw(Streams.seeded(1))
+    env = FleetEnv(5, scenario, L, reward=reward, term="delivered")
+    _, infos = env.reset(options={"episode": episode})
+    sums = dict.fromkeys(env.agents, 0.0)
+    own = dict.fromkeys(env.agents, 0.0)
+    ticks = 0
+    while env.agents:
+        actions = {agent: oldest_goes(infos[agent]["action_mask"]) for agent in env.agents}
+        _, rewards, _, truncated, infos = env.step(actions)
+        ticks += 1
+        for agent, paid in rewards.items():
+            sums[agent] += paid
+            own[agent] += infos[agent]["reward_terms"]["delivered"]
+            assert not truncated[agent]
+    assert ticks == scenario.max_messages
+    fleet = run_fleet(policies.get("drop-oldest"), [episode], L, scenario.value)
+    assert (np.asarray(env.rows.senders.batch.fates) == np.asarray(fleet.senders.batch.fates)).all()
+    for agent in env.possible_agents:
+        assert infos[agent]["qoi"] == pytest.approx(1 + own[agent])
+        assert infos[agent]["arrived"] == infos[agent]["delivered"] + infos[agent]["dropped"]
+        mean = np.mean(list(own.values()))
+        assert sums[agent] == pytest.approx(mean if reward == "team" else own[agent])
+    assert len({round(total, 6) for total in own.values()}) > 1  # they moved differently
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step({})
+
+
+def test_left_is_what_is_left_of_the_share():
+    # 1 byte/us. A alone from 0; at 500 it has 500 of its 1000 bytes left, and B joins. At 750 A has 375 left, B 875.
+    link = Link(Trace("even", np.array([0, 1_000_000]), np.array([0, 1_000_000])))
+    ticks = np.array([0, 500, 750])
+    episode = FleetEpisode(
+        (messages(ticks, np.array([1_000, 10, 10])), messages(ticks, np.array([1_000, 10, 10]))), link
+    )
+    env = FleetEnv(2, FleetScenario.of(2, "lte"), 2)
+    env.reset(options={"episode": episode})
+    seen, *_ = env.step({"robot_0": 3, "robot_1": 2})  # robot 1 rejects its first
+    assert seen["robot_0"]["left"] == [0.5]
+    assert seen["robot_1"]["busy"] == [0.0]
+    # Robot 1's second has 10 bytes: at 20 us after its start both have had 10.
+    seen, *_ = env.step({"robot_0": 2, "robot_1": 3})
+    assert seen["robot_0"]["left"] == [np.float32((500 - 10 - 230) / 1_000)]
+
+
+def test_what_a_step_hands_out_is_never_written_again():
+    env = FleetEnv(robots=2, mask_in_observation=True, **SMALL)
+    seen, infos = env.reset(seed=0)
+    held = [(seen["robot_1"], infos["robot_1"]["action_mask"])]
+    copies = [({k: a.copy() for k, a in seen["robot_1"].items()}, infos["robot_1"]["action_mask"].copy())]
+    while env.agents:
+        seen, _, _, _, infos = env.step(dict.fromkeys(env.agents, L + 1))
+        held.append((seen["robot_1"], infos["robot_1"]["action_mask"]))
+        copies.append(({k: a.copy() for k, a in seen["robot_1"].items()}, infos["robot_1"]["action_mask"].copy()))
+    for (observation, mask), (copy, mask_copy) in zip(held, copies, strict=True):
+        assert all(np.array_equal(observation[key], copy[key]) for key in copy)
+        assert np.array_equal(mask, mask_copy)
+        assert np.array_equal(observation["action_mask"], mask)
+
+
+def test_state_and_spaces():
+    env = FleetEnv(robots=3, fields=["occupancy", "loss"], **SMALL)
+    seen, _ = env.reset(seed=0)
+    assert env.state().shape == env.state_space.shape == (3 * (len(SLOT_FIELDS) * (L + 1) + len(CONTEXT_FIELDS)),)
+    assert env.state_space.contains(env.state())
+    assert set(seen["robot_2"]) == {"occupancy", "loss"}
+    assert env.observation_space("robot_2").contains(seen["robot_2"])
+    assert env.action_space("robot_0").n == L + 2
+    assert env.state().tobytes() != FleetEnv(robots=3, **SMALL).state().tobytes()
+    env.close()
+
+
+def test_seeds_make_the_same_episode_and_go_on_from_it():
+    def crossings(env, seed):
+        env.reset(seed=seed)
+        while env.agents:
+            env.step(dict.fromkeys(env.agents, L + 1))
+        return np.asarray(env.rows.senders.batch.fates)["crossed_us"].tolist()
+
+    one, other = FleetEnv(robots=2, **SMALL), FleetEnv(robots=2, **SMALL)
+    first, second = crossings(one, 5), crossings(one, None)
+    assert crossings(other, 5) == first
+    assert crossings(other, None) == second != first
+    assert crossings(other, 6) != first
+
+
+def test_as_text_every_robot_has_a_line():
+    env = FleetEnv(robots=3, render_mode="ansi", **SMALL)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.render()
+    env.reset(seed=0)
+    for _ in range(8):
+        env.step(dict.fromkeys(env.agents, L + 1))
+    head, *lines = env.render().splitlines()
+    assert head.endswith("of 3 sending")
+    assert [line.split()[0] for line in lines] == env.possible_agents
+    sender = env.rows.senders.batch.senders[1]
+    assert lines[1].count("■") == sender["occupancy"]
+    assert lines[1].count("·") == L - sender["occupancy"]
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert FleetEnv(robots=3, **SMALL).render() is None
+    wide = FleetEnv(robots=2, capacity=100, render_mode="ansi", duration_s=1.0)
+    wide.reset(seed=0)
+    assert "0/100" in wide.render()
+
+
+@pytest.mark.slow
+def test_256_robots():
+    env = FleetEnv(robots=256, capacity=2, duration_s=0.5)
+    _, infos = env.reset(seed=0)
+    while env.agents:
+        _, rewards, _, _, infos = env.step(dict.fromkeys(env.agents, 3))
+    assert len(rewards) == 256
+    assert sum(infos[agent]["delivered"] for agent in env.possible_agents) > 256
+
+
+@pytest.mark.parametrize(
+    ("act", "complaint"),
+    [
+        (lambda: FleetEnv(robots=0), "robots = 0"),
+        (lambda: FleetEnv(reward="all"), "reward = 'all': must be 'team'"),
+        (lambda: FleetEnv(term="speed"), "unknown term 'speed'"),
+        (lambda: FleetEnv(fields=["colour"]), "unknown field 'colour'"),
+        (lambda: FleetEnv(render_mode="rgb_array"), "render_mode = 'rgb_array'"),
+        (lambda: FleetEnv(wheels=4), "no parameter 'wheels'"),
+        (lambda: begun().step({"robot_0": 0}), "actions: none for 'robot_1'"),
+        (lambda: begun().step({"robot_0": 0, "robot_1": L + 2}), "actions['robot_1'] = 6: must lie in 0..5"),
+        (lambda: begun().reset(options={"episode": apart()}), "arrive at the same times"),
+        (lambda: begun().reset(options={"episode": apart(3)}), "the same times"),
+        (lambda: FleetVecEnv(0), "cells = 0"),
+        (lambda: FleetVecEnv(2, reward="mine"), "reward = 'mine'"),
+        (lambda: FleetVecEnv(2, 2).reset(options={"episodes": [None]}), "1 given for 2 cells"),
+        (lambda: half_reset(), "begin together"),
+    ],
+)
+def test_bad_input_is_told_apart(act, complaint):
+    with pytest.raises(BufgymError) as error:
+        act()
+    assert complaint in str(error.value)
+
+
+def begun():
+    env = FleetEnv(robots=2, **SMALL)
+    env.reset(seed=0)
+    return env
+
+
+def apart(robots=2):
+    """Robots whose frames come one after the other."""
+    link = Link(Trace("even", np.array([0, 1_000_000]), np.array([0, 1_000_000])))
+    return FleetEpisode(tuple(messages(np.array([i, 10 + i]), 5) for i in range(robots)), link)
+
+
+def half_reset():
+    envs = FleetVecEnv(2, 2, parameters=PARAMETERS)
+    envs.reset(seed=0)
+    envs.reset(options={"reset_mask": np.array([True, False, False, False])})
+
+
+def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
+    import bufgym.envs
+    import bufgym.fleet
+
+    monkeypatch.delattr(bufgym.envs, "fleet", raising=False)
+    for name in list(sys.modules):
+        if name == "bufgym.envs.fleet" or name.split(".")[0] == "pettingzoo":
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pettingzoo", None)
+    with pytest.raises(BufgymError, match=r'FleetEnv needs pettingzoo: pip install "bufgym\[fleet\]"'):
+        bufgym.fleet.__getattr__("FleetEnv")
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        bufgym.fleet.__getattr__("no_such_thing")
+    assert bufgym.fleet.FleetVecEnv is FleetVecEnv
+
+
+# --- robots as the rows of a batch -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reward", ["team", "own"])
+def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
+    cells, robots = 2, 3
+    envs = FleetVecEnv(cells, robots, "lte", L, reward=reward, parameters=PARAMETERS)
+    fleets = [FleetEnv(robots, "lte", L, reward=reward, **PARAMETERS) for _ in range(cells)]
+    seen, info = envs.reset(seed=11)
+    each = [fleet.reset(seed=11 + c * robots) for c, fleet in enumerate(fleets)]
+    rng = np.random.default_rng(0)
+    assert envs.num_envs == 6
+    for _ in range(60):
+        actions = np.array([some_action(mask, rng) for mask in info["action_mask"]])
+        for c, (observation, infos) in enumerate(each):
+            for r, agent in enumerate(fleets[c].possible_agents):
+                i = c * robots + r
+                assert np.array_equal(info["action_mask"][i], infos[agent]["action_mask"])
+                assert all(np.array_equal(seen[key][i], observation[agent][key]) for key in seen)
+        seen, rewards, terminated, truncated, info = envs.step(actions)
+        each = []
+        for c, fleet in enumerate(fleets):
+            mine = dict(zip(fleet.possible_agents, actions[c * robots : (c + 1) * robots].tolist(), strict=True))
+            observation, paid, ended, _, infos = fleet.step(mine)
+            each.append((observation, infos))
+            assert rewards[c * robots : (c + 1) * robots].tolist() == list(paid.values())
+            assert terminated[c * robots : (c + 1) * robots].tolist() == list(ended.values())
+        assert not truncated.any()
+    assert terminated.all()
+    assert info["qoi"].tolist() == [each[c][1][f"robot_{r}"]["qoi"] for c in range(2) for r in range(3)]
+    # The next step begins the next episode of each cell's streams.
+    seen, rewards, *_ = envs.step(np.zeros(6, np.int64))
+    again = [fleet.reset()[0] for fleet in fleets]
+    assert not rewards.any()
+    assert all(np.array_equal(seen[key][4], again[1]["robot_1"][key]) for key in seen)
+
+
+def test_cells_can_be_given_and_begun_one_by_one():
+    envs = FleetVecEnv(2, 2, "lte", L, autoreset_mode=AutoresetMode.DISABLED, parameters=PARAMETERS)
+    scenario = FleetScenario.of(2, "lte", **PARAMETERS)
+    given = scenario.draw(Streams.seeded(4))
+    envs.reset(seed=0, options={"episodes": [None, given]})
+    assert envs.rows.senders.episodes[3].arrivals is given.arrivals[1]
+    for _ in range(10):
+        envs.step(np.full(4, L + 1))
+    mask = np.array([False, False, True, True])
+    envs.reset(options={"reset_mask": mask, "episodes": [None, given]})
+    assert envs.rows.senders.batch.senders["next"].tolist() == [10, 10, 0, 0]
+
+
+@pytest.mark.slow
+def test_weights_shared_by_all_robots_learn():
+    pytest.importorskip("stable_baselines3", reason="the extra [train] is not installed")
+    maskable = pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
+    from bufgym.sb3 import GymVecEnv
+
+    envs = GymVecEnv(FleetVecEnv(2, 4, "lte", L, autoreset_mode=AutoresetMode.SAME_STEP, parameters=PARAMETERS))
+    envs.seed(0)
+    model = maskable.MaskablePPO("MultiInputPolicy", envs, n_steps=64, batch_size=128, n_epochs=2, seed=0, device="cpu")
+    before = {name: weights.clone() for name, weights in model.policy.state_dict().items()}
+    model.learn(1_024)
+    assert model.num_timesteps == 1_024
+    assert len(model.ep_info_buffer) == 16  # two episodes of 60 ticks of each of 8 robots
+    assert any((weights != before[name]).any() for name, weights in model.policy.state_dict().items())
+    actions, _ = model.predict(envs.reset(), action_masks=np.array(envs.env_method("action_masks")))
+    assert actions.shape == (8,)
