@@ -23,10 +23,12 @@ from agents.grounds import Lengths
 from agents.network import SlotFeatures, SlotScorer
 from agents.worlds import Cell
 from bufgym import suites
+from bufgym.benchmark.topics import run_parts, suite_parts
 from bufgym.errors import BufgymError
-from bufgym.policies import Policy, learned
+from bufgym.policies import Policy, learned, learned_topics
 from bufgym.policies import weights as files
 from bufgym.policies.learned import Network, Weights
+from bufgym.policies.learned_topics import TopicWeights
 from bufgym.policies.weights import StrPath
 
 
@@ -37,9 +39,11 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
         BufgymError: ``model`` is no agent that scores slots, or ``out`` cannot be written.
     """
     path = Path(model)
-    weights = files.read(path)[0] if path.suffix == ".safetensors" else weights_of(_loaded(path))
-    checked = regrets(learned.policy(name, weights))
-    return files.save(out, weights, {"name": name, "about": about, **training(path), "regret": checked})
+    weights = files.read_any(path)[0] if path.suffix == ".safetensors" else weights_of(_loaded(path))
+    notes = {"name": name, "about": about, **training(path)}
+    if isinstance(weights, TopicWeights):
+        return files.save(out, weights, {**notes, "weighted_qoi": weighted(learned_topics.policy(name, weights))})
+    return files.save(out, weights, {**notes, "regret": regrets(learned.policy(name, weights))})
 
 
 CHECKED = (4, 8, 16, 32)
@@ -54,6 +58,18 @@ def regrets(policy: Policy) -> dict[str, float]:
         for label, setting in settings.items()
         for L in CHECKED
     }
+
+
+def weighted(policy: Policy) -> dict[str, float]:
+    """A scheduler's weighted QoI, for a test to find again: on the first test episode of each setting of topics-v1."""
+    found = suites.get("topics-v1")
+    rows = run_parts(
+        [policy], [part._replace(seeds=part.seeds[:1]) for part in suite_parts(found, "test")], found.capacities
+    )
+    first: dict[str, float] = {}
+    for row in rows:
+        first.setdefault(row["scenario"], round(row["weighted_qoi"], 6))
+    return first
 
 
 def _loaded(path: Path) -> MaskablePPO:

@@ -2,11 +2,11 @@
 
 A candidate is a vector of weights; its fitness compares it with Robofleet's published client on the same episodes: the
 weighted QoI is to be large, the age of information of the topics with the highest priority no larger (``AGE_SHARE``),
-that of the others not much larger (``OTHERS_SHARE``), and no ``no_drop`` message may be lost. All candidates of a generation meet the same episodes, the next generation meets
-others; validation episodes say which mean to keep. The search begins at what is greedy: drop what loses the least QoI
-now, send what gains the most a byte.
+that of the others not much larger (``OTHERS_SHARE``), and no ``no_drop`` message may be lost. All candidates of a
+generation meet the same episodes, the next generation meets others; validation episodes say which mean to keep. The
+search begins at what is greedy: drop what loses the least QoI now, send what gains the most a byte.
 
-    python train.py --suite topics-v1 --algo evolution --seeds 5 --steps 12000000 --validate-every 1000000
+    python train.py --suite topics-v1 --algo evolution --seeds 5 --steps 25000000 --validate-every 1000000
 """
 
 from __future__ import annotations

@@ -49,5 +49,7 @@ def _load_shipped(name: str, path: Path) -> Policy:
     return weights.load_shipped(name, path)
 
 
-for _name, _path in files.shipped("agents", "agents/pretrained", "*.safetensors").items():
-    register_later(_name, functools.partial(_load_shipped, _name, _path))
+for _folder, _for_topics in (("", False), ("/topics", True)):
+    _shipped = files.shipped(f"agents{_folder}", f"agents/pretrained{_folder}", "*.safetensors")
+    for _name, _path in _shipped.items():
+        register_later(_name, functools.partial(_load_shipped, _name, _path), for_topics=_for_topics)

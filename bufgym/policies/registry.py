@@ -198,6 +198,8 @@ def signatures() -> tuple[Any, Any, Any, Any]:
 
 _REGISTRY: dict[str, Policy | Callable[[], Policy]] = {}
 """By name: a policy, or what makes it when it is first asked for."""
+_LATER_FOR_TOPICS: set[str] = set()
+"""Names of those to be made that are for topics."""
 
 
 def register(
@@ -251,16 +253,17 @@ def register(
     return add
 
 
-def register_later(name: str, make: Callable[[], Policy]) -> None:
+def register_later(name: str, make: Callable[[], Policy], *, for_topics: bool = False) -> None:
     """Register a policy that is made when it is first asked for; a name that is taken stays as it is."""
-    _REGISTRY.setdefault(name, make)
+    if _REGISTRY.setdefault(name, make) is make and for_topics:
+        _LATER_FOR_TOPICS.add(name)
 
 
 def names(*, for_topics: bool | None = None) -> Iterator[str]:
     """All registered names, in the order of their registration; True: those made for topics only, False: the others."""
-    # What is made when it is first asked for is a learned one: not made for topics.
-    made_for_topics = {name for name, known in _REGISTRY.items() if isinstance(known, Policy) and known.for_topics}
-    return iter([name for name in _REGISTRY if for_topics in (None, name in made_for_topics)])
+    made = {name for name, known in _REGISTRY.items() if isinstance(known, Policy) and known.for_topics}
+    made |= _LATER_FOR_TOPICS
+    return iter([name for name in _REGISTRY if for_topics in (None, name in made)])
 
 
 def get(spec: str | Policy) -> Policy:
