@@ -18,7 +18,8 @@ class Arguments:
     suite: str = ""
     """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
     validation split, and report on its test split; the agent is asked at every arrival. Several, as in a,b: on all of
-    them at once. A suite of many topics (topics-v1) makes a scheduler."""
+    them at once. A suite of many topics (topics-v1) makes a scheduler, one of a fleet (fleet-v1) an agent
+    that all its robots share."""
     data: str = ""
     """Folder of recordings, for suites that need one."""
     capacities: str = ""
@@ -95,18 +96,15 @@ def main(arguments: Arguments | None = None) -> None:
         import tyro
 
         arguments = tyro.cli(Arguments)
-    from agents import (
-        report,
-        scheduling,
-        training,
-    )  # not before the arguments are known to be good: torch takes seconds to load
+    # Not before the arguments are known to be good: torch takes seconds to load.
+    from agents import fleets, report, scheduling, training
     from bufgym.errors import BufgymError
 
     try:
-        schedules = scheduling.wanted(arguments)
+        special = next((kind for kind in (scheduling, fleets) if kind.wanted(arguments)), None)
         folder = training.prepare(arguments)
-        if schedules:
-            scheduling.train_and_report(arguments, folder)
+        if special is not None:
+            special.train_and_report(arguments, folder)
             return
         runs = training.train_all(arguments, folder)
         (report.report_suites if arguments.suite else report.evaluate_and_report)(arguments, folder, runs)

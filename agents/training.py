@@ -33,6 +33,7 @@ from agents.network import IgnoresMasks, policy_of
 from agents.trials import Trials, ValidationSet, plan
 from agents.worlds import World, capacities_of, cells
 from bufgym import suites
+from bufgym.benchmark.fleets import SUITES as FLEET_SUITES
 from bufgym.benchmark.rows import Row
 from bufgym.errors import BufgymError
 from bufgym.policies import load as load_policy
@@ -99,7 +100,7 @@ def prepare(arguments: Arguments) -> Path:
     given = dataclasses.asdict(arguments)
     if arguments.suite:
         for suite in arguments.suites:  # mistakes are told before anything is made
-            if suite not in suites.TOPIC_SUITES:
+            if suite not in (*suites.TOPIC_SUITES, *FLEET_SUITES):
                 plan(arguments, suite, "validation").checked()
     if arguments.resume:
         if not noted.exists():

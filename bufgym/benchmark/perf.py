@@ -30,6 +30,7 @@ from bufgym.kernel import JIT
 from bufgym.sender import Senders
 
 ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
+TOPICS = "bufgym/Topics-v0"
 POLICIES = ("afr", "drop-oldest", "random", "min-gap")
 SEED = 1
 
@@ -62,6 +63,8 @@ class Sizes:
     episodes: int = 1000
     """Episodes of a fixed-policy rollout."""
     repeats: int = 3
+    topic_slots: int = 32
+    """L of the batch with several topics."""
 
 
 def measure(sizes: Sizes | None = None) -> list[Figure]:
@@ -106,9 +109,9 @@ def _play(vector: Any, actions: NDArray[np.int64]) -> None:
         vector.step(row)
 
 
-def _batch_rate(id: str, mode: str, steps: int, sizes: Sizes) -> float:
+def _batch_rate(id: str, mode: str, steps: int, sizes: Sizes, capacity: int) -> float:
     """Decisions a second of one kind of vector environment."""
-    vector: Any = gym.make_vec(id, sizes.batch, vectorization_mode=mode, capacity=sizes.capacity)
+    vector: Any = gym.make_vec(id, sizes.batch, vectorization_mode=mode, capacity=capacity)
     try:
         actions, decisions = record(vector, steps)
         return decisions / best_s(sizes.repeats, lambda: vector.reset(seed=SEED), lambda: _play(vector, actions))
@@ -119,14 +122,23 @@ def _batch_rate(id: str, mode: str, steps: int, sizes: Sizes) -> float:
 def _batches(sizes: Sizes) -> Iterable[Figure]:
     of = f"n = {sizes.batch}, L = {sizes.capacity}, all observation fields, resets in the time"
     for id in ENVIRONMENTS:
-        native = _batch_rate(id, "vector_entry_point", sizes.steps, sizes)
-        sync = _batch_rate(id, "sync", sizes.sync_steps, sizes)
+        native = _batch_rate(id, "vector_entry_point", sizes.steps, sizes, sizes.capacity)
+        sync = _batch_rate(id, "sync", sizes.sync_steps, sizes, sizes.capacity)
         kind = "gym.make_vec(vectorization_mode="
         yield Figure(
             f"native batch, {id}", native, "steps/s", 3e6, f"decisions a second of {kind}'vector_entry_point'), {of}"
         )
         yield Figure(f"SyncVectorEnv, {id}", sync, "steps/s", None, f"decisions a second of {kind}'sync'), {of}")
         yield Figure(f"native / SyncVectorEnv, {id}", native / sync, "times", 50.0, "the ratio of these two")
+    topics = len(scenarios.get("topics").topics)
+    yield Figure(
+        f"native batch of {topics} topics, {TOPICS}",
+        _batch_rate(TOPICS, "vector_entry_point", sizes.steps, sizes, sizes.topic_slots),
+        "steps/s",
+        1e6,
+        "decisions and choices of what to send a second of gym.make_vec(vectorization_mode='vector_entry_point'), "
+        f"n = {sizes.batch}, L = {sizes.topic_slots}, all observation fields, resets in the time",
+    )
 
 
 def _single_rate(id: str, sizes: Sizes) -> float:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +30,9 @@ class Standing:
 
     policy: str
     qoi: Interval
-    """Weighted QoI, relative to the baseline's: sum / sum over the episodes that both met."""
+    """Mean weighted QoI."""
+    relative: Interval
+    """The same over the baseline's: sum / sum over the episodes that both met."""
     lost: float
     """Messages of no_drop topics that were dropped, in all episodes together."""
     age_first_s: Interval
@@ -110,7 +111,9 @@ def summary(
 
     def standings(over: Sequence[Cell]) -> list[Standing]:
         made = [_standing(policy, [here[cell] for cell in over], confidence) for policy, here in statistics.items()]
-        return sorted(made, key=lambda s: (s.policy in unranked, math.isnan(s.qoi.value), -s.qoi.value, s.policy))
+        return sorted(
+            made, key=lambda s: (s.policy in unranked, math.isnan(s.relative.value), -s.relative.value, s.policy)
+        )
 
     return Summary(standings(cells), {cell: standings([cell]) for cell in cells}, baseline, first)
 
@@ -119,9 +122,9 @@ def _runs(rows: Rows) -> tuple[dict[tuple[Any, ...], _Run], tuple[float, ...]]:
     """The runs by (scenario, capacity, policy, trace, seed), and the highest priorities."""
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for number, row in enumerate(rows):
-        for key in ("scenario", "capacity", "policy", "trace", "seed", "topic", "weighted_qoi"):
-            if row.get(key) is None:
-                raise BufgymError(f"rows[{number}]: no {key}")
+        for name in ("scenario", "capacity", "policy", "trace", "seed", "topic", "weighted_qoi"):
+            if row.get(name) is None:
+                raise BufgymError(f"rows[{number}]: no {name}")
         key = (row["scenario"], row["capacity"], row["policy"], row["trace"], row["seed"])
         group = groups.setdefault(key, [])
         if any(other["topic"] == row["topic"] for other in group):
@@ -159,7 +162,8 @@ def _statistics(runs: Any, base: Any, weights: Numbers) -> dict[str, Numbers]:
         return share(np.where(known, numbers, 0.0), known.astype(np.float64))
 
     return {
-        "qoi": share(runs.qoi, base.qoi),
+        "qoi": average(runs.qoi),
+        "relative": share(runs.qoi, base.qoi),
         "lost": weights @ runs.lost,
         "age_first_s": average(runs.age_first),
         "age_others_s": average(runs.age_others),
@@ -186,6 +190,7 @@ def plain(found: Summary, abouts: Mapping[str, str] | None = None) -> str:
     first = f"priority {found.first[0]:g}" if len(found.first) == 1 else "first"
     head = [
         "policy",
+        "QoI",
         f"QoI / {found.baseline}",
         "no_drop lost",
         f"age, {first} (s)",
@@ -196,7 +201,12 @@ def plain(found: Summary, abouts: Mapping[str, str] | None = None) -> str:
     blocks = [(_title(cell, abouts), standings) for cell, standings in found.cells.items()]
     if len(blocks) > 1:
         blocks.append((f"mean of these {len(blocks)}", found.overall))
-    lines = aligned([head, *(_cells(standing) for _, block in blocks for standing in block)])
+    return _in_blocks(head, [(title, [_cells(standing) for standing in standings]) for title, standings in blocks])
+
+
+def _in_blocks(head: list[str], blocks: Sequence[tuple[str, list[list[str]]]]) -> str:
+    """Titled blocks of lines under one head, all in the same columns."""
+    lines = aligned([head, *(line for _, block in blocks for line in block)])
     out, at = [lines[0]], 1
     for title, block in blocks:
         out += ["", title, *lines[at : at + len(block)]]
@@ -213,7 +223,8 @@ def _title(cell: Cell, abouts: Mapping[str, str]) -> str:
 def _cells(standing: Standing) -> list[str]:
     return [
         standing.policy,
-        _with_interval(standing.qoi, ".3f"),
+        f"{standing.qoi.value:.1f}",
+        _with_interval(standing.relative, ".3f"),
         f"{standing.lost:g}",
         _with_interval(standing.age_first_s, ".2f"),
         _with_interval(standing.age_others_s, ".2f"),
@@ -247,18 +258,12 @@ def by_topic(rows: Rows, policy: str) -> str:
     mine = [row for row in rows if row["policy"] == policy]
     if not mine:
         raise BufgymError(f"no row of the policy {policy!r}")
-    order = {cell: k for k, cell in enumerate(dict.fromkeys((row["scenario"], row["capacity"]) for row in mine))}
-    mine.sort(key=lambda row: order[row["scenario"], row["capacity"]])
+    cells = dict.fromkeys((row["scenario"], row["capacity"]) for row in mine)
     blocks = [
-        (_title(cell, {}), _topic_lines(list(group)))
-        for cell, group in groupby(mine, key=lambda row: (row["scenario"], row["capacity"]))
+        (_title(cell, {}), _topic_lines([row for row in mine if (row["scenario"], row["capacity"]) == cell]))
+        for cell in cells
     ]
-    lines = aligned([[column.title for column in TOPIC_COLUMNS], *(line for _, block in blocks for line in block)])
-    out, at = [lines[0]], 1
-    for title, block in blocks:
-        out += ["", title, *lines[at : at + len(block)]]
-        at += len(block)
-    return "\n".join(out)
+    return _in_blocks([column.title for column in TOPIC_COLUMNS], blocks)
 
 
 def _topic_lines(rows: Rows) -> list[list[str]]:

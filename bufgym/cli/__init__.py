@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 
 from bufgym import __version__
-from bufgym.cli import bench, export, figures, leaderboard, listing, perf, play, report, topics, traces, tune
+from bufgym.cli import bench, export, figures, fleet, leaderboard, listing, perf, play, report, topics, traces, tune
 from bufgym.cli.listing import _LISTS, KINDS, environments
 from bufgym.cli.options import Parser, split_policies
 from bufgym.errors import BufgymError, line_in
@@ -60,6 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     listing.add(commands)
     bench.add(commands)
     topics.add(commands)
+    fleet.add(commands)
     report.add(commands)
     tune.add(commands)
     leaderboard.add(commands)

@@ -91,15 +91,25 @@ def _first_line(function: Any) -> str:
 
 
 def _list_rewards() -> str:
-    from bufgym.observe import REWARD_TERMS
+    from bufgym.observe import REWARD_TERMS, TOPIC_REWARD_TERMS
 
-    return columns([(term.name, term.unit, term.meaning) for term in REWARD_TERMS])
+    return _in_two_parts(
+        [[(term.name, term.unit, term.meaning) for term in terms] for terms in (REWARD_TERMS, TOPIC_REWARD_TERMS)]
+    )
 
 
 def _list_observations() -> str:
-    from bufgym.observe import FIELDS
+    from bufgym.observe import FIELDS, TOPIC_FIELDS
 
-    return columns([(f.name, f.per, f.group, f.unit, f.meaning) for f in FIELDS])
+    return _in_two_parts(
+        [[(f.name, f.per, f.group, f.unit, f.meaning) for f in fields] for fields in (FIELDS, TOPIC_FIELDS)]
+    )
+
+
+def _in_two_parts(parts: list[list[tuple[str, ...]]]) -> str:
+    """Rows that every environment has, then those that come with several topics, in the same columns."""
+    lines = columns([row for rows in parts for row in rows]).split("\n")
+    return "\n".join([*lines[: len(parts[0])], "  -- with several topics besides --", *lines[len(parts[0]) :]])
 
 
 def _list_traces() -> str:

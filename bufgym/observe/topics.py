@@ -208,7 +208,7 @@ def observe_topic_context(buffer: Buffer, arrival: Any, arriving: bool, context:
         context[ARRIVAL_TIME_GAP] = squash(arrival.arrival_us - buffer.previous_us, even_us)
         context[ARRIVAL_MOTION_GAP] = squash(arrival.x - buffer.previous_x, even_x)
         gain = value(v, even_x)
-        context[EVEN_VALUE] = gain
+        context[EVEN_VALUE] = topic.weight * gain / max(largest(buffer)[1], TINY)
         context[BEND] = min(merging_loss(v, even_x, gain, even_x, gain) / max(gain, TINY), 1.0)
     context[BUSY] = buffer.busy
     context[LEFT] = buffer.left_fraction

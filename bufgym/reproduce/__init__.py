@@ -1,8 +1,8 @@
-"""The AFR paper's figures and theorems again: our number beside the paper's.
+"""The AFR and Robofleet papers' figures, tables and theorems again: our number beside the paper's.
 
 ``run("afr-fig5", Path("out"))`` returns a text to print and saves the numbers (CSV) and the figure (PNG) under ``out``.
-Each figure is one file, imported only when it is asked for. The numbers need nothing beyond bufgym; the figure needs
-matplotlib, which comes with ``bufgym[plot]``.
+Each figure is one file, imported only when it is asked for. The numbers need nothing beyond bufgym (those of
+robofleet-table1 its extra ``robofleet``); the figure needs matplotlib, which comes with ``bufgym[plot]``.
 """
 
 from __future__ import annotations
@@ -23,6 +23,14 @@ FIGURES: dict[str, str] = {
     "afr-fig8-gap": "AFR paper, Fig. 8, by motion gaps: runs in which tracking would fail, over car_0002",
     "afr-theorems": "AFR paper, Theorems 1-3: AFR against oracle-ideal for every L, T and V",
     "afr-fig9": "AFR paper, Fig. 9: time of one decision of each built-in policy, on this machine",
+    "robofleet-table1": (
+        "Robofleet paper, Table I: bytes of a message as ROS binary, flatbuffer and JSON, really encoded"
+    ),
+    "robofleet-fig3": "Robofleet paper, Fig. 3: latency and throughput against the publish rate, n_T = 1 and no_drop",
+    "robofleet-fig4": "Robofleet paper, Fig. 4: recovery after a dropout, beside rosbridge and native ROS",
+    "robofleet-fig5": "Robofleet paper, Fig. 5: latency and throughput while capacity falls from 100 to 4 Mbit/s",
+    "robofleet-fig6": "Robofleet paper, Fig. 6: latency against the number of consumers, beside native ROS",
+    "robofleet-fig7": "Robofleet paper, Fig. 7: latency of each topic in a bad zone, beside rosbridge and native ROS",
 }
 """Name -> what it shows, in one line."""
 

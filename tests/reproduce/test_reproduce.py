@@ -24,15 +24,24 @@ SMALL: dict[str, dict[str, Any]] = {
     },
     "afr-theorems": {"max_capacity": 4, "last_T": 40},
     "afr-fig9": {"decisions": 1000, "calls": 100},
+    "robofleet-table1": {"points": 50},
+    "robofleet-fig3": {"rates_hz": (5, 100), "duration_s": 0.5, "runs": 1},
+    "robofleet-fig4": {"dropouts_s": (1,), "links_mbit_per_s": (100,), "kinds": ("CompressedImage",), "runs": 2},
+    "robofleet-fig5": {"fall_s": 3, "stay_s": 1, "runs": 1},
+    "robofleet-fig6": {"points": (100,), "max_consumers": 2, "duration_s": 2, "runs": 1},
+    "robofleet-fig7": {"bad_from": 10, "bad_s": 2, "after_s": 1, "bad_mbit_per_s": (1,), "runs": 1},
 }
 """Options that keep each figure short; a new figure must add its own."""
+
+NEEDS_LIBRARIES = {"robofleet-table1": ("rosbags", "flatbuffers")}
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_saves_its_numbers_and_its_figure(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("matplotlib")
+    for library in ("matplotlib", *NEEDS_LIBRARIES.get(name, ())):
+        pytest.importorskip(library)
     if not JIT:
         from bufgym.reproduce import afr_fig5
 
