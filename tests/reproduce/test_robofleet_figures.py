@@ -1,0 +1,323 @@
+"""Robofleet's Fig. 3 to 7: cases worked by hand, the paper's claims where they hold here, and options."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bufgym.errors import BufgymError
+from bufgym.reproduce import robofleet_fig3, robofleet_fig4, robofleet_fig5, robofleet_fig6, robofleet_fig7, run
+from bufgym.reproduce.report import Report
+from bufgym.reproduce.robofleet_evaluation import BYTES, Sent, cloud_bytes, meet, stream
+from bufgym.reproduce.robofleet_fig4 import length_for, recovery_s
+from bufgym.reproduce.robofleet_table1 import PAPER
+from bufgym.scenario import Stream
+from bufgym.topics import Topic
+from bufgym.traces import Trace
+
+NAMES = [f"robofleet-fig{k}" for k in range(3, 8)]
+
+
+def table(made: Report) -> list[dict[str, Any]]:
+    return [dict(zip(made.header, row, strict=True)) for row in made.rows]
+
+
+def mean(rows: list[dict[str, Any]], column: str, **where: Any) -> float:
+    # Floats stand in the table as text, with every digit.
+    wanted = {name: repr(given) if isinstance(given, float) else given for name, given in where.items()}
+    found = [float(row[column]) for row in rows if all(row[name] == given for name, given in wanted.items())]
+    assert found, where
+    return float(np.mean(found))
+
+
+# --- worked by hand --------------------------------------------------------------------------------------------------
+
+TEN_HZ = Stream(Topic("scan"), 10, 12_500, jitter=0, encodings={"ros": 12_500, "json": 37_500})
+"""12.5 ms over 1 MB/s, 37.5 ms as JSON."""
+DROPOUT = Trace.steps([(1.05, 1e6), (1, 0), (20, 1e6)], after="hold")
+"""No link from 1.05 to 2.05 s."""
+
+
+def after_dropout(name: str, **options: Any) -> Sent:
+    return meet(name, (TEN_HZ,), DROPOUT, 5, round_trip_ms=20, **options)
+
+
+def received(sent: Sent, first: int, last: int) -> list[float]:
+    """Of messages ``first`` to ``last``, s; NaN where dropped."""
+    return [round(float(at_s), 6) for at_s in sent.received_s[first : last + 1]]
+
+
+def test_robofleet_over_a_dropout_of_a_second() -> None:
+    sent = after_dropout("robofleet")
+    # 12.5 ms of link and 10 ms to the server.
+    assert received(sent, 0, 10) == [round(0.1 * k + 0.0225, 6) for k in range(11)]
+    # Message 11 is on its way when the link goes; it crosses at 2.0625. Its pong comes at 2.0825, and then message 20
+    # goes, which has overwritten 12 to 19: crosses 2.095, pong 2.115. Message 21 waits for that from 2.1 on.
+    assert received(sent, 11, 11) == [2.0725]
+    assert all(math.isnan(at_s) for at_s in received(sent, 12, 19))
+    assert received(sent, 20, 22) == [2.105, 2.1375, 2.2225]
+    # Nominal 22.5 ms; within 45 ms from message 21 on (37.5 ms), not yet message 20 (105 ms).
+    assert recovery_s(sent, 1.05, 2.05, 2) == pytest.approx(2.1375 - 2.05)
+    # Within 1.5 times, 33.75 ms, only from message 22 on.
+    assert recovery_s(sent, 1.05, 2.05, 1.5) == pytest.approx(2.2225 - 2.05)
+
+
+def test_rosbridge_over_the_same_dropout() -> None:
+    sent = after_dropout("rosbridge")
+    # Nothing is dropped: message 11 + j leaves 37.5 ms x (j + 1) after the link's return, until they come slower.
+    backlog = [round(2.05 + 0.0375 * (j + 1) + 0.01, 6) for j in range(16)]
+    assert received(sent, 11, 26) == backlog
+    assert not np.isnan(sent.received_s).any()
+    # Nominal 47.5 ms. Latency 0.9975 - 0.0625 j falls to 95 ms at j = 14.44: message 26 is the first within.
+    assert recovery_s(sent, 1.05, 2.05, 2) == pytest.approx(backlog[15] - 2.05)
+    assert backlog[15] - 2.05 == pytest.approx(0.61)
+
+
+def test_native_ros_keeps_its_queue() -> None:
+    sent = after_dropout("ros-native", queue_size=3)
+    # Message 11 is on its way; of 12 to 20 the last three wait. Nobody waits for pongs.
+    assert received(sent, 11, 11) == [2.0725]
+    assert all(math.isnan(at_s) for at_s in received(sent, 12, 17))
+    assert received(sent, 18, 21) == [2.085, 2.0975, 2.11, 2.1225]
+    # 110 ms for message 20, 22.5 for message 21, which arrives at 2.1 with the socket just free.
+    assert recovery_s(sent, 1.05, 2.05, 2) == pytest.approx(2.1225 - 2.05)
+
+
+def test_no_drop_queues_all_and_is_paced_by_pongs() -> None:
+    sent = after_dropout("no-drop")
+    assert not np.isnan(sent.received_s).any()
+    # One per 12.5 + 20 ms from 2.05 + 0.0125 on.
+    assert received(sent, 11, 14) == [round(2.0725 + 0.0325 * k, 6) for k in range(4)]
+
+
+def test_a_link_that_stays_away_is_never_recovered_from() -> None:
+    gone = Trace.steps([(1.05, 1e6), (1, 0), (1, 100_000)], after="hold")  # 1 Mbit/s short of what JSON needs
+    sent = meet("rosbridge", (TEN_HZ,), gone, 5, round_trip_ms=20)
+    assert recovery_s(sent, 1.05, 2.05, 2) == math.inf
+    with pytest.raises(BufgymError, match="nothing was received before the dropout"):
+        recovery_s(sent, 0.01, 2.05, 2)
+
+
+def test_copies_follow_one_another() -> None:
+    steady = Trace.constant(1e6, 10)
+    sent = meet("ros-native", (TEN_HZ,), steady, 1, round_trip_ms=20, consumers=3)
+    assert sent.consumer.tolist() == [0, 1, 2] * 10
+    assert np.round(sent.latency_s[:3], 6).tolist() == [0.0225, 0.035, 0.0475]
+    one = meet("robofleet", (TEN_HZ,), steady, 1, round_trip_ms=20, consumers=3)
+    assert np.round(one.latency_s, 6).tolist() == [0.0225] * 10
+
+
+def test_what_became_of_messages_is_told_apart() -> None:
+    sent = Sent(
+        np.array([0, 1, 0, 1]), np.zeros(4, int), np.array([0.0, 1.0, 2.0, 3.0]), np.array([0.5, np.nan, 3.5, 3.2])
+    )
+    assert sent.got.arrival_s.tolist() == [0.0, 3.0, 2.0]  # in the order of receipt
+    assert sent.on(0).got.latency_s.tolist() == [0.5, 1.5]
+    assert len(sent.between(1, 3)) == 2
+    assert sent.received_hz(2) == 0.5
+
+
+def test_the_length_for_a_ratio_lies_between_the_measured_ones() -> None:
+    assert length_for((1, 2, 4), (1.0, 3.0, 7.0)) == "3 s"
+    assert length_for((1, 2), (6.0, 12.0)) == "< 1 s"
+    assert length_for((1, 2), (1.0, 2.0)) == "> 2 s"
+    assert length_for((1, 2), (math.inf, math.inf)) == "none"
+
+
+# --- sizes -----------------------------------------------------------------------------------------------------------
+
+
+def test_sizes_are_table1s() -> None:
+    assert {kind: sizes for kind, sizes in PAPER.items() if kind in BYTES} == {
+        kind: sizes for kind, sizes in BYTES.items() if kind in PAPER
+    }
+    pytest.importorskip("rosbags")
+    pytest.importorskip("flatbuffers")
+    from bufgym.reproduce.encodings import sizes
+
+    for points in (100, 10_000):
+        made = sizes("PointCloud2", points=points)
+        ros, flatbuffer, json = cloud_bytes(points)
+        assert (ros, flatbuffer) == (made["ros1"], made["robofleet"])
+        assert json == pytest.approx(made["json-numbers"], rel=0.1 if points == 100 else 0.001)
+    made = sizes("PoseStamped")
+    assert (made["ros1"], made["robofleet"], made["json-numbers"]) == BYTES["PoseStamped"]
+
+
+def test_streams_have_the_sizes_of_every_sender() -> None:
+    made = stream("LaserScan", 10, priority=3)
+    assert (made.size_bytes, made.encodings, made.topic.priority) == (7_328, {"ros": 7_260, "json": 28_000}, 3)
+
+
+# --- the paper's claims ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_fig3_backpressure_keeps_latency_low_and_no_drop_does_not() -> None:
+    made = robofleet_fig3.report(rates_hz=(10, 100), duration_s=5, runs=2)
+    rows = table(made)
+
+    def latency_ms(sender: str, hz: float) -> float:
+        return mean(rows, "latency_ms", sender=sender, publish_hz=hz)
+
+    assert latency_ms("robofleet", 100) < 2 * latency_ms("robofleet", 10)
+    assert latency_ms("no-drop", 100) > 30 * latency_ms("no-drop", 10)
+    assert latency_ms("no-drop-released", 100) > 10 * latency_ms("no-drop-released", 10)
+    # Fewer messages: 100 Mbit/s take 12.83 ms for 160,344 bytes; with a round trip of 10 ms 43.8 a second.
+    assert mean(rows, "received_hz", sender="robofleet", publish_hz=100) == pytest.approx(43.8, abs=0.5)
+    assert mean(rows, "dropped", sender="robofleet", publish_hz=10) == 0
+    assert mean(rows, "dropped", sender="no-drop", publish_hz=100) == 0
+    assert made.text.count("holds here") == 2
+    assert "cannot be tested up to 10 Hz" in robofleet_fig3.report(rates_hz=(5, 10), duration_s=1, runs=1).text
+
+
+@pytest.mark.slow
+def test_fig4_the_ratio_grows_with_the_dropout() -> None:
+    made = robofleet_fig4.report((2, 20), (50,), ("LaserScan", "PointCloud2"), runs=2, shown_s=2)
+    rows = table(made)
+
+    def took_s(kind: str, dropout: float, sender: str) -> float:
+        return mean(rows, "recovery_s", message=kind, dropout_s=dropout, sender=sender)
+
+    for kind, load in (("LaserScan", 28_000 * 10 / 6.25e6), ("PointCloud2", 562_376 * 5 / 6.25e6)):
+        short, long = (took_s(kind, d, "rosbridge") / took_s(kind, d, "robofleet") for d in (2, 20))
+        assert 1 < short < long / 4
+        # Rosbridge's backlog: dropout x load / (1 - load), to within a few messages.
+        expected = 20 * load / (1 - load)
+        assert took_s(kind, 20, "rosbridge") == pytest.approx(expected, rel=0.15)
+        # Robofleet is back after a few messages, whatever the length.
+        assert took_s(kind, 20, "robofleet") < 0.5
+        assert took_s(kind, 20, "robofleet") == pytest.approx(took_s(kind, 2, "robofleet"), abs=0.1)
+        assert took_s(kind, 20, "ros-native") < took_s(kind, 20, "rosbridge") / 5
+    assert "Native ROS is nearer to Robofleet in 4 of 4 cells" in made.text
+
+
+@pytest.mark.slow
+def test_fig4_a_silence_delays_both() -> None:
+    quick, silent = (table(robofleet_fig4.report((5,), (50,), ("LaserScan",), silence_s=s, runs=1)) for s in (0.0, 2.0))
+    for before, after in zip(quick, silent, strict=True):
+        assert float(after["recovery_s"]) == pytest.approx(float(before["recovery_s"]) + 2, abs=0.3)
+
+
+@pytest.mark.slow
+def test_fig5_low_latency_is_bought_with_fewer_messages() -> None:
+    made = robofleet_fig5.report(runs=1)
+    rows = table(made)
+    highest = {s: max(float(r["max_latency_s"]) for r in rows if r["sender"] == s) for s in robofleet_fig5.SENDERS}
+    # 160,344 bytes at 4 Mbit/s are 0.32 s; the message that goes is at most a period of 33 ms old.
+    assert 0.32 < highest["robofleet"] < 0.37
+    assert highest["no-drop"] > 5
+    total = sum(int(r["received"]) for r in rows if r["sender"] == "robofleet")
+    assert total < 0.75 * 30 * 20
+    # Capacity is a line: in its first second 96.8 Mbit/s in the middle, 4 at the end.
+    link = [float(r["link_mbit_per_s"]) for r in rows if r["sender"] == "robofleet"]
+    assert (link[0], link[-1]) == (pytest.approx(96.8), 4.0)
+    assert "bought with fewer messages: holds here" in made.text
+
+
+def test_fig6_native_ros_grows_with_the_consumers_and_robofleet_does_not() -> None:
+    made = robofleet_fig6.report(points=(1_500,), max_consumers=4, duration_s=10, queue_sizes=(10,), runs=1)
+    rows = table(made)
+    native, own = (
+        [mean(rows, "mean_latency_s", sender=s, consumers=n) for n in (1, 2, 3, 4)] for s in ("ros-native", "robofleet")
+    )
+    # 24,111 bytes at 12 Mbit/s are 16.07 ms: the mean of n copies is (n + 1) / 2 of these, and 5 ms to the server.
+    assert native == pytest.approx([0.005 + 0.016074 * (n + 1) / 2 for n in (1, 2, 3, 4)], abs=1e-4)
+    assert own == pytest.approx([0.005 + 24_344 / 1.5e6] * 4, abs=1e-4)
+    assert made.text.count("holds here") == 2
+
+
+@pytest.mark.slow
+def test_fig6_says_when_copies_exceed_the_link() -> None:
+    made = robofleet_fig6.report(points=(10_000,), max_consumers=4, duration_s=20, runs=1)
+    assert "the link carries 1 of 4 copies" in made.text
+    rows = table(made)
+    assert mean(rows, "received_share", sender="ros-native", consumers=4) < 0.8
+    assert mean(rows, "least_received_share", sender="ros-native", consumers=4) < 0.3
+    assert mean(rows, "received_share", sender="robofleet", consumers=4) == 1
+
+
+@pytest.mark.slow
+def test_fig7_no_drop_is_kept_and_images_go() -> None:
+    made = robofleet_fig7.report(bad_mbit_per_s=(1.0,), image_priorities=(1.0, 0.01), bad_from=100, after_s=10, runs=1)
+    rows = table(made)
+
+    def in_zone(sender: str, topic: str, column: str, priority: float = 1.0) -> float:
+        return mean(rows, column, sender=sender, topic=topic, image_priority=priority)
+
+    assert in_zone("robofleet", "PoseStamped", "lost") == 0
+    assert in_zone("robofleet", "CompressedImage", "lost_in_zone") > 10
+    assert in_zone("robofleet", "CompressedImage", "arrived_in_zone") == pytest.approx(60, abs=1)
+    # 75,224 bytes take 0.6 s; a pose waits for one image at most, and for what else of it goes first.
+    assert in_zone("robofleet", "PoseStamped", "p95_in_zone_ms") < 800
+    # A scan takes 59 ms itself, and only the newest is sent.
+    assert in_zone("robofleet", "LaserScan", "median_in_zone_ms") < 200
+    assert in_zone("robofleet", "CompressedImage", "lost_in_zone", 0.01) > in_zone(
+        "robofleet", "CompressedImage", "lost_in_zone"
+    )
+    for topic in robofleet_fig7.TOPICS:
+        assert in_zone("rosbridge", topic, "median_in_zone_ms") > 20 * in_zone(
+            "robofleet", "PoseStamped", "median_in_zone_ms"
+        )
+    assert "no_drop is never lost: holds here (0 poses" in made.text
+
+
+# --- options ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("option", "given", "rule"),
+    [
+        ("runs", 0, "runs = 0: must be a whole number >= 1"),
+        ("runs", True, "runs = True: must be a whole number >= 1"),
+        ("round_trip_ms", -1, "round_trip_ms = -1: must be a number >= 0"),
+        ("round_trip_ms", math.nan, "round_trip_ms = nan: must be a number >= 0"),
+    ],
+)
+def test_options_of_all_are_checked(name: str, option: str, given: Any, rule: str) -> None:
+    with pytest.raises(BufgymError) as refused:
+        run(name, **{option: given})
+    assert rule in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("report", "options", "rule"),
+    [
+        (robofleet_fig3.report, {"rates_hz": ()}, "rates_hz = (): need at least one number"),
+        (robofleet_fig3.report, {"rates_hz": (10, 0)}, "rates_hz = 0: must be a number > 0"),
+        (robofleet_fig3.report, {"points": 0}, "points = 0: must be a whole number from 1"),
+        (robofleet_fig3.report, {"mbit_per_s": -1}, "mbit_per_s = -1: must be a number > 0"),
+        (robofleet_fig4.report, {"dropouts_s": 5}, "dropouts_s = 5: need at least one number"),
+        (robofleet_fig4.report, {"kinds": ("Laser",)}, "must be some of PointCloud2, CompressedImage, LaserScan"),
+        (robofleet_fig4.report, {"factor": 1}, "factor = 1: must be above 1"),
+        (robofleet_fig4.report, {"shown_s": 3}, "shown_s = 3: must be one of dropouts_s"),
+        (robofleet_fig4.report, {"silence_s": -1}, "silence_s = -1: must be a number >= 0"),
+        (robofleet_fig5.report, {"rate_hz": 0}, "rate_hz = 0: must be a number > 0"),
+        (robofleet_fig5.report, {"fall_s": 1, "stay_s": 0}, "fall_s + stay_s = 1: must be at least 2"),
+        (robofleet_fig6.report, {"max_consumers": 1}, "max_consumers = 1: must be a whole number from 2 to 100"),
+        (robofleet_fig6.report, {"points": 5}, "points = 5: need at least one number of points"),
+        (robofleet_fig6.report, {"queue_sizes": (0,)}, "queue_sizes = 0: must be a number > 0"),
+        (robofleet_fig6.report, {"queue_sizes": (1.5,)}, "queue_sizes = 1.5: must be a whole number >= 1"),
+        (robofleet_fig7.report, {"bad_from": 0}, "bad_from = 0: must be a whole number >= 1"),
+        (robofleet_fig7.report, {"bad_mbit_per_s": (0,)}, "bad_mbit_per_s = 0: must be a number > 0"),
+        (robofleet_fig7.report, {"shown_mbit_per_s": 3}, "shown_mbit_per_s = 3: must be one of bad_mbit_per_s"),
+    ],
+)
+def test_unusable_options_are_refused(report: Callable[..., Report], options: dict[str, Any], rule: str) -> None:
+    with pytest.raises(BufgymError) as refused:
+        report(**options)
+    assert rule in str(refused.value)
+
+
+def test_the_same_seeds_make_the_same_rows() -> None:
+    options: dict[str, Any] = {"rates_hz": (60,), "duration_s": 1, "runs": 2}
+    first, again = (robofleet_fig3.report(**options) for _ in range(2))
+    assert first.rows == again.rows
+    assert first.header[:3] == ["sender", "publish_hz", "run"]
+    by_run = [row[3] for row in first.rows[:2]]
+    assert by_run[0] != by_run[1]  # jitter
