@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 RIVAL = "robofleet"
 
-CONTEXT = ("occupancy", "stalled", "drain")
+CONTEXT = ("occupancy", "stalled", "drain", "left", "in_flight")
 SLOT = (
     *("rank", "time_merged", "motion_merged", "loss", "relative_loss", "size", "priority", "weight", "no_drop"),
     *("own", "waited", "silence", "lateness", "queued", "gain", "gain_per_byte"),
@@ -55,7 +55,7 @@ SLOT = (
 FIELDS = CONTEXT + SLOT
 """What the agent reads."""
 
-PARTS, EPISODES, EPISODE_S = 8, 2, 30.0
+PARTS, EPISODES, EPISODE_S = 12, 1, 30.0
 """Training episodes come in so many parts, one a generation in turn: so many a setting of the suite, so long."""
 POPULATION, SIGMA, MEMORY = 16, 1.0, 10
 """Candidates a generation, first step size, generations over which the mean is averaged."""
@@ -207,7 +207,7 @@ def train(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> tuple
     saved = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
     suite = arguments.suite
     yards = [grounds(suite, "train", 1000 * seed + part, EPISODES, EPISODE_S) for part in range(PARTS)]
-    judges = grounds(suite, "validation", VALIDATION_SEED, 12)
+    judges = grounds(suite, "validation", VALIDATION_SEED, 6)
     begin = to_vector(start())
     if saved.exists():
         search, best, validated = pickle.loads(saved.read_bytes())

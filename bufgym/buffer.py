@@ -51,7 +51,7 @@ TOPIC = np.dtype(
         ("taken_us", np.int64),  # arrival time of the one taken last
         ("taken_x", np.float64),
         ("sent_us", np.int64),  # when the socket took it
-        # what the server has of it
+        # what the server has of it: for who counts, not known on board
         ("received", np.int64),
         ("newest_us", np.int64),  # arrival time of the newest received
         ("aged_us", np.int64),  # until when its age has been counted

@@ -245,10 +245,12 @@ def _with_dropouts(trace: Trace, seed: int) -> Trace:
 
 CLIENT_MEANS = {"scarce": 0.5e6, "half": 1.2e6, "ample": 2.5e6}
 """Bytes/s of the link while it is up; the example client wants 2.8 MB/s once rates are limited."""
+CLIENT_WINDOWS = {"": 1, "-window-5": 5}
+"""n_T of Robofleet's experiments, where a pong may take longer than a message, and of its released client."""
 
 
 def _topics(split: str, data: Path | None) -> dict[str, Setting]:
-    """Robofleet's example client over LTE links with dropouts, at three mean capacities."""
+    """Robofleet's example client over LTE links with dropouts, at three mean capacities and two n_T."""
     first, modes = _FIRST_SEED[split], list(LTE_MODES)
     settings = {}
     for number, (label, mean) in enumerate(CLIENT_MEANS.items()):
@@ -258,7 +260,9 @@ def _topics(split: str, data: Path | None) -> dict[str, Setting]:
             for k, seed in enumerate(seeds)
         ]
         client = Client(robofleet_example(), tuple(links), _motions(split), duration_s=EPISODE_S)
-        settings[label] = Setting(client, f"Robofleet's example client over LTE with dropouts, {mean / 1e6:g} MB/s")
+        for suffix, window in CLIENT_WINDOWS.items():
+            about = f"Robofleet's example client over LTE with dropouts, {mean / 1e6:g} MB/s, n_T = {window}"
+            settings[label + suffix] = Setting(replace(client, window=window), about)
     return settings
 
 

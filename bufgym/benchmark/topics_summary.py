@@ -37,8 +37,10 @@ class Standing:
     """Messages of no_drop topics that were dropped, in all episodes together."""
     age_first_s: Interval
     """Mean age of information of the topics with the highest priority, s."""
+    age_relative: Interval
+    """The same relative to the baseline's: sum / sum over the episodes that both met."""
     age_others_s: Interval
-    """The same of all others."""
+    """Mean age of information of all other topics, s."""
     late: Interval
     """Of the messages delivered on topics with a deadline, the share that came after it."""
     rate_hz: Interval
@@ -166,6 +168,7 @@ def _statistics(runs: Any, base: Any, weights: Numbers) -> dict[str, Numbers]:
         "relative": share(runs.qoi, base.qoi),
         "lost": weights @ runs.lost,
         "age_first_s": average(runs.age_first),
+        "age_relative": share(runs.age_first, base.age_first),
         "age_others_s": average(runs.age_others),
         "late": share(runs.late, runs.due),
         "rate_hz": share(runs.delivered, runs.seconds),
@@ -194,6 +197,7 @@ def plain(found: Summary, abouts: Mapping[str, str] | None = None) -> str:
         f"QoI / {found.baseline}",
         "no_drop lost",
         f"age, {first} (s)",
+        f"age / {found.baseline}",
         "age, others (s)",
         "late",
         "msg/s",
@@ -226,7 +230,8 @@ def _cells(standing: Standing) -> list[str]:
         f"{standing.qoi.value:.1f}",
         _with_interval(standing.relative, ".3f"),
         f"{standing.lost:g}",
-        _with_interval(standing.age_first_s, ".2f"),
+        "-" if math.isnan(standing.age_first_s.value) else f"{standing.age_first_s.value:.2f}",
+        _with_interval(standing.age_relative, ".3f"),
         _with_interval(standing.age_others_s, ".2f"),
         "-" if math.isnan(standing.late.value) else f"{standing.late.value:.1%}",
         "-" if math.isnan(standing.rate_hz.value) else f"{standing.rate_hz.value:.1f}",

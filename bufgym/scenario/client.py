@@ -59,6 +59,8 @@ class Stream:
             for name, most in (("jitter", 1), ("size_cv", 10)):
                 if not is_number(getattr(self, name)) or not 0 <= getattr(self, name) <= most:
                     raise BufgymError(f"{name} = {getattr(self, name)!r}: must lie between 0 and {most}")
+            if not isinstance(self.moves, bool):
+                raise BufgymError(f"moves = {self.moves!r}: must be true or false")
             for name, size in self.encodings.items():
                 if name not in ENCODINGS:
                     raise BufgymError(f"unknown encoding {name!r}; known: {', '.join(ENCODINGS)}")
@@ -269,7 +271,10 @@ def _stream(table: Mapping[str, Any]) -> Stream:
             raise BufgymError(f"topic {name!r}: {key} is missing")
     topic = {key: table[key] for key in table if key in _TOPIC_KEYS}
     if "value" in table:
-        topic["value"] = qoi.parse(str(table["value"]))
+        try:
+            topic["value"] = qoi.parse(str(table["value"]))
+        except BufgymError as error:
+            raise BufgymError(f"topic {name!r}: {error}") from None
     encodings = table.get("encodings", {})
     if not isinstance(encodings, Mapping):
         raise BufgymError(f"topic {name!r}: encodings = {encodings!r}: must be a table of bytes by encoding")

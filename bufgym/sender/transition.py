@@ -329,6 +329,9 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         if sender.topics > 1:
             arrival.gain = topic_gain(batch, i, sender.occupancy, arrival.topic, arrival.x)
             topic = batch.topics[i, arrival.topic]
+            if topic.taken + topic.queued == 0:
+                # until one is sent, spacing counts from here
+                topic.taken_us, topic.taken_x = arrival.arrival_us, arrival.x
             topic.queued += 1
             topic.kept_us = arrival.arrival_us
         elif sender.taken > 0 or sender.occupancy > 0:

@@ -1,0 +1,285 @@
+"""The benchmark of topics: rows of an episode worked by hand, statistics of rows made by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bufgym import policies, qoi, suites
+from bufgym.benchmark import topics
+from bufgym.benchmark.bootstrap import Interval
+from bufgym.benchmark.rows import Row, read_rows, write_rows
+from bufgym.benchmark.topics import ROWS, client_parts, default_policies, run, run_parts, suite_parts
+from bufgym.benchmark.topics_summary import by_topic, plain, summary
+from bufgym.errors import BufgymError
+from bufgym.metrics import TopicOutcome
+from bufgym.scenario import Client, Interruption, Stream
+from bufgym.topics import Topic
+from bufgym.traces import Trace
+
+POSE = Stream(Topic("pose", priority=3, deadline_s=0.5), rate_hz=2, size_bytes=100, jitter=0)
+MAP = Stream(Topic("map", no_drop=True), rate_hz=1, size_bytes=1000, jitter=0)
+CLIENT = Client(
+    (POSE, MAP),
+    (Trace.constant(1000.0, 60.0, name="1 kB/s"),),
+    duration_s=2.0,
+    random_offset=False,
+    propagation_us=0,
+    value=qoi.exponential(0.618),
+)
+"""Poses at 0, 0.5, 1 and 1.5 s that take 0.1 s each, maps at 0 and 1 s that take 1 s each."""
+
+
+def met(policy: str, client: Client = CLIENT, capacity: int = 16) -> dict[str, Row]:
+    """The rows of one run by topic."""
+    return {row["topic"]: row for row in run([policies.get(policy)], client, [capacity], 1, label="hand")}
+
+
+def test_rows_of_an_episode_worked_by_hand() -> None:
+    """First in, first out: pose 0 crosses at 0.1 s, map 0 at 1.1, poses 1 and 2 at 1.2 and 1.3, map 1 at 2.3, pose 3
+    at 2.4. Poses take 0.1, 0.7, 0.3 and 0.9 s from their arrival, maps 1.1 and 1.3 s."""
+    rows = met("fifo")
+    pose, map_ = rows["pose"], rows["map"]
+    assert tuple(pose) == ROWS.columns
+    key = {"scenario": "hand", "trace": "1 kB/s", "seed": 0, "window": 1, "consumers": 1, "policy": "fifo"}
+    assert key.items() <= pose.items() and {"capacity": 16, "priority": 3.0, "weight": 3.0}.items() <= pose.items()
+    assert (pose["no_drop"], map_["no_drop"]) == (False, True)
+    assert (pose["deadline_s"], map_["deadline_s"]) == (0.5, None)
+    assert (pose["arrived"], pose["delivered"], pose["late"]) == (4, 4, 2)
+    assert (map_["arrived"], map_["delivered"], map_["late"], map_["bytes_delivered"]) == (2, 2, 0, 2000)
+    assert pose["mean_sojourn_s"] == pytest.approx(0.5) and map_["mean_sojourn_s"] == pytest.approx(1.2)
+    # x counts the messages: each further one is worth 1 - 0.618.
+    assert pose["qoi"] == pytest.approx(1 + 3 * 0.382) and map_["qoi"] == pytest.approx(1 + 0.382)
+    assert pose["weighted_qoi"] == map_["weighted_qoi"] == pytest.approx(3 * 2.146 + 1.382)
+    assert pose["seconds"] == map_["seconds"] == 2.4
+    # Until the last arrival at 1.5 s: the age of poses grows to 1.2, falls to 0.7, at 1.3 to 0.3; that of maps to 1.5.
+    assert pose["mean_age_s"] == pytest.approx((1.2**2 / 2 + 0.075 + 0.08) / 1.5)
+    assert (pose["peak_age_s"], map_["peak_age_s"]) == pytest.approx((1.2, 1.5))
+    assert map_["mean_age_s"] == pytest.approx(0.75)
+
+
+def test_copies_are_folded_back_into_their_topic() -> None:
+    """Two consumers, whose connections take turns. Poses to the first cross at 0.1, 1.2, 3.4 and 4.6 s, to the second
+    at 1.3, 3.5, 4.7 and 4.8, with a map before or between: 1.575 s a pose to the one, 2.825 s to the other."""
+    rows = met("ros-native", replace(CLIENT, consumers=2))
+    assert list(rows) == ["pose", "map"]
+    assert rows["pose"]["consumers"] == 2 and rows["pose"]["seconds"] == 4.8
+    assert rows["pose"]["mean_sojourn_s"] == pytest.approx((1.575 + 2.825) / 2)
+    assert (rows["pose"]["arrived"], rows["pose"]["delivered"]) == (4, 4)
+    # Both get all of it: the weights of the copies add up to the topic's.
+    assert rows["pose"]["weighted_qoi"] == pytest.approx(3 * 2.146 + 1.382)
+    # One in all for a policy that sends no copies.
+    assert met("fifo", replace(CLIENT, consumers=2))["pose"]["seconds"] == 2.4
+
+
+def test_folding_takes_means_of_what_is_known() -> None:
+    one = TopicOutcome("a to 1", 2.0, 10, 2, 1, 7, 0, 200, 0.5, 0.9, 1.0, 4.0, 1)
+    other = replace(one, topic="a to 2", qoi=3.0, delivered=3, lost=6, mean_sojourn_s=math.nan, late=0)
+    folded = topics._folded([one, other])
+    assert (folded["qoi"], folded["delivered"], folded["lost"], folded["late"]) == (2.5, 2.5, 6.5, 0.5)
+    assert repr(folded["arrived"]) == "10"
+    assert folded["mean_sojourn_s"] == 0.5
+
+
+def test_a_full_buffer_and_a_rate_limit_show() -> None:
+    """L = 1: while map 0 crosses until 1.1 s, pose 1 waits, pose 2 takes its place, and map 1, no_drop, pose 2's.
+    Pose 3 waits from 1.5 s on while map 1 crosses."""
+    rows = met("fifo", capacity=1)
+    assert (rows["pose"]["lost"], rows["pose"]["delivered"]) == (2, 2)
+    assert (rows["map"]["lost"], rows["map"]["delivered"]) == (0, 2)
+    limited = replace(POSE, topic=replace(POSE.topic, rate_limit_hz=1))
+    rows = met("fifo", replace(CLIENT, streams=(limited, MAP)))
+    assert (rows["pose"]["limited"], rows["pose"]["lost"], rows["pose"]["delivered"]) == (2, 0, 2)
+
+
+def test_every_policy_and_capacity_meets_the_same_episodes() -> None:
+    traces = tuple(Trace.constant(rate, 60.0, name="steady") for rate in (800.0, 1600.0))
+    client = replace(CLIENT, traces=traces, streams=(replace(POSE, jitter=0.5), MAP), random_offset=True)
+    chosen = [policies.get(name) for name in ("fifo", "robofleet")]
+    rows = run(chosen, client, [2, 4], [7, 3])
+    assert len(rows) == 2 * 2 * 2 * 2 * 2  # traces, seeds, capacities, policies, topics
+    assert {row["trace"] for row in rows} == {"steady", "steady#2"} and {row["seed"] for row in rows} == {3, 7}
+    assert [repr(row) for row in run(chosen, client, [2, 4], [7, 3])] == [repr(row) for row in rows]
+    alone = run(chosen[1:], client, [4], [3])
+    assert [repr(row) for row in rows if (row["policy"], row["capacity"], row["seed"]) == ("robofleet", 4, 3)] == [
+        repr(row) for row in alone
+    ]
+
+
+def test_many_seeds_run_in_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = run([policies.get("fifo")], replace(CLIENT, random_offset=True), [4], 5)
+    monkeypatch.setattr("bufgym.benchmark.run._BATCH_MESSAGES", 12)
+    assert repr(run([policies.get("fifo")], replace(CLIENT, random_offset=True), [4], 5)) == repr(whole)
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_rows_come_back_to_the_last_bit(tmp_path: Path, ending: str) -> None:
+    if ending == "parquet":
+        pytest.importorskip("pyarrow")
+    # Under L = 2 with two consumers some counts are no whole numbers, and maps have no deadline.
+    rows = run([policies.get(name) for name in ("ros-native", "fifo")], replace(CLIENT, consumers=2), [2], 1)
+    assert any(row["delivered"] % 1 for row in rows)
+    path = write_rows(rows, tmp_path / f"rows.{ending}", ROWS)
+    assert [repr(row) for row in read_rows(path, ROWS)] == [repr(row) for row in rows]
+    assert read_rows(write_rows([], path, ROWS), ROWS) == []
+
+
+def test_a_suites_episodes_are_its_own() -> None:
+    suite = suites.get("topics-v1")
+    parts = suite_parts(suite, "validation", seeds=2, window=5)
+    labels = ("scarce", "scarce-window-5", "half", "half-window-5", "ample", "ample-window-5")
+    assert tuple(dict.fromkeys(part.scenario for part in parts)) == labels
+    assert {part.client.window for part in parts} == {5}
+    assert {len(part.client.traces) for part in parts} == {1}
+    # No two traces of a scenario share an episode's chance.
+    assert [list(part.seeds) for part in parts if part.scenario == "half"][:2] == [[0, 1], [1000, 1001]]
+    assert [len(part.seeds) for part in suite_parts(suite, "validation")] == [5] * len(parts)
+
+
+def test_who_runs_by_default() -> None:
+    names = default_policies()
+    assert {"robofleet", "robofleet-released", "ros-native", "rosbridge", "drop-oldest", "fifo", "edf"} <= set(names)
+    assert "afr" not in names and len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"policies": []}, "policies = []: need at least one"),
+        ({"capacities": []}, "capacities = []: need at least one"),
+        ({"seeds": 0}, "seeds = .*: need at least one"),
+        ({"policies": ["fifo", "fifo"]}, "'fifo' is given more than once"),
+        ({"client": Interruption()}, "Interruption: must be a bufgym.scenario.Client"),
+    ],
+)
+def test_bad_arguments_are_named(change: dict[str, Any], message: str) -> None:
+    given = {"policies": ["fifo"], "client": CLIENT, "capacities": [4], "seeds": 1, **change}
+    given["policies"] = [policies.get(name) for name in given["policies"]]
+    with pytest.raises(BufgymError, match=message.replace("[", r"\[")):
+        run(**given)
+
+
+def test_suites_of_one_queue_are_refused() -> None:
+    with pytest.raises(BufgymError, match="suite lte-v1 has one queue, not topics: bufgym bench --suite lte-v1"):
+        suite_parts(suites.get("lte-v1"), "test")
+
+
+# -------------------- the summary
+
+
+def made(policy: str, seed: int, weighted_qoi: float, scenario: str = "s", **first: Any) -> list[Row]:
+    """The rows of one run of 10 s with a topic of priority 5 (changed by ``first``), one of 1, and one no_drop."""
+    key = {"scenario": scenario, "trace": "t", "seed": seed, "policy": policy, "capacity": 4}
+    run = {"weighted_qoi": weighted_qoi, "seconds": 10.0, "impossible": 0}
+    rest = {"qoi": 1.0, "arrived": 9, "delivered": 4.0, "limited": 0.0, "lost": 0.0, "late": 0.0, "mean_age_s": 2.0}
+    rest |= {"peak_age_s": 3.0, "mean_sojourn_s": 0.5, "p95_sojourn_s": math.nan, "no_drop": False, "deadline_s": 1.0}
+    return [
+        {**key, "topic": "first", "priority": 5.0, **rest, **run, **first},
+        {**key, "topic": "second", "priority": 1.0, **rest, **run, "mean_age_s": 6.0, "lost": 5.0},
+        {**key, "topic": "kept", "priority": 1.0, **rest, **run, "no_drop": True, "deadline_s": None, "lost": 2.0},
+    ]
+
+
+def exactly(x: float) -> Interval:
+    """Of a statistic that every episode agrees on."""
+    return Interval(pytest.approx(x), pytest.approx(x), pytest.approx(x))
+
+
+HALF = [
+    row
+    for seed, h in enumerate((10.0, 40.0, 30.0))
+    for row in [*made("robofleet", seed, 2 * h), *made("mine", seed, h, mean_age_s=1.0, late=1.0)]
+]
+"""A policy that has half of the baseline's QoI in each episode, whatever the episode."""
+
+
+def test_a_summary_worked_by_hand() -> None:
+    found = summary(HALF)
+    base, mine = found.overall
+    assert (base.policy, mine.policy) == ("robofleet", "mine")
+    assert found.cells == {("s", 4): [base, mine]} and found.first == (5.0,)
+    # 80 / 160 in all, and half in every resample.
+    assert mine.relative == exactly(0.5) and base.relative == exactly(1.0)
+    assert mine.qoi.value == pytest.approx(80 / 3) and mine.qoi.low < 80 / 3 < mine.qoi.high
+    assert mine.age_first_s == exactly(1.0) and base.age_first_s == exactly(2.0)
+    # (6 + 2) / 2; two lost of the no_drop topic in each of three episodes, those of "second" do not count.
+    assert mine.age_others_s == exactly(4.0) and mine.lost == 6
+    # One late of 4 + 4 with a deadline; 12 delivered in 10 s.
+    assert mine.late == exactly(1 / 8) and base.late == exactly(0.0) and mine.rate_hz == exactly(1.2)
+
+
+def test_over_all_cells_it_is_the_mean_of_theirs() -> None:
+    more = [*made("robofleet", 0, 100.0, "other"), *made("mine", 0, 150.0, "other")]
+    found = summary([*HALF, *more])
+    assert list(found.cells) == [("s", 4), ("other", 4)]  # as in the rows
+    assert [standing.policy for standing in found.cells["other", 4]] == ["mine", "robofleet"]
+    (mine,) = (standing for standing in found.overall if standing.policy == "mine")
+    assert mine.relative == exactly((0.5 + 1.5) / 2) and mine.lost == 8
+    assert mine.age_first_s == exactly(1.5)
+
+
+def test_intervals_are_paired_and_repeatable() -> None:
+    rows = [
+        row
+        for seed, (base, mine) in enumerate([(10, 11), (100, 108), (50, 57), (20, 23)])
+        for row in [*made("robofleet", seed, base), *made("mine", seed, mine)]
+    ]
+    (mine, _) = summary(rows, seed=1).overall
+    assert summary(list(reversed(rows)), seed=1).overall == summary(rows, seed=1).overall
+    assert mine.relative.value == pytest.approx(199 / 180)
+    # No resample leaves the range of the single ratios, though the episodes differ tenfold.
+    assert 1.08 <= mine.relative.low < mine.relative.value < mine.relative.high <= 1.15
+
+
+def test_unknown_ages_are_left_out() -> None:
+    rows = [*made("robofleet", 0, 1.0, mean_age_s=math.nan), *made("robofleet", 1, 1.0, mean_age_s=3.0)]
+    assert summary(rows).overall[0].age_first_s == exactly(3.0)
+    same = [{**row, "priority": 1.0, "deadline_s": None} for row in made("robofleet", 0, 0.0)]
+    (standing,) = summary(same).overall
+    assert math.isnan(standing.age_others_s.value) and math.isnan(standing.late.value)
+    assert math.isnan(standing.relative.value)  # of nothing
+    assert "  -  " in plain(summary(same))
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([], "no rows to score"),
+        (HALF[3:6], "no row of the baseline 'robofleet'"),
+        (HALF[:-3], "mine at s, L = 4, trace t, seed 2: no row; every policy must meet the same episodes"),
+        ([HALF[0], HALF[0]], r"rows\[1\]: topic 'first' of one run has more than one row"),
+        ([{**HALF[0], "weighted_qoi": None}], r"rows\[0\]: no weighted_qoi"),
+    ],
+)
+def test_rows_that_cannot_be_summed_up(rows: list[Row], message: str) -> None:
+    with pytest.raises(BufgymError, match=message):
+        summary(rows)
+
+
+def test_unranked_policies_come_last() -> None:
+    rows = [*made("robofleet", 0, 1.0), *made("endless", 0, 9.0)]
+    assert [s.policy for s in summary(rows).overall] == ["endless", "robofleet"]
+    assert [s.policy for s in summary(rows, unranked=["endless"]).overall] == ["robofleet", "endless"]
+
+
+def test_the_tables_as_text() -> None:
+    lines = plain(summary(HALF), {"s": "a story"}).splitlines()
+    assert lines[0].split("  ")[0] == "policy" and "age, priority 5 (s)" in lines[0] and "QoI / robofleet" in lines[0]
+    assert lines[2] == "s: a story, L = 4"
+    assert lines[3].split()[:5] == ["robofleet", "53.3", "1.000", "[1.000,", "1.000]"]
+    assert lines[4].split()[-2:] == ["12.5%", "1.2"] and len(lines) == 5
+    lines = by_topic(HALF, "mine").splitlines()
+    assert lines[2] == "s, L = 4"
+    assert lines[3].split() == ["first", "5", "1.00", "9.0", "0.0", "0.0", "4.0", "1.0", "1.000", "3.000", "0.500", "-"]
+    with pytest.raises(BufgymError, match="no row of the policy 'nobody'"):
+        by_topic(HALF, "nobody")
+
+
+def test_run_parts_takes_several_clients() -> None:
+    parts = [*client_parts("a", CLIENT, 1), *client_parts("b", replace(CLIENT, scale=2.0), [5])]
+    rows = run_parts([policies.get("fifo")], parts, [4])
+    assert [(row["scenario"], row["seed"]) for row in rows] == [("a", 0)] * 2 + [("b", 5)] * 2

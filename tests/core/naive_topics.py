@@ -1,0 +1,343 @@
+"""Slow, obvious twin of a sender with topics: a list per topic, messages in flight in a list, everything from scratch.
+
+Written from the model's description, as ``naive`` is; it shares the exact ``naive.Link`` and calls no kernel. Messages
+are dictionaries: seq, us, bytes, x, luck, topic.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+# What the sender may be told: a slot to evict or to send, or one of these.
+REJECT, ACCEPT, HOLD = -1, -2, -1
+
+
+@dataclass
+class Rules:
+    """What the operator asks of one topic. Without any, it is the one queue of a plain sender."""
+
+    v: Any
+    priority: float = 1.0
+    weight: float = 1.0
+    period_us: int = 0
+    limit: float = math.inf
+    no_drop: bool = False
+    deadline_us: float = math.inf
+
+
+class Sent(NamedTuple):
+    """A message that the socket has taken, and when its last byte will have crossed (None: never)."""
+
+    message: dict[str, Any]
+    due: int | None
+
+
+class Sender:
+    """One sender, event by event; ``rules`` is a list, one each topic, or a single one for one queue."""
+
+    def __init__(
+        self,
+        link,
+        rules,
+        capacity,
+        *,
+        max_bytes=None,
+        decide_at="arrival",
+        window=1,
+        pong_us=0,
+        propagation_us=0,
+        schedules=False,
+        drops_heads=False,
+        limit_at_send=False,
+        flush_no_drop=False,
+    ):
+        self.link, self.capacity, self.decide_at = link, capacity, decide_at
+        self.one_queue = isinstance(rules, Rules)
+        self.rules = [rules] if self.one_queue else rules
+        self.max_bytes = math.inf if max_bytes is None else max_bytes
+        self.window, self.pong_us, self.propagation_us = window, pong_us, propagation_us
+        self.schedules, self.drops_heads = schedules, drops_heads
+        self.limit_at_send, self.flush_no_drop = limit_at_send, flush_no_drop
+        self.queues = [[] for _ in self.rules]
+        self.arrived = [[] for _ in self.rules]  # all that came, kept or not
+        self.kept = [[] for _ in self.rules]  # all that was ever enqueued
+        self.sent = [[] for _ in self.rules]  # all that the socket took, in that order
+        self.socket = []  # Sent, in transmission or behind it
+        self.in_flight = []  # sent and not yet answered
+        self.pongs = []  # (us, message) on their way back
+        self.position = 0  # bytes of the link used up when all that the socket took has crossed
+        self.held = False  # the scheduler waits for the next arrival or pong
+        self.newcomer = None
+        self.to_come = self.last_us = 0
+        self.now = 0
+        self.taken, self.crossed, self.dropped, self.order = {}, {}, {}, []
+        self.limited = set()  # dropped by a rate limit
+        self.rejected = self.evicted = self.impossible = 0
+
+    # --- what there is ---------------------------------------------------------------------------------------------
+
+    def lane(self, message):
+        """Which of the queues the message belongs to."""
+        return 0 if self.one_queue else message["topic"]
+
+    def slots(self):
+        """All queued messages, oldest first."""
+        return sorted((m for queue in self.queues for m in queue), key=lambda m: m["seq"])
+
+    def kept_before(self, message):
+        """The message kept before this one (queued, or the newcomer) on its topic; None if it is the first."""
+        lane = self.lane(message)
+        earlier = [m for m in self.sent[lane] + self.queues[lane] if m["seq"] < message["seq"]]
+        return earlier[-1] if earlier else None
+
+    # --- events ----------------------------------------------------------------------------------------------------
+
+    def events(self, messages, first_decision=0, last_decision=math.inf):
+        """Yields "decision", "send", "dequeue" (each wants an answer sent back), "departure" and at last "end"."""
+        self.to_come, self.last_us = len(messages), messages[-1]["us"]
+        for message in messages:
+            yield from self.advance(message["us"])
+            self.now, self.held = message["us"], False
+            if self.too_soon(message):
+                self.drop(message)
+                self.limited.add(message["seq"])
+                self.rejected += 1
+            else:
+                asked = first_decision <= message["seq"] <= last_decision
+                decision = ACCEPT
+                if asked and not (self.decide_at == "overflow" and self.fits(message)):
+                    self.newcomer = message
+                    decision = yield "decision"
+                    self.newcomer = None
+                self.carry_out(decision, message)
+            self.arrived[self.lane(message)].append(message)
+            self.to_come -= 1
+            yield from self.offer()
+        yield from self.advance(math.inf)
+        yield "end"
+
+    def advance(self, until):
+        """All pongs and crossings up to and including ``until``; of those at the same time, pongs first."""
+        while True:
+            pong = self.pongs[0][0] if self.pongs else math.inf
+            done = self.socket[0].due if self.socket and self.socket[0].due is not None else math.inf
+            if min(pong, done) > until or min(pong, done) == math.inf:
+                return
+            self.now = min(pong, done)
+            if pong <= done:
+                self.answered(self.pongs.pop(0)[1])
+                yield from self.offer()
+                continue
+            message = self.socket.pop(0).message
+            self.crossed[message["seq"]] = self.now
+            self.order.append(message["seq"])
+            if self.pong_us > 0:
+                self.pongs.append((self.now + self.pong_us, message))
+            else:
+                self.answered(message)
+            # What is taken at this very moment follows byte by byte, without a pause.
+            yield from self.offer(self.position)
+
+    def answered(self, message):
+        self.in_flight.remove(message)
+        self.held = False
+
+    def offer(self, position=None):
+        """The socket takes what it may; into an empty one the first byte goes at ``position``, or at the link's now."""
+        while not self.held and any(self.window_open(m) for m in self.slots()):
+            head = self.slots()[0]
+            if self.drops_heads and (yield "dequeue") and not self.rules[self.lane(head)].no_drop:
+                self.remove(head)
+                continue
+            message = self.oldest_sendable()
+            if self.schedules:
+                message = self.choice((yield "send"))
+            if message is None:
+                self.held = True
+                return
+            self.take(message, position)
+            yield "departure"
+
+    def take(self, message, position):
+        if not self.socket:
+            self.position = math.floor(self.link.bytes_by(self.now)) if position is None else position
+        self.position += message["bytes"]
+        self.socket.append(Sent(message, self.link.first_time(self.position)))
+        self.in_flight.append(message)
+        self.queues[self.lane(message)].remove(message)
+        self.sent[self.lane(message)].append(message)
+        self.taken[message["seq"]] = self.now
+
+    # --- what may be sent ------------------------------------------------------------------------------------------
+
+    def window_open(self, message):
+        flushed = self.flush_no_drop and self.rules[self.lane(message)].no_drop
+        return len(self.in_flight) < self.window or flushed
+
+    def sendable(self, message):
+        """The oldest of its topic, by n_T and, where rate limits hold back at the socket, by its own."""
+        lane = self.lane(message)
+        if self.queues[lane][0] is not message or not self.window_open(message):
+            return False
+        if self.limit_at_send and self.sent[lane]:
+            return self.now - self.taken[self.sent[lane][-1]["seq"]] >= self.rules[lane].period_us
+        return True
+
+    def oldest_sendable(self):
+        return next((m for m in self.slots() if self.sendable(m)), None)
+
+    def may_hold(self):
+        """Something is still to come, or nothing may go."""
+        return self.to_come > 0 or bool(self.in_flight) or self.oldest_sendable() is None
+
+    def choice(self, k):
+        """The message that the scheduler chose, None to hold; instead of the impossible the oldest that may go."""
+        slots = self.slots()
+        if k == HOLD and self.may_hold():
+            return None
+        if 0 <= k < len(slots) and self.sendable(slots[k]):
+            return slots[k]
+        self.impossible += 1
+        return self.oldest_sendable()
+
+    # --- what may be kept ------------------------------------------------------------------------------------------
+
+    def too_soon(self, message):
+        lane = self.lane(message)
+        if self.limit_at_send or not self.kept[lane]:
+            return False
+        return message["us"] - self.kept[lane][-1]["us"] < self.rules[lane].period_us
+
+    def fits(self, message, without=None):
+        """Whether the message has room, ``without`` one that is queued."""
+        rest = [m for m in self.slots() if m is not without]
+        own = [m for m in rest if self.lane(m) == self.lane(message)]
+        return (
+            len(rest) < self.capacity
+            and len(own) < self.rules[self.lane(message)].limit
+            and sum(m["bytes"] for m in rest) + message["bytes"] <= self.max_bytes
+        )
+
+    def evictable(self, message):
+        """Queued messages any one of which makes room for this one and may be dropped."""
+        return [m for m in self.slots() if not self.rules[self.lane(m)].no_drop and self.fits(message, without=m)]
+
+    def must_keep(self, message):
+        no_drop = self.rules[self.lane(message)].no_drop
+        return no_drop and (self.fits(message) or bool(self.evictable(message)))
+
+    def carry_out(self, decision, message):
+        slots = self.slots()
+        if decision == ACCEPT and self.fits(message):
+            self.enqueue(message)
+        elif decision == REJECT and not self.must_keep(message):
+            self.drop(message)
+            self.rejected += 1
+        elif 0 <= decision < len(slots) and slots[decision] in self.evictable(message):
+            self.remove(slots[decision])
+            self.enqueue(message)
+        else:
+            # What a queue does, but a no_drop message drives out the least important.
+            self.impossible += 1
+            if not self.fits(message) and self.must_keep(message):
+                self.remove(min(self.evictable(message), key=lambda m: self.rules[self.lane(m)].priority))
+            if self.fits(message):
+                self.enqueue(message)
+            else:
+                self.drop(message)
+                self.rejected += 1
+
+    def enqueue(self, message):
+        self.queues[self.lane(message)].append(message)
+        self.kept[self.lane(message)].append(message)
+
+    def remove(self, message):
+        self.queues[self.lane(message)].remove(message)
+        self.drop(message)
+        self.evicted += 1
+
+    def drop(self, message):
+        self.dropped[message["seq"]] = self.now
+
+    # --- information, each time from scratch -----------------------------------------------------------------------
+
+    def gain(self, lane, messages):
+        """Weight x sum of V over these messages of one topic."""
+        return self.rules[lane].weight * sum(self.rules[lane].v(b["x"] - a["x"]) for a, b in pairwise(messages))
+
+    def retained_gain(self):
+        return sum(self.gain(k, self.sent[k] + self.queues[k]) for k in range(len(self.rules)))
+
+    def received(self, lane, until):
+        """(when, message) of what reached the server by then."""
+        at = [(self.crossed[m["seq"]] + self.propagation_us, m) for m in self.sent[lane] if m["seq"] in self.crossed]
+        return [(us, m) for us, m in at if us <= until]
+
+    def delivered_gain(self, until):
+        return sum(self.gain(k, [m for _, m in self.received(k, until)]) for k in range(len(self.rules)))
+
+    def aged(self, until, to_the_end=False):
+        """Weight x age of information integrated, s^2: from a topic's first arrival to its last receipt, or the end.
+
+        Nothing counts after the last arrival of all, ``self.last_us``. Between receipts the age is t minus a constant,
+        so its integral is that of t less a rectangle.
+        """
+        total = Fraction(0)
+        for lane, arrived in enumerate(self.arrived):
+            if not arrived:
+                continue
+            knots = [(arrived[0]["us"], arrived[0]["us"])]  # (from when, arrival time of the newest then)
+            knots += [(min(us, self.last_us), m["us"]) for us, m in self.received(lane, until)]
+            end = max(min(until, self.last_us), knots[-1][0]) if to_the_end else knots[-1][0]
+            area = Fraction(end**2 - knots[0][0] ** 2, 2)
+            for (us, newest), (next_us, _) in pairwise([*knots, (end, None)]):
+                area -= newest * (next_us - us)
+            total += Fraction(self.rules[lane].weight) * area / 10**12
+        return float(total)
+
+    def late(self, until):
+        """Sum of the weights of messages older than their deadline when they reached the server."""
+        return sum(
+            rules.weight
+            for lane, rules in enumerate(self.rules)
+            for us, m in self.received(lane, until)
+            if us - m["us"] > rules.deadline_us
+        )
+
+    # --- what the policy sees --------------------------------------------------------------------------------------
+
+    def left_bytes(self):
+        """Bytes that the socket took and that have not crossed yet."""
+        inside = sum(sent.message["bytes"] for sent in self.socket)
+        if not self.socket or (len(self.socket) == 1 and self.taken[self.socket[0].message["seq"]] == self.now):
+            return inside
+        return min(inside, max(0, self.position - math.floor(self.link.bytes_by(self.now))))
+
+    def reference(self):
+        """What the newcomer's topic has behind it: what was sent last, else the arrival before all that is queued."""
+        lane = self.lane(self.newcomer)
+        if self.sent[lane]:
+            return self.sent[lane][-1]
+        return min(self.queues[lane] + self.arrived[lane][-1:] + [self.newcomer], key=lambda m: m["seq"])
+
+    def gaps(self, message, field):
+        """Distances of a queued message, or of the newcomer, to what is before and after it on its topic."""
+        lane = self.lane(message)
+        arrived = self.arrived[lane]
+        before = self.kept_before(message)
+        if before is None:  # nothing was kept: the arrival before it, or itself
+            before = min([*arrived[-1:], message], key=lambda m: m["seq"])
+        if message is self.newcomer:
+            return message[field] - before[field], message[field] - [message, *arrived][-1][field]
+        later = [m for m in self.queues[lane] if m["seq"] > message["seq"]]
+        if later:
+            after = later[0][field]
+        elif self.lane(self.newcomer) == lane:
+            after = self.newcomer[field]
+        else:  # one more step like the last
+            after = arrived[-1][field] + (arrived[-1][field] - arrived[-2:][0][field])
+        return message[field] - before[field], after - message[field]

@@ -1,0 +1,171 @@
+"""Random episodes with topics, each for the package and for its twin in ``naive_topics``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import naive
+import naive_topics
+import numpy as np
+from cases import Case, cases
+from hypothesis import strategies as st
+
+from bufgym import policies, qoi
+from bufgym.buffer import HOLD
+from bufgym.policies.registry import Client
+from bufgym.sender import Senders
+from bufgym.topics import Topic
+
+TWIN_V = {
+    **{qoi.exponential(base): naive.exponential(base) for base in (0.3, 0.618, 0.95)},
+    **{qoi.saturating(distance): naive.saturating(distance) for distance in (0.5, 2.0, 7.0)},
+}
+"""V functions and their twins."""
+V = st.sampled_from(list(TWIN_V))
+
+
+def decision(luck: float, capacity: int) -> int:
+    """Any decision, impossible ones included: -3 is none at all, then ACCEPT, REJECT, and slots beyond the last."""
+    return int(luck * (capacity + 5)) - 3
+
+
+def choice(now_us: int, queued: int, taken: int, capacity: int) -> int:
+    """Any choice of what to send, HOLD and impossible ones included."""
+    return (now_us // 3 + 5 * queued + 11 * taken) % (capacity + 3) - 1
+
+
+def unwanted(now_us: int, queued: int) -> bool:
+    """Whether the head is to be dropped."""
+    return (now_us // 7 + queued) % 3 == 0
+
+
+assert HOLD == choice(0, 0, 0, 1)
+
+
+def decide_anything(buffer, arrival, memory):
+    return int(arrival.luck * (buffer.capacity + 5)) - 3
+
+
+def send_anything(buffer, memory):
+    return (buffer.now_us // 3 + 5 * len(buffer.slots) + 11 * buffer.taken) % (buffer.capacity + 3) - 1
+
+
+def drop_some(buffer, memory):
+    return (buffer.now_us // 7 + len(buffer.slots)) % 3 == 0
+
+
+@dataclass
+class TopicCase:
+    """One episode, the rules of its topics (none: one queue), and how the program around the policy sends."""
+
+    case: Case
+    topics: tuple[Topic, ...]
+    v: qoi.Value
+    schedules: bool
+    drops_heads: bool
+    client: Client
+
+    def senders(self) -> Senders:
+        """With the episode loaded and the policy's flags set, as ``Senders.run`` does."""
+        case = self.case
+        limits = {"max_bytes": case.max_bytes, "decide_at": case.decide_at}
+        senders = Senders(
+            1, case.capacity, self.v, max_messages=len(case.episode.arrivals), topics=self.topics, **limits
+        )
+        senders.load(0, case.episode)
+        rows = senders.batch.senders
+        rows["ask_at_send"], rows["ask_at_dequeue"] = self.schedules, self.drops_heads
+        rows["limit_at_send"], rows["flush_no_drop"] = self.client.limit_at_send, self.client.flush_no_drop
+        return senders
+
+    def policy(self, *, compile: bool) -> policies.Policy:
+        """One that answers as ``decision``, ``choice`` and ``unwanted`` do."""
+        hooks: dict[str, Any] = {}
+        if self.schedules:
+            hooks["on_send"] = send_anything
+        if self.drops_heads:
+            hooks["on_dequeue"] = drop_some
+        return policies.Policy("test-anything", decide_anything, client=self.client, compile=compile, **hooks)
+
+    def twin(self) -> naive_topics.Sender:
+        case, episode = self.case, self.case.episode
+        rules: Any = naive_topics.Rules(TWIN_V[self.v])
+        if self.topics:
+            rules = [twin_rules(topic, self.v) for topic in self.topics]
+        return naive_topics.Sender(
+            naive.Link(case.knots, episode.link.trace.after, episode.link.offset_us),
+            rules,
+            case.capacity,
+            max_bytes=case.max_bytes,
+            decide_at=case.decide_at,
+            window=episode.window,
+            pong_us=episode.pong_us,
+            propagation_us=episode.link.propagation_us,
+            schedules=self.schedules,
+            drops_heads=self.drops_heads,
+            limit_at_send=self.client.limit_at_send,
+            flush_no_drop=self.client.flush_no_drop,
+        )
+
+    def twin_events(self, twin: naive_topics.Sender) -> Any:
+        episode = self.case.episode
+        return twin.events(self.case.twin_messages, episode.first_decision, episode.last_decision)
+
+
+def twin_rules(topic: Topic, v: qoi.Value) -> naive_topics.Rules:
+    return naive_topics.Rules(
+        TWIN_V[topic.value or v],
+        topic.priority,
+        topic.priority if topic.weight is None else topic.weight,
+        0 if topic.rate_limit_hz is None else round(1e6 / topic.rate_limit_hz),
+        float("inf") if topic.limit is None else topic.limit,
+        topic.no_drop,
+        float("inf") if topic.deadline_s is None else round(topic.deadline_s * 1e6),
+    )
+
+
+@st.composite
+def topic_rules(draw: st.DrawFn, name: str) -> Topic:
+    no_drop = draw(st.sampled_from([False, False, True]))
+    droppable = {
+        "rate_limit_hz": draw(st.sampled_from([None, 50.0, 300.0, 1e6 / 700, 1e6])),
+        "limit": draw(st.sampled_from([None, None, 1, 2, 3])),
+    }
+    return Topic(
+        name,
+        priority=draw(st.sampled_from([0.5, 1.0, 20.0])),
+        no_drop=no_drop,
+        weight=draw(st.sampled_from([None, 0.0, 0.3, 4.0])),
+        value=draw(st.one_of(st.none(), V)),
+        deadline_s=draw(st.sampled_from([None, 0.001, 0.02])),
+        **({} if no_drop else droppable),
+    )
+
+
+@st.composite
+def topic_cases(draw: st.DrawFn, min_topics: int = 0, max_messages: int = 60) -> TopicCase:
+    """Windows of 1 to 4, with and without pongs; 0 topics: a plain sender."""
+    case = draw(cases(max_messages=max_messages))
+    n = draw(st.integers(min_topics, 4))
+    arrivals = case.episode.arrivals.copy()
+    if n > 0:
+        arrivals["topic"] = np.random.default_rng(draw(st.integers(0, 2**32))).integers(0, n, len(arrivals))
+    window, pong_us = draw(st.integers(1, 4)), draw(st.sampled_from([0, 0, 1, 700, 20_000]))
+    case = replace(
+        case,
+        episode=replace(case.episode, arrivals=arrivals, window=window, pong_us=pong_us),
+        twin_messages=[
+            {**m, "topic": int(k)} for m, k in zip(case.twin_messages, np.asarray(arrivals)["topic"], strict=True)
+        ],
+    )
+    topics = tuple(draw(topic_rules(f"topic {k}")) for k in range(n))
+    client = Client(limit_at_send=draw(st.booleans()), flush_no_drop=draw(st.booleans()))
+    return TopicCase(
+        case,
+        topics,
+        draw(V),
+        draw(st.sampled_from([True, True, False])),
+        draw(st.sampled_from([False, False, True])),
+        client,
+    )

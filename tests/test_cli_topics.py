@@ -1,0 +1,163 @@
+"""``bufgym topics`` as a user types it, and each mistake that ends in one line and exit code 2."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from bufgym import policies
+from bufgym.benchmark.rows import read_rows
+from bufgym.benchmark.topics import ROWS
+from bufgym.cli import main
+
+CONFIG = """
+duration_s = 2
+[[topic]]
+name = "pose"
+rate_hz = 10
+size_bytes = 100
+priority = 20
+deadline_s = 0.5
+[[topic]]
+name = "commands"
+rate_hz = 2
+size_bytes = 100
+no_drop = true
+"""
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> str:
+    path = tmp_path / "mine.toml"
+    path.write_text(CONFIG)
+    return str(path)
+
+
+QUICK = ["--trace", "lte-synthetic-0", "--seeds", "2", "--policy", "fifo,edf"]
+
+
+def test_a_client_of_ones_own(config: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "rows.csv"
+    options = ["--capacity", "2,4", "--window", "3", "--by-topic", "edf", "--out", str(out)]
+    assert main(["topics", "--config", config, "--scale", "0.01", *QUICK, *options]) == 0
+    shown = capsys.readouterr().out
+    assert f"The client of {config}." in shown
+    assert "2 episodes of 2 s; n_T = 3, pongs 40 ms after a message has crossed, 1 consumer." in shown
+    assert "mine: 2 topics over lte-synthetic-0 x 0.01, L = 2\n" in shown and "mean of these 2\n" in shown
+    assert "age, priority 20 (s)" in shown
+    assert "edf, topic by topic: means over episodes" in shown and "\ncommands " in shown
+    assert f"24 rows in {out}" in shown
+    rows = read_rows(out, ROWS)
+    # The baseline runs whether named or not.
+    assert [row["policy"] for row in rows[:12:4]] == ["fifo", "edf", "robofleet"]
+    assert {row["capacity"] for row in rows} == {2, 4} and {row["window"] for row in rows} == {3}
+
+
+@pytest.mark.slow  # where nothing is compiled
+def test_the_suite_runs_by_default(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["topics", "--split", "validation", "--seeds", "1", "--policy", "robofleet", "--consumers", "2"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("Suite topics-v1, validation: ")
+    assert "18 episodes of 60 s; n_T = 1 and 5, " in shown and "2 consumers" in shown
+    assert "Not the suite as it is: --consumers given." in shown
+    for label in ("scarce", "half", "ample"):
+        assert f"\n{label}: Robofleet's example client" in shown
+    lines = [line.split() for line in shown.splitlines() if line.startswith("robofleet ")]
+    assert len(lines) == 7 and all(line[2:5] == ["1.000", "[1.000,", "1.000]"] and line[5] == "0" for line in lines)
+
+
+def test_all_policies_by_default_with_a_word_on_the_unbounded(config: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["topics", "--config", config, "--trace", "lte-synthetic-0", "--seeds", "1", "--motion", "none"]) == 0
+    shown = capsys.readouterr().out
+    for name in [*policies.names(for_topics=True), "drop-oldest", "rosbridge"]:
+        assert f"\n{name} " in shown
+    assert "note: rosbridge: its queue is unbounded; its QoI counts what arrives long after" in shown
+
+
+def test_a_users_policy_file(config: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mine = tmp_path / "mine.py"
+    mine.write_text(
+        "from bufgym.policies import ACCEPT, register\n"
+        "@register('my-own')\n"
+        "def my_own(buffer, arrival, memory):\n"
+        "    return ACCEPT if len(buffer.slots) < buffer.capacity else 0\n"
+    )
+    chosen = ["--seeds", "1", "--policy", "my-own", "--policy-file", str(mine)]
+    try:
+        assert main(["topics", "--config", config, "--trace", "lte-synthetic-0", *chosen]) == 0
+        assert "\nmy-own " in capsys.readouterr().out
+    finally:
+        policies.registry._REGISTRY.pop("my-own", None)
+
+
+@pytest.mark.parametrize(
+    ("options", "naming"),
+    [
+        (["--window", "0"], "window = 0: n_T must be"),
+        (["--window", "x"], "'x'"),
+        (["--consumers", "0"], "consumers = 0"),
+        (["--suite", "nope"], "unknown suite 'nope'"),
+        (["--suite", "lte-v1"], "suite lte-v1 has one queue, not topics: bufgym bench --suite lte-v1"),
+        (["--split", "dev"], "split = 'dev'"),
+        (["--policy", "nope"], "unknown policy 'nope'"),
+        (["--policy", "fifo", "fifo"], "'fifo' is given more than once"),
+        (["--policy", "robofleet", "robofleet"], "'robofleet' is given more than once"),
+        (["--capacity", "0"], "0: must be"),
+        (["--seeds", "1001"], "seeds = 1001"),
+        (["--trace", "x.csv"], "--trace needs --config"),
+        (["--motion", "none"], "--motion needs --config"),
+        (["--scale", "2"], "--scale needs --config"),
+        (["--by-topic", "afr"], "--by-topic afr: not among the policies that run"),
+        (["--out", "rows.txt"], "rows.txt: rows are written to .csv or .parquet files"),
+        (["--out", "no-such-folder/rows.csv"], "no-such-folder/rows.csv: no folder"),
+        (["--config", "no-such.toml"], "no-such.toml: no configuration that can be read"),
+        (["--config", "x.toml", "--suite", "topics-v1"], "--suite cannot go with --config"),
+        (["--config", "x.toml", "--split", "test"], "--split cannot go with --config"),
+    ],
+)
+def test_bad_options(options: list[str], naming: str, capsys: pytest.CaptureFixture[str]) -> None:
+    fails(["topics", *options], naming, capsys)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "naming"),
+    [
+        ("priority = 20", "priority = -1", "mine.toml: topic 'pose': priority = -1: must be a number > 0"),
+        ("priority = 20", "priorty = 20", "mine.toml: topic 'pose': unknown key 'priorty'"),
+        ("rate_hz = 10", "rate_hz = 0", "mine.toml: topic 'pose': rate_hz = 0: must be a number > 0"),
+        ("duration_s", "window = 0\nduration_s", "mine.toml: window = 0: n_T must be a whole number"),
+        ("[[topic]]", "[[topics]]", "mine.toml: unknown key 'topics'"),
+        ("duration_s = 2", "duration_s = ", "mine.toml: Invalid value"),
+    ],
+)
+def test_bad_configurations(config: str, old: str, new: str, naming: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path(config).write_text(CONFIG.replace(old, new))
+    fails(["topics", "--config", config, *QUICK], naming, capsys)
+
+
+def test_a_window_given_on_the_command_line_is_not_the_files_fault(
+    config: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fails(["topics", "--config", config, *QUICK, "--window", "0"], "error: window = 0", capsys)
+    fails(["topics", "--config", config, *QUICK, "--trace", "none.csv"], "none.csv", capsys)
+
+
+def test_without_pyarrow_parquet_is_refused_before_the_work(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    fails(["topics", "--out", "rows.parquet"], "Parquet files need pyarrow", capsys)
+
+
+def test_bench_says_where_suites_of_topics_run(capsys: pytest.CaptureFixture[str]) -> None:
+    fails(["bench", "--suite", "topics-v1"], "bufgym topics --suite topics-v1", capsys)
+
+
+def fails(command: list[str], naming: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command ends with code 2 and one line that names the culprit."""
+    assert main(command) == 2
+    shown = capsys.readouterr()
+    assert shown.out == "" and shown.err.count("\n") == 1
+    assert shown.err.startswith("bufgym: error: ") and naming in shown.err
