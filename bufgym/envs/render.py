@@ -154,14 +154,14 @@ def ansi(senders: Senders, i: int, width: int = 100) -> str:
         "capacity".ljust(label) + _capacity_line(senders, i, scene, shown),
         *_message_lines(scene, shown, label),
         "queue".ljust(label) + (_topic_queue_line if scene.topics else _queue_line)(scene, width - label),
-        " " * label
+        " " * _LABEL
         + "  ".join(f"{_mark(fate)} {name}" for fate, name in enumerate(_NAMES))
         + "  _ empty"
         + (f"  {scene.asks}" if scene.topics else "  \x1b[31m9\x1b[0m missing"),
     ]
     if scene.demand > 0:
         lines.append(
-            " " * label
+            " " * _LABEL
             + f"full height {_speed(2 * scene.demand)}, twice the demand; \x1b[31mred\x1b[0m: below the demand"
         )
     return "\n".join(lines) + "\n"

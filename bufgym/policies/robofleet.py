@@ -118,15 +118,32 @@ def robofleet_released(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]
     return overwrite(buffer, arrival)
 
 
+def longest_ago(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+    """The oldest message of the topic that was sent from longest ago, never being time 0; of equals the first topic."""
+    best, earliest_us = 0, buffer.now_us + 1
+    for k in range(len(buffer.slots)):
+        if is_first(buffer, k):
+            sent_us = topic_of(buffer, buffer.slots[k]).sent_us
+            if sent_us < earliest_us or (sent_us == earliest_us and buffer.slots[k].topic < buffer.slots[best].topic):
+                best, earliest_us = k, sent_us
+    return best
+
+
 @register(
     "ros-native",
+    on_send=longest_ago,
     for_topics=True,
     source="ROS publishers, a queue a topic (queue_size: the topic's limit)",
     client=Client(encoding="ros", awaits_pongs=False, copies=True),
     compile=True,
 )
 def ros_native(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """Native ROS: each topic drops its oldest, first in, first out, one copy a consumer, nobody waits for pongs.
+    """Native ROS: each topic drops its oldest; topics take turns; one copy a consumer; nobody waits for pongs.
+
+    ROS has a TCP connection per subscriber, which share the link. The nearest that one socket comes to that is round
+    robin by message: the topic (a copy to each consumer is a topic of its own) that was sent from longest ago goes
+    next. Not here: fairness by bytes (a topic of large messages gets more of the link than one of small ones, which
+    wait for whole large ones), and the sockets' own buffers.
 
     Topics have queues of their own in ROS. Where L is too small for all of them, the oldest message of any goes.
     """

@@ -32,6 +32,8 @@ def test_every_figure_is_a_number_with_its_definition(tmp_path: Path) -> None:
     figures = perf.measure(TINY)
     assert all(math.isfinite(figure.value) and figure.value > 0 and figure.definition for figure in figures)
     assert sum(figure.target is not None for figure in figures) == len(figures) - 2
+    (topics,) = [figure for figure in figures if figure.name == "native batch of 8 topics, bufgym/Topics-v0"]
+    assert (topics.target, topics.unit) == (1e6, "steps/s") and "n = 2, L = 32" in topics.definition
     text = perf.report(figures, TINY.repeats)
     for figure in figures:
         assert figure.name in text and figure.definition in text

@@ -143,6 +143,9 @@ class RosNative(Fifo):
         own = [m for m in helpful if m["topic"] == newcomer["topic"]]
         return [*own, *helpful, REJECT][0]
 
+    def pick(self, queue, now, in_flight, window):
+        return sorted(self.heads(queue), key=lambda m: (self.last_sent.get(m["topic"], 0), m["topic"]))[0]
+
 
 TWINS = {
     "fifo": Fifo,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from naive_queues import ACCEPT as ACCEPTED
 from naive_queues import REJECT as REJECTED
 
-from bufgym import policies, qoi
+from bufgym import files, policies, qoi
 from bufgym.buffer import ACCEPT, HOLD, REJECT
 from bufgym.kernel import JIT
 from bufgym.link import Link
@@ -222,12 +222,28 @@ def test_the_released_client_sleeps_until_an_arrival_or_a_pong():
 
 
 def test_native_ros_drops_the_oldest_of_each_queue():
-    # A publisher's queue of 2: 1 goes for 4. First in, first out, whatever the priority.
+    # A publisher's queue of 2: 1 goes for 4. At 101 ms A was sent from at 0, and C never, which counts as 0 too: A, the
+    # first topic; then C, then A again.
     senders = played("ros-native", "0 A, 1 A, 2 A, 3 C, 4 A", topics({"limit": 2}))
     assert (order(senders), dropped(senders)) == ([0, 2, 3, 4], [1])
     # Where L = 3 is too small for all queues, the oldest of any goes, whatever its rank; no N does.
     senders = played("ros-native", "0 A, 1 N, 2 C, 3 B, 4 A", topics(), capacity=3)
-    assert (order(senders), dropped(senders)) == ([0, 1, 3, 4], [2])
+    assert (sorted(order(senders)), dropped(senders)) == ([0, 1, 3, 4], [2])
+
+
+def test_native_ros_takes_turns():
+    # At 101 ms all count as sent from at 0: A, then B, N. Round again: A (101), B (102), then of A alone.
+    script = "0 A, 1 A, 2 A, 3 A, 4 N, 5 B, 6 B"
+    senders = played("ros-native", script, topics())
+    assert order(senders) == [0, 1, 5, 4, 2, 6, 3]
+    # Neither priority nor no_drop count, and not what came first: B, which came last of all, is sent from at 102.
+    assert taken_ms(senders) == {0: 0, 1: 101, 5: 102, 4: 103, 2: 104, 6: 105, 3: 106}
+    # Who had nothing to send has waited longest, whenever its message came: at 103 ms C goes (never sent from), then A
+    # (101), then B (102).
+    assert order(played("ros-native", "0 A, 1 A, 2 A, 3 B, 4 B, 102.5 C", topics())) == [0, 1, 3, 5, 2, 4]
+    # By message, not by byte: 1, of 5000 bytes, makes B wait for 5 ms, 2 for one.
+    senders = played("ros-native", "0 A, 1 A 5000, 2 A, 3 B, 4 B", topics())
+    assert taken_ms(senders) == {0: 0, 1: 101, 3: 106, 2: 107, 4: 108}
 
 
 def test_rosbridge_keeps_everything():
@@ -257,7 +273,8 @@ def test_clients():
 
 
 def test_made_for_topics():
-    assert sorted(policies.names(for_topics=True)) == sorted(NAMES)
+    trained = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetensors")
+    assert sorted(policies.names(for_topics=True)) == sorted([*NAMES, *trained])
     assert sorted([*policies.names(for_topics=True), *policies.names(for_topics=False)]) == sorted(policies.names())
 
 

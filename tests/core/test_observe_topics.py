@@ -1,0 +1,218 @@
+"""What is observed of several topics: event by event against its twin, written from the table of fields."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from topic_cases import TWIN_V, TopicCase, choice, decision, topic_cases, unwanted
+
+from bufgym.buffer import UNLIMITED_BYTES
+from bufgym.kernel import JIT
+from bufgym.observe import (
+    CONTEXT_FIELDS,
+    FIELDS,
+    SLOT_FIELDS,
+    TOPIC_CONTEXT_FIELDS,
+    TOPIC_FIELDS,
+    TOPIC_SLOT_FIELDS,
+    observe_topic_context,
+    observe_topic_slots,
+)
+from bufgym.sender import (
+    DECISION,
+    DEPARTURE,
+    DEQUEUE,
+    END,
+    SEND,
+    answer_dequeue,
+    answer_send,
+    decide,
+    named,
+    next_event,
+    python_view,
+)
+
+SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
+CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
+NAMES = {DECISION: "decision", DEPARTURE: "departure", DEQUEUE: "dequeue", SEND: "send", END: "end"}
+
+
+def per(g, r):
+    """g / (g + r); 0 of nothing."""
+    return float(g / (g + r)) if g > 0 else 0.0
+
+
+class Twin:
+    """The fields of one moment, from what the slow sender of ``naive_topics`` knows."""
+
+    def __init__(self, case: TopicCase, sender, buffer) -> None:
+        self.case, self.sender, self.buffer = case, sender, buffer
+        self.topics = case.topics
+        self.top = max(topic.share for topic in self.topics) or 1.0
+        self.newcomer = sender.newcomer
+        self.L = case.case.capacity
+
+    def v(self, lane):
+        return TWIN_V[self.topics[lane].value or self.case.v]
+
+    def even(self, lane, field, last):
+        """The even spacing of a topic: from what was sent last (before that: from 0) to its arrival ``last``."""
+        sent, queued = self.sender.sent[lane], self.sender.queues[lane]
+        if not sent and not queued:
+            return 0.0
+        return max(last - (sent[-1][field] if sent else 0), 0) / (len(queued) + 1)
+
+    def last(self, lane, field):
+        """Of the arrival before the newcomer."""
+        arrived = self.sender.arrived[lane]
+        return arrived[-1][field] if arrived else 0
+
+    def gaps(self, m, field):
+        """To what is kept before it on its topic, and to what follows; one more step where nothing does."""
+        lane, s = m["topic"], self.sender
+        before = s.kept_before(m) or m
+        arrived, later = s.arrived[lane], [q for q in s.queues[lane] if q["seq"] > m["seq"]]
+        step = arrived[-1][field] - arrived[-2][field] if len(arrived) > 1 else 0
+        if m is self.newcomer:
+            after = m[field] - arrived[-1][field] if arrived else 0
+        elif later:
+            after = later[0][field] - m[field]
+        elif self.newcomer is not None and self.newcomer["topic"] == lane:
+            after = self.newcomer[field] - m[field]
+        else:
+            after = arrived[-1][field] - m[field] + step
+        return m[field] - before[field], after
+
+    def gain(self, m):
+        """V of what its delivery adds, weighted; the first of a topic is the 1 in its H."""
+        before = self.sender.kept_before(m)
+        return 0.0 if before is None else self.topics[m["topic"]].share * self.v(m["topic"])(m["x"] - before["x"])
+
+    def candidate(self, m, k):
+        """All slot fields of message ``m`` at place ``k``; the newcomer comes after all that are queued."""
+        s, lane, messages = self.sender, m["topic"], self.candidates()
+        topic, v, queue = self.topics[lane], self.v(lane), s.queues[lane]
+        (a_us, b_us), (a, b) = self.gaps(m, "us"), self.gaps(m, "x")
+        even_us = self.even(lane, "us", self.last(lane, "us"))
+        even_x = self.even(lane, "x", self.last(lane, "x"))
+        lost = max(v(a) + v(b) - v(a + b), 0.0)
+        age = s.now - m["us"]
+        gains = [self.gain(each) / self.top / each["bytes"] for each in messages]
+        of_newcomer = self.newcomer is not None and lane == self.newcomer["topic"]
+        return {
+            "occupied": 1.0,
+            "rank": 1.0 if m is self.newcomer else (k + 1) / (len(s.slots()) + 1),
+            "time_before": per(a_us, even_us),
+            "time_merged": per(a_us + b_us, 2 * even_us),
+            "motion_before": per(a, even_x),
+            "motion_merged": per(a + b, 2 * even_x),
+            "loss": lost * topic.share / self.top,
+            "relative_loss": per(lost, max(2 * v(even_x) - v(2 * even_x), 1e-12)),
+            "size": per(m["bytes"], np.mean([each["bytes"] for each in messages])),
+            "priority": topic.priority / max(each.priority for each in self.topics),
+            "weight": topic.share / self.top,
+            "no_drop": float(topic.no_drop),
+            "oldest": float(bool(queue) and m is queue[0]),
+            "own": float(of_newcomer),
+            "waited": per(age, 1e6),
+            "silence": per(s.now - (s.sent[lane][-1]["us"] if s.sent[lane] else 0), 1e6),
+            "lateness": 0.0 if topic.deadline_s is None else per(age, round(topic.deadline_s * 1e6)),
+            "queued": len(queue) / self.L,
+            "gain": self.gain(m) / self.top,
+            "gain_per_byte": per(self.gain(m) / self.top / m["bytes"], np.mean(gains)),
+        }
+
+    def candidates(self):
+        return self.sender.slots() + ([self.newcomer] if self.newcomer is not None else [])
+
+    def slots(self):
+        """{field: numbers of the L + 1 places}."""
+        made = {name: [0.0] * (self.L + 1) for name in SLOT_NAMES}
+        for k, m in enumerate(self.candidates()):
+            for name, number in self.candidate(m, k).items():
+                made[name][self.L if m is self.newcomer else k] = number
+        return made
+
+    def context(self):
+        s, buffer, m = self.sender, self.buffer, self.newcomer
+        most = buffer.max_bytes
+        made = {
+            "occupancy": len(s.slots()) / self.L,
+            "backlog": sum(q["bytes"] for q in s.slots()) / most if most < UNLIMITED_BYTES else 0.0,
+            **dict.fromkeys(("arrival_time_gap", "arrival_motion_gap", "even_value", "bend"), 0.0),
+            "busy": float(bool(s.socket)),
+            # One queue's means, which its own tests look after.
+            "left": buffer.left_fraction,
+            "stalled": per(buffer.stalled_us, (self.L + 1) * buffer.period_us),
+            "departures": per(buffer.departures, 1),
+            "drain": per(buffer.drain, 1),
+            "socket_asks": float(m is None),
+            "in_flight": per(len(s.in_flight), self.case.case.episode.window),
+        }
+        if m is not None:
+            lane = m["topic"]
+            before, v = s.arrived[lane][-1:] or [m], self.v(lane)
+            even_us, even_x = self.even(lane, "us", m["us"]), self.even(lane, "x", m["x"])
+            made["arrival_time_gap"] = per(m["us"] - before[0]["us"], even_us)
+            made["arrival_motion_gap"] = per(m["x"] - before[0]["x"], even_x)
+            made["even_value"] = v(even_x) * self.topics[lane].share / self.top
+            made["bend"] = (2 * v(even_x) - v(2 * even_x)) / v(even_x) if even_x > 0 else 0.0
+        return made
+
+
+def observed(batch, buffer, arriving):
+    """Both observations, by the kernels; the places are full of rubbish before."""
+    rows = np.full((len(SLOT_NAMES), buffer.capacity + 1), np.nan)
+    context = np.full(len(CONTEXT_NAMES), np.nan)
+    sender = batch.senders[0]
+    arrival = batch.arrivals[0, min(sender.next, sender.arrivals - 1)]
+    observe_topic_slots(buffer, arrival, arriving, rows)
+    observe_topic_context(buffer, arrival, arriving, context)
+    return dict(zip(SLOT_NAMES, rows, strict=True)), dict(zip(CONTEXT_NAMES, context, strict=True))
+
+
+@pytest.mark.slow
+@given(topic_cases(min_topics=2))
+@settings(max_examples=50 if JIT else 10)
+def test_every_field_is_its_twins(case):
+    senders, twin = case.senders(), case.twin()
+    batch, L = senders.batch, case.case.capacity
+    seen = named(batch)
+    events = case.twin_events(twin)
+    told = next(events)
+    while True:
+        event = next_event(batch, 0)
+        assert NAMES[event] == told
+        if event == END:
+            break
+        sender = seen.senders[0]
+        if event in (DECISION, SEND):
+            buffer = python_view(seen, 0)
+            by_definition = Twin(case, twin, buffer)
+            slots, context = observed(seen, buffer, event == DECISION)
+            for name, numbers in (by_definition.slots() | by_definition.context()).items():
+                found = (slots | context)[name]
+                np.testing.assert_allclose(found, numbers, rtol=1e-6, atol=1e-6, err_msg=f"{name} at a {told}")
+                assert ((found >= 0) & (found <= 1)).all(), name
+        answer = None
+        if event == DECISION:
+            answer = decision(seen.arrivals[0, sender.next].luck, L)
+            decide(batch, 0, answer)
+        elif event == SEND:
+            answer = choice(twin.now, len(twin.slots()), len(twin.taken), L)
+            answer_send(batch, 0, answer)
+        elif event == DEQUEUE:
+            answer = unwanted(twin.now, len(twin.slots()))
+            answer_dequeue(batch, 0, answer)
+        told = events.send(answer)
+
+
+def test_the_twin_knows_every_field():
+    assert len({*SLOT_NAMES, *CONTEXT_NAMES}) == len(FIELDS + TOPIC_FIELDS)
+
+
+@pytest.mark.parametrize("field", TOPIC_FIELDS, ids=lambda field: field.name)
+def test_fields_say_what_they_are(field):
+    assert field.meaning and field.unit and field.group == "topic"
+    assert (field in TOPIC_SLOT_FIELDS) == (field.per == "slot")
