@@ -64,6 +64,8 @@ AGE_SHARE, AGE_PENALTY = 0.95, 2.0
 OTHERS_SHARE, OTHERS_PENALTY = 1.5, 0.25
 """The same of all other topics: without it, what weighs little is never sent."""
 VALIDATION_SEED = 1
+TINY = 1e-9
+"""So that an age of 0 can be compared with."""
 
 MODEL = "model.safetensors"
 
@@ -152,8 +154,8 @@ def fitness(policy: Policy, grounds: Sequence[Ground]) -> float:
     total = 0.0
     for ground in grounds:
         (qoi, first, others, lost), theirs = ground.reached(policy), ground.rival
-        total += lost - qoi / theirs[0] + AGE_PENALTY * max(0.0, first / theirs[1] - AGE_SHARE)
-        total += OTHERS_PENALTY * max(0.0, others / max(theirs[2], 1.0) - OTHERS_SHARE)
+        total += lost - qoi / theirs[0] + AGE_PENALTY * max(0.0, first / max(theirs[1], TINY) - AGE_SHARE)
+        total += OTHERS_PENALTY * max(0.0, others / max(theirs[2], TINY) - OTHERS_SHARE)
     return total / len(grounds)
 
 

@@ -142,6 +142,8 @@ def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArr
         row["no_drop"], row["v_start"] = topic.no_drop, starts[id(own)]
         if topic.deadline_s is not None:
             row["deadline_us"] = round(topic.deadline_s * 1e6)
+    if topics:
+        table["priority"][len(topics) :] = table["weight"][len(topics) :] = 0.0  # the companion counts for nothing
     values = v.array if len(arrays) == 1 else np.concatenate(arrays)
     values.flags.writeable = False
     return table, values

@@ -71,6 +71,14 @@ def even_gaps(topic: Any, last_us: int, last_x: float) -> tuple[float, float]:
 
 
 @kernel
+def last_of(topic: Any, number: int, arrival: Any, arriving: bool) -> tuple[int, float]:
+    """Time and coordinate of a topic's last arrival, the one at hand included."""
+    if arriving and number == arrival.topic:
+        return arrival.arrival_us, arrival.x
+    return topic.previous_us, topic.previous_x
+
+
+@kernel
 def fill_row(
     buffer: Buffer,
     message: Any,
@@ -107,6 +115,7 @@ def fill_after(
     k: int,
     step_us: int,
     step_x: float,
+    last: tuple[int, float],
     of_all: tuple[float, float],
     rows: NDArray[np.floating[Any]],
 ) -> None:
@@ -114,8 +123,7 @@ def fill_after(
     topic = buffer.topics[topic_number]
     v = buffer.v[topic.v_start :]
     before_us, before_x = float(rows[TIME_BEFORE, k]), float(rows[MOTION_BEFORE, k])
-    last_us, last_x = topic.previous_us, topic.previous_x
-    even_us, even_x = even_gaps(topic, last_us, last_x)
+    even_us, even_x = even_gaps(topic, last[0], last[1])
     lost = max(merging_loss(v, before_x, value(v, before_x), step_x, value(v, step_x)), 0.0)
     even_gain = value(v, even_x)
     even_loss = max(merging_loss(v, even_x, even_gain, even_x, even_gain), ROUNDING)
@@ -133,7 +141,7 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
 
     Empty slots are 0. The newcomer is last; where the socket asks (not ``arriving``) its place is empty too.
     """
-    s, last = len(buffer.slots), buffer.capacity
+    s, capacity = len(buffer.slots), buffer.capacity
     of_all = largest(buffer)
     for k in range(len(buffer.topics)):
         buffer.topics[k].mark = -1
@@ -152,7 +160,8 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
         rows[OLDEST, k] = 1.0 if j < 0 else 0.0
         rows[OWN, k] = 1.0 if arriving and slot.topic == arrival.topic else 0.0
         if j >= 0:
-            fill_after(buffer, slot.topic, j, slot.arrival_us - before_us, slot.x - before_x, of_all, rows)
+            last = last_of(topic, slot.topic, arrival, arriving)
+            fill_after(buffer, slot.topic, j, slot.arrival_us - before_us, slot.x - before_x, last, of_all, rows)
         topic.mark = k
     for number in range(len(buffer.topics)):
         topic = buffer.topics[number]
@@ -165,7 +174,7 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
         else:
             step_us = max(topic.previous_us - tail.arrival_us, 0) + topic.step_us
             step_x = max(topic.previous_x - tail.x, 0.0) + topic.step_x
-        fill_after(buffer, number, j, step_us, step_x, of_all, rows)
+        fill_after(buffer, number, j, step_us, step_x, last_of(topic, number, arrival, arriving), of_all, rows)
     size_sum = float(buffer.backlog_bytes)
     if arriving:
         topic = buffer.topics[arrival.topic]
@@ -176,19 +185,20 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
             before_us, before_x = topic.taken_us, topic.taken_x
         if topic.mark >= 0 or topic.taken > 0:
             gain = topic.weight * value(buffer.v[topic.v_start :], arrival.x - before_x)
-        fill_row(buffer, arrival, last, gain, before_us, before_x, of_all, rows)
-        rows[RANK, last] = 1.0
-        rows[OWN, last] = 1.0
+        fill_row(buffer, arrival, capacity, gain, before_us, before_x, of_all, rows)
+        rows[RANK, capacity] = 1.0
+        rows[OWN, capacity] = 1.0
         step_us, step_x = 0, 0.0
         if topic.arrived > 0:
             step_us, step_x = arrival.arrival_us - topic.previous_us, arrival.x - topic.previous_x
-        fill_after(buffer, arrival.topic, last, step_us, step_x, of_all, rows)
+        newest = last_of(topic, arrival.topic, arrival, arriving)
+        fill_after(buffer, arrival.topic, capacity, step_us, step_x, newest, of_all, rows)
         size_sum += arrival.size_bytes
     count = s + (1 if arriving else 0)
     total = 0.0
     for k in range(s):
         total += rows[GAIN_PER_BYTE, k]
-    total += rows[GAIN_PER_BYTE, last]
+    total += rows[GAIN_PER_BYTE, capacity]
     squash_row(rows[SIZE], size_sum / max(count, 1))
     squash_row(rows[GAIN_PER_BYTE], total / max(count, 1))
 

@@ -4,6 +4,9 @@ As in ``learned``, every candidate is scored by one small network from its own f
 ``observe.TOPIC_FIELDS`` too. At an arrival the *drop* network scores each message that may be evicted, and the newcomer
 if it may be rejected; the *accept* network the newcomer where there is room. When the socket is free the *send* network
 scores the oldest message of each topic. The highest score is done, ties to the oldest. It never holds the socket back.
+
+One rule is not learned: where ``no_drop`` messages fill half of the buffer, they go first. Such a message is lost only
+where nothing but its like is queued, and that is not to be risked for a better score.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from bufgym.observe import (
 )
 from bufgym.policies.learned import Network, begin, forward
 from bufgym.policies.registry import Policy
+from bufgym.policies.robofleet import first_no_drop
 from bufgym.policies.schedulers import fits, make_room, makes_room
 
 SLOTS, CONTEXT = len(SLOT_FIELDS + TOPIC_SLOT_FIELDS), len(CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS)
@@ -93,6 +97,11 @@ def sends(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     if len(buffer.topics) == 1:
         return 0
     send, after = int(memory[SEND_NET]), int(memory[WORK])
+    kept = 0
+    for k in range(len(buffer.slots)):
+        kept += buffer.topics[buffer.slots[k].topic].no_drop
+    if 2 * kept >= buffer.capacity:
+        return first_no_drop(buffer)
     observed(buffer, buffer.slots[0], False, memory)
     best, choice = -np.inf, HOLD
     for k in range(len(buffer.slots)):

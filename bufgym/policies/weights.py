@@ -290,7 +290,7 @@ def _checked_tensors(
         for name in [*own, *given]:
             if name not in given:
                 refuse(name, "is missing")
-            if name not in own and name.startswith(STILL) == bool(which):
+            if name not in own and (topics or name.startswith(STILL) == bool(which)):
                 refuse(name, f"has no place in networks of {len(widths)} hidden layers ({LAYERS[topics]} at most)")
         for name, shape in own.items():
             if given[name] != shape:

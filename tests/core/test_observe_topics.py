@@ -46,8 +46,8 @@ def per(g, r):
 class Twin:
     """The fields of one moment, from what the slow sender of ``naive_topics`` knows."""
 
-    def __init__(self, case: TopicCase, sender, buffer) -> None:
-        self.case, self.sender, self.buffer = case, sender, buffer
+    def __init__(self, case: TopicCase, sender, buffer, origin) -> None:
+        self.case, self.sender, self.buffer, self.origin = case, sender, buffer, origin
         self.topics = case.topics
         self.top = max(topic.share for topic in self.topics) or 1.0
         self.newcomer = sender.newcomer
@@ -57,14 +57,17 @@ class Twin:
         return TWIN_V[self.topics[lane].value or self.case.v]
 
     def even(self, lane, field, last):
-        """The even spacing of a topic: from what was sent last (before that: from 0) to its arrival ``last``."""
+        """The even spacing of a topic: from what was sent last (until then: kept first) to its arrival ``last``."""
         sent, queued = self.sender.sent[lane], self.sender.queues[lane]
         if not sent and not queued:
             return 0.0
-        return max(last - (sent[-1][field] if sent else 0), 0) / (len(queued) + 1)
+        begin = sent[-1] if sent else self.origin[lane]
+        return max(last - begin[field], 0) / (len(queued) + 1)
 
     def last(self, lane, field):
-        """Of the arrival before the newcomer."""
+        """Of a topic's last arrival, the newcomer included."""
+        if self.newcomer is not None and self.newcomer["topic"] == lane:
+            return self.newcomer[field]
         arrived = self.sender.arrived[lane]
         return arrived[-1][field] if arrived else 0
 
@@ -161,6 +164,20 @@ class Twin:
         return made
 
 
+def with_origins(sender):
+    """{topic: the message that entered its empty queue last, before any was sent}, kept up to date by ``sender``."""
+    origin, enqueue = {}, sender.enqueue
+
+    def noting(message):
+        lane = message["topic"]
+        if not sender.sent[lane] and not sender.queues[lane]:
+            origin[lane] = message
+        enqueue(message)
+
+    sender.enqueue = noting
+    return origin
+
+
 def observed(batch, buffer, arriving):
     """Both observations, by the kernels; the places are full of rubbish before."""
     rows = np.full((len(SLOT_NAMES), buffer.capacity + 1), np.nan)
@@ -179,7 +196,7 @@ def test_every_field_is_its_twins(case):
     senders, twin = case.senders(), case.twin()
     batch, L = senders.batch, case.case.capacity
     seen = named(batch)
-    events = case.twin_events(twin)
+    origin, events = with_origins(twin), case.twin_events(twin)
     told = next(events)
     while True:
         event = next_event(batch, 0)
@@ -189,7 +206,7 @@ def test_every_field_is_its_twins(case):
         sender = seen.senders[0]
         if event in (DECISION, SEND):
             buffer = python_view(seen, 0)
-            by_definition = Twin(case, twin, buffer)
+            by_definition = Twin(case, twin, buffer, origin)
             slots, context = observed(seen, buffer, event == DECISION)
             for name, numbers in (by_definition.slots() | by_definition.context()).items():
                 found = (slots | context)[name]

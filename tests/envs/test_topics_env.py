@@ -1,0 +1,488 @@
+"""``bufgym/Topics-v0``: two kinds of event, worked by hand, on copies of the sender, and in Gymnasium's forms."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from bufgym import qoi
+from bufgym import scenario as scenarios
+from bufgym.benchmark import perf
+from bufgym.envs import SenderEnv, SenderVectorEnv, render
+from bufgym.envs.rows import decision_of
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.link import Link
+from bufgym.metrics import topic_outcomes
+from bufgym.observe import CONTEXT_FIELDS, FIELDS, REWARD_TERMS, SLOT_FIELDS, TOPIC_FIELDS, TOPIC_REWARD_TERMS
+from bufgym.scenario import Client, Episode, Stream, messages
+from bufgym.sender import ARRIVAL_WAITS, SOCKET_WAITS, Batch, answer_send, decide
+from bufgym.topics import Topic
+from bufgym.traces import Trace
+
+TERMS = [term.name for term in REWARD_TERMS + TOPIC_REWARD_TERMS]
+L = 5
+STREAMS = (
+    Stream(Topic("pose", priority=5, rate_limit_hz=18, deadline_s=0.05), 20, 400, jitter=0.5),
+    Stream(Topic("image", weight=2, limit=3, value=qoi.saturating(3), deadline_s=0.2), 15, 6_000, size_cv=0.6),
+    Stream(Topic("command", priority=2, no_drop=True), 4, 100),
+    Stream(Topic("log", weight=0), 10, 800),
+)
+LINKS = (Trace.steps([(0.4, 60_000), (0.5, 0), (0.6, 40_000)]), Trace.steps([(0.7, 90_000), (0.2, 0)], after="stop"))
+CLIENT = Client(STREAMS, LINKS, duration_s=2.0 if JIT else 1.0, scale=2.0)
+CASES: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "bytes": {"max_bytes": 9_000},
+    "window": {"window": 3, "round_trip_us": 30_000},
+    "overflow": {"decide_at": "overflow"},
+}
+
+
+def make(case: str = "plain", capacity: int = L, **more: Any) -> SenderEnv:
+    return SenderEnv(CLIENT, capacity, **(CASES[case] | more))
+
+
+def waiting(env: SenderEnv) -> int:
+    """Who asks: nobody (0), an arrival, or the socket."""
+    return int(env.rows.senders.batch.senders["waiting"][0])
+
+
+def copied(env: SenderEnv) -> Batch:
+    """A snapshot, to try something on."""
+    batch = env.rows.senders.batch
+    return batch._replace(**{name: getattr(batch, name).copy() for name in batch._fields if name != "v"})
+
+
+def possible(mask: np.ndarray, rng: np.random.Generator) -> int:
+    return int(rng.choice(np.flatnonzero(mask)))
+
+
+def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
+
+
+# --- Gymnasium -------------------------------------------------------------------------------------------------------
+
+
+def test_gymnasium_finds_nothing_to_complain_about() -> None:
+    env = gym.make("bufgym/Topics-v0", duration_s=1.0).unwrapped
+    check_env(env)
+    assert env.action_space == gym.spaces.Discrete(34)
+    assert len(env.rows.senders.topics) == 8
+    assert set(env.observation_space) == {field.name for field in FIELDS + TOPIC_FIELDS}
+
+
+def test_fields_choose_what_is_observed() -> None:
+    chosen = ["loss", "socket_asks", "silence"]
+    env, everything = make(fields=chosen), make()
+    few, all_of_it = env.reset(seed=3)[0], everything.reset(seed=3)[0]
+    assert set(env.observation_space) == set(few) == set(chosen)
+    assert same(few, {name: all_of_it[name] for name in chosen})
+    assert (few["silence"].shape, few["socket_asks"].shape) == ((L + 1,), (1,))
+    with pytest.raises(BufgymError, match="unknown field 'silence'"):
+        SenderEnv("lte", fields=["silence"])
+    with pytest.raises(BufgymError, match="unknown term 'age'"):
+        SenderEnv("lte", reward="age")
+
+
+@pytest.mark.slow
+def test_same_seed_same_run_and_another_seed_another() -> None:
+    def play(seed: int) -> list[Any]:
+        env, rng, record = make(), np.random.default_rng(0), []
+        for k in range(2):
+            seen, info = env.reset(seed=seed if k == 0 else None)
+            ended = False
+            while not ended:
+                seen, reward, ended, _, info = env.step(int(rng.integers(L + 2)))
+                record.append((reward, info["action_mask"].tolist(), {key: seen[key].tolist() for key in seen}))
+        return record
+
+    assert play(5) == play(5)
+    assert play(5) != play(6)
+
+
+# --- by hand ---------------------------------------------------------------------------------------------------------
+
+V = qoi.saturating(4)
+THREE = (
+    Stream(Topic("pose", priority=4, weight=2, deadline_s=0.01), 10, 100),
+    Stream(Topic("image", priority=1, weight=1, value=qoi.saturating(8)), 10, 100),
+    Stream(Topic("command", priority=2, weight=0.5, no_drop=True), 10, 100),
+)
+BY_HAND = Client(THREE, LINKS[0], value=V)
+"""Weights 2, 1 and 0.5; V is d / 4, of images d / 8, up to 1."""
+
+
+def three_topics(**more: Any) -> Episode:
+    """Seven messages of 100 bytes over 10 bytes/ms: each takes 10 ms.
+
+    0 pose at 0 ms, 1 image at 1, 2 command at 2, 3 pose at 4, 4 image at 6, 5 pose at 8, 6 command at 9. x = ms.
+    """
+    ms = np.array([0, 1, 2, 4, 6, 8, 9])
+    arrivals = messages(1_000 * ms, np.full(7, 100), ms.astype(float))
+    arrivals["topic"] = [0, 1, 2, 0, 1, 0, 2]
+    steady = Trace("steady", np.array([0, 1_000_000]), np.array([0, 10_000]))
+    return Episode(arrivals, Link(steady, propagation_us=1_000), **more)
+
+
+def test_an_episode_of_three_topics_by_hand() -> None:
+    """L = 3. Accept 0, which is asked for and sent at once; accept 1, 2 and 3; 4 comes: the queue is full.
+
+    4 (image) evicts 1 (image); 5 (pose) is rejected; 6 (command) can't be: it evicts 3 (pose). Queued are 2 4 6. At
+    10 ms 0 has crossed and the socket asks. It sends 4, at 20 ms 2, at 30 ms 6, and all have crossed at 40 ms.
+    """
+    env = SenderEnv(BY_HAND, 3, reward={"retained": 1.0, "age": 1.0, "late": 10.0})
+    accept, reject = 4, 3
+    script = [
+        # who asks, at what time, which actions are possible, action, retained, delivered
+        (ARRIVAL_WAITS, 0, [0, 0, 0, 1, 1], accept, 0, 0),
+        (SOCKET_WAITS, 0, [1, 0, 0, 1, 0], 0, 0, 0),
+        (ARRIVAL_WAITS, 1, [0, 0, 0, 1, 1], accept, 0, 0),  # the first image: the 1 in its H
+        (ARRIVAL_WAITS, 2, [1, 0, 0, 0, 1], accept, 0, 0),  # the first command; there is room, so not to be rejected
+        (ARRIVAL_WAITS, 4, [1, 0, 0, 1, 1], accept, 2 * 4 / 4, 0),  # pose: weight 2, V(4) = 1
+        (ARRIVAL_WAITS, 6, [1, 0, 1, 1, 0], 0, 0, 0),  # 4 is the first image now
+        (ARRIVAL_WAITS, 8, [0, 1, 1, 1, 0], reject, 0, 0),  # queued 2 3 4: the command may not be evicted
+        (ARRIVAL_WAITS, 9, [0, 1, 1, 0, 0], 1, -2 + 0.5 * 1, 0),  # 3 goes; command 2 -> 9: V(7) = 1, weight 0.5
+        (SOCKET_WAITS, 10, [1, 1, 0, 0, 0], 1, 0, 0),  # 2 4 6: oldest of their topics are 2 and 4; nothing is to come
+        (SOCKET_WAITS, 20, [1, 0, 0, 0, 0], 0, 0, 0),  # 2 before 6
+        (SOCKET_WAITS, 30, [1, 0, 0, 0, 0], 0, 0, 0.5),
+    ]
+    seen, info = env.reset(options={"episode": three_topics()})
+    totals = dict.fromkeys(TERMS, 0.0)
+    for k, (who, ms, mask, action, retained, delivered) in enumerate(script):
+        now_us = int(env.rows.senders.batch.senders["now_us"][0])
+        assert (waiting(env), now_us) == (who, 1_000 * ms)
+        assert info["action_mask"].tolist() == [bool(each) for each in mask]
+        assert seen["socket_asks"] == [who == SOCKET_WAITS]
+        assert seen["occupied"].tolist()[-1] == (who == ARRIVAL_WAITS)
+        if k == 7:
+            # Command 6 at 9 ms; queued are command 2, pose 3 and image 4; pose 0 was sent.
+            assert seen["priority"].tolist() == [0.5, 1, 0.25, 0.5]
+            assert seen["weight"].tolist() == [0.25, 1, 0.5, 0.25]
+            assert seen["no_drop"].tolist() == [1, 0, 0, 1]
+            assert seen["oldest"].tolist() == [1, 1, 1, 0]
+            assert seen["own"].tolist() == [1, 0, 0, 1]
+            assert seen["rank"].tolist() == [0.25, 0.5, 0.75, 1]
+            assert seen["queued"].tolist() == pytest.approx([1 / 3] * 4)
+            assert seen["waited"].tolist() == pytest.approx([0.007 / 1.007, 0.005 / 1.005, 0.003 / 1.003, 0])
+            assert seen["silence"].tolist() == pytest.approx([0.009 / 1.009] * 4)
+            assert seen["lateness"].tolist() == pytest.approx([0, 5 / 15, 0, 0])
+            # In units of the largest weight: pose V(4) = 1; the newcomer V(7) = 1 of weight 0.5.
+            assert seen["gain"].tolist() == [0, 1, 0, 0.25]
+            mean = (1 + 0.25) / 4
+            assert seen["gain_per_byte"].tolist() == pytest.approx([0, 1 / (1 + mean), 0, 0.25 / (0.25 + mean)])
+            assert seen["size"].tolist() == [0.5] * 4
+            assert seen["in_flight"] == [0.5] and seen["busy"] == [1] and seen["left"].tolist() == pytest.approx([0.1])
+            # Pose 3 stands between 0 (4 ms before) and what is expected 4 + 4 ms after it, one more step than 5 was.
+            # V(4) + V(8) - V(12) = 1; the even gap is (8 - 0) / 2 = 4: it loses V(4) + V(4) - V(8) = 1, too.
+            assert seen["loss"][1] == 1
+            assert seen["relative_loss"][1] == 0.5
+            assert seen["time_before"][1] == 0.5
+            assert seen["time_merged"][1] == pytest.approx((4 + 8) / (4 + 8 + 2 * 4))
+        seen, _, ended, _, info = env.step(action)
+        assert info["reward_terms"]["retained"] == pytest.approx(retained), k
+        assert info["reward_terms"]["delivered"] == pytest.approx(delivered), k
+        for name in TERMS:
+            totals[name] += info["reward_terms"][name]
+        assert ended == (k == len(script) - 1)
+    assert info["impossible"] == 0
+    assert (info["arrived"], info["delivered"], info["dropped"]) == (7, 4, 3)
+    assert info["qoi"] == pytest.approx(2 + 1 + 0.5 * (1 + 1))
+    assert totals["retained"] == totals["delivered"] == pytest.approx(0.5)
+    # Ages until 9 ms, the last arrival, when nothing had been received: 9^2 / 2, 8^2 / 2 and 7^2 / 2 ms^2, weighted.
+    assert totals["age"] == pytest.approx(-(2 * 81 / 2 + 64 / 2 + 0.5 * 49 / 2) / 3.5 * 1e-6)
+    # Pose 0 came at 11 ms, 1 ms too late: 2 of 3.5.
+    assert totals["late"] == pytest.approx(-2 / 3.5)
+    assert not any(array.any() for array in seen.values())
+
+
+def test_hold_waits_for_the_next_arrival_and_the_impossible_sends_the_oldest() -> None:
+    env = SenderEnv(BY_HAND, 3)
+    env.reset(options={"episode": three_topics()})
+    env.step(4)
+    assert waiting(env) == SOCKET_WAITS
+    _, _, _, _, info = env.step(3)  # hold
+    assert (waiting(env), info["impossible"]) == (ARRIVAL_WAITS, 0)
+    env.step(4)
+    assert waiting(env) == SOCKET_WAITS  # asked anew: 0 and 1 are queued
+    for action, impossible, goes in ((4, 1, 0), (2, 1, 0), (1, 0, 1), (0, 0, 0)):
+        batch = copied(env)
+        answer_send(batch, 0, action)
+        assert batch.senders["impossible"][0] == impossible
+        assert batch.senders["chosen"][0] == goes
+
+
+def test_hold_at_a_pong() -> None:
+    """n_T = 1 and 5 ms to the pong: after the last arrival the socket may wait for the pong, then no longer."""
+    env = SenderEnv(BY_HAND, 6, window=2)
+    _, info = env.reset(options={"episode": three_topics(window=2, pong_us=5_000)})
+    rng, ended, asked = np.random.default_rng(0), False, []
+    while not ended:
+        mask = info["action_mask"]
+        if waiting(env) == SOCKET_WAITS:
+            sender = env.rows.senders.batch.senders[0]
+            more = sender["next"] < sender["arrivals"] or sender["ponged"] < sender["taken"]
+            assert mask[6] == more
+            asked.append(bool(more))
+            action = int(np.flatnonzero(mask[:6])[0]) if rng.random() < 0.5 or not more else 6
+        else:
+            action = 7
+        _, _, ended, _, info = env.step(action)
+    assert info["impossible"] == 0 and info["delivered"] == 7
+    assert True in asked
+
+
+# --- random play -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_mask_is_what_does_not_count_as_impossible(case: str) -> None:
+    """Every action on a copy of the sender."""
+    env, rng = make(case), np.random.default_rng(2)
+    _, info = env.reset(seed=9)
+    ended, met = False, {ARRIVAL_WAITS: 0, SOCKET_WAITS: 0}
+    while not ended:
+        met[waiting(env)] += 1
+        if rng.random() < (0.3 if JIT else 0.1):
+            allowed = []
+            for action in range(L + 2):
+                batch = copied(env)
+                before = int(batch.senders["impossible"][0])
+                if waiting(env) == ARRIVAL_WAITS:
+                    carried_out = decide(batch, 0, decision_of(action, L))
+                else:
+                    carried_out = answer_send(batch, 0, -1 if action == L else action)
+                assert carried_out == (int(batch.senders["impossible"][0]) == before)
+                allowed.append(bool(carried_out))
+            assert info["action_mask"].tolist() == allowed
+        # Full queues and holding are what is rare: accept where possible.
+        mask = info["action_mask"]
+        _, _, ended, _, info = env.step(L + 1 if mask[L + 1] else possible(mask, rng))
+    assert info["impossible"] == 0
+    assert min(met.values()) > 3
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_step_of_random_play(case: str) -> None:
+    """Bounds, conservation and sums of rewards, also where many actions are impossible."""
+    env, rng = make(case, reward={"delivered": 1.0, "retained": 2.0, "age": 3.0, "late": 4.0}), np.random.default_rng(1)
+    weights = np.array([topic.share for topic in CLIENT.topics])
+    for k in range(6 if JIT else 1):
+        seen, info = env.reset(seed=7 if k == 0 else None)
+        ended, totals, careless = False, dict.fromkeys(TERMS, 0.0), k % 2
+        while not ended:
+            assert env.observation_space.contains(seen)
+            assert info["action_mask"].any()
+            action = int(rng.integers(L + 2)) if careless else possible(info["action_mask"], rng)
+            seen, reward, ended, truncated, info = env.step(action)
+            terms = info["reward_terms"]
+            assert reward == pytest.approx(sum((i + 1) * terms[name] for i, name in enumerate(TERMS)))
+            assert not truncated
+            sender = env.rows.senders.batch.senders[0]
+            dropped = sender["rejected"] + sender["evicted"]
+            assert sender["next"] == sender["crossed"] + sender["busy"] + sender["occupancy"] + dropped
+            for name in TERMS:
+                totals[name] += terms[name]
+        assert (info["impossible"] > 0) == bool(careless)
+        outcomes = topic_outcomes(env.rows.senders, 0)
+        assert info["qoi"] == pytest.approx(weights @ [made.qoi for made in outcomes])
+        ones = weights @ [made.delivered > 0 for made in outcomes]
+        assert totals["delivered"] == pytest.approx(info["qoi"] - ones, abs=1e-9)
+        assert totals["retained"] == pytest.approx(info["qoi"] - ones, abs=1e-9)
+        assert sum(made.arrived for made in outcomes) == info["arrived"]
+        assert sum(made.limited for made in outcomes) > 0
+        times = env.rows.senders.episodes[0].arrivals
+        first_us = [times["arrival_us"][times["topic"] == k][0] for k in range(4)]
+        areas = [made.mean_age_s * (times["arrival_us"][-1] - first_us[k]) / 1e6 for k, made in enumerate(outcomes)]
+        assert totals["age"] == pytest.approx(-(weights @ areas) / weights.sum())
+        assert totals["late"] == pytest.approx(-(weights @ [made.late for made in outcomes]) / weights.sum())
+
+
+def test_topics_that_weigh_nothing_pay_nothing() -> None:
+    streams = tuple(Stream(Topic(name, weight=0.0, deadline_s=0.01), 10, 100) for name in "ab")
+    env = SenderEnv(Client(streams, LINKS, duration_s=1.0), 3, reward={name: 1.0 for name in TERMS})
+    seen, _ = env.reset(seed=0)
+    ended = False
+    while not ended:
+        assert env.observation_space.contains(seen)
+        seen, reward, ended, _, info = env.step(4)
+        assert reward == 0.0
+    assert info["qoi"] == 0.0 and info["delivered"] > 0
+
+
+def one_topic(**more: Any) -> SenderEnv:
+    stream = Stream(Topic("camera", priority=0.5, weight=0.25, deadline_s=0.05, limit=2), 20, 3_000)
+    return SenderEnv(Client((stream,), LINKS[:1], duration_s=2.0), 4, **more)
+
+
+def test_a_client_of_one_topic() -> None:
+    """Its rules hold: two queued at most; rewards add up; both kinds of event."""
+    env, rng = one_topic(), np.random.default_rng(0)
+    seen, info = env.reset(seed=1)
+    ended, total, met = False, 0.0, set()
+    while not ended:
+        met.add(waiting(env))
+        assert env.observation_space.contains(seen)
+        assert seen["occupied"][:4].sum() <= 2
+        seen, reward, ended, _, info = env.step(possible(info["action_mask"], rng))
+        total += reward
+    assert met == {ARRIVAL_WAITS, SOCKET_WAITS}
+    assert info["impossible"] == 0 and 0 < info["dropped"]
+    assert total == pytest.approx(info["qoi"] - 0.25)
+
+
+def test_one_topic_is_the_largest_of_all() -> None:
+    env = one_topic(reward="late")
+    seen, info = env.reset(seed=1)
+    assert (seen["weight"][-1], seen["priority"][-1]) == (1, 1)
+    ended, total = False, 0.0
+    while not ended:
+        _, reward, ended, _, info = env.step(5 if info["action_mask"][5] else possible(info["action_mask"], np.random))
+        total += reward
+    (made,) = topic_outcomes(env.rows.senders, 0)
+    assert total == pytest.approx(-made.late)
+
+
+# --- the batch -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("case", ["plain", "window"])
+def test_row_i_is_the_single_environment_with_seed_s_plus_i(case: str, mode: str) -> None:
+    n, rng, kinds = 3, np.random.default_rng(0), set()
+    given = CASES[case] | {"duration_s": 0.6}
+    envs = SenderVectorEnv(n, CLIENT, L, autoreset_mode=mode, **given)
+    alone = [SenderEnv(CLIENT, L, **given) for _ in range(n)]
+    seen, info = envs.reset(seed=40)
+    for i, env in enumerate(alone):
+        assert same({name: seen[name][i] for name in seen}, env.reset(seed=40 + i)[0])
+    over, episodes = [False] * n, 0
+    for _ in range(260 if JIT else 100):
+        actions = np.array([possible(mask, rng) for mask in envs.action_masks()])
+        actions = np.where(rng.random(n) < 0.2, rng.integers(L + 2, size=n), actions)
+        kinds.add(tuple(envs.rows.senders.batch.senders["waiting"].tolist()))
+        seen, rewards, terminated, truncated, info = envs.step(actions)
+        assert not truncated.any()
+        for i, env in enumerate(alone):
+            if over[i]:  # this step was the reset
+                observation, told = env.reset()
+                reward, over[i] = 0.0, False
+                assert all(not info["reward_terms"][name][i] for name in TERMS)
+            else:
+                observation, reward, over[i], _, told = env.step(actions[i])
+                if not over[i] or mode == "NextStep":
+                    assert {name: info["reward_terms"][name][i] for name in TERMS} == told["reward_terms"]
+            assert rewards[i] == reward
+            assert terminated[i] == over[i]
+            if over[i]:
+                episodes += 1
+                final = info if mode == "NextStep" else info["final_info"]
+                assert {key: final[key][i] for key in ("qoi", "arrived", "delivered", "dropped")} == {
+                    key: told[key] for key in ("qoi", "arrived", "delivered", "dropped")
+                }
+                if mode == "SameStep":
+                    assert same(info["final_obs"][i], observation)
+                    observation, over[i] = env.reset()[0], False
+            assert same({name: seen[name][i] for name in seen}, observation)
+            assert (envs.action_masks()[i] == env.action_masks()).all()
+    assert episodes > n
+    assert any(ARRIVAL_WAITS in kind and SOCKET_WAITS in kind for kind in kinds)  # both kinds in one step
+
+
+def test_given_episodes() -> None:
+    env, envs = SenderEnv(BY_HAND, 3), SenderVectorEnv(2, BY_HAND, 3)
+    first = env.reset(seed=0, options={"episode": three_topics()})[0]
+    seen, _ = envs.reset(seed=0, options={"episodes": [None, three_topics()]})
+    assert same({name: seen[name][1] for name in seen}, first)
+    assert env.rows.senders.episodes[0].arrivals["topic"].tolist() == [0, 1, 2, 0, 1, 0, 2]
+    unknown = three_topics()
+    unknown.arrivals["topic"][3] = 3
+    with pytest.raises(BufgymError, match="unknown topic 3; the senders know 3"):
+        env.reset(options={"episode": unknown})
+
+
+@pytest.mark.slow
+def test_masked_ppo_learns_on_it() -> None:
+    pytest.importorskip("stable_baselines3", reason="the extra [train] is not installed")
+    maskable = pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed").MaskablePPO
+    from bufgym.sb3 import make_vec_env
+
+    envs = make_vec_env("bufgym/Topics-v0", 4, seed=0, scenario=CLIENT, capacity=L, duration_s=0.5)
+    model = maskable("MultiInputPolicy", envs, n_steps=64, batch_size=64, n_epochs=1, seed=0, device="cpu")
+    model.learn(512)
+    assert len(model.ep_info_buffer) > 0
+    assert (envs.envs.rows.senders.batch.senders["impossible"] == 0).all()
+
+
+# --- pictures --------------------------------------------------------------------------------------------------------
+
+
+def text(env: SenderEnv, width: int = 100) -> list[str]:
+    """The frame without colours, line by line."""
+    return re.sub(r"\x1b\[[0-9;]*m", "", render.ansi(env.rows.senders, 0, width)).splitlines()
+
+
+def test_a_frame_of_text_has_a_lane_a_topic() -> None:
+    """The episode by hand after 0 1 2 3 were accepted and 4 evicted 1: 0 is in transmission, 2 3 4 wait, 5 asks."""
+    env = SenderEnv(BY_HAND, 3)
+    env.reset(options={"episode": three_topics()})
+    env.step(4)
+    assert text(env)[-2].endswith("the socket asks")
+    assert "0 arrived" not in text(env)[0] and "1 arrived: 0 delivered, 0 in transmission, 1/3 queued" in text(env)[0]
+    for action in (0, 4, 4, 4, 0):
+        env.step(action)
+    counts, _, pose, image, command, queue, legend, _ = text(env)
+    assert "5 arrived: 0 delivered, 1 in transmission, 3/3 queued, 1 dropped; H = 0.00" in counts
+    lane = len("a pose          ")
+    assert [line[:lane].split() for line in (pose, image, command)] == [["a", "pose"], ["b", "image"], ["c", "command"]]
+    assert [line[lane:] for line in (pose, image, command)] == ["▶  ■ ?", " ·  ■ ", "  ■   "]
+    assert queue.split() == ["queue", "a", "c", "a", "b", "a"]
+    assert legend.endswith("an arrival asks")
+    for action in (3, 1, 1, 0):
+        env.step(action)
+    # At 30 ms 0 and 4 have reached the server: the ones of pose and image.
+    assert "3 delivered" in text(env)[0] and "H = 3.00" in text(env)[0]
+
+
+@pytest.mark.parametrize("topics", [2, 8, 30])
+@pytest.mark.parametrize("capacity", [1, 32, 200])
+def test_pictures_of_any_size(topics: int, capacity: int) -> None:
+    streams = tuple(Stream(Topic(f"a long name of topic {k}"), 5, 900) for k in range(topics))
+    env = SenderEnv(Client(streams, LINKS[:1], duration_s=1.0), capacity, render_mode="rgb_array")
+    env.reset(seed=0)
+    for k in range(9):
+        env.step(capacity + 1 if waiting(env) == ARRIVAL_WAITS else k % 2 * capacity)
+        assert max(map(len, text(env, 60)[1 : topics + 3])) <= 60
+    frame = env.render()
+    assert (frame.shape, frame.dtype) == ((400, 800, 3), np.uint8)
+    shown = {tuple(pixel) for pixel in frame.reshape(-1, 3).tolist()}
+    queued = tuple(int(render._COLOURS[render.QUEUED][k : k + 2], 16) for k in (1, 3, 5))
+    assert queued in shown
+    assert tuple(frame[2, 2]) == (255, 255, 255)
+
+
+def test_drawing_changes_nothing() -> None:
+    drawn, plain, rng = make(render_mode="rgb_array"), make(), np.random.default_rng(3)
+    drawn.reset(seed=1)
+    _, info = plain.reset(seed=1)
+    ended, k = False, 0
+    while not ended:
+        if k % 40 == 0:
+            drawn.render(), text(drawn)
+        action, k = possible(info["action_mask"], rng), k + 1
+        seen, reward, _, _, _ = drawn.step(action)
+        unseen, reward_unseen, ended, _, info = plain.step(action)
+        assert same(seen, unseen) and reward == reward_unseen
+    assert drawn.render().std() > 5
+
+
+def test_the_example_client_is_what_the_speed_report_measures() -> None:
+    assert len(scenarios.get("topics").topics) == 8
+    assert perf.Sizes().topic_slots == gym.spec(perf.TOPICS).kwargs["capacity"] == 32
+    assert len(SLOT_FIELDS + CONTEXT_FIELDS) == len(FIELDS)
