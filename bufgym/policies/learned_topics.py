@@ -29,7 +29,7 @@ from bufgym.observe import (
 )
 from bufgym.policies.learned import Network, begin, forward
 from bufgym.policies.registry import Policy
-from bufgym.policies.robofleet import first_no_drop
+from bufgym.policies.robofleet import next_no_drop
 from bufgym.policies.schedulers import fits, make_room, makes_room
 
 SLOTS, CONTEXT = len(SLOT_FIELDS + TOPIC_SLOT_FIELDS), len(CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS)
@@ -101,7 +101,7 @@ def sends(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     for k in range(len(buffer.slots)):
         kept += buffer.topics[buffer.slots[k].topic].no_drop
     if 2 * kept >= buffer.capacity:
-        return first_no_drop(buffer)
+        return next_no_drop(buffer, 0)
     observed(buffer, buffer.slots[0], False, memory)
     best, choice = -np.inf, HOLD
     for k in range(len(buffer.slots)):
