@@ -205,10 +205,11 @@ def test_sends_and_drops_by_hand():
     policy = linear(drop_priority=-1, drop_rank=-0.01, send_priority=1)
     senders = run(policy, [ten_messages()], 4, V, topics=HIGH_AND_LOW)
     # 5 (kept) drives out 3 (low); 6 (low) is rejected; 7 (high) and 8 (kept) drive out 1 and 4, the oldest high ones;
-    # 9 (low) is rejected. Queued are 2 5 7 8: high first, then the others in order.
+    # 9 (low) is rejected. Queued are 2 5 7 8: 2 and 5 go first as long as no_drop ones fill half of the buffer, then
+    # the high one.
     assert sorted(fates(senders)["dropped_us"].items()) == [(1, 70), (3, 50), (4, 80), (6, 60), (9, 90)]
-    assert order(senders) == [0, 7, 2, 5, 8]
-    # By the lowest priority sent: 2 5 8, and 7 last.
+    assert order(senders) == [0, 2, 5, 7, 8]
+    # By the lowest priority sent: 8, and 7 last.
     other = linear(drop_priority=-1, drop_rank=-0.01, send_priority=-1)
     assert order(run(other, [ten_messages()], 4, V, topics=HIGH_AND_LOW)) == [0, 2, 5, 8, 7]
 
