@@ -45,7 +45,7 @@ WITHOUT = {
     "rank and motion_merged alone": tuple(name for name in evolution.MOTION if name not in ("rank", "motion_merged")),
 }
 """Fields left out of ``evolution.MOTION``."""
-HIDDEN = ((0, 0), (0, 6), (8, 12))
+HIDDEN = ((4, 0), (4, 3), (4, 12))
 """Hidden units beside the mixing: those of the scorer of links that move, and of links that stand still."""
 
 
@@ -59,7 +59,8 @@ def variants(given: Arguments) -> dict[str, Arguments]:
     for hidden, still in HIDDEN:
         units = replace(given, hidden=hidden, still_hidden=still)
         made[f"{hidden} hidden units where the link moves, {still} where it stands still"] = units
-    made["one scorer for all links"] = replace(given, warm_up=0, hidden=given.still_hidden)
+    if len(given.suites) > 1:
+        made["one scorer for all links"] = replace(given, warm_up=0, hidden=given.still_hidden)
     return {name: replace(arguments, name=f"{given.name}/{k:02d}") for k, (name, arguments) in enumerate(made.items())}
 
 
@@ -76,9 +77,8 @@ def trained(arguments: Arguments, seed: int) -> list[float]:
     return found
 
 
-def table(found: dict[str, list[list[float]]], sizes: dict[str, int]) -> list[str]:
+def table(found: dict[str, list[list[float]]], sizes: dict[str, int], suites: Sequence[str]) -> list[str]:
     """Markdown: a row a variant, mean over its seeds, and the range of the mean over the suites."""
-    suites = SUITES.split(",")
     lines = [f"| variant | numbers | {' | '.join(suites)} | mean (seeds) |", "|---" * (len(suites) + 3) + "|"]
     for name, seeds in found.items():
         by_suite = " | ".join(f"{number:.2f}" for number in np.mean(seeds, axis=0))
@@ -144,11 +144,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--name", default="ablation", help="folder under runs/")
     parser.add_argument("--steps", type=int, default=40_000_000)
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--suites", default=SUITES)
     parser.add_argument("--runs", default="", help="folders of runs whose learning is shown beside")
     parser.add_argument("--out", type=Path, default=None, help="Markdown file to write; printed otherwise")
     options = parser.parse_args(arguments)
-    given = Arguments(suite=SUITES, algo="evolution", name=options.name, steps=options.steps, hidden=4)
-    given = replace(given, validate_every=options.steps // 5, warm_up=options.steps // 2)
+    given = Arguments(suite=options.suites, algo="evolution", name=options.name, steps=options.steps, hidden=4)
+    # Where there is nothing but interruptions, the link never moves.
+    share = 1 if options.suites == "interruption-v1" else 2
+    given = replace(given, validate_every=options.steps // 5, warm_up=options.steps // share)
     try:
         todo = variants(given)
         first, *others = todo.values()
@@ -168,18 +171,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, chosen in todo.items():
         kept, _ = weights.read(Path("runs") / chosen.name / "seed-0" / evolution.MODEL)
         sizes[name] = sum(len(evolution.to_vector(each)) for each in (kept, kept.still) if each)
-    seen = f" --runs {options.runs}" if options.runs else ""
+    seen = f" --suites {options.suites}" if options.suites != SUITES else ""
+    seen += f" --runs {options.runs}" if options.runs else ""
     lines = [
         "# What each part is worth",
         "",
         "Test splits; regret over that of AFR or Drop Oldest, whichever is better. "
-        f"{options.steps:,} decisions a seed, half of them for the scorer of a still link; {options.seeds} seeds, "
-        'whose range is in parentheses: what lies within it is luck. "Everything" has '
+        f"{options.steps:,} decisions a seed, {given.warm_up:,} of them for the scorer of a still link; "
+        f'{options.seeds} seeds, whose range is in parentheses: what lies within it is luck. "Everything" has '
         f"{given.hidden} hidden units where the link moves and {given.still_hidden} where it stands still. Made by",
         "",
         f"`python -m agents.ablation --steps {options.steps} --seeds {options.seeds}{seen}`",
         "",
-        *table(found, sizes),
+        *table(found, sizes, given.suites),
         "",
     ]
     if options.runs:

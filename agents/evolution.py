@@ -227,6 +227,9 @@ def train(
     """
     if not arguments.suite:
         raise BufgymError("--algo evolution learns from a suite's episodes: name one (--suite)")
+    given = [cell for suite in arguments.suites for cell in cells(suite, "train", (1,), arguments.data or None)]
+    if arguments.warm_up and not any(isinstance(cell.scenario, Interruption) for cell in given):
+        raise BufgymError(f"warm_up = {arguments.warm_up}: needs a suite of interruptions")
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
     saved = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
@@ -239,8 +242,6 @@ def train(
         like = replace(like, still=start(like.fields, arguments.still_hidden, np.random.default_rng(seed)))
         still = [yard for yard in everything if yard.exact]
         moving = [yard for yard in everything if not yard.exact] or everything
-    if not still:
-        raise BufgymError(f"warm_up = {arguments.warm_up}: needs a suite of interruptions")
     search = pickle.loads(saved.read_bytes()) if saved.exists() else Search.of(like, warm_up, seed)
     curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), search.steps)
     validations = Record(home / "validation.csv", ("steps", "seconds", *Verdict._fields, "over_rivals"), search.steps)

@@ -10,6 +10,7 @@ the same ones for the agent and for AFR.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.export import command
 from agents.grounds import Lengths
 from agents.trials import Trials
 from agents.worlds import Cell
@@ -214,6 +216,15 @@ def exact(agents: Sequence[Policy]) -> list[str]:
     return [*lines, ""]
 
 
+def reached(files: Sequence[Path]) -> list[str]:
+    """Decisions that each of these seeds learned from."""
+    found = []
+    for file in files:
+        with (file.parent / "curve.csv").open(newline="", encoding="utf-8") as rows:
+            found.append(f"{max(int(row['steps']) for row in csv.DictReader(rows)) / 1e6:.0f} M")
+    return found
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m agents.goals", description=__doc__)
@@ -234,9 +245,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         noted = options.run / "settings.json"
         if noted.exists():
             given = json.loads(noted.read_text(encoding="utf-8"))
-            lines += [f"Trained on {given['suite']}, {given['steps']:,} decisions a seed.", ""]
+            lines += [f"Made by `{command(given)}`; seeds stopped after {', '.join(reached(files))} decisions.", ""]
         data = " --data DIR" if options.data else ""
-        lines += [f"Made by `python -m agents.goals runs/{options.run.name} --suites {options.suites}{data}`.", ""]
+        lines += [f"This page: `python -m agents.goals runs/{options.run.name} --suites {options.suites}{data}`.", ""]
         lines += ["The figure is the regret over AFR's, with its 95 % interval over training seeds and episodes.", ""]
         for suite in options.suites.split(","):
             found = measure(suite, agents, options.run, options.data, options.seeds)

@@ -120,8 +120,9 @@ def _figure(
     bars = right.barh(names, numbers, color=colours)
     right.bar_label(bars, fmt="%.3f", padding=3)
     spread = max(numbers) - min(numbers) or 1.0
-    right.set(xlabel=f"{unit} (axis does not start at 0)", title=title)
-    right.set_xlim(min(numbers) - 0.15 * spread, max(numbers) + 0.2 * spread)
+    low = min(numbers) - 0.15 * spread
+    right.set(xlabel=f"{unit} (axis does not start at 0)" if low > 0 else unit, title=title)
+    right.set_xlim(low, max(numbers) + 0.2 * spread)
     right.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=120)
 

@@ -16,6 +16,7 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard", "cma"):
 import train  # noqa: E402  (these need the extra)
 from agents import evolution, grounds, training, worlds  # noqa: E402
 from bufgym import policies  # noqa: E402
+from bufgym.errors import BufgymError  # noqa: E402
 from bufgym.metrics import outcome  # noqa: E402
 from bufgym.oracle import integer, law  # noqa: E402
 from bufgym.policies import learned, weights  # noqa: E402
@@ -106,6 +107,7 @@ def test_a_yard_asks_for_the_better_of_afr_and_drop_oldest() -> None:
     assert yard.decisions() == 2 * 42
 
 
+@pytest.mark.slow
 def test_interruptions_side_by_side_are_what_each_is_alone() -> None:
     """Rows of one batch with L of their own, again and again, in two V."""
     cells = worlds.cells("interruption-v1", "train", (1, 4, 9))[:6]
@@ -117,6 +119,7 @@ def test_interruptions_side_by_side_are_what_each_is_alone() -> None:
             assert together.regrets(policies.get(name)) == [g.regret(policies.get(name)) for g in one_v]
 
 
+@pytest.mark.slow
 def test_a_yard_in_parts_asks_for_what_the_rivals_reach_on_all_of_them() -> None:
     """Two parts with one ground each, of the same L and V: each part's regret over the mean of both rivals'."""
     cell = worlds.cells("sustained-v1", "train", (10,))[1]
@@ -187,8 +190,9 @@ def test_a_warm_up_learns_a_second_scorer_first() -> None:
 
 
 def test_a_warm_up_needs_interruptions() -> None:
-    with pytest.raises(SystemExit, match="needs a suite of interruptions"):
-        train.main(dataclasses.replace(TINY, suite="sustained-v1", capacities="25", warm_up=20_000))
+    lonely = dataclasses.replace(TINY, suite="sustained-v1", capacities="25", warm_up=20_000)
+    with pytest.raises(BufgymError, match="needs a suite of interruptions"):
+        evolution.train(lonely, training.prepare(lonely), 0)
 
 
 @pytest.mark.slow
