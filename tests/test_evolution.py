@@ -82,6 +82,7 @@ def test_one_run_through_the_longest_interruption_is_a_run_through_each(name: st
     assert ground.regret(policy) == pytest.approx(1 - share @ each / (share @ best), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_sampled_grounds_take_traces_in_turn_and_meet_the_same_episodes_again() -> None:
     given = worlds.cells("sustained-v1", "train", (5, 10))
     found = grounds.grounds(given[:4], seed=3, episodes=8)
