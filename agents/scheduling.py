@@ -11,12 +11,13 @@ search begins at what is greedy: drop what loses the least QoI now, send what ga
 
 from __future__ import annotations
 
+import argparse
 import concurrent.futures
+import json
 import multiprocessing
 import os
 import pickle
 import shutil
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,13 +27,13 @@ from typing import TYPE_CHECKING, Any
 import cma
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
+from agents.callbacks import Record, seed_bar
 from bufgym import policies, suites
-from bufgym.benchmark.rows import Row, write_rows
+from bufgym.benchmark.rows import Row, read_rows, write_rows
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.topics import ROWS, default_policies, run_parts, suite_parts
-from bufgym.benchmark.topics_summary import plain, summary
+from bufgym.benchmark.topics_summary import Standing, plain, summary
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
 from bufgym.link import FOREVER
@@ -217,15 +218,8 @@ def train(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> tuple
         settings = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9}
         search, best, validated = Search(cma.CMAEvolutionStrategy(begin, SIGMA, settings), begin), np.inf, -1
     began = time.perf_counter() - search.seconds
-    bar = tqdm(
-        total=arguments.steps,
-        initial=search.steps,
-        desc=f"seed {seed}",
-        unit=" steps",
-        unit_scale=True,
-        position=line,
-        disable=not sys.stderr.isatty(),
-    )
+    bar = seed_bar(arguments.steps, search.steps, seed, line)
+    validations = Record(home / "validation.csv", ("steps", "seconds", "fitness"), search.steps)
     while True:
         if validated < 0 or search.steps - validated >= arguments.validate_every or search.steps >= arguments.steps:
             reached, validated = fitness(policy_of(search.average), judges), search.steps
@@ -233,8 +227,8 @@ def train(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> tuple
                 best = reached
                 noted = {"name": "evolved", "suite": suite, "seeds": [seed], "algo": "evolution"}
                 weights.save(home / MODEL, from_vector(search.average), noted)
-            with (home / "validation.csv").open("a", encoding="utf-8") as file:
-                file.write(f"{search.steps},{search.seconds:.1f},{reached:.4f}\n")
+            if not validations.rows or validations.rows[-1][0] < search.steps:
+                validations.append(search.steps, round(search.seconds, 1), reached)
             if bar.disable:
                 print(f"seed {seed}: {search.steps:,} of {arguments.steps:,} steps, {reached:.3f}", flush=True)
         if search.steps >= arguments.steps:
@@ -284,3 +278,88 @@ def test_rows(arguments: Arguments, folder: Path, seeds: Sequence[int]) -> list[
     suite = suites.get(arguments.suite)
     parts = suite_parts(suite, "test", arguments.test_seeds or None)
     return run_parts([*agents, *rivals], parts, suite.capacities, progress=True)
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+PAGE = """# Learned scheduling on topics-v1
+
+Eight topics of Robofleet's example client share an uplink that is slower than what they publish and drops out now
+and then (`bufgym list suites`). Agents are slot scorers over each queued message's features, its topic's among them;
+they decide at every arrival what is dropped and at every free socket what goes. All training seeds are shown;
+`learned-scheduler` is the one that did best on validation.
+
+Agents: `{command}`. This page: `python -m agents.scheduling runs/NAME --out docs/topics.md`.
+Without training: `bufgym topics --suite topics-v1`.
+
+Mean over the {settings} settings of the test split, {episodes} episodes each. QoI is the weighted sum of each topic's
+H; beside `robofleet`, as published, on the same episodes, with paired 95 % intervals over episodes. Age is that of
+information at the server, of the topics of priority 20 ("first") and of the others.
+
+| policy | QoI / robofleet's | no_drop lost | age, first / robofleet's | age, first, s | age, others, s | late |
+|---|---|---:|---|---:|---:|---:|
+{overall}
+
+{notes}
+
+## By setting
+
+```
+{text}
+```
+"""
+
+
+def page(folder: Path) -> str:
+    """What a finished run reached, as Markdown."""
+    from agents.export import command
+
+    rows, settings = read_rows(folder / "rows.csv", ROWS), json.loads((folder / "settings.json").read_text("utf-8"))
+    found = summary(rows)
+    lines = ["| " + " | ".join(_cells(standing)) + " |" for standing in found.overall]
+    ours = [standing for standing in found.overall if standing.policy.startswith("agent")]
+    low, high = (f([s.relative.value for s in ours]) for f in (min, max))
+    older = max(s.age_relative.high for s in ours)
+    notes = (
+        f"Over all seeds: QoI {low:.2f} to {high:.2f} times Robofleet's, {sum(s.lost for s in ours):g} no_drop messages "
+        f"lost, the topics of priority 20 at most {older:.3f} times as old (upper end of the interval)."
+    )
+    return PAGE.format(
+        command=command(settings),
+        settings=len(found.cells),
+        episodes=len({(row["trace"], row["seed"]) for row in rows if row["scenario"] == rows[0]["scenario"]}),
+        overall="\n".join(lines),
+        notes=notes,
+        text=plain(found),
+    )
+
+
+def _cells(standing: Standing) -> list[str]:
+    relative, age = standing.relative, standing.age_relative
+    return [
+        standing.policy,
+        f"{relative.value:.3f} [{relative.low:.3f}, {relative.high:.3f}]",
+        f"{standing.lost:g}",
+        f"{age.value:.3f} [{age.low:.3f}, {age.high:.3f}]",
+        f"{standing.age_first_s.value:.2f}",
+        f"{standing.age_others_s.value:.2f}",
+        f"{standing.late.value:.1%}",
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """``python -m agents.scheduling RUN --out FILE``."""
+    parser = argparse.ArgumentParser(
+        prog="python -m agents.scheduling", description="the page about a run's schedulers"
+    )
+    parser.add_argument("run", type=Path, help="its folder, runs/NAME")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="Markdown")
+    options = parser.parse_args(arguments)
+    if not (options.run / "rows.csv").is_file():
+        raise SystemExit(f"error: {options.run / 'rows.csv'}: no such file; the run has not ended")
+    options.out.write_text(page(options.run), encoding="utf-8")
+    print(f"page: {options.out}")
+
+
+if __name__ == "__main__":
+    main()
