@@ -314,15 +314,19 @@ def page(folder: Path) -> str:
     """What a finished run reached, as Markdown."""
     from agents.export import command
 
-    rows, settings = read_rows(folder / "rows.csv", ROWS), json.loads((folder / "settings.json").read_text("utf-8"))
+    rows = read_rows(folder / "rows.csv", ROWS)
+    settings = json.loads((folder / "settings.json").read_text(encoding="utf-8"))
     found = summary(rows)
-    lines = ["| " + " | ".join(_cells(standing)) + " |" for standing in found.overall]
+    unbounded = {name for name in policies.names() if not policies.get(name).ranked}
+    standings = sorted(found.overall, key=lambda standing: standing.policy in unbounded)  # their QoI comes long after
+    lines = ["| " + " | ".join(_cells(standing)) + " |" for standing in standings]
     ours = [standing for standing in found.overall if standing.policy.startswith("agent")]
     low, high = (f([s.relative.value for s in ours]) for f in (min, max))
     older = max(s.age_relative.high for s in ours)
     notes = (
-        f"Over all seeds: QoI {low:.2f} to {high:.2f} times Robofleet's, {sum(s.lost for s in ours):g} no_drop messages "
-        f"lost, the topics of priority 20 at most {older:.3f} times as old (upper end of the interval)."
+        f"Over all seeds: QoI {low:.2f} to {high:.2f} times Robofleet's, {sum(s.lost for s in ours):g} no_drop "
+        f"messages lost, the topics of priority 20 at most {older:.3f} times as old (upper end of the interval). "
+        "`rosbridge` has an unbounded queue: it loses nothing and delivers it long after."
     )
     return PAGE.format(
         command=command(settings),
