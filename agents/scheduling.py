@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.callbacks import Record, seed_bar
-from bufgym import policies, suites
+from bufgym import files, policies, suites
 from bufgym.benchmark.rows import Row, read_rows, write_rows
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.topics import ROWS, default_policies, run_parts, suite_parts
@@ -274,7 +274,8 @@ def train_and_report(arguments: Arguments, folder: Path) -> None:
 def test_rows(arguments: Arguments, folder: Path, seeds: Sequence[int]) -> list[Row]:
     """Each seed's agent and all schedulers on the suite's test split."""
     agents = [replace(weights.load(folder / f"seed-{seed}" / MODEL), name=f"agent (seed {seed})") for seed in seeds]
-    rivals = [policies.get(name) for name in default_policies()]
+    shipped = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetensors")
+    rivals = [policies.get(name) for name in default_policies() if name not in shipped]
     suite = suites.get(arguments.suite)
     parts = suite_parts(suite, "test", arguments.test_seeds or None)
     return run_parts([*agents, *rivals], parts, suite.capacities, progress=True)
