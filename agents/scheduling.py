@@ -75,12 +75,12 @@ MODEL = "model.safetensors"
 
 
 def start() -> TopicWeights:
-    """Greedy: drop what loses least, rather old than new; accept with room; send no_drop first, then gain a byte."""
+    """Greedy: drop what loses least, rather old than new; accept with room; send what gains most a byte."""
     drop, accept, send = (Network(_zeros(len(FIELDS)), _zeros(1), (), _zeros(0)) for _ in range(3))
     for name, number in (("loss", -10.0), ("rank", -0.4)):
         drop.skip[FIELDS.index(name)] = number
     accept.bias[0] = 5.0
-    for name, number in (("gain_per_byte", 10.0), ("no_drop", 10.0), ("silence", 2.0)):
+    for name, number in (("gain_per_byte", 10.0), ("silence", 2.0)):
         send.skip[FIELDS.index(name)] = number
     return TopicWeights(FIELDS, drop, accept, send)
 

@@ -136,7 +136,7 @@ def test_fitness_of_the_rival_itself() -> None:
 )
 def test_fitness_by_hand(reached: tuple[float, float, float, int], expected: float) -> None:
     of: Any = SimpleNamespace(rival=(100.0, 20.0, 20.0, 0), reached=lambda policy: reached)
-    free: Any = SimpleNamespace(rival=(1.0, 1.0, 0.0, 0), reached=lambda policy: (2.0, 0.0, 1.0, 0))
+    free: Any = SimpleNamespace(rival=(1.0, 1.0, 1.0, 0), reached=lambda policy: (2.0, 0.0, 1.0, 0))
     policy = policies.get("fifo")
     assert scheduling.fitness(policy, [of]) == pytest.approx(expected)
     assert scheduling.fitness(policy, [of, free]) == pytest.approx((expected - 2) / 2)
@@ -175,7 +175,7 @@ class KilledError(Exception):
 def rows_of(home: Path) -> list[tuple[int, float]]:
     """(steps, fitness) of each validation."""
     with (home / "validation.csv").open(newline="", encoding="utf-8") as file:
-        return [(int(steps), float(reached)) for steps, _, reached in csv.reader(file)]
+        return [(int(row["steps"]), float(row["fitness"])) for row in csv.DictReader(file)]
 
 
 @pytest.mark.slow

@@ -5,8 +5,8 @@ As in ``learned``, every candidate is scored by one small network from its own f
 if it may be rejected; the *accept* network the newcomer where there is room. When the socket is free the *send* network
 scores the oldest message of each topic. The highest score is done, ties to the oldest. It never holds the socket back.
 
-One rule is not learned: where ``no_drop`` messages fill half of the buffer, they go first. Such a message is lost only
-where nothing but its like is queued, and that is not to be risked for a better score.
+One rule is not learned: ``no_drop`` messages go first, as Robofleet sends them. Such a message is lost only where
+nothing but its like is queued, and that is not to be risked for a better score.
 """
 
 from __future__ import annotations
@@ -97,11 +97,9 @@ def sends(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     if len(buffer.topics) == 1:
         return 0
     send, after = int(memory[SEND_NET]), int(memory[WORK])
-    kept = 0
-    for k in range(len(buffer.slots)):
-        kept += buffer.topics[buffer.slots[k].topic].no_drop
-    if 2 * kept >= buffer.capacity:
-        return next_no_drop(buffer, 0)
+    kept = next_no_drop(buffer, 0)
+    if kept != HOLD:
+        return kept
     observed(buffer, buffer.slots[0], False, memory)
     best, choice = -np.inf, HOLD
     for k in range(len(buffer.slots)):

@@ -118,7 +118,7 @@ def twin(whole):
     def on_send(buffer, memory):
         topics = [m.topic for m in buffer.slots]
         kept = [k for k, topic in enumerate(topics) if buffer.topics[topic].no_drop == 1]
-        if len(kept) >= buffer.capacity / 2:
+        if kept:
             return kept[0]  # that is not learned
         oldest = [k for k, topic in enumerate(topics) if topic not in topics[:k]]
         sends = scores(whole, whole.send, buffer, buffer.slots[0], False)
@@ -205,10 +205,9 @@ def test_sends_and_drops_by_hand():
     policy = linear(drop_priority=-1, drop_rank=-0.01, send_priority=1)
     senders = run(policy, [ten_messages()], 4, V, topics=HIGH_AND_LOW)
     # 5 (kept) drives out 3 (low); 6 (low) is rejected; 7 (high) and 8 (kept) drive out 1 and 4, the oldest high ones;
-    # 9 (low) is rejected. Queued are 2 5 7 8: 2 and 5 go first as long as no_drop ones fill half of the buffer, then
-    # the high one.
+    # 9 (low) is rejected. Queued are 2 5 7 8: the no_drop ones go first.
     assert sorted(fates(senders)["dropped_us"].items()) == [(1, 70), (3, 50), (4, 80), (6, 60), (9, 90)]
-    assert order(senders) == [0, 2, 5, 7, 8]
+    assert order(senders) == [0, 2, 5, 8, 7]
     # By the lowest priority sent: 8, and 7 last.
     other = linear(drop_priority=-1, drop_rank=-0.01, send_priority=-1)
     assert order(run(other, [ten_messages()], 4, V, topics=HIGH_AND_LOW)) == [0, 2, 5, 8, 7]
