@@ -60,7 +60,7 @@ PARTS, EPISODES, EPISODE_S = 12, 1, 30.0
 """Training episodes come in so many parts, one a generation in turn: so many a setting of the suite, so long."""
 POPULATION, SIGMA, MEMORY = 16, 1.0, 10
 """Candidates a generation, first step size, generations over which the mean is averaged."""
-AGE_SHARE, AGE_PENALTY = 0.95, 2.0
+AGE_SHARE, AGE_PENALTY = 0.9, 3.0
 """The age of the first topics is to be this part of the rival's; what is more costs so much."""
 OTHERS_SHARE, OTHERS_PENALTY = 1.5, 0.25
 """The same of all other topics: without it, what weighs little is never sent."""

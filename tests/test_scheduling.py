@@ -114,24 +114,24 @@ def test_reached_is_what_the_metrics_say() -> None:
 
 @pytest.mark.slow
 def test_fitness_of_the_rival_itself() -> None:
-    """As much QoI as itself: -1; 1 - 0.95 of age too much, twice: 0.1; no age is 1.5 times its own."""
+    """As much QoI as itself: -1; 1 - 0.9 of age too much, three times: 0.3; no age is 1.5 times its own."""
     of = ground()
     of.rival = of.reached(policies.get(scheduling.RIVAL))
     lost = of.rival[3]
-    assert scheduling.fitness(policies.get(scheduling.RIVAL), [of]) == pytest.approx(-1 + 2 * (1 - 0.95) + lost)
+    assert scheduling.fitness(policies.get(scheduling.RIVAL), [of]) == pytest.approx(-1 + 3 * (1 - 0.9) + lost)
     twice = scheduling.fitness(policies.get(scheduling.RIVAL), [of, of])
-    assert twice == pytest.approx(-1 + 2 * (1 - 0.95) + lost)
+    assert twice == pytest.approx(-1 + 3 * (1 - 0.9) + lost)
 
 
 @pytest.mark.parametrize(
     ("reached", "expected"),
     [
-        ((50.0, 19.0, 30.0, 0), -0.5),  # half the QoI, ages just as they may be
+        ((50.0, 18.0, 30.0, 0), -0.5),  # half the QoI, ages just as they may be
         ((150.0, 10.0, 10.0, 0), -1.5),  # less age than asked for pays nothing
-        ((100.0, 24.0, 30.0, 0), -1 + 2 * 0.25),  # 1.2 - 0.95
-        ((100.0, 19.0, 40.0, 0), -1 + 0.25 * 0.5),  # 2 - 1.5
-        ((100.0, 19.0, 30.0, 3), -1 + 3.0),  # three no_drop messages
-        ((0.0, 40.0, 60.0, 1), 1 + 2 * 1.05 + 0.25 * 1.5),
+        ((100.0, 24.0, 30.0, 0), -1 + 3 * 0.3),  # 1.2 - 0.9
+        ((100.0, 18.0, 40.0, 0), -1 + 0.25 * 0.5),  # 2 - 1.5
+        ((100.0, 18.0, 30.0, 3), -1 + 3.0),  # three no_drop messages
+        ((0.0, 40.0, 60.0, 1), 1 + 3 * 1.1 + 0.25 * 1.5),
     ],
 )
 def test_fitness_by_hand(reached: tuple[float, float, float, int], expected: float) -> None:
