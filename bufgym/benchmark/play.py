@@ -5,18 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.buffer import HOLD
 from bufgym.envs.rows import action_of
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
-from bufgym.sender import Senders, named, python_view
+from bufgym.sender import ARRIVAL_WAITS, SOCKET_WAITS, Senders, named, python_view
 
 
 class Player:
     """Owns a policy's memory for each of ``n`` senders and turns its decisions into an environment's actions.
 
     The policy hears of departures just before its next decision, as often as there were some, and sees the buffer as
-    it is then. Luck is that of the episode (see ``Episode.with_luck``). An environment asks at arrivals only: a policy
-    that drops at dequeue as well, or whose queue is unbounded, can't play in it.
+    it is then. Luck is that of the episode (see ``Episode.with_luck``). An environment asks at arrivals, and of several
+    topics for what the socket takes: a policy that drops at dequeue, or whose queue is unbounded, can't play in it.
     """
 
     def __init__(self, policy: Policy, n: int = 1) -> None:
@@ -33,10 +34,13 @@ class Player:
         self._taken[i] = 0
 
     def action(self, senders: Senders, i: int = 0) -> int:
-        """The action for sender ``i``, whose decision is due: 0..L-1 evict, L reject, L + 1 accept."""
+        """The action for sender ``i``, whose decision is due: 0..L-1 evict, L reject, L + 1 accept.
+
+        Where the socket asks: 0..L-1 send, L hold.
+        """
         batch = named(senders.batch)
         sender = batch.senders[i]
-        if sender.waiting != 1:
+        if sender.waiting not in (ARRIVAL_WAITS, SOCKET_WAITS):
             raise BufgymError(f"sender {i}: no decision is due")
         seen = python_view(batch, i)
         memory = self._memory[i]
@@ -46,6 +50,13 @@ class Player:
             for _ in range(int(sender.taken - self._taken[i])):
                 self.policy.on_departure(seen, memory)
         self._taken[i] = sender.taken
+        if sender.waiting == SOCKET_WAITS:
+            choice = int(self.policy.on_send(seen, memory))
+            if not HOLD <= choice < senders.capacity:
+                raise BufgymError(
+                    f"policy {self.policy.name}: sends slot {choice}: must be 0..{senders.capacity - 1}, or HOLD"
+                )
+            return senders.capacity if choice == HOLD else choice
         decision = int(self.policy.on_arrival(seen, batch.arrivals[i, sender.next], memory))
         try:
             return action_of(decision, senders.capacity)

@@ -47,7 +47,7 @@ def _play(options: argparse.Namespace) -> None:
         if options.speed:
             time.sleep(1 / options.speed)
         # An episode that asks for no decision ends with its first step, whatever the action.
-        due = env.rows.senders.batch.senders[0]["waiting"] == 1
+        due = env.rows.senders.batch.senders[0]["waiting"] != 0
         _, _, ended, _, info = env.step(player.action(env.rows.senders, 0) if due else options.capacity)
         if ended:
             print(

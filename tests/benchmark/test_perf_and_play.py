@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,15 @@ import pytest
 
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
+from bufgym import scenario as scenarios
 from bufgym.benchmark import perf
 from bufgym.benchmark.play import Player
 from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
+from bufgym.metrics import outcome
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
+from bufgym.sender import run as run_senders
 from bufgym.traces import Trace
 
 PLAYABLE = [
@@ -92,11 +96,33 @@ def test_a_player_in_the_environment_does_what_the_benchmark_does(name: str, sce
         player.action(env.rows.senders)
 
 
+@pytest.mark.parametrize("name", ["robofleet", "edf", "drop-oldest"])
+def test_a_player_of_topics_reaches_what_its_policy_reaches(name: str) -> None:
+    """At arrivals and at a free socket: the same deliveries and the same weighted QoI as a rollout's."""
+    client = replace(scenarios.get("topics"), duration_s=2.0)
+    episode, policy = draw(client, 3), policies.get(name)
+    rolled = run_senders(policy, [episode], 6, client.value, topics=client.topics)
+    env: Any = gym.make("bufgym/Topics-v0", scenario=client, capacity=6).unwrapped
+    env.reset(options={"episode": episode})
+    player, ended, info = Player(policy), False, {}
+    while not ended:
+        _, _, ended, _, info = env.step(player.action(env.rows.senders))
+    reached = outcome(rolled, 0)
+    assert info["qoi"] == pytest.approx(reached.qoi)
+    assert (info["delivered"], info["impossible"]) == (reached.delivered, reached.impossible)
+
+
 def test_a_player_refuses_a_decision_that_means_nothing() -> None:
     env: Any = gym.make("bufgym/Interruption-v0", capacity=3).unwrapped
     env.reset(seed=0)
     with pytest.raises(BufgymError, match="policy odd: decision 3"):
         Player(Policy("odd", lambda buffer, arrival, memory: 3)).action(env.rows.senders)
+    env = gym.make("bufgym/Topics-v0", capacity=3).unwrapped
+    env.reset(seed=0)
+    env.step(4)  # accept: now the socket asks
+    with pytest.raises(BufgymError, match="policy odd: sends slot 3"):
+        odd = Policy("odd", policies.get("fifo").on_arrival, on_send=lambda buffer, memory: 3)
+        Player(odd).action(env.rows.senders)
 
 
 @pytest.mark.parametrize(("name", "why"), [("codel", "drops at dequeue"), ("rosbridge", "has an unbounded queue")])
