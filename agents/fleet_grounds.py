@@ -18,11 +18,12 @@ from agents.evolution import MODEL
 from agents.worlds import capacities_of
 from bufgym import policies
 from bufgym.benchmark import fleets
-from bufgym.benchmark.fleets import BASELINE, FleetSuite
+from bufgym.benchmark.fleets import BASELINE
 from bufgym.cell import Fleet, FleetEpisode, FleetScenario
 from bufgym.policies import Policy, learned, weights
 from bufgym.policies.learned import Weights
 from bufgym.sender import Senders
+from bufgym.suites import FleetSuite
 
 if TYPE_CHECKING:
     from train import Arguments
@@ -87,7 +88,7 @@ def samples(suite: FleetSuite, seed: int) -> list[list[Ground]]:
 
 def judges(suite: FleetSuite) -> list[Ground]:
     """The validation episodes, the same for every seed."""
-    parts = suite.parts("validation", JUDGES)
+    parts = fleets.suite_parts(suite, "validation", JUDGES)
     episodes = [fleets.draw(part.fleet, seed) for part in parts for seed in part.seeds]
     return [Ground(parts[0].fleet, episodes, L) for L in suite.capacities]
 

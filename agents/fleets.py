@@ -16,11 +16,7 @@ own information, at the middle one of the suite's capacities; scoring slots, its
 
 from __future__ import annotations
 
-import concurrent.futures
-import multiprocessing
-import os
 import pickle
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -37,12 +33,13 @@ from agents.callbacks import Between, Checkpoints, Curve, Progress, checkpoints,
 from agents.evolution import MEMORY, MODEL, Search, fields_of, start
 from agents.export import weights_of
 from agents.fleet_grounds import PARTS, Ground, Validation, gain, samples, suite_of
+from agents.seeds import conclude, each_seed, seeds_of
 from agents.training import new_ppo
 from bufgym import policies
 from bufgym.benchmark import fleets
 from bufgym.benchmark.fleets import ROWS
 from bufgym.benchmark.fleets_summary import plain, summary
-from bufgym.benchmark.rows import Row, write_rows
+from bufgym.benchmark.rows import Row
 from bufgym.envs.fleet_vec import FleetVecEnv
 from bufgym.errors import BufgymError
 from bufgym.files import replaced, shipped
@@ -211,26 +208,10 @@ LEARN: dict[str, Callable[[Arguments, Path, int, int], tuple[float, float]]] = {
 
 def train_and_report(arguments: Arguments, folder: Path) -> None:
     """All seeds, each in a process of its own if there are several; then every agent on the test split."""
-    train, seeds = LEARN[arguments.algo], range(arguments.seed, arguments.seed + arguments.seeds)
-    if not seeds:
-        raise BufgymError(f"seeds = {arguments.seeds}: must be >= 1")
-    if len(seeds) == 1:
-        found = [train(arguments, folder, seeds[0], 0)]
-    else:
-        context = multiprocessing.get_context("spawn")
-        workers = min(len(seeds), os.cpu_count() or 1)
-        with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-            jobs = [pool.submit(train, arguments, folder, seed, line) for line, seed in enumerate(seeds)]
-            found = [job.result() for job in jobs]
-    best = int(np.argmax([reached for reached, _ in found]))
-    shutil.copyfile(folder / f"seed-{seeds[best]}" / MODEL, folder / MODEL)
+    seeds, found = seeds_of(arguments), each_seed(LEARN[arguments.algo], arguments, folder)
     rows = test_rows(arguments, folder, seeds)
-    write_rows(rows, folder / "rows.csv", ROWS)
-    text = plain(summary(rows))
-    (folder / "results.txt").write_text(text + "\n", encoding="utf-8")
-    print(text)
-    seconds = ", ".join(f"{s:.0f}" for _, s in found)
-    print(f"\ntraining took {seconds} s; best on validation: seed {seeds[best]}; model and rows are in {folder}")
+    best = seeds[int(np.argmax([reached for reached, _ in found]))]
+    conclude(folder, MODEL, best, [seconds for _, seconds in found], rows, ROWS, plain(summary(rows)))
 
 
 def test_rows(arguments: Arguments, folder: Path, seeds: Sequence[int]) -> list[Row]:
@@ -238,5 +219,5 @@ def test_rows(arguments: Arguments, folder: Path, seeds: Sequence[int]) -> list[
     agents = [replace(weights.load(folder / f"seed-{seed}" / MODEL), name=f"agent (seed {seed})") for seed in seeds]
     rivals = [policies.get(name) for name in fleets.default_policies()]
     suite = suite_of(arguments)
-    parts = suite.parts("test", arguments.test_seeds or None)
+    parts = fleets.suite_parts(suite, "test", arguments.test_seeds or None)
     return fleets.run_parts([*agents, *rivals], parts, suite.capacities, progress=True)

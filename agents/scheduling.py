@@ -12,12 +12,8 @@ search begins at what is greedy: drop what loses the least QoI now, send what ga
 from __future__ import annotations
 
 import argparse
-import concurrent.futures
 import json
-import multiprocessing
-import os
 import pickle
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.callbacks import Record, seed_bar
+from agents.seeds import conclude, each_seed, seeds_of
 from bufgym import files, policies, suites
-from bufgym.benchmark.rows import Row, read_rows, write_rows
+from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.topics import ROWS, default_policies, run_parts, suite_parts
 from bufgym.benchmark.topics_summary import Standing, plain, summary
@@ -249,26 +246,10 @@ def train(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> tuple
 
 def train_and_report(arguments: Arguments, folder: Path) -> None:
     """All seeds, each in a process of its own if there are several; then every scheduler on the test split."""
-    seeds = range(arguments.seed, arguments.seed + arguments.seeds)
-    if not seeds:
-        raise BufgymError(f"seeds = {arguments.seeds}: must be >= 1")
-    if len(seeds) == 1:
-        found = [train(arguments, folder, seeds[0])]
-    else:
-        context = multiprocessing.get_context("spawn")
-        workers = min(len(seeds), os.cpu_count() or 1)
-        with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-            jobs = [pool.submit(train, arguments, folder, seed, line) for line, seed in enumerate(seeds)]
-            found = [job.result() for job in jobs]
-    best = int(np.argmin([reached for reached, _ in found]))
-    shutil.copyfile(folder / f"seed-{seeds[best]}" / MODEL, folder / MODEL)
-    rows = test_rows(arguments, folder, list(seeds))
-    write_rows(rows, folder / "rows.csv", ROWS)
-    text = plain(summary(rows))
-    (folder / "results.txt").write_text(text + "\n", encoding="utf-8")
-    print(text)
-    seconds = ", ".join(f"{s:.0f}" for _, s in found)
-    print(f"\ntraining took {seconds} s; best on validation: seed {seeds[best]}; model and rows are in {folder}")
+    seeds, found = seeds_of(arguments), each_seed(train, arguments, folder)
+    rows = test_rows(arguments, folder, seeds)
+    best = seeds[int(np.argmin([reached for reached, _ in found]))]
+    conclude(folder, MODEL, best, [seconds for _, seconds in found], rows, ROWS, plain(summary(rows)))
 
 
 def test_rows(arguments: Arguments, folder: Path, seeds: Sequence[int]) -> list[Row]:

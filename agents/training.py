@@ -6,12 +6,9 @@ gradient step on a few hundred decisions). So: large batches, few epochs, a smal
 
 from __future__ import annotations
 
-import concurrent.futures
 import dataclasses
 import json
 import math
-import multiprocessing
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -30,12 +27,12 @@ from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoin
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluate import Agent, worlds
 from agents.network import IgnoresMasks, policy_of
+from agents.seeds import each_seed, seeds_of
 from agents.trials import Trials, ValidationSet, plan
 from agents.worlds import World, capacities_of, cells
 from bufgym import suites
 from bufgym.benchmark.fleets import SUITES as FLEET_SUITES
 from bufgym.benchmark.rows import Row
-from bufgym.errors import BufgymError
 from bufgym.policies import load as load_policy
 from bufgym.sb3 import GymVecEnv, make_vec_env
 
@@ -128,20 +125,10 @@ def _default_name(resume: bool) -> str:
 
 def train_all(arguments: Arguments, folder: Path) -> list[Run]:
     """Train every seed, in processes of their own if there are several."""
-    train = ALGORITHMS[arguments.algo].train
-    seeds = range(arguments.seed, arguments.seed + arguments.seeds)
-    if not seeds:
-        raise BufgymError(f"seeds = {arguments.seeds}: must be >= 1")
+    seeds_of(arguments)
     if arguments.suite:
         ValidationSet(arguments, folder, progress=True)  # the clairvoyant's bounds are found once for all seeds
-    if len(seeds) == 1:
-        return [train(arguments, folder, seeds[0], 0)]
-    workers = min(len(seeds), os.cpu_count() or 1)
-    # A fresh interpreter each: torch's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-        jobs = [pool.submit(train, arguments, folder, seed, line) for line, seed in enumerate(seeds)]
-        return [job.result() for job in jobs]
+    return each_seed(ALGORITHMS[arguments.algo].train, arguments, folder)
 
 
 def train_seed(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> Run:

@@ -394,3 +394,44 @@ TOPIC_SUITES = {
     )
 }
 """Suites whose episodes have several topics: another benchmark (``bufgym topics``), no clairvoyant is known there."""
+
+
+# --- many robots -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FleetSuite:
+    """Frozen episodes of a fleet (``bufgym.cell``): what meets each robot is a setting of a suite with one robot."""
+
+    name: str
+    about: str
+    of: str
+    """That suite; its splits are the fleet's."""
+    setting: str
+    robots: int
+    capacities: tuple[int, ...]
+    seeds: int
+    """Episodes a trace."""
+
+    def uplink(self, split: str) -> Uplink:
+        """What each robot would meet if it had a cell for itself."""
+        found = get(self.of).settings(split)[self.setting].scenario
+        assert isinstance(found, Uplink)
+        return found
+
+
+FLEET_SUITES = {
+    suite.name: suite
+    for suite in (
+        FleetSuite(
+            "fleet-v1",
+            "16 robots share a cell; 30 Hz camera over synthetic LTE links, x is each camera's motion",
+            of="lte-v1",
+            setting="motion",
+            robots=16,
+            capacities=(5, 10, 20),
+            seeds=5,
+        ),
+    )
+}
+"""Suites of many robots (``bufgym fleet``)."""

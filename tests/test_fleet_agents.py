@@ -50,7 +50,7 @@ def shipped(name: str = "learned-motion") -> weights.Weights:
 
 
 def test_a_ground_is_what_the_benchmark_says_of_the_same_episodes() -> None:
-    part = SUITE.parts("validation", seeds=2)[0]
+    part = benchmark.suite_parts(SUITE, "validation", seeds=2)[0]
     part = part._replace(
         fleet=dataclasses.replace(part.fleet, uplink=dataclasses.replace(part.fleet.uplink, duration_s=2.0))
     )
@@ -147,7 +147,7 @@ def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: py
     agent = weights.load(folder / "model.safetensors")
     assert fleet_grounds.gain(agent, fleet_grounds.judges(SUITE)) == pytest.approx(found[:, 2].max(), abs=1e-12)
     mine = [row["qoi"] for row in rows if row["policy"] == "agent (seed 0)"]
-    again = benchmark.run_parts([agent], SUITE.parts("test", seeds=1), SUITE.capacities)
+    again = benchmark.run_parts([agent], benchmark.suite_parts(SUITE, "test", seeds=1), SUITE.capacities)
     assert [row["qoi"] for row in again] == mine
 
 

@@ -7,7 +7,7 @@ and the capacity (common random numbers). ``fleets_summary`` makes statistics of
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import NamedTuple
 
 from bufgym import policies as registry
@@ -20,6 +20,7 @@ from bufgym.errors import BufgymError
 from bufgym.metrics import METRICS, outcome
 from bufgym.policies import Policy
 from bufgym.scenario import Streams, Uplink
+from bufgym.suites import FleetSuite
 
 BASELINE = "afr"
 """What the others are measured against: AFR on every robot's buffer."""
@@ -32,47 +33,14 @@ ROWS = Layout(
 """One row a robot and episode: which one, of how many, and its ``Outcome``."""
 
 
-@dataclass(frozen=True)
-class FleetSuite:
-    """Frozen episodes of a fleet: the streams, links and motions of one setting of a suite with one robot."""
-
-    name: str
-    about: str
-    of: str
-    """That suite; its splits are the fleet's."""
-    setting: str
-    robots: int
-    capacities: tuple[int, ...]
-    seeds: int
-    """Episodes a trace."""
-
-    def uplink(self, split: str) -> Uplink:
-        """What each robot would meet if it had a cell for itself."""
-        found = suites.get(self.of).settings(split)[self.setting].scenario
-        assert isinstance(found, Uplink)
-        return found
-
-    def parts(self, split: str, seeds: int | None = None, robots: int | None = None) -> list[Part]:
-        """The episodes of a split; ``seeds`` a trace and ``robots`` a cell, or as many as the suite says."""
-        each = seeds_a_trace(suites.get(self.of), self.seeds if seeds is None else seeds)
-        fleet = FleetScenario(self.robots if robots is None else robots, self.uplink(split))
-        return fleet_parts(self.setting, fleet, [seeds_of(k, each) for k in range(len(fleet.uplink.traces))])
+SUITES = suites.FLEET_SUITES
 
 
-SUITES = {
-    suite.name: suite
-    for suite in (
-        FleetSuite(
-            "fleet-v1",
-            "16 robots share a cell; 30 Hz camera over synthetic LTE links, x is each camera's motion",
-            of="lte-v1",
-            setting="motion",
-            robots=16,
-            capacities=(5, 10, 20),
-            seeds=5,
-        ),
-    )
-}
+def suite_parts(suite: FleetSuite, split: str, seeds: int | None = None, robots: int | None = None) -> list[Part]:
+    """The episodes of a split; ``seeds`` a trace and ``robots`` a cell, or as many as the suite says."""
+    each = seeds_a_trace(suites.get(suite.of), suite.seeds if seeds is None else seeds)
+    fleet = FleetScenario(suite.robots if robots is None else robots, suite.uplink(split))
+    return fleet_parts(suite.setting, fleet, [seeds_of(k, each) for k in range(len(fleet.uplink.traces))])
 
 
 def get(name: str) -> FleetSuite:

@@ -11,7 +11,8 @@ from bufgym.cli.options import split_policies as split
 from bufgym.errors import BufgymError
 
 if TYPE_CHECKING:
-    from bufgym.benchmark.fleets import FleetSuite, Part
+    from bufgym.benchmark.fleets import Part
+    from bufgym.suites import FleetSuite
 
 SUITE = "fleet-v1"
 
@@ -50,7 +51,7 @@ def _fleet(options: argparse.Namespace) -> None:
     if options.out is not None and not checked_target(options.out).absolute().parent.is_dir():
         raise BufgymError(f"{options.out}: no folder to write this file to")
     suite = fleets.get(options.suite)
-    parts = suite.parts(options.split, options.seeds, options.robots)
+    parts = fleets.suite_parts(suite, options.split, options.seeds, options.robots)
     rows = fleets.run_parts(chosen, parts, options.capacity or suite.capacities, progress=True)
     unranked = {policy.name: policy.unranked_because for policy in chosen if not policy.ranked}
     found = fleets_summary.summary(rows, unranked=tuple(unranked))

@@ -45,11 +45,13 @@ def _list_scenarios() -> str:
 
 
 def _list_suites() -> str:
-    from bufgym.suites import SUITES
+    from bufgym.suites import FLEET_SUITES, SUITES, TOPIC_SUITES
 
-    return columns(
-        [(suite.name, suite.about + (f"; needs {suite.needs}" if suite.needs else "")) for suite in SUITES.values()]
-    )
+    listed = [
+        (suite.name, suite.about + (f"; needs {suite.needs}" if suite.needs else "")) for suite in SUITES.values()
+    ]
+    listed += [(suite.name, f"{suite.about} (bufgym topics)") for suite in TOPIC_SUITES.values()]
+    return columns(listed + [(suite.name, f"{suite.about} (bufgym fleet)") for suite in FLEET_SUITES.values()])
 
 
 def _list_policies() -> str:

@@ -63,7 +63,7 @@ def test_a_fleet_of_one_has_the_rows_of_the_benchmark_for_one() -> None:
 
 
 def test_every_policy_and_capacity_meets_the_same_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    parts = fleets.get("fleet-v1").parts("validation", seeds=2, robots=3)[:2]
+    parts = fleets.suite_parts(fleets.get("fleet-v1"), "validation", seeds=2, robots=3)[:2]
     parts = [
         part._replace(fleet=replace(part.fleet, uplink=replace(part.fleet.uplink, duration_s=1.0))) for part in parts
     ]
@@ -86,7 +86,7 @@ def test_fleet_v1_is_lte_v1_with_sixteen_robots(split: str) -> None:
     """Each robot alone would meet what lte-v1's motion setting has: traces, motions, streams, V."""
     alone = suites.get("lte-v1").settings(split)["motion"].scenario
     assert isinstance(alone, Uplink)
-    parts = fleets.get("fleet-v1").parts(split)
+    parts = fleets.suite_parts(fleets.get("fleet-v1"), split)
     assert [part.trace for part in parts] == [trace.name for trace in alone.traces]
     for k, part in enumerate(parts):
         assert part.fleet == FleetScenario(16, replace(alone, traces=(alone.traces[k],)))
@@ -94,14 +94,16 @@ def test_fleet_v1_is_lte_v1_with_sixteen_robots(split: str) -> None:
 
 
 def test_splits_share_no_trace_and_no_motion() -> None:
-    found = [[part.fleet.uplink for part in fleets.get("fleet-v1").parts(split)] for split in suites.SPLITS]
+    found = [
+        [part.fleet.uplink for part in fleets.suite_parts(fleets.get("fleet-v1"), split)] for split in suites.SPLITS
+    ]
     for kind in ("traces", "motion"):
         names = [{recording.name for uplink in split for recording in getattr(uplink, kind)} for split in found]
         assert sum(map(len, names)) == len(set.union(*names))
 
 
 def test_robots_of_an_episode_tick_together_and_move_each_on_its_own() -> None:
-    part = fleets.get("fleet-v1").parts("test", seeds=1, robots=4)[0]
+    part = fleets.suite_parts(fleets.get("fleet-v1"), "test", seeds=1, robots=4)[0]
     episode, again = (fleets.draw(part.fleet, part.seeds[0]) for _ in range(2))
     assert episode.ticks_together and episode.robots == 4
     assert all((a == b).all() for a, b in zip(episode.arrivals, again.arrivals, strict=True))
