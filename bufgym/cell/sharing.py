@@ -32,9 +32,9 @@ from bufgym.sender import (
     arrive,
     cross,
     decide,
+    may_take,
     take,
 )
-from bufgym.sender.transition import may_take
 
 NOTHING = -1
 NOBODY = -1

@@ -13,9 +13,22 @@ The socket takes a message while fewer than n_T are in flight: sent and not yet 
 trip after the last byte has crossed. With n_T = 1 and no delay that is a socket that is free as soon as the link is.
 """
 
+from bufgym.sender.decisions import (
+    answer_dequeue,
+    answer_send,
+    can_evict,
+    can_hold,
+    can_reject,
+    can_send,
+    decide,
+    has_room,
+)
 from bufgym.sender.rules import age_until
+from bufgym.sender.seen import arrival_of, view
 from bufgym.sender.senders import Senders, compiled_rollout, padded, python_rollout, python_view, rollout, run
+from bufgym.sender.socket import credit, cross, may_take, take, transmit
 from bufgym.sender.state import (
+    ARRIVAL_WAITS,
     DECISION,
     DEPARTURE,
     DEQUEUE,
@@ -24,30 +37,12 @@ from bufgym.sender.state import (
     NEVER,
     SEND,
     SENDER,
+    SOCKET_WAITS,
     Batch,
     batch_type,
     named,
 )
-from bufgym.sender.transition import (
-    ARRIVAL_WAITS,
-    SOCKET_WAITS,
-    answer_dequeue,
-    answer_send,
-    arrival_of,
-    arrive,
-    can_evict,
-    can_hold,
-    can_reject,
-    can_send,
-    credit,
-    cross,
-    decide,
-    has_room,
-    next_event,
-    take,
-    transmit,
-    view,
-)
+from bufgym.sender.transition import arrive, next_event
 
 __all__ = [
     "ARRIVAL_WAITS",
@@ -77,6 +72,7 @@ __all__ = [
     "cross",
     "decide",
     "has_room",
+    "may_take",
     "named",
     "next_event",
     "padded",

@@ -18,17 +18,11 @@ from bufgym.link import FOREVER, Knots
 from bufgym.policies.registry import Policy, runs_compiled, signatures
 from bufgym.qoi import Value
 from bufgym.scenario import Episode
+from bufgym.sender.decisions import answer_dequeue, answer_send, decide
+from bufgym.sender.seen import arrival_of, view
+from bufgym.sender.socket import credit
 from bufgym.sender.state import DECISION, DEQUEUE, END, FATE, SEND, SENDER, Batch, batch_type, named
-from bufgym.sender.transition import (
-    answer_dequeue,
-    answer_send,
-    arrival_of,
-    credit,
-    decide,
-    load_row,
-    next_event,
-    view,
-)
+from bufgym.sender.transition import load_row, next_event
 from bufgym.topics import Topic, check_pong, check_topics, check_window, copies_of, topic_table
 
 

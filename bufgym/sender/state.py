@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from bufgym.buffer import MESSAGE, TOPIC
 
 END, DEPARTURE, DECISION, DEQUEUE, SEND = range(5)
+ARRIVAL_WAITS, SOCKET_WAITS = 1, 2
+"""What a sender may be ``waiting`` for: a decision on its arrival, or the choice of what to send."""
 
 SENDER = np.dtype(
     [

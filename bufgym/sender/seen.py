@@ -1,0 +1,94 @@
+"""What a policy sees of its sender."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bufgym.buffer import Buffer
+from bufgym.kernel import kernel
+from bufgym.link import position_at
+from bufgym.sender.state import ARRIVAL_WAITS, Batch
+
+
+@kernel
+def socket_bytes(batch: Batch, i: int) -> int:
+    """Bytes of the messages that the socket took and that have not crossed as a whole."""
+    sender = batch.senders[i]
+    if sender.busy == 1:
+        return int(batch.slots[i, sender.first - 1].size_bytes)
+    total = 0
+    for k in range(sender.crossed, sender.taken):
+        total += batch.arrivals[i, batch.order[i, k]].size_bytes
+    return total
+
+
+@kernel
+def view(batch: Batch, i: int) -> Buffer:
+    """What the policy of sender ``i`` may see now."""
+    sender = batch.senders[i]
+    capacity, first, occupancy = sender.capacity, sender.first, sender.occupancy
+    sent = batch.slots[i, first - 1]
+    taken_us, taken_x = sent.arrival_us, sent.x
+    previous_us, previous_x = sender.previous_us, sender.previous_x
+    if sender.taken == 0:
+        taken_us, taken_x = previous_us, previous_x
+        if sender.occupancy > 0:
+            # a scheduler holds the first of all back
+            taken_us, taken_x = batch.slots[i, first].arrival_us, batch.slots[i, first].x
+    if sender.topics > 1 and sender.waiting == ARRIVAL_WAITS:
+        # gaps are those of the newcomer's topic
+        arrival = batch.arrivals[i, sender.next]
+        topic = batch.topics[i, arrival.topic]
+        previous_us, previous_x = arrival.arrival_us, arrival.x
+        if topic.arrived > 0:
+            previous_us, previous_x = topic.previous_us, topic.previous_x
+        taken_us, taken_x = previous_us, previous_x
+        if topic.taken > 0:
+            taken_us, taken_x = topic.taken_us, topic.taken_x
+        elif topic.queued > 0:
+            k = first
+            while batch.slots[i, k].topic != arrival.topic:
+                k += 1
+            taken_us, taken_x = batch.slots[i, k].arrival_us, batch.slots[i, k].x
+    taken_bytes = socket_bytes(batch, i) if sender.busy > 0 else 0
+    left_bytes = taken_bytes
+    if sender.busy > 0 and (sender.taken_at_us < sender.now_us or sender.busy > 1):
+        reached, sender.segment_now = position_at(
+            batch.knot_us,
+            batch.knot_bytes,
+            sender.first_knot,
+            sender.last_knot,
+            sender.after,
+            sender.segment_now,
+            sender.now_us + sender.offset_us,
+        )
+        left_bytes = min(left_bytes, max(0, sender.position - reached))
+    return Buffer(
+        batch.slots[i, first : first + occupancy],
+        capacity,
+        sender.max_bytes,
+        sender.backlog_bytes,
+        sender.now_us,
+        sender.taken,
+        taken_us,
+        taken_x,
+        previous_us,
+        previous_x,
+        1 if sender.busy > 0 else 0,
+        left_bytes,
+        left_bytes / taken_bytes if sender.busy > 0 else 0.0,
+        sender.now_us - sender.taken_at_us,
+        sender.period_us,
+        sender.departures,
+        sender.drain,
+        batch.v,
+        batch.topics[i],
+        sender.window,
+        sender.taken - sender.ponged,
+    )
+
+
+@kernel
+def arrival_of(batch: Batch, i: int) -> Any:
+    """The arrival that waits for a decision."""
+    return batch.arrivals[i, batch.senders[i].next]
