@@ -3,7 +3,8 @@
 A candidate is a vector of weights; its fitness compares it with Robofleet's published client on the same episodes: the
 weighted QoI is to be large, the age of information of the topics with the highest priority no larger (``AGE_SHARE``),
 that of the others not much larger (``OTHERS_SHARE``), and no ``no_drop`` message may be lost. All candidates of a
-generation meet the same episodes, the next generation meets others; validation episodes say which mean to keep. The
+generation meet the same episodes, the next generation meets others, with other topics and faster or slower links
+(``varied``); validation episodes say which mean to keep. The
 search begins at what is greedy: drop what loses the least QoI now, send what gains the most a byte.
 
     python train.py --suite topics-v1 --algo evolution --seeds 5 --steps 25000000 --validate-every 1000000
@@ -53,7 +54,7 @@ SLOT = (
 FIELDS = CONTEXT + SLOT
 """What the agent reads."""
 
-PARTS, EPISODES, EPISODE_S = 12, 1, 30.0
+PARTS, EPISODES, EPISODE_S = 24, 1, 30.0
 """Training episodes come in so many parts, one a generation in turn: so many a setting of the suite, so long."""
 POPULATION, SIGMA, MEMORY = 16, 1.0, 10
 """Candidates a generation, first step size, generations over which the mean is averaged."""
@@ -62,6 +63,13 @@ AGE_SHARE, AGE_PENALTY = 0.9, 3.0
 OTHERS_SHARE, OTHERS_PENALTY = 1.5, 0.25
 """The same of all other topics: without it, what weighs little is never sent."""
 VALIDATION_SEED = 1
+BELOW_PENALTY = 3.0
+"""What a ground costs where the QoI is below the rival's, for each part of it that is missing."""
+SCALES, KEPT = (0.7, 10.0), 0.75
+"""In training links are so many times as fast, and a topic is there with this probability: who knows one client on
+scarce links alone falls behind its rival on others."""
+AMPLE = 6.0
+"""Validation episodes come once as they are, and once on links so many times as fast."""
 TINY = 1e-9
 """So that an age of 0 can be compared with."""
 
@@ -153,12 +161,15 @@ def fitness(policy: Policy, grounds: Sequence[Ground]) -> float:
     for ground in grounds:
         (qoi, first, others, lost), theirs = ground.reached(policy), ground.rival
         total += lost - qoi / theirs[0] + AGE_PENALTY * max(0.0, first / max(theirs[1], TINY) - AGE_SHARE)
+        total += BELOW_PENALTY * max(0.0, 1 - qoi / theirs[0])
         total += OTHERS_PENALTY * max(0.0, others / max(theirs[2], TINY) - OTHERS_SHARE)
     return total / len(grounds)
 
 
-def grounds(suite: str, split: str, seed: int, episodes: int, episode_s: float | None = None) -> list[Ground]:
-    """One ground for each setting of a suite."""
+def grounds(
+    suite: str, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
+) -> list[Ground]:
+    """One ground for each setting of a suite, its links ``scale`` times as fast; 0: each varied by chance."""
     rng, found = np.random.default_rng(seed), suites.get(suite)
     made = []
     for setting in found.settings(split).values():
@@ -166,8 +177,17 @@ def grounds(suite: str, split: str, seed: int, episodes: int, episode_s: float |
         if not isinstance(client, Client):
             raise BufgymError(f"suite {suite}: has no topics")
         client = client if episode_s is None else replace(client, duration_s=episode_s)
+        client = replace(client, scale=scale) if scale else varied(client, rng)
         made += [Ground(client, L, episodes, rng) for L in found.capacities]
     return made
+
+
+def varied(client: Client, rng: np.random.Generator) -> Client:
+    """The same client with some of its topics, three at least, on links of another speed."""
+    kept = rng.random(len(client.streams)) < KEPT
+    kept[rng.permutation(len(kept))[:3]] = True
+    streams = tuple(stream for stream, here in zip(client.streams, kept, strict=True) if here)
+    return replace(client, streams=streams, scale=float(np.exp(rng.uniform(*np.log(SCALES)))))
 
 
 # --- training --------------------------------------------------------------------------------------------------------
@@ -206,8 +226,8 @@ def train(arguments: Arguments, folder: Path, seed: int, line: int = 0) -> tuple
     home.mkdir(exist_ok=True)
     saved = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
     suite = arguments.suite
-    yards = [grounds(suite, "train", 1000 * seed + part, EPISODES, EPISODE_S) for part in range(PARTS)]
-    judges = grounds(suite, "validation", VALIDATION_SEED, 6)
+    yards = [grounds(suite, "train", 1000 * seed + part, EPISODES, EPISODE_S, scale=0) for part in range(PARTS)]
+    judges = [g for scale in (1.0, AMPLE) for g in grounds(suite, "validation", VALIDATION_SEED, 6, scale=scale)]
     begin = to_vector(start())
     if saved.exists():
         search, best, validated = pickle.loads(saved.read_bytes())

@@ -77,8 +77,11 @@ class Topic:
 
     @property
     def period_us(self) -> int:
-        """Least time between two messages that are kept, us; 0 without a rate limit."""
-        return round(min(1e6 / self.rate_limit_hz, NO_DEADLINE_US)) if self.rate_limit_hz else 0
+        """Least time between two messages that are kept, us, rounded down: who keeps to the limit loses none.
+
+        0 without a rate limit.
+        """
+        return int(min(1e6 / self.rate_limit_hz, NO_DEADLINE_US)) if self.rate_limit_hz else 0
 
     @property
     def share(self) -> float:

@@ -126,12 +126,12 @@ def test_fitness_of_the_rival_itself() -> None:
 @pytest.mark.parametrize(
     ("reached", "expected"),
     [
-        ((50.0, 18.0, 30.0, 0), -0.5),  # half the QoI, ages just as they may be
+        ((50.0, 18.0, 30.0, 0), -0.5 + 3 * 0.5),  # half the QoI, and so much below the rival; ages as they may be
         ((150.0, 10.0, 10.0, 0), -1.5),  # less age than asked for pays nothing
         ((100.0, 24.0, 30.0, 0), -1 + 3 * 0.3),  # 1.2 - 0.9
         ((100.0, 18.0, 40.0, 0), -1 + 0.25 * 0.5),  # 2 - 1.5
         ((100.0, 18.0, 30.0, 3), -1 + 3.0),  # three no_drop messages
-        ((0.0, 40.0, 60.0, 1), 1 + 3 * 1.1 + 0.25 * 1.5),
+        ((0.0, 40.0, 60.0, 1), 1 + 3 * 1.1 + 0.25 * 1.5 + 3),
     ],
 )
 def test_fitness_by_hand(reached: tuple[float, float, float, int], expected: float) -> None:
@@ -161,7 +161,9 @@ def test_grounds_of_a_suite_are_one_a_setting() -> None:
 def small_grounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Grounds of seconds instead of minutes."""
 
-    def grounds(suite: str, split: str, seed: int, episodes: int, episode_s: float | None = None) -> Any:
+    def grounds(
+        suite: str, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
+    ) -> Any:
         rng = np.random.default_rng([seed, split == "train"])
         return [scheduling.Ground(client(duration_s=2.0), 6, 1, rng)]
 
@@ -254,6 +256,19 @@ def test_a_scheduler_learns_alone_and_by_evolution(wrong: dict[str, str]) -> Non
         scheduling.wanted(dataclasses.replace(TINY, **wrong))
     assert scheduling.wanted(TINY)
     assert not scheduling.wanted(dataclasses.replace(TINY, suite="lte-v1"))
+
+
+def test_a_varied_client_keeps_three_topics_at_least() -> None:
+    """Some of its own, in their order, on links of another speed."""
+    whole = client(duration_s=2.0)
+    rng, seen = np.random.default_rng(1), set()
+    for _ in range(30):
+        made = scheduling.varied(whole, rng)
+        assert len(made.streams) >= min(3, len(whole.streams))
+        assert [stream for stream in whole.streams if stream in made.streams] == list(made.streams)
+        assert scheduling.SCALES[0] <= made.scale <= scheduling.SCALES[1]
+        seen.add(len(made.streams))
+    assert len(seen) > 1 or len(whole.streams) <= 3
 
 
 def test_a_suite_of_one_queue_has_no_grounds() -> None:
