@@ -188,7 +188,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ]
     if options.runs:
         runs = [Path(run) for run in options.runs.split(",")]
-        lines += ["## How they learned", "", "Best regret over AFR's on validation so far, mean over the suites; a run ends where it was stopped.", ""]
+        told = "Best regret over AFR's on validation so far, mean over the suites; a run ends where it was stopped."
+        lines += ["## How they learned", "", told, ""]
         lines += [*learning(runs), "", "## What more seeds are worth", ""]
         for run in runs:
             if _settings(run)["algo"] == "evolution" and _settings(run)["seeds"] > 2:

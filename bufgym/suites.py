@@ -91,6 +91,8 @@ def _settings(name: str, split: str, data: Path | None) -> dict[str, Setting]:
 
 def get(name: str) -> Suite:
     """The suite of that name."""
+    if name in FLEET_SUITES:
+        raise BufgymError(f"suite {name} has many robots: bufgym fleet --suite {name}")
     known = SUITES | TOPIC_SUITES
     if name not in known:
         raise BufgymError(f"unknown suite {name!r}; known: {', '.join(known)}")

@@ -354,6 +354,18 @@ def test_play_stops_after_so_many_decisions(capsys: pytest.CaptureFixture[str]) 
     text = capsys.readouterr().out
     assert "decision 2" in text and "decision 3" not in text
     assert "stopped after 2 decisions" in text
+    # This is no terminal.
+    assert "\x1b" not in text
+
+
+@pytest.mark.parametrize("wish", ["", "1"])
+def test_a_terminal_gets_colours_unless_it_wants_none(
+    wish: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("NO_COLOR", wish)
+    assert main(["play", "--speed", "0", "--steps", "2"]) == 0
+    assert ("\x1b" in capsys.readouterr().out) == (not wish)
 
 
 def test_the_module_runs_as_a_command() -> None:

@@ -92,6 +92,28 @@ def test_a_users_policy_file(config: str, tmp_path: Path, capsys: pytest.Capture
         policies.registry._REGISTRY.pop("my-own", None)
 
 
+def test_decisions_that_cannot_be_carried_out_are_told(
+    config: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each of the 2 s x (10 + 2) messages/s is sent by such a decision, whatever its topic."""
+    mine = tmp_path / "mine.py"
+    mine.write_text(
+        "from bufgym.policies import make_room, register\n"
+        "@register('far-off', on_send=lambda buffer, memory: 999, for_topics=True)\n"
+        "def far_off(buffer, arrival, memory):\n"
+        "    return make_room(buffer, arrival)\n"
+    )
+    chosen = ["--seeds", "1", "--policy", "far-off", "--policy-file", str(mine)]
+    try:
+        assert main(["topics", "--config", config, "--trace", "lte-synthetic-0", *chosen]) == 0
+        told = capsys.readouterr().out
+    finally:
+        policies.registry._REGISTRY.pop("far-off", None)
+    assert told.count("impossible") == 1 and "\nnote: far-off gave 24 impossible decisions\n" in told
+    # Nor do the intervals of a single episode look as if they were known.
+    assert "1 episode of 2 s" in told and "1.000 [-]" in told and "1.000 [1.000" not in told
+
+
 @pytest.mark.parametrize(
     ("options", "naming"),
     [
@@ -99,6 +121,8 @@ def test_a_users_policy_file(config: str, tmp_path: Path, capsys: pytest.Capture
         (["--window", "x"], "'x'"),
         (["--consumers", "0"], "consumers = 0"),
         (["--suite", "nope"], "unknown suite 'nope'"),
+        (["--suite", "fleet-v1"], "suite fleet-v1 has many robots: bufgym fleet --suite fleet-v1"),
+        (["--policy", "clairvoyant"], "policy clairvoyant: it plans with a queue of its own"),
         (["--suite", "lte-v1"], "suite lte-v1 has one queue, not topics: bufgym bench --suite lte-v1"),
         (["--split", "dev"], "split = 'dev'"),
         (["--policy", "nope"], "unknown policy 'nope'"),
@@ -112,7 +136,7 @@ def test_a_users_policy_file(config: str, tmp_path: Path, capsys: pytest.Capture
         (["--by-topic", "afr"], "--by-topic afr: not among the policies that run"),
         (["--out", "rows.txt"], "rows.txt: rows are written to .csv or .parquet files"),
         (["--out", "no-such-folder/rows.csv"], "no-such-folder/rows.csv: no folder"),
-        (["--config", "no-such.toml"], "no-such.toml: no configuration that can be read"),
+        (["--config", "no-such.toml"], "error: no-such.toml: no such file\n"),
         (["--config", "x.toml", "--suite", "topics-v1"], "--suite cannot go with --config"),
         (["--config", "x.toml", "--split", "test"], "--split cannot go with --config"),
     ],

@@ -17,7 +17,7 @@ from bufgym.errors import BufgymError
 
 
 class Interval(NamedTuple):
-    """A statistic and its bootstrap interval; all NaN where it is undefined."""
+    """A statistic and its bootstrap interval; all NaN where it is undefined, the interval where no sample tells it."""
 
     value: float
     low: float
@@ -42,6 +42,18 @@ def percentile_interval(numbers: Numbers, confidence: float) -> Interval:
         return Interval(math.nan, math.nan, math.nan)
     low, high = np.percentile(drawn, [50 * (1 - confidence), 50 * (1 + confidence)]).tolist()
     return Interval(float(numbers[0]), low, high)
+
+
+def without_interval(x: Interval) -> Interval:
+    """The statistic alone: each resample of a single episode is that episode, which says nothing of its chance."""
+    return Interval(x.value, math.nan, math.nan)
+
+
+def written(x: Interval, form: str) -> str:
+    """``x`` as text, such as 1.03 [1.01, 1.05]; 1.03 [-] without an interval, - where it is undefined."""
+    if math.isnan(x.value):
+        return "-"
+    return f"{x.value:{form}} " + ("[-]" if math.isnan(x.low) else f"[{x.low:{form}}, {x.high:{form}}]")
 
 
 def ratio(above: Numbers, below: Numbers, defined: NDArray[np.bool_]) -> Numbers:

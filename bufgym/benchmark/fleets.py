@@ -46,8 +46,9 @@ def suite_parts(suite: FleetSuite, split: str, seeds: int | None = None, robots:
 def get(name: str) -> FleetSuite:
     """The fleet's suite of that name."""
     if name not in SUITES:
-        if name in suites.SUITES:
-            raise BufgymError(f"suite {name} has one robot, not a fleet: bufgym bench --suite {name}")
+        if name in suites.SUITES or name in suites.TOPIC_SUITES:
+            command = "bench" if name in suites.SUITES else "topics"
+            raise BufgymError(f"suite {name} has one robot, not a fleet: bufgym {command} --suite {name}")
         raise BufgymError(f"unknown suite {name!r} of a fleet; known: {', '.join(SUITES)}")
     return SUITES[name]
 

@@ -13,7 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark.bootstrap import Interval, check_resampling, percentile_interval, ratio, stream, times_drawn
+from bufgym.benchmark.bootstrap import (
+    Interval,
+    check_resampling,
+    percentile_interval,
+    ratio,
+    stream,
+    times_drawn,
+    without_interval,
+    written,
+)
 from bufgym.benchmark.episodes import TIE, Cell, Numbers
 from bufgym.benchmark.fleets import BASELINE
 from bufgym.benchmark.table import aligned
@@ -76,11 +85,13 @@ def summary(
     check_resampling(resamples, confidence)
     found = _by_policy(rows)
     statistics: dict[str, dict[Cell, dict[str, Numbers]]] = {}
+    episodes: dict[str, int] = {}
     for (scenario, capacity), by_policy in found.items():
         if baseline not in by_policy:
             raise BufgymError(f"{scenario}, L = {capacity}: no row of the baseline {baseline!r}")
         theirs = by_policy[baseline]
-        drawn = times_drawn(len({run[:2] for run in theirs}), resamples, stream(seed, scenario))
+        episodes[scenario] = len({run[:2] for run in theirs})
+        drawn = times_drawn(episodes[scenario], resamples, stream(seed, scenario))
         for policy, mine in by_policy.items():
             if mine.keys() != theirs.keys():
                 trace, number, robot = sorted(mine.keys() ^ theirs.keys())[0]
@@ -93,7 +104,10 @@ def summary(
             raise BufgymError(f"{policy}: no row at {lacks[0][0]}, L = {lacks[0][1]}")
 
     def standings(over: Sequence[Cell]) -> list[Standing]:
-        made = [_standing(policy, [here[cell] for cell in over], confidence) for policy, here in statistics.items()]
+        alone = any(episodes[scenario] == 1 for scenario, _ in over)
+        made = [
+            _standing(policy, [here[cell] for cell in over], confidence, alone) for policy, here in statistics.items()
+        ]
         return sorted(made, key=lambda s: (s.policy in unranked, -s.gain.value, s.policy))
 
     return Summary(standings(list(found)), {cell: standings([cell]) for cell in found}, baseline)
@@ -143,9 +157,13 @@ def _statistics(h: Numbers, base: Numbers, weights: Numbers) -> dict[str, Number
     return {name: weights @ numbers / len(h) for name, numbers in by_episode.items()}
 
 
-def _standing(policy: str, over: Sequence[Mapping[str, Numbers]], confidence: float) -> Standing:
+def _standing(policy: str, over: Sequence[Mapping[str, Numbers]], confidence: float, alone: bool) -> Standing:
+    """``alone``: a cell has but one episode, so that nothing is known of chance."""
     means = {name: np.mean([cell[name] for cell in over], axis=0) for name in over[0]}
-    return Standing(policy, **{name: percentile_interval(numbers, confidence) for name, numbers in means.items()})
+    intervals = {name: percentile_interval(numbers, confidence) for name, numbers in means.items()}
+    if alone:
+        intervals = {name: without_interval(x) for name, x in intervals.items()}
+    return Standing(policy, **intervals)
 
 
 def plain(found: Summary, abouts: Mapping[str, str] | None = None) -> str:
@@ -170,12 +188,11 @@ def _title(cell: Cell, abouts: Mapping[str, str]) -> str:
 
 def _cells(standing: Standing, baseline: str) -> list[str]:
     own = standing.policy == baseline
-    gain, above = standing.gain, standing.above
     return [
         standing.policy,
         f"{standing.team.value:.3f}",
-        "" if own else f"{gain.value:+.3f} [{gain.low:+.3f}, {gain.high:+.3f}]",
-        "" if own else f"{above.value:.1%} [{above.low:.1%}, {above.high:.1%}]",
+        "" if own else written(standing.gain, "+.3f"),
+        "" if own else written(standing.above, ".1%"),
         "" if own else f"{standing.below.value:.1%}",
         f"{standing.worst.value:.3f}",
         f"{standing.fairness.value:.4f}",

@@ -9,7 +9,7 @@ from bufgym.buffer import HOLD
 from bufgym.envs.rows import action_of
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
-from bufgym.sender import ARRIVAL_WAITS, SOCKET_WAITS, Senders, named, python_view
+from bufgym.sender import ARRIVAL_WAITS, SOCKET_WAITS, Senders, answer_of, named, python_view
 
 
 class Player:
@@ -51,13 +51,14 @@ class Player:
                 self.policy.on_departure(seen, memory)
         self._taken[i] = sender.taken
         if sender.waiting == SOCKET_WAITS:
-            choice = int(self.policy.on_send(seen, memory))
+            choice = answer_of(self.policy, "on_send", self.policy.on_send(seen, memory))
             if not HOLD <= choice < senders.capacity:
                 raise BufgymError(
                     f"policy {self.policy.name}: sends slot {choice}: must be 0..{senders.capacity - 1}, or HOLD"
                 )
             return senders.capacity if choice == HOLD else choice
-        decision = int(self.policy.on_arrival(seen, batch.arrivals[i, sender.next], memory))
+        given = self.policy.on_arrival(seen, batch.arrivals[i, sender.next], memory)
+        decision = answer_of(self.policy, "on_arrival", given)
         try:
             return action_of(decision, senders.capacity)
         except BufgymError as error:

@@ -79,7 +79,7 @@ def plain(rows: Rows) -> str:
         if k > 1 and cells[k][1] != cells[k - 1][1]:
             out.append("")
         out.append(line)
-    return "\n".join([*out, *_notes(rows)])
+    return "\n".join([*out, *impossible(rows)])
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
@@ -97,7 +97,7 @@ def markdown(rows: Rows) -> str:
     head, *body = _cells(rows)
     lines = ["| " + " | ".join(line) + " |" for line in body]
     rule = "|---|" + "---:|" * (len(head) - 1)
-    notes = _notes(rows)
+    notes = impossible(rows)
     return "\n".join(["| " + " | ".join(head) + " |", rule, *lines, *(["", *notes] if notes else [])])
 
 
@@ -115,8 +115,8 @@ def _cells(rows: Rows) -> list[list[str]]:
     return lines
 
 
-def _notes(rows: Rows) -> list[str]:
-    """What the reader of the means should know: decisions that could not be carried out."""
+def impossible(rows: Rows) -> list[str]:
+    """What the reader of the means should know: decisions that could not be carried out; one row a run."""
     counts: dict[str, int] = {}
     for row in rows:
         if row.get("impossible"):

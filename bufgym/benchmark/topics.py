@@ -120,6 +120,9 @@ def run_parts(
     policies: Sequence[Policy], parts: Sequence[Part], capacities: Sequence[int], *, progress: bool = False
 ) -> list[Row]:
     """Every policy at every capacity on all episodes of the parts. Arguments as for ``run``."""
+    for policy in policies:
+        if policy.foresee is not None:
+            raise BufgymError(f"policy {policy.name}: it plans with a queue of its own, which no topic of a client has")
     rows: list[Row] = []
     with bar(sum(len(part.seeds) for part in parts) * len(capacities) * len(policies), progress) as advance:
         for part in parts:
@@ -135,6 +138,12 @@ def run_parts(
                             rows += run_rows(key, policy, capacity, client, senders, i)
                         advance(len(batch))
     return rows
+
+
+def one_a_run(rows: Sequence[Row]) -> list[Row]:
+    """The row of one topic of each run: for what is the same in all of them."""
+    names = ("scenario", "trace", "seed", "policy", "capacity")
+    return list({tuple(row[name] for name in names): row for row in rows}.values())
 
 
 def run_rows(key: Row, policy: Policy, capacity: int, client: Client, senders: Senders, i: int) -> list[Row]:

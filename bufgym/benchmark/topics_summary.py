@@ -15,7 +15,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bufgym.benchmark import episodes
-from bufgym.benchmark.bootstrap import Interval, check_resampling, percentile_interval, ratio, stream, times_drawn
+from bufgym.benchmark.bootstrap import (
+    Interval,
+    check_resampling,
+    percentile_interval,
+    ratio,
+    stream,
+    times_drawn,
+    without_interval,
+    written,
+)
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.table import Column, aligned, mean
 from bufgym.benchmark.topics import BASELINE
@@ -112,7 +121,10 @@ def summary(
             statistics.setdefault(policy, {})[cell] = _statistics(_Run(*runs), _Run(*theirs), drawn[cell[0]])
 
     def standings(over: Sequence[Cell]) -> list[Standing]:
-        made = [_standing(policy, [here[cell] for cell in over], confidence) for policy, here in statistics.items()]
+        alone = any(len(table.episodes[scenario]) == 1 for scenario, _ in over)
+        made = [
+            _standing(policy, [here[cell] for cell in over], confidence, alone) for policy, here in statistics.items()
+        ]
         return sorted(
             made, key=lambda s: (s.policy in unranked, math.isnan(s.relative.value), -s.relative.value, s.policy)
         )
@@ -175,9 +187,12 @@ def _statistics(runs: Any, base: Any, weights: Numbers) -> dict[str, Numbers]:
     }
 
 
-def _standing(policy: str, cells: Sequence[Mapping[str, Numbers]], confidence: float) -> Standing:
+def _standing(policy: str, cells: Sequence[Mapping[str, Numbers]], confidence: float, alone: bool) -> Standing:
+    """``alone``: a cell has but one episode, so that nothing is known of chance."""
     over = {name: np.mean([cell[name] for cell in cells], axis=0) for name in cells[0] if name != "lost"}
     intervals = {name: percentile_interval(numbers, confidence) for name, numbers in over.items()}
+    if alone:
+        intervals = {name: without_interval(x) for name, x in intervals.items()}
     return Standing(policy, lost=float(sum(cell["lost"][0] for cell in cells)), **intervals)
 
 
@@ -228,18 +243,14 @@ def _cells(standing: Standing) -> list[str]:
     return [
         standing.policy,
         f"{standing.qoi.value:.1f}",
-        _with_interval(standing.relative, ".3f"),
+        written(standing.relative, ".3f"),
         f"{standing.lost:g}",
         "-" if math.isnan(standing.age_first_s.value) else f"{standing.age_first_s.value:.2f}",
-        _with_interval(standing.age_relative, ".3f"),
-        _with_interval(standing.age_others_s, ".2f"),
+        written(standing.age_relative, ".3f"),
+        written(standing.age_others_s, ".2f"),
         "-" if math.isnan(standing.late.value) else f"{standing.late.value:.1%}",
         "-" if math.isnan(standing.rate_hz.value) else f"{standing.rate_hz.value:.1f}",
     ]
-
-
-def _with_interval(x: Interval, form: str) -> str:
-    return "-" if math.isnan(x.value) else f"{x.value:{form}} [{x.low:{form}}, {x.high:{form}}]"
 
 
 TOPIC_COLUMNS = (

@@ -25,6 +25,7 @@ from bufgym.sender import (
     Batch,
     Senders,
     answer_dequeue,
+    answer_of,
     answer_send,
     arrival_of,
     batch_type,
@@ -81,11 +82,13 @@ def python_fleet_rollout(batch: Batch, shares: Shares, memory: NDArray[np.float6
             i = int(shares.cells["row"][c])
             if event == DECISION:
                 arrival = seen.arrivals[i, seen.senders[i].next]
-                decide_in_cell(batch, shares, c, i, int(policy.on_arrival(python_view(seen, i), arrival, memory[i])))
+                answer = policy.on_arrival(python_view(seen, i), arrival, memory[i])
+                decide_in_cell(batch, shares, c, i, answer_of(policy, "on_arrival", answer))
             elif event == DEQUEUE:
-                answer_dequeue(batch, i, bool(policy.on_dequeue(python_view(seen, i), memory[i])))
+                drop = policy.on_dequeue(python_view(seen, i), memory[i])
+                answer_dequeue(batch, i, bool(answer_of(policy, "on_dequeue", drop)))
             elif event == SEND:
-                answer_send(batch, i, int(policy.on_send(python_view(seen, i), memory[i])))
+                answer_send(batch, i, answer_of(policy, "on_send", policy.on_send(python_view(seen, i), memory[i])))
             elif policy.hears_departures:
                 policy.on_departure(python_view(seen, i), memory[i])
             event = cell_event(batch, shares, c)

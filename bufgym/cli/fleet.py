@@ -42,6 +42,7 @@ def _fleet(options: argparse.Namespace) -> None:
     from bufgym import policies
     from bufgym.benchmark import fleets, fleets_summary
     from bufgym.benchmark.rows import checked_target, write_rows
+    from bufgym.benchmark.table import impossible
 
     load_policies(options.policy_file)
     wanted = [spec for text in options.policy for spec in split(text)] if options.policy else fleets.default_policies()
@@ -56,7 +57,7 @@ def _fleet(options: argparse.Namespace) -> None:
     unranked = {policy.name: policy.unranked_because for policy in chosen if not policy.ranked}
     found = fleets_summary.summary(rows, unranked=tuple(unranked))
     about = [f"Suite {suite.name}, {options.split}: {suite.about}.", _met(parts, suite)]
-    notes = [f"note: {name}: {why}" for name, why in unranked.items()]
+    notes = [*(f"note: {name}: {why}" for name, why in unranked.items()), *impossible(rows)]
     print("\n".join([*about, "", fleets_summary.plain(found), "", *_LEGEND, *notes]))
     if options.out is not None:
         print(f"\n{len(rows)} rows in {write_rows(rows, options.out, fleets.ROWS)}")
@@ -73,4 +74,6 @@ def _met(parts: Sequence[Part], suite: FleetSuite) -> str:
     fleet, episodes = parts[0].fleet, sum(len(part.seeds) for part in parts)
     robots = f"{fleet.robots} robot{'s' if fleet.robots > 1 else ''}"
     changed = "" if fleet.robots == suite.robots else f" (not the suite as it is: it has {suite.robots})"
-    return f"{episodes} episodes of {fleet.uplink.duration_s:g} s on {len(parts)} links, {robots} in a cell{changed}."
+    many = f"{episodes} episode{'s' if episodes > 1 else ''}"
+    links = f"{len(parts)} link{'s' if len(parts) > 1 else ''}"
+    return f"{many} of {fleet.uplink.duration_s:g} s on {links}, {robots} in a cell{changed}."

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import re
 import sys
 from typing import Any
 
@@ -40,10 +42,15 @@ def _play(options: argparse.Namespace) -> None:
     env: Any = gymnasium.make(id, capacity=options.capacity, render_mode="ansi").unwrapped
     player = Player(policy)
     env.reset(options={"episode": draw(env.rows.scenario, options.seed)})
-    # On a terminal each picture takes the place of the one before.
-    clear = "\x1b[H\x1b[J" if sys.stdout.isatty() else ""
+    # On a terminal each picture takes the place of the one before, unless no escapes are wanted (no-color.org).
+    plain = not sys.stdout.isatty() or bool(os.environ.get("NO_COLOR"))
+    clear = "" if plain else "\x1b[H\x1b[J"
+
+    def picture() -> str:
+        return re.sub(r"\x1b\[[\d;]*m", "", env.render()) if plain else str(env.render())
+
     for step in range(options.steps):
-        print(f"{clear}{policy.name}, decision {step + 1}\n{env.render()}", flush=True)
+        print(f"{clear}{policy.name}, decision {step + 1}\n{picture()}", flush=True)
         if options.speed:
             time.sleep(1 / options.speed)
         # An episode that asks for no decision ends with its first step, whatever the action.
@@ -51,7 +58,7 @@ def _play(options: argparse.Namespace) -> None:
         _, _, ended, _, info = env.step(player.action(env.rows.senders, 0) if due else options.capacity)
         if ended:
             print(
-                f"{env.render()}\nover: QoI {info['qoi']:.3f}, {info['delivered']} of {info['arrived']} delivered,"
+                f"{picture()}\nover: QoI {info['qoi']:.3f}, {info['delivered']} of {info['arrived']} delivered,"
                 f" {info['dropped']} dropped"
             )
             return

@@ -54,6 +54,7 @@ def _topics(options: argparse.Namespace) -> None:
     from bufgym import policies
     from bufgym.benchmark import topics, topics_summary
     from bufgym.benchmark.rows import checked_target, write_rows
+    from bufgym.benchmark.table import impossible
 
     load_policies(options.policy_file)
     wanted = [spec for text in options.policy for spec in split(text)] if options.policy else topics.default_policies()
@@ -69,6 +70,7 @@ def _topics(options: argparse.Namespace) -> None:
     unranked = {policy.name: policy.unranked_because for policy in chosen if not policy.ranked}
     found = topics_summary.summary(rows, unranked=tuple(unranked))
     notes = [f"note: {name}: {why}; its QoI counts what arrives long after" for name, why in unranked.items()]
+    notes += impossible(topics.one_a_run(rows))
     print("\n".join([*meets.about, "", topics_summary.plain(found, meets.scenarios), "", *_LEGEND, *notes]))
     if shown is not None:
         print(f"\n{shown}, topic by topic: means over episodes\n{topics_summary.by_topic(rows, shown)}")
@@ -133,7 +135,7 @@ def _own_client(options: argparse.Namespace) -> _Meets:
     parts = client_parts(label, client, options.seeds or SEEDS)
     scaled = f" x {client.scale:g}" if client.scale != 1 else ""
     link = client.traces[0].name if len(client.traces) == 1 else f"{len(client.traces)} links"
-    over = f"{len(client.topics)} topics over {link}{scaled}"
+    over = f"{_counted(len(client.topics), 'topic')} over {link}{scaled}"
     return _Meets(
         parts, options.capacity or [CAPACITY], {label: over}, [f"The client of {options.config}.", _met(parts)]
     )
@@ -147,7 +149,11 @@ def _given(options: argparse.Namespace) -> dict[str, Any]:
 def _met(parts: Sequence[Part]) -> str:
     """How many episodes, and how the client sends."""
     client, episodes = parts[0].client, sum(len(part.seeds) for part in parts)
-    consumers = f"{client.consumers} consumer{'s' if client.consumers > 1 else ''}"
     windows = " and ".join(f"{n}" for n in dict.fromkeys(part.client.window for part in parts))
     pong = f"pongs {client.pong_us / 1000:g} ms after a message has crossed"
-    return f"{episodes} episodes of {client.duration_s:g} s; n_T = {windows}, {pong}, {consumers}."
+    many, consumers = _counted(episodes, "episode"), _counted(client.consumers, "consumer")
+    return f"{many} of {client.duration_s:g} s; n_T = {windows}, {pong}, {consumers}."
+
+
+def _counted(n: int, thing: str) -> str:
+    return f"{n} {thing}{'' if n == 1 else 's'}"

@@ -213,6 +213,8 @@ def reward_weights(
     if not isinstance(reward, str | Mapping):
         raise BufgymError(f"reward = {reward!r}: must be the name of a term ({', '.join(names)}) or weights by name")
     given = {reward: 1.0} if isinstance(reward, str) else dict(reward)
+    if not given:
+        raise BufgymError(f"reward = {reward!r}: give at least one term its weight; known: {', '.join(names)}")
     for name, weight in given.items():
         if name not in names:
             raise BufgymError(f"reward = {reward!r}: unknown term {name!r}; known: {', '.join(names)}")

@@ -18,6 +18,7 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     schedulers,
 )
 from bufgym.policies.registry import Client, Policy, get, names, register, register_later, runs_compiled
+from bufgym.policies.schedulers import make_room
 
 __all__ = [
     "ACCEPT",
@@ -30,6 +31,7 @@ __all__ = [
     "get",
     "is_first",
     "load",
+    "make_room",
     "names",
     "register",
     "runs_compiled",

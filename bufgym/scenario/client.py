@@ -119,8 +119,10 @@ class Client:
         for stream in self.streams:
             if stream.moves and not self.motion:
                 raise BufgymError(f"topic {stream.topic.name!r}: moves, but the client has no motion recording")
-        if not 1 <= self.max_messages <= 10**7:
-            raise BufgymError(f"{self.max_messages} messages in all: must lie between 1 and 10000000")
+        total = self.max_messages * self.consumers
+        if not 1 <= total <= 10**7:
+            copies = f", with a copy for each of {self.consumers} consumers" if self.consumers > 1 else ""
+            raise BufgymError(f"{total} messages in all{copies}: must lie between 1 and 10000000")
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -235,12 +237,16 @@ def read_client(path: str | Path, **parameters: Any) -> Client:
     """A client from a TOML file: ``[[topic]]`` tables with what ``Topic`` and ``Stream`` take, ``window`` and the like.
 
     A topic's ``value`` is written as on the command line (``"exponential:0.618"``), its sizes in other encodings as
-    ``encodings = {json = 28000}``. ``parameters``: what the file does not have, such as ``traces`` and ``motion``.
+    ``encodings = {json = 28000}``. ``parameters``: what the file does not have, such as ``traces`` and ``motion``;
+    without ``traces`` the shipped LTE links and motions, as ``bufgym topics --config`` has them.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise BufgymError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise BufgymError(f"{path}: no configuration that can be read: {error}") from None
+        why = error.strerror if isinstance(error, OSError) else error
+        raise BufgymError(f"{path}: no configuration that can be read: {why}") from None
     try:
         given = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -253,7 +259,8 @@ def read_client(path: str | Path, **parameters: Any) -> Client:
         if not isinstance(tables, list) or not tables:
             raise BufgymError("needs at least one [[topic]]")
         streams = tuple(_stream(table) for table in tables)
-        return Client(streams, **{**given, **parameters})
+        world = {} if "traces" in parameters else _shipped()
+        return Client(streams, **{**given, **world, **parameters})
     except BufgymError as error:
         raise BufgymError(f"{path}: {error}") from None
 
@@ -283,10 +290,13 @@ def _stream(table: Mapping[str, Any]) -> Stream:
 
 def client_over_lte() -> Client:
     """The example client over the shipped synthetic LTE links at a quarter of their capacity."""
+    return Client(robofleet_example(), **_shipped(), scale=0.25)
+
+
+def _shipped() -> dict[str, Any]:
+    """The synthetic links and motions that come with bufgym."""
     names = traces.shipped()
-    return Client(
-        robofleet_example(),
-        tuple(traces.load(name) for name in names if name.startswith("lte-")),
-        tuple(traces.load_motion(name) for name in names if name.startswith("drive-")),
-        scale=0.25,
-    )
+    return {
+        "traces": tuple(traces.load(name) for name in names if name.startswith("lte-")),
+        "motion": tuple(traces.load_motion(name) for name in names if name.startswith("drive-")),
+    }

@@ -25,7 +25,16 @@ from bufgym.sender.decisions import (
 )
 from bufgym.sender.rules import age_until
 from bufgym.sender.seen import arrival_of, view
-from bufgym.sender.senders import Senders, compiled_rollout, padded, python_rollout, python_view, rollout, run
+from bufgym.sender.senders import (
+    Senders,
+    answer_of,
+    compiled_rollout,
+    padded,
+    python_rollout,
+    python_view,
+    rollout,
+    run,
+)
 from bufgym.sender.socket import credit, cross, may_take, take, transmit
 from bufgym.sender.state import (
     ARRIVAL_WAITS,
@@ -59,6 +68,7 @@ __all__ = [
     "Senders",
     "age_until",
     "answer_dequeue",
+    "answer_of",
     "answer_send",
     "arrival_of",
     "arrive",

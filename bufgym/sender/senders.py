@@ -169,6 +169,17 @@ python_view = getattr(view, "py_func", view)
 """``view`` for Python callers, over a ``named`` batch: the compiled kernel must not hand its arrays to Python."""
 
 
+def answer_of(policy: Policy, hook: str, given: Any) -> int:
+    """What a policy that is ordinary Python gave, a whole number (or a yes or no); a BufgymError for anything else."""
+    try:
+        number = int(given)
+    except (TypeError, ValueError, OverflowError):
+        number = None
+    if number is None or number != given:
+        raise BufgymError(f"policy {policy.name}: {hook} returned {given!r}: must be a whole number")
+    return number
+
+
 def python_rollout(batch: Batch, memory: NDArray[np.float64], policy: Policy) -> None:
     """``rollout`` for a policy that is ordinary Python: the transition stays compiled, views are made in Python."""
     seen = named(batch)
@@ -177,11 +188,13 @@ def python_rollout(batch: Batch, memory: NDArray[np.float64], policy: Policy) ->
         while event != END:
             if event == DECISION:
                 arrival = seen.arrivals[i, seen.senders[i].next]
-                decide(batch, i, int(policy.on_arrival(python_view(seen, i), arrival, memory[i])))
+                answer = policy.on_arrival(python_view(seen, i), arrival, memory[i])
+                decide(batch, i, answer_of(policy, "on_arrival", answer))
             elif event == DEQUEUE:
-                answer_dequeue(batch, i, bool(policy.on_dequeue(python_view(seen, i), memory[i])))
+                drop = policy.on_dequeue(python_view(seen, i), memory[i])
+                answer_dequeue(batch, i, bool(answer_of(policy, "on_dequeue", drop)))
             elif event == SEND:
-                answer_send(batch, i, int(policy.on_send(python_view(seen, i), memory[i])))
+                answer_send(batch, i, answer_of(policy, "on_send", policy.on_send(python_view(seen, i), memory[i])))
             elif policy.hears_departures:
                 policy.on_departure(python_view(seen, i), memory[i])
             event = next_event(batch, i)

@@ -123,6 +123,7 @@ def test_who_runs_by_default() -> None:
     ("name", "message"),
     [
         ("lte-v1", "suite lte-v1 has one robot, not a fleet: bufgym bench --suite lte-v1"),
+        ("topics-v1", "suite topics-v1 has one robot, not a fleet: bufgym topics --suite topics-v1"),
         ("fleet-v9", "unknown suite 'fleet-v9' of a fleet; known: fleet-v1"),
     ],
 )
@@ -199,7 +200,9 @@ def test_over_all_cells_it_is_the_mean_of_theirs() -> None:
 
 
 def test_rounding_is_no_gain_and_nothing_is_fair() -> None:
-    rows = [*made("afr", (0.1 + 0.2, 0.0)), *made("mine", (0.3, 0.0)), *made("none", (0.0, 0.0))]
+    nothing = (0.0, 0.0)
+    each = {"afr": (0.1 + 0.2, 0.0), "mine": (0.3, 0.0), "none": nothing}
+    rows = [row for policy, team in each.items() for row in made(policy, team, team)]
     found = summary(rows).overall
     assert of(found, "mine").above == of(found, "mine").below == exactly(0.0)
     assert of(found, "none").fairness == exactly(1.0) and of(found, "none").below == exactly(0.5)
@@ -229,7 +232,7 @@ def test_rows_that_cannot_be_summed_up(rows: list[Row], message: str) -> None:
 
 
 def test_the_table_as_text() -> None:
-    more = [*made("afr", (1.0,), capacity=9), *made("mine", (4.0,), capacity=9)]
+    more = [*made("afr", (1.0,), (1.0,), capacity=9), *made("mine", (4.0,), (4.0,), capacity=9)]
     lines = plain(summary([*HAND, *more]), {"s": "a story"}).splitlines()
     assert lines[0].split("  ")[0] == "policy" and "- afr's [95 %]" in lines[0]
     assert lines[2] == "s: a story, L = 4" and lines[6] == "s: a story, L = 9" and lines[10] == "mean of these 2"
@@ -238,7 +241,32 @@ def test_the_table_as_text() -> None:
     assert lines[4].split() == ["afr", "5.000", "4.000", "0.9400"]
 
 
+def test_one_episode_has_no_interval() -> None:
+    line = plain(summary([*made("afr", (1.0, 2.0)), *made("mine", (4.0, 2.0))])).splitlines()[3]
+    assert line.split() == ["mine", "3.000", "+1.500", "[-]", "50.0%", "[-]", "0.0%", "2.000", "0.9000"]
+
+
 # -------------------- the command
+
+
+@pytest.mark.slow
+def test_decisions_that_cannot_be_carried_out_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mine = tmp_path / "mine.py"
+    mine.write_text(
+        "from bufgym.policies import ACCEPT, register\n"
+        "@register('far-off', on_send=lambda buffer, memory: 999)\n"
+        "def far_off(buffer, arrival, memory):\n"
+        "    return ACCEPT if len(buffer.slots) < buffer.capacity else 0\n"
+    )
+    out = tmp_path / "rows.csv"
+    options = ["--robots", "1", "--seeds", "1", "--capacity", "3", "--split", "validation", "--out", str(out)]
+    try:
+        assert main(["fleet", "--policy", "far-off", "--policy-file", str(mine), *options]) == 0
+    finally:
+        policies.registry._REGISTRY.pop("far-off", None)
+    told = capsys.readouterr().out
+    impossible = sum(row["impossible"] for row in read_rows(out, ROWS) if row["policy"] == "far-off")
+    assert impossible > 0 and f"note: far-off gave {impossible} impossible decisions\n" in told
 
 
 @pytest.mark.slow

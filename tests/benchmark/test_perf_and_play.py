@@ -117,6 +117,8 @@ def test_a_player_refuses_a_decision_that_means_nothing() -> None:
     env.reset(seed=0)
     with pytest.raises(BufgymError, match="policy odd: decision 3"):
         Player(Policy("odd", lambda buffer, arrival, memory: 3)).action(env.rows.senders)
+    with pytest.raises(BufgymError, match="policy odd: on_arrival returned None: must be a whole number"):
+        Player(Policy("odd", lambda buffer, arrival, memory: None)).action(env.rows.senders)
     env = gym.make("bufgym/Topics-v0", capacity=3).unwrapped
     env.reset(seed=0)
     env.step(4)  # accept: now the socket asks

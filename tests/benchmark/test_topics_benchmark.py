@@ -153,6 +153,7 @@ def test_who_runs_by_default() -> None:
         ({"capacities": []}, "capacities = []: need at least one"),
         ({"seeds": 0}, "seeds = .*: need at least one"),
         ({"policies": ["fifo", "fifo"]}, "'fifo' is given more than once"),
+        ({"policies": ["fifo", "clairvoyant"]}, "policy clairvoyant: it plans with a queue of its own"),
         ({"client": Interruption()}, "Interruption: must be a bufgym.scenario.Client"),
     ],
 )
@@ -213,13 +214,24 @@ def test_a_summary_worked_by_hand() -> None:
 
 
 def test_over_all_cells_it_is_the_mean_of_theirs() -> None:
-    more = [*made("robofleet", 0, 100.0, "other"), *made("mine", 0, 150.0, "other")]
+    more = [
+        row
+        for seed in (0, 1)
+        for row in [*made("robofleet", seed, 100.0, "other"), *made("mine", seed, 150.0, "other")]
+    ]
     found = summary([*HALF, *more])
     assert list(found.cells) == [("s", 4), ("other", 4)]  # as in the rows
     assert [standing.policy for standing in found.cells["other", 4]] == ["mine", "robofleet"]
     (mine,) = (standing for standing in found.overall if standing.policy == "mine")
-    assert mine.relative == exactly((0.5 + 1.5) / 2) and mine.lost == 8
+    assert mine.relative == exactly((0.5 + 1.5) / 2) and mine.lost == 10
     assert mine.age_first_s == exactly(1.5)
+
+
+def test_one_episode_has_no_interval() -> None:
+    found = summary([*made("robofleet", 0, 10.0), *made("mine", 0, 15.0)])
+    mine = found.overall[0]
+    assert mine.relative.value == 1.5 and math.isnan(mine.relative.low) and math.isnan(mine.relative.high)
+    assert plain(found).splitlines()[3].split()[:4] == ["mine", "15.0", "1.500", "[-]"]
 
 
 def test_intervals_are_paired_and_repeatable() -> None:

@@ -306,6 +306,22 @@ def test_a_python_policy_does_what_the_compiled_one_does(name):
     )
 
 
+def accept(buffer, arrival, memory):
+    return policies.ACCEPT if len(buffer.slots) < buffer.capacity else policies.REJECT
+
+
+@pytest.mark.parametrize("hook", ["on_arrival", "on_dequeue", "on_send"])
+@pytest.mark.parametrize("given", [None, "1", 0.5])
+def test_what_is_no_whole_number_is_no_answer(hook, given):
+    made, episodes = drawn_episodes(2)
+    odd = policies.Policy("odd", **{"on_arrival": accept, hook: lambda *_: given})
+    complaint = rf"policy odd: {hook} returned {given!r}: must be a whole number"
+    with pytest.raises(BufgymError, match=complaint):
+        run_fleet(odd, episodes, 4, made.value)
+    with pytest.raises(BufgymError, match=complaint):
+        run(odd, [episodes[0].episode(0)], 4, made.value)
+
+
 def test_cells_of_a_batch_know_nothing_of_each_other():
     made, episodes = drawn_episodes(3)
     both = run_fleet(policies.get("afr"), episodes, 4, made.value)

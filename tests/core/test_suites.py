@@ -151,6 +151,8 @@ def fingerprint(name: str) -> str:
 def test_unknown_names_are_named() -> None:
     with pytest.raises(BufgymError, match=r"unknown suite 'lte-v0'; known: interruption-v1, lte-v1"):
         suites.get("lte-v0")
+    with pytest.raises(BufgymError, match="suite fleet-v1 has many robots: bufgym fleet --suite fleet-v1"):
+        suites.get("fleet-v1")
     with pytest.raises(BufgymError, match=r"split = 'tests': must be one of train, validation, test"):
         suites.get("lte-v1").settings("tests")
 

@@ -316,6 +316,7 @@ def test_observation_bounds_hold_where_nothing_moves_and_all_comes_at_once() -> 
         ({"scenario": "moon"}, "unknown scenario 'moon'"),
         ({"reward": "fame"}, "unknown term 'fame'"),
         ({"reward": {"delivered": math.nan}}, "finite"),
+        ({"reward": {}}, "at least one term"),
         ({"fields": ["smell"]}, "unknown field 'smell'"),
         ({"fields": []}, "at least one field"),
         ({"duration_s": math.nan}, "duration_s = nan"),
