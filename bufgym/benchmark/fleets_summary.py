@@ -25,7 +25,7 @@ from bufgym.benchmark.bootstrap import (
 )
 from bufgym.benchmark.episodes import TIE, Cell, Numbers
 from bufgym.benchmark.fleets import BASELINE
-from bufgym.benchmark.table import aligned
+from bufgym.benchmark.table import in_blocks
 from bufgym.errors import BufgymError
 
 
@@ -173,12 +173,7 @@ def plain(found: Summary, abouts: Mapping[str, str] | None = None) -> str:
     blocks = [(_title(cell, abouts or {}), standings) for cell, standings in found.cells.items()]
     if len(blocks) > 1:
         blocks.append((f"mean of these {len(blocks)}", found.overall))
-    lines = aligned([head, *(_cells(standing, given) for _, block in blocks for standing in block)])
-    out, at = [lines[0]], 1
-    for title, block in blocks:
-        out += ["", title, *lines[at : at + len(block)]]
-        at += len(block)
-    return "\n".join(out)
+    return in_blocks(head, [(title, [_cells(one, given) for one in standings]) for title, standings in blocks])
 
 
 def _title(cell: Cell, abouts: Mapping[str, str]) -> str:

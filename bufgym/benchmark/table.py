@@ -122,3 +122,13 @@ def impossible(rows: Rows) -> list[str]:
         if row.get("impossible"):
             counts[row["policy"]] = counts.get(row["policy"], 0) + row["impossible"]
     return [f"note: {policy} gave {count} impossible decisions" for policy, count in counts.items()]
+
+
+def in_blocks(head: list[str], blocks: Sequence[tuple[str, list[list[str]]]]) -> str:
+    """Titled blocks of lines under one head, all in the same columns."""
+    lines = aligned([head, *(line for _, block in blocks for line in block)])
+    out, at = [lines[0]], 1
+    for title, block in blocks:
+        out += ["", title, *lines[at : at + len(block)]]
+        at += len(block)
+    return "\n".join(out)

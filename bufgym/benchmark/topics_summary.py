@@ -26,7 +26,7 @@ from bufgym.benchmark.bootstrap import (
     written,
 )
 from bufgym.benchmark.episodes import Cell, Numbers
-from bufgym.benchmark.table import Column, aligned, mean
+from bufgym.benchmark.table import Column, in_blocks, mean
 from bufgym.benchmark.topics import BASELINE
 from bufgym.errors import BufgymError
 
@@ -220,17 +220,7 @@ def plain(found: Summary, abouts: Mapping[str, str] | None = None) -> str:
     blocks = [(_title(cell, abouts), standings) for cell, standings in found.cells.items()]
     if len(blocks) > 1:
         blocks.append((f"mean of these {len(blocks)}", found.overall))
-    return _in_blocks(head, [(title, [_cells(standing) for standing in standings]) for title, standings in blocks])
-
-
-def _in_blocks(head: list[str], blocks: Sequence[tuple[str, list[list[str]]]]) -> str:
-    """Titled blocks of lines under one head, all in the same columns."""
-    lines = aligned([head, *(line for _, block in blocks for line in block)])
-    out, at = [lines[0]], 1
-    for title, block in blocks:
-        out += ["", title, *lines[at : at + len(block)]]
-        at += len(block)
-    return "\n".join(out)
+    return in_blocks(head, [(title, [_cells(standing) for standing in standings]) for title, standings in blocks])
 
 
 def _title(cell: Cell, abouts: Mapping[str, str]) -> str:
@@ -279,7 +269,7 @@ def by_topic(rows: Rows, policy: str) -> str:
         (_title(cell, {}), _topic_lines([row for row in mine if (row["scenario"], row["capacity"]) == cell]))
         for cell in cells
     ]
-    return _in_blocks([column.title for column in TOPIC_COLUMNS], blocks)
+    return in_blocks([column.title for column in TOPIC_COLUMNS], blocks)
 
 
 def _topic_lines(rows: Rows) -> list[list[str]]:

@@ -25,13 +25,12 @@ from bufgym.sender import (
     Batch,
     Senders,
     answer_dequeue,
-    answer_of,
     answer_send,
     arrival_of,
+    ask,
     batch_type,
     credit,
     named,
-    python_view,
     view,
 )
 
@@ -80,20 +79,14 @@ def python_fleet_rollout(batch: Batch, shares: Shares, memory: NDArray[np.float6
         event = cell_event(batch, shares, c)
         while event != END:
             i = int(shares.cells["row"][c])
-            if event == DECISION:
-                arrival = seen.arrivals[i, seen.senders[i].next]
-                answer = policy.on_arrival(python_view(seen, i), arrival, memory[i])
-                decide_in_cell(batch, shares, c, i, answer_of(policy, "on_arrival", answer))
-            elif event == DEQUEUE:
-                drop = policy.on_dequeue(python_view(seen, i), memory[i])
-                answer_dequeue(batch, i, bool(answer_of(policy, "on_dequeue", drop)))
-            elif event == SEND:
-                answer_send(batch, i, answer_of(policy, "on_send", policy.on_send(python_view(seen, i), memory[i])))
-            elif policy.hears_departures:
-                policy.on_departure(python_view(seen, i), memory[i])
+            ask(policy, batch, seen, i, event, memory[i], functools.partial(_decide, shares, c))
             event = cell_event(batch, shares, c)
     for i in range(len(batch.senders)):
         credit(batch, i, FOREVER)
+
+
+def _decide(shares: Shares, c: int, batch: Batch, i: int, decision: int) -> None:
+    decide_in_cell(batch, shares, c, i, decision)
 
 
 class Fleet:

@@ -101,11 +101,7 @@ class FleetScenario:
         """MESSAGE[n] of one more robot whose camera ticks at these times."""
         arrivals = self._stream.draw(streams).arrivals
         arrivals["arrival_us"] = arrival_us
-        if self.uplink.motion:
-            motion = self.uplink.motion[int(streams.arrival.integers(len(self.uplink.motion)))]
-            start = int(streams.arrival.integers(motion.time_us[-1])) if self.uplink.random_offset else 0
-            x = motion.at(arrival_us + start)
-            arrivals["x"] = x - x[0]
+        self.uplink.move(arrivals, streams.arrival)
         return arrivals
 
     @functools.cached_property

@@ -14,7 +14,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym.cell import Fleet, FleetScenario, Shares, cell_event, decide_in_cell, offer
-from bufgym.envs.rows import DELIVERED, RETAINED, Rows, Shown, decision_of, show
+from bufgym.envs.rows import Rows, Shown, decision_of, pay, show
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel
 from bufgym.link import FOREVER
@@ -71,11 +71,7 @@ def step_cells(
                 offer(batch, shares, c)
             advance_cell(batch, shares, c)
         for i in range(first, first + robots):
-            sender = batch.senders[i]
-            shown.terms[i, DELIVERED] = sender.delivered_gain - paid[i, DELIVERED]
-            shown.terms[i, RETAINED] = sender.retained_gain - paid[i, RETAINED]
-            paid[i, DELIVERED] = sender.delivered_gain
-            paid[i, RETAINED] = sender.retained_gain
+            pay(batch, i, paid, shown)
             show(batch, i, shown)
 
 

@@ -162,6 +162,25 @@ def show_topics(batch: Batch, i: int, shown: Shown) -> None:
 
 
 @kernel
+def pay(batch: Batch, i: int, paid: NDArray[np.float64], shown: Shown) -> None:
+    """Write what row ``i`` has earned since it was paid last."""
+    sender = batch.senders[i]
+    shown.terms[i, DELIVERED] = sender.delivered_gain - paid[i, DELIVERED]
+    shown.terms[i, RETAINED] = sender.retained_gain - paid[i, RETAINED]
+    paid[i, DELIVERED] = sender.delivered_gain
+    paid[i, RETAINED] = sender.retained_gain
+    if sender.topics > 1:
+        weight = 0.0
+        for topic in range(sender.topics):
+            weight += batch.topics[i, topic].weight
+        # Topics that all weigh nothing have paid nothing.
+        weight = weight if weight > 0 else 1.0
+        shown.terms[i, AGE] = (paid[i, AGE] - sender.aged) / weight
+        shown.terms[i, LATE] = (paid[i, LATE] - sender.late) / weight
+        paid[i, AGE], paid[i, LATE] = sender.aged, sender.late
+
+
+@kernel
 def begin_rows(batch: Batch, rows: NDArray[np.int64], paid: NDArray[np.float64], shown: Shown) -> None:
     """Bring freshly loaded rows to their first decision; nothing is paid yet, and ``shown.terms`` stay as they are."""
     for i in rows:
@@ -189,19 +208,7 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64
         elif sender.waiting == SOCKET_WAITS:
             answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
             advance(batch, i)
-        shown.terms[i, DELIVERED] = sender.delivered_gain - paid[i, DELIVERED]
-        shown.terms[i, RETAINED] = sender.retained_gain - paid[i, RETAINED]
-        paid[i, DELIVERED] = sender.delivered_gain
-        paid[i, RETAINED] = sender.retained_gain
-        if sender.topics > 1:
-            weight = 0.0
-            for topic in range(sender.topics):
-                weight += batch.topics[i, topic].weight
-            # Topics that all weigh nothing have paid nothing.
-            weight = weight if weight > 0 else 1.0
-            shown.terms[i, AGE] = (paid[i, AGE] - sender.aged) / weight
-            shown.terms[i, LATE] = (paid[i, LATE] - sender.late) / weight
-            paid[i, AGE], paid[i, LATE] = sender.aged, sender.late
+        pay(batch, i, paid, shown)
         show(batch, i, shown)
 
 
@@ -306,7 +313,8 @@ class Rows:
                     self.seed(i, seeding.np_random()[0])
                 episode = draw(cast(Streams, self.streams[i]))
             load(i, episode)
-            self.senders.batch.senders["ask_at_send"][i] = self.asks_at_send
+        if self.asks_at_send:
+            self.senders.batch.senders["ask_at_send"][rows] = 1
         begin_rows(self.senders.batch, rows, self.paid, self.shown)
 
     def step(self, actions: NDArray[np.int64]) -> None:

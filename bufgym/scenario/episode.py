@@ -15,7 +15,7 @@ from bufgym.kernel import records
 from bufgym.link import Link
 from bufgym.qoi import Value
 from bufgym.scenario.checks import natural
-from bufgym.topics import Topic
+from bufgym.topics import Topic, check_pong, check_window
 
 
 class Streams(NamedTuple):
@@ -51,6 +51,10 @@ class Episode:
     """Bytes of the messages in other encodings, int64[n] each; in one that is not here they have their own sizes."""
     consumers: int = 1
     """How many want each message; who sends copies sends so many."""
+
+    def __post_init__(self) -> None:
+        check_window(self.window)
+        check_pong(self.pong_us)
 
     # Luck is not drawn with the rest: an agent in an environment has chance of its own.
 

@@ -105,17 +105,21 @@ class Uplink:
 
     def draw(self, streams: Streams) -> Episode:
         arrivals = self._stream(streams.arrival) if self.workload is None else _replayed(self.workload)
-        if self.motion:
-            motion = self.motion[int(streams.arrival.integers(len(self.motion)))]
-            start = int(streams.arrival.integers(motion.time_us[-1])) if self.random_offset else 0
-            x = motion.at(arrivals["arrival_us"] + start)
-            arrivals["x"] = x - x[0]
+        self.move(arrivals, streams.arrival)
         trace = self._links[int(streams.link.integers(len(self._links)))]
         offset = 0
         if self.random_offset:
             first, last = self.link_offset_s or (0.0, trace.duration_us / 1e6)
             offset = int(streams.link.integers(round(first * 1e6), max(round(last * 1e6), 1 + round(first * 1e6))))
         return Episode(arrivals, Link(trace, offset, int(self.propagation_us)))
+
+    def move(self, arrivals: NDArray[Any], rng: np.random.Generator) -> None:
+        """Give these messages the x of one of the recordings, if there are any, from a place drawn at random."""
+        if self.motion:
+            motion = self.motion[int(rng.integers(len(self.motion)))]
+            start = int(rng.integers(motion.time_us[-1])) if self.random_offset else 0
+            x = motion.at(arrivals["arrival_us"] + start)
+            arrivals["x"] = x - x[0]
 
     def _stream(self, rng: np.random.Generator) -> NDArray[Any]:
         """MESSAGE[n] of the camera, x being the frame index."""

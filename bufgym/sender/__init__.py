@@ -28,6 +28,7 @@ from bufgym.sender.seen import arrival_of, view
 from bufgym.sender.senders import (
     Senders,
     answer_of,
+    ask,
     compiled_rollout,
     padded,
     python_rollout,
@@ -72,6 +73,7 @@ __all__ = [
     "answer_send",
     "arrival_of",
     "arrive",
+    "ask",
     "batch_type",
     "can_evict",
     "can_hold",

@@ -6,7 +6,7 @@ from typing import Any
 
 from bufgym.buffer import Buffer
 from bufgym.kernel import kernel
-from bufgym.link import position_at
+from bufgym.sender.socket import carried_by_now
 from bufgym.sender.state import ARRIVAL_WAITS, Batch
 
 
@@ -53,16 +53,7 @@ def view(batch: Batch, i: int) -> Buffer:
     taken_bytes = socket_bytes(batch, i) if sender.busy > 0 else 0
     left_bytes = taken_bytes
     if sender.busy > 0 and (sender.taken_at_us < sender.now_us or sender.busy > 1):
-        reached, sender.segment_now = position_at(
-            batch.knot_us,
-            batch.knot_bytes,
-            sender.first_knot,
-            sender.last_knot,
-            sender.after,
-            sender.segment_now,
-            sender.now_us + sender.offset_us,
-        )
-        left_bytes = min(left_bytes, max(0, sender.position - reached))
+        left_bytes = min(left_bytes, max(0, sender.position - carried_by_now(batch, i)))
     return Buffer(
         batch.slots[i, first : first + occupancy],
         capacity,

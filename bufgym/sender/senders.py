@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,9 +21,9 @@ from bufgym.scenario import Episode
 from bufgym.sender.decisions import answer_dequeue, answer_send, decide
 from bufgym.sender.seen import arrival_of, view
 from bufgym.sender.socket import credit
-from bufgym.sender.state import DECISION, DEQUEUE, END, FATE, SEND, SENDER, Batch, batch_type, named
+from bufgym.sender.state import DECISION, DEPARTURE, DEQUEUE, END, FATE, SEND, SENDER, Batch, batch_type, named
 from bufgym.sender.transition import load_row, next_event
-from bufgym.topics import Topic, check_pong, check_topics, check_window, copies_of, topic_table
+from bufgym.topics import Topic, check_topics, copies_of, topic_table
 
 
 def rollout(
@@ -113,8 +113,6 @@ class Senders:
         if self.topics and not (numbers.min() >= 0 and numbers.max() < len(self.topics)):
             unknown = numbers.min() if numbers.min() < 0 else numbers.max()
             raise BufgymError(f"episode: unknown topic {unknown}; the senders know {len(self.topics)}, from 0 on")
-        check_window(episode.window)
-        check_pong(episode.pong_us)
         first_knot, last_knot, after = self._knots.place(link.trace)
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
@@ -180,23 +178,40 @@ def answer_of(policy: Policy, hook: str, given: Any) -> int:
     return number
 
 
+def ask(
+    policy: Policy,
+    batch: Batch,
+    seen: Batch,
+    i: int,
+    event: int,
+    memory: NDArray[np.float64],
+    decide: Callable[[Batch, int, int], object],
+) -> None:
+    """Tell a policy that is ordinary Python of an event of sender ``i`` and carry its answer out.
+
+    ``seen``: the same batch, ``named``; ``memory``: float64[entries]; ``decide``: what carries a DECISION out.
+    """
+    if event == DEPARTURE and not policy.hears_departures:
+        return
+    shown = python_view(seen, i)
+    if event == DECISION:
+        answer = policy.on_arrival(shown, seen.arrivals[i, seen.senders[i].next], memory)
+        decide(batch, i, answer_of(policy, "on_arrival", answer))
+    elif event == DEQUEUE:
+        answer_dequeue(batch, i, bool(answer_of(policy, "on_dequeue", policy.on_dequeue(shown, memory))))
+    elif event == SEND:
+        answer_send(batch, i, answer_of(policy, "on_send", policy.on_send(shown, memory)))
+    else:
+        policy.on_departure(shown, memory)
+
+
 def python_rollout(batch: Batch, memory: NDArray[np.float64], policy: Policy) -> None:
     """``rollout`` for a policy that is ordinary Python: the transition stays compiled, views are made in Python."""
     seen = named(batch)
     for i in range(len(batch.senders)):
         event = next_event(batch, i)
         while event != END:
-            if event == DECISION:
-                arrival = seen.arrivals[i, seen.senders[i].next]
-                answer = policy.on_arrival(python_view(seen, i), arrival, memory[i])
-                decide(batch, i, answer_of(policy, "on_arrival", answer))
-            elif event == DEQUEUE:
-                drop = policy.on_dequeue(python_view(seen, i), memory[i])
-                answer_dequeue(batch, i, bool(answer_of(policy, "on_dequeue", drop)))
-            elif event == SEND:
-                answer_send(batch, i, answer_of(policy, "on_send", policy.on_send(python_view(seen, i), memory[i])))
-            elif policy.hears_departures:
-                policy.on_departure(python_view(seen, i), memory[i])
+            ask(policy, batch, seen, i, event, memory[i], decide)
             event = next_event(batch, i)
         credit(batch, i, FOREVER)
 

@@ -40,21 +40,28 @@ def take(batch: Batch, i: int, k: int) -> None:
 
 
 @kernel
+def carried_by_now(batch: Batch, i: int) -> int:
+    """The position that the link of sender ``i`` has come to."""
+    sender = batch.senders[i]
+    reached, sender.segment_now = position_at(
+        batch.knot_us,
+        batch.knot_bytes,
+        sender.first_knot,
+        sender.last_knot,
+        sender.after,
+        sender.segment_now,
+        sender.now_us + sender.offset_us,
+    )
+    return reached
+
+
+@kernel
 def transmit(batch: Batch, i: int) -> None:
     """The link carries what was taken last: behind the message before it, or from now on if the link was idle."""
     sender = batch.senders[i]
     head = batch.slots[i, sender.first - 1]
     if sender.busy == 1 and sender.follows == 0:
-        reached, sender.segment_now = position_at(
-            batch.knot_us,
-            batch.knot_bytes,
-            sender.first_knot,
-            sender.last_knot,
-            sender.after,
-            sender.segment_now,
-            sender.now_us + sender.offset_us,
-        )
-        sender.position = max(reached, sender.position)
+        sender.position = max(carried_by_now(batch, i), sender.position)
     sender.position += head.size_bytes
     at_us, sender.segment_finish = time_of(
         batch.knot_us,
