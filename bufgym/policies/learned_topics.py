@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, HOLD, REJECT, Buffer
+from bufgym.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.kernel import kernel
 from bufgym.observe import (
     CONTEXT_FIELDS,
@@ -103,10 +103,7 @@ def sends(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     observed(buffer, buffer.slots[0], False, memory)
     best, choice = -np.inf, HOLD
     for k in range(len(buffer.slots)):
-        first = True
-        for j in range(k):
-            first = first and buffer.slots[j].topic != buffer.slots[k].topic
-        if first:
+        if is_first(buffer, k):
             reached = score(buffer, k, send, after, memory)
             if reached > best:
                 best, choice = reached, k
