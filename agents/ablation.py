@@ -40,8 +40,8 @@ WITHOUT = {
     "everything": (),
     "without value (loss, relative_loss, even_value, bend)": ("loss", "relative_loss", "even_value", "bend"),
     "without its curvature (relative_loss, even_value, bend)": ("relative_loss", "even_value", "bend"),
-    "without link (stalled, drain)": ("stalled", "drain"),
-    "without context, so nothing is mixed": ("occupancy", "stalled", "drain", "even_value", "bend"),
+    "without link (stalled, drain)": ("stalled", "service_ratio"),
+    "without context, so nothing is mixed": ("occupancy", "stalled", "service_ratio", "even_value", "bend"),
     "rank and motion_merged alone": tuple(name for name in evolution.MOTION if name not in ("rank", "motion_merged")),
 }
 """Fields left out of ``evolution.MOTION``."""

@@ -22,7 +22,7 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 from torch.nn import functional
 
-from agents.network import IgnoresMasks, SlotFeatures, SlotScorer
+from bufgym.sb3.networks import IgnoresMasks, SlotFeatures, SlotScorer
 
 IMPOSSIBLE = -1e9
 """The value of an impossible action."""

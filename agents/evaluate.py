@@ -15,10 +15,10 @@ from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.score import paired_difference
 from bufgym.envs import SenderVectorEnv
-from bufgym.metrics import Outcome, outcome
 from bufgym.policies import registry
 from bufgym.scenario import Episode, Scenario, Uplink
-from bufgym.sender import run
+from bufgym.sim import run
+from bufgym.sim.metrics import Outcome, outcome
 
 if TYPE_CHECKING:
     from train import Arguments

@@ -42,12 +42,12 @@ from bufgym.scenario import Interruption, Uplink
 if TYPE_CHECKING:
     from train import Arguments
 
-TIME = ("rank", "time_before", "time_merged", "occupancy", "stalled", "drain")
+TIME = ("rank", "time_before", "time_merged", "occupancy", "stalled", "service_ratio")
 """What a queue and a clock can tell, as AFR's."""
 
 MOTION = (
     *("rank", "motion_before", "motion_merged", "loss", "relative_loss"),
-    *("occupancy", "stalled", "drain", "even_value", "bend"),
+    *("occupancy", "stalled", "service_ratio", "even_value", "bend"),
 )
 """With odometry, and the V that is aimed at."""
 

@@ -20,9 +20,7 @@ from sb3_contrib import MaskablePPO
 from torch import nn
 
 from agents.grounds import Lengths
-from agents.network import SlotFeatures, SlotScorer
 from agents.worlds import Cell
-from bufgym import suites
 from bufgym.benchmark.topics import run_parts, suite_parts
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy, learned, learned_topics
@@ -30,6 +28,8 @@ from bufgym.policies import weights as files
 from bufgym.policies.learned import Network, Weights
 from bufgym.policies.learned_topics import TopicWeights
 from bufgym.policies.weights import StrPath
+from bufgym.sb3.networks import SlotFeatures, SlotScorer
+from bufgym.scenario import suites
 
 
 def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:

@@ -19,11 +19,12 @@ from agents.worlds import capacities_of
 from bufgym import policies
 from bufgym.benchmark import fleets
 from bufgym.benchmark.fleets import BASELINE
-from bufgym.cell import Fleet, FleetEpisode, FleetScenario
 from bufgym.policies import Policy, learned, weights
 from bufgym.policies.learned import Weights
-from bufgym.sender import Senders
-from bufgym.suites import FleetSuite
+from bufgym.scenario import FleetEpisode, FleetScenario
+from bufgym.scenario.suites import FleetSuite
+from bufgym.sim import Senders
+from bufgym.sim.cell import Fleet
 
 if TYPE_CHECKING:
     from train import Arguments
@@ -62,7 +63,7 @@ class Ground:
             self.fleet.load(c, episode)
         self.fleet.run(policy)
         sender = self.fleet.senders.batch.senders
-        return float((sender["delivered_gain"] + (sender["crossed"] > 0)).mean())
+        return float((sender["delivered_gain"] + (sender["transmitted"] > 0)).mean())
 
 
 def gain(policy: Policy, grounds: Sequence[Ground]) -> float:

@@ -23,13 +23,13 @@ from agents.export import command
 from agents.grounds import Lengths
 from agents.trials import Trials
 from agents.worlds import Cell
-from bufgym import files, policies, suites
-from bufgym.benchmark.campaign import Plan
+from bufgym import files, policies
 from bufgym.benchmark.score import BASELINE, Interval, regret, scores
+from bufgym.benchmark.sweep import Plan
 from bufgym.errors import BufgymError
 from bufgym.oracle import law, online_optimum
 from bufgym.policies import Policy, registry
-from bufgym.scenario import Interruption
+from bufgym.scenario import Interruption, suites
 
 Numbers = NDArray[np.float64]
 

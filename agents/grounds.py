@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from agents.worlds import Cell
 from bufgym import policies
-from bufgym.benchmark import campaign
+from bufgym.benchmark import sweep
 from bufgym.benchmark.run import best, draw, regret
 from bufgym.benchmark.score import BASELINE
 from bufgym.oracle import by_length, integer, law
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, Interruption, Uplink
-from bufgym.sender import Senders
+from bufgym.sim import Senders
 
 AT_LEAST = 0.003
 """A cell where AFR's regret is smaller counts as if it were this: there is next to nothing to be gained."""
@@ -67,7 +67,7 @@ class Lengths:
         """H by T, float64[t_max + 1]."""
         self.senders.load(0, self.longest())
         self.senders.run(policy)
-        return self.by_length(self.senders.batch.fates["dropped_us"][0])
+        return self.by_length(self.senders.batch.log["dropped_us"][0])
 
     def longest(self) -> Episode:
         """The interruption that holds all others."""
@@ -92,14 +92,14 @@ class SideBySide:
             self.senders.load(i, ground.longest())
         self.senders.capacity = widest
         batch = self.senders.batch
-        self._begun = batch.senders.copy(), batch.fates.copy()
+        self._begun = batch.senders.copy(), batch.log.copy()
 
     def regrets(self, policy: Policy) -> list[float]:
         """By ground."""
         batch = self.senders.batch
-        batch.senders[:], batch.fates[:] = self._begun
+        batch.senders[:], batch.log[:] = self._begun
         self.senders.run(policy)
-        dropped_us = batch.fates["dropped_us"]
+        dropped_us = batch.log["dropped_us"]
         return [ground.regret_of(ground.by_length(row)) for ground, row in zip(self.grounds, dropped_us, strict=True)]
 
 
@@ -111,7 +111,7 @@ class Sampled:
     def __init__(self, cell: Cell, drawn: Sequence[tuple[int, int]]) -> None:
         """The episodes of these (trace, seed)."""
         self.cell, scenario = cell, cell.scenario
-        self.episodes = [draw(campaign.cell(scenario, trace), seed) for trace, seed in drawn]
+        self.episodes = [draw(sweep.cell(scenario, trace), seed) for trace, seed in drawn]
         self.senders = Senders(len(drawn), cell.capacity, scenario.value, max_messages=scenario.max_messages)
         self.best = sum(best(episode, cell.capacity, scenario).qoi for episode in self.episodes)
 
@@ -120,7 +120,7 @@ class Sampled:
             self.senders.load(i, episode)
         self.senders.run(policy)
         delivered = self.senders.batch.senders
-        return regret(float((delivered["delivered_gain"] + (delivered["crossed"] > 0)).sum()), self.best)
+        return regret(float((delivered["delivered_gain"] + (delivered["transmitted"] > 0)).sum()), self.best)
 
 
 def grounds(given: Sequence[Cell], seed: int, episodes: int = EPISODES) -> list[Ground]:

@@ -180,7 +180,7 @@ def report_suite(arguments: Arguments, suite: str, folder: Path, home: Path, run
     (home / "results.json").write_text(json.dumps(saved, indent=2) + "\n", encoding="utf-8")
     # What is below Drop Oldest is in the table alone: it would squeeze the rest.
     shown = [s for s in found.standings if s.ranked and (s.score.value >= 0 or s.policy.startswith("agent"))]
-    # Where no cell bites there is nothing to score.
+    # Where no cell discriminative there is nothing to score.
     shown = [s for s in shown if math.isfinite(s.score.value)]
     reached = {s.policy: s.score.value for s in shown} or {
         name: float(np.mean(numbers)) for name, numbers in qoi.items()
@@ -202,9 +202,9 @@ def standings(found: Scores) -> str:
         better = [_number(standing.improvement.value, ".2f"), _span(standing.improvement, ".2f")]
         name = standing.policy if standing.ranked else f"{standing.policy} (not ranked)"
         lines.append([name, *cells, _number(standing.iqm.value, ".3f"), *better])
-    biting = max((standing.cells for standing in found.standings), default=0)
+    discriminative = max((standing.cells for standing in found.standings), default=0)
     total = len({(cell.scenario, cell.capacity) for cell in found.cells})
-    note = f"{biting} of {total} cells (scenario, L) count; score: 0 is {found.baseline}, 1 the clairvoyant"
+    note = f"{discriminative} of {total} cells (scenario, L) count; score: 0 is {found.baseline}, 1 the clairvoyant"
     return "\n".join([*aligned(lines), note])
 
 

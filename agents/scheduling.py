@@ -27,26 +27,26 @@ from numpy.typing import NDArray
 
 from agents.callbacks import Record, seed_bar
 from agents.seeds import conclude, each_seed, seeds_of
-from bufgym import files, policies, suites
+from bufgym import files, policies
 from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.topics import ROWS, default_policies, run_parts, suite_parts
 from bufgym.benchmark.topics_summary import Standing, plain, summary
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
-from bufgym.link import FOREVER
+from bufgym.model.link import FOREVER
 from bufgym.policies import Policy, learned_topics, weights
 from bufgym.policies.learned import Network
 from bufgym.policies.learned_topics import TopicWeights
-from bufgym.scenario import Client
-from bufgym.sender import Senders, age_until
+from bufgym.scenario import Client, suites
+from bufgym.sim import Senders, age_until
 
 if TYPE_CHECKING:
     from train import Arguments
 
 RIVAL = "robofleet"
 
-CONTEXT = ("occupancy", "stalled", "drain", "left", "in_flight")
+CONTEXT = ("occupancy", "stalled", "service_ratio", "left", "in_flight")
 SLOT = (
     *("rank", "time_merged", "motion_merged", "loss", "relative_loss", "size", "priority", "weight", "no_drop"),
     *("own", "waited", "silence", "lateness", "queued", "gain", "gain_per_byte"),
@@ -146,7 +146,7 @@ class Ground:
                 age_until(batch, i, k, FOREVER)
         topics = np.asarray(batch.topics)[:, :count]
         qoi = batch.senders["delivered_gain"].sum() + ((topics["received"] > 0) * topics["weight"]).sum()
-        dropped = np.asarray(batch.fates["dropped_us"]) >= 0
+        dropped = np.asarray(batch.log["dropped_us"]) >= 0
         lost = sum(
             int((dropped[i, : len(e.arrivals)] & self.never[e.arrivals["topic"]]).sum())
             for i, e in enumerate(self.episodes)

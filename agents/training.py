@@ -26,15 +26,15 @@ from agents import evolution
 from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluate import Agent, worlds
-from agents.network import IgnoresMasks, policy_of
 from agents.seeds import each_seed, seeds_of
 from agents.trials import Trials, ValidationSet, plan
 from agents.worlds import World, capacities_of, cells
-from bufgym import suites
 from bufgym.benchmark.fleets import SUITES as FLEET_SUITES
 from bufgym.benchmark.rows import Row
 from bufgym.policies import load as load_policy
 from bufgym.sb3 import GymVecEnv, make_vec_env
+from bufgym.sb3.networks import IgnoresMasks, policy_of
+from bufgym.scenario import suites
 
 if TYPE_CHECKING:
     from train import Arguments

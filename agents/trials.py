@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 
 from agents.evaluate import Agent
 from agents.worlds import World, capacities_of, cells
-from bufgym import suites
 from bufgym.benchmark import run as bench
-from bufgym.benchmark.campaign import Plan, campaign, cell, units
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.score import BASELINE, BITES, normalised_score, regret
+from bufgym.benchmark.score import BASELINE, DISCRIMINATIVE, normalised_score, regret
+from bufgym.benchmark.sweep import Plan, cell, run_sweep, shards
 from bufgym.errors import BufgymError
-from bufgym.metrics import Outcome, outcome
 from bufgym.policies import Policy
-from bufgym.scenario import Episode
-from bufgym.sender import run
+from bufgym.scenario import Episode, suites
+from bufgym.sim import run
+from bufgym.sim.metrics import Outcome, outcome
 
 if TYPE_CHECKING:
     from train import Arguments
@@ -50,15 +49,15 @@ class Trials:
     def __init__(self, plan: Plan, folder: Path, *, progress: bool = False) -> None:
         self.plan = plan = plan.checked()
         jobs = -1 if importlib.util.find_spec("joblib") else 1
-        self.rows = campaign(plan, folder, jobs=jobs, progress=progress)
+        self.rows = run_sweep(plan, folder, jobs=jobs, progress=progress)
         settings = suites.get(plan.suite).settings(plan.split, plan.data)
         met: dict[str, list[tuple[Row, Episode]]] = {label: [] for label in settings}
-        for unit in units(plan):
-            scenario = cell(settings[unit.label].scenario, unit.trace)
+        for shard in shards(plan):
+            scenario = cell(settings[shard.label].scenario, shard.trace)
             trace = bench.cells(scenario)[0][0]
-            for seed in unit.seeds:
-                key = {"scenario": unit.label, "trace": trace, "seed": seed}
-                met[unit.label].append((key, bench.draw(scenario, seed)))
+            for seed in shard.seeds:
+                key = {"scenario": shard.label, "trace": trace, "seed": seed}
+                met[shard.label].append((key, bench.draw(scenario, seed)))
         self.cells = cells(plan.suite, plan.split, plan.capacities, plan.data)
         self._sizes = [len(met[c.label]) for c in self.cells]
         self._keys = [key | {"capacity": c.capacity} for c in self.cells for key, _ in met[c.label]]
@@ -104,12 +103,12 @@ class Trials:
             np.add.reduceat(given, first)
             for given in (h, self.known(BASELINE), self.known("afr"), self.known("afr", "clairvoyant"))
         )
-        biting = regret(base, best) >= BITES
-        if not biting.any():
+        discriminative = regret(base, best) >= DISCRIMINATIVE
+        if not discriminative.any():
             raise BufgymError(
                 f"suite {self.plan.suite}, L = {list(self.plan.capacities)}: Drop Oldest cannot be bettered"
             )
-        ours, base, afr, best = ours[biting], base[biting], afr[biting], best[biting]
+        ours, base, afr, best = ours[discriminative], base[discriminative], afr[discriminative], best[discriminative]
         mine, theirs = float(regret(ours, best).mean()), float(regret(afr, best).mean())
         return Verdict(float(normalised_score(ours, base, best).mean()), mine, mine / theirs if theirs else np.inf)
 
@@ -139,7 +138,7 @@ def _name(row: Row) -> tuple[str, str, int, int]:
 
 def seeds_for(suite: str, split: str, capacities: Sequence[int], episodes: int, data: str | None) -> int:
     """Seeds a trace, so that all scenarios, traces and capacities together have about so many episodes."""
-    one_seed = sum(len(unit.seeds) for unit in units(Plan(suite, (), split, tuple(capacities), 1, data).checked()))
+    one_seed = sum(len(shard.seeds) for shard in shards(Plan(suite, (), split, tuple(capacities), 1, data).checked()))
     return max(1, round(episodes / (one_seed * len(capacities))))
 
 

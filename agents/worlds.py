@@ -20,11 +20,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym import suites
 from bufgym.envs.rows import Rows
 from bufgym.errors import BufgymError
 from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
-from bufgym.scenario import Episode, Scenario
+from bufgym.scenario import Episode, Scenario, suites
 
 Observation = dict[str, NDArray[np.float32]]
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from bufgym.cell import Fleet, FleetEpisode, FleetScenario, run_fleet
 from bufgym.envs.fleet_vec import FleetVecEnv
 from bufgym.errors import BufgymError
+from bufgym.scenario import FleetEpisode, FleetScenario
+from bufgym.sim.cell import Fleet, run_fleet
 
 if TYPE_CHECKING:
     from bufgym.envs.fleet import FleetEnv, parallel_env

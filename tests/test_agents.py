@@ -18,16 +18,16 @@ import torch  # noqa: E402  (these need the extra)
 import train  # noqa: E402
 from agents import callbacks, training, worlds  # noqa: E402
 from agents.dqn import IMPOSSIBLE, possible  # noqa: E402
-from agents.network import SlotFeatures, SlotScorer  # noqa: E402
 from agents.trials import Trials, plan, seeds_for  # noqa: E402
 from bufgym import policies  # noqa: E402
-from bufgym.benchmark.campaign import Plan  # noqa: E402
 from bufgym.benchmark.run import draw  # noqa: E402
+from bufgym.benchmark.sweep import Plan  # noqa: E402
 from bufgym.errors import BufgymError  # noqa: E402
-from bufgym.qoi import exponential  # noqa: E402
+from bufgym.model.qoi import exponential  # noqa: E402
 from bufgym.sb3 import GymVecEnv  # noqa: E402
+from bufgym.sb3.networks import SlotFeatures, SlotScorer  # noqa: E402
 from bufgym.scenario import Interruption  # noqa: E402
-from bufgym.sender import run  # noqa: E402
+from bufgym.sim import run  # noqa: E402
 
 SHORT = Interruption(law="uniform", t_min=6, t_max=30)
 STEEP = dataclasses.replace(SHORT, value=exponential(0.2))
@@ -79,7 +79,7 @@ def test_a_padded_row_is_the_same_sender(name: str) -> None:
             policies.get(name), [draw(cell.scenario, s) for s in range(4)], cell.capacity, cell.scenario.value
         )
         assert ours == pytest.approx(1 + senders.batch.senders["delivered_gain"])
-    assert not any(rows.summary(slice(None))["impossible"].any() for rows in world.groups)
+    assert not any(rows.summary(slice(None))["invalid"].any() for rows in world.groups)
 
 
 def test_evicting_a_seat_beyond_L_does_what_a_queue_does() -> None:
@@ -89,7 +89,7 @@ def test_evicting_a_seat_beyond_L_does_what_a_queue_does() -> None:
         queue.act(np.where(queue.action_masks()[:, 8], 8, 7))
     for ours, theirs in zip(world.groups, queue.groups, strict=True):
         assert (ours.summary(slice(None))["qoi"] == theirs.summary(slice(None))["qoi"]).all()
-        assert ours.summary(slice(None))["impossible"].any()
+        assert ours.summary(slice(None))["invalid"].any()
 
 
 def test_rewards_add_up_to_the_information_and_rows_begin_anew() -> None:

@@ -33,7 +33,15 @@ def trace(tmp_path: Path) -> str:
 def test_list_names_everything_there_is(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list"]) == 0
     text = capsys.readouterr().out
-    for name in (*policies.names(), *traces.shipped(), *cli.KINDS, "bufgym/Uplink-v0", "lte", "retained", "drain"):
+    for name in (
+        *policies.names(),
+        *traces.shipped(),
+        *cli.KINDS,
+        "bufgym/Uplink-v0",
+        "lte",
+        "retained",
+        "service_ratio",
+    ):
         assert name in text
     assert "every=3" in text
     assert all(call in text for call in shipped_calls().values())
@@ -56,7 +64,7 @@ def test_list_has_a_group_of_policies_made_for_topics(capsys: pytest.CaptureFixt
 
 
 def test_list_opens_no_heavy_module() -> None:
-    heavy = ("bufgym.sender", "bufgym.envs", "matplotlib", "pyarrow", "tqdm", "mcap", "rosbags")
+    heavy = ("bufgym.sim", "bufgym.envs", "matplotlib", "pyarrow", "tqdm", "mcap", "rosbags")
     program = (
         f"import sys; from bufgym.cli import main; main(['list']);print([m for m in {heavy!r} if m in sys.modules])"
     )

@@ -109,7 +109,7 @@ def test_decisions_that_cannot_be_carried_out_are_told(
         told = capsys.readouterr().out
     finally:
         policies.registry._REGISTRY.pop("far-off", None)
-    assert told.count("impossible") == 1 and "\nnote: far-off gave 24 impossible decisions\n" in told
+    assert told.count("invalid") == 1 and "\nnote: far-off gave 24 invalid decisions\n" in told
     # Nor do the intervals of a single episode look as if they were known.
     assert "1 episode of 2 s" in told and "1.000 [-]" in told and "1.000 [1.000" not in told
 

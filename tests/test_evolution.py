@@ -17,11 +17,11 @@ import train  # noqa: E402  (these need the extra)
 from agents import evolution, grounds, training, worlds  # noqa: E402
 from bufgym import policies  # noqa: E402
 from bufgym.errors import BufgymError  # noqa: E402
-from bufgym.metrics import outcome  # noqa: E402
 from bufgym.oracle import integer, law  # noqa: E402
 from bufgym.policies import learned, weights  # noqa: E402
 from bufgym.scenario import Interruption  # noqa: E402
-from bufgym.sender import run  # noqa: E402
+from bufgym.sim import run  # noqa: E402
+from bufgym.sim.metrics import outcome  # noqa: E402
 
 TINY = train.Arguments(
     suite="interruption-v1",

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from bufgym import files, policies, qoi, suites
-from bufgym.benchmark.campaign import cell
+from bufgym import files, policies
 from bufgym.benchmark.run import best, draw
+from bufgym.benchmark.sweep import cell
+from bufgym.model import qoi
 from bufgym.oracle import integer, law
 from bufgym.policies import weights
-from bufgym.scenario import Interruption
-from bufgym.sender import run
+from bufgym.scenario import Interruption, suites
+from bufgym.sim import run
 
 SHIPPED = files.shipped("agents", "agents/pretrained", "*.safetensors")
 
@@ -74,5 +75,5 @@ def test_the_same_weights_serve_a_buffer_nobody_trained_them_for() -> None:
     scenario = Interruption(t_max=600, value=qoi.tabulated([0, 3, 10], [0, 0.7, 1]))
     for name in SHIPPED:
         senders = run(policies.get(name), [scenario.episode(600)], 100, scenario.value)
-        assert int(senders.batch.senders["crossed"][0]) == 102
-        assert int(senders.batch.senders["impossible"][0]) == 0
+        assert int(senders.batch.senders["transmitted"][0]) == 102
+        assert int(senders.batch.senders["invalid"][0]) == 0

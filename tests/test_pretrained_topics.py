@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from bufgym import files, policies, suites
+from bufgym import files, policies
 from bufgym.benchmark.topics import run_parts, suite_parts
 from bufgym.policies import weights
+from bufgym.scenario import suites
 
 SHIPPED = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetensors")
 SUITE = suites.get("topics-v1")

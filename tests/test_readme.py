@@ -60,6 +60,6 @@ def test_policies_run_as_printed(
     try:
         assert main([*command, *chosen]) == 0
         shown = capsys.readouterr().out
-        assert f"\n{name} " in shown and "impossible" not in shown
+        assert f"\n{name} " in shown and "invalid" not in shown
     finally:
         policies.registry._REGISTRY.pop(name, None)

@@ -68,7 +68,7 @@ def test_rows_are_single_environments_and_their_ends_are_told(id: str) -> None:
                 assert told["TimeLimit.truncated"] is False
                 assert told["episode"]["r"] == pytest.approx(sums[i])
                 assert told["episode"]["l"] == lengths[i]
-                for name in ("qoi", "arrived", "delivered", "dropped", "impossible"):
+                for name in ("qoi", "arrived", "delivered", "dropped", "invalid"):
                     assert told[name] == info[name]
                 if id != "bufgym/Topics-v0":  # each topic received adds its weight there
                     assert told["qoi"] == pytest.approx(1 + sums[i])

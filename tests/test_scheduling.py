@@ -17,13 +17,18 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard", "cma"):
 
 import train  # noqa: E402  (these need the extra)
 from agents import scheduling, training  # noqa: E402
-from bufgym import policies, qoi, suites  # noqa: E402
+from bufgym import policies  # noqa: E402
 from bufgym.errors import BufgymError  # noqa: E402
-from bufgym.metrics import topic_outcomes  # noqa: E402
+from bufgym.model import qoi  # noqa: E402
+from bufgym.model.topics import Topic  # noqa: E402
 from bufgym.policies import learned_topics, weights  # noqa: E402
-from bufgym.scenario import Client, Stream  # noqa: E402
-from bufgym.sender import run  # noqa: E402
-from bufgym.topics import Topic  # noqa: E402
+from bufgym.scenario import (  # noqa: E402
+    Client,
+    Stream,
+    suites,
+)
+from bufgym.sim import run  # noqa: E402
+from bufgym.sim.metrics import topic_outcomes  # noqa: E402
 from bufgym.traces import Trace  # noqa: E402
 
 TINY = train.Arguments(
@@ -79,7 +84,7 @@ def test_it_begins_greedy() -> None:
         scheduling.policy_of(scheduling.to_vector(scheduling.start())), [episode], 6, given.value, topics=given.topics
     )
     batch = senders.batch
-    assert batch.senders["impossible"][0] == 0
+    assert batch.senders["invalid"][0] == 0
     assert topic_outcomes(senders, 0)[2].lost == 0
     assert batch.senders["rejected"][0] + batch.senders["evicted"][0] > 5
 

@@ -21,10 +21,10 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard", "matplotlib"):
 import train  # noqa: E402  (these need the extras)
 from agents import evaluate, training  # noqa: E402
 from agents.trials import Trials, Verdict  # noqa: E402
-from bufgym import suites  # noqa: E402
 from bufgym.benchmark.rows import read_rows  # noqa: E402
 from bufgym.errors import BufgymError  # noqa: E402
 from bufgym.policies import registry  # noqa: E402
+from bufgym.scenario import suites  # noqa: E402
 
 REPO = Path(__file__).resolve().parent.parent
 TINY = train.Arguments(
@@ -77,7 +77,7 @@ def test_a_run_leaves_its_results(env: str, capsys: pytest.CaptureFixture[str]) 
     assert qoi == sorted(qoi, reverse=True)
     assert all(row["arrived"] == pytest.approx(row["delivered"] + row["dropped"]) for row in results["scores"])
     assert len({row["arrived"] for row in results["scores"]}) == 1  # all met the same episodes
-    assert all(row["impossible"] == 0 for row in results["scores"] if row["policy"].startswith("agent"))
+    assert all(row["invalid"] == 0 for row in results["scores"] if row["policy"].startswith("agent"))
     assert results["settings"]["env"] == env
     assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "model.zip").exists()
@@ -184,8 +184,8 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: pytest.Ca
     assert {row["training_seed"] for row in rows if row["policy"] == agent} == {0}
     assert {row["training_seed"] for row in rows if row["policy"] != agent} == {None}
     assert {row["scenario"] for row in rows} == set(suites.get("interruption-v1").settings("test"))
-    impossible = sum(row["impossible"] for row in rows if row["policy"] == agent)
-    assert impossible == 0 or algo == "ppo"
+    invalid = sum(row["invalid"] for row in rows if row["policy"] == agent)
+    assert invalid == 0 or algo == "ppo"
     # Validated before the first update, every 384 steps (evolution: a generation), and at the end; the best is kept.
     home = folder / "seed-0"
     with (home / "validation.csv").open(newline="", encoding="utf-8") as file:

@@ -16,7 +16,7 @@ from bufgym.errors import BufgymError
 from bufgym.files import replaced
 from bufgym.policies import Policy
 from bufgym.scenario import Uplink
-from bufgym.sender import NEVER
+from bufgym.sim import NEVER
 
 # More topics than this make no readable table; the CSV file has them all.
 _SHOWN_TOPICS = 6
@@ -64,7 +64,7 @@ def drops(
             for capacity in capacities:
                 for policy in policies:
                     senders = met(policy, [episode], capacity, cell, [None], max_bytes, decide_at)
-                    dropped_us = np.asarray(senders.batch.fates[0])["dropped_us"][: len(arrivals)]
+                    dropped_us = np.asarray(senders.batch.log[0])["dropped_us"][: len(arrivals)]
                     for k in np.flatnonzero(dropped_us != NEVER).tolist():
                         arrival = arrivals[k]
                         yield Drop(

@@ -11,16 +11,15 @@ from dataclasses import asdict, replace
 from typing import NamedTuple
 
 from bufgym import policies as registry
-from bufgym import suites
-from bufgym.benchmark.campaign import seeds_a_trace, seeds_of
 from bufgym.benchmark.rows import TEXT, WHOLE, Layout, Row
 from bufgym.benchmark.run import bar, batches, cells, checked
-from bufgym.cell import FleetEpisode, FleetScenario, run_fleet
+from bufgym.benchmark.sweep import seeds_a_trace, seeds_of
 from bufgym.errors import BufgymError
-from bufgym.metrics import METRICS, outcome
 from bufgym.policies import Policy
-from bufgym.scenario import Streams, Uplink
-from bufgym.suites import FleetSuite
+from bufgym.scenario import FleetEpisode, FleetScenario, Streams, Uplink, suites
+from bufgym.scenario.suites import FleetSuite
+from bufgym.sim.cell import run_fleet
+from bufgym.sim.metrics import METRICS, outcome
 
 BASELINE = "afr"
 """What the others are measured against: AFR on every robot's buffer."""
@@ -80,7 +79,7 @@ def fleet_parts(label: str, fleet: FleetScenario, seeds: Sequence[Sequence[int]]
 def draw(fleet: FleetScenario, seed: int) -> FleetEpisode:
     """The episode of this seed, with the luck of randomised policies."""
     streams = Streams.seeded(seed)
-    return fleet.draw(streams).with_luck(streams.policy)
+    return fleet.draw(streams).with_uniforms(streams.policy)
 
 
 def run_parts(
@@ -95,7 +94,7 @@ def run_parts(
         progress: show a bar on stderr, where that is a terminal and tqdm is installed.
     """
     for policy in policies:
-        if policy.foresee is not None:
+        if policy.privileged is not None:
             raise BufgymError(f"policy {policy.name}: it plans with a link of its own, which no robot in a cell has")
     rows: list[Row] = []
     total = sum(len(part.seeds) for part in parts) * len(capacities) * len(policies)

@@ -10,12 +10,13 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from bufgym import __version__, suites
-from bufgym.benchmark import campaign, folder
+from bufgym import __version__
+from bufgym.benchmark import folder, sweep
 from bufgym.benchmark.report import style, tables
 from bufgym.benchmark.score import Interval, Standing, scores
 from bufgym.errors import BufgymError, where
 from bufgym.files import replaced
+from bufgym.scenario import suites
 
 
 @dataclass(frozen=True)
@@ -85,10 +86,10 @@ def make(path: Path, names: Sequence[str], specs: Mapping[str, Sequence[str]], *
 
 
 def _run(suite: str, specs: Sequence[str], data: str | None = None, jobs: int = -1) -> list[Entry]:
-    plan = campaign.Plan(suite, tuple(specs), data=data)
+    plan = sweep.Plan(suite, tuple(specs), data=data)
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "run"
-        rows = campaign.campaign(plan, out, jobs=jobs)
+        rows = sweep.run_sweep(plan, out, jobs=jobs)
         return entries(rows, suite, folder.read_manifest(out / "manifest.json")["unranked"])
 
 

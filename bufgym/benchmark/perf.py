@@ -27,7 +27,7 @@ from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
 from bufgym.files import replaced
 from bufgym.kernel import JIT
-from bufgym.sender import Senders
+from bufgym.sim import Senders
 
 ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
 TOPICS = "bufgym/Topics-v0"

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import HOLD
 from bufgym.envs.rows import action_of
 from bufgym.errors import BufgymError
+from bufgym.model.buffer import HOLD
 from bufgym.policies import Policy
-from bufgym.sender import ARRIVAL_WAITS, SOCKET_WAITS, Senders, answer_of, named, python_view
+from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, Senders, answer_of, named, python_view
 
 
 class Player:
     """Owns a policy's memory for each of ``n`` senders and turns its decisions into an environment's actions.
 
     The policy hears of departures just before its next decision, as often as there were some, and sees the buffer as
-    it is then. Luck is that of the episode (see ``Episode.with_luck``). An environment asks at arrivals, and of several
+    it is then. Luck is that of the episode (see ``Episode.with_uniforms``). An environment asks at arrivals, and of several
     topics for what the socket takes: a policy that drops at dequeue, or whose queue is unbounded, can't play in it.
     """
 
@@ -26,12 +26,12 @@ class Player:
             raise BufgymError(f"policy {policy.name} {what}: it can be benchmarked, but not play in an environment")
         self.policy = policy
         self._memory: list[NDArray[np.float64] | None] = [None] * n
-        self._taken = np.zeros(n, np.int64)
+        self._dequeued = np.zeros(n, np.int64)
 
     def begin(self, i: int = 0) -> None:
         """Forget everything about sender ``i``: a new episode begins there."""
         self._memory[i] = None
-        self._taken[i] = 0
+        self._dequeued[i] = 0
 
     def action(self, senders: Senders, i: int = 0) -> int:
         """The action for sender ``i``, whose decision is due: 0..L-1 evict, L reject, L + 1 accept.
@@ -47,9 +47,9 @@ class Player:
         if memory is None:
             memory = self._memory[i] = senders.new_memory(self.policy, i)
         if self.policy.hears_departures:
-            for _ in range(int(sender.taken - self._taken[i])):
+            for _ in range(int(sender.dequeued - self._dequeued[i])):
                 self.policy.on_departure(seen, memory)
-        self._taken[i] = sender.taken
+        self._dequeued[i] = sender.dequeued
         if sender.waiting == SOCKET_WAITS:
             choice = answer_of(self.policy, "on_send", self.policy.on_send(seen, memory))
             if not HOLD <= choice < senders.capacity:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
-from bufgym.metrics import METRICS
+from bufgym.sim.metrics import METRICS
 
 Row = dict[str, Any]
 
@@ -33,7 +33,7 @@ WHOLE = (
     "in_transmission",
     "buffered",
     "peak_backlog_bytes",
-    "impossible",
+    "invalid",
 )
 YES_NO = ("certified",)
 

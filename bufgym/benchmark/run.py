@@ -15,12 +15,12 @@ from typing import Any
 
 from bufgym.benchmark.rows import Row
 from bufgym.errors import BufgymError
-from bufgym.metrics import outcome
 from bufgym.oracle import Plan, clairvoyant
 from bufgym.policies import Policy
 from bufgym.scenario import Client, Episode, Interruption, Scenario, Streams, Uplink
-from bufgym.sender import Senders, padded
-from bufgym.sender import run as run_policy
+from bufgym.sim import Senders, padded
+from bufgym.sim import run as run_policy
+from bufgym.sim.metrics import outcome
 
 # Messages held at a time (88 bytes each): many seeds run in several batches.
 _BATCH_MESSAGES = 1_000_000
@@ -42,7 +42,7 @@ def cells(scenario: Scenario) -> list[tuple[str, Scenario]]:
 def draw(scenario: Scenario, seed: int) -> Episode:
     """The episode of this seed, with the luck of randomised policies."""
     streams = Streams.seeded(seed)
-    return scenario.draw(streams).with_luck(streams.policy)
+    return scenario.draw(streams).with_uniforms(streams.policy)
 
 
 def run(
@@ -131,7 +131,7 @@ def met(
 ) -> Senders:
     """The senders after ``policy`` met the episodes; a policy that foresees reads the plans that are known already."""
     memory = None
-    if policy.foresee is not None and all(plan is not None for plan in plans):
+    if policy.privileged is not None and all(plan is not None for plan in plans):
         memory = padded([plan.kept for plan in plans if plan is not None])
     return run_policy(
         policy, episodes, capacity, scenario.value, max_bytes=max_bytes, decide_at=decide_at, memory=memory

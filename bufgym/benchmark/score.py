@@ -37,7 +37,7 @@ from bufgym.errors import BufgymError
 
 __all__ = [
     "BASELINE",
-    "BITES",
+    "DISCRIMINATIVE",
     "CellScore",
     "Interval",
     "Scores",
@@ -53,8 +53,8 @@ __all__ = [
 BASELINE = "drop-oldest"
 """What ROS does: its score is 0."""
 
-BITES = 0.01
-"""A cell bites, and counts, where the baseline's regret is at least this: elsewhere there is nothing to be gained."""
+DISCRIMINATIVE = 0.01
+"""A cell discriminative, and counts, where the baseline's regret is at least this: elsewhere there is nothing to be gained."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class CellScore:
     """See ``regret``; NaN where a clairvoyant H is missing."""
     difference: Interval
     """Mean H minus the reference's, paired; NaN without a reference."""
-    bites: bool
+    discriminative: bool
     """Whether the cell counts in the standings."""
     exact: bool
     """Whether every clairvoyant H is certified to be exact, not just a bound."""
@@ -82,19 +82,19 @@ class CellScore:
 
 @dataclass(frozen=True)
 class Standing:
-    """One policy over all biting cells; NaN where there is none. Which cells bite is settled once, not per resample."""
+    """One policy over all discriminative cells; NaN where there is none. Which cells bite is settled once, not per resample."""
 
     policy: str
     score: Interval
-    """Mean of its scores in the biting cells."""
+    """Mean of its scores in the discriminative cells."""
     iqm: Interval
-    """Interquartile mean of its scores on (biting cell, trace), each computed on sums over seeds. Pairs on which
+    """Interquartile mean of its scores on (discriminative cell, trace), each computed on sums over seeds. Pairs on which
     nothing can be gained have no score and are left out; in a resample a pair weighs as often as it was drawn."""
     regret: Interval
-    """Mean of its regrets in the biting cells."""
+    """Mean of its regrets in the discriminative cells."""
     improvement: Interval
     """Paired probability of improvement over the reference: the share of episodes with H above the reference's, plus
-    half of those with the same H, mean over the biting cells."""
+    half of those with the same H, mean over the discriminative cells."""
     cells: int
     """How many cells bite."""
     ranked: bool
@@ -229,14 +229,16 @@ def scores(
                 score=interval(s.score),
                 regret=interval(s.regret),
                 difference=interval(s.difference),
-                bites=grounds[cell].bites,
+                discriminative=grounds[cell].discriminative,
                 exact=table.exact[cell],
             )
             cell_scores.append(made)
-        biting = [cell for cell in here if grounds[cell].bites]
-        overall = _overall([here[cell] for cell in biting], [grounds[cell] for cell in biting])
+        discriminative = [cell for cell in here if grounds[cell].discriminative]
+        overall = _overall([here[cell] for cell in discriminative], [grounds[cell] for cell in discriminative])
         score, iqm, regrets, improvement = map(interval, overall)
-        standings.append(Standing(policy, score, iqm, regrets, improvement, len(biting), policy not in unranked))
+        standings.append(
+            Standing(policy, score, iqm, regrets, improvement, len(discriminative), policy not in unranked)
+        )
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
     standings.sort(key=lambda s: (not s.ranked, math.isnan(s.score.value), -s.score.value, s.policy))
     return Scores(standings, cell_scores, baseline, reference, confidence, resamples)
@@ -257,7 +259,7 @@ class _Ground:
     """[1 + resamples, traces]: sum H of the baseline."""
     best: Numbers
     """The same of the clairvoyant; NaN where unknown."""
-    bites: bool
+    discriminative: bool
 
     def sums(self, h: Numbers) -> Numbers:
         """[1 + resamples, traces]: sum H over the episodes drawn, from h[1 or 1 + resamples, episodes]."""
@@ -270,8 +272,8 @@ def _ground(table: Table, cell: Cell, baseline: Numbers, weights: Numbers) -> _G
     base, best = (
         np.asarray(np.add.reduceat(weights * h, starts, axis=1)) for h in (baseline, table.best[cell][np.newaxis])
     )
-    bites = bool(regret(base[:1].sum(axis=1), best[:1].sum(axis=1))[0] >= BITES)
-    return _Ground(weights, starts, base, best, bites)
+    discriminative = bool(regret(base[:1].sum(axis=1), best[:1].sum(axis=1))[0] >= DISCRIMINATIVE)
+    return _Ground(weights, starts, base, best, discriminative)
 
 
 class _Statistics(NamedTuple):
@@ -312,7 +314,7 @@ def _statistics(h: Numbers, h_ref: Numbers | None, ground: _Ground) -> _Statisti
 
 
 def _overall(cells: list[_Statistics], grounds: list[_Ground]) -> tuple[Numbers, Numbers, Numbers, Numbers]:
-    """(score, IQM, regret, improvement) over the biting cells, [1 + resamples] each."""
+    """(score, IQM, regret, improvement) over the discriminative cells, [1 + resamples] each."""
     if not cells:
         none = np.full(1, np.nan)
         return none, none, none, none

@@ -79,7 +79,7 @@ def plain(rows: Rows) -> str:
         if k > 1 and cells[k][1] != cells[k - 1][1]:
             out.append("")
         out.append(line)
-    return "\n".join([*out, *impossible(rows)])
+    return "\n".join([*out, *invalid(rows)])
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
@@ -97,7 +97,7 @@ def markdown(rows: Rows) -> str:
     head, *body = _cells(rows)
     lines = ["| " + " | ".join(line) + " |" for line in body]
     rule = "|---|" + "---:|" * (len(head) - 1)
-    notes = impossible(rows)
+    notes = invalid(rows)
     return "\n".join(["| " + " | ".join(head) + " |", rule, *lines, *(["", *notes] if notes else [])])
 
 
@@ -115,13 +115,13 @@ def _cells(rows: Rows) -> list[list[str]]:
     return lines
 
 
-def impossible(rows: Rows) -> list[str]:
+def invalid(rows: Rows) -> list[str]:
     """What the reader of the means should know: decisions that could not be carried out; one row a run."""
     counts: dict[str, int] = {}
     for row in rows:
-        if row.get("impossible"):
-            counts[row["policy"]] = counts.get(row["policy"], 0) + row["impossible"]
-    return [f"note: {policy} gave {count} impossible decisions" for policy, count in counts.items()]
+        if row.get("invalid"):
+            counts[row["policy"]] = counts.get(row["policy"], 0) + row["invalid"]
+    return [f"note: {policy} gave {count} invalid decisions" for policy, count in counts.items()]
 
 
 def in_blocks(head: list[str], blocks: Sequence[tuple[str, list[list[str]]]]) -> str:

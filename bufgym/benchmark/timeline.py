@@ -12,7 +12,7 @@ from bufgym.benchmark.run import best, draw, met, row
 from bufgym.benchmark.score import BASELINE
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
-from bufgym.sender import NEVER
+from bufgym.sim import NEVER
 
 _STEP_S = 0.25
 """The capacity curve is drawn in steps of so many seconds."""
@@ -40,20 +40,20 @@ def timeline(policies: Sequence[Policy], scenario: Scenario, shown: Row) -> dict
     last_us = int(arrivals["arrival_us"][-1])
     for policy in policies:
         senders = met(policy, [episode], capacity, scenario, [plan])
-        fates = np.asarray(senders.batch.fates[0])[: len(arrivals)]
+        log = np.asarray(senders.batch.log[0])[: len(arrivals)]
         found = row({}, policy, capacity, senders, 0, plan)
-        received = np.flatnonzero(fates["crossed_us"] != NEVER)
-        dropped = np.flatnonzero(fates["dropped_us"] != NEVER)
+        received = np.flatnonzero(log["transmitted_us"] != NEVER)
+        dropped = np.flatnonzero(log["dropped_us"] != NEVER)
         told[policy.name] = {
             "qoi": found["qoi"],
             "regret": found["regret"],
             "received": [
-                [int(k), int(fates["taken_us"][k]) / 1e6, int(fates["crossed_us"][k]) / 1e6] for k in received
+                [int(k), int(log["dequeued_us"][k]) / 1e6, int(log["transmitted_us"][k]) / 1e6] for k in received
             ],
-            "dropped": [[int(k), int(fates["dropped_us"][k]) / 1e6] for k in dropped],
+            "dropped": [[int(k), int(log["dropped_us"][k]) / 1e6] for k in dropped],
         }
         if policy.ranked and len(received):
-            last_us = max(last_us, int(fates["crossed_us"][received].max()))
+            last_us = max(last_us, int(log["transmitted_us"][received].max()))
     edges_us = np.arange(0, last_us + round(2e6 * _STEP_S), round(1e6 * _STEP_S))
     carried = np.diff(episode.link.carried_by(edges_us))
     offered_s = max(1, int(arrivals["arrival_us"][-1])) / 1e6

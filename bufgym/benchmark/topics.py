@@ -13,17 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bufgym import policies as registry
-from bufgym import suites
-from bufgym.benchmark.campaign import seeds_a_trace, seeds_of
 from bufgym.benchmark.rows import Layout, Row
 from bufgym.benchmark.run import bar, batches, cells, checked, draw
+from bufgym.benchmark.sweep import seeds_a_trace, seeds_of
 from bufgym.benchmark.table import mean
 from bufgym.errors import BufgymError
-from bufgym.metrics import TopicOutcome, received, topic_outcomes, weighted_qoi
 from bufgym.policies import Policy
-from bufgym.scenario import Client
-from bufgym.sender import Senders
-from bufgym.sender import run as run_policy
+from bufgym.scenario import Client, suites
+from bufgym.sim import Senders
+from bufgym.sim import run as run_policy
+from bufgym.sim.metrics import TopicOutcome, received, topic_outcomes, weighted_qoi
 
 BASELINE = "robofleet"
 """What the others are measured against: Robofleet's client as published."""
@@ -38,10 +37,10 @@ ROWS = Layout(
         *("scenario", "trace", "seed", "window", "consumers", "policy", "capacity"),
         *("topic", "priority", "weight", "no_drop", "deadline_s"),
         *_OF_A_TOPIC[1:],
-        *("weighted_qoi", "seconds", "impossible"),
+        *("weighted_qoi", "seconds", "invalid"),
     ),
     text=("scenario", "trace", "policy", "topic"),
-    whole=("seed", "window", "consumers", "capacity", "arrived", "impossible"),
+    whole=("seed", "window", "consumers", "capacity", "arrived", "invalid"),
     yes_no=("no_drop",),
 )
 """One row a topic and run, in this order.
@@ -49,7 +48,7 @@ ROWS = Layout(
 The rules of the topic (``deadline_s`` is None where it has none), its ``TopicOutcome`` (means over the consumers where
 each gets a copy of its own, and so perhaps no whole numbers), and of the run as a whole: ``weighted_qoi``, the sum of
 weight x H over the topics; ``seconds``, its length until the last arrival or the last receipt, whichever is later;
-``impossible``, decisions that could not be carried out.
+``invalid``, decisions that could not be carried out.
 """
 
 
@@ -121,7 +120,7 @@ def run_parts(
 ) -> list[Row]:
     """Every policy at every capacity on all episodes of the parts. Arguments as for ``run``."""
     for policy in policies:
-        if policy.foresee is not None:
+        if policy.privileged is not None:
             raise BufgymError(f"policy {policy.name}: it plans with a queue of its own, which no topic of a client has")
     rows: list[Row] = []
     with bar(sum(len(part.seeds) for part in parts) * len(capacities) * len(policies), progress) as advance:
@@ -149,14 +148,14 @@ def one_a_run(rows: Sequence[Row]) -> list[Row]:
 def run_rows(key: Row, policy: Policy, capacity: int, client: Client, senders: Senders, i: int) -> list[Row]:
     """What became of each topic at sender ``i``, for the episode that ``key`` names."""
     sender, got = np.asarray(senders.batch.senders)[i], received(senders, i)
-    fates = np.asarray(senders.batch.fates[i])
+    log = np.asarray(senders.batch.log[i])
     last_us = int(np.asarray(senders.batch.arrivals[i])["arrival_us"][sender["arrivals"] - 1])
     if len(got):
-        last_us = max(last_us, int(fates["crossed_us"][got["seq"][-1]] + sender["propagation_us"]))
+        last_us = max(last_us, int(log["transmitted_us"][got["seq"][-1]] + sender["propagation_us"]))
     of_the_run = {
         "weighted_qoi": weighted_qoi(senders, i, got),
         "seconds": last_us / 1e6,
-        "impossible": int(sender["impossible"]),
+        "invalid": int(sender["invalid"]),
     }
     outcomes = topic_outcomes(senders, i)
     made = []

@@ -21,10 +21,10 @@ from typing import Any
 
 from bufgym import __version__, policies
 from bufgym.benchmark import table
-from bufgym.benchmark.campaign import Plan, campaign
 from bufgym.benchmark.episodes import TIE
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import BASELINE, Interval, Scores, scores
+from bufgym.benchmark.sweep import Plan, run_sweep
 from bufgym.errors import BufgymError, where
 from bufgym.files import replaced
 
@@ -109,11 +109,11 @@ class Tried:
 
     spec: str
     score: Interval
-    """Mean over the biting cells; NaN where none bites."""
+    """Mean over the discriminative cells; NaN where none discriminative."""
     regret: Interval
-    """Mean over the same cells, or over all where none bites."""
+    """Mean over the same cells, or over all where none discriminative."""
     gain: Interval
-    """What it is better by than the default, paired: in score, or in regret where no cell bites."""
+    """What it is better by than the default, paired: in score, or in regret where no cell discriminative."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Choice:
 
     @property
     def best(self) -> Tried:
-        """The first of those with the highest score (lowest regret, where no cell bites)."""
+        """The first of those with the highest score (lowest regret, where no cell discriminative)."""
         return max(self.tried, key=lambda tried: tried.gain.value)
 
     @property
@@ -163,14 +163,14 @@ def tune(
         jobs: processes side by side; -1: one a core.
 
     Raises:
-        BufgymError: for the split "test", a policy without a grid, and as for ``campaign``.
+        BufgymError: for the split "test", a policy without a grid, and as for ``run_sweep``.
     """
     if split == "test":
         raise BufgymError("split = 'test': must be validation or train; parameters are never chosen on test episodes")
     specs = {name: settings(name) for name in dict.fromkeys(names or GRIDS)}
     plan = Plan(suite, tuple(spec for those in specs.values() for spec in those), split, seeds=seeds, data=data)
     with tempfile.TemporaryDirectory() as scratch:
-        rows = campaign(plan, Path(scratch) / "run", jobs=jobs)
+        rows = run_sweep(plan, Path(scratch) / "run", jobs=jobs)
     return [compare(name, rows, those) for name, those in specs.items()]
 
 
@@ -178,18 +178,18 @@ def compare(policy: str, rows: Sequence[Row], specs: Sequence[str]) -> Choice:
     """Score the settings ``specs`` of one policy, the default first, from rows that hold theirs and the baseline's."""
     mine = [row for row in rows if row["policy"] in (*specs, BASELINE)]
     made = scores(mine)
-    bites = any(cell.bites for cell in made.cells)
-    gains = scores([*_only(mine, BASELINE), *_gains(mine, specs, bites)])
+    discriminative = any(cell.discriminative for cell in made.cells)
+    gains = scores([*_only(mine, BASELINE), *_gains(mine, specs, discriminative)])
     tried = []
     for spec in specs:
         score, regret = _overall(made, spec)
         better, worse = _overall(gains, spec)
-        gain = better if bites else Interval(-worse.value, -worse.high, -worse.low)
+        gain = better if discriminative else Interval(-worse.value, -worse.high, -worse.low)
         tried.append(Tried(spec, score, regret, gain))
     return Choice(policy, tuple(tried))
 
 
-def _gains(rows: Sequence[Row], specs: Sequence[str], bites: bool) -> list[Row]:
+def _gains(rows: Sequence[Row], specs: Sequence[str], discriminative: bool) -> list[Row]:
     """Rows whose score is that of a setting less that of the default, so that ``scores`` gives its paired interval.
 
     (H - H_baseline) / (H_clairvoyant - H_baseline) is linear in H: for H = H_baseline + H_setting - H_default it is the
@@ -201,7 +201,7 @@ def _gains(rows: Sequence[Row], specs: Sequence[str], bites: bool) -> list[Row]:
     for row in rows:
         if row["policy"] in specs:
             key = _episode(row)
-            start = base[key] if bites else row["clairvoyant"]
+            start = base[key] if discriminative else row["clairvoyant"]
             made.append({**row, "qoi": start + (row["qoi"] - default[key])})
     return made
 
@@ -222,7 +222,7 @@ def _episode(row: Row) -> tuple[Any, ...]:
 def _overall(made: Scores, policy: str) -> tuple[Interval, Interval]:
     """(score, regret) of one policy.
 
-    Where no cell bites there is no standing: the regret is then the mean over all cells, and so are the bounds of its
+    Where no cell discriminative there is no standing: the regret is then the mean over all cells, and so are the bounds of its
     interval, which makes that one a little too wide.
     """
     standing = next(s for s in made.standings if s.policy == policy)

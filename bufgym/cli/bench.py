@@ -49,9 +49,10 @@ def add(commands: Commands) -> None:
 
 
 def _bench(options: argparse.Namespace) -> None:
-    from bufgym import policies, suites
+    from bufgym import policies
     from bufgym.benchmark import rows as files
     from bufgym.benchmark import run, table, tune
+    from bufgym.scenario import suites
 
     load_policies(options.policy_file)
     if options.policies is not None:
@@ -145,14 +146,14 @@ _NOT_WITH_SUITE = (
 
 
 def _suite(options: argparse.Namespace, specs: list[str]) -> None:
-    from bufgym.benchmark import campaign, report
+    from bufgym.benchmark import report, sweep
 
     for name in _NOT_WITH_SUITE:
         if getattr(options, name) is not None:
             raise BufgymError(f"--{name.replace('_', '-')} cannot go with --suite: a suite's episodes are frozen")
     if options.interruption or options.decide_at != "arrival":
         raise BufgymError("--interruption and --decide-at cannot go with --suite: a suite's episodes are frozen")
-    plan = campaign.Plan(
+    plan = sweep.Plan(
         options.suite,
         tuple(specs),
         options.split,
@@ -163,7 +164,7 @@ def _suite(options: argparse.Namespace, specs: list[str]) -> None:
     )
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "run" if options.out is None else Path(options.out)
-        rows = campaign.campaign(
+        rows = sweep.run_sweep(
             plan,
             out,
             jobs=options.jobs,

@@ -12,7 +12,7 @@ from bufgym.errors import BufgymError
 
 if TYPE_CHECKING:
     from bufgym.benchmark.fleets import Part
-    from bufgym.suites import FleetSuite
+    from bufgym.scenario.suites import FleetSuite
 
 SUITE = "fleet-v1"
 
@@ -42,7 +42,7 @@ def _fleet(options: argparse.Namespace) -> None:
     from bufgym import policies
     from bufgym.benchmark import fleets, fleets_summary
     from bufgym.benchmark.rows import checked_target, write_rows
-    from bufgym.benchmark.table import impossible
+    from bufgym.benchmark.table import invalid
 
     load_policies(options.policy_file)
     wanted = [spec for text in options.policy for spec in split(text)] if options.policy else fleets.default_policies()
@@ -57,7 +57,7 @@ def _fleet(options: argparse.Namespace) -> None:
     unranked = {policy.name: policy.unranked_because for policy in chosen if not policy.ranked}
     found = fleets_summary.summary(rows, unranked=tuple(unranked))
     about = [f"Suite {suite.name}, {options.split}: {suite.about}.", _met(parts, suite)]
-    notes = [*(f"note: {name}: {why}" for name, why in unranked.items()), *impossible(rows)]
+    notes = [*(f"note: {name}: {why}" for name, why in unranked.items()), *invalid(rows)]
     print("\n".join([*about, "", fleets_summary.plain(found), "", *_LEGEND, *notes]))
     if options.out is not None:
         print(f"\n{len(rows)} rows in {write_rows(rows, options.out, fleets.ROWS)}")

@@ -22,8 +22,8 @@ def add(commands: Commands) -> None:
 
 
 def _leaderboard(options: argparse.Namespace) -> None:
-    from bufgym import suites
     from bufgym.benchmark import leaderboard, tune
+    from bufgym.scenario import suites
 
     names = options.suites or [name for name, suite in suites.SUITES.items() if not suite.needs or options.data]
     specs = {suites.get(name).name: tune.specs(name) for name in names}

@@ -45,7 +45,7 @@ def _list_scenarios() -> str:
 
 
 def _list_suites() -> str:
-    from bufgym.suites import FLEET_SUITES, SUITES, TOPIC_SUITES
+    from bufgym.scenario.suites import FLEET_SUITES, SUITES, TOPIC_SUITES
 
     listed = [
         (suite.name, suite.about + (f"; needs {suite.needs}" if suite.needs else "")) for suite in SUITES.values()
@@ -77,13 +77,13 @@ def _policy_lines(names: Iterable[str], width: int) -> list[str]:
 
 
 def _list_values() -> str:
-    from bufgym import qoi
+    from bufgym.model import qoi
 
     return columns(
         [
             ("exponential:BASE", _first_line(qoi.exponential)),
             ("saturating:DISTANCE", _first_line(qoi.saturating)),
-            ("(Python only)", f"bufgym.qoi.tabulated: {_first_line(qoi.tabulated)}"),
+            ("(Python only)", f"bufgym.model.qoi.tabulated: {_first_line(qoi.tabulated)}"),
         ]
     )
 

@@ -87,7 +87,7 @@ def scenario(options: argparse.Namespace) -> tuple[Scenario, str]:
 
 
 def _interruption(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario, str]:
-    from bufgym import qoi
+    from bufgym.model import qoi
     from bufgym.scenario import Interruption
 
     made = Interruption(
@@ -105,7 +105,8 @@ def _interruption(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Sc
 
 
 def _uplink(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario, str]:
-    from bufgym import qoi, traces
+    from bufgym import traces
+    from bufgym.model import qoi
     from bufgym.scenario import Uplink
 
     names = traces.shipped()
@@ -140,7 +141,7 @@ def _uplink(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario
 
 def _recording(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario, str]:
     """A workload as it was recorded; with --seeds, from random places on each trace."""
-    from bufgym import qoi
+    from bufgym.model import qoi
     from bufgym.scenario import Uplink
     from bufgym.traces.recordings import read_workload
 

@@ -54,7 +54,7 @@ def _topics(options: argparse.Namespace) -> None:
     from bufgym import policies
     from bufgym.benchmark import topics, topics_summary
     from bufgym.benchmark.rows import checked_target, write_rows
-    from bufgym.benchmark.table import impossible
+    from bufgym.benchmark.table import invalid
 
     load_policies(options.policy_file)
     wanted = [spec for text in options.policy for spec in split(text)] if options.policy else topics.default_policies()
@@ -70,7 +70,7 @@ def _topics(options: argparse.Namespace) -> None:
     unranked = {policy.name: policy.unranked_because for policy in chosen if not policy.ranked}
     found = topics_summary.summary(rows, unranked=tuple(unranked))
     notes = [f"note: {name}: {why}; its QoI counts what arrives long after" for name, why in unranked.items()]
-    notes += impossible(topics.one_a_run(rows))
+    notes += invalid(topics.one_a_run(rows))
     print("\n".join([*meets.about, "", topics_summary.plain(found, meets.scenarios), "", *_LEGEND, *notes]))
     if shown is not None:
         print(f"\n{shown}, topic by topic: means over episodes\n{topics_summary.by_topic(rows, shown)}")
@@ -96,8 +96,8 @@ class _Meets(NamedTuple):
 
 
 def _suite(options: argparse.Namespace) -> _Meets:
-    from bufgym import suites
     from bufgym.benchmark.topics import suite_parts
+    from bufgym.scenario import suites
 
     for name in ("trace", "motion", "scale"):
         if getattr(options, name) is not None:
@@ -150,9 +150,9 @@ def _met(parts: Sequence[Part]) -> str:
     """How many episodes, and how the client sends."""
     client, episodes = parts[0].client, sum(len(part.seeds) for part in parts)
     windows = " and ".join(f"{n}" for n in dict.fromkeys(part.client.window for part in parts))
-    pong = f"pongs {client.pong_us / 1000:g} ms after a message has crossed"
+    ack = f"pongs {client.ack_delay_us / 1000:g} ms after a message has crossed"
     many, consumers = _counted(episodes, "episode"), _counted(client.consumers, "consumer")
-    return f"{many} of {client.duration_s:g} s; n_T = {windows}, {pong}, {consumers}."
+    return f"{many} of {client.duration_s:g} s; n_T = {windows}, {ack}, {consumers}."
 
 
 def _counted(n: int, thing: str) -> str:

@@ -12,11 +12,10 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from bufgym.cell import FleetScenario
 from bufgym.envs.fleet_rows import FleetRows, check_reward
 from bufgym.envs.rows import DELIVERED, RETAINED
 from bufgym.errors import BufgymError
-from bufgym.scenario import Uplink
+from bufgym.scenario import FleetScenario, Uplink
 
 Observation = dict[str, NDArray[Any]]
 Infos = dict[str, dict[str, Any]]
@@ -102,7 +101,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         rows.reset(np.arange(len(rows)), [(options or {}).get("episode")])
         self.agents = list(self.possible_agents)
         masks = rows.shown.mask.copy()
-        infos = {agent: {"action_mask": masks[i], "impossible": 0} for i, agent in enumerate(self.agents)}
+        infos = {agent: {"action_mask": masks[i], "invalid": 0} for i, agent in enumerate(self.agents)}
         return self._observations(masks), infos
 
     def step(
@@ -180,11 +179,11 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         return seen
 
     def _infos(self, masks: NDArray[np.bool_], terms: list[list[float]], ended: bool) -> Infos:
-        impossible = self.rows.senders.batch.senders["impossible"].tolist()
+        invalid = self.rows.senders.batch.senders["invalid"].tolist()
         infos: Infos = {}
         for i, agent in enumerate(self.possible_agents):
             earned = {"delivered": terms[i][DELIVERED], "retained": terms[i][RETAINED]}
-            infos[agent] = {"action_mask": masks[i], "impossible": impossible[i], "reward_terms": earned}
+            infos[agent] = {"action_mask": masks[i], "invalid": invalid[i], "reward_terms": earned}
             if ended:
                 infos[agent] |= {name: number.item() for name, number in self.rows.summary(i).items()}
         return infos

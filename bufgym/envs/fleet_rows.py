@@ -13,13 +13,14 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from bufgym.cell import Fleet, FleetScenario, Shares, cell_event, decide_in_cell, offer
-from bufgym.envs.rows import Rows, Shown, decision_of, pay, show
+from bufgym.envs.rows import Rows, Shown, decision_of, show, write_rewards
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel
-from bufgym.link import FOREVER
-from bufgym.scenario import Streams
-from bufgym.sender import DECISION, END, Batch, credit
+from bufgym.model.link import FOREVER
+from bufgym.scenario import FleetScenario, Streams
+from bufgym.sim import DECISION, END, Batch, credit
+from bufgym.sim.cell import Fleet
+from bufgym.sim.shared_link import Shares, cell_event, decide_in_cell, offer
 
 REWARDS = ("team", "own")
 """Whose information a robot is paid for: the mean over its cell, or its own."""
@@ -46,20 +47,20 @@ def advance_cell(batch: Batch, shares: Shares, c: int) -> None:
 
 @kernel
 def begin_cells(
-    batch: Batch, shares: Shares, cells: NDArray[np.int64], paid: NDArray[np.float64], shown: Shown
+    batch: Batch, shares: Shares, cells: NDArray[np.int64], rewarded: NDArray[np.float64], shown: Shown
 ) -> None:
     """Bring freshly loaded cells to their first tick."""
     for c in cells:
         advance_cell(batch, shares, c)
         robots = shares.cells[c].robots
         for i in range(c * robots, (c + 1) * robots):
-            paid[i, :] = 0.0
+            rewarded[i, :] = 0.0
             show(batch, i, shown)
 
 
 @kernel
 def step_cells(
-    batch: Batch, shares: Shares, actions: NDArray[np.int64], paid: NDArray[np.float64], shown: Shown
+    batch: Batch, shares: Shares, actions: NDArray[np.int64], rewarded: NDArray[np.float64], shown: Shown
 ) -> None:
     """One decision of every robot; cells that have ended stay as they are."""
     for c in range(len(shares.cells)):
@@ -71,7 +72,7 @@ def step_cells(
                 offer(batch, shares, c)
             advance_cell(batch, shares, c)
         for i in range(first, first + robots):
-            pay(batch, i, paid, shown)
+            write_rewards(batch, i, rewarded, shown)
             show(batch, i, shown)
 
 
@@ -123,11 +124,11 @@ class FleetRows(Rows):
             elif not episode.ticks_together:
                 raise BufgymError("episode: in an environment the messages of all robots arrive at the same times")
             self.fleet.load(c, episode)
-        begin_cells(self.senders.batch, self.fleet.shares, cells, self.paid, self.shown)
+        begin_cells(self.senders.batch, self.fleet.shares, cells, self.rewarded, self.shown)
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """One decision of every robot; ``self.shown`` tells what came of it."""
-        step_cells(self.senders.batch, self.fleet.shares, actions, self.paid, self.shown)
+        step_cells(self.senders.batch, self.fleet.shares, actions, self.rewarded, self.shown)
 
     def shared(self, rewards: NDArray[np.float64], reward: str) -> NDArray[np.float64]:
         """What each row is paid, float64[rows], of what each has earned."""

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.cell import FleetScenario
 from bufgym.envs.fleet_rows import FleetRows, check_reward
 from bufgym.envs.single import Observation
 from bufgym.envs.vector import SenderVectorEnv
 from bufgym.errors import BufgymError
-from bufgym.scenario import Uplink
+from bufgym.scenario import FleetScenario, Uplink
 
 
 class FleetVecEnv(SenderVectorEnv):

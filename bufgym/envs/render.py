@@ -18,8 +18,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.link import position_at
-from bufgym.sender import ARRIVAL_WAITS, SOCKET_WAITS, Senders
+from bufgym.model.link import position_at
+from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, Senders
 
 DELIVERED, SENDING, QUEUED, DROPPED, NEWCOMER = range(5)
 _NAMES = ("delivered", "in transmission", "queued", "dropped", "newcomer")
@@ -53,11 +53,11 @@ class _Scene(NamedTuple):
     now_us: int
     arrivals: NDArray[Any]
     """MESSAGE[arrived so far, and the newcomer]"""
-    fates: NDArray[np.int64]
+    log: NDArray[np.int64]
     """The fate of each of them."""
     queue: NDArray[np.int64]
     """Sequence numbers of the queued messages, 0 = oldest."""
-    taken: int
+    dequeued: int
     """Sequence number of the message that the socket took last; -1 if none."""
     capacity: int
     demand: float
@@ -82,21 +82,21 @@ def _scene(senders: Senders, i: int) -> _Scene:
     arrived, waiting = int(sender["next"]), int(sender["waiting"] == ARRIVAL_WAITS)
     planned = episode.arrivals
     arrivals = planned[: arrived + waiting]
-    met = senders.batch.fates[i, : arrived + waiting]
-    fates = np.full(arrived + waiting, QUEUED)
-    fates[met["taken_us"] >= 0] = SENDING
-    fates[met["crossed_us"] >= 0] = DELIVERED
-    fates[met["dropped_us"] >= 0] = DROPPED
-    fates[arrived:] = NEWCOMER
+    met = senders.batch.log[i, : arrived + waiting]
+    log = np.full(arrived + waiting, QUEUED)
+    log[met["dequeued_us"] >= 0] = SENDING
+    log[met["transmitted_us"] >= 0] = DELIVERED
+    log[met["dropped_us"] >= 0] = DROPPED
+    log[arrived:] = NEWCOMER
     first, occupancy = int(sender["first"]), int(sender["occupancy"])
     queue = senders.batch.slots["seq"][i, first : first + occupancy].copy()
-    taken = int(senders.batch.slots["seq"][i, first - 1]) if sender["taken"] > 0 else -1
+    dequeued = int(senders.batch.slots["seq"][i, first - 1]) if sender["dequeued"] > 0 else -1
     span_us = int(planned["arrival_us"][-1] - planned["arrival_us"][0])
     # n messages span n - 1 periods.
     demand = 1e6 * float(planned["size_bytes"][:-1].sum()) / span_us if span_us > 0 else 0.0
-    counts = {name: int((fates[:arrived] == fate).sum()) for fate, name in enumerate(_NAMES[:NEWCOMER])}
+    counts = {name: int((log[:arrived] == entry).sum()) for entry, name in enumerate(_NAMES[:NEWCOMER])}
     names = tuple(topic.name for topic in senders.topics)
-    first_of_all = float(sender["crossed"] > 0)
+    first_of_all = float(sender["transmitted"] > 0)
     asks = ""
     if names:
         rules = senders.batch.topics[i]
@@ -104,7 +104,7 @@ def _scene(senders: Senders, i: int) -> _Scene:
         asks = {ARRIVAL_WAITS: "an arrival asks", SOCKET_WAITS: "the socket asks"}.get(int(sender["waiting"]), "")
     qoi = first_of_all + float(sender["delivered_gain"])
     now_us = int(sender["now_us"])
-    return _Scene(now_us, arrivals, fates, queue, taken, senders.capacity, demand, counts, qoi, names, asks)
+    return _Scene(now_us, arrivals, log, queue, dequeued, senders.capacity, demand, counts, qoi, names, asks)
 
 
 def _rates(senders: Senders, i: int, edges_us: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -126,8 +126,8 @@ def _speed(bytes_per_s: float) -> str:
 # --- text ------------------------------------------------------------------------------------------------------------
 
 
-def _mark(fate: int) -> str:
-    return _painted([(_ANSI[fate], _MARKS[fate])])
+def _mark(entry: int) -> str:
+    return _painted([(_ANSI[entry], _MARKS[entry])])
 
 
 def _painted(marks: Iterable[tuple[str, str]]) -> str:
@@ -145,7 +145,7 @@ def ansi(senders: Senders, i: int, width: int = 100) -> str:
     """
     scene = _scene(senders, i)
     width, label = max(width, _NARROWEST), _TOPIC_LABEL if scene.topics else _LABEL
-    shown = slice(max(0, len(scene.fates) - (width - label)), None)
+    shown = slice(max(0, len(scene.log) - (width - label)), None)
     counts = scene.counts
     held = f"{counts['in transmission']} in transmission, {len(scene.queue)}/{scene.capacity} queued"
     lines = [
@@ -155,7 +155,7 @@ def ansi(senders: Senders, i: int, width: int = 100) -> str:
         *_message_lines(scene, shown, label),
         "queue".ljust(label) + (_topic_queue_line if scene.topics else _queue_line)(scene, width - label),
         " " * _LABEL
-        + "  ".join(f"{_mark(fate)} {name}" for fate, name in enumerate(_NAMES))
+        + "  ".join(f"{_mark(entry)} {name}" for entry, name in enumerate(_NAMES))
         + "  _ empty"
         + (f"  {scene.asks}" if scene.topics else "  \x1b[31m9\x1b[0m missing"),
     ]
@@ -170,7 +170,7 @@ def ansi(senders: Senders, i: int, width: int = 100) -> str:
 def _capacity_line(senders: Senders, i: int, scene: _Scene, shown: slice) -> str:
     edges_us = np.append(scene.arrivals["arrival_us"][shown], scene.now_us)
     rates = _rates(senders, i, np.maximum.accumulate(edges_us))
-    if scene.fates[-1] == NEWCOMER and len(rates) > 1:
+    if scene.log[-1] == NEWCOMER and len(rates) > 1:
         # No time has passed since the newcomer arrived.
         rates[-1] = rates[-2]
     full = 2 * scene.demand or max(1.0, rates.max(initial=0.0))
@@ -182,7 +182,7 @@ def _capacity_line(senders: Senders, i: int, scene: _Scene, shown: slice) -> str
 
 def _message_lines(scene: _Scene, shown: slice, label: int) -> list[str]:
     """A mark for each message; a line for each topic."""
-    marks = [(_ANSI[fate], _MARKS[fate]) for fate in scene.fates[shown]]
+    marks = [(_ANSI[entry], _MARKS[entry]) for entry in scene.log[shown]]
     if not scene.topics:
         return ["messages".ljust(label) + _painted(marks)]
     numbers = scene.arrivals["topic"][shown].tolist()
@@ -195,10 +195,10 @@ def _message_lines(scene: _Scene, shown: slice, label: int) -> list[str]:
 
 def _topic_queue_line(scene: _Scene, columns: int) -> str:
     """The topics' letters: of the message taken last, of the slots, and of the newcomer."""
-    letters = [(_ANSI[int(scene.fates[scene.taken])], scene.letter(scene.taken))] if scene.taken >= 0 else []
+    letters = [(_ANSI[int(scene.log[scene.dequeued])], scene.letter(scene.dequeued))] if scene.dequeued >= 0 else []
     letters += [(_ANSI[QUEUED], scene.letter(seq)) for seq in scene.queue.tolist()]
     letters += [("0", "_")] * (scene.capacity - len(scene.queue))
-    last = [(_ANSI[NEWCOMER], scene.letter(-1))] if scene.fates[-1] == NEWCOMER else []
+    last = [(_ANSI[NEWCOMER], scene.letter(-1))] if scene.log[-1] == NEWCOMER else []
     room = columns // 2 - len(last)
     if len(letters) > room:
         letters = [*letters[: room - 2], ("0", "...")]
@@ -208,11 +208,11 @@ def _topic_queue_line(scene: _Scene, columns: int) -> str:
 def _queue_line(scene: _Scene, columns: int) -> str:
     """The message taken last, the slots and the newcomer, with the number of messages missing between neighbours."""
     parts: list[tuple[int, str]] = []  # (columns, text)
-    before = scene.taken
+    before = scene.dequeued
     if before >= 0:
-        fate = int(scene.fates[before])
-        parts.append((1, _mark(fate)))
-    waiting = [len(scene.arrivals) - 1] if scene.fates[-1] == NEWCOMER else []
+        entry = int(scene.log[before])
+        parts.append((1, _mark(entry)))
+    waiting = [len(scene.arrivals) - 1] if scene.log[-1] == NEWCOMER else []
     free = scene.capacity - len(scene.queue)
     last: list[tuple[int, str]] = []
     for k, seq in enumerate([*scene.queue.tolist(), *waiting]):
@@ -252,7 +252,7 @@ def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:
     )
     figure.subplots_adjust(hspace=0.42)
     now_s = scene.now_us / 1e6
-    held = np.isin(scene.fates, (SENDING, QUEUED, NEWCOMER))
+    held = np.isin(scene.log, (SENDING, QUEUED, NEWCOMER))
     start_s = now_s - _WINDOW_S
     if held.any():
         start_s = min(start_s, float(scene.arrivals["arrival_us"][held][0]) / 1e6)
@@ -297,21 +297,21 @@ def _draw_timeline(axes: Any, scene: _Scene) -> None:
     """One lane for each fate, so that kept and dropped messages stay apart where they are dense."""
     arrival_s = scene.arrivals["arrival_us"] / 1e6
     lanes = (3, 2, 1, 0, 1)  # the newcomer stands in line with the queue
-    for fate, lane in enumerate(lanes):
-        of_fate = arrival_s[scene.fates == fate]
+    for entry, lane in enumerate(lanes):
+        of_entry = arrival_s[scene.log == entry]
         axes.plot(
-            of_fate,
-            np.full(len(of_fate), lane),
+            of_entry,
+            np.full(len(of_entry), lane),
             linestyle="none",
-            marker="D" if fate == NEWCOMER else "|" if fate in (DELIVERED, DROPPED) else "s",
-            markersize=9 if fate in (DELIVERED, DROPPED) else 5,
+            marker="D" if entry == NEWCOMER else "|" if entry in (DELIVERED, DROPPED) else "s",
+            markersize=9 if entry in (DELIVERED, DROPPED) else 5,
             markeredgewidth=1.2,
-            color=_COLOURS[fate],
+            color=_COLOURS[entry],
         )
     axes.set_ylim(-0.6, 3.6)
     axes.set_yticks((3, 2, 1, 0), _NAMES[:NEWCOMER])
-    for tick, fate in zip(axes.get_yticklabels(), range(NEWCOMER), strict=True):
-        tick.set_color(_COLOURS[fate])
+    for tick, entry in zip(axes.get_yticklabels(), range(NEWCOMER), strict=True):
+        tick.set_color(_COLOURS[entry])
     axes.grid(axis="y", color="#eeeeee")
     axes.set_axisbelow(True)
     axes.set_xlabel("time of arrival (s)", fontsize=8, labelpad=1)
@@ -322,17 +322,17 @@ def _draw_lanes(axes: Any, scene: _Scene) -> None:
     arrival_s, lanes = scene.arrivals["arrival_us"] / 1e6, len(scene.topics)
     tall = 190 / lanes  # of a lane, in points, a little less
     shifts, sizes = (0.2, 0.2, 0.0, -0.24, 0.0), (0.4, 0.4, 0.25, 0.3, 0.3)
-    for fate, (shift, size) in enumerate(zip(shifts, sizes, strict=True)):
-        chosen = scene.fates == fate
+    for entry, (shift, size) in enumerate(zip(shifts, sizes, strict=True)):
+        chosen = scene.log == entry
         axes.plot(
             arrival_s[chosen],
             -scene.arrivals["topic"][chosen] + shift,
             linestyle="none",
-            marker="D" if fate == NEWCOMER else "s" if fate == QUEUED else "|",
+            marker="D" if entry == NEWCOMER else "s" if entry == QUEUED else "|",
             markersize=max(2.0, min(9.0, size * tall)),
-            markeredgewidth=1.2 if fate != SENDING else 2.5,
-            color=_COLOURS[fate],
-            label=_NAMES[fate],
+            markeredgewidth=1.2 if entry != SENDING else 2.5,
+            color=_COLOURS[entry],
+            label=_NAMES[entry],
         )
     axes.set_ylim(-lanes + 0.4, 0.6)
     axes.set_yticks(-np.arange(lanes))
@@ -358,7 +358,7 @@ def _draw_slots(axes: Any, scene: _Scene) -> None:
     from matplotlib.patches import Rectangle
 
     L, occupancy = scene.capacity, len(scene.queue)
-    newcomer = scene.fates[-1] == NEWCOMER
+    newcomer = scene.log[-1] == NEWCOMER
     axes.set_axis_off()
     axes.set_ylim(0, 1)
     axes.text(-0.012, 0.5, f"slots {occupancy}/{L}", transform=axes.transAxes, ha="right", va="center", fontsize=9)
@@ -368,7 +368,7 @@ def _draw_slots(axes: Any, scene: _Scene) -> None:
         axes.add_patch(Rectangle((0, 0.2), occupancy, 0.6, facecolor=_COLOURS[QUEUED]))
         return
     axes.set_xlim(-0.3, L + 1.4)
-    before = scene.taken
+    before = scene.dequeued
     seqs = [*scene.queue.tolist(), *([len(scene.arrivals) - 1] if newcomer else [])]
     for k in range(L):
         colour = _COLOURS[QUEUED] if k < occupancy else "#f4f4f4"

@@ -15,10 +15,10 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym import scenario as scenarios
-from bufgym.buffer import ACCEPT, HOLD, REJECT, UNLIMITED_BYTES
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel, prefetch
-from bufgym.link import FOREVER
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, UNLIMITED_BYTES
+from bufgym.model.link import FOREVER
 from bufgym.observe import (
     CONTEXT_FIELDS,
     REWARD_TERMS,
@@ -33,7 +33,7 @@ from bufgym.observe import (
     observe_topic_slots,
 )
 from bufgym.scenario import Episode, Scenario, Streams
-from bufgym.sender import (
+from bufgym.sim import (
     ARRIVAL_WAITS,
     DEPARTURE,
     END,
@@ -162,36 +162,36 @@ def show_topics(batch: Batch, i: int, shown: Shown) -> None:
 
 
 @kernel
-def pay(batch: Batch, i: int, paid: NDArray[np.float64], shown: Shown) -> None:
+def write_rewards(batch: Batch, i: int, rewarded: NDArray[np.float64], shown: Shown) -> None:
     """Write what row ``i`` has earned since it was paid last."""
     sender = batch.senders[i]
-    shown.terms[i, DELIVERED] = sender.delivered_gain - paid[i, DELIVERED]
-    shown.terms[i, RETAINED] = sender.retained_gain - paid[i, RETAINED]
-    paid[i, DELIVERED] = sender.delivered_gain
-    paid[i, RETAINED] = sender.retained_gain
+    shown.terms[i, DELIVERED] = sender.delivered_gain - rewarded[i, DELIVERED]
+    shown.terms[i, RETAINED] = sender.retained_gain - rewarded[i, RETAINED]
+    rewarded[i, DELIVERED] = sender.delivered_gain
+    rewarded[i, RETAINED] = sender.retained_gain
     if sender.topics > 1:
         weight = 0.0
         for topic in range(sender.topics):
             weight += batch.topics[i, topic].weight
         # Topics that all weigh nothing have paid nothing.
         weight = weight if weight > 0 else 1.0
-        shown.terms[i, AGE] = (paid[i, AGE] - sender.aged) / weight
-        shown.terms[i, LATE] = (paid[i, LATE] - sender.late) / weight
-        paid[i, AGE], paid[i, LATE] = sender.aged, sender.late
+        shown.terms[i, AGE] = (rewarded[i, AGE] - sender.aged) / weight
+        shown.terms[i, LATE] = (rewarded[i, LATE] - sender.late) / weight
+        rewarded[i, AGE], rewarded[i, LATE] = sender.aged, sender.late
 
 
 @kernel
-def begin_rows(batch: Batch, rows: NDArray[np.int64], paid: NDArray[np.float64], shown: Shown) -> None:
+def begin_rows(batch: Batch, rows: NDArray[np.int64], rewarded: NDArray[np.float64], shown: Shown) -> None:
     """Bring freshly loaded rows to their first decision; nothing is paid yet, and ``shown.terms`` stay as they are."""
     for i in rows:
         advance(batch, i)
-        paid[i, :] = 0.0
+        rewarded[i, :] = 0.0
         show(batch, i, shown)
 
 
 @kernel
-def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64], shown: Shown) -> None:
-    """One decision in every row. ``paid``: float64[n, reward terms], what earlier steps have paid out.
+def step_rows(batch: Batch, actions: NDArray[np.int64], rewarded: NDArray[np.float64], shown: Shown) -> None:
+    """One decision in every row. ``rewarded``: float64[n, reward terms], what earlier steps have paid out.
 
     A row without a decision due (its episode asked for none) just ends.
     """
@@ -200,7 +200,7 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64
         later = min(i + _AHEAD, len(actions) - 1)
         soon = min(batch.senders[later].next + 1, batch.arrivals.shape[1] - 1)
         prefetch(batch.arrivals, later, soon)
-        prefetch(batch.fates, later, soon)
+        prefetch(batch.log, later, soon)
         sender = batch.senders[i]
         if sender.waiting == ARRIVAL_WAITS:
             decide(batch, i, decision_of(actions[i], sender.capacity))
@@ -208,7 +208,7 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], paid: NDArray[np.float64
         elif sender.waiting == SOCKET_WAITS:
             answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
             advance(batch, i)
-        pay(batch, i, paid, shown)
+        write_rewards(batch, i, rewarded, shown)
         show(batch, i, shown)
 
 
@@ -282,7 +282,7 @@ class Rows:
         )
         self.action_space = spaces.Discrete(self.capacity + 2)
         self.streams: list[Streams | None] = [None] * n
-        self.paid = np.zeros((n, len(self.terms)))
+        self.rewarded = np.zeros((n, len(self.terms)))
         self.shown = self.new_shown()
 
     def __len__(self) -> int:
@@ -315,24 +315,24 @@ class Rows:
             load(i, episode)
         if self.asks_at_send:
             self.senders.batch.senders["ask_at_send"][rows] = 1
-        begin_rows(self.senders.batch, rows, self.paid, self.shown)
+        begin_rows(self.senders.batch, rows, self.rewarded, self.shown)
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """One decision in every row; ``self.shown`` tells what came of it."""
-        step_rows(self.senders.batch, actions, self.paid, self.shown)
+        step_rows(self.senders.batch, actions, self.rewarded, self.shown)
 
     def summary(self, i: Any) -> dict[str, Any]:
         """What the finished episode(s) of row(s) ``i`` came to: qoi and message counts."""
         sender, topics = self.senders.batch.senders[i], self.senders.batch.topics[i]
-        crossed = sender["crossed"]
+        transmitted = sender["transmitted"]
         # The 1 in H = 1 + sum of V, of each topic.
-        first = ((topics["received"] > 0) * topics["weight"]).sum(-1) if self.senders.topics else crossed > 0
+        first = ((topics["received"] > 0) * topics["weight"]).sum(-1) if self.senders.topics else transmitted > 0
         return {
             "qoi": first + sender["delivered_gain"],
             "arrived": sender["next"],
-            "delivered": crossed,
+            "delivered": transmitted,
             "dropped": sender["rejected"] + sender["evicted"],
-            "impossible": sender["impossible"],
+            "invalid": sender["invalid"],
         }
 
     def observation(self, slots: NDArray[np.float32], context: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:

@@ -92,7 +92,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             if name != "episode":
                 raise BufgymError(f"options[{name!r}]: unknown; known: episode")
         self.rows.reset(_ROW, [(options or {}).get("episode")])
-        return self._observation(), {"action_mask": self.action_masks(), "impossible": 0}
+        return self._observation(), {"action_mask": self.action_masks(), "invalid": 0}
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         rows = self.rows
@@ -108,7 +108,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             reward += weight * term
         info = {
             "action_mask": self.action_masks(),
-            "impossible": rows.senders.batch.senders["impossible"].item(),
+            "invalid": rows.senders.batch.senders["invalid"].item(),
             "reward_terms": {term.name: terms[k] for k, term in enumerate(rows.terms)},
         }
         ended = rows.shown.ended.item()

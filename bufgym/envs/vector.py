@@ -185,8 +185,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         for i in np.flatnonzero(done):
             final[i] = rows.observation(rows.shown.slots[i].copy(), rows.shown.context[i].copy())
         mask = np.where(done[:, None], rows.shown.mask, False)
-        last = self._info() | {"action_mask": mask, "_action_mask": done, "_impossible": done, "_reward_terms": done}
-        last["impossible"] = np.where(done, last["impossible"], 0)
+        last = self._info() | {"action_mask": mask, "_action_mask": done, "_invalid": done, "_reward_terms": done}
+        last["invalid"] = np.where(done, last["invalid"], 0)
         rows.reset(np.flatnonzero(done))
         self._steps[done] = 0
         return {"final_obs": final, "_final_obs": done, "final_info": report | last, "_final_info": done}
@@ -196,8 +196,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         info: dict[str, Any] = {
             "action_mask": shown.mask,
             "_action_mask": everywhere,
-            "impossible": self.rows.senders.batch.senders["impossible"].copy(),
-            "_impossible": everywhere,
+            "invalid": self.rows.senders.batch.senders["invalid"].copy(),
+            "_invalid": everywhere,
         }
         if terms:
             info["reward_terms"] = {}

@@ -54,7 +54,7 @@ CONTEXT_FIELDS = (
     Field("left", "context", "link", "fraction", "part of the message in transmission that has not crossed yet"),
     Field("stalled", "context", "link", "g/(g+r), r = L + 1 arrival periods", "time since the socket took a message"),
     Field("departures", "context", "link", "n/(n+1)", "messages the socket took since the previous arrival"),
-    Field("drain", "context", "link", "g/(g+r), r = 1", "running mean of departures per arrival"),
+    Field("service_ratio", "context", "link", "g/(g+r), r = 1", "running mean of departures per arrival"),
     Field("even_value", "context", "value", "QoI", "V of the even motion spacing e"),
     Field("bend", "context", "value", "fraction", "(2 V(e) - V(2e)) / V(e): 0 where V is straight, 1 where it is flat"),
 )
@@ -88,7 +88,7 @@ TIME_BEFORE, TIME_MERGED = _NUMBER["time_before"], _NUMBER["time_merged"]
 MOTION_BEFORE, MOTION_MERGED = _NUMBER["motion_before"], _NUMBER["motion_merged"]
 OCCUPANCY, BACKLOG, BUSY, LEFT = (_NUMBER[name] for name in ("occupancy", "backlog", "busy", "left"))
 ARRIVAL_TIME_GAP, ARRIVAL_MOTION_GAP = _NUMBER["arrival_time_gap"], _NUMBER["arrival_motion_gap"]
-STALLED, DEPARTURES, DRAIN = _NUMBER["stalled"], _NUMBER["departures"], _NUMBER["drain"]
+STALLED, DEPARTURES, DRAIN = _NUMBER["stalled"], _NUMBER["departures"], _NUMBER["service_ratio"]
 RELATIVE_LOSS, EVEN_VALUE, BEND = _NUMBER["relative_loss"], _NUMBER["even_value"], _NUMBER["bend"]
 PRIORITY, WEIGHT, NO_DROP, OLDEST, OWN = (_NUMBER[n] for n in ("priority", "weight", "no_drop", "oldest", "own"))
 WAITED, SILENCE, LATENESS, QUEUED = (_NUMBER[name] for name in ("waited", "silence", "lateness", "queued"))

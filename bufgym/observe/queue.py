@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import UNLIMITED_BYTES, Buffer, arrival_gain
 from bufgym.kernel import kernel
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain
+from bufgym.model.qoi import merging_loss, value
 from bufgym.observe.fields import (
     ARRIVAL_MOTION_GAP,
     ARRIVAL_TIME_GAP,
@@ -31,7 +32,6 @@ from bufgym.observe.fields import (
     TIME_BEFORE,
     TIME_MERGED,
 )
-from bufgym.qoi import merging_loss, value
 
 # So that 0 / (0 + reference) is 0 where nothing moved at all.
 TINY = 1e-30
@@ -56,7 +56,7 @@ def squash_row(row: NDArray[np.floating[Any]], reference: float) -> None:
 @kernel
 def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
     """V of the even motion spacing, and the QoI lost where two such gaps become one."""
-    even = (arrival.x - buffer.taken_x) / (buffer.capacity + 1)
+    even = (arrival.x - buffer.dequeued_x) / (buffer.capacity + 1)
     gain = value(buffer.v, even)
     return gain, merging_loss(buffer.v, even, gain, even, gain)
 
@@ -68,13 +68,13 @@ def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[A
     context[OCCUPANCY] = len(buffer.slots) / buffer.capacity
     context[BACKLOG] = buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0
     time_gap, motion_gap = arrival.arrival_us - buffer.previous_us, arrival.x - buffer.previous_x
-    context[ARRIVAL_TIME_GAP] = squash(time_gap, (arrival.arrival_us - buffer.taken_us) / spread)
-    context[ARRIVAL_MOTION_GAP] = squash(motion_gap, (arrival.x - buffer.taken_x) / spread)
+    context[ARRIVAL_TIME_GAP] = squash(time_gap, (arrival.arrival_us - buffer.dequeued_arrival_us) / spread)
+    context[ARRIVAL_MOTION_GAP] = squash(motion_gap, (arrival.x - buffer.dequeued_x) / spread)
     context[BUSY] = buffer.busy
     context[LEFT] = buffer.left_fraction
     context[STALLED] = squash(buffer.stalled_us, spread * buffer.period_us)
     context[DEPARTURES] = squash(buffer.departures, 1.0)
-    context[DRAIN] = squash(buffer.drain, 1.0)
+    context[DRAIN] = squash(buffer.service_ratio, 1.0)
     context[EVEN_VALUE], even_loss = even_gap(buffer, arrival)
     context[BEND] = even_loss / max(context[EVEN_VALUE], TINY)
 
@@ -88,7 +88,7 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
     """
     s, last = len(buffer.slots), buffer.capacity
     per_rank = 1 / (s + 1)
-    before_us, before_x = buffer.taken_us, buffer.taken_x
+    before_us, before_x = buffer.dequeued_arrival_us, buffer.dequeued_x
     newcomer_gain = arrival_gain(buffer, arrival)
     for k in range(s):
         slot = buffer.slots[k]
@@ -122,7 +122,7 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
     rows[RELATIVE_LOSS, last] = max(rows[LOSS, last], 0.0)
     rows[SIZE, last] = arrival.size_bytes
     even = 1 / (buffer.capacity + 1)
-    even_us, even_x = even * (arrival.arrival_us - buffer.taken_us), even * (arrival.x - buffer.taken_x)
+    even_us, even_x = even * (arrival.arrival_us - buffer.dequeued_arrival_us), even * (arrival.x - buffer.dequeued_x)
     squash_row(rows[TIME_BEFORE], even_us)
     squash_row(rows[TIME_MERGED], 2 * even_us)
     squash_row(rows[MOTION_BEFORE], even_x)

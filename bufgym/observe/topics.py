@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import UNLIMITED_BYTES, Buffer
 from bufgym.kernel import kernel
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
+from bufgym.model.qoi import merging_loss, value
+from bufgym.model.topics import NO_DEADLINE_US
 from bufgym.observe.fields import (
     ARRIVAL_MOTION_GAP,
     ARRIVAL_TIME_GAP,
@@ -45,8 +47,6 @@ from bufgym.observe.fields import (
     WEIGHT,
 )
 from bufgym.observe.queue import ROUNDING, TINY, squash, squash_row
-from bufgym.qoi import merging_loss, value
-from bufgym.topics import NO_DEADLINE_US
 
 _SECOND_US = 1_000_000
 
@@ -64,10 +64,10 @@ def largest(buffer: Buffer) -> tuple[float, float]:
 @kernel
 def even_gaps(topic: Any, last_us: int, last_x: float) -> tuple[float, float]:
     """The even spacing of a topic up to its last arrival, in time (us) and motion."""
-    if topic.taken == 0 and topic.queued == 0:
+    if topic.dequeued == 0 and topic.queued == 0:
         return 0.0, 0.0
     share = 1 / (topic.queued + 1)
-    return share * max(last_us - topic.taken_us, 0), share * max(last_x - topic.taken_x, 0.0)
+    return share * max(last_us - topic.dequeued_arrival_us, 0), share * max(last_x - topic.dequeued_x, 0.0)
 
 
 @kernel
@@ -100,7 +100,7 @@ def fill_row(
     rows[WEIGHT, k] = topic.weight / max(of_all[1], TINY)
     rows[NO_DROP, k] = topic.no_drop
     rows[WAITED, k] = squash(age_us, _SECOND_US)
-    known_us = topic.taken_us if topic.taken > 0 else 0
+    known_us = topic.dequeued_arrival_us if topic.dequeued > 0 else 0
     rows[SILENCE, k] = squash(max(buffer.now_us - known_us, 0), _SECOND_US)
     rows[LATENESS, k] = squash(age_us, topic.deadline_us) if topic.deadline_us < NO_DEADLINE_US else 0.0
     rows[QUEUED, k] = topic.queued / buffer.capacity
@@ -150,10 +150,10 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
         slot = buffer.slots[k]
         topic = buffer.topics[slot.topic]
         j = topic.mark
-        before_us, before_x = topic.taken_us, topic.taken_x
+        before_us, before_x = topic.dequeued_arrival_us, topic.dequeued_x
         if j >= 0:
             before_us, before_x = buffer.slots[j].arrival_us, buffer.slots[j].x
-        elif topic.taken == 0:
+        elif topic.dequeued == 0:
             before_us, before_x = slot.arrival_us, slot.x
         fill_row(buffer, slot, k, slot.gain, before_us, before_x, of_all, rows)
         rows[RANK, k] = (k + 1) / (s + 1)
@@ -181,9 +181,9 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
         before_us, before_x, gain = arrival.arrival_us, arrival.x, 0.0
         if topic.mark >= 0:
             before_us, before_x = buffer.slots[topic.mark].arrival_us, buffer.slots[topic.mark].x
-        elif topic.taken > 0:
-            before_us, before_x = topic.taken_us, topic.taken_x
-        if topic.mark >= 0 or topic.taken > 0:
+        elif topic.dequeued > 0:
+            before_us, before_x = topic.dequeued_arrival_us, topic.dequeued_x
+        if topic.mark >= 0 or topic.dequeued > 0:
             gain = topic.weight * value(buffer.v[topic.v_start :], arrival.x - before_x)
         fill_row(buffer, arrival, capacity, gain, before_us, before_x, of_all, rows)
         rows[RANK, capacity] = 1.0
@@ -224,6 +224,6 @@ def observe_topic_context(buffer: Buffer, arrival: Any, arriving: bool, context:
     context[LEFT] = buffer.left_fraction
     context[STALLED] = squash(buffer.stalled_us, spread * buffer.period_us)
     context[DEPARTURES] = squash(buffer.departures, 1.0)
-    context[DRAIN] = squash(buffer.drain, 1.0)
+    context[DRAIN] = squash(buffer.service_ratio, 1.0)
     context[SOCKET_ASKS] = 0.0 if arriving else 1.0
     context[IN_FLIGHT] = squash(buffer.in_flight, buffer.window)

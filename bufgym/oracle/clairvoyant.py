@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
 from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
+from bufgym.model.qoi import Value
 from bufgym.oracle import labels
 from bufgym.policies.registry import register
-from bufgym.qoi import Value
 from bufgym.scenario import Episode
 
 
@@ -136,13 +136,13 @@ def _fits(
 # --- as a policy -----------------------------------------------------------------------------------------------------
 
 
-def foresee(episode: Episode, capacity: int, max_bytes: int, v: Value) -> NDArray[np.float64]:
+def privileged(episode: Episode, capacity: int, max_bytes: int, v: Value) -> NDArray[np.float64]:
     """The plan as a policy's memory: 1 for each message to keep."""
     limit = None if max_bytes >= UNLIMITED_BYTES else max_bytes
     return clairvoyant(episode, capacity, v, max_bytes=limit).kept.astype(np.float64)
 
 
-@register("clairvoyant", foresee=foresee, source="bufgym.oracle.clairvoyant", compile=True)
+@register("clairvoyant", privileged=privileged, source="bufgym.oracle.clairvoyant", compile=True)
 def follow(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """Knows the whole link and workload beforehand: the bound that no other policy passes."""
     return ACCEPT if memory[arrival.seq] > 0 else REJECT

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel
-from bufgym.qoi import Value, value
+from bufgym.model.qoi import Value, value
 
 
 def _check(capacity: int, T: int) -> None:

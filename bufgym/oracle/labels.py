@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
-from bufgym.qoi import value
+from bufgym.model.qoi import value
 
 NEVER = -1
 """As a limit: the message never finds room."""

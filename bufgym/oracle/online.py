@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, Buffer
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer
+from bufgym.model.qoi import Value
 from bufgym.oracle.interruption import integer
 from bufgym.policies.gaps import min_gap
 from bufgym.policies.registry import Policy
-from bufgym.qoi import Value
 from bufgym.scenario import Interruption
 
 OBJECTIVES = ("ratio", "qoi")
@@ -118,7 +118,7 @@ class OnlineOptimum:
             return ACCEPT
         if buffer.period_us > 0:
             times_us = [*buffer.slots["arrival_us"].tolist(), int(arrival.arrival_us)]
-            positions = [round((us - int(buffer.taken_us)) / float(buffer.period_us)) for us in times_us]
+            positions = [round((us - int(buffer.dequeued_arrival_us)) / float(buffer.period_us)) for us in times_us]
             if self._knows(positions):
                 return self.decision(positions)
         return min_gap(buffer, arrival, memory)
@@ -140,7 +140,7 @@ def online_optimum(
     if isinstance(capacity, bool) or not isinstance(capacity, int | np.integer) or capacity < 1:
         raise BufgymError(f"capacity = {capacity!r}: L must be a whole number >= 1")
     if not isinstance(v, Value):
-        raise BufgymError(f"v = {v!r}: must be a bufgym.qoi Value, such as qoi.exponential(0.618)")
+        raise BufgymError(f"v = {v!r}: must be a bufgym.model.qoi Value, such as qoi.exponential(0.618)")
     if objective not in OBJECTIVES:
         raise BufgymError(f"objective = {objective!r}: must be one of {', '.join(OBJECTIVES)}")
     L, p = int(capacity), _checked(probabilities)

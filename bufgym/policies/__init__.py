@@ -5,13 +5,13 @@ import os
 from pathlib import Path
 
 from bufgym import files
-from bufgym.buffer import ACCEPT, HOLD, REJECT, after, before, is_first
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, after, before, is_first
 from bufgym.policies import (  # noqa: F401  (each registers its policies)
     afr,
+    aqm,
     checkpointing,
     classic,
     gaps,
-    managed,
     middleware,
     robofleet,
     sampling,

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, Buffer
 from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.registry import register
 
 R, C, P = range(3)  # where r, c and p lie in the memory

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, Buffer
 from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.afr import MEMORY, C, P, R, afr_departure, thin
 from bufgym.policies.registry import register
 

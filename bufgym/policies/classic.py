@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, Buffer
 from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.registry import register
 
 
@@ -54,5 +54,5 @@ def random(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     L = buffer.capacity
     if len(buffer.slots) < L:
         return ACCEPT
-    victim = int(arrival.luck * (L + 1))
+    victim = int(arrival.uniform * (L + 1))
     return victim if victim < L else REJECT

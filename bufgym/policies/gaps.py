@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, Buffer, arrival_gain, loss, motion_gaps, time_gaps
 from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, loss, motion_gaps, time_gaps
+from bufgym.model.qoi import value
 from bufgym.policies.registry import register
-from bufgym.qoi import value
 
 
 @kernel
@@ -53,7 +53,7 @@ def even_reject(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> in
     beta, L, s = memory[0], buffer.capacity, len(buffer.slots)
     if s < L:
         return ACCEPT
-    T = arrival.arrival_us - buffer.taken_us
+    T = arrival.arrival_us - buffer.dequeued_arrival_us
     if arrival.arrival_us - buffer.slots[s - 1].arrival_us < beta * T / (L + 1):
         return REJECT
     return smallest_time_gap(buffer, arrival, s)

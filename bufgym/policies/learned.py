@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, Buffer
 from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.observe import CONTEXT_FIELDS, FIELDS, SLOT_FIELDS, observe_context, observe_slots
 from bufgym.policies.registry import Policy
 
@@ -112,7 +112,7 @@ def forward(
 
 def scorer(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """A trained slot scorer."""
-    if memory[OTHER] > 0 and buffer.drain < STILL:
+    if memory[OTHER] > 0 and buffer.service_ratio < STILL:
         return decided(buffer, arrival, memory[int(memory[OTHER]) :])
     return decided(buffer, arrival, memory)
 

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.observe import (
     CONTEXT_FIELDS,
     SLOT_FIELDS,

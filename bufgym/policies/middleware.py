@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, Buffer
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first, keep_last
 from bufgym.policies.registry import Client, register
 
@@ -65,8 +65,10 @@ def lifespan(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 def time_filter(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """DDS TIME_BASED_FILTER: accepts at most one message in `separation_s`; the head goes when full."""
     s, separation_us = len(buffer.slots), 1e6 * memory[0]
-    last_us = buffer.slots[s - 1].arrival_us if s > 0 else buffer.taken_us  # the tail is never dropped before the head
-    if s + buffer.taken > 0 and arrival.arrival_us - last_us < separation_us:
+    last_us = (
+        buffer.slots[s - 1].arrival_us if s > 0 else buffer.dequeued_arrival_us
+    )  # the tail is never dropped before the head
+    if s + buffer.dequeued > 0 and arrival.arrival_us - last_us < separation_us:
         return REJECT
     return keep_last(s, buffer.capacity)
 
@@ -114,7 +116,7 @@ def foxglove_backlog(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) 
     "rosbridge",
     unbounded=True,
     source="rosbridge_server, unbounded outgoing queue",
-    client=Client(encoding="json", awaits_pongs=False),
+    client=Client(encoding="json", awaits_acks=False),
     compile=True,
 )
 def rosbridge(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:

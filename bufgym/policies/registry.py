@@ -3,9 +3,9 @@
 A policy is a plain function ``on_arrival(buffer, arrival, memory) -> decision`` and, where it keeps score of what
 leaves, ``on_departure(buffer, memory)``; a queue discipline that drops at the head as well, as CoDel does, has
 ``on_dequeue(buffer, memory) -> drop it?``; a scheduler ``on_send(buffer, memory) -> slot or HOLD``. ``buffer`` is
-``bufgym.buffer.Buffer``; ``arrival`` a MESSAGE record; ``memory`` a float64 array of the policy's own, laid out and
+``bufgym.model.buffer.Buffer``; ``arrival`` a MESSAGE record; ``memory`` a float64 array of the policy's own, laid out and
 initialised as its registration says; the decision a slot to evict for the newcomer (0 = oldest), REJECT or ACCEPT.
-``arrival.luck`` is a uniform draw in [0, 1) for policies that randomise, so the functions themselves are deterministic.
+``arrival.uniform`` is a uniform draw in [0, 1) for policies that randomise, so the functions themselves are deterministic.
 
     from bufgym.policies import ACCEPT, register
 
@@ -33,9 +33,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.errors import BufgymError
 from bufgym.kernel import compile_for
+from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 
 OnArrival = Callable[[Buffer, Any, NDArray[np.float64]], int]
 OnDeparture = Callable[[Buffer, NDArray[np.float64]], None]
@@ -64,7 +64,7 @@ class Client:
 
     encoding: str = ""
     """Which of an episode's encodings its messages have; empty for their own sizes."""
-    awaits_pongs: bool = True
+    awaits_acks: bool = True
     """Whether it keeps to the scenario's in-flight window n_T; else the socket takes whenever the link is free."""
     limit_at_send: bool = False
     """Whether rate limits hold messages back at the socket, keeping the latest, instead of dropping at arrival."""
@@ -92,7 +92,7 @@ class Policy:
     compile: bool = False
     unbounded: bool = False
     """Whether its queue grows without limit, whatever L is; no bound for L messages holds for it."""
-    foresee: Foresee | None = None
+    privileged: Foresee | None = None
     """(episode, L, B, V) -> memory: for policies that know what is coming, which no robot does."""
     work: tuple[int, int] = (0, 0)
     """Room to work in behind the memory's entries: so many numbers, and so many more for each of L + 1 candidates."""
@@ -121,7 +121,7 @@ class Policy:
         """Why it does not compete with the others; empty if it does."""
         if self.unbounded:
             return "its queue is unbounded"
-        return "it knows the future" if self.foresee is not None else ""
+        return "it knows the future" if self.privileged is not None else ""
 
     @property
     def ranked(self) -> bool:
@@ -184,7 +184,7 @@ def signatures() -> tuple[Any, Any, Any, Any]:
         "v": numba.types.Array(real, 1, "C", readonly=True),
         "topics": numba.types.Array(topic, 1, "C"),
     }
-    reals_of = {"taken_x", "previous_x", "left_fraction", "period_us", "drain"}
+    reals_of = {"dequeued_x", "previous_x", "left_fraction", "period_us", "service_ratio"}
     view = cast(Any, numba.types).NamedTuple(
         tuple(types.get(name, real if name in reals_of else int_) for name in Buffer._fields), Buffer
     )
@@ -213,7 +213,7 @@ def register(
     source: str = "",
     compile: bool = False,
     unbounded: bool = False,
-    foresee: Foresee | None = None,
+    privileged: Foresee | None = None,
     client: Client | None = None,
     for_topics: bool = False,
 ) -> Callable[[OnArrival], OnArrival]:
@@ -244,7 +244,7 @@ def register(
             source,
             compile,
             unbounded,
-            foresee,
+            privileged,
             client=client or Client(),
             for_topics=for_topics,
         )

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.policies.registry import Client, register
 from bufgym.policies.schedulers import fits, make_room, oldest, oldest_of_own, topic_of
 
@@ -43,7 +43,7 @@ def next_no_drop(buffer: Buffer, start: int) -> int:
 def prioritised_wait(buffer: Buffer, k: int) -> float:
     """Priority x time since slot ``k``'s topic was last sent, us; since time 0 if it never was."""
     topic = topic_of(buffer, buffer.slots[k])
-    return float(topic.priority * (buffer.now_us - topic.sent_us))
+    return float(topic.priority * (buffer.now_us - topic.last_dequeue_us))
 
 
 def longest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
@@ -92,7 +92,7 @@ def shortest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
         return best
     for k in range(len(buffer.slots)):
         topic = topic_of(buffer, buffer.slots[k])
-        held_back = topic.taken > 0 and buffer.now_us - topic.sent_us < topic.period_us
+        held_back = topic.dequeued > 0 and buffer.now_us - topic.last_dequeue_us < topic.period_us
         if is_first(buffer, k) and not held_back:
             wait = prioritised_wait(buffer, k)
             if wait < shortest or (wait == shortest and buffer.slots[k].topic < buffer.slots[best].topic):
@@ -123,9 +123,11 @@ def longest_ago(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     best, earliest_us = 0, buffer.now_us + 1
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
-            sent_us = topic_of(buffer, buffer.slots[k]).sent_us
-            if sent_us < earliest_us or (sent_us == earliest_us and buffer.slots[k].topic < buffer.slots[best].topic):
-                best, earliest_us = k, sent_us
+            last_dequeue_us = topic_of(buffer, buffer.slots[k]).last_dequeue_us
+            if last_dequeue_us < earliest_us or (
+                last_dequeue_us == earliest_us and buffer.slots[k].topic < buffer.slots[best].topic
+            ):
+                best, earliest_us = k, last_dequeue_us
     return best
 
 
@@ -134,7 +136,7 @@ def longest_ago(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     on_send=longest_ago,
     for_topics=True,
     source="ROS publishers, a queue a topic (queue_size: the topic's limit)",
-    client=Client(encoding="ros", awaits_pongs=False, copies=True),
+    client=Client(encoding="ros", awaits_acks=False, copies=True),
     compile=True,
 )
 def ros_native(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:

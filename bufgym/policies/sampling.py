@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, Buffer
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_last
 from bufgym.policies.registry import register
 
@@ -32,7 +32,7 @@ def reservoir(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     memory[SEEN] = max(memory[SEEN], len(buffer.slots)) + 1
     if len(buffer.slots) < buffer.capacity:
         return ACCEPT
-    place = int(arrival.luck * memory[SEEN])
+    place = int(arrival.uniform * memory[SEEN])
     return place if place < buffer.capacity else REJECT
 
 
@@ -65,7 +65,7 @@ def decimate(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 def keyframe(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """Motion keyframes: accepts what is `step` in x beyond the keyframe before it; the head goes when full."""
     s, step = len(buffer.slots), memory[0]
-    last_x = buffer.slots[s - 1].x if s > 0 else buffer.taken_x  # the tail is never dropped before the head
-    if s + buffer.taken > 0 and arrival.x - last_x < step:
+    last_x = buffer.slots[s - 1].x if s > 0 else buffer.dequeued_x  # the tail is never dropped before the head
+    if s + buffer.dequeued > 0 and arrival.x - last_x < step:
         return REJECT
     return keep_last(s, buffer.capacity)

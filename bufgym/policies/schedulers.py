@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT, Buffer, is_first
 from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, is_first
 from bufgym.policies.registry import register
 
 # --- who goes for a newcomer -----------------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ def most_aged(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
             slot, topic = buffer.slots[k], topic_of(buffer, buffer.slots[k])
-            newest_us = topic.taken_us if topic.taken > 0 else slot.arrival_us
+            newest_us = topic.dequeued_arrival_us if topic.dequeued > 0 else slot.arrival_us
             age = topic.weight * (buffer.now_us - newest_us)
             if age > most:
                 best, most = k, age

@@ -105,9 +105,9 @@ def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any
     """
     target = Path(path)
     tensors = dict(_tensors(weights))
-    taken = sorted(set(WRITTEN) & set(about))
-    if taken:
-        raise BufgymError(f"{target}: metadata {', '.join(taken)}: written by save itself")
+    reserved = sorted(set(WRITTEN) & set(about))
+    if reserved:
+        raise BufgymError(f"{target}: metadata {', '.join(reserved)}: written by save itself")
     metadata = {
         "format": FORMAT,
         **about,

@@ -24,7 +24,7 @@ from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
 from bufgym.reproduce.report import COLOURS
 from bufgym.scenario import Uplink
-from bufgym.suites import RATE_HZ, motion_value, time_value
+from bufgym.scenario.suites import RATE_HZ, motion_value, time_value
 from bufgym.traces import Motion, Trace
 
 PAPER_FRAMES = 794

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies, sender
-from bufgym.buffer import REJECT, Buffer
+from bufgym import policies
+from bufgym import sim as sender
 from bufgym.errors import BufgymError
+from bufgym.model.buffer import REJECT, Buffer
 from bufgym.policies.afr import C, P, R
 from bufgym.reproduce.report import COLOURS, Report
 from bufgym.scenario import Interruption

@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies, qoi, sender
+from bufgym import policies
+from bufgym import sim as sender
 from bufgym.errors import BufgymError
+from bufgym.model import qoi
+from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
-from bufgym.qoi import Value
 from bufgym.reproduce.report import COLOURS, Report
 from bufgym.scenario import Episode, Interruption
 
@@ -49,7 +51,7 @@ def gained_at_random(
     parts = []
     episode = interruption.episode(T)
     for start in range(0, runs, BATCH):
-        episodes = [episode.with_luck(rng) for _ in range(min(BATCH, runs - start))]
+        episodes = [episode.with_uniforms(rng) for _ in range(min(BATCH, runs - start))]
         parts.append(gained("random", episodes, capacity, interruption.value))
     return np.concatenate(parts)
 

@@ -14,7 +14,7 @@ import numpy as np
 from bufgym.errors import BufgymError
 from bufgym.reproduce.afr_evaluation import PAPER_CEILING, PAPER_FRAMES, load_link, share_carried, streamed
 from bufgym.reproduce.report import COLOURS, Report
-from bufgym.suites import RATE_HZ, SIZE_BYTES
+from bufgym.scenario.suites import RATE_HZ, SIZE_BYTES
 
 PAPER_LOW = (21, 23)
 """The seconds under 500 KB/s that the paper names, counted from 0."""

@@ -30,7 +30,7 @@ from bufgym.reproduce.afr_evaluation import (
     share_carried,
 )
 from bufgym.reproduce.report import Report
-from bufgym.suites import CAPACITIES, SIZE_BYTES
+from bufgym.scenario.suites import CAPACITIES, SIZE_BYTES
 
 PAPER = {"drop-oldest": -0.20, "random": -0.10, "orbbuf": -0.10}
 """The map's RMSE under AFR against that under these, about."""

@@ -35,7 +35,7 @@ from bufgym.reproduce.afr_evaluation import (
     streamed,
 )
 from bufgym.reproduce.report import Report
-from bufgym.suites import CAPACITIES, RATE_HZ, SIZE_BYTES
+from bufgym.scenario.suites import CAPACITIES, RATE_HZ, SIZE_BYTES
 from bufgym.traces import Trace
 
 MORE_RUNS = 100

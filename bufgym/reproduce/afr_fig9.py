@@ -16,10 +16,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies, sender
-from bufgym.buffer import ACCEPT, MESSAGE, Buffer
+from bufgym import policies
+from bufgym import sim as sender
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT, compile_for, records
+from bufgym.model.buffer import ACCEPT, MESSAGE, Buffer
 from bufgym.policies.registry import Policy, signatures
 from bufgym.reproduce.report import COLOURS, Report
 from bufgym.scenario import Interruption
@@ -64,7 +65,7 @@ def compiled_loop() -> Any:
 def full_queue(capacity: int, arrivals: int) -> tuple[Buffer, NDArray[Any]]:
     """A full queue in an interruption, as a policy sees it, and MESSAGE[``arrivals``], the next to come."""
     interruption = Interruption(law="fixed", t_max=capacity + arrivals)
-    episode = interruption.episode(capacity + arrivals).with_luck(np.random.Generator(np.random.PCG64(0)))
+    episode = interruption.episode(capacity + arrivals).with_uniforms(np.random.Generator(np.random.PCG64(0)))
     seen: list[Buffer] = []
 
     def watch(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
@@ -119,7 +120,7 @@ def report(capacity: int = 8, decisions: int = 1_000_000, calls: int = 20_000) -
     buffer, arrivals = full_queue(capacity, 400)
     # Built-in ones alone: a user's policy names no source.
     known = map(policies.get, policies.names(for_topics=False))
-    measured = [p for p in known if p.compile and p.source and p.foresee is None]
+    measured = [p for p in known if p.compile and p.source and p.privileged is None]
     rows: list[list[Any]] = []
     for policy in measured:
         inside, (median, p99) = (

@@ -24,12 +24,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import metrics, policies, qoi, sender
+from bufgym import policies
+from bufgym import sim as sender
 from bufgym.errors import BufgymError
+from bufgym.model import qoi
+from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
-from bufgym.qoi import Value
 from bufgym.reproduce.report import COLOURS, Report
 from bufgym.scenario import Interruption
+from bufgym.sim import metrics
 
 ROUNDING = 1e-12
 """Relative tolerance of every comparison below: sums of V are exact but for rounding."""

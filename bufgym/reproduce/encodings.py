@@ -54,9 +54,9 @@ def laser_scan(
     _whole("intensities", intensities, 4)
     if not 0 <= no_return <= 1:
         raise BufgymError(f"no_return = {no_return!r}: must be from 0 to 1")
-    luck = _luck(seed)
-    ranges = luck.uniform(0.1, 30.0, beams).astype(np.float32)
-    ranges[luck.permutation(beams)[: round(no_return * beams)]] = np.inf
+    uniform = _luck(seed)
+    ranges = uniform.uniform(0.1, 30.0, beams).astype(np.float32)
+    ranges[uniform.permutation(beams)[: round(no_return * beams)]] = np.inf
     width = 1.5 * math.pi
     limits = {"angle_min": -width / 2, "angle_max": width / 2, "angle_increment": width / max(1, beams - 1)}
     timing = {"time_increment": 0.025 / max(1, beams), "scan_time": 0.025, "range_min": 0.1, "range_max": 30.0}
@@ -64,20 +64,20 @@ def laser_scan(
         "header": _header(frame_id),
         **{name: float(np.float32(value)) for name, value in (limits | timing).items()},
         "ranges": ranges,
-        "intensities": luck.uniform(0, 4000, intensities).astype(np.float32),
+        "intensities": uniform.uniform(0, 4000, intensities).astype(np.float32),
     }
 
 
 def nav_sat_fix(frame_id: str = "gps", seed: int = 0) -> Content:
     """A fix with 7 decimals of a degree, 3 of a metre, and a diagonal covariance."""
-    luck = _luck(seed)
-    east, north, up = np.round(luck.uniform(0.5, 9.0, 3), 4)
+    uniform = _luck(seed)
+    east, north, up = np.round(uniform.uniform(0.5, 9.0, 3), 4)
     return {
         "header": _header(frame_id),
         "status": {"status": 0, "service": 1},
-        "latitude": round(30.28 + luck.uniform(0, 0.01), 7),
-        "longitude": round(-97.73 - luck.uniform(0, 0.01), 7),
-        "altitude": round(160 + luck.uniform(0, 30), 3),
+        "latitude": round(30.28 + uniform.uniform(0, 0.01), 7),
+        "longitude": round(-97.73 - uniform.uniform(0, 0.01), 7),
+        "altitude": round(160 + uniform.uniform(0, 30), 3),
         "position_covariance": np.diag([east, north, up]).ravel(),
         "position_covariance_type": 2,
     }
@@ -119,14 +119,14 @@ def pose_stamped(frame_id: str = "map", seed: int = 0) -> Content:
 
 def odometry(frame_id: str = "odom", child_frame_id: str = "base_link", seed: int = 0) -> Content:
     """A pose and a twist on the ground, each with a diagonal covariance."""
-    luck = _luck(seed)
-    ahead, turning = luck.uniform(0, 2), luck.uniform(-1, 1)
+    uniform = _luck(seed)
+    ahead, turning = uniform.uniform(0, 2), uniform.uniform(-1, 1)
     twist = {"linear": {"x": ahead, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turning}}
     return {
         "header": _header(frame_id),
         "child_frame_id": _text("child_frame_id", child_frame_id),
-        "pose": {"pose": _pose(luck), "covariance": np.diag(luck.uniform(0, 0.1, 6)).ravel()},
-        "twist": {"twist": twist, "covariance": np.diag(luck.uniform(0, 0.1, 6)).ravel()},
+        "pose": {"pose": _pose(uniform), "covariance": np.diag(uniform.uniform(0, 0.1, 6)).ravel()},
+        "twist": {"twist": twist, "covariance": np.diag(uniform.uniform(0, 0.1, 6)).ravel()},
     }
 
 
@@ -324,7 +324,7 @@ def _header(frame_id: str) -> Content:
     }
 
 
-def _pose(luck: np.random.Generator) -> Content:
-    x, y, yaw = luck.uniform(-50, 50), luck.uniform(-50, 50), luck.uniform(-math.pi, math.pi)
+def _pose(uniform: np.random.Generator) -> Content:
+    x, y, yaw = uniform.uniform(-50, 50), uniform.uniform(-50, 50), uniform.uniform(-math.pi, math.pi)
     turn = {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
     return {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turn}

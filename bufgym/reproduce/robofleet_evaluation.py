@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from bufgym import policies
 from bufgym.benchmark.run import draw
 from bufgym.errors import BufgymError
+from bufgym.model.topics import Topic
 from bufgym.reproduce.report import COLOURS
 from bufgym.scenario import Client, Stream
 from bufgym.scenario.checks import above_0
-from bufgym.sender import NEVER
-from bufgym.sender import run as run_policy
-from bufgym.topics import Topic
+from bufgym.sim import NEVER
+from bufgym.sim import run as run_policy
 from bufgym.traces import Trace
 
 POINTS = 10_000
@@ -162,8 +162,8 @@ def meet(
     senders = run_policy(policies.get(rival.policy), [draw(client, seed)], room, client.value, topics=client.topics)
     sender = senders.batch.senders[0]
     arrivals = np.asarray(senders.batch.arrivals[0])[: sender["arrivals"]]
-    crossed_us = np.asarray(senders.batch.fates[0])[: sender["arrivals"]]["crossed_us"]
-    received_s = np.where(crossed_us == NEVER, np.nan, (crossed_us + sender["propagation_us"]) / 1e6)
+    transmitted_us = np.asarray(senders.batch.log[0])[: sender["arrivals"]]["transmitted_us"]
+    received_s = np.where(transmitted_us == NEVER, np.nan, (transmitted_us + sender["propagation_us"]) / 1e6)
     consumer, topic = np.divmod(arrivals["topic"], len(streams))
     return Sent(topic, consumer, arrivals["arrival_us"] / 1e6, received_s)
 

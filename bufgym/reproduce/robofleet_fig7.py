@@ -102,7 +102,7 @@ def report(
                 seen[name] = sent
             key = {"bad_mbit_per_s": bad, "sender": name, "image_priority": priority, "run": seed}
             for k, kind in enumerate(TOPICS):
-                rows.append({**key, "topic": kind, **_fate(sent.on(k), from_s, from_s + bad_s)})
+                rows.append({**key, "topic": kind, **_entry(sent.on(k), from_s, from_s + bad_s)})
 
     def draw(figure: Any) -> None:
         panels = figure.subplots(len(SENDERS), 1, sharex=True, sharey=True)
@@ -139,7 +139,7 @@ def _streams(image_priority: float) -> list[Stream]:
     return [stream(kind, hz, **(rules | changed.get(kind, {}))) for kind, (hz, rules) in TOPICS.items()]
 
 
-def _fate(sent: Sent, from_s: float, until_s: float) -> Row:
+def _entry(sent: Sent, from_s: float, until_s: float) -> Row:
     """What became of one topic before the zone and in it."""
     zone = sent.between(from_s, until_s)
     latency_s = zone.got.latency_s

@@ -16,14 +16,18 @@ from bufgym import traces
 from bufgym.errors import BufgymError
 from bufgym.scenario.client import Client, Stream, client_over_lte, read_client, robofleet_example
 from bufgym.scenario.episode import Episode, Scenario, Streams, messages
+from bufgym.scenario.fleet import MAX_ROBOTS, FleetEpisode, FleetScenario
 from bufgym.scenario.interruption import LAWS, Interruption
 from bufgym.scenario.uplink import Uplink
 
 __all__ = [
     "LAWS",
+    "MAX_ROBOTS",
     "SCENARIOS",
     "Client",
     "Episode",
+    "FleetEpisode",
+    "FleetScenario",
     "Interruption",
     "Scenario",
     "Stream",

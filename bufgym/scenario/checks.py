@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bufgym.errors import BufgymError
-from bufgym.qoi import Value
+from bufgym.model.qoi import Value
 
 MAX_RATE_HZ = 100_000
 """Arrivals are counted in whole microseconds: ten to a period at least."""
@@ -43,4 +43,4 @@ def natural(name: str, number: Any) -> int:
 def check_value(scenario: object) -> None:
     given = getattr(scenario, "value")  # noqa: B009  (both kinds of scenario have it)
     if not isinstance(given, Value):
-        raise BufgymError(f"value = {given!r}: must be a bufgym.qoi Value, such as qoi.exponential(0.618)")
+        raise BufgymError(f"value = {given!r}: must be a bufgym.model.qoi Value, such as qoi.exponential(0.618)")

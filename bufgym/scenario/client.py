@@ -18,15 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import qoi, traces
-from bufgym.buffer import MESSAGE
+from bufgym import traces
 from bufgym.errors import BufgymError
 from bufgym.kernel import records
-from bufgym.link import Link
-from bufgym.qoi import Value
+from bufgym.model import qoi
+from bufgym.model.buffer import MESSAGE
+from bufgym.model.link import Link
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic, check_topics, check_window
 from bufgym.scenario.checks import above_0, check_value, is_number, natural, positive, rate
 from bufgym.scenario.episode import Episode, Streams
-from bufgym.topics import Topic, check_topics, check_window
 from bufgym.traces import Motion, Trace
 
 ENCODINGS = ("ros", "json")
@@ -51,7 +52,7 @@ class Stream:
 
     def __post_init__(self) -> None:
         if not isinstance(self.topic, Topic):
-            raise BufgymError(f"stream: {self.topic!r} is not a bufgym.topics.Topic")
+            raise BufgymError(f"stream: {self.topic!r} is not a bufgym.model.topics.Topic")
         try:
             rate(self.rate_hz)
             above_0("size_bytes", self.size_bytes)
@@ -112,7 +113,7 @@ class Client:
         positive(self, "duration_s", "scale")
         check_window(self.window)
         natural("propagation_us", self.propagation_us)
-        natural("round_trip_us", self.pong_us)
+        natural("round_trip_us", self.ack_delay_us)
         if natural("consumers", self.consumers) == 0:
             raise BufgymError("consumers = 0: must be a whole number >= 1")
         check_value(self)
@@ -133,7 +134,7 @@ class Client:
         return sum(self._count(stream) for stream in self.streams)
 
     @property
-    def pong_us(self) -> int:
+    def ack_delay_us(self) -> int:
         """From a message's crossing to its pong, us."""
         return 2 * self.propagation_us if self.round_trip_us is None else self.round_trip_us
 
@@ -163,7 +164,7 @@ class Client:
             arrivals,
             Link(trace, offset, int(self.propagation_us)),
             window=self.window,
-            pong_us=self.pong_us,
+            ack_delay_us=self.ack_delay_us,
             encodings={name: self._resized(arrivals, name) for name in ENCODINGS},
             consumers=self.consumers,
         )

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import MESSAGE
 from bufgym.errors import BufgymError
 from bufgym.kernel import records
-from bufgym.link import Link
-from bufgym.qoi import Value
+from bufgym.model.buffer import MESSAGE
+from bufgym.model.link import Link
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic, check_ack_delay, check_window
 from bufgym.scenario.checks import natural
-from bufgym.topics import Topic, check_pong, check_window
 
 
 class Streams(NamedTuple):
@@ -45,7 +45,7 @@ class Episode:
     """Arrivals after this one, likewise."""
     window: int = 1
     """n_T: messages in flight (sent, and not yet answered by a pong) at most."""
-    pong_us: int = 0
+    ack_delay_us: int = 0
     """From the moment when a message's last byte has crossed to its pong, us; 0: nobody waits for pongs."""
     encodings: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
     """Bytes of the messages in other encodings, int64[n] each; in one that is not here they have their own sizes."""
@@ -54,14 +54,14 @@ class Episode:
 
     def __post_init__(self) -> None:
         check_window(self.window)
-        check_pong(self.pong_us)
+        check_ack_delay(self.ack_delay_us)
 
     # Luck is not drawn with the rest: an agent in an environment has chance of its own.
 
-    def with_luck(self, rng: np.random.Generator) -> Episode:
+    def with_uniforms(self, rng: np.random.Generator) -> Episode:
         """The same episode with fresh luck for randomised policies."""
         arrivals = self.arrivals.copy()
-        arrivals["luck"] = rng.random(len(arrivals))
+        arrivals["uniform"] = rng.random(len(arrivals))
         return replace(self, arrivals=arrivals)
 
     def encoded(self, encoding: str) -> Episode:

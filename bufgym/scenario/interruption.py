@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import qoi
 from bufgym.errors import BufgymError
-from bufgym.link import Link
-from bufgym.qoi import Value
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
 from bufgym.scenario.checks import check_value, natural, positive, rate
 from bufgym.scenario.episode import Episode, Streams, messages
-from bufgym.topics import Topic
 from bufgym.traces import Trace
 
 LAWS = ("fixed", "uniform", "log-uniform", "geometric")

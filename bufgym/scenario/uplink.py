@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import qoi
 from bufgym.errors import BufgymError
-from bufgym.link import Link
-from bufgym.qoi import Value
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
 from bufgym.scenario.checks import check_value, is_number, natural, positive, rate
 from bufgym.scenario.episode import Episode, Streams, unchecked_messages
-from bufgym.topics import Topic
 from bufgym.traces import Motion, Trace
 from bufgym.traces.workload import Workload
 

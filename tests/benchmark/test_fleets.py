@@ -9,17 +9,17 @@ from typing import Any
 
 import pytest
 
-from bufgym import policies, qoi, suites
+from bufgym import policies
 from bufgym.benchmark import fleets
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.fleets import ROWS, fleet_parts, run_parts
 from bufgym.benchmark.fleets_summary import Standing, plain, summary
 from bufgym.benchmark.rows import Row, read_rows, write_rows
 from bufgym.benchmark.run import draw, run
-from bufgym.cell import FleetScenario
 from bufgym.cli import main
 from bufgym.errors import BufgymError
-from bufgym.scenario import Uplink
+from bufgym.model import qoi
+from bufgym.scenario import FleetScenario, Uplink, suites
 from bufgym.traces import Trace
 
 STEADY = Trace.constant(1000.0, 60.0, name="1 kB/s")
@@ -265,8 +265,8 @@ def test_decisions_that_cannot_be_carried_out_are_told(tmp_path: Path, capsys: p
     finally:
         policies.registry._REGISTRY.pop("far-off", None)
     told = capsys.readouterr().out
-    impossible = sum(row["impossible"] for row in read_rows(out, ROWS) if row["policy"] == "far-off")
-    assert impossible > 0 and f"note: far-off gave {impossible} impossible decisions\n" in told
+    invalid = sum(row["invalid"] for row in read_rows(out, ROWS) if row["policy"] == "far-off")
+    assert invalid > 0 and f"note: far-off gave {invalid} invalid decisions\n" in told
 
 
 @pytest.mark.slow

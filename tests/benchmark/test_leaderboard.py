@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from bufgym import policies, suites
+from bufgym import policies
 from bufgym.benchmark import leaderboard
 from bufgym.benchmark.leaderboard import Entry
 from bufgym.cli import main
 from bufgym.errors import BufgymError
-from bufgym.scenario import Interruption
-from bufgym.suites import Setting, Suite
+from bufgym.scenario import Interruption, suites
+from bufgym.scenario.suites import Setting, Suite
 
 REPO = Path(__file__).resolve().parents[2]
 

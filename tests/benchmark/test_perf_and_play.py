@@ -19,10 +19,10 @@ from bufgym.benchmark import perf
 from bufgym.benchmark.play import Player
 from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
-from bufgym.metrics import outcome
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
-from bufgym.sender import run as run_senders
+from bufgym.sim import run as run_senders
+from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
 
 PLAYABLE = [
@@ -56,7 +56,7 @@ def test_recorded_actions_are_possible_when_played_again() -> None:
     envs.reset(seed=perf.SEED)
     for row in actions:
         _, _, _, _, info = envs.step(row)
-        assert not info["impossible"].any()
+        assert not info["invalid"].any()
 
 
 def test_random_actions_are_those_of_the_mask() -> None:
@@ -109,7 +109,7 @@ def test_a_player_of_topics_reaches_what_its_policy_reaches(name: str) -> None:
         _, _, ended, _, info = env.step(player.action(env.rows.senders))
     reached = outcome(rolled, 0)
     assert info["qoi"] == pytest.approx(reached.qoi)
-    assert (info["delivered"], info["impossible"]) == (reached.delivered, reached.impossible)
+    assert (info["delivered"], info["invalid"]) == (reached.delivered, reached.invalid)
 
 
 def test_a_player_refuses_a_decision_that_means_nothing() -> None:

@@ -226,7 +226,7 @@ def test_fates_and_the_longest_gap_by_hand() -> None:
     gap = timeline.longest_gap(TIMELINE["x"], [0, 2, 4])
     assert gap == (2, 4)
     kept, dropped, in_gap, left = timeline.KEPT, timeline.DROPPED, timeline.IN_GAP, timeline.LEFT
-    assert timeline.fates(6, lane, gap) == [kept, dropped, kept, in_gap, kept, left]
+    assert timeline.log(6, lane, gap) == [kept, dropped, kept, in_gap, kept, left]
     assert timeline.longest_gap(TIMELINE["x"], [3]) is None
     assert timeline.longest_gap([0, 1, 2], [0, 1, 2]) == (0, 1)  # the first of equals
 

@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 
-from bufgym import oracle, policies, qoi
+from bufgym import oracle, policies
 from bufgym.benchmark import run
 from bufgym.benchmark.rows import COLUMNS
 from bufgym.errors import BufgymError
+from bufgym.model import qoi
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
 from bufgym.traces import Trace
@@ -24,7 +25,7 @@ def spy(name: str, log: list[Any]) -> Policy:
     """A policy that writes down what it meets and rejects all."""
 
     def on_arrival(buffer: Any, arrival: Any, memory: Any) -> int:
-        log.append((int(arrival.seq), int(arrival.arrival_us), int(arrival.size_bytes), float(arrival.luck)))
+        log.append((int(arrival.seq), int(arrival.arrival_us), int(arrival.size_bytes), float(arrival.uniform)))
         return policies.REJECT
 
     return Policy(name, on_arrival)
@@ -41,7 +42,7 @@ def test_every_policy_and_capacity_meets_the_same_episodes() -> None:
     # Cells come one after the other, capacities within them.
     per = 3 * 20
     assert first[:per] == first[per : 2 * per]
-    assert len({luck for *_, luck in first[:per]}) == per
+    assert len({uniform for *_, uniform in first[:per]}) == per
 
 
 def test_a_seed_means_the_same_episode_in_any_company() -> None:

@@ -73,7 +73,7 @@ def test_scores_by_hand() -> None:
     assert mine.regret.value == pytest.approx(3 / 38)
     assert mine.qoi.value == pytest.approx(17.5)
     assert mine.difference.value == pytest.approx(0.5)  # (2 - 1) / 2
-    assert (mine.episodes, mine.bites, mine.exact) == (2, True, True)
+    assert (mine.episodes, mine.discriminative, mine.exact) == (2, True, True)
     assert cell_of(made, "mine", capacity=2).score.value == pytest.approx(0.4)
     overall = standing_of(made, "mine")
     assert overall.score.value == pytest.approx((5 / 8 + 4 / 10) / 2)
@@ -113,12 +113,12 @@ def test_a_cell_that_does_not_bite_is_shown_and_not_scored() -> None:
     """At L = 9 Drop Oldest's regret is 1 / 200 < 1 %; at L = 8 it is 2 / 200."""
     quiet = rows_of({"drop-oldest": [99.5, 99.5], "afr": [99, 99], "mine": [9, 9]}, [100, 100], capacity=9)
     made = score.scores([*TWO_CELLS, *quiet])
-    assert not cell_of(made, "mine", capacity=9).bites
+    assert not cell_of(made, "mine", capacity=9).discriminative
     assert cell_of(made, "mine", capacity=9).score.value == pytest.approx(-181)
     assert made.standings == score.scores(TWO_CELLS).standings
     edge = rows_of({"drop-oldest": [99, 99], "afr": [99, 99], "mine": [99, 100]}, [100, 100], capacity=8)
     made = score.scores([*TWO_CELLS, *edge])
-    assert cell_of(made, "afr", capacity=8).bites
+    assert cell_of(made, "afr", capacity=8).discriminative
     assert standing_of(made, "mine").cells == 3
 
 
@@ -128,7 +128,7 @@ def test_where_nothing_bites_there_are_no_standings() -> None:
     for best in ([None, None], [14, None], [10, 20]):
         made = score.scores(rows_of(h, best))
         cell = cell_of(made, "afr")
-        assert not cell.bites
+        assert not cell.discriminative
         assert all(math.isnan(number) for number in cell.score)
         assert all(math.isnan(number) for number in cell.regret) == (None in best)
         assert cell.qoi.value == 15

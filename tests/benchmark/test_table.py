@@ -10,7 +10,7 @@ from bufgym.benchmark import table
 
 def row(policy: str, capacity: int, qoi: float, **more: Any) -> dict[str, Any]:
     rest = dict.fromkeys([column.key for column in table.COLUMNS], 1.0)
-    return {**rest, "policy": policy, "capacity": capacity, "qoi": qoi, "regret": None, "impossible": 0, **more}
+    return {**rest, "policy": policy, "capacity": capacity, "qoi": qoi, "regret": None, "invalid": 0, **more}
 
 
 ROWS = [
@@ -18,7 +18,7 @@ ROWS = [
     row("b", 5, 4.0, delivered=4, mean_sojourn_s=math.nan),
     row("a", 5, 6.0),
     row("a", 2, 1.0),
-    row("c", 2, 1.0, impossible=3),
+    row("c", 2, 1.0, invalid=3),
 ]
 
 
@@ -42,7 +42,7 @@ def test_plain_text_is_aligned_and_says_what_was_impossible() -> None:
     body = [line for line in lines[:6] if line]
     assert len({len(line) for line in body}) == 1
     assert body[-1].split()[:4] == ["b", "5", "3.000", "3.5"]
-    assert lines[-1] == "note: c gave 3 impossible decisions"
+    assert lines[-1] == "note: c gave 3 invalid decisions"
     assert "regret" not in lines[0]
 
 

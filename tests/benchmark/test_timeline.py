@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from bufgym import policies, qoi
+from bufgym import policies
 from bufgym.benchmark import run
 from bufgym.benchmark.timeline import choose, timeline
+from bufgym.model import qoi
 from bufgym.scenario import Interruption, Uplink
 from bufgym.traces import Trace
 
@@ -53,7 +54,7 @@ def test_every_message_is_accounted_for_as_in_the_rows(scenario: Any, seed: int)
         x = [made["x"][k] for k in sorted(received)]
         gains = sum(scenario.value(b - a) for a, b in itertools.pairwise(x))
         assert lane["qoi"] == pytest.approx(1 + gains if x else 0.0)
-        assert all(made["arrival_s"][k] <= taken <= crossed for k, taken, crossed in lane["received"])
+        assert all(made["arrival_s"][k] <= dequeued <= transmitted for k, dequeued, transmitted in lane["received"])
         assert all(made["arrival_s"][k] <= when for k, when in lane["dropped"])
 
 
@@ -70,9 +71,9 @@ def test_the_drawn_capacity_carries_the_messages() -> None:
     carried = [0.25 * sum(made["rate"]["bytes_per_s"][: k + 1]) for k in range(len(made["rate"]["t_s"]))]
     assert step_s == 0.25
     for name in ("drop-oldest", "afr", "clairvoyant"):
-        crossed = [crossed for _, _, crossed in made["policies"][name]["received"]]
-        assert made["rate"]["t_s"][-1] + step_s >= max(crossed)
-        for number, at in enumerate(sorted(crossed), start=1):
+        transmitted = [transmitted for _, _, transmitted in made["policies"][name]["received"]]
+        assert made["rate"]["t_s"][-1] + step_s >= max(transmitted)
+        for number, at in enumerate(sorted(transmitted), start=1):
             assert carried[int(at / step_s)] >= 50_000 * number
     assert made["demand_bytes_per_s"] == pytest.approx(10 * 50_000, rel=0.02)
 

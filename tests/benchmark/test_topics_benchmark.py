@@ -9,16 +9,17 @@ from typing import Any
 
 import pytest
 
-from bufgym import policies, qoi, suites
+from bufgym import policies
 from bufgym.benchmark import topics
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Row, read_rows, write_rows
 from bufgym.benchmark.topics import ROWS, client_parts, default_policies, run, run_parts, suite_parts
 from bufgym.benchmark.topics_summary import by_topic, plain, summary
 from bufgym.errors import BufgymError
-from bufgym.metrics import TopicOutcome
-from bufgym.scenario import Client, Interruption, Stream
-from bufgym.topics import Topic
+from bufgym.model import qoi
+from bufgym.model.topics import Topic
+from bufgym.scenario import Client, Interruption, Stream, suites
+from bufgym.sim.metrics import TopicOutcome
 from bufgym.traces import Trace
 
 POSE = Stream(Topic("pose", priority=3, deadline_s=0.5), rate_hz=2, size_bytes=100, jitter=0)
@@ -175,7 +176,7 @@ def test_suites_of_one_queue_are_refused() -> None:
 def made(policy: str, seed: int, weighted_qoi: float, scenario: str = "s", **first: Any) -> list[Row]:
     """The rows of one run of 10 s with a topic of priority 5 (changed by ``first``), one of 1, and one no_drop."""
     key = {"scenario": scenario, "trace": "t", "seed": seed, "policy": policy, "capacity": 4}
-    run = {"weighted_qoi": weighted_qoi, "seconds": 10.0, "impossible": 0}
+    run = {"weighted_qoi": weighted_qoi, "seconds": 10.0, "invalid": 0}
     rest = {"qoi": 1.0, "arrived": 9, "delivered": 4.0, "limited": 0.0, "lost": 0.0, "late": 0.0, "mean_age_s": 2.0}
     rest |= {"peak_age_s": 3.0, "mean_sojourn_s": 0.5, "p95_sojourn_s": math.nan, "no_drop": False, "deadline_s": 1.0}
     return [

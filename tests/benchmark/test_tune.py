@@ -10,13 +10,14 @@ from typing import Any
 
 import pytest
 
-from bufgym import policies, qoi, suites
+from bufgym import policies
 from bufgym.benchmark import tune
 from bufgym.benchmark.tune import Choice
 from bufgym.cli import tune as tune_command
 from bufgym.cli.options import Parser
 from bufgym.errors import BufgymError
-from bufgym.scenario import Interruption
+from bufgym.model import qoi
+from bufgym.scenario import Interruption, suites
 
 LENGTHS = {"tiny-twelve": 12, "tiny-nine": 9}
 """T of each suite, L = 2. Of messages 1..T, `decimate:every=k` accepts 1, 1 + k, 1 + 2k, ... and keeps the last two.

@@ -9,11 +9,11 @@ import naive
 import numpy as np
 from hypothesis import strategies as st
 
-from bufgym import qoi
-from bufgym.link import Link
+from bufgym.model import qoi
+from bufgym.model.link import Link
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, messages
-from bufgym.sender import NEVER, Senders
+from bufgym.sim import NEVER, Senders
 from bufgym.traces import Trace
 
 
@@ -75,7 +75,7 @@ def cases(draw: st.DrawFn, max_bytes: bool = True, max_messages: int = 40) -> Ca
         rng.integers(1, draw(st.sampled_from([2, 4_000])), n),
         np.cumsum(rng.integers(0, 5, n)) / 8,
     )
-    arrivals["luck"] = rng.random(n)
+    arrivals["uniform"] = rng.random(n)
     arrivals["topic"] = rng.integers(0, 3, n)
     knots, after = draw(traces())
     link = Link(trace(knots, after), draw(st.integers(0, 3 * knots[-1][0])), draw(st.integers(0, 30_000)))
@@ -84,7 +84,13 @@ def cases(draw: st.DrawFn, max_bytes: bool = True, max_messages: int = 40) -> Ca
     return Case(
         Episode(arrivals, link, first, last),
         [
-            {"seq": k, "us": int(a["arrival_us"]), "bytes": int(a["size_bytes"]), "x": float(a["x"]), "luck": a["luck"]}
+            {
+                "seq": k,
+                "us": int(a["arrival_us"]),
+                "bytes": int(a["size_bytes"]),
+                "x": float(a["x"]),
+                "uniform": a["uniform"],
+            }
             for k, a in enumerate(np.asarray(arrivals))
         ],
         knots,
@@ -106,25 +112,25 @@ VALUES = st.one_of(
 )
 
 
-def fates(senders: Senders, i: int = 0) -> dict[str, dict[int, int]]:
+def log(senders: Senders, i: int = 0) -> dict[str, dict[int, int]]:
     """{"taken_us": {sequence number: time}, ...}, of what happened at all."""
-    rows = np.asarray(senders.batch.fates[i])[: int(senders.batch.senders[i]["arrivals"])]
+    rows = np.asarray(senders.batch.log[i])[: int(senders.batch.senders[i]["arrivals"])]
     return {
         name: {k: int(us) for k, us in enumerate(rows[name]) if us != NEVER}
-        for name in ("taken_us", "crossed_us", "dropped_us")
+        for name in ("dequeued_us", "transmitted_us", "dropped_us")
     }
 
 
 def order(senders: Senders, i: int = 0) -> list[int]:
     """Sequence numbers in the order in which the link carried them."""
-    return senders.batch.order[i, : senders.batch.senders[i]["crossed"]].tolist()
+    return senders.batch.order[i, : senders.batch.senders[i]["transmitted"]].tolist()
 
 
 def same(a: Senders, b: Senders) -> bool:
     """Whether both batches ended with the same fates and the same information, bit for bit."""
     rows, others = np.asarray(a.batch.senders), np.asarray(b.batch.senders)
     return bool(
-        (np.asarray(a.batch.fates) == np.asarray(b.batch.fates)).all()
+        (np.asarray(a.batch.log) == np.asarray(b.batch.log)).all()
         and (a.batch.order == b.batch.order).all()
         and all((rows[f] == others[f]).all() for f in ("delivered_gain", "retained_gain", "evicted", "rejected"))
     )

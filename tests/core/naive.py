@@ -89,10 +89,10 @@ class Sender:
         self.sending = None  # the message in transmission, outside the buffer
         self.finish = None  # when its last byte will have crossed; None: never
         self.position = 0  # bytes of the link used up when it has
-        self.last_taken = None
+        self.last_dequeued = None
         self.previous = None  # the arrival before this one, kept or not
-        self.taken, self.crossed, self.dropped, self.order = {}, {}, {}, []
-        self.rejected = self.evicted = self.impossible = 0
+        self.dequeued, self.transmitted, self.dropped, self.order = {}, {}, {}, []
+        self.rejected = self.evicted = self.invalid = 0
 
     def run(self, messages, first_decision=0, last_decision=math.inf):
         for message in messages:
@@ -106,8 +106,8 @@ class Sender:
             decision = ACCEPT
             if asked:
                 previous = self.previous if self.previous is not None else message
-                last_taken = self.last_taken if self.last_taken is not None else previous
-                decision = self.policy.decide(list(self.queue), message, self.capacity, last_taken, previous)
+                last_dequeued = self.last_dequeued if self.last_dequeued is not None else previous
+                decision = self.policy.decide(list(self.queue), message, self.capacity, last_dequeued, previous)
             self.carry_out(decision, message)
             self.previous = message
             # (3) an idle socket takes the head at once
@@ -120,7 +120,7 @@ class Sender:
     def advance(self, until):
         while self.sending is not None and self.finish is not None and self.finish <= until:
             done, now = self.sending["seq"], self.finish
-            self.crossed[done] = now
+            self.transmitted[done] = now
             self.order.append(done)
             self.sending = None
             if self.queue:
@@ -133,10 +133,10 @@ class Sender:
             self.evicted += 1
         if not self.queue:
             return
-        self.sending = self.last_taken = self.queue.pop(0)
+        self.sending = self.last_dequeued = self.queue.pop(0)
         self.position = position + self.sending["bytes"]
         self.finish = self.link.first_time(self.position)
-        self.taken[self.sending["seq"]] = now
+        self.dequeued[self.sending["seq"]] = now
         self.policy.departed(self.queue)
 
     def left_bytes(self, now):
@@ -144,7 +144,7 @@ class Sender:
         if self.sending is None:
             return 0
         size = self.sending["bytes"]
-        if self.taken[self.sending["seq"]] == now:
+        if self.dequeued[self.sending["seq"]] == now:
             return size
         return min(size, max(0, self.position - math.floor(self.link.bytes_by(now))))
 
@@ -167,7 +167,7 @@ class Sender:
         # What a queue does: accept where there is room, reject where there is none.
         fits = self.fits(self.queue, message)
         if decision != ACCEPT or not fits:
-            self.impossible += 1
+            self.invalid += 1
         if fits:
             self.queue.append(message)
         else:

@@ -1,4 +1,4 @@
-"""The slow, obvious twin of ``bufgym.cell``: robots that share a link byte by byte, with lists and fractions.
+"""The slow, obvious twin of ``bufgym.sim``: robots that share a link byte by byte, with lists and fractions.
 
 ``whole=True`` shares whole bytes, as the package does, and must agree with it exactly. ``whole=False`` is processor
 sharing itself: every byte is divided, however small the shares.
@@ -53,11 +53,11 @@ class Cell:
             before = now
             robot = self.robots[i]
             previous = robot.previous if robot.previous is not None else message
-            last_taken = robot.last_taken if robot.last_taken is not None else previous
+            last_dequeued = robot.last_dequeued if robot.last_dequeued is not None else previous
             asked = robot.decide_at == "arrival" or not robot.fits(robot.queue, message)
             decision = naive.ACCEPT
             if asked:
-                decision = robot.policy.decide(list(robot.queue), message, robot.capacity, last_taken, previous)
+                decision = robot.policy.decide(list(robot.queue), message, robot.capacity, last_dequeued, previous)
             robot.carry_out(decision, message)
             robot.previous = message
             if robot.sending is None and robot.queue:
@@ -88,7 +88,7 @@ class Cell:
                 robot.left -= least
             for robot in [robot for robot in busy if robot.left == 0]:
                 seq = robot.sending["seq"]
-                robot.crossed[seq] = now
+                robot.transmitted[seq] = now
                 robot.order.append(seq)
                 robot.sending = None
                 if robot.queue:

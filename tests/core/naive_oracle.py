@@ -23,7 +23,7 @@ class Chosen(naive.Policy):
 
     decision = None
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
         return self.decision
 
 

@@ -29,11 +29,11 @@ class Reservoir(Policy):
 
     n = 0
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
         self.n = max(self.n, len(queue)) + 1  # what came unasked is all there
         if len(queue) < L:
             return ACCEPT
-        return one_of([*range(L), *[REJECT] * (self.n - L)], newcomer["luck"])
+        return one_of([*range(L), *[REJECT] * (self.n - L)], newcomer["uniform"])
 
     def departed(self, queue):
         self.n = len(queue)
@@ -44,7 +44,7 @@ class Decimate(Policy):
 
     n = 0
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
         self.n += 1
         if self.n not in range(1, self.n + 1, 3):
             return REJECT
@@ -61,7 +61,7 @@ class Afr(Policy):
         if self.as_released and self.p > 0:
             self.p -= 1
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
         filled = Fraction(len(queue), L)
         low = filled <= Fraction(2, 3) if self.as_released else filled < Fraction(2, 3)
         if self.r > 1 and low:
@@ -93,14 +93,14 @@ class MinGap(Policy):
     def __init__(self, key):
         self.key = key
 
-    def gaps(self, queue, newcomer, last_taken, previous):
+    def gaps(self, queue, newcomer, last_dequeued, previous):
         """The merged gap that each queued message, and last the newcomer, would leave."""
-        at = [m[self.key] for m in [last_taken, *queue, newcomer]]
+        at = [m[self.key] for m in [last_dequeued, *queue, newcomer]]
         at.append(at[-1] + at[-1] - previous[self.key])
         return [after - before for before, after in zip(at, at[2:], strict=False)]
 
-    def full(self, queue, newcomer, L, last_taken, previous):
-        gaps = self.gaps(queue, newcomer, last_taken, previous)
+    def full(self, queue, newcomer, L, last_dequeued, previous):
+        gaps = self.gaps(queue, newcomer, last_dequeued, previous)
         victim = gaps.index(min(gaps))
         return victim if victim < L else REJECT
 
@@ -111,7 +111,7 @@ class OrbBuf(Policy):
     def __init__(self, v):
         self.v = v
 
-    def full(self, queue, newcomer, L, last_taken, previous):
+    def full(self, queue, newcomer, L, last_dequeued, previous):
         similar = [1 - self.v(c["x"] - a["x"]) for a, c in zip(queue, queue[2:], strict=False)]
         return 1 + similar.index(max(similar)) if similar else L - 1
 
@@ -141,11 +141,11 @@ class EvenReject(MinGap):
         super().__init__("us")
         self.beta = beta
 
-    def full(self, queue, newcomer, L, last_taken, previous):
-        even = self.beta * (newcomer["us"] - last_taken["us"]) / (L + 1)
+    def full(self, queue, newcomer, L, last_dequeued, previous):
+        even = self.beta * (newcomer["us"] - last_dequeued["us"]) / (L + 1)
         if newcomer["us"] - queue[-1]["us"] < even:
             return REJECT
-        gaps = self.gaps(queue, newcomer, last_taken, previous)[:L]
+        gaps = self.gaps(queue, newcomer, last_dequeued, previous)[:L]
         return gaps.index(min(gaps))
 
 
@@ -162,7 +162,7 @@ class Steady(Policy):
         width = s + 1 if m == 1 else s - math.floor(math.log2(m))
         return (m, h % width) if width > 0 else None
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
         if not queue:
             self.first = newcomer["seq"]
         places = [self.place(m["seq"] - self.first + 1, L) for m in [*queue, newcomer]]
@@ -185,8 +185,8 @@ class GreedyQoi(Policy):
             return self.v(a) * self.v(b)  # equal, and rounded as in the kernel
         return self.v(a) + self.v(b) - self.v(a + b)
 
-    def full(self, queue, newcomer, L, last_taken, previous):
-        x = [m["x"] for m in [last_taken, *queue, newcomer]]
+    def full(self, queue, newcomer, L, last_dequeued, previous):
+        x = [m["x"] for m in [last_dequeued, *queue, newcomer]]
         gain = self.v(x[-1] - x[-2])
         added = [gain - self.loss(b - a, c - b) for a, b, c in zip(x, x[1:], x[2:], strict=False)]
         return added.index(max(added)) if max(added) > 0 else REJECT
@@ -198,7 +198,7 @@ class OldestThatHelps(Policy):
     def __init__(self, depth=math.inf):
         self.depth = depth
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
         fits = self.sender.fits
         helps = [k for k in range(len(queue)) if fits(queue[:k] + queue[k + 1 :], newcomer)]
         if fits(queue, newcomer) and (len(queue) < self.depth or not helps):
@@ -207,10 +207,10 @@ class OldestThatHelps(Policy):
 
 
 class Anything(Policy):
-    """A policy that decides at random, impossible decisions included: -2 accept, -1 reject, 0 .. L + 1 a slot."""
+    """A policy that decides at random, invalid decisions included: -2 accept, -1 reject, 0 .. L + 1 a slot."""
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
-        return one_of([ACCEPT, REJECT, *range(L + 2)], newcomer["luck"])
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
+        return one_of([ACCEPT, REJECT, *range(L + 2)], newcomer["uniform"])
 
 
 def policy(spec, v):

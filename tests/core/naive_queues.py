@@ -12,8 +12,8 @@ class Policy:
 
     sender = None  # whose policy it is
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
-        return self.full(queue, newcomer, L, last_taken, previous) if len(queue) == L else ACCEPT
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
+        return self.full(queue, newcomer, L, last_dequeued, previous) if len(queue) == L else ACCEPT
 
     def departed(self, queue):
         pass
@@ -24,30 +24,30 @@ class Policy:
 
 
 class DropOldest(Policy):
-    def full(self, queue, newcomer, L, last_taken, previous):
+    def full(self, queue, newcomer, L, last_dequeued, previous):
         return 0
 
 
 class DropNewest(Policy):
-    def full(self, queue, newcomer, L, last_taken, previous):
+    def full(self, queue, newcomer, L, last_dequeued, previous):
         return REJECT
 
 
 class ReplaceNewest(Policy):
-    def full(self, queue, newcomer, L, last_taken, previous):
+    def full(self, queue, newcomer, L, last_dequeued, previous):
         return L - 1
 
 
-def one_of(candidates, luck):
+def one_of(candidates, uniform):
     """A candidate, each as likely as the others."""
-    return candidates[math.floor(luck * len(candidates))]
+    return candidates[math.floor(uniform * len(candidates))]
 
 
 class Random(Policy):
     """The victim is uniform over the queue and the newcomer."""
 
-    def full(self, queue, newcomer, L, last_taken, previous):
-        return one_of([*range(L), REJECT], newcomer["luck"])
+    def full(self, queue, newcomer, L, last_dequeued, previous):
+        return one_of([*range(L), REJECT], newcomer["uniform"])
 
 
 class KeepLast(Policy):
@@ -56,7 +56,7 @@ class KeepLast(Policy):
     def __init__(self, depth=math.inf):
         self.depth = depth
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
         return 0 if len(queue) >= self.depth or len(queue) == L else ACCEPT
 
 
@@ -78,11 +78,11 @@ class Spaced(KeepLast):
         super().__init__()
         self.key, self.distance = key, distance
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
-        accepted = [*([last_taken] if self.sender.taken else []), *queue]
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
+        accepted = [*([last_dequeued] if self.sender.dequeued else []), *queue]
         if accepted and newcomer[self.key] - accepted[-1][self.key] < self.distance:
             return REJECT
-        return super().decide(queue, newcomer, L, last_taken, previous)
+        return super().decide(queue, newcomer, L, last_dequeued, previous)
 
 
 class FoxgloveBacklog(Policy):
@@ -91,7 +91,7 @@ class FoxgloveBacklog(Policy):
     def __init__(self, limit_mb=10):
         self.limit = limit_mb * 1e6
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
         waiting = sum(m["bytes"] for m in queue) + self.sender.left_bytes(newcomer["us"])
         if waiting + newcomer["bytes"] >= self.limit or len(queue) == L:
             return REJECT
@@ -99,7 +99,7 @@ class FoxgloveBacklog(Policy):
 
 
 class Rosbridge(Policy):
-    def decide(self, queue, newcomer, L, last_taken, previous):
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
         return ACCEPT
 
 
@@ -161,14 +161,14 @@ class Red(Policy):
         self.min_th, self.max_th, self.max_p, self.weight = min_th, max_th, max_p, weight
         self.average, self.count = 0, -1
 
-    def decide(self, queue, newcomer, L, last_taken, previous):
+    def decide(self, queue, newcomer, L, last_dequeued, previous):
         self.average += self.weight * (len(queue) - self.average)
         filled = self.average / L
         if self.min_th <= filled < self.max_th:
             self.count += 1
             p = self.max_p * (filled - self.min_th) / (self.max_th - self.min_th)
             # luck < p / (1 - count p), or certain where that is no probability
-            if newcomer["luck"] * (1 - self.count * p) < p:
+            if newcomer["uniform"] * (1 - self.count * p) < p:
                 self.count = 0
                 return REJECT
         elif filled >= self.max_th:

@@ -48,7 +48,7 @@ class Sender:
         max_bytes=None,
         decide_at="arrival",
         window=1,
-        pong_us=0,
+        ack_delay_us=0,
         propagation_us=0,
         schedules=False,
         drops_heads=False,
@@ -59,7 +59,7 @@ class Sender:
         self.one_queue = isinstance(rules, Rules)
         self.rules = [rules] if self.one_queue else rules
         self.max_bytes = math.inf if max_bytes is None else max_bytes
-        self.window, self.pong_us, self.propagation_us = window, pong_us, propagation_us
+        self.window, self.ack_delay_us, self.propagation_us = window, ack_delay_us, propagation_us
         self.schedules, self.drops_heads = schedules, drops_heads
         self.limit_at_send, self.flush_no_drop = limit_at_send, flush_no_drop
         self.queues = [[] for _ in self.rules]
@@ -68,15 +68,15 @@ class Sender:
         self.sent = [[] for _ in self.rules]  # all that the socket took, in that order
         self.socket = []  # Sent, in transmission or behind it
         self.in_flight = []  # sent and not yet answered
-        self.pongs = []  # (us, message) on their way back
+        self.acks = []  # (us, message) on their way back
         self.position = 0  # bytes of the link used up when all that the socket took has crossed
         self.held = False  # the scheduler waits for the next arrival or pong
         self.newcomer = None
         self.to_come = self.last_us = 0
         self.now = 0
-        self.taken, self.crossed, self.dropped, self.order = {}, {}, {}, []
+        self.dequeued, self.transmitted, self.dropped, self.order = {}, {}, {}, []
         self.limited = set()  # dropped by a rate limit
-        self.rejected = self.evicted = self.impossible = 0
+        self.rejected = self.evicted = self.invalid = 0
 
     # --- what there is ---------------------------------------------------------------------------------------------
 
@@ -123,20 +123,20 @@ class Sender:
     def advance(self, until):
         """All pongs and crossings up to and including ``until``; of those at the same time, pongs first."""
         while True:
-            pong = self.pongs[0][0] if self.pongs else math.inf
+            ack = self.acks[0][0] if self.acks else math.inf
             done = self.socket[0].due if self.socket and self.socket[0].due is not None else math.inf
-            if min(pong, done) > until or min(pong, done) == math.inf:
+            if min(ack, done) > until or min(ack, done) == math.inf:
                 return
-            self.now = min(pong, done)
-            if pong <= done:
-                self.answered(self.pongs.pop(0)[1])
+            self.now = min(ack, done)
+            if ack <= done:
+                self.answered(self.acks.pop(0)[1])
                 yield from self.offer()
                 continue
             message = self.socket.pop(0).message
-            self.crossed[message["seq"]] = self.now
+            self.transmitted[message["seq"]] = self.now
             self.order.append(message["seq"])
-            if self.pong_us > 0:
-                self.pongs.append((self.now + self.pong_us, message))
+            if self.ack_delay_us > 0:
+                self.acks.append((self.now + self.ack_delay_us, message))
             else:
                 self.answered(message)
             # What is taken at this very moment follows byte by byte, without a pause.
@@ -159,10 +159,10 @@ class Sender:
             if message is None:
                 self.held = True
                 return
-            self.take(message, position)
+            self.dequeue(message, position)
             yield "departure"
 
-    def take(self, message, position):
+    def dequeue(self, message, position):
         if not self.socket:
             self.position = math.floor(self.link.bytes_by(self.now)) if position is None else position
         self.position += message["bytes"]
@@ -170,7 +170,7 @@ class Sender:
         self.in_flight.append(message)
         self.queues[self.lane(message)].remove(message)
         self.sent[self.lane(message)].append(message)
-        self.taken[message["seq"]] = self.now
+        self.dequeued[message["seq"]] = self.now
 
     # --- what may be sent ------------------------------------------------------------------------------------------
 
@@ -184,7 +184,7 @@ class Sender:
         if self.queues[lane][0] is not message or not self.window_open(message):
             return False
         if self.limit_at_send and self.sent[lane]:
-            return self.now - self.taken[self.sent[lane][-1]["seq"]] >= self.rules[lane].period_us
+            return self.now - self.dequeued[self.sent[lane][-1]["seq"]] >= self.rules[lane].period_us
         return True
 
     def oldest_sendable(self):
@@ -201,7 +201,7 @@ class Sender:
             return None
         if 0 <= k < len(slots) and self.sendable(slots[k]):
             return slots[k]
-        self.impossible += 1
+        self.invalid += 1
         return self.oldest_sendable()
 
     # --- what may be kept ------------------------------------------------------------------------------------------
@@ -242,7 +242,7 @@ class Sender:
             self.enqueue(message)
         else:
             # What a queue does, but a no_drop message drives out the least important.
-            self.impossible += 1
+            self.invalid += 1
             if not self.fits(message) and self.must_keep(message):
                 self.remove(min(self.evictable(message), key=lambda m: self.rules[self.lane(m)].priority))
             if self.fits(message):
@@ -274,7 +274,11 @@ class Sender:
 
     def received(self, lane, until):
         """(when, message) of what reached the server by then."""
-        at = [(self.crossed[m["seq"]] + self.propagation_us, m) for m in self.sent[lane] if m["seq"] in self.crossed]
+        at = [
+            (self.transmitted[m["seq"]] + self.propagation_us, m)
+            for m in self.sent[lane]
+            if m["seq"] in self.transmitted
+        ]
         return [(us, m) for us, m in at if us <= until]
 
     def delivered_gain(self, until):
@@ -313,7 +317,7 @@ class Sender:
     def left_bytes(self):
         """Bytes that the socket took and that have not crossed yet."""
         inside = sum(sent.message["bytes"] for sent in self.socket)
-        if not self.socket or (len(self.socket) == 1 and self.taken[self.socket[0].message["seq"]] == self.now):
+        if not self.socket or (len(self.socket) == 1 and self.dequeued[self.socket[0].message["seq"]] == self.now):
             return inside
         return min(inside, max(0, self.position - math.floor(self.link.bytes_by(self.now))))
 

@@ -10,9 +10,20 @@ from cases import VALUES
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym import qoi
-from bufgym.buffer import MESSAGE, TOPIC, Buffer, arrival_gain, evict, loss, motion_gaps, push, row_width, time_gaps
 from bufgym.kernel import records
+from bufgym.model import qoi
+from bufgym.model.buffer import (
+    MESSAGE,
+    TOPIC,
+    Buffer,
+    arrival_gain,
+    evict,
+    loss,
+    motion_gaps,
+    push,
+    row_width,
+    time_gaps,
+)
 
 
 @given(st.integers(1, 6), st.lists(st.one_of(st.none(), st.integers(-1, 5)), max_size=80))
@@ -40,14 +51,16 @@ def test_agrees_with_a_list(L, actions):
     assert (slots["seq"][0] == 0).all()
 
 
-def buffer(times_us, x, v=None, *, taken_us=0, taken_x=0.0, previous_us=0, previous_x=0.0, taken=1):
+def buffer(times_us, x, v=None, *, dequeued_arrival_us=0, dequeued_x=0.0, previous_us=0, previous_x=0.0, dequeued=1):
     """A buffer that holds messages with these arrival times and coordinates."""
     slots = records(len(times_us), MESSAGE)
     slots["arrival_us"], slots["x"] = times_us, x
     others = dict.fromkeys(Buffer._fields, 0)
-    others.update(slots=slots, capacity=len(x), v=(v or qoi.exponential(0.5)).array, taken=taken)
-    others.update(taken_us=taken_us, taken_x=taken_x, previous_us=previous_us, previous_x=previous_x)
-    others.update(left_fraction=0.0, period_us=0.0, drain=0.0, topics=records(1, TOPIC))
+    others.update(slots=slots, capacity=len(x), v=(v or qoi.exponential(0.5)).array, dequeued=dequeued)
+    others.update(
+        dequeued_arrival_us=dequeued_arrival_us, dequeued_x=dequeued_x, previous_us=previous_us, previous_x=previous_x
+    )
+    others.update(left_fraction=0.0, period_us=0.0, service_ratio=0.0, topics=records(1, TOPIC))
     return Buffer(**others)
 
 
@@ -69,15 +82,17 @@ def test_gaps_by_hand():
 
 
 def test_gain_of_a_newcomer_to_an_empty_buffer():
-    assert arrival_gain(buffer([], [], taken_x=2.0), message(9, 3.0)) == 0.5
-    assert arrival_gain(buffer([], [], taken=0), message(9, 3.0)) == 0  # the very first message is the 1 in H
+    assert arrival_gain(buffer([], [], dequeued_x=2.0), message(9, 3.0)) == 0.5
+    assert arrival_gain(buffer([], [], dequeued=0), message(9, 3.0)) == 0  # the very first message is the 1 in H
 
 
 @given(VALUES, st.lists(st.integers(0, 9), min_size=3, max_size=9), st.integers(0, 9))
 def test_gaps_and_losses_agree_with_a_list(v, steps, back):
     at = np.cumsum(steps).tolist()
     previous = max(at[-2], at[-1] - back)
-    held = buffer(at[1:-1], at[1:-1], v, taken_us=at[0], taken_x=at[0], previous_us=previous, previous_x=previous)
+    held = buffer(
+        at[1:-1], at[1:-1], v, dequeued_arrival_us=at[0], dequeued_x=at[0], previous_us=previous, previous_x=previous
+    )
     newcomer = message(at[-1], at[-1])
     gaps = [b - a for a, b in pairwise([*at, 2 * at[-1] - previous])]
     for k in range(len(at) - 1):

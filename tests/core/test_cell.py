@@ -8,19 +8,20 @@ import math
 import naive
 import numpy as np
 import pytest
-from cases import VALUES, cases, fates, order, same, trace, traces
+from cases import VALUES, cases, log, order, same, trace, traces
 from hypothesis import given
 from hypothesis import strategies as st
 from naive_cell import Cell
 
-from bufgym import policies, qoi, scenario
-from bufgym.buffer import ACCEPT, HOLD, MESSAGE
-from bufgym.cell import Fleet, FleetEpisode, FleetScenario, run_fleet
+from bufgym import policies, scenario
 from bufgym.errors import BufgymError
-from bufgym.link import Link
-from bufgym.metrics import outcome
-from bufgym.scenario import Streams, Uplink, messages
-from bufgym.sender import Senders, run
+from bufgym.model import qoi
+from bufgym.model.buffer import ACCEPT, HOLD, MESSAGE
+from bufgym.model.link import Link
+from bufgym.scenario import FleetEpisode, FleetScenario, Streams, Uplink, messages
+from bufgym.sim import Senders, run
+from bufgym.sim.cell import Fleet, run_fleet
+from bufgym.sim.metrics import outcome
 from bufgym.traces import shipped
 
 V = qoi.exponential(0.5)
@@ -29,8 +30,8 @@ US = trace([(0, 0), (1_000_000, 1_000_000)], "loop")
 
 
 def anything(buffer, arrival, memory):
-    """Decides at random, impossible decisions included."""
-    return int(arrival.luck * (buffer.capacity + 4)) - 2
+    """Decides at random, invalid decisions included."""
+    return int(arrival.uniform * (buffer.capacity + 4)) - 2
 
 
 def accept(buffer, arrival, memory):
@@ -47,7 +48,7 @@ ANYTHING = policies.Policy("test-anything", anything, compile=True)
 ACCEPTS = policies.Policy("test-accept", accept, compile=True)
 HESITANT = policies.Policy("test-hesitant", anything, on_send=hesitant, memory={"asked": 0.0}, compile=True)
 POLICIES = [
-    p for p in (*map(policies.get, policies.names()), ANYTHING, HESITANT) if p.foresee is None and not any(p.work)
+    p for p in (*map(policies.get, policies.names()), ANYTHING, HESITANT) if p.privileged is None and not any(p.work)
 ]
 
 
@@ -57,55 +58,55 @@ def cell(*robots, trace=US, policy=ACCEPTS, capacity=8):
     return run_fleet(policy, [FleetEpisode(tuple(arrivals), Link(trace))], capacity, V)
 
 
-def crossed(fleet):
+def transmitted(fleet):
     """{sequence number: when it had crossed}, a dictionary for each robot."""
-    return [fates(fleet.senders, i)["crossed_us"] for i in range(len(fleet.senders))]
+    return [log(fleet.senders, i)["transmitted_us"] for i in range(len(fleet.senders))]
 
 
 # --- by hand ---------------------------------------------------------------------------------------------------------
 
 
 def test_two_that_send_at_once_take_twice_as_long():
-    assert crossed(cell([(0, 1_000)], [(0, 1_000)])) == [{0: 2_000}, {0: 2_000}]
+    assert transmitted(cell([(0, 1_000)], [(0, 1_000)])) == [{0: 2_000}, {0: 2_000}]
 
 
 def test_who_joins_later_and_who_leaves_earlier():
     # A is alone until 500 and has 500 bytes left; then each gets half a byte a microsecond: A crosses at 1500.
     # B has had 500 by then and the link for itself: its other 500 bytes cross at 2000.
-    assert crossed(cell([(0, 1_000)], [(500, 1_000)])) == [{0: 1_500}, {0: 2_000}]
+    assert transmitted(cell([(0, 1_000)], [(500, 1_000)])) == [{0: 1_500}, {0: 2_000}]
 
 
 def test_a_successor_shares_from_the_byte_on_where_the_message_before_it_ended():
     # A: 100 and then 100; B: 300. Both get 100 by 200; A's second has its 100 by 400, B its second 100 too; B alone
     # needs 100 more: 500.
     fleet = cell([(0, 100), (0, 100)], [(0, 300)])
-    assert crossed(fleet) == [{0: 200, 1: 400}, {0: 500}]
-    assert fates(fleet.senders, 0)["taken_us"] == {0: 0, 1: 200}
+    assert transmitted(fleet) == [{0: 200, 1: 400}, {0: 500}]
+    assert log(fleet.senders, 0)["dequeued_us"] == {0: 0, 1: 200}
 
 
 def test_bytes_that_can_not_be_divided_are_kept_for_all():
     # By 3 us the link has carried 3 bytes: A and B have one each, one is left over. C joins; the three of them need
     # 3 x 4 more for A and B to have their 5: byte 2 + 12 = 14. C has had 4 of its 10 and ends at byte 20 = 5 + 5 + 10.
-    assert crossed(cell([(0, 5)], [(0, 5)], [(3, 10)])) == [{0: 14}, {0: 14}, {0: 20}]
+    assert transmitted(cell([(0, 5)], [(0, 5)], [(3, 10)])) == [{0: 14}, {0: 14}, {0: 20}]
 
 
 def test_an_idle_cell_keeps_nothing():
     # A is done at 10; what the link could have carried until 100 is gone. B and A's second start at 100 together.
-    assert crossed(cell([(0, 10), (100, 10)], [(100, 10)])) == [{0: 10, 1: 120}, {0: 120}]
+    assert transmitted(cell([(0, 10), (100, 10)], [(100, 10)])) == [{0: 10, 1: 120}, {0: 120}]
 
 
 def test_what_crosses_at_the_time_of_an_arrival_has_left_before_it():
     # L = 1. Both first messages cross at 1000; A's second is taken then, so its third, which arrives then, finds room.
     newest = policies.get("drop-newest")
     fleet = cell([(0, 500), (0, 1), (1_000, 1)], [(0, 500)], policy=newest, capacity=1)
-    assert fates(fleet.senders, 0)["dropped_us"] == {}
+    assert log(fleet.senders, 0)["dropped_us"] == {}
     fleet = cell([(0, 500), (0, 1), (999, 1)], [(0, 500)], policy=newest, capacity=1)
-    assert fates(fleet.senders, 0)["dropped_us"] == {2: 999}
+    assert log(fleet.senders, 0)["dropped_us"] == {2: 999}
 
 
 def test_a_link_that_stops_leaves_them_all_in_transmission():
     fleet = cell([(0, 600), (1, 10)], [(0, 600)], trace=trace([(0, 0), (1_000, 1_000)], "stop"))
-    assert crossed(fleet) == [{}, {}]
+    assert transmitted(fleet) == [{}, {}]
     told = [outcome(fleet.senders, i) for i in fleet.rows(0)]
     assert [(o.in_transmission, o.buffered, o.qoi) for o in told] == [(1, 1, 0.0), (1, 0, 0.0)]
 
@@ -143,7 +144,7 @@ def test_one_robot_is_a_sender_under_every_policy(policy):
     made, (episode, _) = drawn_episodes(1, size_bytes=700_000)
     alone = run(policy, [episode.episode(0)], 4, made.value)
     assert same(run_fleet(policy, [episode], 4, made.value).senders, alone)
-    assert fates(alone)["dropped_us"] or policy.unbounded
+    assert log(alone)["dropped_us"] or policy.unbounded
 
 
 @given(cases(), st.integers(2, 5), st.sampled_from(POLICIES))
@@ -162,7 +163,7 @@ def test_robots_that_are_alike_fare_as_one_on_its_share(case, n, policy):
     fleet = run_fleet(policy, [FleetEpisode((case.episode.arrivals,) * n, links(n))], case.capacity, V)
     alone = run(policy, [FleetEpisode((case.episode.arrivals,), links(1)).episode(0)], case.capacity, V)
     for i in range(n):
-        assert fates(fleet.senders, i) == fates(alone)
+        assert log(fleet.senders, i) == log(alone)
         assert order(fleet.senders, i) == order(alone)
 
 
@@ -182,7 +183,7 @@ def cells(draw, idle=True):
         step_us = rng.choice([0, 1, 700, 5_000], n) + rng.integers(0, 3_000, n) * rng.integers(0, 2, n)
         arrival_us = robots[0]["arrival_us"] if together and robots else np.cumsum(step_us)
         arrivals = messages(arrival_us, rng.integers(1, largest, n), np.cumsum(rng.integers(0, 5, n)) / 8)
-        arrivals["luck"] = rng.random(n)
+        arrivals["uniform"] = rng.random(n)
         robots.append(arrivals)
         n = n if together else int(rng.integers(1, 16))
     max_bytes = draw(st.one_of(st.none(), st.integers(1_000, 15_000)))
@@ -193,7 +194,13 @@ def twin(episode, knots, policy, capacity, max_bytes=None, decide_at="arrival", 
     link = naive.Link(knots, episode.link.trace.after, episode.link.offset_us)
     heard = [
         [
-            {"seq": k, "us": int(a["arrival_us"]), "bytes": int(a["size_bytes"]), "x": float(a["x"]), "luck": a["luck"]}
+            {
+                "seq": k,
+                "us": int(a["arrival_us"]),
+                "bytes": int(a["size_bytes"]),
+                "x": float(a["x"]),
+                "uniform": a["uniform"],
+            }
             for k, a in enumerate(np.asarray(arrivals))
         ]
         for arrivals in episode.arrivals
@@ -203,20 +210,20 @@ def twin(episode, knots, policy, capacity, max_bytes=None, decide_at="arrival", 
 
 
 class TwinAnything(naive.Policy):
-    def decide(self, queue, message, capacity, last_taken, previous):
-        drawn = int(message["luck"] * (capacity + 4)) - 2
+    def decide(self, queue, message, capacity, last_dequeued, previous):
+        drawn = int(message["uniform"] * (capacity + 4)) - 2
         return drawn if drawn >= 0 else [naive.ACCEPT, naive.REJECT][drawn + 2]
 
 
 class TwinAccept(naive.Policy):
-    def decide(self, queue, message, capacity, last_taken, previous):
+    def decide(self, queue, message, capacity, last_dequeued, previous):
         return naive.ACCEPT
 
 
 class TwinLook(naive.Policy):
     """Accepts, and notes how much of the message in transmission is left."""
 
-    def decide(self, queue, message, capacity, last_taken, previous):
+    def decide(self, queue, message, capacity, last_dequeued, previous):
         self.noted = [*getattr(self, "noted", []), self.sender.left_bytes(message["us"])]
         return naive.ACCEPT
 
@@ -227,9 +234,9 @@ def test_the_whole_byte_twin_agrees_exactly(drawn, decide_at):
     fleet = run_fleet(ANYTHING, [episode], capacity, V, max_bytes=max_bytes, decide_at=decide_at)
     slow = twin(episode, knots, TwinAnything, capacity, max_bytes, decide_at)
     for i, robot in enumerate(slow.robots):
-        assert fates(fleet.senders, i) == {
-            "taken_us": robot.taken,
-            "crossed_us": robot.crossed,
+        assert log(fleet.senders, i) == {
+            "dequeued_us": robot.dequeued,
+            "transmitted_us": robot.transmitted,
             "dropped_us": robot.dropped,
         }
         assert order(fleet.senders, i) == robot.order
@@ -249,11 +256,11 @@ def test_processor_sharing_itself_within_a_few_bytes(drawn):
     per_us = max(math.ceil((b - a) / (t - s)) for (s, a), (t, b) in itertools.pairwise(knots))
     bound = (2 + per_us) * slow.starts + len(slow.robots) + 2 * per_us
     for i, robot in enumerate(slow.robots):
-        ours = fates(fleet.senders, i)["crossed_us"]
+        ours = log(fleet.senders, i)["transmitted_us"]
         # By position, not by time: an outage stretches the last byte to any length.
-        for k in ours.keys() & robot.crossed.keys():
-            assert abs(slow.link.bytes_by(ours[k]) - slow.link.bytes_by(robot.crossed[k])) <= bound
-        assert len(ours.keys() ^ robot.crossed.keys()) <= 1  # the last one may miss the end of a link that stops
+        for k in ours.keys() & robot.transmitted.keys():
+            assert abs(slow.link.bytes_by(ours[k]) - slow.link.bytes_by(robot.transmitted[k])) <= bound
+        assert len(ours.keys() ^ robot.transmitted.keys()) <= 1  # the last one may miss the end of a link that stops
         assert order(fleet.senders, i) == sorted(ours)
 
 
@@ -275,8 +282,8 @@ def test_what_each_robot_sees_of_its_message_is_the_twins(drawn):
         twins = robot.policy.noted
         for k, (mine, its) in enumerate(zip(seen[i], twins, strict=True)):
             now = int(episode.arrivals[i]["arrival_us"][k])
-            taken = [seq for seq, us in robot.taken.items() if us == now]
-            whole = max((int(episode.arrivals[i]["size_bytes"][seq]) for seq in taken), default=-1)
+            dequeued = [seq for seq, us in robot.dequeued.items() if us == now]
+            whole = max((int(episode.arrivals[i]["size_bytes"][seq]) for seq in dequeued), default=-1)
             assert mine in (its, whole)
 
 
@@ -328,12 +335,12 @@ def test_cells_of_a_batch_know_nothing_of_each_other():
     for c, episode in enumerate(episodes):
         alone = run_fleet(policies.get("afr"), [episode], 4, made.value)
         for i, row in enumerate(both.rows(c)):
-            assert fates(both.senders, row) == fates(alone.senders, i)
+            assert log(both.senders, row) == log(alone.senders, i)
     # and a fleet can be loaded again
     for c, episode in enumerate(reversed(episodes)):
         both.load(c, episode)
     both.run(policies.get("afr"))
-    assert fates(both.senders, 0) == fates(run_fleet(policies.get("afr"), episodes[1:], 4, made.value).senders, 0)
+    assert log(both.senders, 0) == log(run_fleet(policies.get("afr"), episodes[1:], 4, made.value).senders, 0)
 
 
 def test_policies_remember_each_robot_for_itself():
@@ -341,7 +348,7 @@ def test_policies_remember_each_robot_for_itself():
     made, (episode, _) = drawn_episodes(2, size_bytes=900_000)
     twins = FleetEpisode((episode.arrivals[0], episode.arrivals[0], episode.arrivals[1]), episode.link)
     fleet = run_fleet(policies.get("afr"), [twins], 4, made.value)
-    assert fates(fleet.senders, 0) == fates(fleet.senders, 1) != fates(fleet.senders, 2)
+    assert log(fleet.senders, 0) == log(fleet.senders, 1) != log(fleet.senders, 2)
 
 
 # --- scenarios -------------------------------------------------------------------------------------------------------
@@ -371,9 +378,11 @@ def test_cameras_tick_together_and_each_robot_moves_for_itself():
     assert all((np.asarray(a) == np.asarray(b)).all() for a, b in zip(again.arrivals, episode.arrivals, strict=True))
     late = FleetEpisode((first, messages(first["arrival_us"] + 1, 10)), episode.link)
     assert not late.ticks_together
-    lucky = episode.with_luck(np.random.default_rng(0))
-    assert lucky.arrivals[0]["luck"].tolist() != lucky.arrivals[1]["luck"].tolist()
-    assert not first["luck"].any()
+    episode_with_uniforms = episode.with_uniforms(np.random.default_rng(0))
+    assert (
+        episode_with_uniforms.arrivals[0]["uniform"].tolist() != episode_with_uniforms.arrivals[1]["uniform"].tolist()
+    )
+    assert not first["uniform"].any()
 
 
 def test_the_cell_grows_with_the_robots():
@@ -402,7 +411,7 @@ def test_the_cell_grows_with_the_robots():
         (lambda: run_fleet(ACCEPTS, [], 2, V), "no episode"),
         (lambda: Fleet(Senders(3, 2, V, max_messages=1), 2), "multiple of that many senders"),
         (lambda: Fleet(Senders(2, 2, V, max_messages=9), 2).load(0, FleetScenario(3).draw(Streams.seeded(0))), "has 2"),
-        (lambda: run_fleet(policies.Policy("p", accept, foresee=lambda *_: 0), [_short()], 2, V), "link of its own"),
+        (lambda: run_fleet(policies.Policy("p", accept, privileged=lambda *_: 0), [_short()], 2, V), "link of its own"),
     ],
 )
 def test_bad_input_is_told_apart(build, complaint):

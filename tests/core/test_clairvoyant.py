@@ -11,14 +11,15 @@ from cases import VALUES, Case, cases, trace, traces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bufgym import policies, qoi, scenario
+from bufgym import policies, scenario
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
-from bufgym.link import Link
-from bufgym.metrics import outcome
+from bufgym.model import qoi
+from bufgym.model.link import Link
 from bufgym.oracle import clairvoyant, integer, labels
 from bufgym.scenario import Episode, Interruption, messages
-from bufgym.sender import run
+from bufgym.sim import run
+from bufgym.sim.metrics import outcome
 
 V = qoi.exponential(0.5)
 EXACT = 1e-9
@@ -114,7 +115,7 @@ def small(draw: st.DrawFn, equal: bool, windows: bool = False) -> Case:
     episode = Episode(messages(us, size, x), Link(trace(knots, after), int(rng.integers(0, 3 * knots[-1][0]))))
     if windows:
         episode = replace(episode, first_decision=int(rng.integers(0, 3)), last_decision=int(rng.integers(0, n + 1)))
-    twins = [{"seq": k, "us": int(us[k]), "bytes": int(size[k]), "x": float(x[k]), "luck": 0.0} for k in range(n)]
+    twins = [{"seq": k, "us": int(us[k]), "bytes": int(size[k]), "x": float(x[k]), "uniform": 0.0} for k in range(n)]
     max_bytes = draw(st.sampled_from([None, None, unit, 2 * unit, 7 * unit, 3 * unit - 1]))
     decide_at = draw(st.sampled_from(["arrival", "overflow"])) if windows else "arrival"
     return Case(episode, twins, knots, draw(st.integers(1, 3)), max_bytes or None, decide_at)
@@ -218,7 +219,7 @@ def test_no_policy_beats_it(case, v):
 def test_no_policy_beats_it_over_lte(cv):
     lte = scenario.get("lte", duration_s=8.0, size_bytes=500_000, size_cv=cv)
     streams = scenario.Streams.seeded(7)
-    episodes = [lte.draw(streams).with_luck(streams.policy) for _ in range(4)]
+    episodes = [lte.draw(streams).with_uniforms(streams.policy) for _ in range(4)]
     plans = [clairvoyant(episode, 8, lte.value) for episode in episodes]
     # The link is too slow for all, so that there is something to decide.
     assert any(not plan.kept.all() for plan in plans)

@@ -12,10 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym import qoi, scenario, traces
+from bufgym import scenario, traces
 from bufgym.errors import BufgymError
+from bufgym.model import qoi
+from bufgym.model.topics import Topic
 from bufgym.scenario import Client, Stream, Streams, read_client, robofleet_example
-from bufgym.topics import Topic
 
 LINK = traces.Trace.constant(1e6, 60.0, name="1 MB/s")
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "client.toml"
@@ -41,7 +42,7 @@ def test_streams_are_merged_in_order_of_time() -> None:
     assert got["size_bytes"].tolist() == [100, 7, 100, 100, 7, 100]
     assert got["x"].tolist() == [0, 0, 1, 2, 1, 3]  # in periods of the own rate
     assert got["seq"].tolist() == list(range(6))
-    assert (episode.window, episode.pong_us, episode.link.propagation_us) == (3, 40_000, 20_000)
+    assert (episode.window, episode.ack_delay_us, episode.link.propagation_us) == (3, 40_000, 20_000)
 
 
 def test_where_there_is_a_rate_limit_x_counts_its_periods() -> None:
@@ -117,8 +118,8 @@ def test_links_and_arrivals_have_chances_of_their_own() -> None:
 
 
 def test_a_round_trip_of_its_own() -> None:
-    assert client(propagation_us=7).pong_us == 14
-    assert client(propagation_us=7, round_trip_us=0).draw(Streams.seeded(0)).pong_us == 0
+    assert client(propagation_us=7).ack_delay_us == 14
+    assert client(propagation_us=7, round_trip_us=0).draw(Streams.seeded(0)).ack_delay_us == 0
 
 
 def test_the_scenario_topics_is_the_example() -> None:
@@ -138,7 +139,7 @@ def test_the_example_file_is_robofleets_example() -> None:
         assert ours.value is not None and theirs.topic.value is not None
         assert ours.value.array.tolist() == theirs.topic.value.array.tolist()
     default = Client(robofleet_example(), **WORLD)
-    for name in ("window", "propagation_us", "pong_us", "consumers", "duration_s", "value", "scale"):
+    for name in ("window", "propagation_us", "ack_delay_us", "consumers", "duration_s", "value", "scale"):
         assert getattr(read, name) == getattr(default, name), name
 
 
@@ -162,7 +163,7 @@ def test_a_file_may_say_all_that_a_topic_takes(tmp_path: Path) -> None:
     made = read(tmp_path, f"window = 5\nround_trip_us = 9\nconsumers = 2\nduration_s = 3\n{A}{rest}", **WORLD)
     topic = Topic("a", 3, 1.5, limit=4, weight=0, deadline_s=0.2, value=qoi.saturating(4))
     assert made.streams == (Stream(topic, 2, 100, jitter=0.5, size_cv=0.25, moves=True, encodings={"ros": 50}),)
-    assert (made.window, made.pong_us, made.consumers, made.duration_s) == (5, 9, 2, 3)
+    assert (made.window, made.ack_delay_us, made.consumers, made.duration_s) == (5, 9, 2, 3)
 
 
 @pytest.mark.parametrize(

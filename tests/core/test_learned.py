@@ -9,28 +9,29 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from cases import VALUES, cases, fates, same
+from cases import VALUES, cases, log, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bufgym import policies, qoi
+from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
-from bufgym.buffer import ACCEPT, REJECT
 from bufgym.cli import export as command
 from bufgym.cli.options import Parser
 from bufgym.envs import SenderVectorEnv
 from bufgym.envs.rows import decision_of
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
-from bufgym.metrics import outcome
+from bufgym.model import qoi
+from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS, observe_context, observe_slots
 from bufgym.policies import learned
 from bufgym.policies import weights as weights_file
 from bufgym.policies.learned import NAMES, Network, Weights
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Interruption
-from bufgym.sender import named, python_view, run
+from bufgym.sim import named, python_view, run
+from bufgym.sim.metrics import outcome
 
 V = qoi.exponential(0.618)
 SLOT_NAMES = [field.name for field in SLOT_FIELDS]
@@ -81,7 +82,7 @@ def twin(whole):
     """A policy that decides by these weights: every candidate is scored, the best is searched for afterwards."""
 
     def on_arrival(buffer, arrival, memory):
-        made = whole.still if whole.still is not None and buffer.drain < 0.07 else whole
+        made = whole.still if whole.still is not None and buffer.service_ratio < 0.07 else whole
         s, L = len(buffer.slots), buffer.capacity
         slots, context = np.zeros((len(SLOT_NAMES), L + 1)), np.zeros(len(CONTEXT_NAMES))
         observe_slots(buffer, arrival, slots)
@@ -123,7 +124,7 @@ def test_decides_as_its_twin_compiled_and_not(case, v, made, capacity):
     assert same(ours, case.run(twin(made), v))
     assert same(ours, case.run(replace(policy, compile=False), v))
     if case.episode.first_decision == 0 and case.episode.last_decision > len(case.twin_messages):
-        assert int(ours.batch.senders["impossible"][0]) == 0
+        assert int(ours.batch.senders["invalid"][0]) == 0
 
 
 def test_the_twin_counts_as_one_does_by_hand():
@@ -150,7 +151,7 @@ def start(fields, seen):
 @pytest.mark.parametrize(("field", "fixed"), [("motion_merged", "min-motion-gap"), ("time_merged", "min-gap")])
 @given(case=cases(max_bytes=False, max_messages=80), v=VALUES)
 def test_a_linear_scorer_of_merged_gaps_is_the_fixed_policy(field, fixed, case, v):
-    linear = start(("rank", field, "drain"), field)
+    linear = start(("rank", field, "service_ratio"), field)
     assert same(case.run(linear, v), case.run(policies.get(fixed), v))
 
 
@@ -173,8 +174,8 @@ def test_one_set_of_weights_serves_every_capacity():
     episode = Interruption(t_max=100).episode(100)
     for L in (1, 2, 8, 40):
         ours, fixed = (run(each, [episode], L, V) for each in (policy, policies.get("min-motion-gap")))
-        assert fates(ours) == fates(fixed)
-        assert len(fates(ours)["dropped_us"]) == 100 - L
+        assert log(ours) == log(fixed)
+        assert len(log(ours)["dropped_us"]) == 100 - L
 
 
 def test_bytes_that_fit_exactly_are_room():
@@ -183,9 +184,9 @@ def test_bytes_that_fit_exactly_are_room():
     (size,) = set(episode.arrivals["size_bytes"].tolist())
     senders = run(start(("time_merged",), "time_merged"), [episode], 8, V, max_bytes=3 * size)
     (sender,) = senders.batch.senders
-    assert (sender["peak_backlog_bytes"], sender["impossible"]) == (3 * size, 0)
+    assert (sender["peak_backlog_bytes"], sender["invalid"]) == (3 * size, 0)
     assert sender["evicted"] > 0
-    assert len(fates(senders)["dropped_us"]) == 10 - 3
+    assert len(log(senders)["dropped_us"]) == 10 - 3
 
 
 # --- from a trained agent --------------------------------------------------------------------------------------------
@@ -210,8 +211,8 @@ def untrained(tmp_path, network="slots"):
     import torch
     from sb3_contrib import MaskablePPO
 
-    from agents.network import policy_of
     from bufgym.sb3 import make_vec_env
+    from bufgym.sb3.networks import policy_of
 
     env = make_vec_env("bufgym/Uplink-v0", 2, scenario=WORLD, capacity=CAPACITY, decide_at="arrival")
     policy, its_settings = policy_of(network, WIDTH)
@@ -238,7 +239,7 @@ def test_an_exported_agent_decides_as_it_did(tmp_path):
     envs = SenderVectorEnv(len(episodes), WORLD, L, decide_at="arrival")
     envs.reset(options={"episodes": episodes})
     rows, memory = envs.rows, policy.new_memory(1, L)[0]
-    met, differ, taken = 0, 0, set()
+    met, differ, dequeued = 0, 0, set()
     while not rows.shown.ended.all():
         observation = rows.observation(rows.shown.slots, rows.shown.context)
         actions, _ = model.predict(observation, deterministic=True, action_masks=rows.shown.mask)
@@ -247,10 +248,10 @@ def test_an_exported_agent_decides_as_it_did(tmp_path):
             arrival = batch.arrivals[i, batch.senders[i].next]
             decision = policy.on_arrival(python_view(batch, i), arrival, memory)
             met, differ = met + 1, differ + (decision != decision_of(actions[i], L))
-            taken.add(decision)
+            dequeued.add(decision)
         rows.step(np.asarray(actions, np.int64))
     assert met > 3_000
-    assert len(taken) >= 4  # not one answer to everything
+    assert len(dequeued) >= 4  # not one answer to everything
     assert differ <= 0.001 * met
 
     by_agent = run_agent(model, episodes, WORLD, L, "arrival")

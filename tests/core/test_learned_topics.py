@@ -9,18 +9,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import VALUES, cases, fates, order, same
+from cases import VALUES, cases, log, order, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load as tensors_of
 from safetensors.numpy import save as safetensors
 from topic_cases import topic_cases
 
-from bufgym import policies, qoi
-from bufgym.buffer import ACCEPT, HOLD, REJECT
+from bufgym import policies
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
-from bufgym.link import Link
+from bufgym.model import qoi
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT
+from bufgym.model.link import Link
+from bufgym.model.topics import Topic
 from bufgym.observe import (
     CONTEXT_FIELDS,
     SLOT_FIELDS,
@@ -34,8 +36,7 @@ from bufgym.policies.learned import Network, Weights
 from bufgym.policies.learned_topics import NAMES, TopicWeights
 from bufgym.policies.registry import Client, Policy
 from bufgym.scenario import Episode, messages
-from bufgym.sender import run
-from bufgym.topics import Topic
+from bufgym.sim import run
 from bufgym.traces import Trace
 
 V = qoi.exponential(0.618)
@@ -143,7 +144,7 @@ def test_decides_as_its_twin_compiled_and_not(case, whole, capacity):
     assert same(ours, played(case, twin(whole)))
     assert same(ours, played(case, replace(policy, compile=False)))
     if case.case.episode.first_decision == 0 and case.case.episode.last_decision > 10**6:
-        assert int(ours.batch.senders["impossible"][0]) == 0
+        assert int(ours.batch.senders["invalid"][0]) == 0
 
 
 @given(topic_cases(min_topics=2), schedulers())
@@ -206,7 +207,7 @@ def test_sends_and_drops_by_hand():
     senders = run(policy, [ten_messages()], 4, V, topics=HIGH_AND_LOW)
     # 5 (kept) drives out 3 (low); 6 (low) is rejected; 7 (high) and 8 (kept) drive out 1 and 4, the oldest high ones;
     # 9 (low) is rejected. Queued are 2 5 7 8: the no_drop ones go first.
-    assert sorted(fates(senders)["dropped_us"].items()) == [(1, 70), (3, 50), (4, 80), (6, 60), (9, 90)]
+    assert sorted(log(senders)["dropped_us"].items()) == [(1, 70), (3, 50), (4, 80), (6, 60), (9, 90)]
     assert order(senders) == [0, 2, 5, 8, 7]
     # By the lowest priority sent: 8, and 7 last.
     other = linear(drop_priority=-1, drop_rank=-0.01, send_priority=-1)
@@ -218,12 +219,12 @@ def test_one_set_of_weights_serves_every_capacity():
     for L in (1, 2, 9, 40):
         senders = run(policy, [ten_messages()], L, V, topics=HIGH_AND_LOW)
         assert len(order(senders)) == min(10, L + 1)
-        assert senders.batch.senders["impossible"][0] == 0
+        assert senders.batch.senders["invalid"][0] == 0
 
 
 # --- files -----------------------------------------------------------------------------------------------------------
 
-FIELDS = ("waited", "drain", "gain")
+FIELDS = ("waited", "service_ratio", "gain")
 ABOUT = {"name": "small", "about": "Sends something.", "seeds": [3]}
 
 
@@ -335,10 +336,10 @@ def test_tensors_that_break_a_rule_are_refused(path, parts, name, tensor, rule):
 @pytest.mark.parametrize(
     ("key", "value", "rule"),
     [
-        ("fields", ["waited", "drain", "speed"], "field = speed: unknown; known: occupied"),
-        ("fields", ["waited", "drain", "drain"], "field = drain: given more than once"),
-        ("fields", ["waited", "drain"], "must be [2] for 2 fields"),
-        ("fields", ["drain", "waited", "gain"], "the file was changed"),
+        ("fields", ["waited", "service_ratio", "speed"], "field = speed: unknown; known: occupied"),
+        ("fields", ["waited", "service_ratio", "service_ratio"], "field = drain: given more than once"),
+        ("fields", ["waited", "service_ratio"], "must be [2] for 2 fields"),
+        ("fields", ["service_ratio", "waited", "gain"], "the file was changed"),
         ("fields", [], "must be a list of at least one field"),
         ("observation", weights.observation_hash(), "trained on other observations than this bufgym's"),
         ("format", 2, "this bufgym reads format 1"),
@@ -360,7 +361,7 @@ def test_a_policy_for_one_queue_may_not_read_what_only_topics_have(path):
     nets = [network(np.random.default_rng(0), 1, 0) for _ in range(2)]
     with pytest.raises(BufgymError, match="field = waited: unknown"):
         weights.save(path, Weights(("waited",), *nets), ABOUT)
-    weights.save(path, Weights(("drain",), *nets), ABOUT)
+    weights.save(path, Weights(("service_ratio",), *nets), ABOUT)
     assert isinstance(weights.read_any(path)[0], Weights)
     assert not policies.load(path).schedules
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym.errors import BufgymError
-from bufgym.link import FOREVER, Knots, Link, position_at, segment, time_of
+from bufgym.model.link import FOREVER, Knots, Link, position_at, segment, time_of
 
 # 1000 bytes in the first 10 ms, nothing for 10 ms, then 3000 bytes in 10 ms: 0.1, 0 and 0.3 bytes a microsecond.
 KNOTS = [(0, 0), (10_000, 1_000), (20_000, 1_000), (30_000, 4_000)]

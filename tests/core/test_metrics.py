@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from cases import trace
 
-from bufgym import policies, qoi
-from bufgym.link import Link
-from bufgym.metrics import METRICS, ages_s, outcome, received
+from bufgym import policies
+from bufgym.model import qoi
+from bufgym.model.link import Link
 from bufgym.scenario import Episode, messages
-from bufgym.sender import run
+from bufgym.sim import run
+from bufgym.sim.metrics import METRICS, ages_s, outcome, received
 
 S = 1_000_000
 
@@ -49,7 +50,7 @@ def queue_of_two():
 def test_outcome():
     result = outcome(queue_of_two(), 0)
     assert (result.arrived, result.delivered, result.dropped) == (4, 3, 1)
-    assert (result.in_transmission, result.buffered, result.impossible) == (0, 0, 0)
+    assert (result.in_transmission, result.buffered, result.invalid) == (0, 0, 0)
     assert result.qoi == 1 + 2 / 8 + 2 / 8
     assert result.longest_gap == 2
     assert result.longest_gap_s == 0.6

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from topic_cases import TWIN_V, TopicCase, choice, decision, topic_cases, unwanted
 
-from bufgym.buffer import UNLIMITED_BYTES
 from bufgym.kernel import JIT
+from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.observe import (
     CONTEXT_FIELDS,
     FIELDS,
@@ -19,7 +19,7 @@ from bufgym.observe import (
     observe_topic_context,
     observe_topic_slots,
 )
-from bufgym.sender import (
+from bufgym.sim import (
     DECISION,
     DEPARTURE,
     DEQUEUE,
@@ -149,7 +149,7 @@ class Twin:
             "left": buffer.left_fraction,
             "stalled": per(buffer.stalled_us, (self.L + 1) * buffer.period_us),
             "departures": per(buffer.departures, 1),
-            "drain": per(buffer.drain, 1),
+            "service_ratio": per(buffer.service_ratio, 1),
             "socket_asks": float(m is None),
             "in_flight": per(len(s.in_flight), self.case.case.episode.window),
         }
@@ -214,10 +214,10 @@ def test_every_field_is_its_twins(case):
                 assert ((found >= 0) & (found <= 1)).all(), name
         answer = None
         if event == DECISION:
-            answer = decision(seen.arrivals[0, sender.next].luck, L)
+            answer = decision(seen.arrivals[0, sender.next].uniform, L)
             decide(batch, 0, answer)
         elif event == SEND:
-            answer = choice(twin.now, len(twin.slots()), len(twin.taken), L)
+            answer = choice(twin.now, len(twin.slots()), len(twin.dequeued), L)
             answer_send(batch, 0, answer)
         elif event == DEQUEUE:
             answer = unwanted(twin.now, len(twin.slots()))

@@ -14,16 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import bufgym.envs  # noqa: F401  (registers)
-from bufgym import policies, qoi
+from bufgym import policies
 from bufgym.benchmark.play import Player
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
-from bufgym.link import Link
+from bufgym.model import qoi
+from bufgym.model.link import Link
 from bufgym.oracle import integer
 from bufgym.oracle.online import OnlineOptimum, law, online_optimum
 from bufgym.policies import ACCEPT, REJECT, Policy
 from bufgym.scenario import Episode, Interruption, messages
-from bufgym.sender import run
+from bufgym.sim import run
 from bufgym.traces import Trace
 
 V = qoi.exponential(0.618)
@@ -41,7 +42,7 @@ def means(policy: Policy, L: int, probabilities: np.ndarray, v: qoi.Value = V) -
     """
     scenario = Interruption(t_max=len(probabilities) - 1)
     lengths = np.flatnonzero(probabilities)
-    episodes = [scenario.episode(int(T)).with_luck(np.random.default_rng(7)) for T in lengths]
+    episodes = [scenario.episode(int(T)).with_uniforms(np.random.default_rng(7)) for T in lengths]
     gained = np.asarray(run(policy, episodes, L, v).batch.senders["delivered_gain"])
     best = np.array([integer(L, int(T), v) for T in lengths])
     p = probabilities[lengths]
@@ -239,7 +240,7 @@ def test_what_the_table_lacks_is_left_to_min_gap(made):
     at_once = Episode(messages(np.zeros(12, np.int64), 10), Link(trace))
     assert same(run(made.policy(), [at_once], 3, V), run(min_gap, [at_once], 3, V))
     pairs = Episode(messages(np.repeat(np.arange(8), 2) * 10_000, 10), Link(trace))
-    assert run(made.policy(), [pairs], 3, V).batch.senders["impossible"][0] == 0
+    assert run(made.policy(), [pairs], 3, V).batch.senders["invalid"][0] == 0
 
 
 def test_decisions(made):
@@ -273,7 +274,7 @@ def test_another_capacity_is_an_error(made):
         ({"probabilities": [0.5, math.nan]}, r"P\(T = 1\) = nan: must be a number >= 0"),
         ({"probabilities": [0.5, 0.25]}, "probabilities add up to 0.75: must add up to 1"),
         ({"probabilities": [0.0, 0.0]}, "probabilities add up to 0: must add up to 1"),
-        ({"v": 0.618}, "v = 0.618: must be a bufgym.qoi Value"),
+        ({"v": 0.618}, "v = 0.618: must be a bufgym.model.qoi Value"),
         ({"objective": "regret"}, "objective = 'regret': must be one of ratio, qoi"),
         # C(31, 3) = 4495 for L = 2, T up to 30.
         ({"max_states": 4494}, "L = 2, T up to 30: 4495 states: max_states = 4494"),

@@ -11,12 +11,13 @@ from cases import VALUES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bufgym import policies, qoi
+from bufgym import policies
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
+from bufgym.model import qoi
 from bufgym.oracle import by_length, ideal, integer
 from bufgym.scenario import Interruption
-from bufgym.sender import run
+from bufgym.sim import run
 
 # The number of examples is set where one of them is hundreds of runs.
 FEW = settings(max_examples=12 if JIT else 3)
@@ -87,7 +88,7 @@ def test_no_policy_beats_it(v):
 
 
 SCENARIO = Interruption(t_max=max(LENGTHS))
-EPISODES = [SCENARIO.episode(T).with_luck(np.random.default_rng(T)) for T in LENGTHS]
+EPISODES = [SCENARIO.episode(T).with_uniforms(np.random.default_rng(T)) for T in LENGTHS]
 
 
 @pytest.mark.parametrize(("L", "T"), [(0, 5), (3, -1)])

@@ -7,22 +7,23 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cases import VALUES, cases, fates, order, same
+from cases import VALUES, cases, log, order, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bufgym import policies, qoi
+from bufgym import policies
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
-from bufgym.link import Link
-from bufgym.metrics import outcome
+from bufgym.model import qoi
+from bufgym.model.link import Link
 from bufgym.policies import ACCEPT, REJECT, afr, register, registry
 from bufgym.scenario import Episode, Interruption, Streams, Uplink, messages
-from bufgym.sender import Senders, run
+from bufgym.sim import Senders, run
+from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
 
 V = qoi.exponential(0.618)
-ALL = tuple(name for name in policies.names() if policies.get(name).foresee is None)
+ALL = tuple(name for name in policies.names() if policies.get(name).privileged is None)
 BUILT_IN = [
     "afr",
     "afr-paper",
@@ -62,15 +63,15 @@ BUILT_IN = [
 ]
 
 
-def interruption(name, L, T, luck=0):
+def interruption(name, L, T, uniform=0):
     """One run through an interruption of T messages."""
-    episode = Interruption(t_max=T).episode(T).with_luck(np.random.default_rng(luck))
+    episode = Interruption(t_max=T).episode(T).with_uniforms(np.random.default_rng(uniform))
     return run(policies.get(name), [episode], L, V)
 
 
 def drops(senders, period_us=33_333):
     """[(arrival at which it happened, message dropped)], in that order."""
-    return sorted((us // period_us, seq) for seq, us in fates(senders)["dropped_us"].items())
+    return sorted((us // period_us, seq) for seq, us in log(senders)["dropped_us"].items())
 
 
 def kept(senders):
@@ -104,7 +105,7 @@ def test_every_decision_is_possible_and_repeatable(name, case, v):
     senders = case.run(policy, v)
     # Outside the arrivals that ask, a full queue rejects without being asked: those are not the policy's.
     if case.episode.first_decision == 0 and case.episode.last_decision > len(case.twin_messages):
-        assert outcome(senders, 0).impossible == 0
+        assert outcome(senders, 0).invalid == 0
     assert same(senders, case.run(policy, v))
 
 
@@ -199,8 +200,8 @@ def share_kept(name):
     """How often each of messages 1..T is kept, over many runs."""
     rng = np.random.default_rng(7)
     episode = Interruption(t_max=T).episode(T)
-    senders = run(policies.get(name), [episode.with_luck(rng) for _ in range(RUNS)], L, V)
-    return (np.asarray(senders.batch.fates)["crossed_us"] >= 0)[:, 1 : T + 1].mean(0)
+    senders = run(policies.get(name), [episode.with_uniforms(rng) for _ in range(RUNS)], L, V)
+    return (np.asarray(senders.batch.log)["transmitted_us"] >= 0)[:, 1 : T + 1].mean(0)
 
 
 def test_random_is_equation_9():
@@ -218,15 +219,15 @@ def test_reservoir_is_uniform():
 
 def test_reservoir_is_uniform_when_asked_at_overflow_only():
     rng = np.random.default_rng(8)
-    episodes = [Interruption(t_max=T).episode(T).with_luck(rng) for _ in range(RUNS)]
+    episodes = [Interruption(t_max=T).episode(T).with_uniforms(rng) for _ in range(RUNS)]
     senders = run(policies.get("reservoir"), episodes, L, V, decide_at="overflow")
-    share = (np.asarray(senders.batch.fates)["crossed_us"] >= 0)[:, 1 : T + 1].mean(0)
+    share = (np.asarray(senders.batch.log)["transmitted_us"] >= 0)[:, 1 : T + 1].mean(0)
     assert np.abs(share - L / T).max() < 4.5 * np.sqrt(L / T * (1 - L / T) / RUNS)
 
 
 def test_luck_decides_and_nothing_else():
-    assert drops(interruption("random", 3, 40, luck=1)) == drops(interruption("random", 3, 40, luck=1))
-    assert drops(interruption("random", 3, 40, luck=1)) != drops(interruption("random", 3, 40, luck=2))
+    assert drops(interruption("random", 3, 40, uniform=1)) == drops(interruption("random", 3, 40, uniform=1))
+    assert drops(interruption("random", 3, 40, uniform=1)) != drops(interruption("random", 3, 40, uniform=2))
 
 
 # --- the others ------------------------------------------------------------------------------------------------------
@@ -375,7 +376,7 @@ def test_policies_meet_the_same_episodes(seed):
     scenario = Uplink(traces=(link,), size_cv=0.4, duration_s=4)
     for name in ALL:
         streams = Streams.seeded(seed)
-        episodes = [scenario.draw(streams).with_luck(streams.policy) for _ in range(3)]
+        episodes = [scenario.draw(streams).with_uniforms(streams.policy) for _ in range(3)]
         senders = run(policies.get(name), episodes, 5, V)
         if name == ALL[0]:
             reference = episodes
@@ -395,4 +396,4 @@ def test_decimate_keeps_one_in_every(every: float, kept: list[int]) -> None:
     episode = Episode(arrivals, Link(Trace.constant(1e6, 20)))
     senders = run(policies.get(f"decimate:every={every}"), [episode], 4, qoi.exponential())
     assert senders.batch.order[0, : len(kept)].tolist() == kept
-    assert int(senders.batch.senders["crossed"][0]) == len(kept)
+    assert int(senders.batch.senders["transmitted"][0]) == len(kept)

@@ -7,17 +7,18 @@ from types import SimpleNamespace
 import naive
 import numpy as np
 import pytest
-from cases import VALUES, cases, fates, order, same
+from cases import VALUES, cases, log, order, same
 from hypothesis import given, settings
 
-from bufgym import policies, qoi
+from bufgym import policies
 from bufgym.kernel import JIT
-from bufgym.link import Link
-from bufgym.metrics import outcome
+from bufgym.model import qoi
+from bufgym.model.link import Link
 from bufgym.policies import ACCEPT, REJECT
 from bufgym.policies.checkpointing import growing_gap, site
 from bufgym.scenario import Episode, Interruption, messages
-from bufgym.sender import run
+from bufgym.sim import run
+from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
 
 V = qoi.exponential(0.618)
@@ -44,7 +45,7 @@ SETTINGS = [
 @settings(max_examples=50 if JIT else 5)
 def test_agrees_with_twin(spec, case, v):
     ours, twin = case.run(policies.get(spec), v), case.run_twin(naive.policy(spec, v))
-    assert fates(ours) == {"taken_us": twin.taken, "crossed_us": twin.crossed, "dropped_us": twin.dropped}
+    assert log(ours) == {"dequeued_us": twin.dequeued, "transmitted_us": twin.transmitted, "dropped_us": twin.dropped}
 
 
 def interruption(spec, L, T):
@@ -162,8 +163,8 @@ def test_other_names_for_the_same(name, twin, case, v):
 def test_lifespan():
     # 30 frames/s, a frame takes 100 ms: a queue of 30 would be 3 s old. Nothing that is sent has waited over 0.5 s.
     def longest_wait_us(name):
-        taken = fates(stream(name, 300, 33_333, 30, size_bytes=100_000))["taken_us"]
-        return max(us - k * 33_333 for k, us in taken.items())
+        dequeued = log(stream(name, 300, 33_333, 30, size_bytes=100_000))["dequeued_us"]
+        return max(us - k * 33_333 for k, us in dequeued.items())
 
     assert 0.5e6 - 33_333 <= longest_wait_us("lifespan") <= 0.5e6
     assert longest_wait_us("drop-oldest") > 2.5e6
@@ -172,7 +173,7 @@ def test_lifespan():
         arrivals = messages(np.array([0, 0]), 500_000)  # the second waits until the first has crossed, at 0.5 s
         episode = Episode(arrivals, Link(Trace.constant(1e6, 20)))
         result = run(policies.get(f"lifespan:lifespan_s={lifespan_s}"), [episode], 4, V)
-        assert len(fates(result)["dropped_us"]) == dropped
+        assert len(log(result)["dropped_us"]) == dropped
 
 
 def test_time_filter():
@@ -192,8 +193,8 @@ def test_foxglove_backlog():
     # reach 10.2 MB. With 0.4 MB: 1 + 23 make 9.6, the 25th would reach 10.0 exactly: dropped.
     for size_bytes, kept in ((300_000, 33), (400_000, 24)):
         senders = stream("foxglove-backlog", 60, 1, 100, size_bytes=size_bytes, bytes_per_s=1.0)
-        assert len(fates(senders)["dropped_us"]) == 60 - kept
-    assert len(fates(stream("foxglove-backlog", 60, 1, 8, bytes_per_s=1.0))["dropped_us"]) == 60 - 9  # L
+        assert len(log(senders)["dropped_us"]) == 60 - kept
+    assert len(log(stream("foxglove-backlog", 60, 1, 8, bytes_per_s=1.0))["dropped_us"]) == 60 - 9  # L
 
 
 def test_rosbridge_drops_nothing():
@@ -209,7 +210,7 @@ def test_codel_drops_ever_faster():
     # Two messages arrive for each that leaves: the one taken at k ms is k/2 ms old. At 10 ms that is the target of 5;
     # an interval later, at 110 ms, the first is dropped; from there on the gaps are 100 ms / sqrt(count).
     senders = stream("codel", 1_000, 500, 1_000)
-    times_ms = sorted(us / MS for us in fates(senders)["dropped_us"].values())[:8]
+    times_ms = sorted(us / MS for us in log(senders)["dropped_us"].values())[:8]
     exact = 110 + np.cumsum([0, *(100 / np.sqrt(np.arange(1, 8)))])
     assert exact[:5] == pytest.approx([110, 210, 280.7, 338.4, 388.4], abs=0.05)
     assert times_ms == np.ceil(exact).tolist()  # the socket takes a message each ms
@@ -220,7 +221,7 @@ def test_codel_leaves_a_good_queue_alone():
     # however old they are: a message of 100 ms is never over target when one waits behind it at most.
     arrivals = messages(np.repeat(np.arange(100) * 10 * MS, 4), 1_000)
     episode = Episode(arrivals, Link(Trace.constant(1e6, 20)))
-    assert fates(run(policies.get("codel"), [episode], 8, V))["dropped_us"] == {}
+    assert log(run(policies.get("codel"), [episode], 8, V))["dropped_us"] == {}
     slow = stream("codel", 100, 100 * MS, 2, size_bytes=150_000)
     assert int(slow.batch.senders["rejected"][0]) > 0
     assert int(slow.batch.senders["evicted"][0]) == 0
@@ -230,15 +231,19 @@ def test_red_drops_with_p_over_1_minus_count_p():
     # Half full, between 1/4 and 3/4: p_b = 0.1 x 1/2 = 0.05. Then 0.05 / (1 - 0.05 count): uniform over 20 arrivals.
     red, memory = policies.get("red").on_arrival, policies.get("red").new_memory()[0]
     memory[3], half = 1.0, SimpleNamespace(capacity=8, slots=[None] * 4)  # weight 1: the average is the occupancy
-    unlucky, lucky = SimpleNamespace(luck=0.0), SimpleNamespace(luck=1 - 1e-9)
+    unlucky, episode_with_uniforms = SimpleNamespace(uniform=0.0), SimpleNamespace(uniform=1 - 1e-9)
     for count in range(19):
         p = 0.05 / (1 - 0.05 * count)
-        for luck, decision in ((p - 1e-9, REJECT), (p + 1e-9, ACCEPT)):
-            assert red(half, SimpleNamespace(luck=luck), memory.copy()) == decision
-        assert red(half, lucky, memory) == ACCEPT
-    assert red(half, lucky, memory) == REJECT  # the 20th in any case
+        for uniform, decision in ((p - 1e-9, REJECT), (p + 1e-9, ACCEPT)):
+            assert red(half, SimpleNamespace(uniform=uniform), memory.copy()) == decision
+        assert red(half, episode_with_uniforms, memory) == ACCEPT
+    assert red(half, episode_with_uniforms, memory) == REJECT  # the 20th in any case
     # Below 1/4 none, from 3/4 on all.
-    for s, arrival, decision in ((1, unlucky, ACCEPT), (6, lucky, REJECT), (8, lucky, REJECT)):
+    for s, arrival, decision in (
+        (1, unlucky, ACCEPT),
+        (6, episode_with_uniforms, REJECT),
+        (8, episode_with_uniforms, REJECT),
+    ):
         assert red(SimpleNamespace(capacity=8, slots=[None] * s), arrival, memory.copy()) == decision
 
 
@@ -247,7 +252,7 @@ def test_red_averages():
     red, memory = policies.get("red").on_arrival, policies.get("red").new_memory()[0]
     seen = []
     for _ in range(4):
-        red(SimpleNamespace(capacity=8, slots=[None] * 4), SimpleNamespace(luck=0.9), memory)
+        red(SimpleNamespace(capacity=8, slots=[None] * 4), SimpleNamespace(uniform=0.9), memory)
         seen.append((memory[4], memory[5]))
     assert seen == [
         (pytest.approx(average), count) for average, count in ((0.8, -1), (1.44, -1), (1.952, -1), (2.3616, 0))

@@ -11,8 +11,8 @@ from cases import VALUES
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym import qoi
 from bufgym.errors import BufgymError
+from bufgym.model import qoi
 
 NAN, INF = math.nan, math.inf
 

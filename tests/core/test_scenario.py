@@ -8,7 +8,7 @@ from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
-from cases import fates, trace
+from cases import log, trace
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,7 +16,7 @@ from bufgym import policies, scenario
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.scenario import LAWS, SCENARIOS, Interruption, Streams, Uplink, messages
-from bufgym.sender import run
+from bufgym.sim import run
 from bufgym.traces import Motion, Trace
 
 STEADY = trace([(0, 0), (1_000_000, 5_000_000)], "loop")
@@ -68,11 +68,11 @@ def test_an_interruption_is_one(T):
 
     senders = run(policies.Policy("note", note), [made.episode(T)], 50, made.value)
     assert asked == [(k, 1, 230_000) for k in range(1, T + 1)]
-    crossed_us = fates(senders)["crossed_us"]
-    assert len(crossed_us) == T + 2
+    transmitted_us = log(senders)["transmitted_us"]
+    assert len(transmitted_us) == T + 2
     resumes_us = T * 33_333 + 33_333 // 2
-    assert all(resumes_us < crossed_us[k] <= resumes_us + 1 for k in range(T + 1))
-    assert 0 < crossed_us[T + 1] - (T + 1) * 33_333 <= 1
+    assert all(resumes_us < transmitted_us[k] <= resumes_us + 1 for k in range(T + 1))
+    assert 0 < transmitted_us[T + 1] - (T + 1) * 33_333 <= 1
 
 
 def test_lengths_outside():
@@ -166,11 +166,11 @@ def test_streams_are_separate():
 
 def test_luck():
     episode = Interruption().episode(20)
-    lucky, again, other = (episode.with_luck(np.random.default_rng(s)) for s in (1, 1, 2))
-    assert (lucky.arrivals["luck"] == again.arrivals["luck"]).all()
-    assert (lucky.arrivals["luck"] != other.arrivals["luck"]).all()
-    assert (episode.arrivals["luck"] == 0).all()  # the drawn episode itself is shared and stays as it was
-    assert (lucky.arrivals["arrival_us"] == episode.arrivals["arrival_us"]).all()
+    episode_with_uniforms, again, other = (episode.with_uniforms(np.random.default_rng(s)) for s in (1, 1, 2))
+    assert (episode_with_uniforms.arrivals["uniform"] == again.arrivals["uniform"]).all()
+    assert (episode_with_uniforms.arrivals["uniform"] != other.arrivals["uniform"]).all()
+    assert (episode.arrivals["uniform"] == 0).all()  # the drawn episode itself is shared and stays as it was
+    assert (episode_with_uniforms.arrivals["arrival_us"] == episode.arrivals["arrival_us"]).all()
 
 
 # --- errors ----------------------------------------------------------------------------------------------------------
@@ -187,7 +187,7 @@ def test_luck():
         ({"rate_hz": float("nan")}, "rate_hz = nan"),
         ({"rate_hz": "30"}, "rate_hz = '30'"),
         ({"size_bytes": -1}, "size_bytes = -1"),
-        ({"value": 0.618}, "value = 0.618: must be a bufgym.qoi Value"),
+        ({"value": 0.618}, "value = 0.618: must be a bufgym.model.qoi Value"),
     ],
 )
 def test_bad_interruptions(parameters, rule):

@@ -7,30 +7,31 @@ from dataclasses import replace
 import naive_schedulers
 import numpy as np
 import pytest
-from cases import cases, fates, order, same, trace
+from cases import cases, log, order, same, trace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_queues import ACCEPT as ACCEPTED
 from naive_queues import REJECT as REJECTED
 
-from bufgym import files, policies, qoi
-from bufgym.buffer import ACCEPT, HOLD, REJECT
+from bufgym import files, policies
 from bufgym.kernel import JIT
-from bufgym.link import Link
+from bufgym.model import qoi
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT
+from bufgym.model.link import Link
+from bufgym.model.topics import Topic
 from bufgym.policies import registry
 from bufgym.scenario import Episode, messages
-from bufgym.sender import NEVER, Senders, run
-from bufgym.topics import Topic
+from bufgym.sim import NEVER, Senders, run
 
 V = qoi.exponential(0.618)
 MS = 1_000
 NAMES = list(naive_schedulers.TWINS)
-ALL = [name for name in policies.names() if policies.get(name).foresee is None]
+ALL = [name for name in policies.names() if policies.get(name).privileged is None]
 
 A, B, C, N = range(4)
 
 
-def played(name, script, topics, *, capacity=8, blocked_ms=100, window=1, pong_ms=0, max_bytes=None):
+def played(name, script, topics, *, capacity=8, blocked_ms=100, window=1, ack_ms=0, max_bytes=None):
     """``script``: "0 A, 10 B" and so on, ms and topic; 1000 bytes each, or as a third word says.
 
     Nothing crosses for ``blocked_ms``, then 1000 bytes a ms. So message 0, which the socket takes at once, leaves at
@@ -42,21 +43,21 @@ def played(name, script, topics, *, capacity=8, blocked_ms=100, window=1, pong_m
     arrivals["topic"] = ["ABCN".index(line[1]) for line in lines]
     knots = [(0, 0), (blocked_ms * MS, 0)] if blocked_ms else [(0, 0)]
     link = Link(trace([*knots, ((blocked_ms + 1_000) * MS, 1_000 * 1_000)], "hold"))
-    episode = Episode(arrivals, link, window=window, pong_us=pong_ms * MS)
+    episode = Episode(arrivals, link, window=window, ack_delay_us=ack_ms * MS)
     return run(policies.get(name), [episode], capacity, V, topics=topics, max_bytes=max_bytes)
 
 
 def dropped(senders):
     """What was dropped, in that order."""
-    return [seq for _, seq in sorted((us, seq) for seq, us in fates(senders)["dropped_us"].items())]
+    return [seq for _, seq in sorted((us, seq) for seq, us in log(senders)["dropped_us"].items())]
 
 
 def count(senders, what):
     return int(np.asarray(senders.batch.senders)[0][what])
 
 
-def taken_ms(senders):
-    return {seq: us / MS for seq, us in fates(senders)["taken_us"].items()}
+def dequeued_ms(senders):
+    return {seq: us / MS for seq, us in log(senders)["dequeued_us"].items()}
 
 
 def topics(a=1.0, b=2.0, c=3.0, **more):
@@ -74,7 +75,7 @@ def topics(a=1.0, b=2.0, c=3.0, **more):
 def test_fifo_takes_them_as_they_come():
     senders = played("fifo", "0 A, 1 C, 2 B, 3 A, 4 C, 5 N", topics())
     assert order(senders) == [0, 1, 2, 3, 4, 5]
-    assert taken_ms(senders) == {0: 0, 1: 101, 2: 102, 3: 103, 4: 104, 5: 105}
+    assert dequeued_ms(senders) == {0: 0, 1: 101, 2: 102, 3: 103, 4: 104, 5: 105}
 
 
 def test_strict_priority():
@@ -136,7 +137,7 @@ def test_no_drop_makes_its_way(name):
     # A buffer full of N: the next is lost, for nothing can go, and that shows.
     senders = played(name, "0 C, 1 N, 2 N, 3 N", topics(), capacity=2)
     assert dropped(senders) == [3]
-    assert count(senders, "impossible") == 0
+    assert count(senders, "invalid") == 0
 
 
 def test_bytes():
@@ -146,7 +147,7 @@ def test_bytes():
     )
     # 1, 2 and 4 are 2500 bytes: none of them alone makes room for 5.
     assert dropped(senders) == [3, 5]
-    assert count(senders, "impossible") == 0
+    assert count(senders, "invalid") == 0
 
 
 # --- Robofleet -------------------------------------------------------------------------------------------------------
@@ -160,7 +161,7 @@ def test_robofleet_as_published():
     senders = played("robofleet", ROBOFLEET, topics(1, 2))
     assert dropped(senders) == [1]
     assert order(senders) == [0, 4, 5, 3, 2]
-    assert taken_ms(senders) == {0: 0, 4: 101, 5: 102, 3: 103, 2: 104}
+    assert dequeued_ms(senders) == {0: 0, 4: 101, 5: 102, 3: 103, 2: 104}
 
 
 def test_robofleet_as_released():
@@ -169,17 +170,17 @@ def test_robofleet_as_released():
     senders = played("robofleet-released", ROBOFLEET, topics(1, 2))
     assert dropped(senders) == [1]
     assert order(senders) == [0, 4, 5, 2, 3]
-    assert taken_ms(senders) == {0: 0, 4: 101, 5: 101, 2: 103, 3: 104}
+    assert dequeued_ms(senders) == {0: 0, 4: 101, 5: 101, 2: 103, 3: 104}
 
 
 def test_robofleet_released_begins_no_pass_while_the_window_is_full():
     # n_T = 2, pongs 50 ms after crossing, an open link. 0 fills half of the window, and each arrival is a pass
     # of its own: 1 goes, 2 finds two on their way and waits for 0's pong at 51 ms, when 3 goes with it.
-    senders = played("robofleet-released", "0 A, 1 N, 2 N, 3 N", topics(), blocked_ms=0, window=2, pong_ms=50)
-    assert taken_ms(senders) == {0: 0, 1: 1, 2: 51, 3: 51}
+    senders = played("robofleet-released", "0 A, 1 N, 2 N, 3 N", topics(), blocked_ms=0, window=2, ack_ms=50)
+    assert dequeued_ms(senders) == {0: 0, 1: 1, 2: 51, 3: 51}
     # As published, n_T holds for no_drop too: 0's pong comes at 51, 1's at 52.
-    senders = played("robofleet", "0 A, 1 N, 2 N, 3 N", topics(), blocked_ms=0, window=2, pong_ms=50)
-    assert taken_ms(senders) == {0: 0, 1: 1, 2: 51, 3: 52}
+    senders = played("robofleet", "0 A, 1 N, 2 N, 3 N", topics(), blocked_ms=0, window=2, ack_ms=50)
+    assert dequeued_ms(senders) == {0: 0, 1: 1, 2: 51, 3: 52}
 
 
 @pytest.mark.parametrize("name", ["robofleet", "robofleet-released"])
@@ -208,7 +209,7 @@ def test_rate_limits_at_arrival_and_at_the_socket():
     # goes, whose priority x wait is 105 against 2 x 105. 3 came at 120, sooner than 205: it is overwritten.
     senders = played("robofleet-released", "0 A, 40 A, 80 A, 105 B, 120 A, 160 A, 205 A", limited, blocked_ms=0)
     assert (order(senders), dropped(senders)) == ([0, 2, 3, 6], [1, 4, 5])
-    assert taken_ms(senders) == {0: 0, 2: 105, 3: 106, 6: 205}
+    assert dequeued_ms(senders) == {0: 0, 2: 105, 3: 106, 6: 205}
 
 
 def test_the_released_client_sleeps_until_an_arrival_or_a_pong():
@@ -237,13 +238,13 @@ def test_native_ros_takes_turns():
     senders = played("ros-native", script, topics())
     assert order(senders) == [0, 1, 5, 4, 2, 6, 3]
     # Neither priority nor no_drop count, and not what came first: B, which came last of all, is sent from at 102.
-    assert taken_ms(senders) == {0: 0, 1: 101, 5: 102, 4: 103, 2: 104, 6: 105, 3: 106}
+    assert dequeued_ms(senders) == {0: 0, 1: 101, 5: 102, 4: 103, 2: 104, 6: 105, 3: 106}
     # Who had nothing to send has waited longest, whenever its message came: at 103 ms C goes (never sent from), then A
     # (101), then B (102).
     assert order(played("ros-native", "0 A, 1 A, 2 A, 3 B, 4 B, 102.5 C", topics())) == [0, 1, 3, 5, 2, 4]
     # By message, not by byte: 1, of 5000 bytes, makes B wait for 5 ms, 2 for one.
     senders = played("ros-native", "0 A, 1 A 5000, 2 A, 3 B, 4 B", topics())
-    assert taken_ms(senders) == {0: 0, 1: 101, 3: 106, 2: 107, 4: 108}
+    assert dequeued_ms(senders) == {0: 0, 1: 101, 3: 106, 2: 107, 4: 108}
 
 
 def test_rosbridge_keeps_everything():
@@ -254,9 +255,9 @@ def test_rosbridge_keeps_everything():
 @pytest.mark.parametrize("name", ["rosbridge", "ros-native"])
 def test_rivals_do_not_wait_for_pongs(name):
     # The link is free each ms. Who keeps to n_T = 1 waits for a pong 50 ms after each crossing.
-    settings = {"blocked_ms": 0, "window": 1, "pong_ms": 50}
-    assert taken_ms(played(name, "0 A, 0 B, 0 C", topics(), **settings)) == {0: 0, 1: 1, 2: 2}
-    assert taken_ms(played("fifo", "0 A, 0 B, 0 C", topics(), **settings)) == {0: 0, 1: 51, 2: 102}
+    settings = {"blocked_ms": 0, "window": 1, "ack_ms": 50}
+    assert dequeued_ms(played(name, "0 A, 0 B, 0 C", topics(), **settings)) == {0: 0, 1: 1, 2: 2}
+    assert dequeued_ms(played("fifo", "0 A, 0 B, 0 C", topics(), **settings)) == {0: 0, 1: 51, 2: 102}
 
 
 def test_clients():
@@ -264,7 +265,7 @@ def test_clients():
         return policies.get(name).client
 
     assert [name for name in ALL if client(name).limit_at_send or client(name).flush_no_drop] == ["robofleet-released"]
-    assert [name for name in ALL if not client(name).awaits_pongs] == ["rosbridge", "ros-native"]
+    assert [name for name in ALL if not client(name).awaits_acks] == ["rosbridge", "ros-native"]
     assert {name: client(name).encoding for name in ALL if client(name).encoding} == {
         "rosbridge": "json",
         "ros-native": "ros",
@@ -299,8 +300,8 @@ def test_your_own_can_be_made_for_topics(monkeypatch):
 def topics_cases(draw, max_bytes=True):
     """(case, topics): random episodes of three topics with all that a topic may have."""
     case = draw(cases(max_bytes=max_bytes))
-    window, pong_us = draw(st.integers(1, 4)), draw(st.sampled_from([0, 0, 2_000, 30_000]))
-    case = replace(case, episode=replace(case.episode, window=window, pong_us=pong_us))
+    window, ack_delay_us = draw(st.integers(1, 4)), draw(st.sampled_from([0, 0, 2_000, 30_000]))
+    case = replace(case, episode=replace(case.episode, window=window, ack_delay_us=ack_delay_us))
     made = []
     for name in "ABC":
         no_drop = draw(st.booleans())
@@ -375,7 +376,7 @@ def test_every_answer_is_possible(name, drawn):
     case, topics = drawn
     # Outside the arrivals that ask a full queue rejects unasked: those are not the policy's.
     case = replace(case, episode=replace(case.episode, first_decision=0, last_decision=2**31))
-    assert count(run_topics(case, topics, policies.get(name)), "impossible") == 0
+    assert count(run_topics(case, topics, policies.get(name)), "invalid") == 0
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("robofleet")])
@@ -400,14 +401,14 @@ def accounts(senders, topics):
     """For each topic, how many messages there are of each fate; no message has two."""
     sender, batch = np.asarray(senders.batch.senders)[0], senders.batch
     n = int(sender["arrivals"])
-    rows, topic = np.asarray(batch.fates[0])[:n], np.asarray(batch.arrivals[0])["topic"][:n]
+    rows, topic = np.asarray(batch.log[0])[:n], np.asarray(batch.arrivals[0])["topic"][:n]
     queued = np.zeros(n, bool)
     queued[np.asarray(batch.slots[0])["seq"][sender["first"] : sender["first"] + sender["occupancy"]]] = True
-    crossed, lost = rows["crossed_us"] != NEVER, rows["dropped_us"] != NEVER
-    sending = (rows["taken_us"] != NEVER) & ~crossed
-    fate = np.stack([crossed, sending, queued, lost])
-    assert (fate.sum(0) == 1).all()
-    return [fate[:, topic == k].sum(1).tolist() for k in range(len(topics))]
+    transmitted, lost = rows["transmitted_us"] != NEVER, rows["dropped_us"] != NEVER
+    sending = (rows["dequeued_us"] != NEVER) & ~transmitted
+    entry = np.stack([transmitted, sending, queued, lost])
+    assert (entry.sum(0) == 1).all()
+    return [entry[:, topic == k].sum(1).tolist() for k in range(len(topics))]
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -419,7 +420,7 @@ def test_every_policy_runs_on_topics_and_nothing_is_lost(name, drawn):
     rows = np.asarray(senders.batch.topics)[0]
     for k, (delivered, sending, queued, lost) in enumerate(accounts(senders, topics)):
         assert rows["arrived"][k] == delivered + sending + queued + lost
-        assert rows["taken"][k] == delivered + sending
+        assert rows["dequeued"][k] == delivered + sending
         assert rows["queued"][k] == queued
     assert count(senders, "next") == len(case.twin_messages)
     no_drop_is_kept_while_others_could_go(senders, topics)
@@ -427,10 +428,10 @@ def test_every_policy_runs_on_topics_and_nothing_is_lost(name, drawn):
 
 def no_drop_is_kept_while_others_could_go(senders, topics):
     n = int(senders.batch.senders[0]["arrivals"])
-    rows, arrivals = np.asarray(senders.batch.fates[0])[:n], np.asarray(senders.batch.arrivals[0])[:n]
+    rows, arrivals = np.asarray(senders.batch.log[0])[:n], np.asarray(senders.batch.arrivals[0])[:n]
     free = np.array([not topic.no_drop for topic in topics])[arrivals["topic"]]
     for lost in np.flatnonzero(~free & (rows["dropped_us"] != NEVER)):
         at_us = arrivals["arrival_us"][lost]
         assert rows["dropped_us"][lost] == at_us  # rejected when it came: no_drop is never evicted
-        later = [(rows[field] == NEVER) | (rows[field] > at_us) for field in ("taken_us", "dropped_us")]
+        later = [(rows[field] == NEVER) | (rows[field] > at_us) for field in ("dequeued_us", "dropped_us")]
         assert not (free & later[0] & later[1])[:lost].any()

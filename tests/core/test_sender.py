@@ -7,17 +7,17 @@ from dataclasses import replace
 import naive
 import numpy as np
 import pytest
-from cases import VALUES, Case, cases, fates, order, same, trace
+from cases import VALUES, Case, cases, log, order, same, trace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym import policies, qoi
-from bufgym.buffer import ACCEPT, REJECT
+from bufgym import policies
 from bufgym.errors import BufgymError
-from bufgym.link import Link
-from bufgym.metrics import outcome
+from bufgym.model import qoi
+from bufgym.model.buffer import ACCEPT, REJECT
+from bufgym.model.link import Link
 from bufgym.scenario import Episode, messages
-from bufgym.sender import (
+from bufgym.sim import (
     DECISION,
     DEPARTURE,
     DEQUEUE,
@@ -31,21 +31,22 @@ from bufgym.sender import (
     next_event,
     run,
 )
+from bufgym.sim.metrics import outcome
 
 V = qoi.exponential(0.5)
 MS = 1_000
 
 
 def anything(buffer, arrival, memory):
-    """Decides at random, impossible decisions included."""
-    return int(arrival.luck * (buffer.capacity + 4)) - 2
+    """Decides at random, invalid decisions included."""
+    return int(arrival.uniform * (buffer.capacity + 4)) - 2
 
 
 # The twin draws from [accept, reject, 0, 1, ..., L + 1]; ACCEPT is -2 and REJECT is -1, so floor(luck x (L + 4)) - 2.
 assert (ACCEPT, REJECT) == (-2, -1)
 ANYTHING = policies.Policy("test-anything", anything, compile=True)
 POLICIES = {
-    p.name: p for p in (*map(policies.get, policies.names()), ANYTHING) if p.foresee is None and not any(p.work)
+    p.name: p for p in (*map(policies.get, policies.names()), ANYTHING) if p.privileged is None and not any(p.work)
 }
 """All but the learned ones, whose twin is in ``test_learned``."""
 
@@ -63,9 +64,9 @@ def test_order_of_things_at_an_arrival():
     # so message 1 is taken at once. Message 2 arrives at the same time and waits its turn.
     senders = line([0, 1, 1])
     senders.run(policies.get("drop-oldest"))
-    assert fates(senders) == {
-        "taken_us": {0: 0, 1: 1 * MS, 2: 2 * MS},
-        "crossed_us": {0: 1 * MS, 1: 2 * MS, 2: 3 * MS},
+    assert log(senders) == {
+        "dequeued_us": {0: 0, 1: 1 * MS, 2: 2 * MS},
+        "transmitted_us": {0: 1 * MS, 1: 2 * MS, 2: 3 * MS},
         "dropped_us": {},
     }
 
@@ -74,11 +75,11 @@ def test_a_departure_makes_room_for_the_arrival_at_its_instant():
     # L = 1. At 1 ms the socket takes message 1, so message 2, which arrives then, finds room: nothing is dropped.
     senders = line([0, 0, 1], capacity=1)
     senders.run(policies.get("drop-newest"))
-    assert fates(senders)["dropped_us"] == {}
+    assert log(senders)["dropped_us"] == {}
     # Half a millisecond earlier it does not.
     arrivals = messages(np.array([0, 0, 999]), 1_000)
     senders = run(policies.get("drop-newest"), [Episode(arrivals, Link(trace([(0, 0), (1_000, 1_000)], "loop")))], 1, V)
-    assert fates(senders)["dropped_us"] == {2: 999}
+    assert log(senders)["dropped_us"] == {2: 999}
 
 
 def test_the_message_in_transmission_cannot_be_dropped():
@@ -86,7 +87,7 @@ def test_the_message_in_transmission_cannot_be_dropped():
     senders = line([0, 0, 0, 0, 0])
     senders.run(policies.get("drop-oldest"))
     assert order(senders) == [0, 3, 4]
-    assert fates(senders)["dropped_us"] == {1: 0, 2: 0}
+    assert log(senders)["dropped_us"] == {1: 0, 2: 0}
     # H = 1 + V(3) + V(1) = 1 + 7/8 + 1/2
     assert outcome(senders, 0).qoi == 2.375
 
@@ -103,7 +104,7 @@ def test_a_link_that_stops_keeps_what_it_has():
         1,
         0,
     )
-    assert fates(senders)["taken_us"] == {0: 0, 1: 1 * MS, 2: 2 * MS}
+    assert log(senders)["dequeued_us"] == {0: 0, 1: 1 * MS, 2: 2 * MS}
 
 
 def test_start_offset():
@@ -111,7 +112,7 @@ def test_start_offset():
     arrivals = messages(np.array([0]), 1_000)
     link = Link(trace([(0, 0), (5 * MS, 0), (10 * MS, 5_000)], "hold"), offset_us=3 * MS, propagation_us=7)
     senders = run(policies.get("drop-oldest"), [Episode(arrivals, link)], 1, V)
-    assert fates(senders)["crossed_us"] == {0: 3 * MS}
+    assert log(senders)["transmitted_us"] == {0: 3 * MS}
 
 
 def test_bytes_limit():
@@ -127,7 +128,7 @@ def test_bytes_limit():
     # (arrival, is there room, which slots would make room)
     assert asked == [(0, True, []), (1, True, []), (2, True, [0]), (3, False, [0, 1]), (4, False, [])]
     assert order(senders) == [0, 2, 3]
-    assert outcome(senders, 0).impossible == 1
+    assert outcome(senders, 0).invalid == 1
 
 
 @pytest.mark.parametrize(("decide_at", "asked"), [("arrival", [0, 1, 2, 3, 4]), ("overflow", [3, 4])])
@@ -152,7 +153,7 @@ def test_what_the_policy_sees():
     line([0, 0, 4, 4], sizes=[8_000, 500, 700, 1], capacity=3).run(policies.Policy("note", note))
     last = views[3]
     assert last.slots == [1, 2]
-    assert (last.capacity, last.backlog_bytes, last.taken, last.taken_x, last.busy) == (3, 1_200, 1, 0.0, 1)
+    assert (last.capacity, last.backlog_bytes, last.dequeued, last.dequeued_x, last.busy) == (3, 1_200, 1, 0.0, 1)
     # Message 0 has had 4 of its 8 ms; the arrival before this one came at 4 ms with x = 2.
     assert (last.left_bytes, last.left_fraction, last.stalled_us) == (4_000, 0.5, 4 * MS)
     assert (last.previous_us, last.previous_x, last.departures) == (4 * MS, 2.0, 0)
@@ -178,7 +179,7 @@ def stale(buffer, memory):
 
 
 def unlucky(buffer, memory):
-    return buffer.slots[0].luck < 0.4
+    return buffer.slots[0].uniform < 0.4
 
 
 def head_dropper(on_dequeue, on_arrival=take_all, compiled=True):
@@ -193,14 +194,14 @@ def test_every_second_head_is_dropped(compiled):
     # The heads are asked about in turn: 0 goes out at 0 ms, 1 is dropped at 1 ms and 2 goes out, 3 is dropped at 2 ms.
     senders = line([0, 0, 0, 0, 0], capacity=5)
     senders.run(head_dropper(every_second, compiled=compiled))
-    assert fates(senders) == {
-        "taken_us": {0: 0, 2: 1 * MS, 4: 2 * MS},
-        "crossed_us": {0: 1 * MS, 2: 2 * MS, 4: 3 * MS},
+    assert log(senders) == {
+        "dequeued_us": {0: 0, 2: 1 * MS, 4: 2 * MS},
+        "transmitted_us": {0: 1 * MS, 2: 2 * MS, 4: 3 * MS},
         "dropped_us": {1: 1 * MS, 3: 2 * MS},
     }
     result = outcome(senders, 0)
     # H = 1 + V(2) + V(2)
-    assert (result.qoi, result.dropped, result.delivered, result.impossible) == (2.5, 2, 3, 0)
+    assert (result.qoi, result.dropped, result.delivered, result.invalid) == (2.5, 2, 3, 0)
     assert (senders.batch.senders[0]["evicted"], senders.batch.senders[0]["retained_gain"]) == (2, 1.5)
 
 
@@ -210,9 +211,9 @@ def test_a_link_without_heads_goes_idle(compiled):
     # idle link at 10 ms. (x is the frame index: H = 1 + V(3) + V(1).)
     senders = line([0, 0, 1, 4, 10], capacity=5, sizes=[5_000, 1_000, 1_000, 1_000, 1_000])
     senders.run(head_dropper(stale, compiled=compiled))
-    assert fates(senders) == {
-        "taken_us": {0: 0, 3: 5 * MS, 4: 10 * MS},
-        "crossed_us": {0: 5 * MS, 3: 6 * MS, 4: 11 * MS},
+    assert log(senders) == {
+        "dequeued_us": {0: 0, 3: 5 * MS, 4: 10 * MS},
+        "transmitted_us": {0: 5 * MS, 3: 6 * MS, 4: 11 * MS},
         "dropped_us": {1: 5 * MS, 2: 5 * MS},
     }
     assert outcome(senders, 0).qoi == 2.375
@@ -225,11 +226,11 @@ def test_the_bytes_after_a_dropped_head_follow_without_a_pause(compiled):
     fast = Link(trace([(0, 0), (10, 7_000)], "loop"))
     episode = Episode(messages(np.array([0, 0, 0]), 1_000), fast)
     senders = run(head_dropper(every_second, compiled=compiled), [episode], 5, V)
-    assert fates(senders)["crossed_us"] == {0: 2, 2: 3}
+    assert log(senders)["transmitted_us"] == {0: 2, 2: 3}
     # Where nothing follows, the link rests, and the next message begins when it arrives: 2 at 2 us, byte 1400.
     episode = Episode(messages(np.array([0, 0, 2]), 1_000), fast)
     senders = run(head_dropper(every_second, compiled=compiled), [episode], 5, V)
-    assert fates(senders) == {"taken_us": {0: 0, 2: 2}, "crossed_us": {0: 2, 2: 4}, "dropped_us": {1: 2}}
+    assert log(senders) == {"dequeued_us": {0: 0, 2: 2}, "transmitted_us": {0: 2, 2: 4}, "dropped_us": {1: 2}}
 
 
 @COMPILED_OR_NOT
@@ -237,7 +238,7 @@ def test_every_head_is_dropped(compiled):
     # Nothing is ever sent: each message goes as it comes, and nothing is known.
     senders = line([0, 0, 3], capacity=1)
     senders.run(head_dropper(lambda buffer, memory: True, compiled=compiled))
-    assert fates(senders) == {"taken_us": {}, "crossed_us": {}, "dropped_us": {0: 0, 1: 0, 2: 3 * MS}}
+    assert log(senders) == {"dequeued_us": {}, "transmitted_us": {}, "dropped_us": {0: 0, 1: 0, 2: 3 * MS}}
     assert (outcome(senders, 0).qoi, senders.batch.senders[0]["retained_gain"]) == (0.0, 0.0)
 
 
@@ -245,7 +246,7 @@ def test_what_the_policy_sees_at_the_head():
     seen = []
 
     def note(buffer, memory):
-        seen.append((buffer.now_us, buffer.slots["seq"].tolist(), buffer.busy, buffer.left_bytes, buffer.taken))
+        seen.append((buffer.now_us, buffer.slots["seq"].tolist(), buffer.busy, buffer.left_bytes, buffer.dequeued))
         return bool(buffer.slots[0].seq == 1)
 
     line([0, 0, 0], capacity=5).run(head_dropper(note, compiled=False))
@@ -275,15 +276,15 @@ def test_head_droppers_run_the_same_compiled_or_not(case, v, policy):
 @given(cases(), HEAD_DROPPERS)
 def test_what_is_dropped_at_the_head_might_never_have_come(case, policy):
     # The link serves the rest as if the dropped messages had been rejected at once.
-    ours = fates(case.run(policy, V))
+    ours = log(case.run(policy, V))
 
     class Reject(naive.Policy):
-        def decide(self, queue, newcomer, L, last_taken, previous):
+        def decide(self, queue, newcomer, L, last_dequeued, previous):
             return naive.REJECT if newcomer["seq"] in ours["dropped_us"] else naive.ACCEPT
 
     everyone_asks = replace(case.episode, first_decision=0, last_decision=2**31)
     twin = replace(case, episode=everyone_asks, decide_at="arrival").run_twin(Reject())
-    assert (ours["taken_us"], ours["crossed_us"]) == (twin.taken, twin.crossed)
+    assert (ours["dequeued_us"], ours["transmitted_us"]) == (twin.dequeued, twin.transmitted)
     assert ours["dropped_us"].keys() == twin.dropped.keys()
 
 
@@ -293,13 +294,13 @@ def test_what_is_dropped_at_the_head_might_never_have_come(case, policy):
 def agree(case: Case, name: str, v: qoi.Value) -> None:
     """The kernel and the twin made the same run."""
     ours, twin = case.run(POLICIES[name], v), case.run_twin(naive.policy(name, v))
-    assert fates(ours) == {"taken_us": twin.taken, "crossed_us": twin.crossed, "dropped_us": twin.dropped}
+    assert log(ours) == {"dequeued_us": twin.dequeued, "transmitted_us": twin.transmitted, "dropped_us": twin.dropped}
     assert order(ours) == twin.order
     sender, result = ours.batch.senders[0], outcome(ours, 0)
     assert (sender["rejected"], sender["evicted"]) == (twin.rejected, twin.evicted)
-    assert (sender["taken"], sender["crossed"]) == (len(twin.taken), len(twin.crossed))
+    assert (sender["dequeued"], sender["transmitted"]) == (len(twin.dequeued), len(twin.transmitted))
     assert sender["backlog_bytes"] == sum(m["bytes"] for m in twin.queue)
-    assert result.impossible == twin.impossible
+    assert result.invalid == twin.invalid
     assert (result.arrived, result.delivered) == (len(case.twin_messages), len(twin.order))
     assert (result.dropped, result.in_transmission) == (len(twin.dropped), int(twin.sending is not None))
     assert result.buffered == len(twin.queue)
@@ -357,22 +358,23 @@ def conserve(case: Case, senders: Senders) -> None:
     sender = senders.batch.senders[0]
     arrived, first, queued = int(sender["next"]), int(sender["first"]), int(sender["occupancy"])
     if case.decide_at == "arrival" and case.episode.first_decision == 0 and case.episode.last_decision > arrived:
-        assert sender["impossible"] == 0
-    assert arrived == sender["crossed"] + sender["busy"] + queued + sender["rejected"] + sender["evicted"]
-    rows = np.asarray(senders.batch.fates[0])[:arrived]
+        assert sender["invalid"] == 0
+    assert arrived == sender["transmitted"] + sender["busy"] + queued + sender["rejected"] + sender["evicted"]
+    rows = np.asarray(senders.batch.log[0])[:arrived]
     topic = np.asarray(case.episode.arrivals)["topic"][:arrived]
     slots = np.asarray(senders.batch.slots[0])[first : first + queued]
-    dropped, crossed = rows["dropped_us"] != NEVER, rows["crossed_us"] != NEVER
-    sending = (rows["taken_us"] != NEVER) & ~crossed
+    dropped, transmitted = rows["dropped_us"] != NEVER, rows["transmitted_us"] != NEVER
+    sending = (rows["dequeued_us"] != NEVER) & ~transmitted
     assert sending.sum() == sender["busy"]
     for k in range(3):
         of = topic == k
         assert (
-            of.sum() == (dropped & of).sum() + (crossed & of).sum() + (sending & of).sum() + (slots["topic"] == k).sum()
+            of.sum()
+            == (dropped & of).sum() + (transmitted & of).sum() + (sending & of).sum() + (slots["topic"] == k).sum()
         )
     # Oldest first, none twice, none of those that left.
     assert (np.diff(slots["seq"]) > 0).all()
-    assert not (dropped | crossed | sending)[slots["seq"]].any()
+    assert not (dropped | transmitted | sending)[slots["seq"]].any()
     assert queued <= case.capacity
     assert sender["backlog_bytes"] == slots["size_bytes"].sum() <= (case.max_bytes or 2**62)
 
@@ -382,7 +384,7 @@ def test_rows_of_a_batch_do_not_meet():
     together = run(policies.get("afr"), episodes, 4, V)
     for k, episode in enumerate(episodes):
         alone = run(policies.get("afr"), [episode], 4, V)
-        assert fates(alone) == fates(together, k)
+        assert log(alone) == log(together, k)
         assert order(alone) == order(together, k)
 
 
@@ -400,7 +402,7 @@ def test_loading_again_forgets_the_last_episode():
     senders.run(policies.get("min-gap"))
     senders.load(0, short)
     senders.run(policies.get("min-gap"))
-    assert fates(senders) == fates(run(policies.get("min-gap"), [short], 3, V))
+    assert log(senders) == log(run(policies.get("min-gap"), [short], 3, V))
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bufgym import suites
-from bufgym.benchmark.campaign import Plan, cell, units
 from bufgym.benchmark.run import draw
+from bufgym.benchmark.sweep import Plan, cell, shards
 from bufgym.errors import BufgymError
-from bufgym.scenario import Interruption, Uplink
+from bufgym.scenario import Interruption, Uplink, suites
 
 EMBEDDED = [name for name, suite in suites.SUITES.items() if not suite.needs]
 RECORDED = [name for name, suite in suites.SUITES.items() if suite.needs]
@@ -130,7 +129,7 @@ def test_an_embedded_suite_is_frozen(name: str) -> None:
 def fingerprint(name: str) -> str:
     """SHA-256 over every episode of the test split, as the benchmark draws them."""
     digest = hashlib.sha256()
-    for unit in units(Plan(name, ("afr",)).checked()):
+    for unit in shards(Plan(name, ("afr",)).checked()):
         scenario = suites.get(name).settings("test")[unit.label].scenario
         digest.update(f"{unit.label} {unit.trace} {scenario.value.name}".encode())
         part = cell(scenario, unit.trace)
@@ -139,9 +138,9 @@ def fingerprint(name: str) -> str:
             # In steps of 1e-9: interpolation may differ in the last bit elsewhere. x often ends in ...5 in the tenth
             # decimal, so the edges of the steps are moved away from there.
             x = np.floor(episode.arrivals["x"] * 1e9 + 0.5034).astype(np.int64)
-            luck = np.floor(episode.arrivals["luck"] * 1e9).astype(np.int64)
+            uniform = np.floor(episode.arrivals["uniform"] * 1e9).astype(np.int64)
             knots = (episode.link.trace.time_us, episode.link.trace.cumulative_bytes)
-            for column in (episode.arrivals["arrival_us"], episode.arrivals["size_bytes"], x, luck, *knots):
+            for column in (episode.arrivals["arrival_us"], episode.arrivals["size_bytes"], x, uniform, *knots):
                 digest.update(np.ascontiguousarray(column, "<i8").tobytes())
             whole = (episode.link.offset_us, episode.link.propagation_us, episode.first_decision, episode.last_decision)
             digest.update(f"{seed} {whole} {episode.link.trace.after}".encode())

@@ -7,13 +7,15 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from cases import VALUES, cases, fates, order, same, trace
+from cases import VALUES, cases, log, order, same, trace
 from hypothesis import given
 from hypothesis import strategies as st
 from topic_cases import choice, decision, topic_cases, unwanted
 
-from bufgym import policies, qoi
-from bufgym.buffer import (
+from bufgym import policies
+from bufgym.errors import BufgymError
+from bufgym.model import qoi
+from bufgym.model.buffer import (
     ACCEPT,
     HOLD,
     REJECT,
@@ -25,11 +27,11 @@ from bufgym.buffer import (
     motion_gaps,
     time_gaps,
 )
-from bufgym.errors import BufgymError
-from bufgym.link import FOREVER, Link
+from bufgym.model.link import FOREVER, Link
+from bufgym.model.topics import Topic, check_topics, check_window
 from bufgym.policies.registry import Client
 from bufgym.scenario import Episode, messages
-from bufgym.sender import (
+from bufgym.sim import (
     DECISION,
     DEPARTURE,
     DEQUEUE,
@@ -52,7 +54,6 @@ from bufgym.sender import (
     python_view,
     run,
 )
-from bufgym.topics import Topic, check_topics, check_window
 
 V = qoi.exponential(0.5)
 MS = 1_000
@@ -89,35 +90,35 @@ def after_run(played, topics=(), *, capacity=5, on_arrival=take_all, client=None
 def test_two_in_flight_over_a_round_trip_of_100_ms():
     # 0 and 1 go at once: 0 crosses at 1 ms, 1 behind it at 2. Their pongs come at 101 and 102 ms and let 2 and 3 go;
     # 3 follows 2 on the link (102 to 103 ms). The pong of 2 comes at 202 ms and lets 4 go.
-    senders = after_run(episode([0] * 5, window=2, pong_us=100 * MS))
-    assert fates(senders) == {
-        "taken_us": {0: 0, 1: 0, 2: 101 * MS, 3: 102 * MS, 4: 202 * MS},
-        "crossed_us": {0: 1 * MS, 1: 2 * MS, 2: 102 * MS, 3: 103 * MS, 4: 203 * MS},
+    senders = after_run(episode([0] * 5, window=2, ack_delay_us=100 * MS))
+    assert log(senders) == {
+        "dequeued_us": {0: 0, 1: 0, 2: 101 * MS, 3: 102 * MS, 4: 202 * MS},
+        "transmitted_us": {0: 1 * MS, 1: 2 * MS, 2: 102 * MS, 3: 103 * MS, 4: 203 * MS},
         "dropped_us": {},
     }
 
 
 def test_one_in_flight_leaves_the_link_idle():
     # Each message takes 1 ms and its pong another 50: one every 51 ms, on a link that could carry 51 meanwhile.
-    senders = after_run(episode([0, 0, 0], window=1, pong_us=50 * MS))
-    assert fates(senders)["taken_us"] == {0: 0, 1: 51 * MS, 2: 102 * MS}
-    assert fates(senders)["crossed_us"] == {0: 1 * MS, 1: 52 * MS, 2: 103 * MS}
+    senders = after_run(episode([0, 0, 0], window=1, ack_delay_us=50 * MS))
+    assert log(senders)["dequeued_us"] == {0: 0, 1: 51 * MS, 2: 102 * MS}
+    assert log(senders)["transmitted_us"] == {0: 1 * MS, 1: 52 * MS, 2: 103 * MS}
     # Without pongs to wait for, the window only counts what has not crossed yet.
     senders = after_run(episode([0, 0, 0], window=3))
-    assert fates(senders)["taken_us"] == {0: 0, 1: 0, 2: 0}
-    assert fates(senders)["crossed_us"] == {0: 1 * MS, 1: 2 * MS, 2: 3 * MS}
+    assert log(senders)["dequeued_us"] == {0: 0, 1: 0, 2: 0}
+    assert log(senders)["transmitted_us"] == {0: 1 * MS, 1: 2 * MS, 2: 3 * MS}
 
 
 def test_a_client_that_awaits_no_pongs():
-    senders = after_run(episode([0, 0, 0], window=2, pong_us=50 * MS), client=Client(awaits_pongs=False))
-    assert fates(senders)["taken_us"] == {0: 0, 1: 1 * MS, 2: 2 * MS}
+    senders = after_run(episode([0, 0, 0], window=2, ack_delay_us=50 * MS), client=Client(awaits_acks=False))
+    assert log(senders)["dequeued_us"] == {0: 0, 1: 1 * MS, 2: 2 * MS}
 
 
 @pytest.mark.parametrize(("third_ms", "dropped"), [(51, {}), (50.999, {2: 50_999})])
 def test_a_pong_comes_before_an_arrival_at_its_instant(third_ms, dropped):
     # L = 1: message 1 waits for the pong of 0, at 51 ms. What comes then finds room, a microsecond earlier it does not.
-    senders = after_run(episode([0, 0, third_ms], window=1, pong_us=50 * MS), capacity=1)
-    assert fates(senders)["dropped_us"] == dropped
+    senders = after_run(episode([0, 0, third_ms], window=1, ack_delay_us=50 * MS), capacity=1)
+    assert log(senders)["dropped_us"] == dropped
 
 
 def test_10_hz_of_a_30_hz_stream_is_every_third():
@@ -131,31 +132,29 @@ def test_10_hz_of_a_30_hz_stream_is_every_third():
     # 0, 33.333, 66.667, 100, ... ms: those kept are exactly 1 / rate apart. Of the others nobody is asked.
     senders = after_run(episode([round(k * 1e6 / 30) / MS for k in range(10)]), camera, on_arrival=note)
     assert order(senders) == asked == [0, 3, 6, 9]
-    assert fates(senders)["dropped_us"].keys() == {1, 2, 4, 5, 7, 8}
-    assert np.asarray(senders.batch.fates[0])["limited"].tolist() == [0, 1, 1] * 3 + [0]
+    assert log(senders)["dropped_us"].keys() == {1, 2, 4, 5, 7, 8}
+    assert np.asarray(senders.batch.log[0])["limited"].tolist() == [0, 1, 1] * 3 + [0]
     # A microsecond too soon after the last one kept is too soon; what was dropped does not count.
     senders = after_run(episode([0, 99.999, 100, 199.999, 200.001]), camera)
     assert order(senders) == [0, 2, 4]
     # What the policy rejected was not kept either: 1 comes 1 ms later and is asked about.
     senders = after_run(episode([0, 1, 2]), camera, on_arrival=lambda b, a, m: REJECT if a.seq == 0 else ACCEPT)
-    assert fates(senders)["dropped_us"] == {0: 0, 2: 2 * MS}
+    assert log(senders)["dropped_us"] == {0: 0, 2: 2 * MS}
 
 
 @pytest.mark.parametrize(
-    ("hooks", "impossible"), [({}, 0), ({"on_send": lambda b, m: 0}, 3), ({"on_send": lambda b, m: HOLD}, 1)]
+    ("hooks", "invalid"), [({}, 0), ({"on_send": lambda b, m: 0}, 3), ({"on_send": lambda b, m: HOLD}, 1)]
 )
-def test_rate_limits_at_the_socket(hooks, impossible):
+def test_rate_limits_at_the_socket(hooks, invalid):
     # 10 Hz: 0 goes at once. At 1 and 60 ms nothing may go, at 120 ms it may: 1, the oldest. It crosses at 121 ms, which
     # is too soon for 2; no arrival or pong comes after that, so 2 and 3 stay.
     topics = (Topic("status", rate_limit_hz=10), Topic("other"))
     senders = after_run(episode([0, 1, 60, 120]), topics, client=Client(limit_at_send=True), **hooks)
-    held_first = (
-        impossible == 1
-    )  # who always holds must let one go when nothing is to come, 0 at 120 ms; then nothing may
-    assert fates(senders)["taken_us"] == ({0: 120 * MS} if held_first else {0: 0, 1: 120 * MS})
-    assert fates(senders)["dropped_us"] == {}
+    held_first = invalid == 1  # who always holds must let one go when nothing is to come, 0 at 120 ms; then nothing may
+    assert log(senders)["dequeued_us"] == ({0: 120 * MS} if held_first else {0: 0, 1: 120 * MS})
+    assert log(senders)["dropped_us"] == {}
     # Slot 0 is asked for in vain at 1, 60 and 121 ms. To hold is no mistake when nothing may go.
-    assert senders.batch.senders[0]["impossible"] == impossible
+    assert senders.batch.senders[0]["invalid"] == invalid
 
 
 def test_a_buffer_full_of_no_drop():
@@ -169,8 +168,8 @@ def test_a_buffer_full_of_no_drop():
         capacity=2,
         on_arrival=lambda b, a, m: 0 if a.seq > 2 else ACCEPT,
     )
-    assert fates(senders)["dropped_us"] == {3: 0, 4: 0}
-    assert (senders.batch.senders[0]["rejected"], senders.batch.senders[0]["impossible"]) == (2, 2)
+    assert log(senders)["dropped_us"] == {3: 0, 4: 0}
+    assert (senders.batch.senders[0]["rejected"], senders.batch.senders[0]["invalid"]) == (2, 2)
     # With droppable messages in the buffer it drives out the oldest of the lowest priority, though "reject" is said:
     # 1 is camera, 2 and 3 status (priority 1), 4 the command.
     topics = (Topic("command", no_drop=True), Topic("camera", priority=20), Topic("status"))
@@ -180,27 +179,27 @@ def test_a_buffer_full_of_no_drop():
         capacity=3,
         on_arrival=lambda b, a, m: REJECT if a.seq == 4 else ACCEPT,
     )
-    assert fates(senders)["dropped_us"] == {2: 0}
+    assert log(senders)["dropped_us"] == {2: 0}
 
 
 @pytest.mark.parametrize("nonsense", [REJECT, -3, -4, 99])
 def test_no_answer_drops_a_no_drop_message_that_has_room(nonsense):
     senders = after_run(episode([0]), (Topic("command", no_drop=True),), on_arrival=lambda b, a, m: nonsense)
-    assert fates(senders)["dropped_us"] == {}
-    assert senders.batch.senders[0]["impossible"] == 1
+    assert log(senders)["dropped_us"] == {}
+    assert senders.batch.senders[0]["invalid"] == 1
 
 
 def test_minus_three_is_no_decision():
     # Neither for a queue without topics: impossible, so what a queue does.
     senders = after_run(episode([0]), on_arrival=lambda b, a, m: -3)
-    assert (order(senders), senders.batch.senders[0]["impossible"]) == ([0], 1)
+    assert (order(senders), senders.batch.senders[0]["invalid"]) == ([0], 1)
 
 
 def test_a_limit_of_one_topic():
     # At most one camera message waits, though the buffer has room; status is not concerned.
     topics = (Topic("camera", limit=1), Topic("status"))
     senders = after_run(episode([0, 0, 0, 0], [0, 0, 0, 1]), topics)
-    assert fates(senders)["dropped_us"] == {2: 0}
+    assert log(senders)["dropped_us"] == {2: 0}
     # Slot 0 (status) is no help for a camera message, slot 1 (camera) is.
     topics = (Topic("camera", limit=1), Topic("status"))
     senders = Senders(1, 5, V, max_messages=4, topics=topics)
@@ -218,18 +217,18 @@ def test_a_topic_is_sent_in_order():
     topics = (Topic("a"), Topic("b"))
     senders = after_run(episode([0] * 5, [0, 0, 1, 0, 1]), topics, on_send=scripted(0, 2, 1, 0, 0))
     assert order(senders) == [0, 1, 3, 2, 4]
-    assert senders.batch.senders[0]["impossible"] == 1
+    assert senders.batch.senders[0]["invalid"] == 1
 
 
 def test_holding_until_the_next_arrival_or_pong():
     # 0 is held back at 0 ms; at 5 ms message 1 arrives, both wait, the scheduler holds again; nothing else is to come
     # after 7 ms, so that the third HOLD is impossible and 0 goes. At its crossing 1 goes, then 2.
     senders = after_run(episode([0, 5, 7]), on_send=scripted(HOLD, HOLD, HOLD, 0, 0))
-    assert fates(senders)["taken_us"] == {0: 7 * MS, 1: 8 * MS, 2: 9 * MS}
-    assert senders.batch.senders[0]["impossible"] == 1
+    assert log(senders)["dequeued_us"] == {0: 7 * MS, 1: 8 * MS, 2: 9 * MS}
+    assert senders.batch.senders[0]["invalid"] == 1
     # While a pong is to come, holding is possible: 1 is held back at 1 ms of its own accord until that of 0 at 11 ms.
-    senders = after_run(episode([0, 0], window=2, pong_us=10 * MS), on_send=scripted(0, HOLD, 0))
-    assert fates(senders)["taken_us"] == {0: 0, 1: 11 * MS}
+    senders = after_run(episode([0, 0], window=2, ack_delay_us=10 * MS), on_send=scripted(0, HOLD, 0))
+    assert log(senders)["dequeued_us"] == {0: 0, 1: 11 * MS}
 
 
 def test_flushing_no_drop():
@@ -238,18 +237,18 @@ def test_flushing_no_drop():
     topics = (Topic("command", no_drop=True), Topic("camera"))
     for hooks in ({}, {"on_send": lambda buffer, memory: 0}):
         senders = after_run(
-            episode([0] * 4, [1, 0, 1, 0], window=1, pong_us=50 * MS),
+            episode([0] * 4, [1, 0, 1, 0], window=1, ack_delay_us=50 * MS),
             topics,
             client=Client(flush_no_drop=True),
             **hooks,
         )
-        assert fates(senders)["taken_us"] == {0: 0, 1: 0, 3: 0, 2: 53 * MS}
+        assert log(senders)["dequeued_us"] == {0: 0, 1: 0, 3: 0, 2: 53 * MS}
 
 
 def test_flushing_is_for_no_drop_alone():
     # A plain sender has no no_drop messages: its window holds.
-    senders = after_run(episode([0] * 3, window=1, pong_us=50 * MS), client=Client(flush_no_drop=True))
-    assert fates(senders)["taken_us"] == {0: 0, 1: 51 * MS, 2: 102 * MS}
+    senders = after_run(episode([0] * 3, window=1, ack_delay_us=50 * MS), client=Client(flush_no_drop=True))
+    assert log(senders)["dequeued_us"] == {0: 0, 1: 51 * MS, 2: 102 * MS}
 
 
 def test_information_of_two_topics():
@@ -331,7 +330,7 @@ def test_gaps_behind_a_message_that_was_held_back():
 
         def note(buffer, arrival, memory, gaps=gaps):
             between = [time_gaps(buffer, arrival, k) for k in range(len(buffer.slots) + 1)]
-            gaps.append((buffer.taken_us, buffer.taken_x, between))
+            gaps.append((buffer.dequeued_arrival_us, buffer.dequeued_x, between))
             return REJECT if arrival.seq == 1 else ACCEPT
 
         after_run(episode([1, 4, 8], x=[5, 6, 7]), topics, on_arrival=note, on_send=scripted(HOLD, HOLD, HOLD, 0))
@@ -360,7 +359,7 @@ def test_gaps_behind_a_message_that_was_held_back():
         ({"no_drop": 1}, "no_drop = 1: must be true or false"),
         ({"limit": 0}, "limit = 0: must be a whole number from 1"),
         ({"limit": 1.5}, "limit = 1.5: must be a whole number from 1"),
-        ({"value": 0.618}, "value = 0.618: must be a V of bufgym.qoi"),
+        ({"value": 0.618}, "value = 0.618: must be a V of bufgym.model.qoi"),
         ({"no_drop": True, "rate_limit_hz": 10}, "rate_limit_hz = 10: a no_drop topic can't have a rate limit"),
         ({"no_drop": True, "limit": 3}, "limit = 3: a no_drop topic can't have a limit"),
     ],
@@ -402,10 +401,10 @@ def test_bad_window(window):
         after_run(episode([0], window=window))
 
 
-@pytest.mark.parametrize("pong_us", [-1, 0.5, True, None, 2**62])
-def test_bad_pong(pong_us):
-    with pytest.raises(BufgymError, match=f"pong_us = {pong_us!r}: must be a whole number >= 0"):
-        after_run(episode([0], pong_us=pong_us))
+@pytest.mark.parametrize("ack_delay_us", [-1, 0.5, True, None, 2**62])
+def test_bad_pong(ack_delay_us):
+    with pytest.raises(BufgymError, match=f"ack_delay_us = {ack_delay_us!r}: must be a whole number >= 0"):
+        after_run(episode([0], ack_delay_us=ack_delay_us))
 
 
 # --- against the twin ------------------------------------------------------------------------------------------------
@@ -426,7 +425,7 @@ def test_agrees_with_twin_event_by_event(case):
         answer = None
         if expected == "decision":
             agree_on_gaps(senders, twin)
-            answer = decision(twin.newcomer["luck"], case.case.capacity)
+            answer = decision(twin.newcomer["uniform"], case.case.capacity)
             decide(batch, 0, answer)
         elif expected == "send":
             masks = [can_send(batch, 0, k) for k in range(-1, case.case.capacity + 1)]
@@ -434,7 +433,7 @@ def test_agrees_with_twin_event_by_event(case):
                 len(masks) - 1 - view.slots.size
             )
             assert can_hold(batch, 0) == twin.may_hold()
-            answer = choice(twin.now, len(twin.slots()), len(twin.taken), case.case.capacity)
+            answer = choice(twin.now, len(twin.slots()), len(twin.dequeued), case.case.capacity)
             answer_send(batch, 0, answer)
         elif expected == "dequeue":
             answer = unwanted(twin.now, len(twin.slots()))
@@ -456,12 +455,12 @@ def agree(senders, twin, until=None, to_the_end=False):
     assert sender["now_us"] == twin.now
     assert slots["seq"].tolist() == [m["seq"] for m in twin.slots()]
     assert sender["backlog_bytes"] == sum(m["bytes"] for m in twin.slots())
-    assert sender["taken"] - sender["ponged"] == len(twin.in_flight)
+    assert sender["dequeued"] - sender["acked"] == len(twin.in_flight)
     assert sender["busy"] == len(twin.socket)
-    assert (sender["rejected"], sender["evicted"], sender["impossible"]) == (
+    assert (sender["rejected"], sender["evicted"], sender["invalid"]) == (
         twin.rejected,
         twin.evicted,
-        twin.impossible,
+        twin.invalid,
     )
     assert sender["retained_gain"] == pytest.approx(twin.retained_gain(), abs=1e-9)
     assert sender["delivered_gain"] == pytest.approx(twin.delivered_gain(until), abs=1e-9)
@@ -474,7 +473,7 @@ def agree(senders, twin, until=None, to_the_end=False):
     assert sender["aged"] == pytest.approx(twin.aged(until, to_the_end), rel=1e-9, abs=1e-12)
     assert sender["late"] == pytest.approx(twin.late(until))
     for k, row in enumerate(np.asarray(batch.topics[0])[: len(twin.rules)]):
-        assert (row["queued"], row["arrived"], row["taken"], row["received"]) == (
+        assert (row["queued"], row["arrived"], row["dequeued"], row["received"]) == (
             len(twin.queues[k]),
             len(twin.arrived[k]),
             len(twin.sent[k]),
@@ -482,7 +481,11 @@ def agree(senders, twin, until=None, to_the_end=False):
         )
         if twin.sent[k]:
             last = twin.sent[k][-1]
-            assert (row["taken_us"], row["taken_x"], row["sent_us"]) == (last["us"], last["x"], twin.taken[last["seq"]])
+            assert (row["dequeued_arrival_us"], row["dequeued_x"], row["last_dequeue_us"]) == (
+                last["us"],
+                last["x"],
+                twin.dequeued[last["seq"]],
+            )
 
 
 def agree_on_gaps(senders, twin):
@@ -491,7 +494,7 @@ def agree_on_gaps(senders, twin):
     buffer, arrival = python_view(seen, 0), seen.arrivals[0, seen.senders[0].next]
     newcomer, slots = twin.newcomer, twin.slots()
     reference, last = twin.reference(), twin.kept_before(newcomer)
-    assert (buffer.taken_us, buffer.taken_x) == (reference["us"], reference["x"])
+    assert (buffer.dequeued_arrival_us, buffer.dequeued_x) == (reference["us"], reference["x"])
     gain = twin.gain(twin.lane(newcomer), [last, newcomer]) if last else 0.0
     assert arrival_gain(buffer, arrival) == pytest.approx(gain, abs=1e-12)
     assert has_room(senders.batch, 0) == twin.fits(newcomer)
@@ -513,16 +516,20 @@ def agree_on_gaps(senders, twin):
 
 
 def agree_on_fates(senders, twin):
-    assert {k for k, f in enumerate(np.asarray(senders.batch.fates[0])) if f["limited"]} == twin.limited
-    assert fates(senders) == {"taken_us": twin.taken, "crossed_us": twin.crossed, "dropped_us": twin.dropped}
+    assert {k for k, f in enumerate(np.asarray(senders.batch.log[0])) if f["limited"]} == twin.limited
+    assert log(senders) == {
+        "dequeued_us": twin.dequeued,
+        "transmitted_us": twin.transmitted,
+        "dropped_us": twin.dropped,
+    }
     assert order(senders) == twin.order
 
 
 @given(topic_cases(max_messages=150), st.booleans())
 def test_rollouts_agree_with_twin(case, compiled):
     answers = {
-        "decision": lambda: decision(twin.newcomer["luck"], case.case.capacity),
-        "send": lambda: choice(twin.now, len(twin.slots()), len(twin.taken), case.case.capacity),
+        "decision": lambda: decision(twin.newcomer["uniform"], case.case.capacity),
+        "send": lambda: choice(twin.now, len(twin.slots()), len(twin.dequeued), case.case.capacity),
         "dequeue": lambda: unwanted(twin.now, len(twin.slots())),
     }
     twin, answer, event = case.twin(), None, ""
@@ -546,7 +553,7 @@ def test_the_same_inputs_make_the_same_run(case):
     again.load(0, case.case.episode)  # which forgets the run before
     again.run(policy)
     assert same(first, again)
-    for name in ("aged", "late", "impossible"):
+    for name in ("aged", "late", "invalid"):
         assert first.batch.senders[0][name] == again.batch.senders[0][name]
     assert (np.asarray(first.batch.topics) == np.asarray(again.batch.topics)).all()
 
@@ -576,7 +583,7 @@ def test_invariants_after_every_event(case, chance):
         elif event == DEQUEUE:
             answer_dequeue(batch, 0, chance.random() < 0.5)
         hold(case, senders)
-    assert sender["impossible"] == 0 or not everyone
+    assert sender["invalid"] == 0 or not everyone
     assert sender["next"] == len(case.case.twin_messages)
     assert next_event(batch, 0) == END  # and stays there
 
@@ -588,11 +595,11 @@ def test_invariants_under_impossible_decisions(case):
     while event != END:
         event = next_event(batch, 0)
         if event == DECISION:
-            luck = float(batch.arrivals[0, batch.senders[0]["next"]]["luck"])
-            kept_if_possible(case, senders, decision(luck, case.case.capacity))
+            uniform = float(batch.arrivals[0, batch.senders[0]["next"]]["uniform"])
+            kept_if_possible(case, senders, decision(uniform, case.case.capacity))
         elif event == SEND:
             sender = batch.senders[0]
-            k = choice(int(sender["now_us"]), int(sender["occupancy"]), int(sender["taken"]), case.case.capacity)
+            k = choice(int(sender["now_us"]), int(sender["occupancy"]), int(sender["dequeued"]), case.case.capacity)
             answer_send(batch, 0, k)
         elif event == DEQUEUE:
             answer_dequeue(batch, 0, True)
@@ -607,7 +614,7 @@ def kept_if_possible(case, senders, answer, possible=False):
     seq = int(sender["next"])
     newcomer = np.asarray(batch.arrivals[0])[seq].copy()
     assert decide(batch, 0, answer) or not possible
-    gone = np.asarray(batch.fates[0])["dropped_us"] != NEVER
+    gone = np.asarray(batch.log[0])["dropped_us"] != NEVER
     assert not any(gone[m["seq"]] and case.topics[m["topic"]].no_drop for m in slots)
     if not (gone[seq] and case.topics[newcomer["topic"]].no_drop):
         return
@@ -621,18 +628,18 @@ def hold(case, senders):
     batch = senders.batch
     sender = np.asarray(batch.senders)[0]
     arrived, first, queued = int(sender["next"]), int(sender["first"]), int(sender["occupancy"])
-    rows = np.asarray(batch.fates[0])[:arrived]
+    rows = np.asarray(batch.log[0])[:arrived]
     topic = np.asarray(case.case.episode.arrivals)["topic"]
     x = np.asarray(case.case.episode.arrivals)["x"]
     slots = np.asarray(batch.slots[0])[first : first + queued]
-    dropped, crossed, taken = (rows[name] != NEVER for name in ("dropped_us", "crossed_us", "taken_us"))
-    assert (crossed <= taken).all() and not (dropped & taken).any()
-    assert not (dropped | taken)[slots["seq"]].any()
-    assert (taken & ~crossed).sum() == sender["busy"]
+    dropped, transmitted, dequeued = (rows[name] != NEVER for name in ("dropped_us", "transmitted_us", "dequeued_us"))
+    assert (transmitted <= dequeued).all() and not (dropped & dequeued).any()
+    assert not (dropped | dequeued)[slots["seq"]].any()
+    assert (dequeued & ~transmitted).sum() == sender["busy"]
     assert dropped.sum() == sender["rejected"] + sender["evicted"]
     assert queued <= case.case.capacity
     assert sender["backlog_bytes"] == slots["size_bytes"].sum() <= (case.case.max_bytes or 2**62)
-    in_flight = batch.order[0, sender["ponged"] : sender["taken"]]
+    in_flight = batch.order[0, sender["acked"] : sender["dequeued"]]
     if case.client.flush_no_drop:
         # Only no_drop messages were sent beyond the window.
         in_flight = in_flight[case.case.episode.window :]
@@ -644,9 +651,9 @@ def hold(case, senders):
     for k, rules in enumerate(case.topics):
         of = topic[:arrived] == k
         own = slots["topic"] == k
-        assert of.sum() == (of & (dropped | taken)).sum() + own.sum() == batch.topics[0, k]["arrived"]
+        assert of.sum() == (of & (dropped | dequeued)).sum() + own.sum() == batch.topics[0, k]["arrived"]
         assert own.sum() == batch.topics[0, k]["queued"] <= (rules.limit or case.case.capacity)
-        sent = [seq for seq in batch.order[0, : sender["taken"]].tolist() if topic[seq] == k]
+        sent = [seq for seq in batch.order[0, : sender["dequeued"]].tolist() if topic[seq] == k]
         kept = sent + slots["seq"][own].tolist()
         assert kept == sorted(kept)  # in order of arrival
         v = rules.value or case.v
@@ -664,7 +671,7 @@ def head(buffer, memory):
 
 
 def anything(buffer, arrival, memory):
-    return int(arrival.luck * (buffer.capacity + 4)) - 2
+    return int(arrival.uniform * (buffer.capacity + 4)) - 2
 
 
 def holds_sometimes(buffer, memory):
@@ -674,7 +681,7 @@ def holds_sometimes(buffer, memory):
 PLAIN = [
     p
     for p in (*map(policies.get, policies.names()), policies.Policy("test-anything", anything, compile=True))
-    if p.foresee is None and not p.unbounded and not any(p.work) and not p.schedules and p.client == Client()
+    if p.privileged is None and not p.unbounded and not any(p.work) and not p.schedules and p.client == Client()
 ]
 """All policies of one queue that know nothing beforehand, and one that decides at random."""
 
@@ -707,11 +714,15 @@ def scheduled(policy, on_send):
 
 
 @given(cases(), VALUES, st.integers(1, 4), st.sampled_from([0, 1, 3_000]))
-def test_one_topic_without_rules_has_the_same_window(case, v, window, pong_us):
+def test_one_topic_without_rules_has_the_same_window(case, v, window, ack_delay_us):
     for on_send in (head, holds_sometimes):
         policy = replace(PLAIN[-1], on_send=on_send)
-        plain = run(policy, [replace(case.episode, window=window, pong_us=pong_us)], case.capacity, v)
+        plain = run(policy, [replace(case.episode, window=window, ack_delay_us=ack_delay_us)], case.capacity, v)
         topics = run(
-            policy, [replace(one_topic(case), window=window, pong_us=pong_us)], case.capacity, v, topics=[Topic("only")]
+            policy,
+            [replace(one_topic(case), window=window, ack_delay_us=ack_delay_us)],
+            case.capacity,
+            v,
+            topics=[Topic("only")],
         )
         assert same(plain, topics)

@@ -15,14 +15,15 @@ from hypothesis import strategies as st
 from safetensors.numpy import load as tensors_of
 from safetensors.numpy import save as safetensors
 
-from bufgym import __version__, policies, qoi
+from bufgym import __version__, policies
 from bufgym.errors import BufgymError
+from bufgym.model import qoi
 from bufgym.policies import learned, registry, weights
 from bufgym.policies.learned import Network, Weights
 from bufgym.scenario import Interruption
-from bufgym.sender import run
+from bufgym.sim import run
 
-FIELDS = ("time_merged", "drain")
+FIELDS = ("time_merged", "service_ratio")
 ABOUT = {"name": "small", "about": "Drops what is in its way.", "seeds": [0, 1], "scores": {"regret": 0.25}}
 
 
@@ -76,7 +77,7 @@ def refused(path, *told):
 
 @pytest.mark.parametrize("widths", [(), (1,), (8,), (16, 4), (256,)])
 def test_what_is_written_comes_back_bit_for_bit(path, widths):
-    before = made(*widths, fields=("drain", "motion_merged", "loss"))
+    before = made(*widths, fields=("service_ratio", "motion_merged", "loss"))
     assert weights.save(path, before, ABOUT) == path
     after, metadata = weights.read(path)
     assert after.fields == before.fields
@@ -111,9 +112,9 @@ def test_a_loaded_policy_is_one_like_any_other(path):
     episodes = [Interruption(t_max=30).episode(T) for T in (5, 17, 30)]
     v = qoi.exponential(0.618)
     ours, same = run(policy, episodes, 4, v), run(learned.policy("same", before), episodes, 4, v)
-    assert np.array_equal(np.asarray(ours.batch.fates), np.asarray(same.batch.fates))
+    assert np.array_equal(np.asarray(ours.batch.log), np.asarray(same.batch.log))
     other = run(learned.policy("other", made(4, seed=2)), episodes, 4, v)
-    assert not np.array_equal(np.asarray(ours.batch.fates), np.asarray(other.batch.fates))
+    assert not np.array_equal(np.asarray(ours.batch.log), np.asarray(other.batch.log))
 
 
 # --- what is not written ---------------------------------------------------------------------------------------------
@@ -152,7 +153,7 @@ def test_weights_that_could_not_be_read_are_not_written(path):
     with pytest.raises(BufgymError, match="1 to 256 hidden units"):
         weights.save(path, made(257), ABOUT)
     with pytest.raises(BufgymError, match="field = speed: unknown"):
-        weights.save(path, made(3, fields=("speed", "drain")), ABOUT)
+        weights.save(path, made(3, fields=("speed", "service_ratio")), ABOUT)
     assert not path.exists()
     with pytest.raises(BufgymError, match="cannot be written"):
         weights.save(path / "no" / "folder", good, ABOUT)
@@ -222,9 +223,9 @@ def test_metadata_that_are_no_json_object_are_refused(path, parts, text, rule):
         ("fields", "time_merged", "must be a list of at least one field"),
         ("fields", [], "must be a list of at least one field"),
         ("fields", ["time_merged", "speed"], "field = speed: unknown; known: occupied, rank"),
-        ("fields", ["time_merged", ["drain"]], "unknown; known: occupied, rank"),
-        ("fields", ["drain", "drain"], "field = drain: given more than once"),
-        ("fields", ["drain"], "must be [1] for 1 fields and hidden layers of [3]"),
+        ("fields", ["time_merged", ["service_ratio"]], "unknown; known: occupied, rank"),
+        ("fields", ["service_ratio", "service_ratio"], "field = drain: given more than once"),
+        ("fields", ["service_ratio"], "must be [1] for 1 fields and hidden layers of [3]"),
     ],
 )
 def test_metadata_that_break_a_rule_are_refused(path, parts, key, value, rule):

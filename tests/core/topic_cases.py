@@ -11,11 +11,12 @@ import numpy as np
 from cases import Case, cases
 from hypothesis import strategies as st
 
-from bufgym import policies, qoi
-from bufgym.buffer import HOLD
+from bufgym import policies
+from bufgym.model import qoi
+from bufgym.model.buffer import HOLD
+from bufgym.model.topics import Topic
 from bufgym.policies.registry import Client
-from bufgym.sender import Senders
-from bufgym.topics import Topic
+from bufgym.sim import Senders
 
 TWIN_V = {
     **{qoi.exponential(base): naive.exponential(base) for base in (0.3, 0.618, 0.95)},
@@ -25,14 +26,14 @@ TWIN_V = {
 V = st.sampled_from(list(TWIN_V))
 
 
-def decision(luck: float, capacity: int) -> int:
+def decision(uniform: float, capacity: int) -> int:
     """Any decision, impossible ones included: -3 is none at all, then ACCEPT, REJECT, and slots beyond the last."""
-    return int(luck * (capacity + 5)) - 3
+    return int(uniform * (capacity + 5)) - 3
 
 
-def choice(now_us: int, queued: int, taken: int, capacity: int) -> int:
+def choice(now_us: int, queued: int, dequeued: int, capacity: int) -> int:
     """Any choice of what to send, HOLD and impossible ones included."""
-    return (now_us // 3 + 5 * queued + 11 * taken) % (capacity + 3) - 1
+    return (now_us // 3 + 5 * queued + 11 * dequeued) % (capacity + 3) - 1
 
 
 def unwanted(now_us: int, queued: int) -> bool:
@@ -44,11 +45,11 @@ assert HOLD == choice(0, 0, 0, 1)
 
 
 def decide_anything(buffer, arrival, memory):
-    return int(arrival.luck * (buffer.capacity + 5)) - 3
+    return int(arrival.uniform * (buffer.capacity + 5)) - 3
 
 
 def send_anything(buffer, memory):
-    return (buffer.now_us // 3 + 5 * len(buffer.slots) + 11 * buffer.taken) % (buffer.capacity + 3) - 1
+    return (buffer.now_us // 3 + 5 * len(buffer.slots) + 11 * buffer.dequeued) % (buffer.capacity + 3) - 1
 
 
 def drop_some(buffer, memory):
@@ -100,7 +101,7 @@ class TopicCase:
             max_bytes=case.max_bytes,
             decide_at=case.decide_at,
             window=episode.window,
-            pong_us=episode.pong_us,
+            ack_delay_us=episode.ack_delay_us,
             propagation_us=episode.link.propagation_us,
             schedules=self.schedules,
             drops_heads=self.drops_heads,
@@ -151,10 +152,10 @@ def topic_cases(draw: st.DrawFn, min_topics: int = 0, max_messages: int = 60) ->
     arrivals = case.episode.arrivals.copy()
     if n > 0:
         arrivals["topic"] = np.random.default_rng(draw(st.integers(0, 2**32))).integers(0, n, len(arrivals))
-    window, pong_us = draw(st.integers(1, 4)), draw(st.sampled_from([0, 0, 1, 700, 20_000]))
+    window, ack_delay_us = draw(st.integers(1, 4)), draw(st.sampled_from([0, 0, 1, 700, 20_000]))
     case = replace(
         case,
-        episode=replace(case.episode, arrivals=arrivals, window=window, pong_us=pong_us),
+        episode=replace(case.episode, arrivals=arrivals, window=window, ack_delay_us=ack_delay_us),
         twin_messages=[
             {**m, "topic": int(k)} for m, k in zip(case.twin_messages, np.asarray(arrivals)["topic"], strict=True)
         ],

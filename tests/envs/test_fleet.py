@@ -11,13 +11,13 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from bufgym import policies
-from bufgym.cell import FleetEpisode, FleetScenario, run_fleet
 from bufgym.envs import SenderEnv
 from bufgym.errors import BufgymError
 from bufgym.fleet import FleetVecEnv
-from bufgym.link import Link
+from bufgym.model.link import Link
 from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
-from bufgym.scenario import Streams, messages
+from bufgym.scenario import FleetEpisode, FleetScenario, Streams, messages
+from bufgym.sim.cell import run_fleet
 from bufgym.traces import Trace
 
 pytest.importorskip("pettingzoo", reason="the extra [fleet] is not installed")
@@ -84,13 +84,13 @@ def test_an_episode_is_the_rollout_of_the_same_policy(reward):
         actions = {agent: oldest_goes(infos[agent]["action_mask"]) for agent in env.agents}
         _, rewards, _, truncated, infos = env.step(actions)
         ticks += 1
-        for agent, paid in rewards.items():
-            sums[agent] += paid
+        for agent, rewarded in rewards.items():
+            sums[agent] += rewarded
             own[agent] += infos[agent]["reward_terms"]["delivered"]
             assert not truncated[agent]
     assert ticks == scenario.max_messages
     fleet = run_fleet(policies.get("drop-oldest"), [episode], L, scenario.value)
-    assert (np.asarray(env.rows.senders.batch.fates) == np.asarray(fleet.senders.batch.fates)).all()
+    assert (np.asarray(env.rows.senders.batch.log) == np.asarray(fleet.senders.batch.log)).all()
     for agent in env.possible_agents:
         assert infos[agent]["qoi"] == pytest.approx(1 + own[agent])
         assert infos[agent]["arrived"] == infos[agent]["delivered"] + infos[agent]["dropped"]
@@ -150,7 +150,7 @@ def test_seeds_make_the_same_episode_and_go_on_from_it():
         env.reset(seed=seed)
         while env.agents:
             env.step(dict.fromkeys(env.agents, L + 1))
-        return np.asarray(env.rows.senders.batch.fates)["crossed_us"].tolist()
+        return np.asarray(env.rows.senders.batch.log)["transmitted_us"].tolist()
 
     one, other = FleetEnv(robots=2, **SMALL), FleetEnv(robots=2, **SMALL)
     first, second = crossings(one, 5), crossings(one, None)
@@ -271,9 +271,9 @@ def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
         each = []
         for c, fleet in enumerate(fleets):
             mine = dict(zip(fleet.possible_agents, actions[c * robots : (c + 1) * robots].tolist(), strict=True))
-            observation, paid, ended, _, infos = fleet.step(mine)
+            observation, rewarded, ended, _, infos = fleet.step(mine)
             each.append((observation, infos))
-            assert rewards[c * robots : (c + 1) * robots].tolist() == list(paid.values())
+            assert rewards[c * robots : (c + 1) * robots].tolist() == list(rewarded.values())
             assert terminated[c * robots : (c + 1) * robots].tolist() == list(ended.values())
         assert not truncated.any()
     assert terminated.all()

@@ -13,7 +13,7 @@ import pytest
 import bufgym
 from bufgym.envs import SenderEnv, SenderVectorEnv, render
 from bufgym.kernel import JIT
-from bufgym.link import Link
+from bufgym.model.link import Link
 from bufgym.scenario import Episode, Interruption, Uplink, messages
 from bufgym.traces import Trace
 

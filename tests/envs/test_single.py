@@ -11,15 +11,15 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import bufgym
-from bufgym import qoi
-from bufgym.buffer import UNLIMITED_BYTES, Buffer, motion_gaps, time_gaps
 from bufgym.envs import SenderEnv
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
-from bufgym.link import Link
+from bufgym.model import qoi
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, motion_gaps, time_gaps
+from bufgym.model.link import Link
 from bufgym.observe import CONTEXT_FIELDS, FIELDS, SLOT_FIELDS
 from bufgym.scenario import Episode, Interruption, Scenario, Uplink, messages
-from bufgym.sender import Batch, view
+from bufgym.sim import Batch, view
 from bufgym.traces import Trace, drive_motion
 
 FADING = Trace.steps([(0.4, 9e6), (0.5, 0), (0.6, 2e6)])
@@ -95,14 +95,14 @@ def test_an_id_that_names_its_module() -> None:
 
 
 def test_fields_choose_what_is_observed() -> None:
-    env, everything = make("fading", "arrival", fields=["drain", "loss"]), make("fading", "arrival")
-    assert set(env.observation_space) == {"loss", "drain"}
+    env, everything = make("fading", "arrival", fields=["service_ratio", "loss"]), make("fading", "arrival")
+    assert set(env.observation_space) == {"loss", "service_ratio"}
     few, all_of_it = env.reset(seed=3)[0], everything.reset(seed=3)[0]
-    assert set(few) == {"loss", "drain"}
+    assert set(few) == {"loss", "service_ratio"}
     assert set(all_of_it) == {field.name for field in FIELDS}
     assert same(few, {name: all_of_it[name] for name in few})
     assert env.observation_space["loss"].shape == (5,)
-    assert env.observation_space["drain"].shape == (1,)
+    assert env.observation_space["service_ratio"].shape == (1,)
 
 
 # --- rewards ---------------------------------------------------------------------------------------------------------
@@ -117,25 +117,25 @@ def test_rewards_worked_by_hand() -> None:
     for slot in (0, 1):
         env = SenderEnv(Interruption(law="fixed", t_max=4), 2)
         env.reset(seed=0)
-        paid = []
+        rewarded = []
         for action in (3, 3, slot, 2):
             _, reward, ended, truncated, info = env.step(action)
-            paid.append((info["reward_terms"]["retained"], info["reward_terms"]["delivered"]))
+            rewarded.append((info["reward_terms"]["retained"], info["reward_terms"]["delivered"]))
             assert reward == info["reward_terms"]["retained"]
             assert not truncated
         assert ended
         expected = [(v1, 0), (v1, 0), (v2 - v1, 0), (v2, v1 + v2 + v2)]
-        np.testing.assert_allclose(paid, expected, atol=1e-15)
+        np.testing.assert_allclose(rewarded, expected, atol=1e-15)
         assert info["qoi"] == pytest.approx(1 + v1 + 2 * v2)
-        assert (info["arrived"], info["delivered"], info["dropped"], info["impossible"]) == (6, 4, 2, 0)
+        assert (info["arrived"], info["delivered"], info["dropped"], info["invalid"]) == (6, 4, 2, 0)
 
 
 def test_rejecting_all_and_weighted_rewards() -> None:
     """T = 3, all rejected: 0 and 4 are delivered, V(4) is paid by the last step, at half and twice its worth."""
     env = SenderEnv(Interruption(law="fixed", t_max=3), 2, reward={"delivered": 2.0, "retained": 0.5})
     env.reset(seed=0)
-    paid = [env.step(2)[1] for _ in range(3)]
-    assert paid == [0, 0, pytest.approx(2.5 * (1 - 0.618**4))]
+    rewarded = [env.step(2)[1] for _ in range(3)]
+    assert rewarded == [0, 0, pytest.approx(2.5 * (1 - 0.618**4))]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -146,7 +146,7 @@ def test_every_step_of_random_play(scenario: str, variant: str) -> None:
     L, most = env.rows.capacity, VARIANTS[variant].get("max_bytes", UNLIMITED_BYTES)
     for k in range(EPISODES):
         observation, info = env.reset(seed=7 if k == 0 else None)
-        ended, total, impossible = False, np.zeros(2), 0
+        ended, total, invalid = False, np.zeros(2), 0
         while not ended:
             assert env.observation_space.contains(observation)
             sender = env.rows.senders.batch.senders[0]
@@ -161,26 +161,26 @@ def test_every_step_of_random_play(scenario: str, variant: str) -> None:
             else:
                 allowed = [True] * (L + 2)  # an episode that asks for nothing: whatever is said counts for nothing
             action = int(rng.integers(L + 2))
-            impossible += not allowed[action]
+            invalid += not allowed[action]
             observation, reward, ended, truncated, info = env.step(action)
             assert not truncated
             terms = info["reward_terms"]
             total += terms["delivered"], terms["retained"]
             assert reward == terms["retained"]
-            assert info["impossible"] == impossible
-            sender, fates = env.rows.senders.batch.senders[0], env.rows.senders.batch.fates[0]
+            assert info["invalid"] == invalid
+            sender, log = env.rows.senders.batch.senders[0], env.rows.senders.batch.log[0]
             arrived = int(sender["next"])
-            dropped = int((fates["dropped_us"][:arrived] >= 0).sum())
-            crossed = int((fates["crossed_us"][:arrived] >= 0).sum())
-            assert arrived == crossed + sender["busy"] + sender["occupancy"] + dropped
-            assert (crossed, dropped) == (sender["crossed"], sender["rejected"] + sender["evicted"])
+            dropped = int((log["dropped_us"][:arrived] >= 0).sum())
+            transmitted = int((log["transmitted_us"][:arrived] >= 0).sum())
+            assert arrived == transmitted + sender["busy"] + sender["occupancy"] + dropped
+            assert (transmitted, dropped) == (sender["transmitted"], sender["rejected"] + sender["evicted"])
             assert 0 <= sender["backlog_bytes"] <= most
             assert 0 <= sender["occupancy"] <= L
         assert info["arrived"] == arrived == len(env.rows.senders.episodes[0].arrivals)
-        assert (info["delivered"], info["dropped"]) == (crossed, dropped)
+        assert (info["delivered"], info["dropped"]) == (transmitted, dropped)
         np.testing.assert_allclose(total, max(0.0, info["qoi"] - 1), atol=1e-9)
         # H by its definition, from what crossed.
-        x = env.rows.senders.episodes[0].arrivals["x"][: len(fates)][fates["crossed_us"][:arrived] >= 0]
+        x = env.rows.senders.episodes[0].arrivals["x"][: len(log)][log["transmitted_us"][:arrived] >= 0]
         assert info["qoi"] == pytest.approx(env.rows.scenario.value.information(np.sort(x)))
     if scenario == "dying":
         assert sender["occupancy"] + sender["busy"] > 0  # stranded, and still all sums hold
@@ -193,7 +193,7 @@ def test_an_episode_that_asks_for_no_decision_ends_with_the_first_step() -> None
     assert not any(array.any() for array in observation.values())
     _, reward, ended, _, info = env.step(0)
     assert ended
-    assert (info["delivered"], info["dropped"], info["impossible"]) == (5, 0, 0)
+    assert (info["delivered"], info["dropped"], info["invalid"]) == (5, 0, 0)
     assert reward == pytest.approx(4 * (1 - 0.618))
     assert info["qoi"] == pytest.approx(1 + 4 * (1 - 0.618))
 
@@ -202,18 +202,18 @@ def test_an_episode_that_asks_for_no_decision_ends_with_the_first_step() -> None
 def test_an_impossible_action_does_what_a_queue_does(variant: str) -> None:
     env, queue, rng = make("fading", variant), make("fading", variant), np.random.default_rng(0)
     (_, info), _ = env.reset(seed=2), queue.reset(seed=2)
-    ended, impossible = False, 0
+    ended, invalid = False, 0
     while not ended:
         mask = info["action_mask"]
         action = int(rng.choice(np.flatnonzero(~mask) if rng.random() < 0.5 and not mask.all() else np.arange(6)))
         instead = action if mask[action] else 5 if mask[5] else 4
-        impossible += action != instead or not mask[action]
+        invalid += action != instead or not mask[action]
         observation, reward, ended, _, info = env.step(action)
         as_queue, reward_there, _, _, there = queue.step(instead)
         assert same(observation, as_queue)
         assert reward == reward_there
-        assert (info["impossible"], there["impossible"]) == (impossible, 0)
-    assert impossible > 5
+        assert (info["invalid"], there["invalid"]) == (invalid, 0)
+    assert invalid > 5
 
 
 # --- observations ----------------------------------------------------------------------------------------------------
@@ -227,7 +227,10 @@ def twin(buffer: Buffer, arrival: Any, V: qoi.Value) -> dict[str, list[float]]:
         return float(g / (g + r)) if g > 0 else 0.0
 
     L, s = buffer.capacity, len(buffer.slots)
-    even_us, even_x = (arrival.arrival_us - buffer.taken_us) / (L + 1), (arrival.x - buffer.taken_x) / (L + 1)
+    even_us, even_x = (
+        (arrival.arrival_us - buffer.dequeued_arrival_us) / (L + 1),
+        (arrival.x - buffer.dequeued_x) / (L + 1),
+    )
     sizes = [*(slot.size_bytes for slot in buffer.slots), arrival.size_bytes]
     fields: dict[str, list[float]] = {field.name: [] for field in SLOT_FIELDS}
     for k in [*range(s), *[None] * (L - s), s]:
@@ -236,7 +239,7 @@ def twin(buffer: Buffer, arrival: Any, V: qoi.Value) -> dict[str, list[float]]:
         else:
             (a_us, b_us), (a, b) = gaps_us(buffer, arrival, k), gaps_x(buffer, arrival, k)
             # Nothing is lost with the very first message of all: it has no gap before it yet.
-            first = buffer.taken == 0 and k == 0
+            first = buffer.dequeued == 0 and k == 0
             values = [
                 1.0,
                 (k + 1) / (s + 1),
@@ -260,7 +263,7 @@ def twin(buffer: Buffer, arrival: Any, V: qoi.Value) -> dict[str, list[float]]:
         buffer.left_fraction,
         per(buffer.stalled_us, stalled_by),
         per(buffer.departures, 1.0),
-        per(buffer.drain, 1.0),
+        per(buffer.service_ratio, 1.0),
         V(even_x),
         (2 * V(even_x) - V(2 * even_x)) / V(even_x) if even_x > 0 else 0.0,
     ]

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from bufgym import qoi
 from bufgym import scenario as scenarios
 from bufgym.benchmark import perf
 from bufgym.envs import SenderEnv, SenderVectorEnv, render
 from bufgym.envs.rows import decision_of
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
-from bufgym.link import Link
-from bufgym.metrics import topic_outcomes
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.model.topics import Topic
 from bufgym.observe import CONTEXT_FIELDS, FIELDS, REWARD_TERMS, SLOT_FIELDS, TOPIC_FIELDS, TOPIC_REWARD_TERMS
 from bufgym.scenario import Client, Episode, Stream, messages
-from bufgym.sender import ARRIVAL_WAITS, SOCKET_WAITS, Batch, answer_send, decide
-from bufgym.topics import Topic
+from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, Batch, answer_send, decide
+from bufgym.sim.metrics import topic_outcomes
 from bufgym.traces import Trace
 
 TERMS = [term.name for term in REWARD_TERMS + TOPIC_REWARD_TERMS]
@@ -190,7 +190,7 @@ def test_an_episode_of_three_topics_by_hand() -> None:
         for name in TERMS:
             totals[name] += info["reward_terms"][name]
         assert ended == (k == len(script) - 1)
-    assert info["impossible"] == 0
+    assert info["invalid"] == 0
     assert (info["arrived"], info["delivered"], info["dropped"]) == (7, 4, 3)
     assert info["qoi"] == pytest.approx(2 + 1 + 0.5 * (1 + 1))
     assert totals["retained"] == totals["delivered"] == pytest.approx(0.5)
@@ -207,33 +207,33 @@ def test_hold_waits_for_the_next_arrival_and_the_impossible_sends_the_oldest() -
     env.step(4)
     assert waiting(env) == SOCKET_WAITS
     _, _, _, _, info = env.step(3)  # hold
-    assert (waiting(env), info["impossible"]) == (ARRIVAL_WAITS, 0)
+    assert (waiting(env), info["invalid"]) == (ARRIVAL_WAITS, 0)
     env.step(4)
     assert waiting(env) == SOCKET_WAITS  # asked anew: 0 and 1 are queued
-    for action, impossible, goes in ((4, 1, 0), (2, 1, 0), (1, 0, 1), (0, 0, 0)):
+    for action, invalid, goes in ((4, 1, 0), (2, 1, 0), (1, 0, 1), (0, 0, 0)):
         batch = copied(env)
         answer_send(batch, 0, action)
-        assert batch.senders["impossible"][0] == impossible
+        assert batch.senders["invalid"][0] == invalid
         assert batch.senders["chosen"][0] == goes
 
 
 def test_hold_at_a_pong() -> None:
     """n_T = 1 and 5 ms to the pong: after the last arrival the socket may wait for the pong, then no longer."""
     env = SenderEnv(BY_HAND, 6, window=2)
-    _, info = env.reset(options={"episode": three_topics(window=2, pong_us=5_000)})
+    _, info = env.reset(options={"episode": three_topics(window=2, ack_delay_us=5_000)})
     rng, ended, asked = np.random.default_rng(0), False, []
     while not ended:
         mask = info["action_mask"]
         if waiting(env) == SOCKET_WAITS:
             sender = env.rows.senders.batch.senders[0]
-            more = sender["next"] < sender["arrivals"] or sender["ponged"] < sender["taken"]
+            more = sender["next"] < sender["arrivals"] or sender["acked"] < sender["dequeued"]
             assert mask[6] == more
             asked.append(bool(more))
             action = int(np.flatnonzero(mask[:6])[0]) if rng.random() < 0.5 or not more else 6
         else:
             action = 7
         _, _, ended, _, info = env.step(action)
-    assert info["impossible"] == 0 and info["delivered"] == 7
+    assert info["invalid"] == 0 and info["delivered"] == 7
     assert True in asked
 
 
@@ -252,18 +252,18 @@ def test_the_mask_is_what_does_not_count_as_impossible(case: str) -> None:
             allowed = []
             for action in range(L + 2):
                 batch = copied(env)
-                before = int(batch.senders["impossible"][0])
+                before = int(batch.senders["invalid"][0])
                 if waiting(env) == ARRIVAL_WAITS:
                     carried_out = decide(batch, 0, decision_of(action, L))
                 else:
                     carried_out = answer_send(batch, 0, -1 if action == L else action)
-                assert carried_out == (int(batch.senders["impossible"][0]) == before)
+                assert carried_out == (int(batch.senders["invalid"][0]) == before)
                 allowed.append(bool(carried_out))
             assert info["action_mask"].tolist() == allowed
         # Full queues and holding are what is rare: accept where possible.
         mask = info["action_mask"]
         _, _, ended, _, info = env.step(L + 1 if mask[L + 1] else possible(mask, rng))
-    assert info["impossible"] == 0
+    assert info["invalid"] == 0
     assert min(met.values()) > 3
 
 
@@ -285,10 +285,10 @@ def test_every_step_of_random_play(case: str) -> None:
             assert not truncated
             sender = env.rows.senders.batch.senders[0]
             dropped = sender["rejected"] + sender["evicted"]
-            assert sender["next"] == sender["crossed"] + sender["busy"] + sender["occupancy"] + dropped
+            assert sender["next"] == sender["transmitted"] + sender["busy"] + sender["occupancy"] + dropped
             for name in TERMS:
                 totals[name] += terms[name]
-        assert (info["impossible"] > 0) == bool(careless)
+        assert (info["invalid"] > 0) == bool(careless)
         outcomes = topic_outcomes(env.rows.senders, 0)
         assert info["qoi"] == pytest.approx(weights @ [made.qoi for made in outcomes])
         ones = weights @ [made.delivered > 0 for made in outcomes]
@@ -332,7 +332,7 @@ def test_a_client_of_one_topic() -> None:
         seen, reward, ended, _, info = env.step(possible(info["action_mask"], rng))
         total += reward
     assert met == {ARRIVAL_WAITS, SOCKET_WAITS}
-    assert info["impossible"] == 0 and 0 < info["dropped"]
+    assert info["invalid"] == 0 and 0 < info["dropped"]
     assert total == pytest.approx(info["qoi"] - 0.25)
 
 
@@ -417,7 +417,7 @@ def test_masked_ppo_learns_on_it() -> None:
     model = maskable("MultiInputPolicy", envs, n_steps=64, batch_size=64, n_epochs=1, seed=0, device="cpu")
     model.learn(512)
     assert len(model.ep_info_buffer) > 0
-    assert (envs.envs.rows.senders.batch.senders["impossible"] == 0).all()
+    assert (envs.envs.rows.senders.batch.senders["invalid"] == 0).all()
 
 
 # --- pictures --------------------------------------------------------------------------------------------------------

@@ -12,10 +12,10 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, FlattenObservation, RecordEpisodeStatistics
 
 import bufgym
-from bufgym import qoi
 from bufgym.envs import SenderEnv, SenderVectorEnv
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
+from bufgym.model import qoi
 from bufgym.scenario import Interruption, Scenario, Uplink
 from bufgym.traces import Trace
 

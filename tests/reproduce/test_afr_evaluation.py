@@ -15,7 +15,7 @@ from bufgym.errors import BufgymError
 from bufgym.reproduce import NEEDS_DATA, afr_fig6, afr_fig7_qoi, afr_fig8_gap, run
 from bufgym.reproduce import afr_evaluation as common
 from bufgym.reproduce.report import Report
-from bufgym.suites import motion_value
+from bufgym.scenario.suites import motion_value
 from bufgym.traces import Motion, Trace, write_csv
 
 SHIPPED: dict[str, Any] = {"trace": "lte-synthetic-0", "motion": ["drive-0"], "frames": 60, "capacities": (3,)}

@@ -9,13 +9,15 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from bufgym import policies, qoi, sender
+from bufgym import policies
+from bufgym import sim as sender
 from bufgym.kernel import JIT
+from bufgym.model import qoi
+from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
-from bufgym.qoi import Value
 from bufgym.reproduce import afr_fig4, afr_fig5, afr_fig9, afr_theorems
 from bufgym.scenario import Interruption
-from bufgym.sender import NEVER
+from bufgym.sim import NEVER
 
 # -------------------- Fig. 4
 
@@ -106,8 +108,8 @@ def test_random_keeps_each_message_as_eq_9_says(L: int, T: int) -> None:
     runs = 20_000 if JIT else 200
     rng = np.random.default_rng(7)
     episode = Interruption(law="fixed", t_max=T).episode(T)
-    done = sender.run(policies.get("random"), [episode.with_luck(rng) for _ in range(runs)], L, qoi.exponential())
-    kept = (np.array(done.batch.fates["dropped_us"]) == NEVER).mean(axis=0)
+    done = sender.run(policies.get("random"), [episode.with_uniforms(rng) for _ in range(runs)], L, qoi.exponential())
+    kept = (np.array(done.batch.log["dropped_us"]) == NEVER).mean(axis=0)
     assert kept[0] == kept[T + 1] == 1
     for i in range(1, T + 1):
         expected = (L / (L + 1)) ** min(T - i + 1, T - L)

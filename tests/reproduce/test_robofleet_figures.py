@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from bufgym.errors import BufgymError
+from bufgym.model.topics import Topic
 from bufgym.reproduce import robofleet_fig3, robofleet_fig4, robofleet_fig5, robofleet_fig6, robofleet_fig7, run
 from bufgym.reproduce.report import Report
 from bufgym.reproduce.robofleet_evaluation import BYTES, Sent, cloud_bytes, meet, stream
 from bufgym.reproduce.robofleet_fig4 import length_for, recovery_s
 from bufgym.reproduce.robofleet_table1 import PAPER
 from bufgym.scenario import Stream
-from bufgym.topics import Topic
 from bufgym.traces import Trace
 
 NAMES = [f"robofleet-fig{k}" for k in range(3, 8)]
@@ -272,7 +272,7 @@ def test_fig7_no_drop_is_kept_and_images_go() -> None:
     assert "no_drop is never lost: holds here (0 poses" in made.text
     # Native ROS's turns by message: 75,188 + 7,260 + 75 bytes a round are 0.66 s, so 45 poses of 300 in the zone; a
     # full queue of 10 makes them nearly a second old. What waits at its end, 10 of each, goes once the link is good.
-    gone, came = (in_zone("ros-native", "PoseStamped", f"{fate}_in_zone") for fate in ("lost", "arrived"))
+    gone, came = (in_zone("ros-native", "PoseStamped", f"{entry}_in_zone") for entry in ("lost", "arrived"))
     lost = gone / came
     assert lost == pytest.approx(1 - (45 + 10) / 300, abs=0.02)
     assert 800 < in_zone("ros-native", "PoseStamped", "median_in_zone_ms") < 1000

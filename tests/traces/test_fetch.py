@@ -255,8 +255,8 @@ def test_an_empty_answer_is_no_file(site: Site, tmp_path: Path) -> None:
 
 def test_nobody_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("no_proxy", "*")
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as dequeued:
+        port = dequeued.getsockname()[1]
     with pytest.raises(BufgymError, match=r"no connection \(Connection refused\) \(given up after 3 attempts\)$"):
         download(f"http://127.0.0.1:{port}/", tmp_path / "part", None, HASTY)
 

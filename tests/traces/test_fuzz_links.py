@@ -89,36 +89,36 @@ def ends_well(path: Path, format: str | None, column: str | None = None) -> bool
     return True
 
 
-def mutated(luck: random.Random, data: bytes, others: list[bytes]) -> bytes:
+def mutated(uniform: random.Random, data: bytes, others: list[bytes]) -> bytes:
     found = bytearray(data)
-    for _ in range(luck.choice([0, 0, 1, 1, 1, 2, 4, 16])):
-        at, length = luck.randrange(len(found) + 1), luck.choice([1, 1, 3, 20, 200])
-        match luck.randrange(7):
+    for _ in range(uniform.choice([0, 0, 1, 1, 1, 2, 4, 16])):
+        at, length = uniform.randrange(len(found) + 1), uniform.choice([1, 1, 3, 20, 200])
+        match uniform.randrange(7):
             case 0 if found:
-                found[at % len(found)] ^= 1 << luck.randrange(8)
+                found[at % len(found)] ^= 1 << uniform.randrange(8)
             case 1:
                 del found[at : at + length]
             case 2:
-                found[at:at] = luck.choice(ABSURD)
+                found[at:at] = uniform.choice(ABSURD)
             case 3:
-                found[at:at] = found[at : at + length] * luck.choice([1, 2, 50])
+                found[at:at] = found[at : at + length] * uniform.choice([1, 2, 50])
             case 4:
-                other = luck.choice(others)
-                place = luck.randrange(len(other))
+                other = uniform.choice(others)
+                place = uniform.randrange(len(other))
                 found[at : at + length] = other[place : place + length]
             case 5:
                 del found[at:]
             case _:
-                found[at : at + 1] = luck.choice([b"0", b"9", b"-", b".", b" ", b"\n", b",", b"e", b'"', b"}"])
+                found[at : at + 1] = uniform.choice([b"0", b"9", b"-", b".", b" ", b"\n", b",", b"e", b'"', b"}"])
     return bytes(found)
 
 
-def packed(luck: random.Random, data: bytes) -> bytes:
-    if luck.random() < 0.5:
+def packed(uniform: random.Random, data: bytes) -> bytes:
+    if uniform.random() < 0.5:
         return gzip.compress(data, 1)
     target = io.BytesIO()
-    with zipfile.ZipFile(target, "w", luck.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])) as archive:
-        for k in range(luck.choice([1, 1, 1, 2])):
+    with zipfile.ZipFile(target, "w", uniform.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])) as archive:
+        for k in range(uniform.choice([1, 1, 1, 2])):
             archive.writestr(f"{k}.csv", data)
     return target.getvalue()
 
@@ -152,15 +152,15 @@ def test_mutated_files_end_well(tmp_path: Path, batch: int) -> None:
     read = 0
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for k in range(batch, COUNT, BATCHES):
-        luck = random.Random(f"{SEED}-{k}")
-        format, data = luck.choice(files)
-        data = mutated(luck, data, others)
-        if luck.random() < 0.2:
-            data = packed(luck, data)
-            data = mutated(luck, data, others) if luck.random() < 0.5 else data
-        column = luck.choice([None, None, None, "UL_bitrate"])
+        uniform = random.Random(f"{SEED}-{k}")
+        format, data = uniform.choice(files)
+        data = mutated(uniform, data, others)
+        if uniform.random() < 0.2:
+            data = packed(uniform, data)
+            data = mutated(uniform, data, others) if uniform.random() < 0.5 else data
+        column = uniform.choice([None, None, None, "UL_bitrate"])
         path = written(tmp_path, data, f"fuzz-{SEED}-{k}")
-        read += ends_well(path, luck.choice([None, None, format, luck.choice(list(FORMATS))]), column)
+        read += ends_well(path, uniform.choice([None, None, format, uniform.choice(list(FORMATS))]), column)
         path.unlink()
     assert COUNT < 400 or read > 0  # mutations are mild enough for some to be sound
     # Kilobytes on Linux; the greatest that the process ever had.

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bufgym import oracle, policies, scenario, sender
+from bufgym import oracle, policies, scenario
+from bufgym import sim as sender
 from bufgym.benchmark import drops
 from bufgym.errors import BufgymError, TraceError
 from bufgym.traces import Motion, Trace
@@ -194,7 +195,7 @@ def test_the_link_takes_each_message_for_its_own_size() -> None:
     """From 4 s on 10 bytes a ms: 1000 bytes take 100 ms, 3000 take 300."""
     meets = uplink(recorded((1000, 3000, 1000, 1000)))
     ran = sender.run(policies.get("drop-newest"), [meets.draw(scenario.Streams.seeded(0))], 3, meets.value)
-    assert np.asarray(ran.batch.fates[0])["crossed_us"].tolist() == [4_100_000, 4_400_000, 4_500_000, 4_600_000]
+    assert np.asarray(ran.batch.log[0])["transmitted_us"].tolist() == [4_100_000, 4_400_000, 4_500_000, 4_600_000]
 
 
 def test_the_clairvoyant_of_a_recording() -> None:

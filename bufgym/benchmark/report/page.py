@@ -11,7 +11,7 @@ from bufgym.benchmark.folder import Run
 from bufgym.benchmark.report import charts, costs, style, tables
 from bufgym.benchmark.report.charts import Chart, Context
 from bufgym.benchmark.report.timeline import timeline
-from bufgym.benchmark.score import BITES, CellScore, Scores, Standing
+from bufgym.benchmark.score import DISCRIMINATIVE, CellScore, Scores, Standing
 from bufgym.errors import BufgymError
 
 
@@ -47,7 +47,7 @@ def html(run: Run, scores: Scores) -> str:
             reference=next((s for s in scores.standings if s.policy == scores.reference), None),
             heat=tables.heat_map(scores),
             shade=_shade,
-            threshold=f"{BITES:.0%}".replace("%", " %"),
+            threshold=f"{DISCRIMINATIVE:.0%}".replace("%", " %"),
             colour=context.colour,
             charts=made,
             episode=run.timeline,
@@ -95,7 +95,7 @@ def _best(scores: Scores) -> Standing | None:
 def _shade(cell: CellScore) -> str:
     """How strongly a cell of the heat map is coloured, and with what: one CSS declaration."""
     value = cell.score.value
-    if math.isnan(value) or not cell.bites:
+    if math.isnan(value) or not cell.discriminative:
         return ""
     hue = "better" if value >= 0 else "worse"
     return f"--hue: var(--{hue}); --strength: {min(abs(value), 1) * 80:.0f}%"

@@ -84,7 +84,7 @@ def heat_map(scores: Scores) -> HeatMap:
         columns=list(columns.items()),
         lines=[(standing.policy, by_policy[standing.policy]) for standing in scores.standings],
         inexact={(cell.scenario, cell.capacity) for cell in scores.cells if not cell.exact},
-        flat={(cell.scenario, cell.capacity) for cell in scores.cells if not cell.bites},
+        flat={(cell.scenario, cell.capacity) for cell in scores.cells if not cell.discriminative},
     )
 
 

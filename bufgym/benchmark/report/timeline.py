@@ -36,7 +36,7 @@ def longest_gap(x: Sequence[float], received: Sequence[int]) -> tuple[int, int] 
     return max(pairs, key=lambda pair: x[pair[1]] - x[pair[0]]) if pairs else None
 
 
-def fates(messages: int, lane: Mapping[str, Any], gap: tuple[int, int] | None) -> list[int]:
+def log(messages: int, lane: Mapping[str, Any], gap: tuple[int, int] | None) -> list[int]:
     """What became of each message, in the order of their arrival."""
     found = np.full(messages, LEFT)
     dropped = [entry[0] for entry in lane["dropped"]]
@@ -45,7 +45,7 @@ def fates(messages: int, lane: Mapping[str, Any], gap: tuple[int, int] | None) -
         within = [seq for seq in dropped if gap[0] < seq < gap[1]]
         found[within] = IN_GAP
     found[[entry[0] for entry in lane["received"]]] = KEPT
-    return [int(fate) for fate in found]
+    return [int(entry) for entry in found]
 
 
 def _figure(found: Mapping[str, Any]) -> Figure:
@@ -55,7 +55,7 @@ def _figure(found: Mapping[str, Any]) -> Figure:
     for name in names:
         lane = found["policies"][name]
         gap = longest_gap(x, [entry[0] for entry in lane["received"]])
-        rows.append(fates(len(at), lane, gap))
+        rows.append(log(len(at), lane, gap))
         hover.append(_hover(at, lane))
         cells = [f"{lane['qoi']:.1f}", "–", "–"]
         if gap is not None:
@@ -86,8 +86,8 @@ def _hover(at: Sequence[float], lane: Mapping[str, Any]) -> list[str]:
     words = ["still queued at the end"] * len(at)
     for seq, when in lane["dropped"]:
         words[seq] = f"dropped {when:.2f} s"
-    for seq, taken, crossed in lane["received"]:
-        words[seq] = f"sent {taken:.2f} s, delivered {crossed:.2f} s"
+    for seq, dequeued, transmitted in lane["received"]:
+        words[seq] = f"sent {dequeued:.2f} s, delivered {transmitted:.2f} s"
     return words
 
 

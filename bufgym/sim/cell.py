@@ -10,14 +10,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.cell.scenario import FleetEpisode, check_robots
-from bufgym.cell.sharing import CELL, Shares, cell_event, decide_in_cell, load_cell, shares_type
 from bufgym.errors import BufgymError
 from bufgym.kernel import compile_for, records
-from bufgym.link import FOREVER
+from bufgym.model.link import FOREVER
+from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy, runs_compiled, signatures
-from bufgym.qoi import Value
-from bufgym.sender import (
+from bufgym.scenario.fleet import FleetEpisode, check_robots
+from bufgym.sim import (
     DECISION,
     DEQUEUE,
     END,
@@ -33,6 +32,7 @@ from bufgym.sender import (
     named,
     view,
 )
+from bufgym.sim.shared_link import CELL, Shares, cell_event, decide_in_cell, load_cell, shares_type
 
 
 def fleet_rollout(
@@ -122,7 +122,7 @@ class Fleet:
 
     def run(self, policy: Policy, memory: NDArray[np.float64] | None = None) -> None:
         """Run every loaded cell to its end, ``policy`` on each robot; ``memory``: float64[rows, entries]."""
-        if policy.foresee is not None:
+        if policy.privileged is not None:
             raise BufgymError(f"policy {policy.name}: it plans with a link of its own, which no robot in a cell has")
         if memory is None:
             memory = policy.new_memory(len(self.senders), self.senders.capacity)

@@ -11,19 +11,19 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import MESSAGE, TOPIC, UNLIMITED_BYTES, check_limits, row_width
 from bufgym.errors import BufgymError
 from bufgym.kernel import compile_for, records
-from bufgym.link import FOREVER, Knots
+from bufgym.model.buffer import MESSAGE, TOPIC, UNLIMITED_BYTES, check_limits, row_width
+from bufgym.model.link import FOREVER, Knots
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic, check_topics, copies_of, topic_table
 from bufgym.policies.registry import Policy, runs_compiled, signatures
-from bufgym.qoi import Value
 from bufgym.scenario import Episode
-from bufgym.sender.decisions import answer_dequeue, answer_send, decide
-from bufgym.sender.seen import arrival_of, view
-from bufgym.sender.socket import credit
-from bufgym.sender.state import DECISION, DEPARTURE, DEQUEUE, END, FATE, SEND, SENDER, Batch, batch_type, named
-from bufgym.sender.transition import load_row, next_event
-from bufgym.topics import Topic, check_topics, copies_of, topic_table
+from bufgym.sim.decisions import answer_dequeue, answer_send, decide
+from bufgym.sim.socket import credit
+from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, LOG_ENTRY, SEND, SENDER, Batch, batch_type, named
+from bufgym.sim.transition import load_row, next_event
+from bufgym.sim.view import arrival_of, view
 
 
 def rollout(
@@ -92,7 +92,7 @@ class Senders:
             records(n, SENDER),
             records((n, row_width(self.capacity)), MESSAGE),
             records((n, max_messages), MESSAGE),
-            records((n, max_messages), FATE),
+            records((n, max_messages), LOG_ENTRY),
             np.zeros((n, max_messages), np.int64),
             self._knots.us,
             self._knots.bytes,
@@ -125,20 +125,20 @@ class Senders:
             (self.capacity, self.max_bytes, int(self.decide_at == "overflow")),
             (episode.first_decision, episode.last_decision),
             (first_knot, last_knot, after, link.offset_us, link.propagation_us),
-            (episode.window, episode.pong_us),
+            (episode.window, episode.ack_delay_us),
         )
 
     def new_memory(self, policy: Policy, i: int) -> NDArray[np.float64]:
         """Fresh memory of ``policy`` for the episode of sender ``i``, float64[entries]."""
         memory: NDArray[np.float64] = policy.new_memory(1, self.capacity)[0]
-        if policy.foresee is not None:
-            memory = policy.foresee(self.episodes[i], self.capacity, self.max_bytes, self.value)
+        if policy.privileged is not None:
+            memory = policy.privileged(self.episodes[i], self.capacity, self.max_bytes, self.value)
         return memory
 
     def run(self, policy: Policy, memory: NDArray[np.float64] | None = None) -> None:
         """Run every loaded sender to its end under ``policy``; ``memory``: float64[n, entries], fresh by default."""
         if memory is None:
-            rows = range(len(self)) if policy.foresee is not None else ()
+            rows = range(len(self)) if policy.privileged is not None else ()
             memory = (
                 padded([self.new_memory(policy, i) for i in rows])
                 if rows
@@ -147,8 +147,8 @@ class Senders:
         senders = self.batch.senders
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
         senders["limit_at_send"], senders["flush_no_drop"] = policy.client.limit_at_send, policy.client.flush_no_drop
-        if not policy.client.awaits_pongs:
-            senders["window"], senders["pong_us"] = 1, 0
+        if not policy.client.awaits_acks:
+            senders["window"], senders["ack_delay_us"] = 1, 0
         if runs_compiled(policy):
             compiled_rollout()(self.batch, memory, *policy.compiled, policy.hears_departures)
         else:

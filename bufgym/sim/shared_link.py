@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
-from bufgym.link import FOREVER, position_at, time_of
-from bufgym.sender import (
+from bufgym.model.link import FOREVER, position_at, time_of
+from bufgym.sim import (
     ARRIVAL_WAITS,
     DECISION,
     DEPARTURE,
@@ -30,10 +30,10 @@ from bufgym.sender import (
     SOCKET_WAITS,
     Batch,
     arrive,
-    cross,
     decide,
-    may_take,
-    take,
+    dequeue,
+    finish_transmission,
+    may_dequeue,
 )
 
 NOTHING = -1
@@ -167,7 +167,7 @@ def next_finish(batch: Batch, shares: Shares, c: int) -> tuple[int, int, int]:
 
 
 @kernel
-def cross_in_cell(batch: Batch, shares: Shares, c: int, goal: int, position: int, finish_us: int) -> None:
+def finish_in_cell(batch: Batch, shares: Shares, c: int, goal: int, position: int, finish_us: int) -> None:
     """The message with the least goal has crossed, and its sender's socket is free; equals go one after the other."""
     cell = shares.cells[c]
     robot = 0
@@ -178,7 +178,7 @@ def cross_in_cell(batch: Batch, shares: Shares, c: int, goal: int, position: int
     cell.busy -= 1
     shares.goals[c, robot] = FOREVER
     batch.senders[i].finish_us = finish_us
-    cross(batch, i)
+    finish_transmission(batch, i)
     cell.free = i
 
 
@@ -192,7 +192,7 @@ def offer(batch: Batch, shares: Shares, c: int) -> int:
     i = cell.free
     sender = batch.senders[i]
     cell.row = i
-    if not may_take(batch, i):
+    if not may_dequeue(batch, i):
         sender.follows = 0
         cell.free = NOBODY
         return NOTHING
@@ -201,7 +201,7 @@ def offer(batch: Batch, shares: Shares, c: int) -> int:
     if sender.ask_at_send == 1 and sender.chosen == NEVER:
         sender.waiting = SOCKET_WAITS
         return SEND
-    take(batch, i, max(sender.chosen, 0))
+    dequeue(batch, i, max(sender.chosen, 0))
     join(batch, shares, c, i)
     sender.cleared, sender.follows, sender.chosen = 0, 0, NEVER
     cell.free = NOBODY
@@ -257,7 +257,7 @@ def cell_event(batch: Batch, shares: Shares, c: int) -> int:
             continue
         goal, position, finish_us = next_finish(batch, shares, c)
         if finish_us <= min(cell.next_us, FOREVER - 1):
-            cross_in_cell(batch, shares, c, goal, position, finish_us)
+            finish_in_cell(batch, shares, c, goal, position, finish_us)
         elif cell.next_us == FOREVER:
             return END
         else:

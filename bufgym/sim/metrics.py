@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.sender import NEVER, Senders
+from bufgym.sim import NEVER, Senders
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Outcome:
     """The largest age just before any receipt, s."""
     peak_backlog_bytes: int
     """Bytes queued at most; one that goes straight to an idle socket passes through the queue as well."""
-    impossible: int
+    invalid: int
     """Decisions that could not be carried out as given."""
 
 
@@ -53,7 +53,7 @@ METRICS = tuple(f.name for f in fields(Outcome))
 def received(senders: Senders, i: int) -> NDArray[Any]:
     """MESSAGE[delivered]: what the link carried, in the order in which it did."""
     batch = senders.batch
-    order: NDArray[np.int64] = batch.order[i, : batch.senders[i]["crossed"]]
+    order: NDArray[np.int64] = batch.order[i, : batch.senders[i]["transmitted"]]
     messages: NDArray[Any] = np.asarray(batch.arrivals[i])[order]
     return messages
 
@@ -63,16 +63,16 @@ def outcome(senders: Senders, i: int) -> Outcome:
     batch = senders.batch
     sender = np.asarray(batch.senders)[i]
     got = received(senders, i)
-    fates = np.asarray(batch.fates[i])[: sender["arrivals"]]
-    crossed_us = fates["crossed_us"][got["seq"]]
-    sojourn_s = (crossed_us - got["arrival_us"]) / 1e6
-    mean_age, peak_age, max_age = ages_s(crossed_us + sender["propagation_us"], got["arrival_us"])
+    log = np.asarray(batch.log[i])[: sender["arrivals"]]
+    transmitted_us = log["transmitted_us"][got["seq"]]
+    sojourn_s = (transmitted_us - got["arrival_us"]) / 1e6
+    mean_age, peak_age, max_age = ages_s(transmitted_us + sender["propagation_us"], got["arrival_us"])
     none = float("nan")
     return Outcome(
         qoi=weighted_qoi(senders, i, got) if senders.topics else senders.value.information(got["x"]),
         arrived=int(sender["next"]),
         delivered=len(got),
-        dropped=int((fates["dropped_us"] != NEVER).sum()),
+        dropped=int((log["dropped_us"] != NEVER).sum()),
         in_transmission=int(sender["busy"]),
         buffered=int(sender["occupancy"]),
         longest_gap=float(np.diff(got["x"]).max(initial=0)),
@@ -83,7 +83,7 @@ def outcome(senders: Senders, i: int) -> Outcome:
         peak_age_s=peak_age,
         max_age_s=max_age,
         peak_backlog_bytes=int(sender["peak_backlog_bytes"]),
-        impossible=int(sender["impossible"]),
+        invalid=int(sender["invalid"]),
     )
 
 
@@ -118,16 +118,16 @@ def topic_outcomes(senders: Senders, i: int) -> list[TopicOutcome]:
     """The statistics of each topic of sender ``i``'s run, in the order of its topics."""
     sender = np.asarray(senders.batch.senders)[i]
     arrivals = np.asarray(senders.batch.arrivals[i])[: sender["arrivals"]]
-    fates = np.asarray(senders.batch.fates[i])[: sender["arrivals"]]
+    log = np.asarray(senders.batch.log[i])[: sender["arrivals"]]
     got = received(senders, i)
     until_us = int(arrivals["arrival_us"][-1])
     made = []
     for k, topic in enumerate(senders.topics):
         of_it = arrivals["topic"] == k
         mine = got[got["topic"] == k]
-        dropped = of_it & (fates["dropped_us"] != NEVER)
-        limited = int((dropped & (fates["limited"] == 1)).sum())
-        at_us = fates["crossed_us"][mine["seq"]] + sender["propagation_us"]
+        dropped = of_it & (log["dropped_us"] != NEVER)
+        limited = int((dropped & (log["limited"] == 1)).sum())
+        at_us = log["transmitted_us"][mine["seq"]] + sender["propagation_us"]
         sojourn_s = (at_us - mine["arrival_us"]) / 1e6
         first_us = int(arrivals["arrival_us"][of_it][0]) if of_it.any() else until_us
         mean_age, peak_age = ages_between_s(at_us, mine["arrival_us"], first_us, until_us)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel
-from bufgym.qoi import merging_loss, value
+from bufgym.model.qoi import merging_loss, value
 
 MESSAGE = np.dtype(
     [
@@ -23,7 +23,7 @@ MESSAGE = np.dtype(
         ("size_bytes", np.int64),
         ("topic", np.int64),
         ("x", np.float64),  # coordinate: how far the scene has moved on (frame index or motion)
-        ("luck", np.float64),  # uniform in [0, 1): a randomised policy's own draw for this arrival
+        ("uniform", np.float64),  # uniform in [0, 1): a randomised policy's own draw for this arrival
         ("gain", np.float64),  # V(x - x of the message kept before it): what its delivery adds
     ],
     align=True,
@@ -31,7 +31,7 @@ MESSAGE = np.dtype(
 
 TOPIC = np.dtype(
     [
-        # what the topic is (see ``bufgym.topics.Topic``)
+        # what the topic is (see ``bufgym.model.topics.Topic``)
         ("priority", np.float64),
         ("weight", np.float64),  # of its H in the weighted sum
         ("period_us", np.int64),  # rate limit: at most one message a period; 0 for none
@@ -47,10 +47,10 @@ TOPIC = np.dtype(
         ("previous_x", np.float64),
         ("step_us", np.int64),  # time between its last two arrivals
         ("step_x", np.float64),
-        ("taken", np.int64),  # messages the socket took
-        ("taken_us", np.int64),  # arrival time of the one taken last
-        ("taken_x", np.float64),
-        ("sent_us", np.int64),  # when the socket took it
+        ("dequeued", np.int64),  # messages the socket took
+        ("dequeued_arrival_us", np.int64),  # arrival time of the one taken last
+        ("dequeued_x", np.float64),
+        ("last_dequeue_us", np.int64),  # when the socket took it
         # what the server has of it: for who counts, not known on board
         ("received", np.int64),
         ("newest_us", np.int64),  # arrival time of the newest received
@@ -95,13 +95,13 @@ class Buffer(NamedTuple):
     """Bytes queued."""
     now_us: int
     """The robot's clock, us."""
-    taken: int
+    dequeued: int
     """How many messages the socket has taken so far (delivered, or in transmission)."""
-    taken_us: int
+    dequeued_arrival_us: int
     """Arrival time of the message that the socket took last, us; while there was none, that of the oldest queued, else
     that of the previous arrival. Of several topics the newcomer's counts, here and in the next three.
     """
-    taken_x: float
+    dequeued_x: float
     """Coordinate of the message that the socket took last."""
     previous_us: int
     """Arrival time of the arrival before this one, kept or not, us."""
@@ -119,7 +119,7 @@ class Buffer(NamedTuple):
     """Running mean of the time between arrivals, us."""
     departures: int
     """Messages the socket has taken since the arrival before this one."""
-    drain: float
+    service_ratio: float
     """Running mean of departures per arrival: 1 = the link keeps up, 0 = it stands still."""
     v: NDArray[np.float64]
     """The value function, for ``qoi.value(buffer.v, distance)``; with several topics that of each from its
@@ -206,9 +206,9 @@ def time_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int]:
     if j >= 0:
         since = buffer.slots[j].arrival_us
     elif topic_arrives(buffer, arrival, topic):
-        since = buffer.taken_us
+        since = buffer.dequeued_arrival_us
     else:
-        since = buffer.topics[topic].taken_us if buffer.topics[topic].taken > 0 else here
+        since = buffer.topics[topic].dequeued_arrival_us if buffer.topics[topic].dequeued > 0 else here
     if k == s:
         return here - since, here - buffer.previous_us
     j = after(buffer, k, topic)
@@ -231,9 +231,9 @@ def motion_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
     if j >= 0:
         since = buffer.slots[j].x
     elif topic_arrives(buffer, arrival, topic):
-        since = buffer.taken_x
+        since = buffer.dequeued_x
     else:
-        since = buffer.topics[topic].taken_x if buffer.topics[topic].taken > 0 else here
+        since = buffer.topics[topic].dequeued_x if buffer.topics[topic].dequeued > 0 else here
     if k == s:
         return here - since, here - buffer.previous_x
     j = after(buffer, k, topic)
@@ -253,9 +253,9 @@ def arrival_gain(buffer: Buffer, arrival: Any) -> float:
     if len(buffer.topics) == 1:
         if s > 0:
             return value(buffer.v, arrival.x - buffer.slots[s - 1].x)
-        return value(buffer.v, arrival.x - buffer.taken_x) if buffer.taken > 0 else 0.0
+        return value(buffer.v, arrival.x - buffer.dequeued_x) if buffer.dequeued > 0 else 0.0
     topic = buffer.topics[arrival.topic]
-    if topic.queued == 0 and topic.taken == 0:
+    if topic.queued == 0 and topic.dequeued == 0:
         return 0.0
     return float(topic.weight * value(buffer.v[topic.v_start :], motion_gaps(buffer, arrival, s)[0]))
 

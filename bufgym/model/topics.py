@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import MAX_CAPACITY, TOPIC
 from bufgym.errors import BufgymError
 from bufgym.kernel import records
-from bufgym.qoi import Value
+from bufgym.model.buffer import MAX_CAPACITY, TOPIC
+from bufgym.model.qoi import Value
 
 MAX_TOPICS = 256
 MAX_WINDOW = 10**6
@@ -59,7 +59,7 @@ class Topic:
         ):
             raise self._wrong("limit", self.limit, f"must be a whole number from 1 to {MAX_CAPACITY}, or none")
         if self.value is not None and not isinstance(self.value, Value):
-            raise self._wrong("value", self.value, "must be a V of bufgym.qoi")
+            raise self._wrong("value", self.value, "must be a V of bufgym.model.qoi")
         if self.no_drop and self.rate_limit_hz is not None:
             raise self._wrong("rate_limit_hz", self.rate_limit_hz, "a no_drop topic can't have a rate limit: it drops")
         if self.no_drop and self.limit is not None:
@@ -94,7 +94,7 @@ def check_topics(topics: Sequence[Topic]) -> tuple[Topic, ...]:
     known: set[str] = set()
     for topic in topics:
         if not isinstance(topic, Topic):
-            raise BufgymError(f"topics: {topic!r} is not a bufgym.topics.Topic")
+            raise BufgymError(f"topics: {topic!r} is not a bufgym.model.topics.Topic")
         if topic.name in known:
             raise BufgymError(f"topic {topic.name!r}: two topics have this name")
         known.add(topic.name)
@@ -119,11 +119,15 @@ def check_window(window: Any) -> int:
     return int(window)
 
 
-def check_pong(pong_us: Any) -> int:
+def check_ack_delay(ack_delay_us: Any) -> int:
     """The time from a message's crossing to its pong, us, or an error."""
-    if isinstance(pong_us, bool) or not isinstance(pong_us, int | np.integer) or not 0 <= pong_us < NO_DEADLINE_US // 2:
-        raise BufgymError(f"pong_us = {pong_us!r}: must be a whole number >= 0, us")
-    return int(pong_us)
+    if (
+        isinstance(ack_delay_us, bool)
+        or not isinstance(ack_delay_us, int | np.integer)
+        or not 0 <= ack_delay_us < NO_DEADLINE_US // 2
+    ):
+        raise BufgymError(f"ack_delay_us = {ack_delay_us!r}: must be a whole number >= 0, us")
+    return int(ack_delay_us)
 
 
 def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArray[Any], NDArray[np.float64]]:

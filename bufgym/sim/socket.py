@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from bufgym.kernel import kernel
-from bufgym.link import FOREVER, position_at, time_of
-from bufgym.sender.rules import (
+from bufgym.model.link import FOREVER, position_at, time_of
+from bufgym.sim.rules import (
     arrives_on_topic,
+    dequeued_on_topic,
     sendable,
-    taken_on_topic,
 )
-from bufgym.sender.state import Batch
+from bufgym.sim.state import Batch
 
 
 @kernel
-def take(batch: Batch, i: int, k: int) -> None:
+def dequeue(batch: Batch, i: int, k: int) -> None:
     """Slot ``k`` goes from the buffer to the socket; when its bytes will have crossed is the link's affair."""
     sender = batch.senders[i]
     first = sender.first
@@ -25,18 +25,18 @@ def take(batch: Batch, i: int, k: int) -> None:
         batch.slots[i, first] = batch.arrivals[i, seq]
         batch.slots[i, first].gain = gain
     head = batch.slots[i, first]
-    batch.order[i, sender.taken] = head.seq
+    batch.order[i, sender.dequeued] = head.seq
     sender.busy += 1
     sender.first += 1
     sender.occupancy -= 1
     sender.backlog_bytes -= head.size_bytes
-    sender.taken += 1
-    sender.taken_at_us = sender.now_us
+    sender.dequeued += 1
+    sender.last_dequeue_us = sender.now_us
     sender.departures += 1
-    fate = batch.fates[i, head.seq]
-    fate.taken_us, fate.gain = sender.now_us, head.gain
+    entry = batch.log[i, head.seq]
+    entry.dequeued_us, entry.gain = sender.now_us, head.gain
     if sender.topics > 1:
-        taken_on_topic(batch, i, head)
+        dequeued_on_topic(batch, i, head)
 
 
 @kernel
@@ -56,7 +56,7 @@ def carried_by_now(batch: Batch, i: int) -> int:
 
 
 @kernel
-def transmit(batch: Batch, i: int) -> None:
+def begin_transmission(batch: Batch, i: int) -> None:
     """The link carries what was taken last: behind the message before it, or from now on if the link was idle."""
     sender = batch.senders[i]
     head = batch.slots[i, sender.first - 1]
@@ -76,59 +76,59 @@ def transmit(batch: Batch, i: int) -> None:
     if sender.busy == 1:
         sender.finish_us = due_us
     else:
-        batch.fates[i, head.seq].due_us = due_us
+        batch.log[i, head.seq].due_us = due_us
 
 
 @kernel
-def cross(batch: Batch, i: int) -> None:
+def finish_transmission(batch: Batch, i: int) -> None:
     """The last byte of the message in transmission has crossed; without pongs to wait for, its place is free."""
     sender = batch.senders[i]
-    seq = batch.order[i, sender.crossed]
-    batch.fates[i, seq].crossed_us = sender.finish_us
+    seq = batch.order[i, sender.transmitted]
+    batch.log[i, seq].transmitted_us = sender.finish_us
     sender.now_us = sender.finish_us
-    sender.crossed += 1
+    sender.transmitted += 1
     sender.busy -= 1
     if sender.busy > 0:
-        sender.finish_us = batch.fates[i, batch.order[i, sender.crossed]].due_us
+        sender.finish_us = batch.log[i, batch.order[i, sender.transmitted]].due_us
     elif sender.occupancy > 0:
         sender.follows = 1
-    if sender.pong_us == 0:
-        sender.ponged += 1
+    if sender.ack_delay_us == 0:
+        sender.acked += 1
         sender.held = 0
 
 
 @kernel
-def next_pong_us(batch: Batch, i: int) -> int:
+def next_ack_us(batch: Batch, i: int) -> int:
     """When the next pong comes for a message that has crossed; FOREVER if none is on its way."""
     sender = batch.senders[i]
-    if sender.ponged == sender.crossed:
+    if sender.acked == sender.transmitted:
         return FOREVER
-    return int(batch.fates[i, batch.order[i, sender.ponged]].crossed_us + sender.pong_us)
+    return int(batch.log[i, batch.order[i, sender.acked]].transmitted_us + sender.ack_delay_us)
 
 
 @kernel
 def credit(batch: Batch, i: int, until_us: int) -> None:
     """Count the information of what reached the server by ``until_us``, propagation included."""
     sender = batch.senders[i]
-    while sender.credited < sender.crossed:
+    while sender.credited < sender.transmitted:
         seq = batch.order[i, sender.credited]
-        fate = batch.fates[i, seq]
-        received_us = fate.crossed_us + sender.propagation_us
+        entry = batch.log[i, seq]
+        received_us = entry.transmitted_us + sender.propagation_us
         if until_us < received_us:
             break
-        sender.delivered_gain += fate.gain
+        sender.delivered_gain += entry.gain
         sender.credited += 1
         if sender.topics > 1:
             arrives_on_topic(batch, i, batch.arrivals[i, seq], received_us)
 
 
 @kernel
-def may_take(batch: Batch, i: int) -> bool:
+def may_dequeue(batch: Batch, i: int) -> bool:
     """Whether the socket may take a message now: one is queued, and n_T leaves room in flight."""
     sender = batch.senders[i]
     if sender.occupancy == 0 or sender.held == 1:
         return False
-    if sender.taken - sender.ponged < sender.window:
+    if sender.dequeued - sender.acked < sender.window:
         return True
     if sender.flush_no_drop == 1:
         for k in range(sender.occupancy):

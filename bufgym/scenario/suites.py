@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bufgym import qoi
 from bufgym.errors import BufgymError
-from bufgym.qoi import Value
+from bufgym.model import qoi
+from bufgym.model.qoi import Value
 from bufgym.scenario import Client, Interruption, Scenario, Uplink, robofleet_example
 from bufgym.traces import Motion, Trace, drive_motion, markov_link, read_motion, read_trace, synthetic_lte
 from bufgym.traces.synthetic import LTE_MODES
@@ -403,7 +403,7 @@ TOPIC_SUITES = {
 
 @dataclass(frozen=True)
 class FleetSuite:
-    """Frozen episodes of a fleet (``bufgym.cell``): what meets each robot is a setting of a suite with one robot."""
+    """Frozen episodes of a fleet (``bufgym.sim``): what meets each robot is a setting of a suite with one robot."""
 
     name: str
     about: str

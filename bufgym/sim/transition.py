@@ -6,15 +6,15 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from bufgym.buffer import ACCEPT, REJECT
 from bufgym.kernel import kernel
-from bufgym.link import FOREVER
-from bufgym.sender.decisions import choose, decide, has_room, oldest_sendable
-from bufgym.sender.rules import (
+from bufgym.model.buffer import ACCEPT, REJECT
+from bufgym.model.link import FOREVER
+from bufgym.sim.decisions import choose, decide, has_room, oldest_sendable
+from bufgym.sim.rules import (
     too_soon,
 )
-from bufgym.sender.socket import cross, may_take, next_pong_us, take, transmit
-from bufgym.sender.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NEVER, SEND, SOCKET_WAITS, Batch
+from bufgym.sim.socket import begin_transmission, dequeue, finish_transmission, may_dequeue, next_ack_us
+from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NEVER, SEND, SOCKET_WAITS, Batch
 
 # Weights of the running means: about the last 8 arrivals for the period, 16 for the drain.
 _PERIOD_WEIGHT, _DRAIN_WEIGHT = 1 / 8, 1 / 16
@@ -39,27 +39,33 @@ def load_row(
     """
     for k in range(len(arrivals)):
         batch.arrivals[i, k] = arrivals[k]
-        fate = batch.fates[i, k]
-        fate.taken_us, fate.due_us, fate.crossed_us, fate.dropped_us, fate.limited = NEVER, NEVER, NEVER, NEVER, 0
+        entry = batch.log[i, k]
+        entry.dequeued_us, entry.due_us, entry.transmitted_us, entry.dropped_us, entry.limited = (
+            NEVER,
+            NEVER,
+            NEVER,
+            NEVER,
+            0,
+        )
     for k in range(len(topics)):
         batch.topics[i, k] = topics[k]
     sender = batch.senders[i]
     sender.capacity, sender.max_bytes, sender.ask_when_full = buffer
     sender.first_decision, sender.last_decision = decisions
     sender.first_knot, sender.last_knot, sender.after, sender.offset_us, sender.propagation_us = link
-    sender.topics, sender.window, sender.pong_us = len(topics), window[0], window[1]
+    sender.topics, sender.window, sender.ack_delay_us = len(topics), window[0], window[1]
     sender.segment_now, sender.segment_finish = sender.first_knot, sender.first_knot
     sender.arrivals = len(arrivals)
     sender.first = 1
     sender.now_us, sender.next, sender.waiting, sender.occupancy, sender.backlog_bytes = 0, 0, 0, 0, 0
     sender.busy, sender.position, sender.finish_us = 0, 0, 0
     sender.ask_at_dequeue, sender.cleared, sender.follows = 0, 0, 0
-    sender.ask_at_send, sender.chosen, sender.held, sender.ponged = 0, NEVER, 0, 0
+    sender.ask_at_send, sender.chosen, sender.held, sender.acked = 0, NEVER, 0, 0
     sender.limit_at_send, sender.flush_no_drop = 0, 0
-    sender.taken, sender.crossed, sender.credited = 0, 0, 0
-    sender.rejected, sender.evicted, sender.impossible, sender.peak_backlog_bytes = 0, 0, 0, 0
-    sender.previous_us, sender.taken_at_us, sender.departures = 0, 0, 0
-    sender.previous_x, sender.period_us, sender.drain = 0.0, 0.0, 0.0
+    sender.dequeued, sender.transmitted, sender.credited = 0, 0, 0
+    sender.rejected, sender.evicted, sender.invalid, sender.peak_backlog_bytes = 0, 0, 0, 0
+    sender.previous_us, sender.last_dequeue_us, sender.departures = 0, 0, 0
+    sender.previous_x, sender.period_us, sender.service_ratio = 0.0, 0.0, 0.0
     sender.delivered_gain, sender.retained_gain, sender.aged, sender.late = 0.0, 0.0, 0.0, 0.0
 
 
@@ -68,7 +74,7 @@ def next_event(batch: Batch, i: int) -> int:
     """Move sender ``i`` on to its next DEPARTURE, DECISION, DEQUEUE, SEND or END (see the package's text)."""
     sender = batch.senders[i]
     while True:
-        if may_take(batch, i):
+        if may_dequeue(batch, i):
             if sender.ask_at_dequeue > sender.cleared:
                 return DEQUEUE
             if sender.ask_at_send == 1 and sender.chosen == NEVER:
@@ -77,20 +83,20 @@ def next_event(batch: Batch, i: int) -> int:
             if sender.chosen == NEVER and (sender.limit_at_send == 1 or sender.flush_no_drop == 1):
                 choose(batch, i, oldest_sendable(batch, i))
                 continue
-            take(batch, i, max(sender.chosen, 0))
-            transmit(batch, i)
+            dequeue(batch, i, max(sender.chosen, 0))
+            begin_transmission(batch, i)
             sender.cleared, sender.follows, sender.chosen = 0, 0, NEVER
             return DEPARTURE
         sender.follows = 0
         more = sender.next < sender.arrivals
         arrives_us = batch.arrivals[i, sender.next].arrival_us if more else FOREVER - 1
-        pong_us = next_pong_us(batch, i) if sender.pong_us > 0 else FOREVER
-        if sender.busy > 0 and sender.finish_us <= arrives_us and sender.finish_us < pong_us:
-            cross(batch, i)
+        ack_delay_us = next_ack_us(batch, i) if sender.ack_delay_us > 0 else FOREVER
+        if sender.busy > 0 and sender.finish_us <= arrives_us and sender.finish_us < ack_delay_us:
+            finish_transmission(batch, i)
             continue
-        if sender.pong_us > 0 and pong_us <= arrives_us:
-            sender.now_us = pong_us
-            sender.ponged += 1
+        if sender.ack_delay_us > 0 and ack_delay_us <= arrives_us:
+            sender.now_us = ack_delay_us
+            sender.acked += 1
             sender.held = 0
             continue
         if not more:
@@ -113,11 +119,11 @@ def arrive(batch: Batch, i: int) -> bool:
         if sender.next == 1:
             sender.period_us = float(gap_us)
         sender.period_us += _PERIOD_WEIGHT * (gap_us - sender.period_us)
-        sender.drain += _DRAIN_WEIGHT * (sender.departures - sender.drain)
+        sender.service_ratio += _DRAIN_WEIGHT * (sender.departures - sender.service_ratio)
     else:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
     if sender.topics > 1 and sender.limit_at_send == 0 and too_soon(batch, i, arrival.topic):
-        batch.fates[i, sender.next].limited = 1
+        batch.log[i, sender.next].limited = 1
         decide(batch, i, REJECT)  # which is possible: a no_drop topic has no rate limit
         return False
     asked = sender.first_decision <= sender.next <= sender.last_decision

@@ -13,7 +13,7 @@ The socket takes a message while fewer than n_T are in flight: sent and not yet 
 trip after the last byte has crossed. With n_T = 1 and no delay that is a socket that is free as soon as the link is.
 """
 
-from bufgym.sender.decisions import (
+from bufgym.sim.decisions import (
     answer_dequeue,
     answer_send,
     can_evict,
@@ -23,9 +23,8 @@ from bufgym.sender.decisions import (
     decide,
     has_room,
 )
-from bufgym.sender.rules import age_until
-from bufgym.sender.seen import arrival_of, view
-from bufgym.sender.senders import (
+from bufgym.sim.rules import age_until
+from bufgym.sim.senders import (
     Senders,
     answer_of,
     ask,
@@ -36,14 +35,14 @@ from bufgym.sender.senders import (
     rollout,
     run,
 )
-from bufgym.sender.socket import credit, cross, may_take, take, transmit
-from bufgym.sender.state import (
+from bufgym.sim.socket import begin_transmission, credit, dequeue, finish_transmission, may_dequeue
+from bufgym.sim.state import (
     ARRIVAL_WAITS,
     DECISION,
     DEPARTURE,
     DEQUEUE,
     END,
-    FATE,
+    LOG_ENTRY,
     NEVER,
     SEND,
     SENDER,
@@ -52,7 +51,8 @@ from bufgym.sender.state import (
     batch_type,
     named,
 )
-from bufgym.sender.transition import arrive, next_event
+from bufgym.sim.transition import arrive, next_event
+from bufgym.sim.view import arrival_of, view
 
 __all__ = [
     "ARRIVAL_WAITS",
@@ -60,7 +60,7 @@ __all__ = [
     "DEPARTURE",
     "DEQUEUE",
     "END",
-    "FATE",
+    "LOG_ENTRY",
     "NEVER",
     "SEND",
     "SENDER",
@@ -75,16 +75,18 @@ __all__ = [
     "arrive",
     "ask",
     "batch_type",
+    "begin_transmission",
     "can_evict",
     "can_hold",
     "can_reject",
     "can_send",
     "compiled_rollout",
     "credit",
-    "cross",
     "decide",
+    "dequeue",
+    "finish_transmission",
     "has_room",
-    "may_take",
+    "may_dequeue",
     "named",
     "next_event",
     "padded",
@@ -92,7 +94,5 @@ __all__ = [
     "python_view",
     "rollout",
     "run",
-    "take",
-    "transmit",
     "view",
 ]

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import REJECT, Buffer
 from bufgym.kernel import kernel
+from bufgym.model.buffer import REJECT, Buffer
 from bufgym.policies.classic import keep_first
 from bufgym.policies.registry import register
 
@@ -122,7 +122,7 @@ def red(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     if min_th <= average < max_th:
         memory[COUNT] += 1  # arrivals since the last drop: spreads the drops evenly
         p_b = memory[MAX_P] * (average - min_th) / (max_th - min_th)
-        if arrival.luck * (1 - memory[COUNT] * p_b) < p_b:  # with probability p_b / (1 - count p_b)
+        if arrival.uniform * (1 - memory[COUNT] * p_b) < p_b:  # with probability p_b / (1 - count p_b)
             memory[COUNT] = 0.0
             return REJECT
     elif max_th <= average:

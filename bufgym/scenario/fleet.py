@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bufgym import scenario as scenarios
 from bufgym.errors import BufgymError
-from bufgym.link import Link
-from bufgym.qoi import Value
+from bufgym.model.link import Link
+from bufgym.model.qoi import Value
 from bufgym.scenario import Episode, Streams, Uplink
 
 MAX_ROBOTS = 256
@@ -48,10 +48,10 @@ class FleetEpisode:
         """What that robot would meet if it had the cell for itself."""
         return Episode(self.arrivals[robot], self.link)
 
-    def with_luck(self, rng: np.random.Generator) -> FleetEpisode:
+    def with_uniforms(self, rng: np.random.Generator) -> FleetEpisode:
         """The same episode with fresh luck for randomised policies."""
-        lucky = [self.episode(i).with_luck(rng).arrivals for i in range(self.robots)]
-        return FleetEpisode(tuple(lucky), self.link)
+        episode_with_uniforms = [self.episode(i).with_uniforms(rng).arrivals for i in range(self.robots)]
+        return FleetEpisode(tuple(episode_with_uniforms), self.link)
 
 
 @dataclass(frozen=True)

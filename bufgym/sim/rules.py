@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Any
 
 from bufgym.kernel import kernel
-from bufgym.qoi import value
-from bufgym.sender.state import Batch
+from bufgym.model.qoi import value
+from bufgym.sim.state import Batch
 
 
 @kernel
@@ -31,8 +31,8 @@ def topic_gain(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
     j = kept_before(batch, i, k, topic)
     if j >= 0:
         return float(rules.weight * value(batch.v[rules.v_start :], x - batch.slots[i, batch.senders[i].first + j].x))
-    if rules.taken > 0:
-        return float(rules.weight * value(batch.v[rules.v_start :], x - rules.taken_x))
+    if rules.dequeued > 0:
+        return float(rules.weight * value(batch.v[rules.v_start :], x - rules.dequeued_x))
     return 0.0
 
 
@@ -52,13 +52,13 @@ def merge_on_topic(batch: Batch, i: int, k: int) -> None:
 
 
 @kernel
-def taken_on_topic(batch: Batch, i: int, message: Any) -> None:
+def dequeued_on_topic(batch: Batch, i: int, message: Any) -> None:
     """The socket has taken ``message``."""
     topic = batch.topics[i, message.topic]
     topic.queued -= 1
-    topic.taken += 1
-    topic.taken_us, topic.taken_x = message.arrival_us, message.x
-    topic.sent_us = batch.senders[i].now_us
+    topic.dequeued += 1
+    topic.dequeued_arrival_us, topic.dequeued_x = message.arrival_us, message.x
+    topic.last_dequeue_us = batch.senders[i].now_us
 
 
 @kernel
@@ -124,11 +124,13 @@ def refuge(batch: Batch, i: int) -> int:
 def sendable(batch: Batch, i: int, k: int) -> bool:
     """Whether slot ``k`` may be sent by the window and, where rate limits hold back at the socket, by its own."""
     sender = batch.senders[i]
-    full = sender.taken - sender.ponged >= sender.window
+    full = sender.dequeued - sender.acked >= sender.window
     if sender.topics == 1:
         return not full
     rules = batch.topics[i, batch.slots[i, sender.first + k].topic]
     if full and not (sender.flush_no_drop == 1 and rules.no_drop == 1):
         return False
-    held_back = sender.limit_at_send == 1 and rules.taken > 0 and sender.now_us - rules.sent_us < rules.period_us
+    held_back = (
+        sender.limit_at_send == 1 and rules.dequeued > 0 and sender.now_us - rules.last_dequeue_us < rules.period_us
+    )
     return not held_back

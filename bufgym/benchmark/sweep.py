@@ -1,9 +1,9 @@
 """A suite's benchmark: many runs over all cores or a cluster, safe against a kill.
 
-The work is cut into units (one scenario, one trace, some seeds; all policies and capacities). The rows of a finished
-unit lie in a file of their own under ``parts/``; a run that is started again skips them. When all are there, they
+The work is cut into shards (one scenario, one trace, some seeds; all policies and capacities). The rows of a finished
+shard lie in a file of their own under ``parts/``; a run that is started again skips them. When all are there, they
 become ``rows.parquet`` (or ``rows.csv``) beside ``manifest.json``, which says what was run, and ``timeline.json``, one
-episode in full. The rows do not depend on where or in which order the units ran.
+episode in full. The rows do not depend on where or in which order the shards ran.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bufgym import __version__, policies, suites
+from bufgym import __version__, policies
 from bufgym.benchmark import cluster, timeline
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.folder import FORMAT, read_manifest
@@ -27,12 +27,12 @@ from bufgym.benchmark.run import bar, distinct, run
 from bufgym.benchmark.score import BASELINE
 from bufgym.errors import BufgymError, line_in
 from bufgym.files import replaced
-from bufgym.scenario import Scenario, Uplink
+from bufgym.scenario import Scenario, Uplink, suites
 
 _SEEDS_A_TRACE = 1000
 """Episode s of trace k has the seed 1000 k + s: no two traces of a scenario share an episode's chance."""
 
-_SEEDS_A_UNIT = 25
+_SEEDS_A_SHARD = 25
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Plan:
     data: str | None = None
     """Folder of recordings, for suites that need one."""
     policy_file: str | None = None
-    """A Python file that registers policies; it is run wherever units run."""
+    """A Python file that registers policies; it is run wherever shards run."""
 
     def checked(self) -> Plan:
         """The same with nothing left open; a mistake in it ends in an error here, before any work."""
@@ -75,7 +75,7 @@ def seeds_a_trace(suite: suites.Suite, seeds: int | None) -> int:
 
 
 @dataclass(frozen=True)
-class Unit:
+class Shard:
     """One piece of the work."""
 
     plan: Plan
@@ -89,7 +89,7 @@ class Unit:
         return f"{self.label}-{self.trace}-{self.seeds[0]}"
 
 
-def units(plan: Plan) -> list[Unit]:
+def shards(plan: Plan) -> list[Shard]:
     """All pieces of a checked plan, in the order of the rows."""
     made = []
     seeds = int(plan.seeds or 0)
@@ -97,8 +97,8 @@ def units(plan: Plan) -> list[Unit]:
         traces = len(setting.scenario.traces) if isinstance(setting.scenario, Uplink) else 1
         for trace in range(traces):
             numbers = seeds_of(trace, seeds)
-            for k in range(0, seeds, _SEEDS_A_UNIT):
-                made.append(Unit(plan, label, trace, tuple(numbers[k : k + _SEEDS_A_UNIT])))
+            for k in range(0, seeds, _SEEDS_A_SHARD):
+                made.append(Shard(plan, label, trace, tuple(numbers[k : k + _SEEDS_A_SHARD])))
     return made
 
 
@@ -113,29 +113,29 @@ def cell(scenario: Scenario, trace: int) -> Scenario:
 
 
 _LOADED: set[str] = set()
-"""Policy files that this process has run for a unit."""
+"""Policy files that this process has run for a shard."""
 
 
-def run_unit(unit: Unit, load: Callable[[str | None], None] | None = None) -> list[Row]:
-    """The rows of one unit; ``load`` runs the plan's policy file where that has not been done yet."""
-    plan = unit.plan
+def run_shard(shard: Shard, load: Callable[[str | None], None] | None = None) -> list[Row]:
+    """The rows of one shard; ``load`` runs the plan's policy file where that has not been done yet."""
+    plan = shard.plan
     if load is not None and plan.policy_file is not None and plan.policy_file not in _LOADED:
         load(plan.policy_file)
         _LOADED.add(plan.policy_file)
-    setting = suites.get(plan.suite).settings(plan.split, plan.data)[unit.label]
+    setting = suites.get(plan.suite).settings(plan.split, plan.data)[shard.label]
     chosen = [policies.get(spec) for spec in plan.specs]
-    return run(chosen, cell(setting.scenario, unit.trace), plan.capacities, unit.seeds, label=unit.label)
+    return run(chosen, cell(setting.scenario, shard.trace), plan.capacities, shard.seeds, label=shard.label)
 
 
-def _attempt(number: int, unit: Unit, load: Callable[[str | None], None] | None) -> tuple[int, list[Row] | Exception]:
-    """The unit's number and its rows, or what went wrong: joblib throws finished units away when one raises."""
+def _attempt(number: int, shard: Shard, load: Callable[[str | None], None] | None) -> tuple[int, list[Row] | Exception]:
+    """The shard's number and its rows, or what went wrong: joblib throws finished shards away when one raises."""
     try:
-        return number, run_unit(unit, load)
+        return number, run_shard(shard, load)
     except BufgymError as error:
         return number, error
     except Exception as error:
         # A traceback stays behind in the process; where in the user's own file it was must be said here.
-        place = line_in(error, unit.plan.policy_file or "")
+        place = line_in(error, shard.plan.policy_file or "")
         if place is None:
             return number, error
         return number, BufgymError(f"{place}: {type(error).__name__}: {error}")
@@ -144,7 +144,7 @@ def _attempt(number: int, unit: Unit, load: Callable[[str | None], None] | None)
 # --- the folder ------------------------------------------------------------------------------------------------------
 
 
-def campaign(
+def run_sweep(
     plan: Plan,
     out: Path,
     *,
@@ -181,14 +181,14 @@ def campaign(
     _claim(out, wanted)
     if not whole.exists():
         parts.mkdir(exist_ok=True)
-        todo = units(plan)
-        files = [parts / f"{unit.name}.{form}" for unit in todo]
-        missing = [(unit, file) for unit, file in zip(todo, files, strict=True) if not file.exists()]
-        with bar(len(todo), progress, unit="unit", done=len(todo) - len(missing)) as advance:
-            for k, rows in _spread([unit for unit, _ in missing], jobs, backend, address, load):
+        todo = shards(plan)
+        files = [parts / f"{shard.name}.{form}" for shard in todo]
+        missing = [(shard, file) for shard, file in zip(todo, files, strict=True) if not file.exists()]
+        with bar(len(todo), progress, unit="shard", done=len(todo) - len(missing)) as advance:
+            for k, rows in _spread([shard for shard, _ in missing], jobs, backend, address, load):
                 write_rows(rows, missing[k][1])
                 advance(1)
-        rows = [row for unit, file in zip(todo, files, strict=True) for row in _read(file, unit)]
+        rows = [row for shard, file in zip(todo, files, strict=True) for row in _read(file, shard)]
         write_rows(rows, whole)
     else:
         rows = read_rows(whole)
@@ -277,14 +277,14 @@ def _short(given: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def _read(file: Path, unit: Unit) -> list[Row]:
-    """The rows of a finished unit; an error if the file is not what this plan would have written."""
+def _read(file: Path, shard: Shard) -> list[Row]:
+    """The rows of a finished shard; an error if the file is not what this plan would have written."""
     again = "delete this file and run the command again: only its rows are made anew"
     try:
         rows = read_rows(file)
     except BufgymError as error:
         raise BufgymError(f"{error}; {again}") from None
-    expected = len(unit.plan.specs) * len(unit.plan.capacities) * len(unit.seeds)
+    expected = len(shard.plan.specs) * len(shard.plan.capacities) * len(shard.seeds)
     if len(rows) != expected or any(tuple(row) != COLUMNS for row in rows):
         raise BufgymError(f"{file}: {len(rows)} rows where {expected} of {len(COLUMNS)} columns were written; {again}")
     return rows
@@ -299,18 +299,18 @@ def _write_json(file: Path, content: dict[str, Any]) -> None:
 
 
 def _spread(
-    work: Sequence[Unit],
+    work: Sequence[Shard],
     jobs: int,
     backend: str,
     address: str | None,
     load: Callable[[str | None], None] | None,
 ) -> Iterator[tuple[int, list[Row]]]:
-    """(number, rows) of each unit, as they become ready; after an error no further ones are begun."""
+    """(number, rows) of each shard, as they become ready; after an error no further ones are begun."""
     if not work:
         return
     if backend == "sequential" or (backend == "loky" and jobs == 1):
-        for k, unit in enumerate(work):
-            yield k, run_unit(unit)
+        for k, shard in enumerate(work):
+            yield k, run_shard(shard)
         return
     if backend == "threading":
         load = None  # this process has run the policy file

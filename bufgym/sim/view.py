@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from bufgym.buffer import Buffer
 from bufgym.kernel import kernel
-from bufgym.sender.socket import carried_by_now
-from bufgym.sender.state import ARRIVAL_WAITS, Batch
+from bufgym.model.buffer import Buffer
+from bufgym.sim.socket import carried_by_now
+from bufgym.sim.state import ARRIVAL_WAITS, Batch
 
 
 @kernel
@@ -17,7 +17,7 @@ def socket_bytes(batch: Batch, i: int) -> int:
     if sender.busy == 1:
         return int(batch.slots[i, sender.first - 1].size_bytes)
     total = 0
-    for k in range(sender.crossed, sender.taken):
+    for k in range(sender.transmitted, sender.dequeued):
         total += batch.arrivals[i, batch.order[i, k]].size_bytes
     return total
 
@@ -28,13 +28,13 @@ def view(batch: Batch, i: int) -> Buffer:
     sender = batch.senders[i]
     capacity, first, occupancy = sender.capacity, sender.first, sender.occupancy
     sent = batch.slots[i, first - 1]
-    taken_us, taken_x = sent.arrival_us, sent.x
+    dequeued_arrival_us, dequeued_x = sent.arrival_us, sent.x
     previous_us, previous_x = sender.previous_us, sender.previous_x
-    if sender.taken == 0:
-        taken_us, taken_x = previous_us, previous_x
+    if sender.dequeued == 0:
+        dequeued_arrival_us, dequeued_x = previous_us, previous_x
         if sender.occupancy > 0:
             # a scheduler holds the first of all back
-            taken_us, taken_x = batch.slots[i, first].arrival_us, batch.slots[i, first].x
+            dequeued_arrival_us, dequeued_x = batch.slots[i, first].arrival_us, batch.slots[i, first].x
     if sender.topics > 1 and sender.waiting == ARRIVAL_WAITS:
         # gaps are those of the newcomer's topic
         arrival = batch.arrivals[i, sender.next]
@@ -42,17 +42,17 @@ def view(batch: Batch, i: int) -> Buffer:
         previous_us, previous_x = arrival.arrival_us, arrival.x
         if topic.arrived > 0:
             previous_us, previous_x = topic.previous_us, topic.previous_x
-        taken_us, taken_x = previous_us, previous_x
-        if topic.taken > 0:
-            taken_us, taken_x = topic.taken_us, topic.taken_x
+        dequeued_arrival_us, dequeued_x = previous_us, previous_x
+        if topic.dequeued > 0:
+            dequeued_arrival_us, dequeued_x = topic.dequeued_arrival_us, topic.dequeued_x
         elif topic.queued > 0:
             k = first
             while batch.slots[i, k].topic != arrival.topic:
                 k += 1
-            taken_us, taken_x = batch.slots[i, k].arrival_us, batch.slots[i, k].x
-    taken_bytes = socket_bytes(batch, i) if sender.busy > 0 else 0
-    left_bytes = taken_bytes
-    if sender.busy > 0 and (sender.taken_at_us < sender.now_us or sender.busy > 1):
+            dequeued_arrival_us, dequeued_x = batch.slots[i, k].arrival_us, batch.slots[i, k].x
+    socket_total = socket_bytes(batch, i) if sender.busy > 0 else 0
+    left_bytes = socket_total
+    if sender.busy > 0 and (sender.last_dequeue_us < sender.now_us or sender.busy > 1):
         left_bytes = min(left_bytes, max(0, sender.position - carried_by_now(batch, i)))
     return Buffer(
         batch.slots[i, first : first + occupancy],
@@ -60,22 +60,22 @@ def view(batch: Batch, i: int) -> Buffer:
         sender.max_bytes,
         sender.backlog_bytes,
         sender.now_us,
-        sender.taken,
-        taken_us,
-        taken_x,
+        sender.dequeued,
+        dequeued_arrival_us,
+        dequeued_x,
         previous_us,
         previous_x,
         1 if sender.busy > 0 else 0,
         left_bytes,
-        left_bytes / taken_bytes if sender.busy > 0 else 0.0,
-        sender.now_us - sender.taken_at_us,
+        left_bytes / socket_total if sender.busy > 0 else 0.0,
+        sender.now_us - sender.last_dequeue_us,
         sender.period_us,
         sender.departures,
-        sender.drain,
+        sender.service_ratio,
         batch.v,
         batch.topics[i],
         sender.window,
-        sender.taken - sender.ponged,
+        sender.dequeued - sender.acked,
     )
 
 

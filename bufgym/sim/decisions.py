@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from bufgym.buffer import ACCEPT, HOLD, REJECT, evict, push
 from bufgym.kernel import kernel
-from bufgym.qoi import value
-from bufgym.sender.rules import (
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, push
+from bufgym.model.qoi import value
+from bufgym.sim.rules import (
     at_limit,
     kept_before,
     merge_on_topic,
@@ -13,7 +13,7 @@ from bufgym.sender.rules import (
     sendable,
     topic_gain,
 )
-from bufgym.sender.state import Batch
+from bufgym.sim.state import Batch
 
 # --- at an arrival ----------------------------------------------------------------------------------------------------
 
@@ -62,7 +62,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     """
     sender = batch.senders[i]
     arrival = batch.arrivals[i, sender.next]
-    fate = batch.fates[i, sender.next]
+    entry = batch.log[i, sender.next]
     possible = True
     enqueue = True
     if decision >= 0 and can_evict(batch, i, decision):
@@ -83,12 +83,12 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         if sender.topics > 1:
             arrival.gain = topic_gain(batch, i, sender.occupancy, arrival.topic, arrival.x)
             topic = batch.topics[i, arrival.topic]
-            if topic.taken + topic.queued == 0:
+            if topic.dequeued + topic.queued == 0:
                 # until one is sent, spacing counts from here
-                topic.taken_us, topic.taken_x = arrival.arrival_us, arrival.x
+                topic.dequeued_arrival_us, topic.dequeued_x = arrival.arrival_us, arrival.x
             topic.queued += 1
             topic.kept_us = arrival.arrival_us
-        elif sender.taken > 0 or sender.occupancy > 0:
+        elif sender.dequeued > 0 or sender.occupancy > 0:
             arrival.gain = value(batch.v, arrival.x - batch.slots[i, sender.first + sender.occupancy - 1].x)
         sender.retained_gain += arrival.gain
         sender.first = push(batch.slots, i, sender.first, sender.occupancy, arrival)
@@ -96,10 +96,10 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         sender.backlog_bytes += arrival.size_bytes
         sender.peak_backlog_bytes = max(sender.peak_backlog_bytes, sender.backlog_bytes)
     else:
-        fate.dropped_us = sender.now_us
+        entry.dropped_us = sender.now_us
         sender.rejected += 1
     if not possible:
-        sender.impossible += 1
+        sender.invalid += 1
     if sender.topics > 1:
         topic = batch.topics[i, arrival.topic]
         topic.step_us, topic.step_x = 0, 0.0
@@ -123,13 +123,13 @@ def remove(batch: Batch, i: int, k: int) -> None:
     gone = batch.slots[i, sender.first + k]
     sender.backlog_bytes -= gone.size_bytes
     sender.retained_gain -= gone.gain
-    batch.fates[i, gone.seq].dropped_us = sender.now_us
+    batch.log[i, gone.seq].dropped_us = sender.now_us
     if sender.topics > 1:
         merge_on_topic(batch, i, k)
     elif k + 1 < sender.occupancy:
         after = batch.slots[i, sender.first + k + 1]
         merged = 0.0
-        if sender.taken > 0 or k > 0:
+        if sender.dequeued > 0 or k > 0:
             merged = value(batch.v, after.x - batch.slots[i, sender.first + k - 1].x)
         sender.retained_gain += merged - after.gain
         after.gain = merged
@@ -170,7 +170,7 @@ def can_send(batch: Batch, i: int, k: int) -> bool:
 def can_hold(batch: Batch, i: int) -> bool:
     """Whether the socket may wait: for something that is still to come, or because nothing may be sent."""
     sender = batch.senders[i]
-    if sender.next < sender.arrivals or sender.ponged < sender.taken:
+    if sender.next < sender.arrivals or sender.acked < sender.dequeued:
         return True
     return oldest_sendable(batch, i) == HOLD
 
@@ -208,7 +208,7 @@ def answer_send(batch: Batch, i: int, k: int) -> bool:
     else:
         possible = can_send(batch, i, k)
     if not possible:
-        sender.impossible += 1
+        sender.invalid += 1
         k = oldest_sendable(batch, i)
     choose(batch, i, k)
     return possible

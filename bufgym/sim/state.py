@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.buffer import MESSAGE, TOPIC
+from bufgym.model.buffer import MESSAGE, TOPIC
 
 END, DEPARTURE, DECISION, DEQUEUE, SEND = range(5)
 ARRIVAL_WAITS, SOCKET_WAITS = 1, 2
@@ -25,7 +25,7 @@ SENDER = np.dtype(
         ("ask_at_send", np.int64),  # 1: a scheduler chooses which message the free socket takes
         ("topics", np.int64),  # 1: one queue, whatever the messages' topics; else each topic has rules of its own
         ("window", np.int64),  # n_T: messages sent and not yet answered by a pong, at most
-        ("pong_us", np.int64),  # from a message's crossing to its pong
+        ("ack_delay_us", np.int64),  # from a message's crossing to its pong
         ("limit_at_send", np.int64),  # 1: rate limits hold back at the socket, 0: they drop at arrival
         ("flush_no_drop", np.int64),  # 1: no_drop messages are sent even when the window is full
         # its episode
@@ -51,26 +51,26 @@ SENDER = np.dtype(
         ("follows", np.int64),  # 1: the head follows the message before it without a pause
         ("chosen", np.int64),  # the slot that the scheduler sends next, NEVER before it is asked
         ("held", np.int64),  # 1: the scheduler sends nothing before the next arrival or pong
-        ("ponged", np.int64),  # messages answered by a pong
+        ("acked", np.int64),  # messages answered by a pong
         ("position", np.int64),  # bytes of the trace used up when all that the socket took has crossed
         ("finish_us", np.int64),  # when the message in transmission will have crossed
         ("segment_now", np.int64),  # where on the trace the clock and the socket were last looked up
         ("segment_finish", np.int64),
         # counts
-        ("taken", np.int64),  # messages the socket took
-        ("crossed", np.int64),  # messages that left the socket
+        ("dequeued", np.int64),  # messages the socket took
+        ("transmitted", np.int64),  # messages that left the socket
         ("credited", np.int64),  # messages that reached the server
         ("rejected", np.int64),
         ("evicted", np.int64),
-        ("impossible", np.int64),  # decisions that could not be carried out as given
+        ("invalid", np.int64),  # decisions that could not be carried out as given
         ("peak_backlog_bytes", np.int64),  # queued at most
         # what the policy may know of its own past
         ("previous_us", np.int64),
         ("previous_x", np.float64),
-        ("taken_at_us", np.int64),  # when the socket last took a message
+        ("last_dequeue_us", np.int64),  # when the socket last took a message
         ("departures", np.int64),
         ("period_us", np.float64),
-        ("drain", np.float64),
+        ("service_ratio", np.float64),
         # information
         ("delivered_gain", np.float64),  # sum of V over what reached the server
         ("retained_gain", np.float64),  # sum of V over what is kept or sent
@@ -80,11 +80,11 @@ SENDER = np.dtype(
     align=True,
 )
 
-FATE = np.dtype(
+LOG_ENTRY = np.dtype(
     [
-        ("taken_us", np.int64),  # the socket took it out of the buffer
+        ("dequeued_us", np.int64),  # the socket took it out of the buffer
         ("due_us", np.int64),  # its last byte will cross the link; known once the socket has it
-        ("crossed_us", np.int64),  # its last byte crossed the link
+        ("transmitted_us", np.int64),  # its last byte crossed the link
         ("dropped_us", np.int64),  # it was evicted or rejected
         ("limited", np.int64),  # 1: a rate limit dropped it
         ("gain", np.float64),  # V that its delivery adds; it is settled once the socket has taken it
@@ -101,10 +101,10 @@ class Batch(NamedTuple):
     senders: NDArray[Any]
     """SENDER[n]"""
     slots: NDArray[Any]
-    """MESSAGE[n, 1 + 2 L] (see ``bufgym.buffer``)"""
+    """MESSAGE[n, 1 + 2 L] (see ``bufgym.model.buffer``)"""
     arrivals: NDArray[Any]
     """MESSAGE[n, messages]"""
-    fates: NDArray[Any]
+    log: NDArray[Any]
     """FATE[n, messages]"""
     order: NDArray[np.int64]
     """[n, messages]: sequence numbers in the order in which the socket took them."""
@@ -120,7 +120,7 @@ def batch_type() -> Any:
     """Numba's type of a ``Batch``."""
     array, int_ = numba.types.Array, numba.types.int64
     record = {
-        name: numba.from_dtype(dtype) for name, dtype in (("s", SENDER), ("m", MESSAGE), ("f", FATE), ("t", TOPIC))
+        name: numba.from_dtype(dtype) for name, dtype in (("s", SENDER), ("m", MESSAGE), ("f", LOG_ENTRY), ("t", TOPIC))
     }
     ints = array(int_, 1, "C")
     return cast(Any, numba.types).NamedTuple(

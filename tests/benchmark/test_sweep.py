@@ -15,17 +15,17 @@ from typing import Any
 
 import pytest
 
-from bufgym import policies, suites
-from bufgym.benchmark import campaign, run
-from bufgym.benchmark.campaign import Plan
+from bufgym import policies
+from bufgym.benchmark import run, sweep
 from bufgym.benchmark.rows import read_rows, write_rows
+from bufgym.benchmark.sweep import Plan
 from bufgym.cli import main
 from bufgym.cli.options import load_policies
 from bufgym.errors import BufgymError
-from bufgym.scenario import Uplink
+from bufgym.scenario import Uplink, suites
 from bufgym.traces import Trace
 
-pytest.importorskip("joblib", reason="a campaign needs joblib")
+pytest.importorskip("joblib", reason="a sweep needs joblib")
 
 THREE = ("afr", "random", "drop-oldest")
 TINY = Plan("interruption-v1", THREE, capacities=(2, 4), seeds=3)
@@ -115,7 +115,7 @@ def mine(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.parametrize("backend", ["sequential", "threading"])
 def test_in_this_process_the_rows_are_those_of_the_experiment(tmp_path: Path, backend: str, expected: str) -> None:
-    rows = campaign.campaign(TINY, tmp_path, jobs=2, backend=backend, form="csv")
+    rows = sweep.run_sweep(TINY, tmp_path, jobs=2, backend=backend, form="csv")
     assert repr(rows) == rows_in(tmp_path) == expected
     assert sorted(path.name for path in tmp_path.iterdir()) == ["manifest.json", "rows.csv", "timeline.json"]
 
@@ -147,7 +147,7 @@ def test_so_are_they_from_other_processes_which_know_a_users_policy(
 
 def test_each_trace_has_seeds_of_its_own(tmp_path: Path, small: Plan) -> None:
     """2 labels x 2 traces x 2 capacities x 3 policies x 2 seeds; the second trace's seeds count from 1000."""
-    rows = campaign.campaign(small, tmp_path, backend="sequential")
+    rows = sweep.run_sweep(small, tmp_path, backend="sequential")
     assert len(rows) == 2 * 2 * 2 * 3 * 2
     assert {(row["trace"], row["seed"]) for row in rows} == {
         *((rows[0]["trace"], seed) for seed in (0, 1)),
@@ -167,15 +167,15 @@ def test_many_seeds_are_several_units_and_the_same_rows(
     tmp_path: Path, small: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = Plan(small.suite, small.specs, seeds=5)
-    whole = campaign.campaign(plan, tmp_path / "whole", backend="sequential")
-    monkeypatch.setattr(campaign, "_SEEDS_A_UNIT", 2)
-    assert [len(unit.seeds) for unit in campaign.units(plan.checked())] == [2, 2, 1] * 4
-    assert len({unit.name for unit in campaign.units(plan.checked())}) == 12
+    whole = sweep.run_sweep(plan, tmp_path / "whole", backend="sequential")
+    monkeypatch.setattr(sweep, "_SEEDS_A_SHARD", 2)
+    assert [len(shard.seeds) for shard in sweep.shards(plan.checked())] == [2, 2, 1] * 4
+    assert len({shard.name for shard in sweep.shards(plan.checked())}) == 12
 
     def key(row: dict[str, Any]) -> tuple[Any, ...]:
         return (row["scenario"], row["trace"], row["seed"], row["capacity"], row["policy"])
 
-    parted = campaign.campaign(plan, tmp_path / "parted", backend="sequential")
+    parted = sweep.run_sweep(plan, tmp_path / "parted", backend="sequential")
     assert repr(sorted(parted, key=key)) == repr(sorted(whole, key=key))
 
 
@@ -190,7 +190,7 @@ def test_the_baseline_is_always_there_and_the_suite_fills_what_is_open(small: Pl
 
 
 LTE = ["bench", "--suite", "lte-v1", "--policies", "afr,mine", "--capacity", 5, "--seeds", 1, "--format", "csv"]
-"""24 units."""
+"""24 shards."""
 
 
 @pytest.mark.slow
@@ -213,11 +213,11 @@ def test_a_run_that_was_killed_goes_on_where_it_was(
 
     alone = [str(word) for word in (*words[:-2], "--backend", "sequential", "--out")]
     with monkeypatch.context() as patch:
-        patch.setattr(campaign.shutil, "rmtree", lambda *_, **__: None)  # the parts stay, to be looked at
+        patch.setattr(sweep.shutil, "rmtree", lambda *_, **__: None)  # the parts stay, to be looked at
         assert main([*alone, str(killed)]) == 0
     after = contents(killed / "parts")
     assert len([name for name in after if not name.startswith(".")]) == 24
-    assert all(after[name] == was for name, was in kept.items()), "a finished unit was touched"
+    assert all(after[name] == was for name, was in kept.items()), "a finished shard was touched"
     assert main([*alone, str(whole)]) == 0
     for name in ("rows.csv", "timeline.json"):
         assert (killed / name).read_bytes() == (whole / name).read_bytes()
@@ -226,30 +226,30 @@ def test_a_run_that_was_killed_goes_on_where_it_was(
 
 
 def test_a_second_call_runs_nothing(tmp_path: Path, small: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = campaign.campaign(small, tmp_path, backend="sequential", form="csv")
+    rows = sweep.run_sweep(small, tmp_path, backend="sequential", form="csv")
     before = contents(tmp_path)
-    monkeypatch.setattr(campaign, "run_unit", None)
+    monkeypatch.setattr(sweep, "run_shard", None)
     # Without a word about the format, what is there counts.
-    assert repr(campaign.campaign(small, tmp_path, backend="sequential")) == repr(rows)
+    assert repr(sweep.run_sweep(small, tmp_path, backend="sequential")) == repr(rows)
     assert contents(tmp_path) == before
 
 
 def test_parts_alone_say_the_format_too(tmp_path: Path, small: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(campaign, "_read", _interrupt)
-        campaign.campaign(small, tmp_path, backend="sequential", form="csv")
+        patch.setattr(sweep, "_read", _interrupt)
+        sweep.run_sweep(small, tmp_path, backend="sequential", form="csv")
     (tmp_path / "parts" / ".one-0-0.csv.abcdefgh").touch()  # what a kill in the middle of a write leaves
-    monkeypatch.setattr(campaign, "run_unit", None)
-    campaign.campaign(small, tmp_path, backend="sequential")
+    monkeypatch.setattr(sweep, "run_shard", None)
+    sweep.run_sweep(small, tmp_path, backend="sequential")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["manifest.json", "rows.csv", "timeline.json"]
 
 
 def test_what_is_missing_of_a_finished_folder_is_made_anew(tmp_path: Path, small: Plan) -> None:
-    campaign.campaign(small, tmp_path, backend="sequential", form="csv")
+    sweep.run_sweep(small, tmp_path, backend="sequential", form="csv")
     before = {name: content for name, (content, _) in contents(tmp_path).items()}
     for name in ("timeline.json", "rows.csv"):
         (tmp_path / name).unlink()
-        campaign.campaign(small, tmp_path, backend="sequential", form="csv")
+        sweep.run_sweep(small, tmp_path, backend="sequential", form="csv")
         assert {name: content for name, (content, _) in contents(tmp_path).items()} == before
 
 
@@ -257,28 +257,28 @@ def test_what_is_missing_of_a_finished_folder_is_made_anew(tmp_path: Path, small
 def test_an_error_in_one_unit_loses_no_finished_rows(
     tmp_path: Path, small: Plan, backend: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The second unit fails at once; a slower first one is finished and kept, and no unit is begun afterwards."""
-    right, begun = campaign.run_unit, []
+    """The second shard fails at once; a slower first one is finished and kept, and no shard is begun afterwards."""
+    right, begun = sweep.run_shard, []
 
-    def fails(unit: campaign.Unit, load: Any = None) -> Any:
-        begun.append(unit.name)
-        if unit.name == "one-1-1000":
+    def fails(shard: sweep.Shard, load: Any = None) -> Any:
+        begun.append(shard.name)
+        if shard.name == "one-1-1000":
             raise MemoryError("no room")
         time.sleep(0.2)
-        return right(unit)
+        return right(shard)
 
-    monkeypatch.setattr(campaign, "run_unit", fails)
+    monkeypatch.setattr(sweep, "run_shard", fails)
     with pytest.raises(MemoryError, match="no room"):
-        campaign.campaign(small, tmp_path, jobs=2, backend=backend, form="csv")
+        sweep.run_sweep(small, tmp_path, jobs=2, backend=backend, form="csv")
     written = {path.stem for path in (tmp_path / "parts").iterdir()}
     assert "one-0-0" in written and written == set(begun) - {"one-1-1000"}
     kept = contents(tmp_path / "parts")
 
     begun.clear()
-    monkeypatch.setattr(campaign, "run_unit", lambda unit, load=None: begun.append(unit.name) or right(unit))
-    rows = campaign.campaign(small, tmp_path, jobs=2, backend="sequential", form="csv")
+    monkeypatch.setattr(sweep, "run_shard", lambda shard, load=None: begun.append(shard.name) or right(shard))
+    rows = sweep.run_sweep(small, tmp_path, jobs=2, backend="sequential", form="csv")
     assert len(begun) == 4 - len(kept) and not set(begun) & written
-    assert repr(rows) == repr(campaign.campaign(small, tmp_path / "whole", backend="sequential", form="csv"))
+    assert repr(rows) == repr(sweep.run_sweep(small, tmp_path / "whole", backend="sequential", form="csv"))
 
 
 def test_a_mistake_in_a_users_policy_is_shown_where_it_is_even_from_other_processes(tmp_path: Path, mine: Path) -> None:
@@ -303,10 +303,10 @@ def test_a_mistake_in_a_users_policy_is_shown_where_it_is_even_from_other_proces
     ],
 )
 def test_another_plan_needs_another_folder(tmp_path: Path, change: dict[str, Any], key: str) -> None:
-    campaign.campaign(TINY, tmp_path, backend="sequential")
+    sweep.run_sweep(TINY, tmp_path, backend="sequential")
     before = contents(tmp_path)
     with pytest.raises(BufgymError, match=rf"manifest\.json: {key} is .*, but this run has .*choose another --out"):
-        campaign.campaign(Plan(**{**vars(TINY), **change}), tmp_path, backend="sequential")
+        sweep.run_sweep(Plan(**{**vars(TINY), **change}), tmp_path, backend="sequential")
     assert contents(tmp_path) == before
 
 
@@ -315,16 +315,16 @@ def test_so_does_another_version_or_another_policy_file(
 ) -> None:
     load_policies(str(mine))
     plan = Plan("small-v1", ("mine",), policy_file=str(mine))
-    campaign.campaign(plan, tmp_path / "out", backend="sequential")
+    sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
     before = contents(tmp_path / "out")
     text = mine.read_text()
     mine.write_text(text.replace("% 2", "% 3"))
     with pytest.raises(BufgymError, match="policy_file is"):
-        campaign.campaign(plan, tmp_path / "out", backend="sequential")
+        sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
     mine.write_text(text)
-    monkeypatch.setattr(campaign, "__version__", "0.0.0")
+    monkeypatch.setattr(sweep, "__version__", "0.0.0")
     with pytest.raises(BufgymError, match=r'bufgym is ".*", but this run has "0\.0\.0"'):
-        campaign.campaign(plan, tmp_path / "out", backend="sequential")
+        sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
     assert contents(tmp_path / "out") == before
 
 
@@ -340,10 +340,10 @@ def test_so_do_other_recordings_of_the_same_names(tmp_path: Path, monkeypatch: p
         (tmp_path / name).mkdir()
         (tmp_path / name / "rate").write_text(rate)
     first, other, same = (Plan("found-v1", ("afr",), data=str(tmp_path / name)) for name in "abc")
-    rows = campaign.campaign(first, tmp_path / "out", backend="sequential")
+    rows = sweep.run_sweep(first, tmp_path / "out", backend="sequential")
     with pytest.raises(BufgymError, match="scenarios is"):
-        campaign.campaign(other, tmp_path / "out", backend="sequential")
-    assert repr(campaign.campaign(same, tmp_path / "out", backend="sequential")) == repr(rows)
+        sweep.run_sweep(other, tmp_path / "out", backend="sequential")
+    assert repr(sweep.run_sweep(same, tmp_path / "out", backend="sequential")) == repr(rows)
 
 
 @pytest.mark.parametrize("name", ["rows.csv", "rows.parquet", "parts/one-0-0.csv"])
@@ -351,7 +351,7 @@ def test_rows_without_a_manifest_are_left_alone(tmp_path: Path, small: Plan, nam
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("someone else's")
     with pytest.raises(BufgymError, match=r"holds rows without a manifest\.json; choose another --out"):
-        campaign.campaign(small, tmp_path, backend="sequential")
+        sweep.run_sweep(small, tmp_path, backend="sequential")
     assert list(contents(tmp_path)) == [name]
 
 
@@ -366,14 +366,14 @@ def test_rows_without_a_manifest_are_left_alone(tmp_path: Path, small: Plan, nam
     ],
 )
 def test_a_broken_manifest_is_named(tmp_path: Path, small: Plan, change: Callable[[str], str], told: str) -> None:
-    campaign.campaign(small, tmp_path, backend="sequential")
+    sweep.run_sweep(small, tmp_path, backend="sequential")
     manifest = tmp_path / "manifest.json"
     text = manifest.read_text()
     manifest.write_text(change(text))
     assert manifest.read_text() != text
     before = contents(tmp_path)
     with pytest.raises(BufgymError, match=rf"manifest\.json.*{told}"):
-        campaign.campaign(small, tmp_path, backend="sequential")
+        sweep.run_sweep(small, tmp_path, backend="sequential")
     assert contents(tmp_path) == before
 
 
@@ -384,11 +384,11 @@ def test_a_broken_part_is_named_and_made_anew_once_deleted(
 ) -> None:
     if form == "parquet":
         pytest.importorskip("pyarrow")
-    whole = campaign.campaign(small, tmp_path / "whole", backend="sequential", form=form)
+    whole = sweep.run_sweep(small, tmp_path / "whole", backend="sequential", form=form)
     out = tmp_path / "out"
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(campaign, "_read", _interrupt)  # all parts are there, but not yet their sum
-        campaign.campaign(small, out, backend="sequential", form=form)
+        patch.setattr(sweep, "_read", _interrupt)  # all parts are there, but not yet their sum
+        sweep.run_sweep(small, out, backend="sequential", form=form)
     part = out / "parts" / f"one-1-1000.{form}"
     rows, content = read_rows(part), part.read_bytes()
     if harm == "fewer":
@@ -399,10 +399,10 @@ def test_a_broken_part_is_named_and_made_anew_once_deleted(
         part.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "noise": b"\xff\x00" * 99}[harm])
     before = contents(out)
     with pytest.raises(BufgymError, match=rf"one-1-1000\.{form}.*; delete this file and run the command again"):
-        campaign.campaign(small, out, backend="sequential", form=form)
+        sweep.run_sweep(small, out, backend="sequential", form=form)
     assert contents(out) == before
     part.unlink()
-    assert repr(campaign.campaign(small, out, backend="sequential", form=form)) == repr(whole)
+    assert repr(sweep.run_sweep(small, out, backend="sequential", form=form)) == repr(whole)
     assert (out / f"rows.{form}").read_bytes() == (tmp_path / "whole" / f"rows.{form}").read_bytes()
 
 
@@ -431,14 +431,14 @@ def test_a_bad_plan_ends_before_anything_is_written(
     tmp_path: Path, small: Plan, change: dict[str, Any], told: str
 ) -> None:
     with pytest.raises(BufgymError, match=told):
-        campaign.campaign(Plan(**{**vars(small), **change}), tmp_path / "out", backend="sequential")
+        sweep.run_sweep(Plan(**{**vars(small), **change}), tmp_path / "out", backend="sequential")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("jobs", "backend"), [(0, "loky"), (-2, "loky"), (1, "sloky")])
 def test_so_do_a_bad_backend_and_number_of_jobs(tmp_path: Path, small: Plan, jobs: int, backend: str) -> None:
     with pytest.raises(BufgymError, match="backend = 'sloky': must be one of loky" if jobs == 1 else f"jobs = {jobs}:"):
-        campaign.campaign(small, tmp_path / "out", jobs=jobs, backend=backend)
+        sweep.run_sweep(small, tmp_path / "out", jobs=jobs, backend=backend)
     assert not (tmp_path / "out").exists()
 
 
@@ -451,7 +451,7 @@ def test_a_backend_that_is_not_installed_names_the_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)  # importing it now fails
     with pytest.raises(BufgymError, match=rf'{module} is missing: pip install "bufgym\[{extra}\]"'):
-        campaign.campaign(small, tmp_path, jobs=2, backend=backend)
+        sweep.run_sweep(small, tmp_path, jobs=2, backend=backend)
 
 
 def fails(words: list[object], told: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -526,7 +526,7 @@ def test_a_report_of_broken_rows_names_the_file(
 ) -> None:
     if form == "parquet":
         pytest.importorskip("pyarrow")
-    campaign.campaign(small, tmp_path, backend="sequential", form=form)
+    sweep.run_sweep(small, tmp_path, backend="sequential", form=form)
     path = tmp_path / f"rows.{form}"
     content = path.read_bytes()
     path.write_bytes({"cut": content[: len(content) // 2], "noise": b"\xff\x00" * 99, "empty": b""}[harm])
