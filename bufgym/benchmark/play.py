@@ -16,8 +16,8 @@ class Player:
     """Owns a policy's memory for each of ``n`` senders and turns its decisions into an environment's actions.
 
     The policy hears of departures just before its next decision, as often as there were some, and sees the buffer as
-    it is then. Luck is that of the episode (see ``Episode.with_uniforms``). An environment asks at arrivals, and of several
-    topics for what the socket takes: a policy that drops at dequeue, or whose queue is unbounded, can't play in it.
+    it is then. Its uniform draws are the episode's (``Episode.with_uniforms``). An environment asks at arrivals, and
+    with several topics for what to send next. A policy that drops at dequeue, or has an unbounded queue, can't play.
     """
 
     def __init__(self, policy: Policy, n: int = 1) -> None:

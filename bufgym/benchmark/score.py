@@ -54,7 +54,7 @@ BASELINE = "drop-oldest"
 """What ROS does: its score is 0."""
 
 DISCRIMINATIVE = 0.01
-"""A cell discriminative, and counts, where the baseline's regret is at least this: elsewhere there is nothing to be gained."""
+"""A cell is discriminative, and counts, where the baseline's regret is at least this."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +82,14 @@ class CellScore:
 
 @dataclass(frozen=True)
 class Standing:
-    """One policy over all discriminative cells; NaN where there is none. Which cells bite is settled once, not per resample."""
+    """One policy over all discriminative cells; NaN where there is none. Resampling does not choose cells anew."""
 
     policy: str
     score: Interval
     """Mean of its scores in the discriminative cells."""
     iqm: Interval
-    """Interquartile mean of its scores on (discriminative cell, trace), each computed on sums over seeds. Pairs on which
-    nothing can be gained have no score and are left out; in a resample a pair weighs as often as it was drawn."""
+    """Interquartile mean of its scores on (discriminative cell, trace), each computed on sums over seeds. Pairs on
+    which nothing can be gained have no score and are left out; in a resample a pair weighs as often as it was drawn."""
     regret: Interval
     """Mean of its regrets in the discriminative cells."""
     improvement: Interval

@@ -222,8 +222,8 @@ def _episode(row: Row) -> tuple[Any, ...]:
 def _overall(made: Scores, policy: str) -> tuple[Interval, Interval]:
     """(score, regret) of one policy.
 
-    Where no cell discriminative there is no standing: the regret is then the mean over all cells, and so are the bounds of its
-    interval, which makes that one a little too wide.
+    Where no cell is discriminative there is no standing: the regret is then the mean over all cells, and so are the
+    bounds of its interval, which makes that one a little too wide.
     """
     standing = next(s for s in made.standings if s.policy == policy)
     if standing.cells:

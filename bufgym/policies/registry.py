@@ -3,9 +3,9 @@
 A policy is a plain function ``on_arrival(buffer, arrival, memory) -> decision`` and, where it keeps score of what
 leaves, ``on_departure(buffer, memory)``; a queue discipline that drops at the head as well, as CoDel does, has
 ``on_dequeue(buffer, memory) -> drop it?``; a scheduler ``on_send(buffer, memory) -> slot or HOLD``. ``buffer`` is
-``bufgym.model.buffer.Buffer``; ``arrival`` a MESSAGE record; ``memory`` a float64 array of the policy's own, laid out and
-initialised as its registration says; the decision a slot to evict for the newcomer (0 = oldest), REJECT or ACCEPT.
-``arrival.uniform`` is a uniform draw in [0, 1) for policies that randomise, so the functions themselves are deterministic.
+``bufgym.model.buffer.Buffer``; ``arrival`` a MESSAGE record; ``memory`` a float64 array of the policy's own, laid out
+and initialised as its registration says; the decision a slot to evict for the newcomer (0 = oldest), REJECT or ACCEPT.
+``arrival.uniform`` is a uniform draw in [0, 1) for policies that randomise; the functions themselves are deterministic.
 
     from bufgym.policies import ACCEPT, register
 

@@ -1,23 +1,17 @@
 """Scenarios: what meets the sender. All randomness is drawn here, before the simulation, which has none.
 
 ``Scenario.draw(streams) -> Episode`` draws one episode: when messages arrive, how large they are, how far the scene
-moves, which link carries them. Arrivals, link and policy luck come from separate streams, so that two policies (or
+moves, which link carries them. Arrivals, link and policies draw from separate streams, so that two policies (or
 two policy seeds) meet the very same episode: common random numbers.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from dataclasses import fields, replace
-from typing import Any
-
-from bufgym import traces
-from bufgym.errors import BufgymError
-from bufgym.scenario.client import Client, Stream, client_over_lte, read_client, robofleet_example
+from bufgym.scenario.client import Client, Stream, read_client, robofleet_example
 from bufgym.scenario.episode import Episode, Scenario, Streams, messages
 from bufgym.scenario.fleet import MAX_ROBOTS, FleetEpisode, FleetScenario
 from bufgym.scenario.interruption import LAWS, Interruption
+from bufgym.scenario.registry import SCENARIOS, get
 from bufgym.scenario.uplink import Uplink
 
 __all__ = [
@@ -38,38 +32,3 @@ __all__ = [
     "read_client",
     "robofleet_example",
 ]
-
-
-def _lte() -> Uplink:
-    names = traces.shipped()
-    return Uplink(
-        traces=tuple(traces.load(name) for name in names if name.startswith("lte-")),
-        motion=tuple(traces.load_motion(name) for name in names if name.startswith("drive-")),
-    )
-
-
-SCENARIOS: dict[str, tuple[Callable[[], Scenario], str]] = {
-    "interruption": (Interruption, "one interruption of unknown length (AFR paper, Sec. III-B)"),
-    "lte": (_lte, "30 Hz camera on a driving robot over the shipped synthetic LTE traces"),
-    "topics": (client_over_lte, "the topics of Robofleet's example client over the shipped synthetic LTE traces"),
-}
-
-
-@functools.cache
-def _named(name: str) -> Scenario:
-    return SCENARIOS[name][0]()
-
-
-def get(spec: str | Scenario, **overrides: Any) -> Scenario:
-    """The scenario of that name (or the given one), with the given parameters changed."""
-    if isinstance(spec, str):
-        if spec not in SCENARIOS:
-            raise BufgymError(f"unknown scenario {spec!r}; known: {', '.join(SCENARIOS)}")
-        spec = _named(spec)
-    if not overrides:
-        return spec
-    known = {f.name for f in fields(spec)}  # type: ignore[arg-type]
-    for name in overrides:
-        if name not in known:
-            raise BufgymError(f"{type(spec).__name__}: no parameter {name!r}; it has: {', '.join(sorted(known))}")
-    return replace(spec, **overrides)  # type: ignore[type-var]

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import scenario as scenarios
 from bufgym.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
-from bufgym.scenario import Episode, Streams, Uplink
+from bufgym.scenario import registry
+from bufgym.scenario.episode import Episode, Streams
+from bufgym.scenario.uplink import Uplink
 
 MAX_ROBOTS = 256
 
@@ -118,7 +119,7 @@ class FleetScenario:
 
 
 def _uplink(spec: str | Uplink, **parameters: Any) -> Uplink:
-    found = scenarios.get(spec, **parameters)
+    found = registry.get(spec, **parameters)
     if not isinstance(found, Uplink):
         raise BufgymError(f"scenario {spec!r}: a fleet needs an Uplink, whose link goes on; it is {found!r}")
     return found

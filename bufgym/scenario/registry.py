@@ -1,0 +1,50 @@
+"""The one registry of scenarios, by name."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
+
+from bufgym import traces
+from bufgym.errors import BufgymError
+from bufgym.scenario.client import client_over_lte
+from bufgym.scenario.episode import Scenario
+from bufgym.scenario.interruption import Interruption
+from bufgym.scenario.uplink import Uplink
+
+
+def _lte() -> Uplink:
+    names = traces.shipped()
+    return Uplink(
+        traces=tuple(traces.load(name) for name in names if name.startswith("lte-")),
+        motion=tuple(traces.load_motion(name) for name in names if name.startswith("drive-")),
+    )
+
+
+SCENARIOS: dict[str, tuple[Callable[[], Scenario], str]] = {
+    "interruption": (Interruption, "one interruption of unknown length (AFR paper, Sec. III-B)"),
+    "lte": (_lte, "30 Hz camera on a driving robot over the shipped synthetic LTE traces"),
+    "topics": (client_over_lte, "the topics of Robofleet's example client over the shipped synthetic LTE traces"),
+}
+
+
+@functools.cache
+def _named(name: str) -> Scenario:
+    return SCENARIOS[name][0]()
+
+
+def get(spec: str | Scenario, **overrides: Any) -> Scenario:
+    """The scenario of that name (or the given one), with the given parameters changed."""
+    if isinstance(spec, str):
+        if spec not in SCENARIOS:
+            raise BufgymError(f"unknown scenario {spec!r}; known: {', '.join(SCENARIOS)}")
+        spec = _named(spec)
+    if not overrides:
+        return spec
+    known = {f.name for f in fields(spec)}  # type: ignore[arg-type]
+    for name in overrides:
+        if name not in known:
+            raise BufgymError(f"{type(spec).__name__}: no parameter {name!r}; it has: {', '.join(sorted(known))}")
+    return replace(spec, **overrides)  # type: ignore[type-var]
