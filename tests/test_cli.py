@@ -14,7 +14,7 @@ from bufgym import __version__, cli, policies, traces
 from bufgym.benchmark.rows import read_rows
 from bufgym.cli import main, split_policies
 from bufgym.kernel import JIT
-from bufgym.traces.generators import shipped_calls
+from bufgym.traces.generate.shipped import shipped_calls
 
 QUICK = ["--seconds", "1", "--fps", "10", "--seeds", "2", "--capacity", "2"]
 """A benchmark of a few messages."""

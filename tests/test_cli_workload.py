@@ -10,7 +10,7 @@ import pytest
 from bufgym.cli import main, trace_bags
 from bufgym.cli.options import Parser
 from bufgym.errors import BufgymError
-from bufgym.traces import motion
+from bufgym.traces import MotionSettings
 
 # A message a second; nothing crosses for 4 s, then 10 kB/s.
 WORKLOAD = """time_s,bytes,topic,x
@@ -87,7 +87,7 @@ def test_one_topic_and_some_seeds(here: Path, capsys: pytest.CaptureFixture[str]
     [
         (["--fps", "30"], "--fps cannot go with --workload: a recording has its own"),
         (["--topics", "/lidar"], "no topic '/lidar'; it has: /camera, /odom"),
-        (["--odom", "/odom"], "odom = '/odom': needs a recording, and this is none"),
+        (["--odom", "/odom"], "odom = '/odom': needs a recording, which this is not"),
         (["--fov-deg", "70"], "--fov-deg needs --odom or --motion"),
         (["--bridge-gaps"], "--bridge-gaps needs --odom"),
         (["--interruption"], "cannot go with --interruption"),
@@ -176,9 +176,9 @@ def test_the_help_tells_the_defaults(capsys: pytest.CaptureFixture[str]) -> None
             main([*words, "--help"])
         said = " ".join(capsys.readouterr().out.split())
         for option, default in (
-            ("--fov-deg DEG", motion.DEFAULT_FOV_DEG),
-            ("--scene-scale-m M", motion.DEFAULT_SCENE_SCALE_M),
-            ("--max-gap-s S", motion.DEFAULT_MAX_GAP_S),
+            ("--fov-deg DEG", MotionSettings().fov_deg),
+            ("--scene-scale-m M", MotionSettings().scene_scale_m),
+            ("--max-gap-s S", MotionSettings().max_gap_s),
         ):
             # The last mention explains it; the usage line comes first.
             assert said.rpartition(option)[2].partition("default: ")[2].startswith(f"{default:g})")

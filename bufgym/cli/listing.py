@@ -116,7 +116,7 @@ def _in_two_parts(parts: list[list[tuple[str, ...]]]) -> str:
 
 def _list_traces() -> str:
     from bufgym.traces import shipped
-    from bufgym.traces.generators import shipped_calls
+    from bufgym.traces.generate.shipped import shipped_calls
 
     kinds = {"lte": "bandwidth, synthetic LTE", "drive": "motion of a driving robot, synthetic"}
     calls = shipped_calls()

@@ -8,7 +8,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from bufgym.cli.options import count, least_0, positive
-from bufgym.cli.trace_bags import WORKLOAD_OPTIONS, given, given_motion, refuse_motion, workload_lines, workload_options
+from bufgym.cli.trace_bags import (
+    WORKLOAD_OPTIONS,
+    motion_settings,
+    refuse_motion,
+    workload_arguments,
+    workload_lines,
+    workload_options,
+)
 from bufgym.errors import BufgymError
 
 if TYPE_CHECKING:
@@ -143,12 +150,12 @@ def _recording(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scena
     """A workload as it was recorded; with --seeds, from random places on each trace."""
     from bufgym.model import qoi
     from bufgym.scenario import Uplink
-    from bufgym.traces.recordings import read_workload
+    from bufgym.traces import read_workload
 
     for name in _STREAM_ONLY:
         if getattr(options, name) is not None:
             raise BufgymError(f"--{name.replace('_', '-')} cannot go with --workload: a recording has its own")
-    workload = read_workload(options.workload, **given(options))
+    workload = read_workload(options.workload, **workload_arguments(options))
     motions = [] if options.motion in (None, ["none"]) else [_motion(name, options) for name in options.motion]
     if options.odom is None and not motions:
         refuse_motion(options, "needs --odom or --motion")
@@ -192,12 +199,12 @@ def _links(options: argparse.Namespace) -> tuple[Trace, ...]:
 def _motion(name: str, options: argparse.Namespace) -> Motion:
     """A motion by its shipped name or from a file, measured as the options say."""
     from bufgym import traces
-    from bufgym.traces.motion import MOTION_HEADER
+    from bufgym.traces.formats.motions import MOTION_HEADER
 
-    settings = given_motion(options)
-    if not settings:
+    settings = motion_settings(options)
+    if settings is None:
         return traces.load_motion(name)
-    motion = traces.read_motion(traces.shipped().get(name, name), **settings)
+    motion = traces.read_motion(traces.shipped().get(name, name), settings)
     if motion.source.endswith(f"({MOTION_HEADER})"):
         refuse_motion(options, f"cannot go with {name}, which holds finished coordinates")
     return motion

@@ -1,6 +1,6 @@
 """``bufgym trace from-bag`` and ``from-poses``: a robot's recording as a workload, a trajectory as motion.
 
-And the options that say which part of a recording counts, and what its motion is measured by.
+Also the options, shared with ``bench``, that choose a part of a recording and say how its motion is measured.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from bufgym.cli.options import Commands, command, positive
 from bufgym.errors import BufgymError
 
 if TYPE_CHECKING:
-    from bufgym.traces.workload import Workload
+    from bufgym.traces import MotionSettings, Workload
+    from bufgym.traces.formats.bags import Bag
+    from bufgym.traces.workload import TopicSummary
 
 MOTION_OPTIONS = ("fov_deg", "scene_scale_m", "max_gap_s")
 WORKLOAD_OPTIONS = ("topics", "odom", "bridge_gaps", *MOTION_OPTIONS)
@@ -23,25 +25,25 @@ WORKLOAD_OPTIONS = ("topics", "odom", "bridge_gaps", *MOTION_OPTIONS)
 
 def add(commands: Commands) -> None:
     """Declare ``from-bag`` and ``from-poses`` among the commands of ``bufgym trace``."""
-    made = command(commands, "from-bag", _from_bag, "messages and motion out of a robot's recording (extra 'ros')")
-    made.add_argument(
+    bag = command(commands, "from-bag", _from_bag, "messages and motion from a robot's recording (extra 'ros')")
+    bag.add_argument(
         "file", metavar="FILE", help="MCAP, ROS 1 bag, rosbag2 folder or .db3; alone: its topics are listed"
     )
-    workload_options(made)
-    made.add_argument("-o", "--out", metavar="OUT.csv", help="write the workload there (time_s,bytes,topic[,x])")
-    made = command(commands, "from-poses", _from_poses, "camera motion out of a trajectory: TUM, EuRoC or KITTI")
-    made.add_argument("file", metavar="FILE", help="the trajectory, plain or gzip'd")
-    made.add_argument(
-        "--format", choices=("tum", "euroc", "kitti"), help="its format (default: told from its first line)"
+    workload_options(bag)
+    bag.add_argument("-o", "--out", metavar="OUT.csv", help="write the workload there (time_s,bytes,topic[,x])")
+    poses = command(commands, "from-poses", _from_poses, "camera motion from a trajectory: TUM, EuRoC or KITTI")
+    poses.add_argument("file", metavar="FILE", help="the trajectory, plain or gzip'd")
+    poses.add_argument(
+        "--format", choices=("tum", "euroc", "kitti"), help="its format (default: recognised by its first line)"
     )
-    made.add_argument("--times", metavar="FILE", help="KITTI's times (default: NAME_times.txt beside NAME.txt)")
-    _motion_options(made)
-    made.add_argument("--bridge-gaps", action="store_true", help="write it in spite of gaps")
-    made.add_argument("-o", "--out", metavar="OUT.csv", help="write the motion there (t_s,motion)")
+    poses.add_argument("--times", metavar="FILE", help="KITTI's times (default: NAME_times.txt beside NAME.txt)")
+    _motion_options(poses)
+    poses.add_argument("--bridge-gaps", action="store_true", help="write it in spite of gaps")
+    poses.add_argument("-o", "--out", metavar="OUT.csv", help="write the motion there (t_s,motion)")
 
 
 def workload_options(parser: argparse._ActionsContainer) -> None:
-    """Add the options that ``given`` reads."""
+    """Add the options that ``workload_arguments`` reads."""
     option = parser.add_argument
     option("--topics", nargs="+", metavar="T", help="topics, by name or pattern ('/camera/*'); default: all")
     option("--odom", metavar="TOPIC", help="take x from the motion on this topic (of tf: TOPIC:PARENT:CHILD)")
@@ -50,46 +52,51 @@ def workload_options(parser: argparse._ActionsContainer) -> None:
 
 
 def _motion_options(parser: argparse._ActionsContainer) -> None:
-    # A test holds these defaults to those of bufgym.traces.motion, which is not loaded for a help text.
+    # A test compares these defaults with those of MotionSettings, which is not imported for a help text.
     option = parser.add_argument
-    option("--fov-deg", type=positive, metavar="DEG", help="field of view of a camera that moves so (default: 60)")
-    option("--scene-scale-m", type=positive, metavar="M", help="moving so far shows a new scene, m (default: 2)")
+    option(
+        "--fov-deg", type=positive, metavar="DEG", help="field of view of a camera that moves like this (default: 60)"
+    )
+    option("--scene-scale-m", type=positive, metavar="M", help="moving this far shows a new scene, m (default: 2)")
     option("--max-gap-s", type=positive, metavar="S", help="longer times without a pose are gaps, s (default: 1)")
 
 
-def given_motion(options: argparse.Namespace) -> dict[str, Any]:
-    """The options on how motion is measured that were given, as arguments of ``read_motion``."""
-    return {name: getattr(options, name) for name in MOTION_OPTIONS if getattr(options, name) is not None}
+def motion_settings(options: argparse.Namespace) -> MotionSettings | None:
+    """The options on how motion is measured; None if none of them was given."""
+    from bufgym.traces import MotionSettings
+
+    values = {name: getattr(options, name) for name in MOTION_OPTIONS if getattr(options, name) is not None}
+    return MotionSettings(**values) if values else None
 
 
-def given(options: argparse.Namespace) -> dict[str, Any]:
-    """The workload options that were given, as arguments of ``read_workload``; on motion only where it has odometry."""
-    found: dict[str, Any] = {}
+def workload_arguments(options: argparse.Namespace) -> dict[str, Any]:
+    """The workload options that were given, as arguments of ``read_workload``; those on motion only with odometry."""
+    arguments: dict[str, Any] = {}
     if options.topics is not None:
-        found["topics"] = [name for text in options.topics for name in text.split(",") if name]
+        arguments["topics"] = [name for text in options.topics for name in text.split(",") if name]
     if options.odom is not None:
-        found.update(odom=options.odom, bridge_gaps=bool(options.bridge_gaps), **given_motion(options))
+        arguments.update(odom=options.odom, bridge_gaps=bool(options.bridge_gaps), settings=motion_settings(options))
     elif options.bridge_gaps:
         raise BufgymError("--bridge-gaps needs --odom")
-    return found
+    return arguments
 
 
 def refuse_motion(options: argparse.Namespace, why: str) -> None:
-    """An error if an option on how motion is measured was given."""
-    for name in given_motion(options):
-        raise BufgymError(f"--{name.replace('_', '-')} {why}")
+    """Raise an error if an option on how motion is measured was given."""
+    for name in MOTION_OPTIONS:
+        if getattr(options, name) is not None:
+            raise BufgymError(f"--{name.replace('_', '-')} {why}")
 
 
 def workload_lines(workload: Workload) -> list[str]:
-    """A table of its topics, and what is to be known of its motion."""
+    """A table of its topics, and what there is to know about its motion."""
     from bufgym.benchmark.table import aligned
 
     cells = [["topic", "messages", "rate (1/s)", "bytes", "mean bytes", "share"]]
-    for line in workload.summary():
-        rate = "-" if math.isnan(line.rate_hz) else f"{line.rate_hz:.3f}"
-        mean = f"{line.total_bytes / line.messages:,.0f}"
-        name = line.topic or "(no name)"
-        cells.append([name, f"{line.messages:,}", rate, f"{line.total_bytes:,}", mean, f"{line.share:.1%}"])
+    for topic in workload.summary():
+        messages, rate, total_bytes, share = _summary_cells(topic)
+        mean = f"{topic.total_bytes / topic.messages:,.0f}"
+        cells.append([topic.topic or "(no name)", messages, rate, total_bytes, mean, share])
     duration_s, total = workload.duration_us / 1e6, int(workload.size_bytes.sum())
     rate = f", {total / duration_s:,.0f} bytes/s" if duration_s > 0 else ""
     lines = [*aligned(cells), f"{len(workload):,} messages, {total:,} bytes in {duration_s:.3f} s{rate}"]
@@ -102,14 +109,12 @@ def workload_lines(workload: Workload) -> list[str]:
 
 
 def _from_bag(options: argparse.Namespace) -> None:
-    from bufgym.traces import bags
-    from bufgym.traces.recordings import workload_from_bag
-    from bufgym.traces.workload import write_workload_csv
+    from bufgym.traces import read_bag, workload_from_bag, write_workload_csv
 
-    arguments = given(options)
+    arguments = workload_arguments(options)
     if options.odom is None:
         refuse_motion(options, "needs --odom")
-    bag = bags.read_bag(options.file, arguments.pop("odom", None))
+    bag = read_bag(options.file, arguments.pop("odom", None))
     if options.topics is None and options.out is None and options.odom is None:
         print(f"{bag.path} ({bag.kind})\n")
         print("\n".join(_listed(bag, workload_from_bag(bag).summary() if len(bag.time_ns) else [])))
@@ -124,9 +129,9 @@ def _from_bag(options: argparse.Namespace) -> None:
 
 
 def _from_poses(options: argparse.Namespace) -> None:
-    from bufgym.traces.motion import read_motion, write_motion_csv
+    from bufgym.traces import read_motion, write_motion_csv
 
-    motion = read_motion(options.file, format=options.format, times=options.times, **given_motion(options))
+    motion = read_motion(options.file, motion_settings(options), format=options.format, times=options.times)
     seconds = motion.duration_us / 1e6
     print(f"{motion.name}\n  source  {motion.source}\n  motion  {motion.total:.3f} fields of view in {seconds:.3f} s")
     count = len(motion.gaps)
@@ -139,18 +144,21 @@ def _from_poses(options: argparse.Namespace) -> None:
     print(f"wrote {options.out}")
 
 
-def _listed(bag: Any, summary: Sequence[Any]) -> list[str]:
+def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
     """Every topic of a recording with its type, those without messages at the end."""
     from bufgym.benchmark.table import aligned
-    from bufgym.traces.bag_poses import carries_poses
+    from bufgym.traces.formats.bag_poses import carries_poses
 
     cells = [["topic", "messages", "rate (1/s)", "bytes", "share", "for --odom", "type"]]
-    for line in summary:
-        type = bag.topics[line.topic]
-        rate = "-" if math.isnan(line.rate_hz) else f"{line.rate_hz:.3f}"
-        poses = "yes" if carries_poses(type) else ""
-        numbers = [f"{line.messages:,}", rate, f"{line.total_bytes:,}", f"{line.share:.1%}"]
-        cells.append([line.topic, *numbers, poses, type])
-    met = {line.topic for line in summary}
-    cells += [[name, "0", "-", "0", "-", "", type] for name, type in bag.topics.items() if name not in met]
+    for topic in summary:
+        type = bag.topics[topic.topic]
+        cells.append([topic.topic, *_summary_cells(topic), "yes" if carries_poses(type) else "", type])
+    with_messages = {topic.topic for topic in summary}
+    cells += [[name, "0", "-", "0", "-", "", type] for name, type in bag.topics.items() if name not in with_messages]
     return aligned(cells)
+
+
+def _summary_cells(topic: TopicSummary) -> list[str]:
+    """Messages, rate, bytes and share of a topic."""
+    rate = "-" if math.isnan(topic.rate_hz) else f"{topic.rate_hz:.3f}"
+    return [f"{topic.messages:,}", rate, f"{topic.total_bytes:,}", f"{topic.share:.1%}"]

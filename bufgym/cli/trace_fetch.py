@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,8 @@ from bufgym.cli.options import Commands, columns, command
 from bufgym.errors import BufgymError
 
 if TYPE_CHECKING:
-    from bufgym.traces.datasets import Dataset
-    from bufgym.traces.fetch import Fetched
+    from bufgym.traces.datasets.fetch import Fetched
+    from bufgym.traces.datasets.table import Dataset
 
 NOT_KNOWN = "not known"
 
@@ -29,37 +30,37 @@ def add(commands: Commands) -> None:
 
 
 def _fetch(options: argparse.Namespace) -> None:
-    from bufgym.traces.datasets import datasets
-    from bufgym.traces.fetch import fetch_dataset
+    from bufgym.traces.datasets.fetch import fetch_dataset
+    from bufgym.traces.datasets.table import datasets
 
-    known = datasets()
+    table = datasets()
     if options.name is None:
         if not options.list:
             raise BufgymError("trace fetch: needs the NAME of a data set (--list names them)")
-        print(_overview(list(known.values())))
+        print(_overview(list(table.values())))
         return
-    if options.name not in known:
-        raise BufgymError(f"{options.name}: no such data set: must be one of {', '.join(known)}")
-    dataset = known[options.name]
+    if options.name not in table:
+        raise BufgymError(f"{options.name}: no such data set: must be one of {', '.join(table)}")
+    dataset = table[options.name]
     if options.list:
         print(f"{dataset.name}\n{columns(_about(dataset))}\n{_addresses(dataset)}".rstrip())
         return
     bars = _Bars()
     try:
-        found = fetch_dataset(dataset, options.to, options.given, note=_note, watch=bars.watch)
+        fetched = fetch_dataset(dataset, options.to, options.given, note=_note, watch=bars.watch)
     finally:
         bars.close()
-    print(f"{dataset.name}\n{columns([*_results(found), *_about(dataset)])}")
+    print(f"{dataset.name}\n{columns([*_results(fetched), *_about(dataset)])}")
 
 
-# --- what there is to say ---------------------------------------------------------------------------------------------
+# --- output -----------------------------------------------------------------------------------------------------------
 
 
-def _overview(known: list[Dataset]) -> str:
-    from bufgym.traces.fetch import cache_folder
+def _overview(table: list[Dataset]) -> str:
+    from bufgym.traces.datasets.fetch import cache_folder
 
     lines = [("NAME", "FILES", "WITH SHA256", "LICENCE", "HOLDS")]
-    for dataset in known:
+    for dataset in table:
         summed = sum(remote.sha256 is not None for remote in dataset.files)
         count = str(len(dataset.files) or "by hand")
         lines.append((dataset.name, count, str(summed), dataset.licence or NOT_KNOWN, dataset.holds))
@@ -84,18 +85,15 @@ def _addresses(dataset: Dataset) -> str:
     return columns([("file", remote.address, f"sha256 {remote.sha256 or NOT_KNOWN}") for remote in dataset.files])
 
 
-def _results(found: list[Fetched]) -> list[tuple[str, str]]:
-    how = ", ".join(
-        f"{count} {origin}"
-        for origin in ("downloaded", "there already", "given")
-        if (count := sum(each.origin == origin for each in found))
-    )
-    right = sum(each.known for each in found)
-    lines = [("files", how), ("sha256", f"{right} of {len(found)} checked against the known sum")]
-    lines += [("sha256 found", f"{each.sha256}  {each.path.name} (none known)") for each in found if not each.known]
-    first = found[0].path
-    lines.append(("at", str(first if len(found) == 1 else first.parent)))
-    return lines + [("unpacked", str(each.unpacked)) for each in found if each.unpacked is not None]
+def _results(fetched: list[Fetched]) -> list[tuple[str, str]]:
+    origins = Counter(file.origin for file in fetched)
+    counts = ", ".join(f"{count} {origin}" for origin, count in origins.items())
+    verified = sum(file.known for file in fetched)
+    lines = [("files", counts), ("sha256", f"{verified} of {len(fetched)} checked against the known sum")]
+    lines += [("sha256 found", f"{file.sha256}  {file.path.name} (none known)") for file in fetched if not file.known]
+    first = fetched[0].path
+    lines.append(("at", str(first if len(fetched) == 1 else first.parent)))
+    return lines + [("unpacked", str(file.unpacked)) for file in fetched if file.unpacked is not None]
 
 
 # --- progress ---------------------------------------------------------------------------------------------------------
@@ -106,7 +104,7 @@ def _note(sentence: str) -> None:
 
 
 class _Bars:
-    """A bar a file where a person looks on and tqdm is there; else a line every 10 seconds and at the end."""
+    """A progress bar for each file on a terminal with tqdm; elsewhere a line every 10 seconds and at the end."""
 
     EVERY_S = 10.0
 

@@ -1,4 +1,4 @@
-"""``bufgym trace``: bandwidth traces described, drawn, checked, converted. Other verbs have modules of their own."""
+"""``bufgym trace``: describe, plot, validate and convert bandwidth traces. Other verbs have modules of their own."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bufgym.cli import trace_bags, trace_fetch, trace_fit
+from bufgym.cli import trace_bags, trace_fetch, trace_fit, trace_generate
 from bufgym.cli.options import Commands, columns, command
 from bufgym.errors import BufgymError, TraceError
 
@@ -31,15 +31,16 @@ def add(commands: Commands) -> None:
         verbs, "validate", _validate, "read each file and say whether it is sound; exit code 1 if not all"
     )
     convert = command(verbs, "convert", _convert, "write bandwidth traces in another format and say what was lost")
-    for made in (info, plot, validate, convert):
-        made.add_argument("files", nargs="+", metavar="FILE", help="a file, archive.zip:member, or a shipped name")
-        made.add_argument("--format", metavar="NAME", help="the files' format, where it is not to be detected")
-        made.add_argument("--column", metavar="NAME", help="which column of rates, in UCC files (default DL_bitrate)")
+    for parser in (info, plot, validate, convert):
+        parser.add_argument("files", nargs="+", metavar="FILE", help="a file, archive.zip:member, or a shipped name")
+        parser.add_argument("--format", metavar="NAME", help="the files' format, where it is not to be detected")
+        parser.add_argument("--column", metavar="NAME", help="which column of rates, in UCC files (default DL_bitrate)")
     plot.add_argument("--out", required=True, metavar="FILE", help="the picture to write: .png, .svg or .pdf")
     convert.add_argument("--to", metavar="NAME", help="csv or mahimahi; by default csv where --out ends in .csv")
     convert.add_argument("--out", required=True, metavar="PATH", help="the file to write; a folder for several files")
     trace_bags.add(verbs)
     trace_fit.add(verbs)
+    trace_generate.add(verbs)
     trace_fetch.add(verbs)
 
 
@@ -81,8 +82,8 @@ def _validate(options: argparse.Namespace) -> None:
             failed += 1
             print(f"error  {' '.join(str(error).split())}")
         else:
-            found = traces.describe(trace)
-            print(f"OK     {trace.source}: {found['duration_s']:.1f} s, mean {found['mean_KBps']:.1f} KB/s")
+            summary = traces.describe(trace)
+            print(f"OK     {trace.source}: {summary['duration_s']:.1f} s, mean {summary['mean_KBps']:.1f} KB/s")
     if len(names) > 1:
         print(f"{len(names) - failed} of {len(names)} files are sound")
     if failed:
@@ -90,17 +91,17 @@ def _validate(options: argparse.Namespace) -> None:
 
 
 def _with_members(names: list[str]) -> list[str]:
-    """The names, and in place of each zip archive all of its members."""
+    """The names, with each zip archive of several members replaced by its members."""
     from bufgym import traces
 
-    found: list[str] = []
+    expanded: list[str] = []
     for name in names:
         try:
-            inside = traces.members(name) if Path(name).is_file() else []
+            members = traces.members(name) if Path(name).is_file() else []
         except TraceError:
-            inside = []  # reading it says what is wrong
-        found += [f"{name}:{member}" for member in inside] if len(inside) > 1 else [name]
-    return found
+            members = []  # reading it says what is wrong
+        expanded += [f"{name}:{member}" for member in members] if len(members) > 1 else [name]
+    return expanded
 
 
 # --- convert ---------------------------------------------------------------------------------------------------------
@@ -112,8 +113,8 @@ def _convert(options: argparse.Namespace) -> None:
     out = Path(options.out)
     to = options.to or ("csv" if out.suffix == ".csv" else None)
     if to not in traces.WRITERS:
-        said = f"--to {to}" if to else f"--out {out}: does not tell the format; --to"
-        raise BufgymError(f"{said}: must be one of {', '.join(traces.WRITERS)}")
+        option = f"--to {to}" if to else f"--out {out}: does not tell the format; --to"
+        raise BufgymError(f"{option}: must be one of {', '.join(traces.WRITERS)}")
     for name, target in _targets(options.files, out, to):
         trace = _load(name, options)
         traces.WRITERS[to](trace, target)
@@ -122,18 +123,18 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
-    """What to write to for each file: ``out`` for a single one, else files of their names in the folder ``out``."""
+    """Each file with its target: ``out`` for a single one, else a file of its name in the folder ``out``."""
     if len(names) == 1 and not out.is_dir():
         if out.exists() and Path(names[0]).exists() and out.samefile(names[0]):
             raise BufgymError(f"--out {out}: must not be the file that is read")
         return [(names[0], out)]
-    from bufgym.traces.readers import trace_name
+    from bufgym.traces.formats.links import trace_name
 
     if not out.is_dir():
         raise BufgymError(f"--out {out}: must be an existing folder for {len(names)} files")
     targets = [(name, out / (trace_name(name) + (".csv" if to == "csv" else ".mahimahi"))) for name in names]
     for name, target in targets:
-        if [each for _, each in targets].count(target) > 1 or target.exists():
+        if [path for _, path in targets].count(target) > 1 or target.exists():
             raise BufgymError(f"{name}: {target} is taken: must be written by itself, with --out FILE")
     return targets
 
@@ -161,7 +162,7 @@ def _plot(options: argparse.Namespace) -> None:
 
 
 def _draw(axis: Axes, trace: Trace) -> None:
-    """Rates over time; what is under 500 KB/s is marked in red below the axis's zero."""
+    """Draw rates over time; stretches under 500 KB/s are marked in red below zero."""
     import numpy as np
 
     from bufgym import traces
@@ -173,10 +174,10 @@ def _draw(axis: Axes, trace: Trace) -> None:
     top = max(float(rates.max()) / 1e6, 0.001) * 1.05
     low = (rates < 500_000.0).astype(float)
     axis.stairs(-0.05 * top * low, edges_s, baseline=-0.02 * top * low, fill=True, color="tab:red", linewidth=0)
-    found = traces.describe(trace)
-    told = f"mean {found['mean_KBps'] / 1e3:.3g} MB/s, {found['seconds_below_500KBps']:.4g} s under 500 KB/s (red)"
+    summary = traces.describe(trace)
+    title = f"mean {summary['mean_KBps'] / 1e3:.3g} MB/s, {summary['seconds_below_500KBps']:.4g} s under 500 KB/s (red)"
     axis.set_title(trace.name, fontsize="medium", loc="left")
-    axis.set_title(told, fontsize="small", loc="right")
+    axis.set_title(title, fontsize="small", loc="right")
     axis.set_ylabel("MB/s")
     axis.set_xlim(0, edges_s[-1])
     axis.set_ylim(-0.07 * top, top)

@@ -23,7 +23,7 @@ from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.scenario import Client, Interruption, Scenario, Uplink, robofleet_example
 from bufgym.traces import Motion, Trace, drive_motion, markov_link, read_motion, read_trace, synthetic_lte
-from bufgym.traces.synthetic import LTE_MODES
+from bufgym.traces.generate.lte import LTE_MODES
 
 SPLITS = ("train", "validation", "test")
 

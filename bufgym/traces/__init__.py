@@ -1,4 +1,4 @@
-"""Bandwidth traces, motion recordings and workloads: in from files, out to files, or made up from a seed.
+"""Bandwidth traces, motion recordings and workloads: from files, into files, or generated from a seed.
 
 trace = load("lte-synthetic-3")            # shipped with bufgym
 trace = read_trace("TMobile-LTE-short.up.gz")
@@ -6,32 +6,42 @@ trace = Trace.steps([(5, 8e6), (2, 0)])    # 5 s at 8 MB/s, 2 s of nothing
 trace = markov_link("tram", seed=3)        # as recorded in trams
 motion = read_motion("freiburg1_desk.groundtruth.txt.gz")
 workload = read_workload("drive.mcap", topics=["/camera/*"], odom="/odom")
+
+`Trace`, `Motion` and `Workload` are here, with what `shipped` loads by name. `formats` reads and writes files,
+`generate` makes links, motions and frame sizes, `fit` fits links to recordings and compares both, and `datasets`
+fetches public recordings.
 """
 
-from bufgym.traces.archives import members
-from bufgym.traces.bags import read_bag
+from bufgym.traces.formats.archives import members
+from bufgym.traces.formats.bags import read_bag
+from bufgym.traces.formats.links import FORMATS, detect_format, read_trace
+from bufgym.traces.formats.motions import read_motion, write_motion_csv
+from bufgym.traces.formats.recordings import read_workload, workload_from_bag
+from bufgym.traces.formats.trajectories import read_poses
+from bufgym.traces.formats.workloads import read_workload_csv, write_workload_csv
+from bufgym.traces.formats.writers import WRITERS, Difference, difference, write_csv, write_mahimahi
 from bufgym.traces.generate import (
     Corridor,
+    Driving,
     FrameModel,
+    drive_motion,
     fitted_links,
     frame_sizes,
     gilbert_elliott,
     markov_link,
+    outage,
     ramp,
     read_links,
     roaming,
     steady,
+    synthetic_lte,
     tunnel,
 )
-from bufgym.traces.motion import Motion, motion_from_poses, read_motion, write_motion_csv
-from bufgym.traces.poses import read_poses
-from bufgym.traces.readers import FORMATS, detect_format, read_trace
-from bufgym.traces.recordings import read_workload, workload_from_bag
+from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
+from bufgym.traces.poses import Poses
 from bufgym.traces.shipped import load, load_motion, shipped
-from bufgym.traces.synthetic import Driving, drive_motion, outage, synthetic_lte
 from bufgym.traces.trace import Trace, describe
-from bufgym.traces.workload import Workload, read_workload_csv, write_workload_csv
-from bufgym.traces.writers import WRITERS, Difference, difference, write_csv, write_mahimahi
+from bufgym.traces.workload import Workload
 
 __all__ = [
     "FORMATS",
@@ -41,6 +51,8 @@ __all__ = [
     "Driving",
     "FrameModel",
     "Motion",
+    "MotionSettings",
+    "Poses",
     "Trace",
     "Workload",
     "describe",

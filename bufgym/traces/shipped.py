@@ -5,20 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 from bufgym import files
-from bufgym.errors import TraceError, where
-from bufgym.traces.archives import split_member
-from bufgym.traces.files import StrPath
-from bufgym.traces.motion import Motion, read_motion
-from bufgym.traces.readers import read_trace
+from bufgym.traces.formats.archives import split_member
+from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.links import read_trace
+from bufgym.traces.formats.motions import read_motion
+from bufgym.traces.motion import Motion
 from bufgym.traces.trace import After, Trace
 
 
 def shipped() -> dict[str, Path]:
-    """Names of the shipped files, and where they are: `lte-synthetic-0` .. `7` and the motions `drive-0`,
-    `drive-1`.
+    """Name -> path of the shipped files: `lte-synthetic-0` .. `7` and the motions `drive-0`, `drive-1`.
 
-    A wheel carries them inside the package; a checkout has them in its top-level `traces/`. Empty if neither
-    is there.
+    A wheel carries them inside the package; a checkout has them in its top-level `traces/`. Empty if neither exists.
     """
     return files.shipped("traces", "traces", "*.csv")
 
@@ -26,7 +24,7 @@ def shipped() -> dict[str, Path]:
 def load(
     name_or_path: StrPath, format: str | None = None, after: After = "loop", *, column: str | None = None
 ) -> Trace:
-    """A bandwidth trace by its shipped name or from a file (see `read_trace`); a shipped name goes first.
+    """A bandwidth trace by its shipped name or from a file (see `read_trace`); a shipped name takes precedence.
 
     Raises:
         TraceError: neither a shipped name nor a file (the message lists the names), or a broken file.
@@ -35,7 +33,7 @@ def load(
 
 
 def load_motion(name_or_path: StrPath) -> Motion:
-    """A motion recording by its shipped name or from a file, trajectories with the defaults of `read_motion`.
+    """A motion recording by its shipped name or from a file; trajectories are read with the default settings.
 
     Raises:
         TraceError: as `load`.
@@ -44,10 +42,10 @@ def load_motion(name_or_path: StrPath) -> Motion:
 
 
 def _resolve(name_or_path: StrPath) -> StrPath:
-    known = shipped()
-    if isinstance(name_or_path, str) and name_or_path in known:
-        return known[name_or_path]
+    paths = shipped()
+    if isinstance(name_or_path, str) and name_or_path in paths:
+        return paths[name_or_path]
     if not split_member(name_or_path)[0].exists():
-        names = ", ".join(known) or "none found"
-        raise TraceError(where(name_or_path, None, None, f"no such file, and no shipped trace (known: {names})"))
+        names = ", ".join(paths) or "none found"
+        raise fault(name_or_path, f"no such file, and no shipped trace (known: {names})")
     return name_or_path

@@ -1,9 +1,8 @@
-"""A link's capacity over time: how many bytes could have crossed since the trace began.
+"""A link's capacity over time: how many bytes it could have carried since the trace began.
 
-Model: cumulative bytes, piecewise linear between knots (the view of mahimahi's `link_queue`, with straight
-lines in place of packets). Time is int64 microseconds and capacity int64 bytes, so that what is computed
-from a trace is the same on every machine. Numbers of a link at rest: 1 MB/s for one second is the two knots
-(0, 0), (1_000_000, 1_000_000).
+Model: cumulative bytes, piecewise linear between knots (the view of mahimahi's `link_queue`, with straight lines in
+place of packets). Time is int64 microseconds and capacity int64 bytes, so that what is computed from a trace is the
+same on every machine. For example, 1 MB/s for one second is the two knots (0, 0), (1_000_000, 1_000_000).
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -24,15 +23,13 @@ After = Literal["loop", "hold", "stop"]
 
 US_PER_S: Final = 1_000_000
 
-# Interpolating inside a segment computes (bytes x microseconds); below this it fits an int64 with a bit to
-# spare.
+# Interpolating inside a segment computes (bytes x microseconds); below this limit it fits an int64 with a bit to spare.
 PRODUCT_LIMIT: Final = 2**62
 
 # Four months. A longer trace is a unit mistake (ns or ms read as s), not a recording.
 MAX_DURATION_S: Final = 10**7
 
-# Traces whose knots lie closer than this (mahimahi: 1 ms) hold single packets; their rates are taken over
-# whole seconds.
+# Traces with knots closer than this (mahimahi: 1 ms) hold single packets; their rates are taken over whole seconds.
 _FINE_SEGMENT_US: Final = 100_000
 
 
@@ -40,33 +37,28 @@ _FINE_SEGMENT_US: Final = 100_000
 class Trace:
     """The capacity of a link, checked when it is made; its arrays are read-only.
 
-    Attributes:
-        name: what to call it in tables, for example "report_car_0002".
-        time_us: int64[K], K >= 2, microseconds, strictly increasing from 0.
-        cumulative_bytes: int64[K], bytes that could have crossed by then, non-decreasing from 0. Between two
-            knots the rate is constant.
-        after: what follows the last knot: "loop" begins again at the first, "hold" goes on at the rate of
-            the last segment, "stop" carries nothing more.
-        source: where it comes from, in words, with the file's format.
-
     Raises:
-        BufgymError: an array is not whole numbers (NaN included), too short, negative, out of order, does
-            not start at 0; a segment with (bytes x microseconds) >= 2**62, which integer interpolation could
-            not hold; no capacity at all in a trace that loops (a message would never leave).
+        BufgymError: an array is not whole numbers (NaN included), too short, negative, out of order, or does not start
+            at 0; a segment has (bytes x microseconds) >= 2**62, which integer interpolation could not hold; a trace
+            that loops has no capacity at all (a message would never leave).
     """
 
     name: str
+    """What to call it in tables, for example "report_car_0002"."""
     time_us: Int64Array
+    """int64[K], K >= 2, microseconds, strictly increasing from 0."""
     cumulative_bytes: Int64Array
+    """int64[K], bytes that the link could have carried by then, non-decreasing from 0; the rate between knots is
+    constant."""
     after: After = "loop"
+    """What follows the last knot: "loop" begins again at the first, "hold" continues at the rate of the last segment,
+    "stop" carries nothing more."""
     source: str = ""
+    """Where it comes from, in words, with the file's format."""
 
     def __post_init__(self) -> None:
         time_us = _whole_numbers(self.time_us, "time_us")
-        cumulative = _whole_numbers(self.cumulative_bytes, "cumulative_bytes")
-        # The dataclass is frozen for its users; this is where its arrays are settled.
-        object.__setattr__(self, "time_us", time_us)
-        object.__setattr__(self, "cumulative_bytes", cumulative)
+        freeze(self, time_us=time_us, cumulative_bytes=_whole_numbers(self.cumulative_bytes, "cumulative_bytes"))
         self._check()
 
     def _check(self) -> None:
@@ -79,24 +71,19 @@ class Trace:
             raise self._broken(f"{time_us.size} knots: must be at least 2")
         if time_us[0] != 0 or cumulative[0] != 0:
             raise self._broken(f"first knot ({time_us[0]} us, {cumulative[0]} bytes): must be (0, 0)")
-        bad = time_us[1:] <= time_us[:-1]
-        if bad.any():
-            k = int(np.argmax(bad)) + 1
-            raise self._broken(f"time_us[{k}] = {time_us[k]} after {time_us[k - 1]}: must increase at every knot")
-        bad = cumulative[1:] < cumulative[:-1]
-        if bad.any():
-            k = int(np.argmax(bad)) + 1
-            raise self._broken(f"cumulative_bytes[{k}] = {cumulative[k]} after {cumulative[k - 1]}: must not decrease")
+        if (k := first_true(time_us[1:] <= time_us[:-1])) is not None:
+            value, previous = time_us[k + 1], time_us[k]
+            raise self._broken(f"time_us[{k + 1}] = {value} after {previous}: must increase at every knot")
+        if (k := first_true(cumulative[1:] < cumulative[:-1])) is not None:
+            value, previous = cumulative[k + 1], cumulative[k]
+            raise self._broken(f"cumulative_bytes[{k + 1}] = {value} after {previous}: must not decrease")
         if self.duration_us >= PRODUCT_LIMIT or self.total_bytes >= PRODUCT_LIMIT:
             raise self._broken(f"ends at ({self.duration_us} us, {self.total_bytes} bytes): both must be below 2**62")
         segment_us, segment_bytes = np.diff(time_us), np.diff(cumulative)
-        bad = segment_bytes > (PRODUCT_LIMIT - 1) // segment_us
-        if bad.any():
-            k = int(np.argmax(bad))
+        if (k := first_true(segment_bytes > (PRODUCT_LIMIT - 1) // segment_us)) is not None:
             raise self._broken(
-                f"segment {k} carries {segment_bytes[k]} bytes in {segment_us[k]} us: "
-                "bytes x microseconds must be below 2**62, so that integer interpolation cannot "
-                "overflow (put in more knots)"
+                f"segment {k} carries {segment_bytes[k]} bytes in {segment_us[k]} us: bytes x microseconds must be "
+                "below 2**62, so that integer interpolation cannot overflow (add more knots)"
             )
         if self.after == "loop" and self.total_bytes == 0:
             raise self._broken('no capacity at all: with after = "loop" a message would never leave')
@@ -125,7 +112,7 @@ class Trace:
 
     @property
     def total_bytes(self) -> int:
-        """Bytes that can cross from the first knot to the last."""
+        """Bytes that the link can carry from the first knot to the last."""
         return int(self.cumulative_bytes[-1])
 
     @property
@@ -138,8 +125,7 @@ class Trace:
         return self.time_us, np.diff(self.cumulative_bytes) * float(US_PER_S) / np.diff(self.time_us)
 
     def rate_bytes_per_s(self, time_us: npt.ArrayLike) -> Float64Array:
-        """Rate in bytes/s at each time (microseconds, any shape); at a knot, that of the segment which
-        begins there.
+        """Rate in bytes/s at each time (microseconds, any shape); at a knot, that of the segment that begins there.
 
         Beyond the last knot `after` decides: loop, hold, or 0.
 
@@ -151,19 +137,18 @@ class Trace:
             raise self._broken(f"time_us = {times.min()}: must be >= 0")
         _, rates = self.segments()
         inside = times % self.duration_us if self.after == "loop" else np.minimum(times, self.duration_us - 1)
-        found = rates[np.searchsorted(self.time_us, inside, side="right") - 1]
+        rate = rates[np.searchsorted(self.time_us, inside, side="right") - 1]
         if self.after == "stop":
-            found = np.where(times >= self.duration_us, 0.0, found)
-        return np.asarray(found, dtype=np.float64)
+            rate = np.where(times >= self.duration_us, 0.0, rate)
+        return np.asarray(rate, dtype=np.float64)
 
     def samples(self, window_us: int | None = None) -> tuple[Int64Array, Float64Array]:
         """The trace as measurements: lengths int64[n] in microseconds and mean rates float64[n] in bytes/s.
 
         Args:
-            window_us: take means over consecutive windows of this length; an incomplete last one is left out
-                (unless it is the only one). By default the samples are the segments themselves, except for
-                traces of single packets (median segment under 100 ms, as in mahimahi files), which are seen
-                through windows of 1 s.
+            window_us: take means over consecutive windows of this length; an incomplete last one is left out unless it
+                is the only one. By default the samples are the segments themselves, except for traces of single packets
+                (median segment under 100 ms, as in mahimahi files), where they are windows of 1 s.
 
         Raises:
             BufgymError: `window_us` below 1.
@@ -177,8 +162,8 @@ class Trace:
             raise self._broken(f"window_us = {window_us}: must be >= 1")
         window_us = min(window_us, self.duration_us)
         edges_us = np.arange(0, self.duration_us + 1, window_us, dtype=np.int64)
-        crossed = np.diff(np.interp(edges_us, self.time_us, self.cumulative_bytes))
-        return np.diff(edges_us), crossed * (US_PER_S / window_us)
+        window_bytes = np.diff(np.interp(edges_us, self.time_us, self.cumulative_bytes))
+        return np.diff(edges_us), window_bytes * (US_PER_S / window_us)
 
     def seconds_below(self, bytes_per_s: float, window_us: int | None = None) -> float:
         """Total length, in seconds, of the `samples` whose rate is strictly below `bytes_per_s`."""
@@ -195,7 +180,7 @@ class Trace:
             raise self._broken(f"factor = {factor}: must be a finite number >= 0")
         if self.total_bytes * factor >= PRODUCT_LIMIT:
             raise self._broken(f"factor = {factor}: the total of {self.total_bytes} bytes would pass 2**62")
-        # Multiplying and rounding both keep order, so the counts cannot start to decrease.
+        # Multiplying and rounding both preserve order, so the counts cannot start to decrease.
         cumulative = np.rint(self.cumulative_bytes * factor).astype(np.int64)
         return Trace(self.name, self.time_us, cumulative, self.after, f"{self.source} x {factor:g}".strip())
 
@@ -209,19 +194,19 @@ class Trace:
         after: After = "loop",
         source: str = "",
     ) -> Trace:
-        """A trace from measurements that follow each other without a gap.
+        """A trace from measurements that follow each other without gaps.
 
         Args:
             interval_us: int64[K-1], length of each interval in microseconds, > 0.
-            bytes_in_interval: int64[K-1], bytes that crossed in it, >= 0.
+            bytes_in_interval: int64[K-1], bytes transmitted in each, >= 0.
+            name, after, source: those of the trace.
         """
         lengths = _whole_numbers(interval_us, "interval_us")
         counts = _whole_numbers(bytes_in_interval, "bytes_in_interval")
         for what, values, least in (("interval_us", lengths, 1), ("bytes_in_interval", counts, 0)):
-            if values.size and values.min() < least:
-                k = int(np.argmax(values < least))
+            if (k := first_true(values < least)) is not None:
                 raise BufgymError(f"trace {name!r}: {what}[{k}] = {values[k]}: must be >= {least}")
-            # A float sum cannot wrap round, as an int64 sum would.
+            # A float sum cannot wrap around, as an int64 sum would.
             if values.sum(dtype=np.float64) >= PRODUCT_LIMIT:
                 raise BufgymError(f"trace {name!r}: sum of {what}: must be below 2**62")
         return cls(name, _from_zero(lengths), _from_zero(counts), after, source)
@@ -237,7 +222,7 @@ class Trace:
 
     @classmethod
     def steps(cls, steps: Iterable[tuple[float, float]], *, name: str = "steps", after: After = "loop") -> Trace:
-        """Constant rates in a row, each given as (seconds, bytes/s), with a knot at least every second.
+        """Constant rates one after the other, each as (seconds, bytes/s), with a knot at least every second.
 
         `Trace.steps([(2, 7e6), (0.5, 0)])` is two good seconds and an outage of half a second. Durations are
         rounded to whole microseconds, and each knot's count to a whole byte.
@@ -268,19 +253,18 @@ class Trace:
 def describe(trace: Trace) -> dict[str, float]:
     """A trace's statistics, by the definitions of common tables of bandwidth data sets. 1 KB = 1000 bytes.
 
-    All are over `Trace.samples`, so a trace of single packets counts in whole seconds:
+    All are over `Trace.samples`, so for a trace of single packets they are over whole seconds:
 
     - `duration_s`: length of all samples;
     - `mean_KBps`: bytes over time;
-    - `min_KBps`: least rate among samples at least half as long as the median one (a stray sample of some ms
-      says little), `max_KBps`: greatest rate among all;
+    - `min_KBps`: least rate among samples at least half as long as the median one (a stray sample of some ms means
+      little), `max_KBps`: greatest rate among all;
     - `seconds_below_500KBps`: length of the samples under 500 KB/s;
     - `longest_run_below_500KBps_s`: greatest length of such samples in a row.
     """
     lengths_us, rates = trace.samples()
     low = rates < 500_000.0
-    # Cumulative low time, and its value where the current run began: their difference is the run's length so
-    # far.
+    # Cumulative low time, and its value where the current run began: their difference is the run's length so far.
     low_us = np.cumsum(np.where(low, lengths_us, 0))
     before_run = np.maximum.accumulate(np.where(low, 0, low_us))
     long_enough = lengths_us >= 0.5 * np.median(lengths_us)
@@ -295,28 +279,36 @@ def describe(trace: Trace) -> dict[str, float]:
 
 
 def _from_zero(values: Int64Array) -> Int64Array:
-    """Running sums of int64[n] as int64[n+1], beginning with 0."""
+    """Cumulative sums of int64[n] as int64[n+1], beginning with 0."""
     sums = np.zeros(values.size + 1, np.int64)
     np.cumsum(values, out=sums[1:])
     return sums
 
 
 def _whole_numbers(values: npt.ArrayLike, what: str) -> Int64Array:
-    """`values` as a read-only int64[n] of its own, or a BufgymError that says why not."""
-    given = np.asarray(values)
-    if given.ndim != 1:
-        raise BufgymError(f"{what} has {given.ndim} dimensions: must be a row of numbers")
-    if given.dtype == np.int64 and given.base is None and not given.flags.writeable:
-        return given  # nobody else can write to it, and large traces are not copied
-    if given.dtype.kind not in "iuf" and given.size:
-        raise BufgymError(f"{what} holds {given.dtype} values: must be whole numbers below 2**63")
-    if given.dtype.kind == "f":
-        bad = ~(np.isfinite(given) & (given == np.floor(given)))
-        if bad.any():
-            k = int(np.argmax(bad))
-            raise BufgymError(f"{what}[{k}] = {given[k]}: must be a whole number")
-    if given.dtype.kind in "uf" and given.size and (given.max() >= 2**63 or given.min() < -(2**63)):
-        raise BufgymError(f"{what} reaches {given.max()}: must be below 2**63")
-    own = given.astype(np.int64, copy=True)
-    own.flags.writeable = False
-    return own
+    """`values` as an int64[n] that nobody else can write to, or a BufgymError that says why not."""
+    numbers = np.asarray(values)
+    if numbers.ndim != 1:
+        raise BufgymError(f"{what} has {numbers.ndim} dimensions: must be a row of numbers")
+    if numbers.dtype == np.int64 and numbers.base is None and not numbers.flags.writeable:
+        return numbers  # read-only already, so that large traces are not copied
+    kind = numbers.dtype.kind
+    if kind not in "iuf" and numbers.size:
+        raise BufgymError(f"{what} holds {numbers.dtype} values: must be whole numbers below 2**63")
+    if kind == "f" and (k := first_true(~(np.isfinite(numbers) & (numbers == np.floor(numbers))))) is not None:
+        raise BufgymError(f"{what}[{k}] = {numbers[k]}: must be a whole number")
+    if kind in "uf" and numbers.size and (numbers.max() >= 2**63 or numbers.min() < -(2**63)):
+        raise BufgymError(f"{what} reaches {numbers.max()}: must be below 2**63")
+    return numbers.astype(np.int64, copy=True)
+
+
+def first_true(flags: npt.NDArray[np.bool_]) -> int | None:
+    """The first index of bool[n] at which it is True, None if there is none."""
+    return int(np.argmax(flags)) if flags.any() else None
+
+
+def freeze(owner: object, **arrays: npt.NDArray[Any]) -> None:
+    """Make these arrays read-only and store them in the fields of a frozen dataclass."""
+    for field, values in arrays.items():
+        values.flags.writeable = False
+        object.__setattr__(owner, field, values)

@@ -426,7 +426,7 @@ def _short():
 
 
 def test_a_workload_is_no_stream(tmp_path):
-    from bufgym.traces.workload import Workload
+    from bufgym.traces import Workload
 
     assert isinstance(FleetScenario().uplink, Uplink)
     assert FleetScenario().uplink.traces

@@ -11,7 +11,8 @@ import pytest
 from link_files import SAMPLES, written
 
 from bufgym.errors import TraceError
-from bufgym.traces import archives, files, members, read_trace
+from bufgym.traces import members, read_trace
+from bufgym.traces.formats import archives, text
 
 
 def zipped(folder: Path, contents: dict[str, str | bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
@@ -87,7 +88,7 @@ def test_damaged_archives(tmp_path: Path) -> None:
 
 
 def test_a_bomb_in_a_zip_stops_at_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "MAX_TEXT_BYTES", 10**6)
+    monkeypatch.setattr(text, "MAX_TEXT_BYTES", 10**6)
     path = zipped(tmp_path, {"lte.csv": "7\n" * 5_000_000})
     assert path.stat().st_size < 20_000
     with pytest.raises(TraceError, match="more than 1000000 bytes of text"):

@@ -21,8 +21,8 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from bufgym.errors import BufgymError, TraceError
-from bufgym.traces.bags import is_bag, matching, read_bag
-from bufgym.traces.recordings import read_workload, workload_from_bag
+from bufgym.traces import MotionSettings, read_workload, workload_from_bag
+from bufgym.traces.formats.bags import is_bag, matching, read_bag
 
 WRITERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "mcap, zstd": ("mcap", lambda path: cases.write_mcap(path, cases.drive())),
@@ -95,7 +95,7 @@ def test_the_db3_file_alone_under_any_name(tmp_path: Path) -> None:
 def test_field_of_view_scene_scale_and_what_begins_when(tmp_path: Path) -> None:
     """x begins at the first message chosen: /status at 700 ms, when 0.7 m are behind."""
     path = cases.write_mcap(tmp_path / "drive.mcap", cases.drive())
-    workload = read_workload(path, topics=["/status", "/odom"], odom="/odom", fov_deg=90, scene_scale_m=4)
+    workload = read_workload(path, topics=["/status", "/odom"], odom="/odom", settings=MotionSettings(90, 4))
     assert workload.x == pytest.approx([0, 0.175, 0.25, 1.25])
     later = read_workload(path, topics=["/status"], odom="/odom")
     assert later.arrival_us.tolist() == [0] and later.x is not None and later.x.tolist() == [0]
@@ -131,7 +131,7 @@ def test_gaps_are_refused_unless_told_to_bridge_them(tmp_path: Path) -> None:
     assert bridged.gaps == ((2_000_000, 6_000_000),) and bridged.longest_gap_s == 4.0
     # 10 degrees a second throughout; after the last pose (8 s) nothing is known to move.
     assert bridged.x == pytest.approx([k / 6 for k in (0, 1, 2, 3, 4, 5, 6, 7, 8, 8)])
-    patient = read_workload(path, topics=["/cam"], odom="/odom", max_gap_s=4)
+    patient = read_workload(path, topics=["/cam"], odom="/odom", settings=MotionSettings(max_gap_s=4))
     assert patient.gaps == ()
 
 
@@ -217,7 +217,7 @@ def test_lengths_out_of_all_proportion(tmp_path: Path, monkeypatch: pytest.Monke
         path.write_bytes(raw)
         with pytest.raises(TraceError, match="cut off or damaged"):
             read_bag(path)
-    from bufgym.traces import bags
+    from bufgym.traces.formats import bags
 
     monkeypatch.setattr(bags, "MAX_CHUNK_BYTES", 300)
     monkeypatch.setattr(bags, "MAX_BAG_MESSAGES", 8)

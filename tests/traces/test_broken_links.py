@@ -11,7 +11,9 @@ import pytest
 from link_files import HEADER, UCC_HEADER, knots, written
 
 from bufgym.errors import BufgymError, TraceError
-from bufgym.traces import FORMATS, files, mahimahi, read_trace, readers
+from bufgym.traces import FORMATS, read_trace
+from bufgym.traces.formats import links, mahimahi
+from bufgym.traces.formats import text as text_files
 
 BROKEN = [
     # Mahimahi: a lone bad line among good ones, which the fast way has to give up on.
@@ -38,8 +40,8 @@ BROKEN = [
     (HEADER + "1000,1,0\n", "line 2: interval in ms = 0: must be above 0"),
     (HEADER + "1000,1,2000\n", "line 2: interval in ms = 2000: must not begin before time 0"),
     (HEADER + "1000,1\n", "line 2: 1000,1: must have 3 columns, has 2"),
-    (HEADER + "1e3,1,1\n", "line 2: t_ms = 1e3: must be a number of ms"),
-    (HEADER + "10000000001,1,1\n", "line 2: t_ms = 10000000001: must be at most 10000000 s"),
+    (HEADER + "1e3,1,1\n", "line 2: time in ms = 1e3: must be a number of ms"),
+    (HEADER + "10000000001,1,1\n", "line 2: time in ms = 10000000001: must be at most 10000000 s"),
     (HEADER + "9000000,1000000000000,9000000\n", r"line 2: bytes x microseconds .*: must be below 2\*\*62"),
     (HEADER + "1000,0,1000\n", "no capacity at all"),
     ("t,bytes\n1,2\n", "line 1: t,bytes: must fit a known format"),
@@ -143,7 +145,7 @@ def test_damaged_gzip(tmp_path: Path, text: str) -> None:
 
 @pytest.mark.parametrize("text", ["1\n" * 500, HEADER + "1,1,1\n" + "2,1,1\n" * 90])
 def test_reading_stops_where_the_text_gets_too_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    monkeypatch.setattr(files, "MAX_TEXT_BYTES", 30)
+    monkeypatch.setattr(text_files, "MAX_TEXT_BYTES", 30)
     with pytest.raises(TraceError, match="more than 30 bytes of text"):
         read_trace(written(tmp_path, gzip.compress(text.encode())))
 
@@ -152,7 +154,7 @@ def test_reading_stops_where_the_text_gets_too_long(tmp_path: Path, monkeypatch:
 def test_reading_stops_after_so_many_lines(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, count: int
 ) -> None:
-    monkeypatch.setattr(files, "MAX_LINES", count)
+    monkeypatch.setattr(text_files, "MAX_LINES", count)
     with pytest.raises(TraceError, match=f"line {count + 1}: more than {count} .*must be fewer"):
         read_trace(written(tmp_path, text))
 
@@ -214,7 +216,7 @@ def test_longer_cells_keep_the_count_at_each_of_their_ends(
 
 def test_format_must_be_said_where_two_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path, "1\n2\n")
-    seconds = readers.Format("one number, s", lambda text: text.isdigit(), FORMATS["mahimahi"].read)
+    seconds = links.Format("one number, s", lambda text: text.isdigit(), FORMATS["mahimahi"].read)
     monkeypatch.setitem(FORMATS, "seconds", seconds)
     with pytest.raises(TraceError, match=r"fits more than one format \(mahimahi, seconds\): say which with format="):
         read_trace(path)

@@ -26,11 +26,11 @@ from http_server import DATA, Site, serving
 from bufgym.cli import trace_fetch
 from bufgym.cli.options import Parser
 from bufgym.errors import BufgymError
-from bufgym.traces import datasets as table
-from bufgym.traces import fetch_http
-from bufgym.traces.datasets import Dataset, Remote, datasets
-from bufgym.traces.fetch import Fetched, cache_folder, fetch_dataset
-from bufgym.traces.fetch_http import Patience, download
+from bufgym.traces.datasets import download as downloading
+from bufgym.traces.datasets import table
+from bufgym.traces.datasets.download import Patience, download
+from bufgym.traces.datasets.fetch import Fetched, cache_folder, fetch_dataset
+from bufgym.traces.datasets.table import Dataset, Remote, datasets
 
 ROOT = Path(__file__).resolve().parents[2]
 SHA256 = hashlib.sha256(DATA).hexdigest()
@@ -80,7 +80,7 @@ def test_a_cut_connection_goes_on_where_it_was(site: Site, tmp_path: Path) -> No
 
 def test_the_next_call_goes_on_too(site: Site, tmp_path: Path) -> None:
     site.cuts = [1000, 1000, 1000]
-    with pytest.raises(BufgymError, match=r"cut after 3000 of 300000 bytes \(given up after 3 attempts\); 3000 bytes"):
+    with pytest.raises(BufgymError, match=r"cut after 3000 of 300000 bytes \(gave up after 3 attempts\); 3000 bytes"):
         get(site, tmp_path)
     assert left(tmp_path) == [".data.bin.part", ".data.bin.part.json"]
     assert get(site, tmp_path).path.read_bytes() == DATA
@@ -90,7 +90,7 @@ def test_the_next_call_goes_on_too(site: Site, tmp_path: Path) -> None:
 
 def test_headway_is_no_failure(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten cuts, thirty thousand bytes each, with patience for three."""
-    monkeypatch.setattr(fetch_http, "HEADWAY_BYTES", 30_000)
+    monkeypatch.setattr(downloading, "HEADWAY_BYTES", 30_000)
     site.cuts = [30_000] * 9
     assert get(site, tmp_path).path.read_bytes() == DATA
     assert len(site.asked) == 10
@@ -128,7 +128,7 @@ def test_a_file_in_chunks(site: Site, tmp_path: Path) -> None:
 @pytest.mark.parametrize("sha256", [None, "new"])
 def test_a_file_that_changed_meanwhile_is_not_patched_together(site: Site, tmp_path: Path, sha256: str | None) -> None:
     site.cuts = [1000] * 3
-    with pytest.raises(BufgymError, match="run the same command again to go on"):
+    with pytest.raises(BufgymError, match="run the same command again to resume"):
         get(site, tmp_path, None)
     site.data, site.etag = bytes(250_000), '"v2"'
     done = get(site, tmp_path, sha256 and hashlib.sha256(site.data).hexdigest())
@@ -138,13 +138,13 @@ def test_a_file_that_changed_meanwhile_is_not_patched_together(site: Site, tmp_p
 def test_parts_that_do_not_fit_are_found_by_the_sum(site: Site, tmp_path: Path) -> None:
     """The server changes the file and keeps its ETag."""
     site.cuts = [1000] * 3
-    with pytest.raises(BufgymError, match="run the same command again to go on"):
+    with pytest.raises(BufgymError, match="run the same command again to resume"):
         get(site, tmp_path)
     site.data = DATA[::-1]
     said: list[str] = []
     done = get(site, tmp_path, hashlib.sha256(site.data).hexdigest(), note=said.append)
     assert done.path.read_bytes() == DATA[::-1]
-    assert said == ["data.bin: the parts do not fit together: fetching it anew"]
+    assert said == ["data.bin: the parts do not fit together: fetching it again"]
 
 
 def test_a_wrong_sum_keeps_nothing(site: Site, tmp_path: Path) -> None:
@@ -174,7 +174,7 @@ def test_slow_bytes_are_waited_for(site: Site, tmp_path: Path) -> None:
 
 def test_silence_is_not(site: Site, tmp_path: Path) -> None:
     site.stall = True
-    with pytest.raises(BufgymError, match=r"the server fell silent \(given up after 3 attempts\); 3000 bytes are kept"):
+    with pytest.raises(BufgymError, match=r"the server fell silent \(gave up after 3 attempts\); 3000 bytes are kept"):
         get(site, tmp_path)
     assert site.asked == [None, "bytes=1000-", "bytes=2000-"]
 
@@ -183,7 +183,7 @@ def test_errors_that_pass_and_errors_that_stay(site: Site, tmp_path: Path) -> No
     site.codes = [500, 429]
     assert get(site, tmp_path).path.read_bytes() == DATA
     site.codes = [503] * 3
-    with pytest.raises(BufgymError, match=r"the server says 503 Service Unavailable \(given up after 3 attempts\)$"):
+    with pytest.raises(BufgymError, match=r"the server says 503 Service Unavailable \(gave up after 3 attempts\)$"):
         get(site, tmp_path, path="other.bin")
     site.codes = [403, 200]
     with pytest.raises(BufgymError, match=r"the server says 403 Forbidden$"):
@@ -196,7 +196,7 @@ def test_errors_that_pass_and_errors_that_stay(site: Site, tmp_path: Path) -> No
     [
         ("/nothing", r"/nothing: no such file on the server \(404\)"),
         ("/file", "302 .*'file:///etc/hostname' is not allowed"),
-        ("/nowhere", "leads to an address that is none"),
+        ("/nowhere", "redirects to an invalid address"),
     ],
 )
 def test_addresses_that_lead_nowhere(site: Site, tmp_path: Path, path: str, says: str) -> None:
@@ -215,11 +215,11 @@ def test_no_way_back_from_https_to_http() -> None:
     from urllib.error import HTTPError
     from urllib.request import Request
 
-    from bufgym.traces.fetch_connection import _Redirects
+    from bufgym.traces.datasets.connection import SafeRedirects
 
     nothing: Any = None
     with pytest.raises(HTTPError, match="redirects to http://b/, which is not allowed") as caught:
-        _Redirects().redirect_request(Request("https://a/"), io.BytesIO(), 302, "Found", nothing, "http://b/")
+        SafeRedirects().redirect_request(Request("https://a/"), io.BytesIO(), 302, "Found", nothing, "http://b/")
     caught.value.close()
 
 
@@ -257,7 +257,7 @@ def test_nobody_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("no_proxy", "*")
     with socket.create_server(("127.0.0.1", 0)) as dequeued:
         port = dequeued.getsockname()[1]
-    with pytest.raises(BufgymError, match=r"no connection \(Connection refused\) \(given up after 3 attempts\)$"):
+    with pytest.raises(BufgymError, match=r"no connection \(Connection refused\) \(gave up after 3 attempts\)$"):
         download(f"http://127.0.0.1:{port}/", tmp_path / "part", None, HASTY)
 
     def unresolved(*arguments: object, **options: object) -> None:
@@ -273,7 +273,7 @@ def test_a_full_disk(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(fetch_http, "_write", full)
+        patch.setattr(downloading, "_write", full)
         with pytest.raises(BufgymError, match="mine: the disk is full: make room and run the same command again"):
             get(site, tmp_path)
     usage = shutil.disk_usage(tmp_path)._replace(free=299_999)
@@ -307,7 +307,7 @@ def test_garbled_answers_end_in_a_file_or_our_error(tmp_path: Path, monkeypatch:
         thread = threading.Thread(target=serve)
         thread.start()
         for _ in range(300):
-            fetch_http.discard(tmp_path / "part")
+            downloading.discard(tmp_path / "part")
             try:
                 address = f"http://127.0.0.1:{server.getsockname()[1]}/"
                 download(address, tmp_path / "part", None, Patience(attempts=2, first_wait_s=0, silence_s=0.5))
@@ -324,8 +324,8 @@ def test_garbled_answers_end_in_a_file_or_our_error(tmp_path: Path, monkeypatch:
 FETCH = """
 import sys
 from pathlib import Path
-from bufgym.traces.datasets import Dataset, Remote
-from bufgym.traces.fetch import fetch_dataset
+from bufgym.traces.datasets.fetch import fetch_dataset
+from bufgym.traces.datasets.table import Dataset, Remote
 address, to, sha256 = sys.argv[1:]
 mine = Dataset("mine", "", "", "", "", None, "", (Remote("data.bin", address, sha256),))
 print(fetch_dataset(mine, Path(to))[0].origin)
@@ -342,10 +342,10 @@ def test_killed_in_the_middle(site: Site, tmp_path: Path) -> None:
     part = tmp_path / "mine" / ".data.bin.part"
     with fetching(site, tmp_path) as process:
         until = time.monotonic() + 30
-        while fetch_http.size(part) < 50_000 and time.monotonic() < until:
+        while downloading.size(part) < 50_000 and time.monotonic() < until:
             time.sleep(0.005)
         process.kill()
-    kept = fetch_http.size(part)
+    kept = downloading.size(part)
     assert 50_000 <= kept < 300_000
     site.drip = None
     assert get(site, tmp_path).path.read_bytes() == DATA
@@ -435,7 +435,7 @@ def test_an_archive_that_nothing_vouches_for_must_unpack(site: Site, tmp_path: P
 def test_the_table_says_what_is_known() -> None:
     summed = [path for dataset in datasets().values() for path in (f"{dataset.name}/{r.path}" for r in dataset.files)]
     assert len(summed) == len(set(summed))
-    assert set(table._sums()) <= set(summed)
+    assert set(table.checksums()) <= set(summed)
     for dataset in datasets().values():
         assert dataset.page.startswith("https://") and dataset.citation and dataset.title
         for remote in dataset.files:

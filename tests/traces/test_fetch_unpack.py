@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from bufgym.errors import BufgymError
-from bufgym.traces import fetch_unpack
-from bufgym.traces.fetch_unpack import unpack
+from bufgym.traces.datasets import unpack as unpacking
+from bufgym.traces.datasets.unpack import unpack
 
 DATA = random.Random(1).randbytes(300_000)
 
@@ -94,7 +94,7 @@ def test_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         unpack(
             tarred(tmp_path / "a.tgz", ("first", bytes(600_000)), ("second", bytes(600_000))), tmp_path / "out", 10**6
         )
-    monkeypatch.setattr(fetch_unpack, "MAX_MEMBERS", 3)
+    monkeypatch.setattr(unpacking, "MAX_MEMBERS", 3)
     many = [(f"{k}", b"") for k in range(4)]
     with pytest.raises(BufgymError, match="3 files: must be less"):
         unpack(zipped(tmp_path / "a.zip", *many), tmp_path / "out")

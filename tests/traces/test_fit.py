@@ -12,9 +12,10 @@ from bufgym.cli import trace_fit
 from bufgym.cli.options import Parser
 from bufgym.errors import BufgymError
 from bufgym.traces import Trace, write_csv
+from bufgym.traces.fit.compare import compare, held_out, ks_distance
+from bufgym.traces.fit.fit import fit_links, mode_of, rates_of
+from bufgym.traces.fit.statistics import autocorrelation, spells
 from bufgym.traces.generate import LinkParameters, OutageParameters, fitted_links, markov_link, read_links
-from bufgym.traces.generate.compare import compare, held_out, ks_distance
-from bufgym.traces.generate.fit import autocorrelation, fit_links, mode_of, rates_of, spells
 from bufgym.traces.generate.markov import link_rates
 from bufgym.traces.trace import Float64Array
 
@@ -37,7 +38,7 @@ def recordings(link: LinkParameters = KNOWN, first_seed: int = 0) -> list[Float6
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits that try each memory on some thousand seconds only."""
-    monkeypatch.setattr("bufgym.traces.generate.fit._TRIAL_S", 2_000)
+    monkeypatch.setattr("bufgym.traces.fit.fit._TRIAL_S", 2_000)
 
 
 def rows_of(values: list[float]) -> list[Float64Array]:

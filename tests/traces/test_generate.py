@@ -12,15 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym.cli import trace_fit
+from bufgym.cli import trace_generate
 from bufgym.cli.options import Parser
 from bufgym.errors import BufgymError, TraceError
 from bufgym.traces import load_motion, read_motion, read_trace
 from bufgym.traces.generate import (
     Corridor,
+    Driving,
     FrameModel,
     LinkParameters,
     OutageParameters,
+    drive_motion,
     fitted_links,
     frame_sizes,
     gilbert_elliott,
@@ -35,7 +37,6 @@ from bufgym.traces.generate.markov import MAX_OUTAGE_S, link_rates
 from bufgym.traces.generate.parameters import LINKS, PROBABILITIES
 from bufgym.traces.generate.roaming import PHY_MBIT_PER_S, SENSITIVITY_DBM
 from bufgym.traces.motion import Motion
-from bufgym.traces.synthetic import Driving, drive_motion
 from bufgym.traces.trace import Trace
 
 MODES = ("bicycle", "bus", "car", "foot", "train", "tram")
@@ -355,7 +356,7 @@ def test_a_wrong_value_in_a_parameter_file(value: str, tmp_path: Path) -> None:
 
 def generate(*arguments: str) -> None:
     parser = Parser(prog="bufgym trace")
-    trace_fit.add(parser.add_subparsers(required=True))
+    trace_generate.add(parser.add_subparsers(required=True))
     options = parser.parse_args(["generate", *arguments])
     options.command(options)
 

@@ -24,8 +24,8 @@ from bufgym.traces import (
     synthetic_lte,
     write_csv,
 )
-from bufgym.traces.generators import SHIPPED_LTE, write_shipped
-from bufgym.traces.synthetic import LTE_MODES, MAX_FADE_S
+from bufgym.traces.generate.lte import LTE_MODES, MAX_FADE_S
+from bufgym.traces.generate.shipped import SHIPPED_LTE, write_shipped
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMAND_BYTES_PER_S = 6.9e6  # 30 frames of 230 kB a second
@@ -106,7 +106,7 @@ def test_broken_arguments(make: Callable[[], object], says: str) -> None:
 
 
 def test_the_command_makes_the_shipped_files_byte_for_byte(tmp_path: Path) -> None:
-    command = [sys.executable, "-W", "error", "-m", "bufgym.traces.generators", str(tmp_path / "new")]
+    command = [sys.executable, "-W", "error", "-m", "bufgym.traces.generate.shipped", str(tmp_path / "new")]
     done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     made = {path.name: path.read_bytes() for path in (tmp_path / "new").iterdir()}
@@ -117,7 +117,7 @@ def test_the_command_makes_the_shipped_files_byte_for_byte(tmp_path: Path) -> No
 
 def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(TraceError, match="cannot be made"):
+    with pytest.raises(TraceError, match="cannot be created"):
         write_shipped(tmp_path / "file" / "below")
 
 

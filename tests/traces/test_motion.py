@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bufgym.errors import BufgymError, TraceError
-from bufgym.traces import Motion, motion_from_poses, read_motion, write_motion_csv
+from bufgym.traces import Motion, MotionSettings, Poses, motion_from_poses, read_motion, write_motion_csv
 
 DATA = Path(os.environ.get("BUFGYM_SHARED_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 
@@ -36,7 +36,7 @@ def test_translation_over_scale_and_rotation_over_field_of_view(tmp_path: Path) 
     # 1 m / 2 m = 0.5; 90 degrees / 60 degrees = 1.5.
     assert motion.coordinate == pytest.approx([0.0, 0.5, 2.0])
     assert (motion.name, motion.gaps) == ("path", ())
-    other = read_motion(tmp_path / "path.txt", fov_deg=90, scene_scale_m=4)
+    other = read_motion(tmp_path / "path.txt", MotionSettings(fov_deg=90, scene_scale_m=4))
     assert other.coordinate == pytest.approx([0.0, 0.25, 1.25])
 
 
@@ -48,7 +48,9 @@ def test_a_quaternion_and_its_negative_are_one_orientation(tmp_path: Path) -> No
 def test_small_angles_are_not_lost() -> None:
     angle = 1e-7
     quaternions = np.array([[0, 0, 0, 1], [0, 0, math.sin(angle / 2), math.cos(angle / 2)]])
-    motion = motion_from_poses(np.array([0, 1_000_000]), np.zeros((2, 3)), quaternions, fov_deg=math.degrees(1.0))
+    motion = motion_from_poses(
+        Poses(np.array([0, 1_000_000]), np.zeros((2, 3)), quaternions), MotionSettings(fov_deg=math.degrees(1.0))
+    )
     assert motion.total == pytest.approx(angle, rel=1e-6)
 
 
@@ -59,8 +61,9 @@ def test_fast_poses_are_resampled_so_that_jitter_is_not_motion() -> None:
     position = np.zeros((count, 3))
     position[:, 0] = 2e-4 * (np.arange(count) % 3 == 1)
     upright = np.tile([0.0, 0, 0, 1], (count, 1))
-    every = motion_from_poses(time_us, position, upright, rate_hz=1000)
-    camera = motion_from_poses(time_us, position, upright)
+    poses = Poses(time_us, position, upright)
+    every = motion_from_poses(poses, MotionSettings(rate_hz=1000))
+    camera = motion_from_poses(poses)
     assert every.time_us.size == count and camera.time_us.size == 301
     assert every.total == pytest.approx(2000 * 2e-4 / 2)
     assert camera.total < every.total / 5
@@ -71,7 +74,7 @@ def test_resampling_keeps_a_steady_turn_steady() -> None:
     time_us = np.arange(101, dtype=np.int64) * 10_000
     angle = 2 * np.pi * time_us / 1e6
     quaternion = np.stack([0 * angle, 0 * angle, np.sin(angle / 2), np.cos(angle / 2)], axis=1)
-    motion = motion_from_poses(time_us, np.zeros((101, 3)), quaternion, rate_hz=30)
+    motion = motion_from_poses(Poses(time_us, np.zeros((101, 3)), quaternion), MotionSettings(rate_hz=30))
     assert np.diff(motion.coordinate) == pytest.approx(np.full(30, 12 / 60), rel=1e-3)
     assert motion.total == pytest.approx(6.0)
 
@@ -79,7 +82,7 @@ def test_resampling_keeps_a_steady_turn_steady() -> None:
 def test_gaps_are_reported() -> None:
     time_us = np.array([0, 500_000, 3_000_000, 3_500_000])
     position = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0]])
-    motion = motion_from_poses(time_us, position, np.tile([0.0, 0, 0, 1], (4, 1)))
+    motion = motion_from_poses(Poses(time_us, position, np.tile([0.0, 0, 0, 1], (4, 1))))
     assert motion.gaps == ((500_000, 3_000_000),)
     assert motion.at(1_750_000) == pytest.approx(0.25)
 
@@ -136,12 +139,11 @@ def test_broken_files(tmp_path: Path, text: str, says: str) -> None:
         read_motion(written(tmp_path, text))
 
 
-def test_broken_arguments(tmp_path: Path) -> None:
-    path = written(tmp_path, WALK_AND_TURN)
+def test_broken_arguments() -> None:
     for name in ("fov_deg", "scene_scale_m", "rate_hz", "max_gap_s"):
         for value in (0.0, float("nan"), -1.0):
             with pytest.raises(BufgymError, match=f"{name} = {value}: must be a finite number above 0"):
-                read_motion(path, **{name: value})
+                MotionSettings(**{name: value})
     with pytest.raises(BufgymError, match="must increase at index 1"):
         Motion("m", np.array([0, 0]), np.array([0.0, 1.0]))
     with pytest.raises(BufgymError, match="must not decrease at index 2"):

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym.errors import BufgymError, TraceError
-from bufgym.traces.motion import read_motion
-from bufgym.traces.poses import Poses, angles, detect_pose_format, quaternions, read_poses, slerp
+from bufgym.traces import MotionSettings, read_motion
+from bufgym.traces.formats.trajectories import detect_pose_format, read_poses
+from bufgym.traces.poses import Poses, angles, quaternions, slerp
 
 # 1 m forward in the first second, then a turn of 90 degrees about z in the next: x = 0, 0.5, 2.
 H = math.sqrt(0.5)
@@ -52,9 +53,9 @@ def test_one_path_in_each_format(tmp_path: Path, format: str, text: str) -> None
     assert motion.time_us.tolist() == [0, 1_000_000, 2_000_000]
     assert motion.coordinate == pytest.approx([0.0, 0.5, 2.0])
     assert f"format {format}" in motion.source
-    assert read_motion(path, fov_deg=90, scene_scale_m=4).coordinate == pytest.approx([0, 0.25, 1.25])
-    assert read_motion(path, max_gap_s=0.5).gaps == ((0, 1_000_000), (1_000_000, 2_000_000))
-    assert read_motion(path, max_gap_s=0.5).longest_gap_s == 1.0
+    assert read_motion(path, MotionSettings(fov_deg=90, scene_scale_m=4)).coordinate == pytest.approx([0, 0.25, 1.25])
+    assert read_motion(path, MotionSettings(max_gap_s=0.5)).gaps == ((0, 1_000_000), (1_000_000, 2_000_000))
+    assert read_motion(path, MotionSettings(max_gap_s=0.5)).longest_gap_s == 1.0
     zipped = tmp_path / "path.txt.gz"
     zipped.write_bytes(gzip.compress(path.read_bytes()))
     assert read_motion(zipped).coordinate.tolist() == motion.coordinate.tolist()
@@ -180,7 +181,7 @@ def test_real_euroc(shared_data: Path, name: str) -> None:
     if not path.exists():
         pytest.skip(f"trajectory absent: euroc/{name}.txt.gz")
     # A field of view of 10**9 degrees leaves the translation alone; 20 Hz is below 30, so nothing is resampled.
-    motion = read_motion(path, fov_deg=1e9, scene_scale_m=1)
+    motion = read_motion(path, MotionSettings(fov_deg=1e9, scene_scale_m=1))
     assert motion.total == pytest.approx(lengths(path, euroc=True), rel=1e-6)
     assert np.median(np.diff(motion.time_us)) == pytest.approx(50_000, abs=2)
     assert read_motion(path).total > motion.total / 2
@@ -190,7 +191,7 @@ def test_real_kitti(shared_data: Path) -> None:
     path = shared_data / "kitti" / "KITTI_00_gt.txt.gz"
     if not path.exists():
         pytest.skip("trajectory absent: kitti/KITTI_00_gt.txt.gz")
-    motion = read_motion(path, fov_deg=1e9, scene_scale_m=1)
+    motion = read_motion(path, MotionSettings(fov_deg=1e9, scene_scale_m=1))
     # Sequence 00 is 3.7 km long, 4541 poses in 470.6 s; its times come from KITTI_00_gt_times.txt.gz.
     assert motion.total == pytest.approx(3724, abs=1) and motion.total == pytest.approx(lengths(path, euroc=False))
     assert (motion.time_us.size, motion.gaps) == (4541, ())

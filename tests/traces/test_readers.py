@@ -10,7 +10,8 @@ import pytest
 from link_files import HEADER, UCC_HEADER, knots, written
 
 from bufgym.errors import BufgymError
-from bufgym.traces import detect_format, mahimahi, read_trace
+from bufgym.traces import detect_format, read_trace
+from bufgym.traces.formats import mahimahi
 
 # ---------------------------------------------------------------- numbers worked by hand
 
@@ -47,7 +48,7 @@ def test_mahimahi_in_small_pieces_is_the_same(tmp_path: Path, monkeypatch: pytes
     assert np.interp(ends_us, whole.time_us, whole.cumulative_bytes).tolist() == expected.tolist()
     monkeypatch.setattr(mahimahi, "_CHUNK_BYTES", 11)
     assert read_trace(path) == whole
-    monkeypatch.setattr(mahimahi, "_fast_values", lambda block, last_ms: None)
+    monkeypatch.setattr(mahimahi, "_parsed_at_once", lambda block, last_ms: None)
     assert read_trace(path) == whole
 
 

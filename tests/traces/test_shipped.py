@@ -16,7 +16,7 @@ import pytest
 
 from bufgym.errors import BufgymError, TraceError
 from bufgym.traces import drive_motion, load, load_motion, shipped, synthetic_lte
-from bufgym.traces.generators import shipped_calls
+from bufgym.traces.generate.shipped import shipped_calls
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -15,9 +15,8 @@ from bufgym import oracle, policies, scenario
 from bufgym import sim as sender
 from bufgym.benchmark import drops
 from bufgym.errors import BufgymError, TraceError
-from bufgym.traces import Motion, Trace
-from bufgym.traces.recordings import read_workload
-from bufgym.traces.workload import Workload, read_workload_csv, write_workload_csv
+from bufgym.traces import Motion, Trace, Workload, read_workload_csv, write_workload_csv
+from bufgym.traces.formats.recordings import read_workload
 
 CSV = """time_s,bytes,topic,x
 100.5,1000,/camera,2
@@ -61,7 +60,7 @@ def test_some_topics_of_a_file(tmp_path: Path) -> None:
     assert [late.topic_of(k) for k in range(2)] == ["/odom", "/imu"]
     with pytest.raises(BufgymError, match=r"no topic '/lidar'; it has: /camera, /odom"):
         read_workload(written(tmp_path, CSV), topics=["/lidar"])
-    with pytest.raises(BufgymError, match=r"odom = '/odom': needs a recording, and this is none"):
+    with pytest.raises(BufgymError, match=r"odom = '/odom': needs a recording, which this is not"):
         read_workload(written(tmp_path, CSV), odom="/odom")
 
 
@@ -101,7 +100,7 @@ def test_round_trip_is_exact(
     [
         ("", "w.csv: is empty: must begin with the header time_s,bytes"),
         ("t,bytes\n", "line 1: t,bytes: must be the header time_s,bytes"),
-        ("time_s,bytes\n", "w.csv: holds no message: must hold one at least"),
+        ("time_s,bytes\n", "w.csv: holds no message: must hold at least one"),
         ("time_s,bytes\n1\n", "line 2: 1: must have 2 columns, has 1"),
         ("time_s,bytes\n1,0\n", "line 2: bytes = 0: must be at least 1"),
         ("time_s,bytes\n1,1.5\n", "line 2: bytes = 1.5: must be a whole number"),
@@ -126,7 +125,7 @@ def test_broken_arrays() -> None:
         ((np.array([0.0, 5]), size), "arrival_us must be int64"),
         ((time_us, np.array([1])), "size_bytes must be int64"),
         ((time_us, np.array([1, 0])), "size_bytes must lie between 1"),
-        ((time_us[:0], size[:0]), "one at least"),
+        ((time_us[:0], size[:0]), "at least one message"),
         ((time_us, size, np.array([0, 1])), "topic must lie between 0 and 0"),
         ((time_us, size, None, ("",), np.array([0, math.nan])), "x must be finite"),
         ((time_us, size, None, ("",), np.array([0, -1.0])), "x must be .* not decrease"),

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from link_files import SAMPLES, knots, written
 
 from bufgym.errors import TraceError
-from bufgym.traces import Trace, difference, read_trace, write_csv, write_mahimahi, writers
+from bufgym.traces import Trace, difference, read_trace, write_csv, write_mahimahi
+from bufgym.traces.formats import writers
 
 
 def test_csv_is_exact(tmp_path: Path) -> None:

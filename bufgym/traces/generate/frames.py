@@ -1,70 +1,65 @@
 """Sizes of compressed RGB-D frames that grow with motion and with detail.
 
-A frame of a scene at rest and of ordinary detail has the base size. Motion adds to it, up to a share of the base
-that is reached at a stated speed of the scene: noise of the depth at edges and rolling shutter leave less to
-predict from neighbouring pixels. Detail is what there is to see: it stays while the camera stands still and is
-forgotten as the scene moves on (an AR(1) process over the coordinate, not over time). A little noise is new in
-each frame.
+A frame of a scene at rest and of ordinary detail has the base size. Motion adds to it, up to a share of the base that
+is reached at a stated speed of the scene: depth noise at edges and rolling shutter leave less to predict from
+neighbouring pixels. Detail is how much there is to see: it stays while the camera stands still and is forgotten as the
+scene moves on (an AR(1) process over the coordinate, not over time). A little noise is new in each frame.
 
 The base is that of a 640 x 480 RGB-D frame of depth (RVL) and a JPEG of low quality, about 230 kB. The shares are
-assumptions (with `drive_motion` they make a coefficient of variation of 0.10 to 0.12); they are not fitted, for want
-of recordings with sizes and poses.
+assumptions (with `drive_motion` they give a coefficient of variation of 0.10 to 0.12); they are not fitted, because
+there are no recordings with both sizes and poses.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from bufgym.errors import BufgymError
-from bufgym.traces.generate.chance import NORMAL_UNIFORMS, checked, nearly_normal, stream
+from bufgym.traces.generate.draws import NORMAL_UNIFORMS, nearly_normal, stream
+from bufgym.traces.generate.ranges import Between, check_ranges
 from bufgym.traces.motion import Motion
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 
 
 @dataclass(frozen=True)
 class FrameModel:
-    """Shares are parts of the base.
+    """How large frames are; shares are parts of the base.
 
-    Attributes:
-        base_bytes: a frame at rest, of ordinary detail, 1 to 10**9.
-        motion_share: what full motion adds.
-        full_motion_per_s: speed of the coordinate, 1/s, at which it does: turning in place at 45 degrees/s.
-        detail_share: standard deviation of what detail adds or takes.
-        detail_scale: coordinate over which detail is half forgotten (a correlation of 1 / (1 + step / scale)
-            from frame to frame).
-        noise_share: standard deviation of what is new in each frame.
-        least, most: sizes are kept within these multiples of the base.
+    Raises:
+        BufgymError: a value out of its range.
     """
 
-    base_bytes: float = 230_000.0
-    motion_share: float = 0.25
-    full_motion_per_s: float = 0.75
-    detail_share: float = 0.12
-    detail_scale: float = 0.5
-    noise_share: float = 0.02
-    least: float = 0.4
-    most: float = 2.0
+    base_bytes: Annotated[float, Between(1, 1e9)] = 230_000.0
+    """Size of a frame at rest, of ordinary detail."""
+    motion_share: Annotated[float, Between(0, 10)] = 0.25
+    """What full motion adds."""
+    full_motion_per_s: Annotated[float, Between(1e-6, 1e6)] = 0.75
+    """Speed of the coordinate, 1/s, from which on motion is full: turning in place at 45 degrees/s."""
+    detail_share: Annotated[float, Between(0, 10)] = 0.12
+    """Standard deviation of what detail adds or takes away."""
+    detail_scale: Annotated[float, Between(1e-6, 1e6)] = 0.5
+    """Coordinate over which detail is half forgotten (a correlation of 1 / (1 + step / scale) from frame to frame)."""
+    noise_share: Annotated[float, Between(0, 10)] = 0.02
+    """Standard deviation of what is new in each frame."""
+    least: Annotated[float, Between(0, 1)] = 0.4
+    """No frame is smaller than this multiple of the base."""
+    most: Annotated[float, Between(1, 100)] = 2.0
+    """No frame is larger than this multiple of the base."""
 
     def __post_init__(self) -> None:
-        checked("base_bytes", self.base_bytes, 1, 1e9)
-        checked("motion_share", self.motion_share, 0, 10)
-        checked("full_motion_per_s", self.full_motion_per_s, 1e-6, 1e6)
-        checked("detail_share", self.detail_share, 0, 10)
-        checked("detail_scale", self.detail_scale, 1e-6, 1e6)
-        checked("noise_share", self.noise_share, 0, 10)
-        checked("least", self.least, 0, 1)
-        checked("most", self.most, 1, 100)
+        check_ranges(self)
 
 
 def frame_sizes(arrival_us: Int64Array, motion: Motion, seed: int, model: FrameModel | None = None) -> Int64Array:
-    """int64[n], bytes (>= 1) of the frames that arrive at these times.
+    """Sizes of the frames that arrive at these times: int64[n], bytes, >= 1.
 
     Args:
         arrival_us: int64[n], microseconds, >= 0, strictly increasing.
-        motion: what the camera does; past its end it begins again.
+        motion: how the camera moves; past its end it begins again.
         seed: >= 0.
         model: by default `FrameModel()`.
 
@@ -88,7 +83,7 @@ def frame_sizes(arrival_us: Int64Array, motion: Motion, seed: int, model: FrameM
 
 
 def _movement(times: Int64Array, motion: Motion) -> tuple[Float64Array, Float64Array]:
-    """Coordinate passed since the frame before, and its speed in 1/s; the first frame has those of the second."""
+    """How far the coordinate moved since the previous frame, and its speed in 1/s; the first frame has the second's."""
     if len(times) < 2:
         return np.zeros(len(times)), np.zeros(len(times))
     moved = np.diff(motion.at(times))

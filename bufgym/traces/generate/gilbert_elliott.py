@@ -1,8 +1,8 @@
 """A link of two states, good and bad, each left with a fixed chance a step.
 
 E. N. Gilbert, "Capacity of a burst-noise channel", Bell System Technical Journal 39(5), 1960; E. O. Elliott,
-"Estimates of error rates for codes on burst-noise channels", ibid. 42(5), 1963. They speak of bit errors; here
-a state has a capacity, as TCP makes of lost packets a lower rate.
+"Estimates of error rates for codes on burst-noise channels", ibid. 42(5), 1963. They model bit errors; here a state
+has a capacity, because TCP turns lost packets into a lower rate.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from bufgym.errors import BufgymError
-from bufgym.traces.generate.chance import checked, stream
+from bufgym.traces.generate.draws import stream
+from bufgym.traces.generate.ranges import checked
 from bufgym.traces.trace import US_PER_S, Trace
 
 _MAX_STEPS = 10**7
@@ -28,8 +29,8 @@ def gilbert_elliott(
 ) -> Trace:
     """A trace in steps of `step_s`, which loops.
 
-    The share of time in the bad state tends to mean_bad_s / (mean_good_s + mean_bad_s); the first step is
-    drawn from it.
+    The share of time in the bad state tends to mean_bad_s / (mean_good_s + mean_bad_s); the first state is drawn with
+    that chance.
 
     Args:
         seed: >= 0.
@@ -49,18 +50,18 @@ def gilbert_elliott(
     checked("mean_bad_s", mean_bad_s, step_s, 1e9)
     if bad_bytes_per_s > good_bytes_per_s:
         raise BufgymError(f"bad_bytes_per_s = {bad_bytes_per_s}: must be at most good_bytes_per_s = {good_bytes_per_s}")
-    leave = (step_s / mean_good_s, step_s / mean_bad_s)
+    leave_chances = (step_s / mean_good_s, step_s / mean_bad_s)
     uniforms = stream(seed).random(max(1, round(duration_s / step_s))).tolist()
     bad = uniforms[0] < mean_bad_s / (mean_good_s + mean_bad_s)
     states = [bad]
     for uniform in uniforms[1:]:
-        bad ^= uniform < leave[bad]
+        bad ^= uniform < leave_chances[bad]
         states.append(bad)
     step_us = round(step_s * US_PER_S)
-    carried = np.array([round(rate * step_s) for rate in (good_bytes_per_s, bad_bytes_per_s)], np.int64)
+    step_bytes = np.array([round(rate * step_s) for rate in (good_bytes_per_s, bad_bytes_per_s)], np.int64)
     return Trace.from_intervals(
         np.full(len(states), step_us),
-        carried[np.array(states, np.int64)],
+        step_bytes[np.array(states, np.int64)],
         name=f"gilbert-elliott-{seed}",
         source=f"gilbert_elliott(seed={seed}, {duration_s:g} s, good {mean_good_s:g} s, bad {mean_bad_s:g} s)",
     )

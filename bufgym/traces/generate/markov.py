@@ -1,17 +1,18 @@
-"""A mobile link whose rate follows a hidden Markov process, with outages: one set of parameters a way of moving.
+"""A mobile link whose rate follows a hidden Markov process, with outages; one set of parameters for each mode.
 
-The normal score z of a second's rate is a sum of three independent parts whose variances add up to 1: the
-*place* (drawn once a trace: some routes are better than others), the *level* (held for a geometric time, then
-drawn anew: how well the cell suits the spot) and a *fast* AR(1) process. The rate is the quantile of the
-recordings that belongs to z, so the law of the rates is the recordings' own, and its autocorrelation at lag k
-is, on the scale of z, place + level (1 - 1/stay)**k + fast memory**k.
+The normal score z of a second's rate is a sum of three independent parts whose variances add up to 1: the *place*
+(drawn once a trace: some routes are better than others), the *level* (held for a geometric time, then drawn again: how
+good the coverage is there) and a *fast* AR(1) process. The rate is the quantile of the recordings that corresponds to
+z, so rates have the recordings' own distribution. Their autocorrelation at lag k is, on the scale of z,
+place + level (1 - 1/stay)**k + fast memory**k.
 
-Outages are laid over it: runs of seconds under 500 KB/s, alternating with gaps that are short or long by chance
-(which makes clusters), their lengths of a law that can be heavy-tailed (for most modes it is nearly geometric). When
-they come does not depend on z, but rates within 5 s of one are lowered by a factor: links fade and recover.
+Outages come on top: runs of seconds under 500 KB/s, separated by gaps that are randomly short or long (which makes
+clusters), with lengths whose distribution can be heavy-tailed (for most modes it is nearly geometric). When they occur
+does not depend on z, but rates within 5 s of one are lowered by a factor, because links fade and recover.
 
-The Belgium logs, but for those in trains, also have a rhythm of 5 s (in trams rates 5 s apart are correlated by 0.81,
-3 or 7 s apart by 0.67 and 0.64), which may be their measurement's. The model has none, and is too low at 5 s for it.
+The Belgium logs, except those in trains, also have a rhythm of 5 s, which may come from their measurement: in trams,
+rates 5 s apart are correlated by 0.81, 3 or 7 s apart by 0.67 and 0.64. The model has none, so its correlation at 5 s
+is too low.
 
 Both processes are Markov modulated in the sense of W. Fischer and K. Meier-Hellstern, "The Markov-modulated Poisson
 process (MMPP) cookbook", Performance Evaluation 18(2), 1993: a rate governed by a hidden chain.
@@ -30,8 +31,9 @@ from typing import Final
 import numpy as np
 
 from bufgym.errors import BufgymError
-from bufgym.traces.generate.chance import NORMAL_UNIFORMS, checked, nearly_normal, second_stream, stream
+from bufgym.traces.generate.draws import NORMAL_UNIFORMS, nearly_normal, second_stream, stream
 from bufgym.traces.generate.parameters import DEVIATIONS, SHOULDER_S, LinkParameters, OutageParameters, fitted_links
+from bufgym.traces.generate.ranges import checked
 from bufgym.traces.trace import US_PER_S, Float64Array, Trace
 
 MAX_LINK_S: Final = 10**6
@@ -47,30 +49,30 @@ def markov_link(
     mean_bytes_per_s: float | None = None,
     links: Mapping[str, LinkParameters] | None = None,
 ) -> Trace:
-    """A trace with one sample a second, which loops. A longer one begins with the shorter one of its seed.
+    """A trace with one sample a second, which loops. A longer one begins as the shorter one with the same seed.
 
     Args:
         mode: one of `links`: foot, bicycle, bus, tram, train, car; wifi-cafe, wifi-campus, wifi-office,
             wifi-restr.
-        seed: >= 0. Modes with one seed share their luck: they are good and bad at the same times.
+        seed: >= 0. Modes with the same seed share their uniform draws, so they are good and bad at the same times.
         duration_s: whole seconds, 1 to 10**6.
-        mean_bytes_per_s: scale this very trace to that mean, 1 to 10**10; by default rates are the
-            recordings', and the mean differs from seed to seed as it does between recordings.
+        mean_bytes_per_s: scale this very trace to that mean, 1 to 10**10; by default rates are the recordings', and the
+            mean differs from seed to seed as it does between recordings.
         links: by default `fitted_links()`.
 
     Raises:
         BufgymError: an argument out of its range.
     """
-    known = fitted_links() if links is None else links
-    if mode not in known:
-        raise BufgymError(f"mode = {mode!r}: must be one of {', '.join(known)}")
+    links = fitted_links() if links is None else links
+    if mode not in links:
+        raise BufgymError(f"mode = {mode!r}: must be one of {', '.join(links)}")
     checked("duration_s", duration_s, 1, MAX_LINK_S)
     if int(duration_s) != duration_s:
         raise BufgymError(f"duration_s = {duration_s}: must be a whole number")
-    rates = link_rates(known[mode], seed, int(duration_s))
+    rates = link_rates(links[mode], seed, int(duration_s))
     if mean_bytes_per_s is not None:
         checked("mean_bytes_per_s", mean_bytes_per_s, 1, 1e10)
-        # math.fsum is exact, so the sum does not depend on how numpy splits it among vector lanes.
+        # math.fsum is exact, so the sum does not depend on how numpy splits it between vector lanes.
         rates = rates * (mean_bytes_per_s * len(rates) / math.fsum(rates.tolist()))
     counts = np.rint(rates).astype(np.int64)
     source = f"markov_link({mode}, seed={seed}, {duration_s:g} s)"
@@ -78,12 +80,12 @@ def markov_link(
 
 
 def link_rates(link: LinkParameters, seed: int, count: int) -> Float64Array:
-    """float64[count], bytes/s of each second."""
+    """Rate of each second: float64[count], bytes/s."""
     scores = _scores(link, stream(seed), count)
     rates = _interpolated(scores, DEVIATIONS, link.quantiles_bytes_per_s)
     if link.outages is None:
         return rates
-    # Those just beyond the end lower the last seconds, as they would in a longer trace.
+    # Outages just beyond the end lower the last seconds, as they would in a longer trace.
     outages = list(_outages(link.outages, second_stream(seed), count + SHOULDER_S))
     beside = np.zeros(count, np.bool_)
     for start, low in outages:
@@ -95,57 +97,57 @@ def link_rates(link: LinkParameters, seed: int, count: int) -> Float64Array:
 
 
 def _scores(link: LinkParameters, random: np.random.Generator, count: int) -> Float64Array:
-    """float64[count], nearly normal."""
+    """Nearly normal scores of the seconds: float64[count]."""
     place = float(nearly_normal(random.random((1, NORMAL_UNIFORMS)))[0])
-    # A row a second, so that a longer trace begins as a shorter one.
+    # A row for each second, so that a longer trace begins as a shorter one.
     uniforms = random.random((count, 2 * NORMAL_UNIFORMS + 1))
     second = np.arange(count)
-    moves = (uniforms[:, -1] < 1 / link.level_stay_s) | (second == 0)
-    level = nearly_normal(uniforms[:, :NORMAL_UNIFORMS])[np.maximum.accumulate(np.where(moves, second, 0))]
+    redrawn = (uniforms[:, -1] < 1 / link.level_stay_s) | (second == 0)
+    level = nearly_normal(uniforms[:, :NORMAL_UNIFORMS])[np.maximum.accumulate(np.where(redrawn, second, 0))]
     fast = np.array(_ar1(nearly_normal(uniforms[:, NORMAL_UNIFORMS:-1]).tolist(), link.fast_memory))
     fast_share = max(0.0, 1 - link.place_share - link.level_share)
     slow = math.sqrt(link.place_share) * place + math.sqrt(link.level_share) * level
     return np.asarray(slow + math.sqrt(fast_share) * fast, np.float64)
 
 
-def _ar1(fresh: list[float], memory: float) -> list[float]:
-    """An AR(1) process of variance 1 driven by `fresh`."""
+def _ar1(shocks: list[float], memory: float) -> list[float]:
+    """An AR(1) process of variance 1 driven by `shocks`."""
     share = math.sqrt(1 - memory**2)
-    value, values = fresh[0], []
-    for k, shock in enumerate(fresh):
+    value, values = shocks[0], []
+    for k, shock in enumerate(shocks):
         value = memory * value + share * shock if k else shock
         values.append(value)
     return values
 
 
 def _outages(p: OutageParameters, random: np.random.Generator, count: int) -> Iterator[tuple[int, Float64Array]]:
-    """Each outage as its first second and its rates. The first comes after a long gap."""
+    """Each outage as its first second and its rates. The first follows a long gap."""
     quarters = tuple(k / 4 for k in range(5))
-    end, short = 0, False
+    end, is_soon = 0, False
     while True:
-        start = end + _geometric(float(random.random()), p.short_gap_s if short else p.long_gap_s)
+        start = end + _geometric(float(random.random()), p.short_gap_s if is_soon else p.long_gap_s)
         if start >= count:
             return
         length = _outage_length(float(random.random()), p)
         yield start, _interpolated(random.random(length), quarters, p.low_quantiles_bytes_per_s)
-        end, short = start + length, float(random.random()) < p.short_gap_share
+        end, is_soon = start + length, float(random.random()) < p.short_gap_share
 
 
 def _geometric(uniform: float, mean: float) -> int:
-    """1, 2, ... by inversion."""
+    """A geometric number 1, 2, ... of that mean, by inversion."""
     if mean <= 1:
         return 1
     return 1 + math.floor(math.log1p(-uniform) / math.log1p(-1 / mean))
 
 
 def _outage_length(uniform: float, p: OutageParameters) -> int:
-    """Discrete Lomax by inversion, cut off at MAX_OUTAGE_S."""
-    beyond: float = p.length_scale_s * ((1 - uniform) ** (-1 / p.length_tail) - 1)
-    return 1 + math.floor(min(beyond, MAX_OUTAGE_S - 1))
+    """A length in s of a discrete Lomax distribution, by inversion, cut off at MAX_OUTAGE_S."""
+    excess_s: float = p.length_scale_s * ((1 - uniform) ** (-1 / p.length_tail) - 1)
+    return 1 + math.floor(min(excess_s, MAX_OUTAGE_S - 1))
 
 
 def _interpolated(at: Float64Array, x: tuple[float, ...], y: tuple[float, ...]) -> Float64Array:
-    """Linear between (x, y), held beyond; step by step, since `np.interp` may fuse a product and a sum."""
+    """Linear between (x, y), held beyond; step by step, because `np.interp` may fuse a product and a sum."""
     knots, values = np.array(x), np.array(y)
     inside = np.minimum(np.maximum(at, knots[0]), knots[-1])
     k = np.minimum(np.searchsorted(knots, inside, side="right") - 1, len(knots) - 2)

@@ -1,32 +1,34 @@
-"""Parameters of a fitted link, and the file that keeps them, one entry a way of moving.
+"""Parameters of fitted links, and the file that holds them: one entry for each mode, that is, way of moving.
 
-`links.json` beside this module is what `bufgym trace fit` made of public recordings; it carries its command.
+`links.json` beside this module is what `bufgym trace fit` wrote for public recordings; it states the command.
 """
 
 from __future__ import annotations
 
 import functools
 import json
-import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from bufgym.errors import BufgymError, TraceError, where
-from bufgym.traces.files import StrPath, write_text
+from bufgym.errors import BufgymError
+from bufgym.traces.formats.faults import StrPath, fault, os_errors
+from bufgym.traces.formats.text import write_text
+from bufgym.traces.generate.ranges import Between, check_ranges, checked, is_finite
 
 LINKS: Final = Path(__file__).with_name("links.json")
 
-# Where the law of the rates is tabled, and the same as numbers of standard deviations; -3 and 3 stand for the
-# least and the greatest rate.
+# Where the distribution of the rates is tabulated, and the same in standard deviations; -3 and 3 stand for the least
+# and the greatest rate.
 PROBABILITIES: Final = (0.0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
 DEVIATIONS: Final = (-3.0, -2.326348, -1.644854, -1.281552, -0.67449, 0.0, 0.67449, 1.281552, 1.644854, 2.326348, 3.0)
 
 # Quantiles 0, 1/4, 1/2, 3/4 and 1 of the seconds of an outage.
 LOW_QUANTILES: Final = 5
 
-# Seconds before and after an outage that are worse than others.
+# Seconds before and after an outage in which rates are lower.
 SHOULDER_S: Final = 5
 
 _MAX_RATE: Final = 1e10
@@ -35,132 +37,126 @@ _MAX_FILE_BYTES: Final = 1 << 20
 
 @dataclass(frozen=True)
 class OutageParameters:
-    """Seconds below a threshold, in runs: how far apart, how long, how bad.
+    """Outages: runs of seconds below a threshold.
 
-    Attributes:
-        spells: runs of such seconds that the numbers come from.
-        short_gap_share: chance that the next one follows soon: outages come in clusters.
-        short_gap_s, long_gap_s: mean time from one's end to the next one's start, each geometric, s.
-        shoulder: mean rate within SHOULDER_S of an outage, relative to that of seconds farther off.
-        length_tail, length_scale_s: a run goes on beyond k s with chance (1 + k / scale)**-tail.
-        low_quantiles_bytes_per_s: 5 rates, from least to greatest, of the seconds inside.
-        borrowed: whether lengths and rates come from all modes of the fit, for there are too few spells.
+    Raises:
+        BufgymError: a value out of its range.
     """
 
-    spells: int
-    short_gap_share: float
-    short_gap_s: float
-    long_gap_s: float
-    shoulder: float
-    length_tail: float
-    length_scale_s: float
+    spells: Annotated[int, Between(1, 1e9)]
+    """Number of outages that the other numbers come from."""
+    short_gap_share: Annotated[float, Between(0, 1)]
+    """Chance that the next outage follows soon: outages come in clusters."""
+    short_gap_s: Annotated[float, Between(1, 1e7)]
+    """Mean time from one's end to the start of the next, if that follows soon; geometric, s."""
+    long_gap_s: Annotated[float, Between(1, 1e7)]
+    """The same for the others."""
+    shoulder: Annotated[float, Between(0, 1)]
+    """Mean rate within SHOULDER_S of an outage, relative to that of seconds farther away."""
+    length_tail: Annotated[float, Between(0.1, 100)]
+    """An outage lasts longer than k s with chance (1 + k / length_scale_s)**-length_tail."""
+    length_scale_s: Annotated[float, Between(0.01, 1e4)]
+    """See length_tail."""
     low_quantiles_bytes_per_s: tuple[float, ...]
+    """5 rates, from least to greatest, of the seconds inside."""
     borrowed: bool = False
+    """Whether lengths and rates come from all modes of the fit, because there are too few outages."""
 
     def __post_init__(self) -> None:
-        _within(self, "spells", 1, 1e9)
-        _within(self, "short_gap_share", 0, 1)
-        _within(self, "short_gap_s", 1, 1e7)
-        _within(self, "long_gap_s", 1, 1e7)
-        _within(self, "shoulder", 0, 1)
-        _within(self, "length_tail", 0.1, 100)
-        _within(self, "length_scale_s", 0.01, 1e4)
-        _quantiles(self, "low_quantiles_bytes_per_s", LOW_QUANTILES)
+        check_ranges(self)
+        _check_quantiles(self, "low_quantiles_bytes_per_s", LOW_QUANTILES)
 
 
 @dataclass(frozen=True)
 class LinkParameters:
     """A link in steps of 1 s; `markov.py` says how a trace is drawn from it.
 
-    Attributes:
-        recordings, seconds: what it was fitted to.
-        quantiles_bytes_per_s: rates at `PROBABILITIES` among the seconds neither of outages nor beside them.
-        place_share: part of the variance (of the normal scores of the rates) that stays for a whole trace.
-        level_share: part that holds for a while, then is drawn anew.
-        level_stay_s: how long that is in the mean, s.
-        fast_memory: correlation from one second to the next of the part that is left, an AR(1) process.
-        outages: None if there were none.
+    Raises:
+        BufgymError: a value out of its range.
     """
 
-    recordings: int
-    seconds: int
+    recordings: Annotated[int, Between(1, 1e9)]
+    """Number of recordings that it was fitted to."""
+    seconds: Annotated[int, Between(1, 1e9)]
+    """Their total length, s."""
     quantiles_bytes_per_s: tuple[float, ...]
-    place_share: float
+    """Rates at `PROBABILITIES` among the seconds that are neither in an outage nor beside one."""
+    place_share: Annotated[float, Between(0, 1)]
+    """Share of the variance (of the rates' normal scores) that stays the same for a whole trace."""
     level_share: float
-    level_stay_s: float
-    fast_memory: float
+    """Share that stays the same for a while, then is drawn again; at most 1 - place_share."""
+    level_stay_s: Annotated[float, Between(1, 1e7)]
+    """How long that is on average, s."""
+    fast_memory: Annotated[float, Between(0, 0.999)]
+    """Correlation from one second to the next of the remaining part, an AR(1) process."""
     outages: OutageParameters | None
+    """None if there were none."""
 
     def __post_init__(self) -> None:
-        _within(self, "recordings", 1, 1e9)
-        _within(self, "seconds", 1, 1e9)
-        _quantiles(self, "quantiles_bytes_per_s", len(PROBABILITIES))
+        check_ranges(self)
+        checked("level_share", self.level_share, 0, 1 - self.place_share + 1e-9)
+        _check_quantiles(self, "quantiles_bytes_per_s", len(PROBABILITIES))
         if not self.quantiles_bytes_per_s[0] > 0:
             raise BufgymError("quantiles_bytes_per_s must be above 0: a second outside outages carries something")
-        _within(self, "place_share", 0, 1)
-        _within(self, "level_share", 0, 1 - self.place_share + 1e-9)
-        _within(self, "level_stay_s", 1, 1e7)
-        _within(self, "fast_memory", 0, 0.999)
 
 
 @functools.cache
 def fitted_links() -> Mapping[str, LinkParameters]:
-    """The links that come with bufgym, by way of moving (or, for WiFi, by place)."""
+    """Mode -> link, of the links that come with bufgym; for WiFi the mode is a place."""
     return read_links(LINKS)
 
 
 def read_links(path: StrPath) -> dict[str, LinkParameters]:
-    """Parameters by mode, from a file that `bufgym trace fit` made.
+    """Mode -> parameters, from a file that `bufgym trace fit` wrote.
 
     Raises:
         TraceError: the file cannot be read, is over 1 MiB, or a value breaks its rule.
     """
-    try:
-        with open(path, "rb") as file:
-            raw = file.read(_MAX_FILE_BYTES + 1)
-    except OSError as error:
-        raise TraceError(where(path, None, None, f"cannot be read: {error.strerror or error}")) from error
+    with os_errors(path, "read"), open(path, "rb") as file:
+        raw = file.read(_MAX_FILE_BYTES + 1)
     if len(raw) > _MAX_FILE_BYTES:
-        raise TraceError(where(path, None, None, f"must be at most {_MAX_FILE_BYTES} bytes"))
+        raise fault(path, f"must be at most {_MAX_FILE_BYTES} bytes")
     try:
-        found = json.loads(raw)
+        content = json.loads(raw)
     except (ValueError, RecursionError) as error:
-        raise TraceError(where(path, None, None, f"must be JSON: {error}")) from error
-    modes = found.get("modes") if isinstance(found, dict) else None
+        raise fault(path, f"must be JSON: {error}") from error
+    modes = content.get("modes") if isinstance(content, dict) else None
     if not isinstance(modes, dict) or not modes:
-        raise TraceError(where(path, None, None, 'must be an object with "modes", as `bufgym trace fit` writes it'))
-    made = {}
+        raise fault(path, 'must be an object with "modes", as `bufgym trace fit` writes it')
+    links = {}
     for mode, entry in modes.items():
         try:
-            made[mode] = _link(entry)
+            links[mode] = _link(entry)
         except BufgymError as error:
-            raise TraceError(where(path, None, None, f"mode {mode!r}: {error}")) from error
-    return made
+            raise fault(path, f"mode {mode!r}: {error}") from error
+    return links
 
 
 def write_links(links: Mapping[str, LinkParameters], path: StrPath, threshold_bytes_per_s: float, made_by: str) -> None:
-    """Write parameters by mode; the same links give the same bytes.
+    """Write the parameters of each mode; the same links give the same bytes.
 
     Args:
-        threshold_bytes_per_s: below which a second counts as one of an outage.
-        made_by: the command, to be kept with its result.
+        links: mode -> parameters.
+        path: the file to write.
+        threshold_bytes_per_s: a second with a lower rate counts as one of an outage.
+        made_by: the command that made them, stated in the file.
     """
-    whole = {
+    content = {
         "about": "Links fitted to recordings, in steps of 1 s: see bufgym/traces/generate/markov.py. Rates in bytes/s.",
         "made_by": made_by,
         "outage_below_bytes_per_s": threshold_bytes_per_s,
         "probabilities_of_quantiles": PROBABILITIES,
         "modes": {mode: asdict(link) for mode, link in links.items()},
     }
-    write_text(path, [_dumped(whole)])
+    write_text(path, [_dumped(content)])
 
 
-def _dumped(whole: Mapping[str, Any]) -> str:
-    """JSON with a line for each number, but rows of numbers on one."""
-    text = json.dumps(whole, indent=2)
-    for row in {m for part in text.split("[")[1:] for m in [part.split("]")[0]]}:
-        text = text.replace(f"[{row}]", f"[{', '.join(cell.strip() for cell in row.split(','))}]")
-    return text + "\n"
+def _dumped(content: Mapping[str, Any]) -> str:
+    """JSON with one line for each number, and one for each row of numbers."""
+    text = json.dumps(content, indent=2)
+    return (
+        re.sub(r"\[[^]]*\]", lambda row: re.sub(r"\s+", " ", row[0]).replace("[ ", "[").replace(" ]", "]"), text) + "\n"
+    )
 
 
 def _link(entry: object) -> LinkParameters:
@@ -171,27 +167,19 @@ def _link(entry: object) -> LinkParameters:
 
 
 def _values(entry: object, kind: type[LinkParameters] | type[OutageParameters]) -> dict[str, Any]:
-    """The entry's values, if it has just the fields of `kind`, rows as tuples."""
+    """The entry's values, with rows as tuples; it must have exactly the fields of `kind`."""
     names = {field.name for field in fields(kind)}
     if not isinstance(entry, dict) or set(entry) != names:
         raise BufgymError(f"must be an object with {', '.join(sorted(names))}")
     return {name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()}
 
 
-def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _within(owner: object, name: str, least: float, most: float) -> None:
-    value = getattr(owner, name)
-    if not (_number(value) and least <= value <= most):
-        raise BufgymError(f"{name} = {value!r}: must be a number from {least:g} to {most:g}")
-
-
-def _quantiles(owner: object, name: str, count: int) -> None:
-    row = getattr(owner, name)
-    good = (
-        isinstance(row, tuple) and len(row) == count and all(_number(rate) and 0 <= rate <= _MAX_RATE for rate in row)
-    )
-    if not good or list(row) != sorted(row):
+def _check_quantiles(owner: object, name: str, count: int) -> None:
+    rates = getattr(owner, name)
+    is_row = isinstance(rates, tuple) and len(rates) == count
+    if (
+        not is_row
+        or not all(is_finite(rate) and 0 <= rate <= _MAX_RATE for rate in rates)
+        or list(rates) != sorted(rates)
+    ):
         raise BufgymError(f"{name}: must be {count} rates from 0 to {_MAX_RATE:g} bytes/s that do not decrease")

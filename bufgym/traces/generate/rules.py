@@ -1,4 +1,4 @@
-"""Links by rule, without chance: steady, a linear ramp, a tunnel. `synthetic.outage` is the fourth.
+"""Links by rule, without randomness: steady, a linear ramp, a tunnel, regular outages.
 
 The ramp of Robofleet's Fig. 5 is `ramp(100e6 / 8, 4e6 / 8, 15)`: 100 to 4 Mbit/s in 15 s (K. S. Sikand et al.,
 "Robofleet: Open Source Communication and Management for Fleets of Autonomous Robots", IROS 2021).
@@ -8,22 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
 from bufgym.errors import BufgymError
-from bufgym.traces.generate.chance import checked
+from bufgym.traces.generate.ranges import checked
 from bufgym.traces.trace import US_PER_S, After, Trace
 
-# A line is cut into steps of this length; the bytes of each are those of the line.
+# A linear change is cut into steps of this length; each carries the bytes of the line.
 STEP_US: Final = 100_000
 _MAX_S: Final = 10**5
 
 
 def steady(bytes_per_s: float, duration_s: float = 300.0) -> Trace:
-    """One rate throughout, which loops.
+    """One rate throughout; it loops.
 
     Raises:
         BufgymError: a rate that is not from 1 to 10**10, a duration that is not from 0.001 to 10**5 s.
@@ -33,11 +32,11 @@ def steady(bytes_per_s: float, duration_s: float = 300.0) -> Trace:
 
 
 def ramp(start_bytes_per_s: float, end_bytes_per_s: float, duration_s: float = 15.0, after: After = "hold") -> Trace:
-    """A rate that changes evenly from start to end; then, by default, the rate of the last step goes on.
+    """A rate that changes linearly from start to end; by default the rate of the last step then continues.
 
     Raises:
-        BufgymError: a rate that is not from 0 to 10**10, a duration that is not from 0.001 to 10**5 s, an
-            unknown `after`.
+        BufgymError: a rate that is not from 0 to 10**10, a duration that is not from 0.001 to 10**5 s, an unknown
+            `after`.
     """
     checked("start_bytes_per_s", start_bytes_per_s, 0, 1e10)
     checked("end_bytes_per_s", end_bytes_per_s, 0, 1e10)
@@ -57,21 +56,52 @@ def tunnel(
     """A drive through a tunnel: steady, a fade to nothing, a blackout, a fade in, steady again; it loops.
 
     Args:
-        bytes_per_s: outside, 1 to 10**10.
-        before_s, fade_s, blackout_s, recover_s, after_s: length of each part, 0 to 10**5 s; the parts with
-            capacity must not all be 0.
+        bytes_per_s: rate outside the tunnel, 1 to 10**10.
+        before_s, fade_s, blackout_s, recover_s, after_s: length of each part, 0 to 10**5 s; the parts with capacity
+            must not all be 0.
 
     Raises:
         BufgymError: an argument out of its range.
     """
     checked("bytes_per_s", bytes_per_s, 1, 1e10)
-    lengths = {"before_s": before_s, "fade_s": fade_s, "blackout_s": blackout_s}
-    lengths |= {"recover_s": recover_s, "after_s": after_s}
-    for name, length_s in lengths.items():
-        checked(name, length_s, 0, _MAX_S)
-    edges = [bytes_per_s, bytes_per_s, 0.0, 0.0, bytes_per_s, bytes_per_s]
-    parts = zip(lengths.values(), pairwise(edges), strict=True)
-    return _lines([(length_s, *rates) for length_s, rates in parts], "tunnel", "loop")
+    parts = [
+        (checked("before_s", before_s, 0, _MAX_S), bytes_per_s, bytes_per_s),
+        (checked("fade_s", fade_s, 0, _MAX_S), bytes_per_s, 0.0),
+        (checked("blackout_s", blackout_s, 0, _MAX_S), 0.0, 0.0),
+        (checked("recover_s", recover_s, 0, _MAX_S), 0.0, bytes_per_s),
+        (checked("after_s", after_s, 0, _MAX_S), bytes_per_s, bytes_per_s),
+    ]
+    return _lines(parts, "tunnel", "loop")
+
+
+def outage(
+    period_s: float,
+    length_s: float,
+    bytes_per_s: float,
+    *,
+    repeats: int = 1,
+    outage_bytes_per_s: float = 0.0,
+) -> Trace:
+    """A steady link that breaks down at the end of each period.
+
+    `outage(10, 2, 8e6)` is 8 s at 8 MB/s, then 2 s of nothing, and so on.
+
+    Args:
+        period_s: from the end of one breakdown to the end of the next, s.
+        length_s: length of the breakdown, s, above 0 and below the period.
+        bytes_per_s: rate of the link otherwise.
+        repeats: periods in the trace, >= 1; the trace loops in any case.
+        outage_bytes_per_s: rate during the breakdown.
+
+    Raises:
+        BufgymError: an argument out of its range.
+    """
+    if not 0 < length_s < period_s:
+        raise BufgymError(f"length_s = {length_s}: must be above 0 and below period_s = {period_s}")
+    if repeats < 1:
+        raise BufgymError(f"repeats = {repeats}: must be >= 1")
+    period = [(period_s - length_s, bytes_per_s), (length_s, outage_bytes_per_s)]
+    return Trace.steps(period * repeats, name=f"outage-{length_s:g}s-every-{period_s:g}s")
 
 
 def _lines(parts: Sequence[tuple[float, float, float]], name: str, after: After) -> Trace:

@@ -1,7 +1,8 @@
-"""zip and tar archives from strangers: unpacked inside their folder, up to a stated size, or refused.
+"""Unpack zip and tar archives that nobody vouches for: inside their folder, up to a stated size, or not at all.
 
-What an archive says of itself is not believed: names are checked, bytes are counted as they come out. Only plain files
-and folders come out; links, devices, encrypted files, and names that lead out of the folder end in a BufgymError.
+Nothing that an archive says about itself is trusted: names are checked, and bytes are counted as they are unpacked.
+Only plain files and folders are unpacked. Links, devices, encrypted files, and names that lead out of the folder are
+refused.
 """
 
 from __future__ import annotations
@@ -21,17 +22,17 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from bufgym.errors import BufgymError, where
-from bufgym.traces.fetch_connection import in_words
-from bufgym.traces.fetch_http import disk
+from bufgym.traces.datasets.connection import in_words
+from bufgym.traces.datasets.download import disk
 
 MAX_UNPACKED_BYTES: Final = 2 * 2**30
 MAX_MEMBERS: Final = 100_000
 ENDINGS: Final = (".zip", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz", ".tar")
 
-# The longest that is read at once: tarfile takes a header of any announced length in one go.
-_MAX_READ = 16 * 2**20
-_BLOCK = 2**20
-# What the libraries raise of broken archives, as found by breaking some.
+# tarfile reads a header of any announced length at once; this is the longest that it may.
+_MAX_READ_BYTES = 16 * 2**20
+_BLOCK_BYTES = 2**20
+# What the libraries raise on broken archives, found by breaking some.
 _DAMAGED = (
     zipfile.BadZipFile,
     tarfile.TarError,
@@ -48,23 +49,23 @@ _DAMAGED = (
 
 
 def ending(name: str) -> str | None:
-    """The ending by which a file is known as an archive."""
-    return next((each for each in ENDINGS if name.lower().endswith(each)), None)
+    """The ending that marks a file as an archive, None if it has no such ending."""
+    return next((suffix for suffix in ENDINGS if name.lower().endswith(suffix)), None)
 
 
 def unpack(archive: Path, folder: Path, most_bytes: int | None = None) -> list[Path]:
-    """Unpack `archive` into `folder`, which must not be there yet: after an error it is not there either.
+    """Unpack `archive` into `folder`, which must not exist yet; after an error it does not exist either.
 
     Args:
         archive: named .zip, .tar, .tgz, .tar.gz, .tar.bz2 or .tar.xz.
-        folder: made by this call, whole.
-        most_bytes: bytes after decompression, MAX_UNPACKED_BYTES by default.
+        folder: created by this call, complete.
+        most_bytes: limit of the bytes after decompression, MAX_UNPACKED_BYTES by default.
 
     Returns:
         The files, in the archive's order.
 
     Raises:
-        BufgymError: a damaged archive, one too big, or a member that has no place in the folder.
+        BufgymError: a damaged archive, one that is too big, or a member that must not be in the folder.
     """
     most_bytes = MAX_UNPACKED_BYTES if most_bytes is None else most_bytes
     kind = ending(archive.name)
@@ -75,10 +76,10 @@ def unpack(archive: Path, folder: Path, most_bytes: int | None = None) -> list[P
         with disk(unfinished):
             unfinished.mkdir(parents=True)
         names = []
-        left = most_bytes
+        remaining = most_bytes
         for name, stream in members(archive, most_bytes):
             target = _place(archive, unfinished, name)
-            left -= _copy(archive, name, stream, target, left, most_bytes)
+            remaining -= _copy(archive, name, stream, target, remaining, most_bytes)
             names.append(target.relative_to(unfinished))
             if len(names) > MAX_MEMBERS:
                 raise BufgymError(f"{archive}: more than {MAX_MEMBERS} files: must be fewer")
@@ -105,15 +106,15 @@ def _place(archive: Path, folder: Path, name: str) -> Path:
     return target
 
 
-def _copy(archive: Path, name: str, stream: IO[bytes], target: Path, left: int, most_bytes: int) -> int:
+def _copy(archive: Path, name: str, stream: IO[bytes], target: Path, remaining: int, most_bytes: int) -> int:
     count = 0
     with disk(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         out = target.open("xb")
     with out:
-        while block := stream.read(_BLOCK):
+        while block := stream.read(_BLOCK_BYTES):
             count += len(block)
-            if count > left:
+            if count > remaining:
                 raise _too_big(archive, name, most_bytes)
             with disk(target):
                 out.write(block)
@@ -127,7 +128,7 @@ def _too_big(archive: Path, name: str, most_bytes: int) -> BufgymError:
 def _zip(archive: Path, most_bytes: int) -> Iterator[tuple[str, IO[bytes]]]:
     with zipfile.ZipFile(archive) as opened:
         infos = opened.infolist()
-        # Both may lie, which the copying finds out; an honest bomb is refused before a byte is written.
+        # Refuses an honest bomb before a byte is written; copying counts again, since both numbers may lie.
         if len(infos) > MAX_MEMBERS or sum(info.file_size for info in infos) > most_bytes:
             raise BufgymError(
                 f"{archive}: unpacks to more than {most_bytes} bytes or {MAX_MEMBERS} files: must be less"
@@ -138,7 +139,7 @@ def _zip(archive: Path, most_bytes: int) -> Iterator[tuple[str, IO[bytes]]]:
                 raise BufgymError(where(archive, None, info.filename, "must not be encrypted", field="member"))
             if stat.S_IFMT(mode) not in (0, stat.S_IFREG, stat.S_IFDIR):
                 raise BufgymError(where(archive, None, info.filename, "must be a plain file", field="member"))
-            # Finder's folder of icons and attributes is no part of any data set.
+            # Finder's folder of icons and attributes belongs to no data set.
             if not info.is_dir() and not info.filename.startswith("__MACOSX/"):
                 with opened.open(info) as stream:
                     yield info.filename, stream
@@ -168,20 +169,20 @@ def _tar(archive: Path, most_bytes: int) -> Iterator[tuple[str, IO[bytes]]]:
 
 
 class _Bounded(io.RawIOBase):
-    """The decompressed bytes of a tar file, up to a limit that leaves room for headers."""
+    """The decompressed bytes of a tar file, up to a limit that leaves room for its headers."""
 
     def __init__(self, archive: Path, inner: IO[bytes], most_bytes: int) -> None:
-        self._archive, self._inner, self._stated = archive, inner, most_bytes
+        self._archive, self._inner, self._most_bytes = archive, inner, most_bytes
         self._limit = most_bytes + 3 * tarfile.BLOCKSIZE * MAX_MEMBERS
 
     def read(self, size: int = -1) -> bytes:
-        if size > _MAX_READ:
-            raise BufgymError(f"{self._archive}: a header of {size} bytes: must be at most {_MAX_READ}")
+        if size > _MAX_READ_BYTES:
+            raise BufgymError(f"{self._archive}: a header of {size} bytes: must be at most {_MAX_READ_BYTES}")
         return self._inner.read(size)
 
     def seek(self, offset: int, whence: int = 0) -> int:
         if offset > self._limit:
-            raise BufgymError(f"{self._archive}: unpacks to more than {self._stated} bytes: must be less")
+            raise BufgymError(f"{self._archive}: unpacks to more than {self._most_bytes} bytes: must be less")
         return self._inner.seek(offset, whence)
 
     def tell(self) -> int:

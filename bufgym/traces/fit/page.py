@@ -1,4 +1,4 @@
-"""The page that compares recordings and generated links, mode by mode, and its pictures."""
+"""The page that compares recordings with generated links, mode by mode, and its pictures."""
 
 from __future__ import annotations
 
@@ -11,30 +11,20 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError, TraceError, where
-from bufgym.files import replaced
-from bufgym.traces.generate.compare import (
-    KS_DISTANCE,
-    SETS,
-    HeldOut,
-    Row,
-    Rows,
-    compare,
-    generated_sets,
-    held_out,
-    outage_gaps,
-    outage_lengths,
-)
-from bufgym.traces.generate.fit import autocorrelation
+from bufgym.errors import BufgymError
+from bufgym.traces.fit.compare import KS_DISTANCE, SETS, HeldOut, Row, compare, generated_sets, held_out
+from bufgym.traces.fit.statistics import Rows, autocorrelation, outage_gaps, outage_lengths
+from bufgym.traces.formats.faults import os_errors
+from bufgym.traces.formats.text import write_text
 from bufgym.traces.generate.parameters import SHOULDER_S, LinkParameters
 from bufgym.traces.trace import Float64Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Below this a statistic counts as not met.
+# Below this p-value a statistic does not match.
 _LEVEL: Final = 0.05
-# From so many modes on, all on one side are more than chance.
+# With so many modes or more, all on one side is more than chance.
 _MANY_MODES: Final = 6
 _DRAWN_SETS: Final = 40
 _LAGS_DRAWN: Final = (1, 2, 3, 4, 5, 7, 10, 14, 20, 30, 45, 60)
@@ -44,17 +34,17 @@ _INTRODUCTION: Final = """\
 
 Made by `{command}`; do not edit.
 
-What the generator is: `bufgym/traces/generate/markov.py`. How it is fitted: `fit.py` beside it. Its parameters:
-`links.json`.
+The generator is `bufgym/traces/generate/markov.py`, with its parameters in `links.json` beside it;
+`bufgym/traces/fit/fit.py` fits them.
 
 How to read the tables. A *set* is as many generated traces as there are recordings of that mode, each as long as its
-counterpart. *Generated* is the median of {sets} sets, *95 % of sets* the range of their middle 95 %, *p* twice the
-smaller share of sets at or beyond the recordings' value (a Monte Carlo test: generated traces carry their own
+counterpart. *Generated* is the median of {sets} sets, *95 % of sets* the range of their middle 95 %, and *p* twice the
+smaller share of sets at or beyond the recordings' value (a Monte Carlo test: generated traces have their own
 correlation in time, so seconds need not be independent). Rows with p < {level} are in bold: there the model does not
-match. With so many rows one in twenty is expected to be bold by chance; and since the parameters were fitted to these
-very recordings, a p near 1 is less than it seems. With few recordings the sets scatter widely and much would pass;
-what the test can tell is shown by the last column of the first table, the rows that links of independent seconds
-without outages, with the same law of rates, do not match.
+match. With so many rows, one in twenty is expected to be bold by chance; and because the parameters were fitted to
+these very recordings, a p near 1 means less than it seems. With few recordings the sets scatter widely, and much would
+pass. What the test can detect is shown by the last column of the first table: the rows that links of independent
+seconds without outages, with the same distribution of rates, do not match.
 
 *Held out* is the honest test of the distribution: a recording against links fitted to the others of its mode.
 *Kolmogorov-Smirnov distance* is the greatest distance between two cumulative distributions.
@@ -68,7 +58,14 @@ def write_page(
     command: str,
     sets: int = SETS,
 ) -> None:
-    """Write the page, and if matplotlib is there a picture a mode into `figures/` beside it.
+    """Write the page and, if matplotlib is installed, a picture of each mode into `figures/` beside it.
+
+    Args:
+        links: mode -> what was fitted.
+        recordings: mode -> what it was fitted to.
+        page: the file to write.
+        command: what the page names as its origin.
+        sets: generated sets for each comparison.
 
     Raises:
         TraceError: a file cannot be written.
@@ -76,19 +73,12 @@ def write_page(
     compared = {mode: compare(links[mode], rows, sets) for mode, rows in recordings.items()}
     plain = {mode: compare(_without_memory(links[mode]), rows, sets) for mode, rows in recordings.items()}
     unseen = {mode: held_out(mode, rows, sets) for mode, rows in recordings.items()}
-    try:
+    with os_errors(page, "written"):
         (page.parent / "figures").mkdir(parents=True, exist_ok=True)
         pictures = {mode: _picture(mode, links[mode], rows, page.parent) for mode, rows in recordings.items()}
-        parts = [
-            _INTRODUCTION.format(command=command, sets=sets, level=_LEVEL),
-            _summary(links, compared, plain, unseen),
-        ]
-        for mode, rows in compared.items():
-            parts.append(_section(mode, links[mode], rows, unseen[mode], pictures[mode]))
-        with replaced(page) as temporary:
-            temporary.write_text("\n".join(parts), encoding="utf-8")
-    except OSError as error:
-        raise TraceError(where(page, None, None, f"cannot be written: {error.strerror or error}")) from error
+    parts = [_INTRODUCTION.format(command=command, sets=sets, level=_LEVEL), _summary(links, compared, plain, unseen)]
+    parts += [_section(mode, links[mode], rows, pictures[mode]) for mode, rows in compared.items()]
+    write_text(page, ["\n".join(parts)])
 
 
 def _summary(
@@ -103,11 +93,11 @@ def _summary(
         "|---|---|---|---|---|---|---|",
     ]
     for mode, rows in compared.items():
-        link, (bad, tested), (worse, of) = links[mode], _unmatched(rows), _unmatched(plain[mode])
-        found = 0 if link.outages is None else link.outages.spells
+        link, (names, tested), (plain_names, plain_tested) = links[mode], _unmatched(rows), _unmatched(plain[mode])
+        outages = 0 if link.outages is None else link.outages.spells
         lines.append(
-            f"| {mode} | {link.recordings} | {link.seconds} | {found} | {len(bad)} of {tested} "
-            f"| {', '.join(bad) or 'none'} | {len(worse)} of {of} |"
+            f"| {mode} | {link.recordings} | {link.seconds} | {outages} | {len(names)} of {tested} "
+            f"| {', '.join(names) or 'none'} | {len(plain_names)} of {plain_tested} |"
         )
     if len(compared) >= _MANY_MODES:
         lines.append("\n" + _leanings(compared))
@@ -123,28 +113,28 @@ def _summary(
 
 
 def _unmatched(rows: Sequence[Row]) -> tuple[list[str], int]:
-    """Names of the rows that do not match, and how many rows could."""
+    """Names of the rows that do not match, and how many rows were tested."""
     tested = [row for row in rows if not math.isnan(row.p)]
     return [row.name.split(",")[0] for row in tested if row.p < _LEVEL], len(tested)
 
 
 def _leanings(compared: Mapping[str, Sequence[Row]]) -> str:
-    """The statistics that lean to one side in every mode: a bias, be it within chance in each of them."""
+    """The statistics that lean to one side in every mode: a bias, even if it is within chance in each of them."""
     above: dict[str, list[bool]] = {}
     for row in itertools.chain.from_iterable(compared.values()):
-        # Of the distance only one side means anything; what is equal leans nowhere.
+        # Only one side of the distance means anything, and what is equal leans to neither side.
         if not math.isnan(row.p) and row.name != KS_DISTANCE and row.real != row.median:
             above.setdefault(row.name, []).append(row.real > row.median)
     leaning = {name: sides for name, sides in above.items() if len(sides) >= _MANY_MODES and len(set(sides)) == 1}
-    said = [f"{name.split(',')[0]} ({'too low' if sides[0] else 'too high'})" for name, sides in leaning.items()]
-    return f"Generated links lean to one side in every mode in: {', '.join(said) or 'nothing'}.\n"
+    phrases = [f"{name.split(',')[0]} ({'too low' if sides[0] else 'too high'})" for name, sides in leaning.items()]
+    return f"Generated links lean to one side in every mode in: {', '.join(phrases) or 'nothing'}.\n"
 
 
 def _without_memory(link: LinkParameters) -> LinkParameters:
     return replace(link, place_share=0.0, level_share=0.0, fast_memory=0.0, outages=None)
 
 
-def _section(mode: str, link: LinkParameters, rows: Sequence[Row], unseen: HeldOut, picture: str | None) -> str:
+def _section(mode: str, link: LinkParameters, rows: Sequence[Row], picture: str | None) -> str:
     lines = [f"## {mode}\n", f"{_count(link.recordings, 'recording')}, {link.seconds} s. {_words(link)}\n"]
     lines += ["| statistic | recordings | generated | 95 % of sets | p |", "|---|---|---|---|---|"]
     for row in rows:
@@ -161,21 +151,19 @@ def _section(mode: str, link: LinkParameters, rows: Sequence[Row], unseen: HeldO
 
 def _words(link: LinkParameters) -> str:
     fast = max(0.0, 1 - link.place_share - link.level_share)
-    said = (
+    variance = (
         f"Variance of the scores: place {link.place_share:.2f}, level {link.level_share:.2f} (mean stay "
         f"{link.level_stay_s:g} s), fast {fast:.2f} (memory {link.fast_memory:.2f} a second)."
     )
     o = link.outages
     if o is None:
-        return said + " No outages."
-    clusters = (
-        f"a share of {o.short_gap_share:.2f} after {o.short_gap_s:g} s in the mean, " if o.short_gap_share else ""
-    )
-    borrowed = " Their lengths and depths are those of all modes, for there are too few." if o.borrowed else ""
-    apart = f"{clusters}{'others' if clusters else 'each'} after {o.long_gap_s:g} s"
-    beyond = f"they go on beyond k s with chance (1 + k / {o.length_scale_s:g})^-{o.length_tail:g}"
-    beside = f"Rates within {SHOULDER_S} s of one are {100 * o.shoulder:.0f} % of the others."
-    return f"{said} {_count(o.spells, 'outage')}: {apart}; {beyond}.{borrowed} {beside}"
+        return variance + " No outages."
+    clusters = f"a share of {o.short_gap_share:.2f} after {o.short_gap_s:g} s on average, " if o.short_gap_share else ""
+    borrowed = " Their lengths and depths are those of all modes, because there are too few." if o.borrowed else ""
+    gaps = f"{clusters}{'others' if clusters else 'each'} after {o.long_gap_s:g} s"
+    lengths = f"they last longer than k s with chance (1 + k / {o.length_scale_s:g})^-{o.length_tail:g}"
+    shoulder = f"Rates within {SHOULDER_S} s of one are {100 * o.shoulder:.0f} % of the others."
+    return f"{variance} {_count(o.spells, 'outage')}: {gaps}; {lengths}.{borrowed} {shoulder}"
 
 
 def _count(n: int, what: str) -> str:
@@ -190,22 +178,22 @@ def _short(value: float) -> str:
 
 
 def _picture(mode: str, link: LinkParameters, rows: Rows, folder: Path) -> str | None:
-    """Draw one mode; the file's name from the page, or None without matplotlib."""
+    """Draw one mode; the picture's path relative to the page, or None without matplotlib."""
     try:
         import matplotlib
         from matplotlib.figure import Figure
     except ImportError:
         return None
-    made = [row for each in generated_sets(link, rows, _DRAWN_SETS) for row in each]
+    generated = [trace for traces in generated_sets(link, rows, _DRAWN_SETS) for trace in traces]
     name = f"figures/link-{mode}.svg"
-    # Without a salt and a date of its own the same picture has the same bytes.
+    # With a fixed salt and without a date, the same picture has the same bytes.
     with matplotlib.rc_context({"svg.hashsalt": "bufgym", "svg.fonttype": "none", "font.size": 8}):
         figure = Figure(figsize=(9, 2.4), layout="constrained")
         axes = figure.subplots(1, 4)
-        for label, drawn, colour in (("recordings", rows, "C0"), ("generated", made, "C1")):
+        for label, drawn, colour in (("recordings", rows, "C0"), ("generated", generated, "C1")):
             rates = np.concatenate(drawn)
-            at = np.linspace(0, 1, 101)
-            axes[0].plot(np.quantile(rates, at) / 1e6, at, colour, label=label)
+            shares = np.linspace(0, 1, 101)
+            axes[0].plot(np.quantile(rates, shares) / 1e6, shares, colour, label=label)
             axes[1].plot(_LAGS_DRAWN, autocorrelation(drawn, _LAGS_DRAWN)[0], colour, marker=".")
             _survival(axes[2], outage_lengths(drawn), colour)
             _survival(axes[3], outage_gaps(drawn), colour)
@@ -221,16 +209,16 @@ def _picture(mode: str, link: LinkParameters, rows: Rows, folder: Path) -> str |
 
 
 def _survival(axis: Axes, values: Float64Array, colour: str) -> None:
-    """Share of values that are at least x, both axes logarithmic, at 60 points at most."""
+    """Share of values that are at least x, both axes logarithmic, at no more than 60 points."""
     if not values.size:
         return
-    kinds, counts = np.unique(values, return_counts=True)
+    distinct, counts = np.unique(values, return_counts=True)
     share = counts[::-1].cumsum()[::-1] / values.size
-    shown = np.unique(np.geomspace(1, kinds.size, 60).astype(int)) - 1
-    axis.loglog(kinds[shown], share[shown], colour)
+    drawn = np.unique(np.geomspace(1, distinct.size, 60).astype(int)) - 1
+    axis.loglog(distinct[drawn], share[drawn], colour)
 
 
 def check_page(path: Path) -> None:
-    """Raise BufgymError if a page could not be written there."""
+    """Raise BufgymError if `path` is not the name of a page."""
     if path.suffix != ".md":
         raise BufgymError(f"--page {path}: must end in .md")

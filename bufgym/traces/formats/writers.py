@@ -1,7 +1,7 @@
-"""Bandwidth traces into files, and what a format could not hold.
+"""Bandwidth traces into files, and how much a copy differs from its original.
 
-`write_csv` is exact. A Mahimahi file holds packets of 1500 bytes at whole ms, so a trace that is not made of those
-loses something; `difference` says how much, by reading back what was written.
+`write_csv` is exact. A Mahimahi file holds packets of 1500 bytes at whole ms, so any other trace loses something;
+`difference` says how much, from the trace and what was read back.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from bufgym.errors import TraceError, where
-from bufgym.traces.files import StrPath, write_text
-from bufgym.traces.mahimahi import PACKET_BYTES
-from bufgym.traces.readers_intervals import MAX_INTERVAL_BYTES
-from bufgym.traces.readers_text import CSV_HEADER
+from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES
+from bufgym.traces.formats.mahimahi import PACKET_BYTES
+from bufgym.traces.formats.tables import CSV_HEADER
+from bufgym.traces.formats.text import write_text
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Int64Array, Trace
 
-# As many lines as the reader takes, at most 11 digits each, in its 4 GiB.
+# Lines of at most 11 digits, as many as fit into the reader's 4 GiB.
 MAX_PACKETS: Final = 3 * 10**8
 
 _CHUNK_PACKETS: Final = 10**6
@@ -28,13 +28,13 @@ def write_csv(trace: Trace, path: StrPath) -> None:
     """Write the `csv` format, one line a segment; `read_trace` gives back the same knots, exactly.
 
     Raises:
-        TraceError: the file cannot be written, or the trace is beyond what the reader takes (10**12 bytes in
-            a segment, 10**7 s).
+        TraceError: the file cannot be written, or the trace is beyond what the reader accepts (10**12 bytes
+            in a segment, 10**7 s).
     """
     segment_bytes = np.diff(trace.cumulative_bytes)
     if segment_bytes.max() > MAX_INTERVAL_BYTES or trace.duration_us > MAX_DURATION_S * US_PER_S:
         rule = f"a segment must hold at most {MAX_INTERVAL_BYTES} bytes, the trace {MAX_DURATION_S} s"
-        raise TraceError(where(path, None, None, f"cannot be written: {rule}"))
+        raise fault(path, f"cannot be written: {rule}")
     ends_us, lengths_us = trace.time_us[1:].tolist(), np.diff(trace.time_us).tolist()
     lines = (
         f"{_milliseconds(end_us)},{count},{_milliseconds(length_us)}\n"
@@ -44,20 +44,20 @@ def write_csv(trace: Trace, path: StrPath) -> None:
 
 
 def write_mahimahi(trace: Trace, path: StrPath) -> None:
-    """Write the `mahimahi` format: a line for each packet, at the first whole ms by which its 1500 bytes have crossed.
+    """Write the `mahimahi` format: a line for each packet, at the first whole ms by which its 1500 bytes are through.
 
-    So no packet is ahead of the trace, and none is behind by more than what is left of its ms. The last line tells
-    how long the trace lasts, so there is a packet at the end (the next whole ms) even if its bytes have not all
-    crossed by then. A trace that came from Mahimahi is given back exactly (its packets of ms 0 as packets of ms 1).
+    So no packet is ahead of the trace, and none is behind by more than what is left of its ms. The last line says how
+    long the trace lasts, so there is a packet at the end (the next whole ms) even if not all its bytes are through by
+    then. A trace that came from Mahimahi is preserved exactly (its packets of ms 0 as packets of ms 1).
 
     Raises:
-        TraceError: the file cannot be written, or the trace is beyond what the reader takes (10**7 s, 3 * 10**8
+        TraceError: the file cannot be written, or the trace is beyond what the reader accepts (10**7 s, 3 * 10**8
             packets).
     """
     packets = trace.total_bytes // PACKET_BYTES
     if packets > MAX_PACKETS or trace.duration_us > MAX_DURATION_S * US_PER_S:
         rule = f"the trace must last at most {MAX_DURATION_S} s and hold at most {MAX_PACKETS} packets"
-        raise TraceError(where(path, None, None, f"cannot be written: {rule}"))
+        raise fault(path, f"cannot be written: {rule}")
     write_text(path, _stamps(trace, packets))
 
 
@@ -65,12 +65,12 @@ WRITERS: Final[dict[str, Callable[[Trace, StrPath], None]]] = {"csv": write_csv,
 
 
 class Difference(NamedTuple):
-    """What a copy of a trace has more than the trace.
+    """How a copy of a trace differs from the trace.
 
     Attributes:
-        duration_us: time of the last knot, microseconds.
-        total_bytes: bytes that can cross from the first knot to the last.
-        largest_bytes: the greatest distance between the cumulative bytes of both at any one time, >= 0.
+        duration_us: how much longer the copy lasts, microseconds.
+        total_bytes: how many more bytes the copy carries in all.
+        largest_bytes: the greatest difference between the cumulative bytes of both at any one time, >= 0.
     """
 
     duration_us: int
@@ -80,10 +80,10 @@ class Difference(NamedTuple):
     def __str__(self) -> str:
         if not any(self):
             return "nothing lost"
-        told = [f"total {self.total_bytes:+d} bytes", f"at most {self.largest_bytes:.6g} bytes off at any time"]
+        parts = [f"total {self.total_bytes:+d} bytes", f"at most {self.largest_bytes:.6g} bytes off at any time"]
         if self.duration_us:
-            told.append(f"duration {self.duration_us / 1000:+g} ms")
-        return ", ".join(told)
+            parts.append(f"duration {self.duration_us / 1000:+g} ms")
+        return ", ".join(parts)
 
 
 def difference(trace: Trace, copy: Trace) -> Difference:
@@ -95,30 +95,30 @@ def difference(trace: Trace, copy: Trace) -> Difference:
     largest = 0.0
     for times in (trace.time_us, copy.time_us):
         inside = times[times <= end_us]
-        mine, its = (np.interp(inside, each.time_us, each.cumulative_bytes) for each in (trace, copy))
-        largest = max(largest, float(np.abs(mine - its).max()))
+        original, copied = (np.interp(inside, link.time_us, link.cumulative_bytes) for link in (trace, copy))
+        largest = max(largest, float(np.abs(original - copied).max()))
     return Difference(copy.duration_us - trace.duration_us, copy.total_bytes - trace.total_bytes, largest)
 
 
 def _stamps(trace: Trace, packets: int) -> Iterator[str]:
-    """The lines of all packets that have crossed by the end, and of one more where the last comes before it."""
+    """The lines of all packets that are through by the end, and one more if the last is through before the end."""
     end_ms, last_ms = -(-trace.duration_us // 1000), 0
     for first in range(1, packets + 1, _CHUNK_PACKETS):
         due = np.arange(first, min(first + _CHUNK_PACKETS, packets + 1), dtype=np.int64) * PACKET_BYTES
-        stamps_ms = -(-_crossed_at(trace, due) // 1000)
+        stamps_ms = -(-_transmitted_us(trace, due) // 1000)
         last_ms = int(stamps_ms[-1])
         yield "".join(f"{stamp}\n" for stamp in stamps_ms.tolist())
     if last_ms < end_ms:
         yield f"{end_ms}\n"
 
 
-def _crossed_at(trace: Trace, due: Int64Array) -> Int64Array:
-    """When so many bytes (int64[n], each from 1 to the total) have crossed: int64[n] microseconds, rounded up."""
+def _transmitted_us(trace: Trace, due: Int64Array) -> Int64Array:
+    """When so many bytes (int64[n], each from 1 to the total) are through: int64[n] microseconds, rounded up."""
     time_us, cumulative = trace.time_us, trace.cumulative_bytes
     k = np.searchsorted(cumulative, due, side="left")
-    passed, length = due - cumulative[k - 1], time_us[k] - time_us[k - 1]
-    # At most (bytes x microseconds) of a segment, which a Trace keeps below 2**62.
-    return np.asarray(time_us[k - 1] - (-passed * length) // (cumulative[k] - cumulative[k - 1]), np.int64)
+    within, length_us = due - cumulative[k - 1], time_us[k] - time_us[k - 1]
+    # The product is at most (bytes x microseconds) of a segment, which a Trace keeps below 2**62.
+    return np.asarray(time_us[k - 1] - (-within * length_us) // (cumulative[k] - cumulative[k - 1]), np.int64)
 
 
 def _milliseconds(time_us: int) -> str:

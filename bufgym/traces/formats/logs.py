@@ -1,4 +1,4 @@
-"""Readers of what measuring tools wrote: UCC's 4G and 5G CSV (G-NetTrack Pro), NYU-METS (iPerf), Sabre's JSON.
+"""Readers of the logs of measuring tools: UCC's 4G and 5G CSV (G-NetTrack Pro), NYU-METS (iPerf), Sabre's JSON.
 
 Sources: D. Raca et al., "Beyond Throughput, The Next Generation: a 5G Dataset with Channel and Context Metrics",
 MMSys 2020; L. Mei et al., "Realtime Mobile Bandwidth Prediction using LSTM Neural Networks", PAM 2019;
@@ -13,15 +13,16 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import Final, NoReturn
 
-from bufgym.errors import TraceError, where
-from bufgym.traces.files import Line, StrPath, TextFile, is_number
-from bufgym.traces.readers_intervals import Intervals, Knots
-from bufgym.traces.readers_text import MAX_MBIT_PER_S
+from bufgym.errors import TraceError
+from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.intervals import Intervals, Knots
+from bufgym.traces.formats.tables import MAX_MBIT_PER_S
+from bufgym.traces.formats.text import Line, is_number, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 
 UCC_COLUMNS: Final = ("DL_bitrate", "UL_bitrate")
 
-# Samples of "about 1 s" with whole-second stamps: two may share one, the next be some s later.
+# Samples about 1 s apart with stamps of whole seconds: two may share one, and the next may be some seconds later.
 MIN_UCC_STEP_S: Final = -2
 MAX_UCC_STEP_S: Final = 5
 
@@ -36,26 +37,24 @@ _JSON_SPACE: Final = re.compile(r"[ \t\n\r]*")
 
 def fits_ucc(text: str) -> bool:
     """A header with a time and both bitrates among its columns."""
-    return {_UCC_TIME, *UCC_COLUMNS} <= {cell.strip() for cell in text.split(",")}
+    return {_UCC_TIME, *UCC_COLUMNS} <= set(split_cells(text))
 
 
 def read_ucc(path: StrPath, column: str = "DL_bitrate") -> Knots:
     """Each line counts for 1 s at its rate in kbit/s, as in the data set's own figures.
 
-    Its stamps have whole seconds only, two lines often share one, and on their clock a recording lasts up to a tenth
-    longer than it has lines. The note says how long. A stamp more than 2 s before or 5 s after the one above is a gap,
-    and refused.
+    The stamps have whole seconds only, and two lines often share one. By the stamps a recording lasts up to a tenth
+    longer than by its number of lines; the note says how long. A stamp more than 2 s before or 5 s after the one above
+    counts as a gap and is refused.
     """
     intervals = Intervals()
-    with TextFile(path) as file:
+    with open_text(path) as file:
         lines = file.lines()
         header = next(lines, None)
         columns = ", ".join((_UCC_TIME, *UCC_COLUMNS))
         if header is None or not fits_ucc(header.text):
-            raise TraceError(
-                where(path, header and header.number, None, f"must begin with a header that names {columns}")
-            )
-        names = [cell.strip() for cell in header.text.split(",")]
+            raise fault(path, f"must begin with a header that names {columns}", line=header and header.number)
+        names = split_cells(header.text)
         time_at, rate_at = names.index(_UCC_TIME), names.index(column)
         first = previous = None
         for line in lines:
@@ -81,15 +80,15 @@ def _stamp(line: Line, text: str) -> datetime:
 
 
 def fits_nyu(text: str) -> bool:
-    """A number and a unit of iPerf."""
-    cells = [cell.strip() for cell in text.split(",")]
+    """A number and one of iPerf's units."""
+    cells = split_cells(text)
     return len(cells) == 2 and is_number(cells[0]) and cells[1] in _NYU_BITS
 
 
 def read_nyu(path: StrPath) -> Knots:
-    """Each line is the rate of 1 s, its unit beside it; bytes are rounded to whole ones."""
+    """Each line is the rate of 1 s with its unit; bytes are rounded to whole numbers."""
     intervals = Intervals()
-    with TextFile(path) as file:
+    with open_text(path) as file:
         for line in file.lines():
             value, unit = line.columns(2, ",")
             if unit not in _NYU_BITS:
@@ -100,16 +99,16 @@ def read_nyu(path: StrPath) -> Knots:
 
 
 def fits_sabre(text: str) -> bool:
-    """The opening of a list."""
+    """The opening bracket of a list."""
     return text.startswith("[")
 
 
 def read_sabre(path: StrPath) -> Knots:
-    """A JSON list of objects with `duration_ms` and `bandwidth_kbps` (1000 bit/s); what else they hold is left aside.
+    """A JSON list of objects with `duration_ms` and `bandwidth_kbps` (1000 bit/s); their other members are ignored.
 
-    Sample by sample, so that an error names its line and no more than one is held as objects.
+    Samples are parsed one by one, so that an error names the line of its sample and only one is held as objects.
     """
-    with TextFile(path) as file:
+    with open_text(path) as file:
         text = file.text()
     intervals = Intervals()
     for line, sample in _items(path, text):
@@ -118,10 +117,10 @@ def read_sabre(path: StrPath) -> Knots:
 
 
 def _items(path: StrPath, text: str) -> Iterator[tuple[Line, object]]:
-    """What the list holds, one after the other, each with the line where it begins."""
+    """The items of the list, each with the line where it begins."""
     decoder = json.JSONDecoder(parse_constant=_no_constant)
     place = _after(path, text, 0, "[")
-    number, counted = 1, 0
+    number, counted = 1, 0  # lines are counted as far as `counted`
     more = text[place : place + 1] != "]"
     while more:
         number, counted = number + text.count("\n", counted, place), place
@@ -130,13 +129,13 @@ def _items(path: StrPath, text: str) -> Iterator[tuple[Line, object]]:
         except (ValueError, RecursionError) as error:
             raise _json_error(path, text, number, error) from error
         yield Line(path, number, text[place : min(end, place + _SHOWN_CHARACTERS)]), item
-        place = _space(text, end)
+        place = _skip_space(text, end)
         more = text[place : place + 1] != "]"
         if more:
             place = _after(path, text, place, ",")
     end = _after(path, text, place, "]")
     if end < len(text):
-        raise _text_error(path, text, end, "must be nothing after the list")
+        raise _error_at(path, text, end, "must be nothing after the list")
 
 
 def _add_sample(intervals: Intervals, line: Line, sample: object) -> None:
@@ -159,23 +158,23 @@ def _add_sample(intervals: Intervals, line: Line, sample: object) -> None:
     intervals.add(line, length_us, round(values[1] * length_us / 8000))
 
 
-def _space(text: str, place: int) -> int:
-    """Where the white space at `place` ends."""
-    found = _JSON_SPACE.match(text, place)
-    return place if found is None else found.end()
+def _skip_space(text: str, place: int) -> int:
+    """The end of the white space at `place`."""
+    space = _JSON_SPACE.match(text, place)
+    return place if space is None else space.end()
 
 
 def _after(path: StrPath, text: str, place: int, mark: str) -> int:
-    """Where what follows the mark begins; the mark must come next."""
-    place = _space(text, place)
+    """The place after the mark and the white space around it; the mark must come next."""
+    place = _skip_space(text, place)
     if text[place : place + 1] != mark:
-        raise _text_error(path, text, place, f"must be {mark!r}, for a list of objects")
-    return _space(text, place + 1)
+        raise _error_at(path, text, place, f"must be {mark!r}, for a list of objects")
+    return _skip_space(text, place + 1)
 
 
-def _text_error(path: StrPath, text: str, place: int, rule: str) -> TraceError:
-    shown = text[place : place + _SHOWN_CHARACTERS] or None
-    return TraceError(where(path, 1 + text.count("\n", 0, place), shown, rule))
+def _error_at(path: StrPath, text: str, place: int, rule: str) -> TraceError:
+    value = text[place : place + _SHOWN_CHARACTERS] or None
+    return fault(path, rule, line=1 + text.count("\n", 0, place), value=value)
 
 
 def _no_constant(name: str) -> NoReturn:
@@ -184,8 +183,7 @@ def _no_constant(name: str) -> NoReturn:
 
 def _json_error(path: StrPath, text: str, number: int, error: Exception) -> TraceError:
     if isinstance(error, json.JSONDecodeError):
-        return TraceError(
-            where(path, error.lineno, text[error.pos : error.pos + _SHOWN_CHARACTERS], f"must be JSON ({error.msg})")
-        )
-    told = "nested too deep" if isinstance(error, RecursionError) else str(error).partition(";")[0]
-    return TraceError(where(path, number, None, f"must be JSON ({told})"))
+        value = text[error.pos : error.pos + _SHOWN_CHARACTERS]
+        return fault(path, f"must be JSON ({error.msg})", line=error.lineno, value=value)
+    reason = "nested too deep" if isinstance(error, RecursionError) else str(error).partition(";")[0]
+    return fault(path, f"must be JSON ({reason})", line=number)

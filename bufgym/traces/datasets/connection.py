@@ -1,0 +1,117 @@
+"""A connection to an http or https server. Its failures are sorted into final ones and those worth another attempt.
+
+Proxies are taken from the environment, as usual. Redirections may lead to http and https addresses only.
+"""
+
+from __future__ import annotations
+
+import errno
+import http.client
+import socket
+import ssl
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO
+from urllib.error import HTTPError, URLError
+from urllib.parse import urlsplit
+
+from bufgym.errors import BufgymError
+
+_SHOWN_CHARACTERS = 200
+# Request timeout, too early, too many requests, and errors inside the server: they may pass.
+_PASSING_CODES = frozenset({408, 425, 429, 500, 502, 503, 504})
+
+
+class BrokenError(Exception):
+    """A failure that another attempt may put right."""
+
+    def __init__(self, reason: str, wait_s: float = 0.0, stale: bool = False) -> None:
+        """
+        Args:
+            reason: what happened.
+            wait_s: how long the server asks to wait, s.
+            stale: whether the part file no longer fits the server's file.
+        """
+        super().__init__(reason)
+        self.wait_s = wait_s
+        self.stale = stale
+
+
+def in_words(said: object) -> str:
+    """What a server or a library said, as one printable line of limited length."""
+    text = " ".join(str(said).split())
+    short = text if len(text) <= _SHOWN_CHARACTERS else text[:_SHOWN_CHARACTERS] + "..."
+    return (short if short.isprintable() else ascii(short)) or type(said).__name__
+
+
+class SafeRedirects(urllib.request.HTTPRedirectHandler):
+    """Follows redirections to http and https alone, and never from https back to http."""
+
+    def redirect_request(
+        self,
+        req: urllib.request.Request,
+        fp: IO[bytes],
+        code: int,
+        msg: str,
+        headers: http.client.HTTPMessage,
+        newurl: str,
+    ) -> urllib.request.Request | None:
+        scheme = urlsplit(newurl).scheme
+        if scheme not in ("http", "https") or (scheme == "http" and req.type == "https"):
+            raise HTTPError(newurl, code, f"redirects to {newurl}, which is not allowed", headers, fp)
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+@contextmanager
+def opened(request: urllib.request.Request, silence_s: float) -> Iterator[http.client.HTTPResponse]:
+    """The server's response with code 2xx, after redirections.
+
+    Args:
+        request: of an http or https address.
+        silence_s: give up when the server sends nothing for so long, s.
+
+    Raises:
+        BrokenError: worth another attempt.
+        BufgymError: not worth one.
+    """
+    try:
+        response = urllib.request.build_opener(SafeRedirects).open(request, timeout=silence_s)
+    except HTTPError as error:
+        error.close()
+        raise _refused(request.full_url, error) from None
+    except (OSError, http.client.HTTPException) as error:
+        raise _unreachable(request, error) from None
+    except ValueError as error:  # a redirection to something that is no host name
+        raise BufgymError(f"{request.full_url}: redirects to an invalid address ({in_words(error)})") from None
+    with response:
+        yield response
+
+
+def _refused(address: str, error: HTTPError) -> Exception:
+    reason = in_words(error.reason)
+    if error.code == 416:
+        return BrokenError("the part on disk no longer fits the server's file", stale=True)
+    if error.code in _PASSING_CODES:
+        wait = error.headers.get("Retry-After", "")
+        return BrokenError(f"the server says {error.code} {reason}", float(wait) if wait.isdecimal() else 0.0)
+    if error.code == 404:
+        return BufgymError(
+            f"{address}: no such file on the server (404); it may have moved: fetch it by hand, then use --from"
+        )
+    return BufgymError(f"{address}: the server says {error.code} {reason}")
+
+
+def _unreachable(request: urllib.request.Request, error: Exception) -> Exception:
+    address = request.full_url
+    reason = error.reason if isinstance(error, URLError) else error
+    if isinstance(reason, socket.gaierror):
+        return BufgymError(f"{address}: no network, or no such host as {request.host} ({reason.strerror})")
+    if isinstance(reason, ssl.SSLCertVerificationError):
+        return BufgymError(f"{address}: the server's certificate is not trusted ({reason.verify_message})")
+    if isinstance(reason, OSError) and reason.errno in (errno.ENETUNREACH, errno.ENETDOWN):
+        return BufgymError(f"{address}: no network ({reason.strerror})")
+    if isinstance(reason, TimeoutError):
+        return BrokenError("the server does not respond")
+    failure = "no connection" if isinstance(error, URLError) else "the connection broke"
+    return BrokenError(f"{failure} ({in_words(getattr(reason, 'strerror', None) or reason)})")

@@ -1,0 +1,126 @@
+"""Are generated links like the recordings? Each statistic of the recordings against its distribution under the model.
+
+For a mode, a *set* is as many generated traces as there are recordings, each as long as its counterpart. A statistic of
+the recordings is compared with the same statistic of many sets: the p-value is twice the smaller share of sets at or
+beyond it (a Monte Carlo test; A. C. Davison and D. V. Hinkley, "Bootstrap Methods and their Application", 1997, sec.
+4.2). Generated traces are correlated in time as the model says, so the test does not assume independent seconds, as a
+table of the Kolmogorov-Smirnov statistic would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from bufgym.traces.fit.fit import fit_links
+from bufgym.traces.fit.statistics import STATISTICS, Rows
+from bufgym.traces.generate.markov import link_rates
+from bufgym.traces.generate.parameters import LinkParameters
+from bufgym.traces.trace import Float64Array
+
+SETS: Final = 199
+KS_DISTANCE: Final = "KS distance"
+# Beyond the seeds that a fit uses for its trials.
+_FIRST_SEED: Final = 1_000_000
+
+
+@dataclass(frozen=True)
+class Row:
+    """One statistic, compared."""
+
+    name: str
+    """What it is, with its unit."""
+    real: float
+    """Its value for the recordings; NaN if not defined."""
+    median: float
+    """Median of the sets."""
+    low: float
+    """2.5 % quantile of the sets."""
+    high: float
+    """97.5 % quantile of the sets."""
+    p: float
+    """p-value, two-sided; for the KS distance, one-sided."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Each recording against links fitted to the others of its mode; of a single recording, its halves."""
+
+    parts: int
+    """How many recordings (or halves)."""
+    distance: float
+    """Median of their Kolmogorov-Smirnov distances from what those links generate."""
+    usual: float
+    """Median distance of a single generated trace."""
+    beyond: int
+    """Recordings farther off than 95 % of single generated traces."""
+
+
+def generated_sets(link: LinkParameters, rows: Rows, sets: int) -> list[list[Float64Array]]:
+    """`sets` times a generated trace for each recording, as long as the recording."""
+    n = len(rows)
+    return [[link_rates(link, _FIRST_SEED + k * n + i, len(row)) for i, row in enumerate(rows)] for k in range(sets)]
+
+
+def compare(link: LinkParameters, rows: Rows, sets: int = SETS) -> list[Row]:
+    """A row for each of `STATISTICS`, and one for the distance of the whole distribution."""
+    generated = generated_sets(link, rows, sets)
+    compared = []
+    for name, statistic in STATISTICS.items():
+        compared.append(_row(name, statistic(rows), [statistic(traces) for traces in generated]))
+    pooled = np.sort(np.concatenate([row for traces in generated for row in traces]))
+    distances = [ks_distance(np.concatenate(traces), pooled) for traces in generated]
+    real = ks_distance(np.concatenate(rows), pooled)
+    p = (1 + sum(distance >= real for distance in distances)) / (sets + 1)
+    return [*compared, Row(KS_DISTANCE, real, *_middle(distances), p)]
+
+
+def held_out(mode: str, rows: Rows, sets: int = SETS) -> HeldOut:
+    """How far recordings are from links that were fitted without them."""
+    parts = list(rows) if len(rows) > 1 else [np.array(half) for half in np.array_split(rows[0], 2)]
+    distances, usual, beyond = [], [], 0
+    for k, part in enumerate(parts):
+        link = fit_links({mode: parts[:k] + parts[k + 1 :]})[mode]
+        generated = [traces[0] for traces in generated_sets(link, [part], sets)]
+        pooled = np.sort(np.concatenate(generated))
+        single = [ks_distance(trace, pooled) for trace in generated]
+        distances.append(ks_distance(part, pooled))
+        usual += single
+        beyond += bool(distances[-1] > np.quantile(single, 0.95))
+    return HeldOut(len(parts), float(np.median(distances)), float(np.median(usual)), beyond)
+
+
+def ks_distance(values: Float64Array, others: Float64Array) -> float:
+    """Greatest distance between the cumulative distributions of two samples; `others` float64[m] is sorted."""
+    ordered = np.sort(values)
+    # Between two of `values` their distribution is flat and the other only grows, so the greatest distance is at one of
+    # them or just before it.
+    return max(_distance_at(ordered, others, "left"), _distance_at(ordered, others, "right"))
+
+
+def _distance_at(ordered: Float64Array, others: Float64Array, side: Literal["left", "right"]) -> float:
+    share = np.searchsorted(ordered, ordered, side=side) / ordered.size
+    other_share = np.searchsorted(others, ordered, side=side) / others.size
+    return float(np.abs(share - other_share).max())
+
+
+def _row(name: str, real: float, generated: Sequence[float]) -> Row:
+    """Sets where the statistic is NaN (no outages, say) are left out; a NaN of the recordings has no p-value."""
+    values = np.array([value for value in generated if not np.isnan(value)])
+    if np.isnan(real) or not values.size:
+        return Row(name, real, *_middle(values), np.nan)
+    # A difference in the last digits, from adding in another order, is none.
+    tolerance = 1e-9 * max(1.0, abs(real))
+    at_most, at_least = int((values <= real + tolerance).sum()), int((values >= real - tolerance).sum())
+    return Row(name, real, *_middle(values), min(1.0, 2 * (1 + min(at_most, at_least)) / (values.size + 1)))
+
+
+def _middle(values: Float64Array | list[float]) -> tuple[float, float, float]:
+    """Median, 2.5 % and 97.5 % quantile; NaN of no values."""
+    if not len(values):
+        return np.nan, np.nan, np.nan
+    low, median, high = np.quantile(values, [0.025, 0.5, 0.975])
+    return float(median), float(low), float(high)

@@ -1,0 +1,27 @@
+"""Errors about files, in the form that all readers and writers share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+
+from bufgym.errors import TraceError, where
+
+StrPath = str | PathLike[str]
+
+
+def fault(
+    path: StrPath, rule: str, *, line: int | None = None, value: object | None = None, field: str | None = None
+) -> TraceError:
+    """The error to raise about a file; the arguments are those of `bufgym.errors.where`."""
+    return TraceError(where(path, line, value, rule, field=field))
+
+
+@contextmanager
+def os_errors(path: StrPath, action: str, line: int | None = None) -> Iterator[None]:
+    """Turn an OSError into a TraceError: the file "cannot be read" (or whatever the action is), and why."""
+    try:
+        yield
+    except OSError as error:
+        raise fault(path, f"cannot be {action}: {error.strerror or error}", line=line) from error

@@ -1,0 +1,136 @@
+"""Intervals that follow each other, each with its length and its bytes: what the readers of measurements share."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.text import Line
+from bufgym.traces.trace import MAX_DURATION_S, PRODUCT_LIMIT, US_PER_S, Int64Array
+
+MAX_INTERVAL_BYTES: Final = 10**12
+
+# A rate that would have to hold for longer is a gap in the recording, across which nothing is known.
+MAX_HOLD_S: Final = 86_400
+
+
+class Knots(NamedTuple):
+    """A capacity as it was read.
+
+    Attributes:
+        time_us: int64[K], microseconds, from 0.
+        cumulative_bytes: int64[K], bytes up to each time, from 0.
+        note: what the trace's `source` should say about the reading; empty for nothing.
+    """
+
+    time_us: Int64Array
+    cumulative_bytes: Int64Array
+    note: str = ""
+
+
+class Intervals:
+    """Measurements that follow each other, collected and checked one at a time."""
+
+    def __init__(self) -> None:
+        self._us = array("q")
+        self._bytes = array("q")
+        self._end_us: int | None = None
+
+    def add(self, line: Line, length_us: int, count: int) -> None:
+        """Add an interval of `length_us` > 0 in which `count` >= 0 bytes were transmitted."""
+        if count > MAX_INTERVAL_BYTES:
+            raise line.error(count, f"must be at most {MAX_INTERVAL_BYTES} in an interval", "bytes")
+        if length_us * count >= PRODUCT_LIMIT:
+            raise line.error(length_us * count, "must be below 2**62", "bytes x microseconds of the interval")
+        self._us.append(length_us)
+        self._bytes.append(count)
+
+    def add_ending_at(self, line: Line, end_ms: str, length_ms: str, count: str) -> None:
+        """Add an interval given as text. It must begin where the one before ended.
+
+        Across a gap the capacity is unknown, and bufgym invents none.
+        """
+        end_us = line.milliseconds("time in ms", end_ms, MAX_DURATION_S)
+        length_us = line.milliseconds("interval in ms", length_ms, MAX_DURATION_S)
+        bytes_in_interval = line.whole("bytes", count, MAX_INTERVAL_BYTES)
+        start_us = end_us - length_us
+        if length_us == 0:
+            raise line.error(0, "must be above 0", "interval in ms")
+        if start_us < 0:
+            raise line.error(f"{length_us / 1000:g}", "must not begin before time 0", "interval in ms")
+        if self._end_us is not None and start_us != self._end_us:
+            rule = f"must begin where the line above ended ({self._end_us / 1000:.10g} ms)"
+            raise line.error(f"{start_us / 1000:.10g}", rule, "start in ms")
+        self._end_us = end_us
+        self.add(line, length_us, bytes_in_interval)
+
+    def median_us(self) -> int:
+        """The median length, microseconds."""
+        return round(float(np.median(np.asarray(self._us))))
+
+    def __len__(self) -> int:
+        return len(self._us)
+
+    def knots(self, path: StrPath, note: str = "") -> Knots:
+        """The capacity of all intervals together.
+
+        Raises:
+            TraceError: there is none, or they last beyond MAX_DURATION_S.
+        """
+        if not self._us:
+            raise fault(path, "holds no measurement: must hold at least one")
+        columns = (np.asarray(column, np.int64) for column in (self._us, self._bytes))
+        time_us, cumulative = (np.append(0, np.cumsum(column)) for column in columns)
+        if time_us[-1] > MAX_DURATION_S * US_PER_S:
+            duration_s = f"{time_us[-1] / US_PER_S:g}"
+            raise fault(path, f"must be at most {MAX_DURATION_S}", value=duration_s, field="duration in s")
+        return Knots(time_us, cumulative, note)
+
+
+class Rate(NamedTuple):
+    """The rate from some time on.
+
+    Attributes:
+        line: where it is stated.
+        time: its time as it is written in the line.
+        start_us: its time, microseconds.
+        bytes_per_us: bytes a microsecond.
+    """
+
+    line: Line
+    time: str
+    start_us: int
+    bytes_per_us: float
+
+
+def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
+    """The capacity when each rate holds until the next line's time, and the last one for the median interval.
+
+    The first time becomes 0. Of lines with the same time (30 of the Lumos5G files have some) the last counts. Each
+    interval's bytes are rounded to a whole number, so the total is off by at most half a byte a line.
+    """
+    intervals = Intervals()
+    previous: Rate | None = None
+    for rate in rates:
+        if previous is not None:
+            length_us = rate.start_us - previous.start_us
+            above = f"the line above ({previous.start_us / US_PER_S:.10g})"
+            if length_us < 0:
+                raise rate.line.error(rate.time, f"must not be before {above}", "time in s")
+            if length_us > MAX_HOLD_S * US_PER_S:
+                raise rate.line.error(rate.time, f"must be at most {MAX_HOLD_S} s after {above}", "time in s")
+            if length_us > 0:
+                intervals.add(previous.line, length_us, round(previous.bytes_per_us * length_us))
+        previous = rate
+    if previous is None:
+        raise fault(path, "is empty: must hold a line for each sample")
+    if not len(intervals):
+        line = previous.line
+        raise line.error(line.text, "must have a second line: how long a single rate holds is unknown")
+    length_us = intervals.median_us()
+    intervals.add(previous.line, length_us, round(previous.bytes_per_us * length_us))
+    return intervals.knots(path)

@@ -1,0 +1,68 @@
+"""Motion from files: camera trajectories (see `trajectories`), or CSV of finished coordinates, header `t_s,motion`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.links import trace_name
+from bufgym.traces.formats.text import Line, is_header, open_text, write_text
+from bufgym.traces.formats.trajectories import read_poses, read_rows, seconds
+from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
+from bufgym.traces.trace import US_PER_S
+
+MOTION_HEADER: Final = "t_s,motion"
+
+MAX_COORDINATE: Final = 1e9
+
+
+def read_motion(
+    path: StrPath, settings: MotionSettings | None = None, *, format: str | None = None, times: StrPath | None = None
+) -> Motion:
+    """Read a trajectory (TUM, EuRoC, KITTI) or a `t_s,motion` CSV, plain or gzip'd, recognised by the first line.
+
+    The first time becomes 0. A CSV holds finished coordinates, which are used as they are, minus the first. Stretches
+    without a pose are bridged and listed in `Motion.gaps`.
+
+    Args:
+        path: the file.
+        settings: how the motion of a trajectory is measured, by default `MotionSettings()`.
+        format, times: of a trajectory, see `trajectories.read_poses`.
+
+    Raises:
+        TraceError: the file cannot be read, or a line breaks a rule of its format. The message names the file, the
+            line, the value and the rule.
+        BufgymError: a format that does not exist.
+    """
+    with open_text(path) as file:
+        first = next((line for line in file.lines() if not line.text.startswith("#")), None)
+    if first is None:
+        raise fault(path, "is empty: must hold a trajectory or a motion recording")
+    if format is None and times is None and is_header(first.text, MOTION_HEADER):
+        time_us, values = read_rows(path, _motion_row, skip=first.number)
+        return Motion(trace_name(path), time_us, values[:, 0] - values[0, 0], f"{path} ({MOTION_HEADER})")
+    poses = read_poses(path, format=format, times=times)
+    source = f"{path} (trajectory, format {poses.format})"
+    return motion_from_poses(poses, settings, name=trace_name(path), source=source)
+
+
+def write_motion_csv(motion: Motion, path: StrPath) -> None:
+    """Write `t_s,motion`; `read_motion` gives back the same times and coordinates, bit for bit.
+
+    Raises:
+        TraceError: the file cannot be written.
+    """
+    rows = (
+        f"{t // US_PER_S}.{t % US_PER_S:06d}".rstrip("0").rstrip(".") + f",{x!r}\n"
+        for t, x in zip(motion.time_us.tolist(), motion.coordinate.tolist(), strict=True)
+    )
+    write_text(path, [MOTION_HEADER + "\n"], rows)
+
+
+def _motion_row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
+    """Time, then the coordinate, which must not decrease."""
+    time, text = line.columns(2, ",")
+    value = line.decimal("motion", text, 0, MAX_COORDINATE)
+    if previous is not None and value < previous[0]:
+        raise line.error(text, f"must not be below the line above ({previous[0]!r})", "motion")
+    return time, seconds(line, time), [value]

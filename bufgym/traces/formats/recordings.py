@@ -1,0 +1,138 @@
+"""A robot's recording as a workload: the messages of some topics in one queue, with x from its odometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bufgym.errors import BufgymError
+from bufgym.traces.formats import bags
+from bufgym.traces.formats.faults import StrPath
+from bufgym.traces.formats.links import trace_name
+from bufgym.traces.formats.workloads import read_workload_csv
+from bufgym.traces.motion import MotionSettings, motion_from_poses
+from bufgym.traces.poses import gaps_between, longest_s
+from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
+from bufgym.traces.workload import Workload
+
+
+def read_workload(
+    path: StrPath,
+    *,
+    topics: Sequence[str] | None = None,
+    odom: str | None = None,
+    settings: MotionSettings | None = None,
+    bridge_gaps: bool = False,
+) -> Workload:
+    """Read a recording of a robot (see `bags.read_bag`) or a workload CSV, recognised by the first bytes.
+
+    Args:
+        path: the file or folder.
+        topics: names, or patterns such as ``/camera/*``; by default all. They share one queue.
+        odom: the topic whose motion gives x (recordings only; see `bags.read_bag`).
+        settings: how motion is measured, by default `MotionSettings()`.
+        bridge_gaps: take motion across a gap as the straight way from its first pose to its last (before the first
+            pose and after the last: none); otherwise a gap is an error.
+
+    Raises:
+        TraceError: a file that cannot be read, or breaks a rule of its format.
+        BufgymError: an unknown topic, no message, or gaps without `bridge_gaps`.
+    """
+    if not bags.is_bag(path):
+        if odom is not None:
+            raise BufgymError(f"{path}: odom = {odom!r}: needs a recording, which this is not")
+        return _with_topics(read_workload_csv(path), topics)
+    return workload_from_bag(bags.read_bag(path, odom), topics=topics, settings=settings, bridge_gaps=bridge_gaps)
+
+
+def workload_from_bag(
+    bag: bags.Bag,
+    *,
+    topics: Sequence[str] | None = None,
+    settings: MotionSettings | None = None,
+    bridge_gaps: bool = False,
+) -> Workload:
+    """The messages of these topics, with x from the bag's poses if it was read with some. See `read_workload`."""
+    settings = settings or MotionSettings()
+    names = bags.matching(bag.path, list(bag.topics), topics)
+    numbers = [list(bag.topics).index(name) for name in names]
+    chosen = np.isin(bag.topic, numbers)
+    if not chosen.any():
+        raise BufgymError(f"{bag.path}: no message on {', '.join(names) or 'any topic'}")
+    time_ns = bag.time_ns[chosen]
+    x, gaps = _motion_at(time_ns, bag, settings, bridge_gaps)
+    source = f"{bag.path} ({bag.kind})"
+    if bag.poses is not None:
+        measured = f"{settings.fov_deg:g} degrees, {settings.scene_scale_m:g} m"
+        source = f"{bag.path} ({bag.kind}, motion from {bag.poses.format}: {measured})"
+    return Workload(
+        trace_name(str(bag.path).removesuffix(".mcap").removesuffix(".bag").removesuffix(".db3")),
+        (time_ns - time_ns[0]) // 1000,
+        bag.size_bytes[chosen],
+        _renumbered(bag.topic[chosen], numbers, len(bag.topics)),
+        tuple(names),
+        x,
+        source,
+        gaps,
+    )
+
+
+def _motion_at(
+    time_ns: Int64Array, bag: bags.Bag, settings: MotionSettings, bridge_gaps: bool
+) -> tuple[Float64Array | None, tuple[tuple[int, int], ...]]:
+    """x of messages at these times, from 0, and the gaps in the poses between them; None without poses."""
+    if bag.poses is None:
+        return None, ()
+    motion = motion_from_poses(bag.poses, settings)
+    time_us = (time_ns - bag.poses_from_ns) // 1000
+    gaps = _gaps(time_us, bag.poses.time_us, settings.max_gap_s)
+    if gaps and not bridge_gaps:
+        start, _ = max(gaps, key=lambda gap: gap[1] - gap[0])
+        count = f"{len(gaps)} gaps" if len(gaps) > 1 else "a gap"
+        raise BufgymError(
+            f"{bag.path}: {bag.poses.format} has {count} of more than {settings.max_gap_s:g} s without a pose, the "
+            f"longest {longest_s(gaps):.1f} s, at {start / US_PER_S:.1f} s: say --bridge-gaps (bridge_gaps=True) to "
+            "take motion across as even, or choose other odometry"
+        )
+    # Before the first pose and after the last no motion is known: np.interp holds its ends.
+    x = np.interp(time_us, motion.time_us, motion.coordinate)
+    return x - x[0], gaps
+
+
+def _gaps(arrival_us: Int64Array, pose_us: Int64Array, max_gap_s: float) -> tuple[tuple[int, int], ...]:
+    """Stretches without a pose from the first message to the last, in microseconds from the first message."""
+    first, last = int(arrival_us[0]), int(arrival_us[-1])
+    inside = pose_us[(pose_us > first) & (pose_us < last)]
+    # Motion before the first message does not matter, but the last pose before it tells where that message is.
+    before = first if pose_us[0] > first else int(pose_us[pose_us <= first][-1])
+    after = last if pose_us[-1] < last else int(pose_us[pose_us >= last][0])
+    edges_us = np.concatenate([[before], inside, [after]])
+    return tuple((start - first, end - first) for start, end in gaps_between(edges_us, max_gap_s))
+
+
+def _with_topics(workload: Workload, patterns: Sequence[str] | None) -> Workload:
+    """The workload with these topics alone; its clock and its x begin with their first message."""
+    if patterns is None:
+        return workload
+    assert workload.topic is not None
+    names = bags.matching(workload.source, workload.topics, patterns)
+    numbers = [workload.topics.index(name) for name in names]
+    chosen = np.isin(workload.topic, numbers)
+    arrival_us = workload.arrival_us[chosen]
+    return replace(
+        workload,
+        arrival_us=arrival_us - arrival_us[0],
+        size_bytes=workload.size_bytes[chosen],
+        topic=_renumbered(workload.topic[chosen], numbers, len(workload.topics)),
+        topics=tuple(names),
+        x=None if workload.x is None else workload.x[chosen] - workload.x[chosen][0],
+    )
+
+
+def _renumbered(topic: Int64Array, numbers: Sequence[int], count: int) -> Int64Array:
+    """Topics by their place in `numbers`, int64[n]."""
+    place = np.zeros(count, np.int64)
+    place[list(numbers)] = np.arange(len(numbers))
+    return np.asarray(place[topic], dtype=np.int64)

@@ -1,0 +1,272 @@
+"""Text files, written completely or not at all, and read with bounds: plain, gzip'd, or a zip archive's member.
+
+Every reader gets its lines from here, so that a directory, a truncated download, a binary file or a compression bomb
+ends in the same clear `TraceError` whatever the format. The limits are 4 GiB of text after decompression, 10**7 lines
+(Mahimahi, which is read in blocks, has no limit for lines of bare numbers), 4096 characters a line, and 16 MiB for
+JSON, which is held as a whole.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import itertools
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import IO, Final, NamedTuple
+
+from bufgym.errors import TraceError
+from bufgym.files import replaced
+from bufgym.traces.formats.archives import ZIP_MAGIC, damage_errors, open_member, split_member
+from bufgym.traces.formats.faults import StrPath, fault, os_errors
+
+# Text after decompression; reading stops as soon as there is more.
+MAX_TEXT_BYTES: Final = 4 * 2**30
+MAX_LINE_CHARACTERS: Final = 4096
+MAX_LINES: Final = 10**7
+MAX_JSON_BYTES: Final = 16 * 2**20
+
+_GZIP_MAGIC = b"\x1f\x8b"
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+_PIECE_BYTES = 2**20
+# int() and float() accept more than a data file should hold: "1_000", "infinity", digits of other scripts.
+_WHOLE = re.compile(r"[0-9]+")
+_NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_MILLISECONDS = re.compile(r"([0-9]+)(?:\.([0-9]{1,3})0*)?")
+
+
+def is_number(text: str) -> bool:
+    """Whether `text` is a plain finite decimal number."""
+    return _NUMBER.fullmatch(text) is not None
+
+
+def split_cells(text: str) -> list[str]:
+    """The cells between commas, without white space around them."""
+    return [cell.strip() for cell in text.split(",")]
+
+
+def is_header(text: str, header: str) -> bool:
+    """Whether a line is that header of comma-separated names, whatever blanks are around the names."""
+    return ",".join(split_cells(text)) == header
+
+
+class Line(NamedTuple):
+    """A line of a file, with methods that parse its cells.
+
+    Each method raises a TraceError that names file, line, value and rule.
+
+    Attributes:
+        path: the file.
+        number: of the line, counted from 1.
+        text: of the line, without surrounding white space.
+    """
+
+    path: StrPath
+    number: int
+    text: str
+
+    def error(self, value: object | None, rule: str, field: str | None = None) -> TraceError:
+        """The error to raise about this line."""
+        return fault(self.path, rule, line=self.number, value=value, field=field)
+
+    def columns(self, count: int, separator: str | None = None) -> list[str]:
+        """The line's cells, of which there must be `count`; separated by white space unless a separator is given."""
+        cells = [cell.strip() for cell in self.text.split(separator)]
+        if len(cells) != count:
+            raise self.error(self.text, f"must have {count} columns, has {len(cells)}")
+        return cells
+
+    def whole(self, field: str, text: str, most: int) -> int:
+        """A whole number from 0 to `most`."""
+        if not _WHOLE.fullmatch(text):
+            raise self.error(text, "must be a whole number >= 0", field)
+        value = int(text)
+        if value > most:
+            raise self.error(text, f"must be at most {most}", field)
+        return value
+
+    def decimal(self, field: str, text: str, least: float, most: float) -> float:
+        """A finite number from `least` to `most`."""
+        if not _NUMBER.fullmatch(text):
+            raise self.error(text, "must be a finite number", field)
+        value = float(text)
+        if not least <= value <= most:
+            raise self.error(text, f"must be from {least:g} to {most:g}", field)
+        return value
+
+    def milliseconds(self, field: str, text: str, most_s: int) -> int:
+        """A time >= 0 in ms with at most three decimals, as exact microseconds."""
+        match = _MILLISECONDS.fullmatch(text)
+        if not match:
+            raise self.error(text, "must be a number of ms >= 0 with at most 3 decimals", field)
+        value = int(match[1]) * 1000 + int((match[2] or "").ljust(3, "0"))
+        if value > most_s * 1_000_000:
+            raise self.error(text, f"must be at most {most_s} s", field)
+        return value
+
+
+@contextmanager
+def open_text(path: StrPath) -> Iterator[TextFile]:
+    """Open a text file for one pass: plain, gzip or zip, recognised by its first bytes whatever its name.
+
+    Raises:
+        TraceError: missing, not a regular file, unreadable; a zip of several members of which none is named (as in
+            `archive.zip:member`).
+    """
+    with ExitStack() as stack:
+        with os_errors(path, "opened"):
+            file, member = split_member(path)
+            raw = stack.enter_context(_open(path, file))
+            stream: IO[bytes] = raw
+            magic = raw.peek(4)[:4]
+            packing = "plain"
+            if magic.startswith(ZIP_MAGIC):
+                packing = "zip"
+                stream = stack.enter_context(io.BufferedReader(open_member(path, raw, member)))
+            elif member is not None:
+                raise fault(path, f"{file} is no zip archive: cannot have members")
+            elif magic.startswith(_GZIP_MAGIC):
+                packing = "gzip"
+                stream = stack.enter_context(io.BufferedReader(gzip.GzipFile(fileobj=raw)))
+        yield TextFile(path, stream, packing)
+
+
+class TextFile:
+    """An open text file. Use one of `lines`, `first`, `text` and `read`; all of them respect the module's limits.
+
+    Raises:
+        TraceError: unreadable, damaged or truncated gzip or zip data, more than MAX_TEXT_BYTES.
+    """
+
+    def __init__(self, path: StrPath, stream: IO[bytes], packing: str) -> None:
+        """
+        Args:
+            path: the file's name, for error messages.
+            stream: its bytes after decompression.
+            packing: "plain", "gzip" or "zip", for error messages.
+        """
+        self.path = path
+        self._stream = stream
+        self._packing = packing
+        self._read_bytes = 0
+
+    def read(self, count: int, line: int) -> bytes:
+        """Up to `count` bytes, empty at the end; `line` is the line number for error messages."""
+        return self._take(count, line, whole_line=False)
+
+    def lines(self) -> Iterator[Line]:
+        """The lines that are not blank, numbered from 1, without surrounding white space.
+
+        Raises:
+            TraceError: also for a line over MAX_LINE_CHARACTERS, a line that is not UTF-8, and more than MAX_LINES
+                lines, blank ones included.
+        """
+        for number, raw in self._raw_lines():
+            line = parsed_line(self.path, number, raw)
+            if len(raw) > MAX_LINE_CHARACTERS and not raw.endswith(b"\n"):
+                raise _too_long(line)
+            if line.text:
+                yield line
+
+    def first(self) -> Line | None:
+        """The first line that is not blank, None in an empty file.
+
+        JSON may be a single line of any length, so only its opening bracket is returned.
+        """
+        for number, raw in self._raw_lines():
+            bracket = raw.lstrip()[:1]
+            if bracket in (b"[", b"{"):
+                return Line(self.path, number, bracket.decode())
+            line = parsed_line(self.path, number, raw)
+            if line.text:
+                return line
+        return None
+
+    def text(self, most: int = MAX_JSON_BYTES) -> str:
+        """All of it, at most `most` bytes.
+
+        Raises:
+            TraceError: also if it is longer than `most`, or not UTF-8.
+        """
+        content = bytearray()
+        while piece := self._take(_PIECE_BYTES, content.count(b"\n") + 1, whole_line=False):
+            content += piece
+            if len(content) > most:
+                rule = f"more than {most} bytes of JSON: must be at most"
+                raise fault(self.path, rule, line=content.count(b"\n") + 1)
+        try:
+            return content.decode("utf-8")
+        except UnicodeDecodeError as error:
+            line = content.count(b"\n", 0, error.start) + 1
+            value = bytes(content[error.start : error.start + 20])
+            raise fault(self.path, "must be UTF-8 text", line=line, value=value) from error
+
+    def _raw_lines(self) -> Iterator[tuple[int, bytes]]:
+        """Each line's number and bytes; of a line that is too long, the first bytes, as many as show that it is."""
+        for number in itertools.count(1):
+            # Two more than the limit, so that a line of just that length still comes with its end ("\r\n").
+            raw = self._take(MAX_LINE_CHARACTERS + 2, number, whole_line=True)
+            if not raw:
+                return
+            if number > MAX_LINES:
+                raise fault(self.path, f"more than {MAX_LINES} lines: must be fewer", line=number)
+            yield number, raw
+
+    def _take(self, count: int, line: int, whole_line: bool) -> bytes:
+        with os_errors(self.path, "read", line), damage_errors(self.path, self._packing, line):
+            data = self._stream.readline(count) if whole_line else self._stream.read(count)
+        is_start = self._read_bytes == 0
+        self._read_bytes += len(data)
+        if self._read_bytes > MAX_TEXT_BYTES:
+            raise fault(self.path, f"more than {MAX_TEXT_BYTES} bytes of text: must be less", line=line)
+        if is_start and data.startswith(_BYTE_ORDER_MARK):
+            # Some editors write it. It is no part of the text; a file of nothing else counts as a blank line.
+            return data.removeprefix(_BYTE_ORDER_MARK) or b"\n"
+        return data
+
+
+def parsed_line(path: StrPath, number: int, raw: bytes) -> Line:
+    """A line of bytes as text.
+
+    Raises:
+        TraceError: it is not UTF-8, or longer than MAX_LINE_CHARACTERS.
+    """
+    try:
+        line = Line(path, number, raw.decode("utf-8").strip())
+    except UnicodeDecodeError as error:
+        rule = f"must be UTF-8 text (byte {error.start + 1} is not)"
+        raise fault(path, rule, line=number, value=raw[:60]) from error
+    if len(line.text) > MAX_LINE_CHARACTERS:
+        raise _too_long(line)
+    return line
+
+
+def write_text(path: StrPath, *parts: Iterable[str]) -> None:
+    """Write all parts, one after the other, as UTF-8; or no file at all.
+
+    Raises:
+        TraceError: it cannot be written.
+    """
+    with (
+        os_errors(path, "written"),
+        replaced(Path(path)) as temporary,
+        temporary.open("w", encoding="utf-8", newline="\n") as file,
+    ):
+        for part in parts:
+            file.writelines(part)
+
+
+def _too_long(line: Line) -> TraceError:
+    return line.error(line.text, f"must be at most {MAX_LINE_CHARACTERS} characters")
+
+
+def _open(path: StrPath, file: Path) -> io.BufferedReader:
+    if file.is_dir():
+        raise fault(path, "is a directory: must be a file")
+    if not file.exists():
+        raise fault(path, "no such file")
+    if not file.is_file():
+        raise fault(path, "must be a regular file")
+    return file.open("rb")

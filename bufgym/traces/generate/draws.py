@@ -1,0 +1,44 @@
+"""What every generator draws from: uniform doubles of PCG64, and sums of twelve of them for a normal distribution.
+
+A seed gives the same bytes on every machine: sums are taken in a fixed order, products and square roots are exact to
+the last bit by IEEE 754, and results are rounded to whole bytes. Where a logarithm or a power is needed, its last bit
+may differ between C libraries; the rounding removes the difference.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from bufgym.errors import BufgymError
+from bufgym.traces.trace import Float64Array
+
+# Uniforms that make one nearly normal number: the variance of twelve is 1.
+NORMAL_UNIFORMS: Final = 12
+
+
+def stream(seed: int) -> np.random.Generator:
+    """The random numbers of a seed.
+
+    Raises:
+        BufgymError: a seed below 0.
+    """
+    if seed < 0:
+        raise BufgymError(f"seed = {seed}: must be >= 0")
+    return np.random.Generator(np.random.PCG64(seed))
+
+
+def second_stream(seed: int) -> np.random.Generator:
+    """A stream that never overlaps `stream(seed)`: the same generator, 2**127 draws ahead."""
+    stream(seed)  # checks the seed
+    return np.random.Generator(np.random.PCG64(seed).jumped())
+
+
+def nearly_normal(uniforms: Float64Array) -> Float64Array:
+    """float64[n, 12] of uniforms to float64[n] of mean 0 and standard deviation 1, within -6..6."""
+    total = uniforms[:, 0].copy()
+    # Column by column: `sum` may add in another order on another processor.
+    for k in range(1, NORMAL_UNIFORMS):
+        total += uniforms[:, k]
+    return total - 6.0

@@ -1,0 +1,79 @@
+"""Generate the traces that bufgym ships: `python -m bufgym.traces.generate.shipped traces/`.
+
+The models are in `lte.py` and `driving.py`; this file states which seeds and parameters are shipped.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Final
+
+from bufgym.errors import BufgymError
+from bufgym.traces.formats.faults import StrPath, os_errors
+from bufgym.traces.formats.motions import write_motion_csv
+from bufgym.traces.formats.writers import write_csv
+from bufgym.traces.generate.driving import drive_motion
+from bufgym.traces.generate.lte import LteMode, synthetic_lte
+
+# Mode and mean in bytes/s of lte-synthetic-<seed>.csv. The means lie around the 6.9 MB/s of 30 frames of 230 kB a
+# second: from a link that barely suits a robot to one where only breakdowns are a problem.
+SHIPPED_LTE: Final[tuple[tuple[LteMode, float], ...]] = (
+    ("walk", 8e6),
+    ("walk", 10e6),
+    ("walk", 12e6),
+    ("drive", 8e6),
+    ("drive", 10e6),
+    ("drive", 12e6),
+    ("train", 9e6),
+    ("train", 11e6),
+)
+SHIPPED_SEEDS_OF_MOTION: Final = (0, 1)
+SHIPPED_DURATION_S: Final = 300
+
+
+def shipped_calls() -> dict[str, str]:
+    """Name of each shipped file -> the call that generates it, with its seed."""
+    links = {
+        f"lte-synthetic-{seed}": f'synthetic_lte({seed}, {SHIPPED_DURATION_S}, {mean / 1e6:g}e6, "{mode}")'
+        for seed, (mode, mean) in enumerate(SHIPPED_LTE)
+    }
+    motions = {f"drive-{seed}": f"drive_motion({seed}, {SHIPPED_DURATION_S})" for seed in SHIPPED_SEEDS_OF_MOTION}
+    return motions | links
+
+
+def write_shipped(folder: StrPath) -> list[Path]:
+    """Write the shipped traces and motion recordings into `folder`, which is created if need be; their paths.
+
+    Raises:
+        TraceError: the folder or a file cannot be written.
+    """
+    folder = Path(folder)
+    with os_errors(folder, "created"):
+        folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for seed, (mode, mean_bytes_per_s) in enumerate(SHIPPED_LTE):
+        paths.append(folder / f"lte-synthetic-{seed}.csv")
+        write_csv(synthetic_lte(seed, SHIPPED_DURATION_S, mean_bytes_per_s, mode), paths[-1])
+    for seed in SHIPPED_SEEDS_OF_MOTION:
+        paths.append(folder / f"drive-{seed}.csv")
+        write_motion_csv(drive_motion(seed, SHIPPED_DURATION_S), paths[-1])
+    return paths
+
+
+def main(arguments: list[str]) -> int:
+    """Write the shipped files into the folder that is the one argument; the process's exit status."""
+    if len(arguments) != 1 or arguments[0].startswith("-"):
+        print("usage: python -m bufgym.traces.generate.shipped FOLDER", file=sys.stderr)
+        return 2
+    try:
+        for path in write_shipped(arguments[0]):
+            print(path)
+    except BufgymError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
