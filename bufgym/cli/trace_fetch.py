@@ -25,7 +25,12 @@ def add(commands: Commands) -> None:
     fetch.add_argument("--list", action="store_true", help="name the data sets, or all that is known of NAME")
     fetch.add_argument("--to", metavar="DIR", help="the folder for data sets, instead of the cache folder")
     fetch.add_argument(
-        "--from", dest="given", nargs="+", default=(), metavar="FILE", help="files fetched by hand: download nothing"
+        "--from",
+        dest="local_files",
+        nargs="+",
+        default=(),
+        metavar="FILE",
+        help="files fetched by hand: download nothing",
     )
 
 
@@ -47,7 +52,7 @@ def _fetch(options: argparse.Namespace) -> None:
         return
     bars = _Bars()
     try:
-        fetched = fetch_dataset(dataset, options.to, options.given, note=_note, watch=bars.watch)
+        fetched = fetch_dataset(dataset, options.to, options.local_files, note=_note, watch=bars.watch)
     finally:
         bars.close()
     print(f"{dataset.name}\n{columns([*_results(fetched), *_about(dataset)])}")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import inspect
 from collections.abc import Callable
-from typing import Any
 
 from bufgym.cli.options import Commands, Parser, command, count, least_0, natural, number, positive
 from bufgym.errors import BufgymError
@@ -30,57 +29,35 @@ def add(commands: Commands) -> None:
 def _add_links(kinds: Commands) -> None:
     link = _kind(kinds, "link", _link, "a mobile link as recorded in trams, trains, ... (or in WiFi)", "markov_link")
     link.add_argument("--mode", required=True, metavar="NAME", help="foot, bicycle, bus, tram, train, car, wifi-...")
-    link.add_argument(
-        "--mean",
-        type=positive,
-        dest="mean_bytes_per_s",
-        metavar="BYTES/S",
-        help="scale to this mean (default: as recorded)",
-    )
+    help = "scale to this mean (default: as recorded)"
+    link.add_argument("--mean", dest="mean_bytes_per_s", type=positive, metavar="BYTES/S", help=help)
     link.add_argument("--links", metavar="FILE", help="parameters made by 'bufgym trace fit' (default: bufgym's own)")
     states = _kind(kinds, "gilbert-elliott", _generate, "a link of two states, good and bad", "gilbert_elliott")
-    for state, bytes_per_s, mean_s in (("good", 10e6, 20.0), ("bad", 0.0, 2.0)):
-        name = f"{state}_bytes_per_s"
-        states.add_argument(
-            f"--{state}", type=least_0, dest=name, default=bytes_per_s, metavar="BYTES/S", help="(%(default)s)"
-        )
-        name = f"mean_{state}_s"
-        states.add_argument(
-            f"--mean-{state}", type=positive, dest=name, default=mean_s, metavar="S", help="mean stay (%(default)s)"
-        )
+    _option(states, "--good", "good_bytes_per_s", least_0, 10e6, "BYTES/S")
+    _option(states, "--bad", "bad_bytes_per_s", least_0, 0.0, "BYTES/S")
+    _option(states, "--mean-good", "mean_good_s", positive, 20.0, "S", "mean stay")
+    _option(states, "--mean-bad", "mean_bad_s", positive, 2.0, "S", "mean stay")
     path = _kind(kinds, "roaming", _roaming, "WiFi past access points, with hand-overs", "roaming")
-    path.add_argument("--access-points", type=count, default=4, metavar="N", help="in a row (%(default)s)")
-    path.add_argument("--spacing", type=positive, default=50.0, metavar="M", help="between them (%(default)s)")
-    path.add_argument("--speed", type=positive, default=1.0, metavar="M/S", help="of the robot (%(default)s)")
-    path.add_argument(
-        "--gap", type=least_0, default=1.0, metavar="S", help="without a link at a hand-over (%(default)s)"
-    )
+    _option(path, "--access-points", "access_points", count, 4, "N", "in a row")
+    _option(path, "--spacing", "spacing_m", positive, 50.0, "M", "between them")
+    _option(path, "--speed", "speed_m_per_s", positive, 1.0, "M/S", "of the robot")
+    _option(path, "--gap", "gap_s", least_0, 1.0, "S", "without a link at a hand-over")
 
 
 def _add_rules(kinds: Commands) -> None:
-    rate: dict[str, Any] = {"type": positive, "dest": "bytes_per_s", "default": 10e6, "metavar": "BYTES/S"}
     steady = _kind(kinds, "steady", _generate, "one rate throughout", "steady", seeded=False)
-    steady.add_argument("--rate", **rate, help="(%(default)s)")
+    _option(steady, "--rate", "bytes_per_s", positive, 10e6, "BYTES/S")
     help = "a rate that changes evenly (default: Robofleet's 100 to 4 Mbit/s)"
     ramp = _kind(kinds, "ramp", _generate, help, "ramp", seeded=False)
     ramp.set_defaults(duration_s=15.0)
-    for name, bytes_per_s in (("start", 12.5e6), ("end", 0.5e6)):
-        ramp.add_argument(
-            f"--{name}",
-            type=least_0,
-            dest=f"{name}_bytes_per_s",
-            default=bytes_per_s,
-            metavar="BYTES/S",
-            help="(%(default)s)",
-        )
+    _option(ramp, "--start", "start_bytes_per_s", least_0, 12.5e6, "BYTES/S")
+    _option(ramp, "--end", "end_bytes_per_s", least_0, 0.5e6, "BYTES/S")
     tunnel = command(kinds, "tunnel", _generate, "steady, fade, blackout, fade in, steady")
     tunnel.set_defaults(generator="tunnel")
     tunnel.add_argument("-o", "--out", required=True, metavar="FILE", help="the CSV to write")
-    tunnel.add_argument("--rate", **rate, help="outside (%(default)s)")
-    for name, seconds in (("before", 20.0), ("fade", 3.0), ("blackout", 10.0), ("recover", 2.0), ("after", 20.0)):
-        tunnel.add_argument(
-            f"--{name}", type=least_0, dest=f"{name}_s", default=seconds, metavar="S", help="its length (%(default)s)"
-        )
+    _option(tunnel, "--rate", "bytes_per_s", positive, 10e6, "BYTES/S", "outside")
+    for part, seconds in (("before", 20.0), ("fade", 3.0), ("blackout", 10.0), ("recover", 2.0), ("after", 20.0)):
+        _option(tunnel, f"--{part}", f"{part}_s", least_0, seconds, "S", "its length")
 
 
 def _add_motion(kinds: Commands) -> None:
@@ -89,8 +66,8 @@ def _add_motion(kinds: Commands) -> None:
     drive.add_argument("--turn", type=_range, metavar="LOW,HIGH", help="turn rates in place, degrees/s (30,60)")
     frames = _kind(kinds, "frames", _frames, "RGB-D frames whose sizes follow motion and detail (time_s,bytes,x)")
     frames.add_argument("--motion", metavar="FILE", help="a motion or trajectory, or a shipped name (default: drive)")
-    frames.add_argument("--rate-hz", type=positive, default=30.0, metavar="HZ", help="frames a second (%(default)s)")
-    frames.add_argument("--base", type=positive, default=230_000.0, metavar="BYTES", help="at rest (%(default)s)")
+    _option(frames, "--rate-hz", "rate_hz", positive, 30.0, "HZ", "frames a second")
+    _option(frames, "--base", "base_bytes", positive, 230_000.0, "BYTES", "at rest")
 
 
 def _kind(
@@ -105,12 +82,18 @@ def _kind(
     parser = command(kinds, name, function, help)
     parser.set_defaults(generator=generator)
     if seeded:
-        parser.add_argument("--seed", type=natural, default=0, metavar="N", help="whole number >= 0 (%(default)s)")
-    parser.add_argument(
-        "--duration", type=positive, dest="duration_s", default=300.0, metavar="S", help="length in s (%(default)s)"
-    )
+        _option(parser, "--seed", "seed", natural, 0, "N", "whole number >= 0")
+    _option(parser, "--duration", "duration_s", positive, 300.0, "S", "length in s")
     parser.add_argument("-o", "--out", required=True, metavar="FILE", help="the CSV to write")
     return parser
+
+
+def _option(
+    parser: Parser, flag: str, dest: str, type: Callable[[str], float], default: float, unit: str, help: str = ""
+) -> None:
+    """Add the option of a number, with its default stated in the help text."""
+    help = f"{help} (%(default)s)".strip()
+    parser.add_argument(flag, dest=dest, type=type, default=default, metavar=unit, help=help)
 
 
 def _range(text: str) -> tuple[float, float]:
@@ -148,12 +131,8 @@ def _link(options: argparse.Namespace) -> None:
 def _roaming(options: argparse.Namespace) -> None:
     from bufgym.traces import Corridor
 
-    options.corridor = Corridor(
-        access_points=options.access_points,
-        spacing_m=options.spacing,
-        speed_m_per_s=options.speed,
-        gap_s=options.gap,
-    )
+    names = ("access_points", "spacing_m", "speed_m_per_s", "gap_s")
+    options.corridor = Corridor(**{name: getattr(options, name) for name in names})
     _generate(options)
 
 
@@ -180,7 +159,7 @@ def _frames(options: argparse.Namespace) -> None:
         raise BufgymError(f"--duration x --rate-hz = {frames:g} frames: must be from 1 to 1e7")
     motion = load_motion(options.motion) if options.motion else drive_motion(options.seed, options.duration_s)
     arrival_us = np.rint(np.arange(int(frames)) * (1e6 / options.rate_hz)).astype(np.int64)
-    sizes = frame_sizes(arrival_us, motion, options.seed, FrameModel(base_bytes=options.base))
+    sizes = frame_sizes(arrival_us, motion, options.seed, FrameModel(base_bytes=options.base_bytes))
     x = motion.at(arrival_us)
     write_workload_csv(Workload("frames", arrival_us, sizes, x=x - x[0]), options.out)
     print(f"wrote {options.out}: {len(sizes)} frames, mean {sizes.mean() / 1e3:.1f} kB")

@@ -7,8 +7,8 @@ trace = markov_link("tram", seed=3)        # as recorded in trams
 motion = read_motion("freiburg1_desk.groundtruth.txt.gz")
 workload = read_workload("drive.mcap", topics=["/camera/*"], odom="/odom")
 
-`Trace`, `Motion` and `Workload` are here, with what `shipped` loads by name. `formats` reads and writes files,
-`generate` makes links, motions and frame sizes, `fit` fits links to recordings and compares both, and `datasets`
+This room holds `Trace`, `Motion` and `Workload`, and `shipped`, which loads them by name. `formats` reads and writes
+files, `generate` makes links, motions and frame sizes, `fit` fits links to recordings and compares both, and `datasets`
 fetches public recordings.
 """
 

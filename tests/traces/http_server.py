@@ -1,15 +1,24 @@
-"""An HTTP server for tests that cuts connections, lies, stalls and changes its mind."""
+"""An HTTP server for tests that cuts connections, lies, stalls and changes its mind; and a data set that it serves."""
 
 from __future__ import annotations
 
+import hashlib
 import http.server
 import random
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bufgym.traces.datasets.download import Patience
+from bufgym.traces.datasets.fetch import Fetched, fetch_dataset
+from bufgym.traces.datasets.table import Dataset, Remote
 
 DATA = random.Random(1).randbytes(300_000)
+SHA256 = hashlib.sha256(DATA).hexdigest()
+HASTY = Patience(attempts=3, first_wait_s=0.01, silence_s=0.3)
 
 
 @dataclass
@@ -119,3 +128,17 @@ def serving() -> Iterator[Site]:
         site.closing.set()
         server.shutdown()
         thread.join()
+
+
+def of(*remotes: Remote) -> Dataset:
+    return Dataset("mine", "My data", "noise", "none", "https://example.org/", None, "nobody", remotes)
+
+
+def get(site: Site, to: Path, sha256: str | None = SHA256, path: str = "data.bin", **options: Any) -> Fetched:
+    remote = Remote(path, f"{site.address}/data.bin", sha256)
+    return fetch_dataset(of(remote), to, patience=HASTY, **options)[0]
+
+
+def left(to: Path) -> list[str]:
+    """Names of the data set's files, hidden ones too."""
+    return sorted(path.name for path in (to / "mine").iterdir())

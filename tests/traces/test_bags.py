@@ -165,7 +165,7 @@ def test_odometry_that_is_none(tmp_path: Path, odom: str, says: str) -> None:
 
 def test_poses_that_are_none(tmp_path: Path) -> None:
     def bag(*data: bytes, encoding: str = "cdr") -> Path:
-        entries = [(k, "/odom", "nav_msgs/msg/Odometry", each) for k, each in enumerate(data)]
+        entries = [(k, "/odom", "nav_msgs/msg/Odometry", message) for k, message in enumerate(data)]
         return cases.write_mcap(tmp_path / "p.mcap", entries, encoding=encoding)
 
     good = cases.odometry(0, 0)

@@ -1,4 +1,4 @@
-"""The fit finds what the generator was told, and the comparison tells a link from one that is not it."""
+"""The fit recovers the generator's parameters, and the comparison distinguishes a link from other ones."""
 
 from __future__ import annotations
 
@@ -45,18 +45,18 @@ def rows_of(values: list[float]) -> list[Float64Array]:
     return [np.array(values)]
 
 
-def test_the_fit_finds_what_the_generator_was_told() -> None:
-    found = fit_links({"known": recordings()})["known"]
-    assert (found.recordings, found.seconds) == (20, 12_000)
+def test_the_fit_recovers_the_parameters_of_the_generator() -> None:
+    fitted = fit_links({"known": recordings()})["known"]
+    assert (fitted.recordings, fitted.seconds) == (20, 12_000)
     # Quantiles within a tenth; those of 5 and 95 % and beyond within a fifth, but for that of 1 %, which few of some
     # 400 levels reach.
-    wrong = np.abs(np.array(found.quantiles_bytes_per_s) / np.array(KNOWN.quantiles_bytes_per_s) - 1)
+    wrong = np.abs(np.array(fitted.quantiles_bytes_per_s) / np.array(KNOWN.quantiles_bytes_per_s) - 1)
     assert wrong[3:-3].max() < 0.1
     assert np.delete(wrong, 1).max() < 0.2
-    assert 0.55 <= found.place_share + found.level_share <= 0.85
-    assert 14 <= found.level_stay_s <= 56
-    assert found.fast_memory <= 0.6
-    outages = found.outages
+    assert 0.55 <= fitted.place_share + fitted.level_share <= 0.85
+    assert 14 <= fitted.level_stay_s <= 56
+    assert fitted.fast_memory <= 0.6
+    outages = fitted.outages
     assert outages is not None
     assert outages.spells > 100
     assert 0.3 <= outages.short_gap_share <= 0.7
@@ -104,8 +104,8 @@ def test_runs() -> None:
 
 def test_autocorrelation_by_hand() -> None:
     """1, -1, 1, -1 about 0: products at lag 1 are all -1, at lag 2 all 1, the variance is 1; no pair at lag 9."""
-    found, pairs = autocorrelation(rows_of([1.0, -1.0, 1.0, -1.0]), (1, 2, 9))
-    assert found.tolist() == [-1.0, 1.0, 0.0]
+    correlations, pairs = autocorrelation(rows_of([1.0, -1.0, 1.0, -1.0]), (1, 2, 9))
+    assert correlations.tolist() == [-1.0, 1.0, 0.0]
     assert pairs.tolist() == [3, 2, 0]
 
 
@@ -159,9 +159,9 @@ def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory()
 
 @pytest.mark.usefixtures("quick")
 def test_halves_of_a_single_recording_are_held_out() -> None:
-    found = held_out("one", [link_rates(KNOWN, 1, 600)], sets=19)
-    assert found.parts == 2
-    assert 0 < found.distance < 1
+    halves = held_out("one", [link_rates(KNOWN, 1, 600)], sets=19)
+    assert halves.parts == 2
+    assert 0 < halves.distance < 1
 
 
 # -------------------- the command

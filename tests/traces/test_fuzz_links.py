@@ -90,27 +90,27 @@ def ends_well(path: Path, format: str | None, column: str | None = None) -> bool
 
 
 def mutated(uniform: random.Random, data: bytes, others: list[bytes]) -> bytes:
-    found = bytearray(data)
+    mutant = bytearray(data)
     for _ in range(uniform.choice([0, 0, 1, 1, 1, 2, 4, 16])):
-        at, length = uniform.randrange(len(found) + 1), uniform.choice([1, 1, 3, 20, 200])
+        at, length = uniform.randrange(len(mutant) + 1), uniform.choice([1, 1, 3, 20, 200])
         match uniform.randrange(7):
-            case 0 if found:
-                found[at % len(found)] ^= 1 << uniform.randrange(8)
+            case 0 if mutant:
+                mutant[at % len(mutant)] ^= 1 << uniform.randrange(8)
             case 1:
-                del found[at : at + length]
+                del mutant[at : at + length]
             case 2:
-                found[at:at] = uniform.choice(ABSURD)
+                mutant[at:at] = uniform.choice(ABSURD)
             case 3:
-                found[at:at] = found[at : at + length] * uniform.choice([1, 2, 50])
+                mutant[at:at] = mutant[at : at + length] * uniform.choice([1, 2, 50])
             case 4:
                 other = uniform.choice(others)
                 place = uniform.randrange(len(other))
-                found[at : at + length] = other[place : place + length]
+                mutant[at : at + length] = other[place : place + length]
             case 5:
-                del found[at:]
+                del mutant[at:]
             case _:
-                found[at : at + 1] = uniform.choice([b"0", b"9", b"-", b".", b" ", b"\n", b",", b"e", b'"', b"}"])
-    return bytes(found)
+                mutant[at : at + 1] = uniform.choice([b"0", b"9", b"-", b".", b" ", b"\n", b",", b"e", b'"', b"}"])
+    return bytes(mutant)
 
 
 def packed(uniform: random.Random, data: bytes) -> bytes:
@@ -125,7 +125,7 @@ def packed(uniform: random.Random, data: bytes) -> bytes:
 
 def seeds() -> list[tuple[str, bytes]]:
     """A file of each format, and the beginnings of recorded ones."""
-    found = [(format, text.encode()) for format, text in SAMPLES.items()]
+    files = [(format, text.encode()) for format, text in SAMPLES.items()]
     named = os.environ.get("BUFGYM_SHARED_DATA")
     data = Path(named) if named else Path(__file__).resolve().parents[3] / "shared" / "data"
     for format, pattern in {
@@ -137,11 +137,11 @@ def seeds() -> list[tuple[str, bytes]]:
     }.items():
         for path in sorted(data.glob(pattern))[:3]:
             raw = path.read_bytes()
-            found.append((format, (gzip.decompress(raw) if path.suffix == ".gz" else raw)[:3000]))
+            files.append((format, (gzip.decompress(raw) if path.suffix == ".gz" else raw)[:3000]))
     for path in data.glob("ucc_5g/*.zip"):
         with zipfile.ZipFile(path) as archive, archive.open(members(path)[0]) as member:
-            found.append(("ucc", member.read(3000)))
-    return found
+            files.append(("ucc", member.read(3000)))
+    return files
 
 
 @pytest.mark.parametrize("batch", range(BATCHES))

@@ -109,10 +109,10 @@ def test_the_command_makes_the_shipped_files_byte_for_byte(tmp_path: Path) -> No
     command = [sys.executable, "-W", "error", "-m", "bufgym.traces.generate.shipped", str(tmp_path / "new")]
     done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
-    made = {path.name: path.read_bytes() for path in (tmp_path / "new").iterdir()}
+    written = {path.name: path.read_bytes() for path in (tmp_path / "new").iterdir()}
     kept = {path.name: path.read_bytes() for path in (ROOT / "traces").glob("*.csv")}
-    assert len(made) == len(SHIPPED_LTE) + 2
-    assert made == kept
+    assert len(written) == len(SHIPPED_LTE) + 2
+    assert written == kept
 
 
 def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
@@ -125,9 +125,9 @@ def test_shipped_traces_trouble_a_robot_but_not_always() -> None:
     for seed, (mode, mean) in enumerate(SHIPPED_LTE):
         trace = load(f"lte-synthetic-{seed}")
         assert trace.cumulative_bytes.tolist() == synthetic_lte(seed, 300, mean, mode).cumulative_bytes.tolist()
-        found = describe(trace)
-        assert found["duration_s"] == 300.0
-        assert 3 <= found["seconds_below_500KBps"] <= 45
+        summary = describe(trace)
+        assert summary["duration_s"] == 300.0
+        assert 3 <= summary["seconds_below_500KBps"] <= 45
         assert 30 <= trace.seconds_below(DEMAND_BYTES_PER_S) <= 150
 
 

@@ -157,9 +157,9 @@ def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, fl
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
-    found = quaternions(matrix[None])[0]
-    wanted = np.array([x, y, z, w])
-    assert min(np.abs(found - wanted).max(), np.abs(found + wanted).max()) < 1e-12
+    computed = quaternions(matrix[None])[0]
+    expected = np.array([x, y, z, w])
+    assert min(np.abs(computed - expected).max(), np.abs(computed + expected).max()) < 1e-12
 
 
 def lengths(path: Path, euroc: bool) -> float:

@@ -105,7 +105,7 @@ def test_same_trace_by_any_packing(tmp_path: Path, text: str, format: str) -> No
     plain = written(tmp_path, text)
     expected = read_trace(plain, format=format)
     assert detect_format(plain) == format
-    assert f"{format}, as told" in expected.source
+    assert f"{format}, requested" in expected.source
     dressed = {
         "gzip": gzip.compress(text.encode()),
         "Windows": text.replace("\n", "\r\n").encode(),

@@ -51,14 +51,14 @@ def table(shared_data: Path) -> Table:
 
 
 def compare(trace: Trace, expected: dict[str, float], rates: float, extremes: float, mean: float, s: float) -> None:
-    found = describe(trace)
-    assert set(found) == set(expected)
+    summary = describe(trace)
+    assert set(summary) == set(expected)
     for key, value in expected.items():
         if key == "min_KBps":
             value = LEAST_WITHOUT_LINES_OF_NO_LENGTH.get(trace.name, value)
         relative = {"mean_KBps": mean, "min_KBps": extremes, "max_KBps": extremes}.get(key, 0.0)
         absolute = ROUNDING + (rates if key.endswith("KBps") and key[0] == "m" else s)
-        assert found[key] == pytest.approx(value, rel=relative, abs=absolute), (trace.source, key)
+        assert summary[key] == pytest.approx(value, rel=relative, abs=absolute), (trace.source, key)
 
 
 @pytest.mark.parametrize("name", SETS)

@@ -50,11 +50,11 @@ bench --seconds 1 --fps 10 --seeds 1 --capacity 2 --policies afr,drop-oldest --f
 def test_each_file_is_made_by_the_call_that_is_stated() -> None:
     assert set(shipped_calls()) == set(shipped())
     for name, call in shipped_calls().items():
-        made: Any = eval(call, {"synthetic_lte": synthetic_lte, "drive_motion": drive_motion})
+        generated: Any = eval(call, {"synthetic_lte": synthetic_lte, "drive_motion": drive_motion})
         if name.startswith("drive-"):
-            assert np.array_equal(load_motion(name).coordinate, made.coordinate)
+            assert np.array_equal(load_motion(name).coordinate, generated.coordinate)
         else:
-            assert np.array_equal(load(name).cumulative_bytes, made.cumulative_bytes)
+            assert np.array_equal(load(name).cumulative_bytes, generated.cumulative_bytes)
         assert f"({name.split('-')[-1]}," in call  # the seed
 
 

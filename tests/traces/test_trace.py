@@ -35,8 +35,8 @@ def test_after_the_end(after: str, rate: float) -> None:
 
 
 def test_describe_counts_low_seconds_and_their_longest_run() -> None:
-    found = describe(STORY)
-    assert found == {
+    summary = describe(STORY)
+    assert summary == {
         "duration_s": 4.0,
         "mean_KBps": 575.0,
         "min_KBps": 0.0,
@@ -49,17 +49,17 @@ def test_describe_counts_low_seconds_and_their_longest_run() -> None:
 def test_describe_leaves_short_samples_out_of_the_minimum_only() -> None:
     # Three samples of 1 s and a stray one of 0.1 s without a byte.
     trace = Trace.from_intervals([1_000_000, 100_000, 1_000_000, 1_000_000], [600_000, 0, 700_000, 800_000])
-    found = describe(trace)
-    assert (found["min_KBps"], found["max_KBps"]) == (600.0, 800.0)
-    assert found["seconds_below_500KBps"] == found["longest_run_below_500KBps_s"] == 0.1
+    summary = describe(trace)
+    assert (summary["min_KBps"], summary["max_KBps"]) == (600.0, 800.0)
+    assert summary["seconds_below_500KBps"] == summary["longest_run_below_500KBps_s"] == 0.1
 
 
 def test_a_trace_of_single_packets_is_described_by_whole_seconds() -> None:
     # A packet of 1500 bytes in the first ms of every 10 ms, for 2.5 s: 150 KB/s, by rates of 0 and 1500 KB/s.
     trace = Trace.from_intervals([1000, 9000] * 250, [1500, 0] * 250)
-    found = describe(trace)
-    assert found["duration_s"] == 2.0
-    assert found["min_KBps"] == found["max_KBps"] == found["mean_KBps"] == pytest.approx(150.0)
+    summary = describe(trace)
+    assert summary["duration_s"] == 2.0
+    assert summary["min_KBps"] == summary["max_KBps"] == summary["mean_KBps"] == pytest.approx(150.0)
 
 
 def test_seconds_below_is_strict() -> None:
@@ -87,7 +87,7 @@ def test_constant_at_a_rate_that_is_no_whole_number() -> None:
 
 def test_arrays_are_read_only_and_apart_from_those_given() -> None:
     given_us, given_bytes = np.array([0, 10]), np.array([0, 10])
-    trace = Trace("mine", given_us, given_bytes)
+    trace = Trace("link", given_us, given_bytes)
     given_us[1] = 99
     assert trace.time_us.tolist() == [0, 10]
     for array in (trace.time_us, trace.cumulative_bytes):
@@ -187,6 +187,6 @@ def test_scaling_keeps_order_and_describe_keeps_its_bounds(rows: list[tuple[int,
     scaled = trace.scaled(factor)
     assert (np.diff(scaled.cumulative_bytes) >= 0).all()
     assert abs(scaled.total_bytes - trace.total_bytes * factor) <= 0.5 + 1e-9 * trace.total_bytes * factor
-    found = describe(trace)
-    assert found["longest_run_below_500KBps_s"] <= found["seconds_below_500KBps"] + 1e-9
-    assert found["seconds_below_500KBps"] <= found["duration_s"] + 1e-9
+    summary = describe(trace)
+    assert summary["longest_run_below_500KBps_s"] <= summary["seconds_below_500KBps"] + 1e-9
+    assert summary["seconds_below_500KBps"] <= summary["duration_s"] + 1e-9

@@ -42,7 +42,7 @@ def test_info_by_format_and_column_out_of_a_zip(tmp_path: Path, capsys: pytest.C
     member = f"{an_archive(tmp_path)}:ucc.csv"
     assert main(["trace", "info", member, "--format", "ucc", "--column", "UL_bitrate"]) == 0
     out = capsys.readouterr().out
-    assert "(format ucc, as told, column UL_bitrate," in out
+    assert "(format ucc, requested, column UL_bitrate," in out
     # 20 and 8 kbit/s are 2.5 and 1 KB/s.
     assert ["mean_KBps", "1.75"] in [line.split() for line in out.splitlines()]
     assert "--format" not in failed(["trace", "info", member, "--column", "Speed"], capsys)

@@ -164,9 +164,9 @@ def uplink(workload: Workload, **other: object) -> scenario.Uplink:
 
 
 def test_an_episode_is_the_recording_as_it_is() -> None:
-    meets = uplink(recorded((1, 2, 3, 4)))
-    episode = meets.draw(scenario.Streams.seeded(3))
-    assert meets.max_messages == 4
+    stream = uplink(recorded((1, 2, 3, 4)))
+    episode = stream.draw(scenario.Streams.seeded(3))
+    assert stream.max_messages == 4
     assert episode.arrivals["arrival_us"].tolist() == [0, 1_000_000, 2_000_000, 3_000_000]
     assert episode.arrivals["size_bytes"].tolist() == [1, 2, 3, 4]
     assert episode.arrivals["topic"].tolist() == [0, 1, 0, 1]
@@ -177,8 +177,8 @@ def test_an_episode_is_the_recording_as_it_is() -> None:
 def test_what_would_this_policy_have_dropped_of_my_recording() -> None:
     """L = 1 and nothing crosses for 4 s: message 0 is in transmission, 1 waits, 2 and 3 find the buffer full."""
     chosen = [policies.get(name) for name in ("drop-oldest", "drop-newest")]
-    found = list(drops.drops(chosen, uplink(recorded()), [1, 2], 1))
-    assert [(d.policy, d.capacity, d.message, d.time_s, d.topic, d.x, d.dropped_s) for d in found] == [
+    dropped = list(drops.drops(chosen, uplink(recorded()), [1, 2], 1))
+    assert [(d.policy, d.capacity, d.message, d.time_s, d.topic, d.x, d.dropped_s) for d in dropped] == [
         ("drop-oldest", 1, 1, 1.0, "/odom", 0.0, 2.0),
         ("drop-oldest", 1, 2, 2.0, "/camera", 1.0, 3.0),
         ("drop-newest", 1, 2, 2.0, "/camera", 1.0, 2.0),
@@ -192,18 +192,18 @@ def test_what_would_this_policy_have_dropped_of_my_recording() -> None:
 
 def test_the_link_takes_each_message_for_its_own_size() -> None:
     """From 4 s on 10 bytes a ms: 1000 bytes take 100 ms, 3000 take 300."""
-    meets = uplink(recorded((1000, 3000, 1000, 1000)))
-    ran = sender.run(policies.get("drop-newest"), [meets.draw(scenario.Streams.seeded(0))], 3, meets.value)
+    stream = uplink(recorded((1000, 3000, 1000, 1000)))
+    ran = sender.run(policies.get("drop-newest"), [stream.draw(scenario.Streams.seeded(0))], 3, stream.value)
     assert np.asarray(ran.batch.log[0])["transmitted_us"].tolist() == [4_100_000, 4_400_000, 4_500_000, 4_600_000]
 
 
 def test_the_clairvoyant_of_a_recording() -> None:
     """L = 1: message 0 and one more. The last has moved on furthest: 1 + V(2). An upper bound where sizes differ."""
-    meets = uplink(recorded())
-    plan = oracle.clairvoyant(meets.draw(scenario.Streams.seeded(0)), 1, meets.value)
+    stream = uplink(recorded())
+    plan = oracle.clairvoyant(stream.draw(scenario.Streams.seeded(0)), 1, stream.value)
     assert (plan.qoi, plan.certified) == (pytest.approx(2 - math.exp(-2)), True)
-    meets = uplink(recorded((1000, 900, 1000, 1000)))
-    assert oracle.clairvoyant(meets.draw(scenario.Streams.seeded(0)), 1, meets.value).qoi >= 2 - math.exp(-2) - 1e-12
+    stream = uplink(recorded((1000, 900, 1000, 1000)))
+    assert oracle.clairvoyant(stream.draw(scenario.Streams.seeded(0)), 1, stream.value).qoi >= 2 - math.exp(-2) - 1e-12
 
 
 def test_x_from_elsewhere_or_from_the_number() -> None:

@@ -29,9 +29,9 @@ def test_mahimahi_by_hand(tmp_path: Path) -> None:
     write_mahimahi(trace, path)
     assert path.read_text() == "2\n3\n7\n"
     # The trace has 3500 bytes after 3.5 ms and 4000 after 4, the copy 3000 up to 6 ms and 4500 at 7.
-    found = difference(trace, read_trace(path))
-    assert found == (0, 500, 1000.0)
-    assert str(found) == "total +500 bytes, at most 1000 bytes off at any time"
+    lost = difference(trace, read_trace(path))
+    assert lost == (0, 500, 1000.0)
+    assert str(lost) == "total +500 bytes, at most 1000 bytes off at any time"
 
 
 def test_mahimahi_of_a_broken_ms(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from bufgym.traces.datasets.table import Dataset, Remote, datasets
 from bufgym.traces.datasets.unpack import ending, unpack
 from bufgym.traces.formats.faults import StrPath
 
-Origin = Literal["downloaded", "there already", "given"]
+Origin = Literal["downloaded", "there already", "copied"]
 Note: TypeAlias = Callable[[str], None]
 """Called with a sentence about what is being done."""
 Watch: TypeAlias = Callable[[str], Progress]
@@ -67,7 +67,7 @@ def cache_folder() -> Path:
 def fetch_dataset(
     dataset: str | Dataset,
     to: StrPath | None = None,
-    given: Sequence[StrPath] = (),
+    local_files: Sequence[StrPath] = (),
     *,
     note: Note | None = None,
     watch: Watch | None = None,
@@ -78,13 +78,13 @@ def fetch_dataset(
     Args:
         dataset: a name of `datasets()`, or a data set of your own.
         to: the folder for data sets, by default `cache_folder()`.
-        given: files fetched by hand, recognised by name or checksum; if there are any, nothing is downloaded.
+        local_files: files fetched by hand, recognised by name or checksum; if there are any, nothing is downloaded.
         note: called with what happens, in sentences.
         watch: called with the name of each file before its download, for a callback that reports the progress.
         patience: when to give up on a server.
 
     Returns:
-        The files, in the order of the data set or of `given`.
+        The files, in the order of the data set or of `local_files`.
 
     Raises:
         BufgymError: no such data set, a wrong checksum, an unknown address, or an error of `download` or `unpack`.
@@ -93,7 +93,7 @@ def fetch_dataset(
         if dataset not in datasets():
             raise BufgymError(f"{dataset}: no such data set: must be one of {', '.join(datasets())}")
         dataset = datasets()[dataset]
-    if not dataset.files and not given:
+    if not dataset.files and not local_files:
         raise BufgymError(
             f"{dataset.name}: the address of its files is not known: fetch them by hand from {dataset.page} and "
             f"name them with --from FILE"
@@ -105,8 +105,8 @@ def fetch_dataset(
         folder.mkdir(parents=True, exist_ok=True)
     waiting = f"waiting for another bufgym that fetches {dataset.name}"
     with _locked(root / f".{dataset.name}.lock", lambda: note(waiting)):
-        if given:
-            return [_copied(dataset, folder, Path(file)) for file in given]
+        if local_files:
+            return [_copied(dataset, folder, Path(file)) for file in local_files]
         return [_downloaded(remote, folder, note, watch, patience) for remote in dataset.files]
 
 
@@ -156,7 +156,7 @@ def _copied(dataset: Dataset, folder: Path, file: Path) -> Fetched:
             shutil.copyfile(file, copy)
             if _sha256(copy) != checksum:
                 raise BufgymError(f"{file}: changed while it was copied")
-    return _settled(remote, target, checksum, "given")
+    return _settled(remote, target, checksum, "copied")
 
 
 def _recognised(dataset: Dataset, file: Path, checksum: str) -> Remote:
@@ -180,7 +180,7 @@ def _settled(remote: Remote, target: Path, checksum: str, origin: Origin) -> Fet
         unpacked = _unpacked(target, renew=origin != "there already")
     except BufgymError:
         if remote.sha256 is None:
-            # Nothing vouches for this file: make the next attempt fetch it again.
+            # There is no checksum to verify this file with, so the next attempt must fetch it again.
             target.unlink()
         raise
     return Fetched(target, checksum, remote.sha256 is not None, origin, unpacked)

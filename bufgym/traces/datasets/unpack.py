@@ -1,4 +1,4 @@
-"""Unpack zip and tar archives that nobody vouches for: inside their folder, up to a stated size, or not at all.
+"""Unpack untrusted zip and tar archives: inside their folder, up to a stated size, or not at all.
 
 Nothing that an archive says about itself is trusted: names are checked, and bytes are counted as they are unpacked.
 Only plain files and folders are unpacked. Links, devices, encrypted files, and names that lead out of the folder are

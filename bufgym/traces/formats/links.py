@@ -91,7 +91,7 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
             The message names the file, the line, the value and the rule.
         BufgymError: an unknown `format`, `after` or `column`.
     """
-    origin = "as told"
+    origin = "requested"
     if format is None:
         format, origin = detect_format(path), "detected"
     elif format not in FORMATS:

@@ -32,7 +32,7 @@ _UCC_TIME_FORMAT: Final = "%Y.%m.%d_%H.%M.%S"
 _NYU_BITS: Final = {"bits/sec": 1, "Kbits/sec": 10**3, "Mbits/sec": 10**6, "Gbits/sec": 10**9}
 _SABRE_FIELDS: Final = {"duration_ms": MAX_DURATION_S * 1000, "bandwidth_kbps": _MAX_KBIT_PER_S}
 _SHOWN_CHARACTERS: Final = 40
-_JSON_SPACE: Final = re.compile(r"[ \t\n\r]*")
+_MARK: Final = re.compile(r"[ \t\n\r]*([\[\],]?)[ \t\n\r]*")
 
 
 def fits_ucc(text: str) -> bool:
@@ -119,23 +119,30 @@ def read_sabre(path: StrPath) -> Knots:
 def _items(path: StrPath, text: str) -> Iterator[tuple[Line, object]]:
     """The items of the list, each with the line where it begins."""
     decoder = json.JSONDecoder(parse_constant=_no_constant)
-    place = _after(path, text, 0, "[")
-    number, counted = 1, 0  # lines are counted as far as `counted`
-    more = text[place : place + 1] != "]"
-    while more:
+    number, counted = 1, 0  # the line number of the place `counted`
+    mark = _mark(path, text, 0, "[")
+    if text.startswith("]", mark.end()):
+        mark = _mark(path, text, mark.end(), "]")
+    while mark[1] != "]":
+        place = mark.end()
         number, counted = number + text.count("\n", counted, place), place
         try:
             item, end = decoder.raw_decode(text, place)
         except (ValueError, RecursionError) as error:
             raise _json_error(path, text, number, error) from error
         yield Line(path, number, text[place : min(end, place + _SHOWN_CHARACTERS)]), item
-        place = _skip_space(text, end)
-        more = text[place : place + 1] != "]"
-        if more:
-            place = _after(path, text, place, ",")
-    end = _after(path, text, place, "]")
-    if end < len(text):
-        raise _error_at(path, text, end, "must be nothing after the list")
+        mark = _mark(path, text, end, ",]")
+    if mark.end() < len(text):
+        raise _error_at(path, text, mark.end(), "must be nothing after the list")
+
+
+def _mark(path: StrPath, text: str, place: int, marks: str) -> re.Match[str]:
+    """The mark that comes next, with the white space around it; it must be one of `marks`."""
+    match = _MARK.match(text, place)
+    assert match is not None  # it may match nothing at all
+    if not match[1] or match[1] not in marks:
+        raise _error_at(path, text, match.start(1), f"must be {marks[0]!r}, for a list of objects")
+    return match
 
 
 def _add_sample(intervals: Intervals, line: Line, sample: object) -> None:
@@ -156,20 +163,6 @@ def _add_sample(intervals: Intervals, line: Line, sample: object) -> None:
         raise line.error(values[0], "must be above 0", "duration_ms")
     # kbit/s times microseconds is thousandths of a bit.
     intervals.add(line, length_us, round(values[1] * length_us / 8000))
-
-
-def _skip_space(text: str, place: int) -> int:
-    """The end of the white space at `place`."""
-    space = _JSON_SPACE.match(text, place)
-    return place if space is None else space.end()
-
-
-def _after(path: StrPath, text: str, place: int, mark: str) -> int:
-    """The place after the mark and the white space around it; the mark must come next."""
-    place = _skip_space(text, place)
-    if text[place : place + 1] != mark:
-        raise _error_at(path, text, place, f"must be {mark!r}, for a list of objects")
-    return _skip_space(text, place + 1)
 
 
 def _error_at(path: StrPath, text: str, place: int, rule: str) -> TraceError:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from bufgym.errors import BufgymError
 from bufgym.traces.formats import bags
@@ -56,9 +57,7 @@ def workload_from_bag(
 ) -> Workload:
     """The messages of these topics, with x from the bag's poses if it was read with some. See `read_workload`."""
     settings = settings or MotionSettings()
-    names = bags.matching(bag.path, list(bag.topics), topics)
-    numbers = [list(bag.topics).index(name) for name in names]
-    chosen = np.isin(bag.topic, numbers)
+    names, chosen, topic = _chosen(bag.path, list(bag.topics), bag.topic, topics)
     if not chosen.any():
         raise BufgymError(f"{bag.path}: no message on {', '.join(names) or 'any topic'}")
     time_ns = bag.time_ns[chosen]
@@ -71,8 +70,8 @@ def workload_from_bag(
         trace_name(str(bag.path).removesuffix(".mcap").removesuffix(".bag").removesuffix(".db3")),
         (time_ns - time_ns[0]) // 1000,
         bag.size_bytes[chosen],
-        _renumbered(bag.topic[chosen], numbers, len(bag.topics)),
-        tuple(names),
+        topic,
+        names,
         x,
         source,
         gaps,
@@ -117,22 +116,25 @@ def _with_topics(workload: Workload, patterns: Sequence[str] | None) -> Workload
     if patterns is None:
         return workload
     assert workload.topic is not None
-    names = bags.matching(workload.source, workload.topics, patterns)
-    numbers = [workload.topics.index(name) for name in names]
-    chosen = np.isin(workload.topic, numbers)
+    names, chosen, topic = _chosen(workload.source, workload.topics, workload.topic, patterns)
     arrival_us = workload.arrival_us[chosen]
     return replace(
         workload,
         arrival_us=arrival_us - arrival_us[0],
         size_bytes=workload.size_bytes[chosen],
-        topic=_renumbered(workload.topic[chosen], numbers, len(workload.topics)),
-        topics=tuple(names),
+        topic=topic,
+        topics=names,
         x=None if workload.x is None else workload.x[chosen] - workload.x[chosen][0],
     )
 
 
-def _renumbered(topic: Int64Array, numbers: Sequence[int], count: int) -> Int64Array:
-    """Topics by their place in `numbers`, int64[n]."""
-    place = np.zeros(count, np.int64)
-    place[list(numbers)] = np.arange(len(numbers))
-    return np.asarray(place[topic], dtype=np.int64)
+def _chosen(
+    source: str, topics: Sequence[str], topic: Int64Array, patterns: Sequence[str] | None
+) -> tuple[tuple[str, ...], npt.NDArray[np.bool_], Int64Array]:
+    """The topics that fit, which messages they have (bool[n]), and these messages' topics by their new numbers."""
+    names = bags.matching(source, topics, patterns)
+    numbers = [topics.index(name) for name in names]
+    chosen = np.isin(topic, numbers)
+    renumbered = np.zeros(len(topics), np.int64)
+    renumbered[numbers] = np.arange(len(numbers))
+    return tuple(names), chosen, renumbered[topic[chosen]]

@@ -1,4 +1,4 @@
-"""LTE-like links from a seed, for those who have no recordings at hand.
+"""LTE-like links from a seed, for users without recordings.
 
 Everything is drawn from a seed (numpy's PCG64, uniform doubles only) and rounded to whole bytes, so a seed gives the
 same integers on every machine.

@@ -46,9 +46,9 @@ def test_archives_unpack(tmp_path: Path, name: str) -> None:
     else:
         mode = {"tgz": "w:gz", "tar": "w"}.get(name.split(".", 1)[1], f"w:{name.split('.')[-1]}")
         archive = tarred(tmp_path / name, *members, mode=mode)
-    found = unpack(archive, tmp_path / "out")
-    assert [str(path.relative_to(tmp_path / "out")) for path in found] == ["top/log.txt", "top/deep/er.bin"]
-    assert found[0].read_bytes() == b"1 2\n" and found[1].read_bytes() == DATA
+    paths = unpack(archive, tmp_path / "out")
+    assert [str(path.relative_to(tmp_path / "out")) for path in paths] == ["top/log.txt", "top/deep/er.bin"]
+    assert paths[0].read_bytes() == b"1 2\n" and paths[1].read_bytes() == DATA
 
 
 @pytest.mark.parametrize("name", ["../out.txt", "/tmp/out.txt", "a/../../out.txt", "C:out.txt", "a\\..\\out.txt"])
