@@ -22,7 +22,7 @@ from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
 from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
 from ray.tune.registry import register_env
 
-from bufgym.fleet import FleetEnv
+from bufgym.envs import FleetEnv
 
 SHARED = "every robot"
 """The one module that all agents are mapped to."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import action_of
+from bufgym.envs.step import action_of
 from bufgym.errors import BufgymError
 from bufgym.model.buffer import HOLD
 from bufgym.policies import Policy

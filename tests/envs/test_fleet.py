@@ -11,9 +11,8 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from bufgym import policies
-from bufgym.envs import SenderEnv
+from bufgym.envs import FleetVecEnv, SenderEnv
 from bufgym.errors import BufgymError
-from bufgym.fleet import FleetVecEnv
 from bufgym.model.link import Link
 from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
 from bufgym.scenario import FleetEpisode, FleetScenario, Streams, messages
@@ -24,7 +23,7 @@ pytest.importorskip("pettingzoo", reason="the extra [fleet] is not installed")
 
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-from bufgym.fleet import FleetEnv, parallel_env
+from bufgym.envs import FleetEnv, parallel_env
 
 L = 4
 SMALL: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 600_000}
@@ -234,7 +233,6 @@ def half_reset():
 
 def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
     import bufgym.envs
-    import bufgym.fleet
 
     monkeypatch.delattr(bufgym.envs, "fleet", raising=False)
     for name in list(sys.modules):
@@ -242,10 +240,10 @@ def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pettingzoo", None)
     with pytest.raises(BufgymError, match=r'FleetEnv needs pettingzoo: pip install "bufgym\[fleet\]"'):
-        bufgym.fleet.__getattr__("FleetEnv")
+        bufgym.envs.__getattr__("FleetEnv")
     with pytest.raises(AttributeError, match="no_such_thing"):
-        bufgym.fleet.__getattr__("no_such_thing")
-    assert bufgym.fleet.FleetVecEnv is FleetVecEnv
+        bufgym.envs.__getattr__("no_such_thing")
+    assert bufgym.envs.FleetVecEnv is FleetVecEnv
 
 
 # --- robots as the rows of a batch -----------------------------------------------------------------------------------

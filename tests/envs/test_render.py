@@ -12,6 +12,7 @@ import pytest
 
 import bufgym
 from bufgym.envs import SenderEnv, SenderVectorEnv, render
+from bufgym.envs.render import scene
 from bufgym.kernel import JIT
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, Interruption, Uplink, messages
@@ -82,11 +83,11 @@ def test_image_shows_each_fate_in_its_colour() -> None:
         env.step(action)
     image = env.render()
     shown = {tuple(pixel) for pixel in image.reshape(-1, 3).tolist()}
-    colour = [tuple(int(c[k : k + 2], 16) for k in (1, 3, 5)) for c in render._COLOURS]
-    assert colour[render.QUEUED] in shown
-    assert colour[render.SENDING] in shown
-    assert colour[render.NEWCOMER] in shown
-    assert colour[render.DROPPED] in shown
+    colour = [tuple(int(c[k : k + 2], 16) for k in (1, 3, 5)) for c in render.image.COLOURS]
+    assert colour[scene.QUEUED] in shown
+    assert colour[scene.SENDING] in shown
+    assert colour[scene.NEWCOMER] in shown
+    assert colour[scene.DROPPED] in shown
     assert tuple(image[2, 2]) == (255, 255, 255)
 
 

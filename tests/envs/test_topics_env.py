@@ -13,7 +13,8 @@ from gymnasium.utils.env_checker import check_env
 from bufgym import scenario as scenarios
 from bufgym.benchmark import perf
 from bufgym.envs import SenderEnv, SenderVectorEnv, render
-from bufgym.envs.rows import decision_of
+from bufgym.envs.render import scene
+from bufgym.envs.step import decision_of
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.model import qoi
@@ -462,7 +463,7 @@ def test_pictures_of_any_size(topics: int, capacity: int) -> None:
     frame = env.render()
     assert (frame.shape, frame.dtype) == ((400, 800, 3), np.uint8)
     shown = {tuple(pixel) for pixel in frame.reshape(-1, 3).tolist()}
-    queued = tuple(int(render._COLOURS[render.QUEUED][k : k + 2], 16) for k in (1, 3, 5))
+    queued = tuple(int(render.image.COLOURS[scene.QUEUED][k : k + 2], 16) for k in (1, 3, 5))
     assert queued in shown
     assert tuple(frame[2, 2]) == (255, 255, 255)
 
