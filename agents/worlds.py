@@ -152,13 +152,4 @@ class World(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
 
 def _rows(cell: Cell, size: int, reward: str) -> Rows:
-    return Rows(
-        size,
-        scenario=cell.scenario,
-        capacity=cell.capacity,
-        max_bytes=None,
-        decide_at="arrival",
-        reward=reward,
-        fields=None,
-        parameters={},
-    )
+    return Rows(size, cell.scenario, cell.capacity, reward=reward)

@@ -64,24 +64,17 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         scenario: str | Uplink | FleetScenario = "lte",
         capacity: int = 8,
         *,
-        max_bytes: int | None = None,
         reward: str = "team",
         term: str | Mapping[str, float] = "retained",
+        max_bytes: int | None = None,
         fields: Sequence[str] | None = None,
         mask_in_observation: bool = False,
         render_mode: str | None = None,
         **parameters: Any,
     ) -> None:
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
-        self.rows = FleetRows(
-            1,
-            scenario=FleetScenario.of(robots, scenario, **parameters),
-            capacity=capacity,
-            max_bytes=max_bytes,
-            reward=reward,
-            term=term,
-            fields=fields,
-        )
+        fleet = FleetScenario.of(robots, scenario, **parameters)
+        self.rows = FleetRows(1, fleet, capacity, reward=reward, term=term, max_bytes=max_bytes, fields=fields)
         self.mask_in_observation = mask_in_observation
         self.possible_agents = [f"robot_{i}" for i in range(len(self.rows))]
         self.agents: list[str] = []

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-from gymnasium.vector import AutoresetMode
-
 from bufgym.checks import whole
-from bufgym.envs.rows import FleetRows
+from bufgym.envs.rows import FleetRows, Rows
 from bufgym.envs.vector import SenderVectorEnv
 from bufgym.scenario import FleetScenario, Uplink
 
@@ -40,22 +38,11 @@ class FleetVecEnv(SenderVectorEnv):
         scenario: str | Uplink | FleetScenario = "lte",
         capacity: int = 8,
         *,
-        max_bytes: int | None = None,
-        reward: str = "team",
-        term: str | Mapping[str, float] = "retained",
-        fields: Sequence[str] | None = None,
-        max_episode_steps: int | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
         parameters: Mapping[str, Any] | None = None,
+        **options: Any,
     ) -> None:
-        rows = FleetRows(
-            whole("cells", cells, 1),
-            scenario=FleetScenario.of(robots, scenario, **(parameters or {})),
-            capacity=capacity,
-            max_bytes=max_bytes,
-            reward=reward,
-            term=term,
-            fields=fields,
-        )
-        self._set_up(rows, max_episode_steps, autoreset_mode, render_mode)
+        fleet: Any = FleetScenario.of(robots, scenario, **(parameters or {}))
+        super().__init__(whole("cells", cells, 1), fleet, capacity, **options)
+
+    def _make_rows(self, n: int, scenario: Any, capacity: int, **options: Any) -> Rows:
+        return FleetRows(n, scenario, capacity, **options)

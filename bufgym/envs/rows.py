@@ -76,16 +76,16 @@ class Rows:
     def __init__(
         self,
         n: int,
-        *,
         scenario: str | Scenario,
         capacity: int,
+        *,
         max_bytes: int | None = None,
         decide_at: str = "arrival",
         reward: str | Mapping[str, float] = "retained",
         fields: Sequence[str] | None = None,
-        parameters: Mapping[str, Any] | None = None,
+        **parameters: Any,
     ) -> None:
-        self.scenario = scenarios.get(scenario, **(parameters or {}))
+        self.scenario = scenarios.get(scenario, **parameters)
         topics = self.scenario.topics
         self.senders = Senders(
             n,
@@ -212,12 +212,12 @@ class FleetRows(Rows):
     def __init__(
         self,
         cells: int,
-        *,
         scenario: FleetScenario,
         capacity: int,
-        max_bytes: int | None = None,
+        *,
         reward: str = "team",
         term: str | Mapping[str, float] = "retained",
+        max_bytes: int | None = None,
         fields: Sequence[str] | None = None,
     ) -> None:
         """``reward``: "team" or "own"; ``term``: what ``Rows`` calls reward; the rest as of ``Rows``."""
@@ -225,14 +225,8 @@ class FleetRows(Rows):
             raise BufgymError(
                 f"reward = {reward!r}: must be 'team' (the mean over the robots) or 'own'; its term is `term`"
             )
-        super().__init__(
-            cells * scenario.robots,
-            scenario=scenario.uplink,
-            capacity=capacity,
-            max_bytes=max_bytes,
-            reward=term,
-            fields=fields,
-        )
+        n = cells * scenario.robots
+        super().__init__(n, scenario.uplink, capacity, max_bytes=max_bytes, reward=term, fields=fields)
         self.reward = reward
         self._draw = scenario.draw
         self.robots = scenario.robots

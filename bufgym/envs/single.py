@@ -78,13 +78,13 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
         self.rows = Rows(
             1,
-            scenario=scenario,
-            capacity=capacity,
+            scenario,
+            capacity,
             max_bytes=max_bytes,
             decide_at=decide_at,
             reward=reward,
             fields=fields,
-            parameters=parameters,
+            **parameters,
         )
         self.observation_space = cast(Any, self.rows.observation_space)
         self.action_space = self.rows.action_space

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -29,9 +29,11 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     With several topics some rows may ask what to drop and others what to send: the field ``socket_asks`` says which.
 
     ``num_envs``: n, rows. ``max_episode_steps`` truncates episodes, as Gymnasium's ``TimeLimit`` does.
-    ``autoreset_mode``: one of Gymnasium's. ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector
-    environments do; a sequence seeds row by row. Options of ``reset``: ``reset_mask`` (bool[n], rows to reset) and
-    ``episodes`` (one a row, None where the next is drawn).
+    ``autoreset_mode``: one of Gymnasium's. ``options``: the other arguments of ``SenderEnv``.
+
+    ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do; a sequence seeds row by row.
+    Options of ``reset``: ``reset_mask`` (bool[n], rows to reset) and ``episodes`` (one a row, None where the next is
+    drawn).
 
     ``info`` has Gymnasium's form: ``info["action_mask"]`` bool[n, L + 2], ``info["invalid"]`` int64[n],
     ``info["reward_terms"]`` float64[n] by name; with SAME_STEP autoreset ``info["final_obs"]`` and
@@ -51,35 +53,12 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         scenario: str | Scenario = "lte",
         capacity: int = 8,
         *,
-        max_bytes: int | None = None,
-        decide_at: str = "arrival",
-        reward: str | Mapping[str, float] = "retained",
-        fields: Sequence[str] | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
-        **parameters: Any,
+        **options: Any,
     ) -> None:
-        rows = Rows(
-            whole("num_envs", num_envs, 1),
-            scenario=scenario,
-            capacity=capacity,
-            max_bytes=max_bytes,
-            decide_at=decide_at,
-            reward=reward,
-            fields=fields,
-            parameters=parameters,
-        )
-        self._set_up(rows, max_episode_steps, autoreset_mode, render_mode)
-
-    def _set_up(
-        self,
-        rows: Rows,
-        max_episode_steps: int | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
-    ) -> None:
-        """Be the vector environment of ``rows``."""
+        rows = self._make_rows(whole("num_envs", num_envs, 1), scenario, capacity, **options)
         if max_episode_steps is not None and max_episode_steps < 1:
             raise BufgymError(f"max_episode_steps = {max_episode_steps}: must be >= 1, or None for no limit")
         try:
@@ -100,6 +79,9 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._done = np.zeros(self.num_envs, np.bool_)
         self._every_row = np.ones(self.num_envs, np.bool_)
         self._pool: list[StepOutput] = []
+
+    def _make_rows(self, n: int, scenario: Any, capacity: int, **options: Any) -> Rows:
+        return Rows(n, scenario, capacity, **options)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

@@ -250,5 +250,5 @@ def test_bad_clients(parameters: dict[str, Any], rule: str) -> None:
 
 
 def test_a_stream_publishes_on_a_topic() -> None:
-    with pytest.raises(BufgymError, match=r"stream: 'a' is not a bufgym\.topics\.Topic"):
+    with pytest.raises(BufgymError, match=r"stream: 'a' is not a bufgym\.model\.topics\.Topic"):
         Stream("a", 1, 1)

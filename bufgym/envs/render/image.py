@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.render.scene import (
-    DELIVERED,
-    DROPPED,
-    NEWCOMER,
-    QUEUED,
-    SENDING,
-    STATES,
-    Scene,
-    letter,
-    link_rates,
-    scene_of,
-)
+from bufgym.envs.render.scene import DROPPED, NEWCOMER, QUEUED, SENDING, STATES, Scene, letter, link_rates, scene_of
 from bufgym.sim import Senders
 
 COLOURS = ("#2a9d5c", "#2f6fde", "#e0a100", "#d1495b", "#8e3bb8")
@@ -71,9 +61,6 @@ def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:
         axes.tick_params(labelsize=8)
     _draw_link(link, senders, i, scene, start_s)
     (_draw_lanes if scene.topics else _draw_timeline)(timeline, scene)
-    timeline.grid(axis="y", color="#eeeeee")
-    timeline.set_axisbelow(True)
-    timeline.set_xlabel("time of arrival (s)", fontsize=8, labelpad=1)
     _draw_slots(slots, scene)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba(), np.uint8)[..., :3].copy()
@@ -103,19 +90,8 @@ def _draw_link(axes: Any, senders: Senders, i: int, scene: Scene, start_s: float
 
 def _draw_timeline(axes: Any, scene: Scene) -> None:
     """One lane for each state, so that kept and dropped messages stay apart where they are dense."""
-    arrival_s = scene.arrivals["arrival_us"] / 1e6
-    lanes = (3, 2, 1, 0, 1)  # the newcomer stands in line with the queue
-    for state, lane in enumerate(lanes):
-        times_s = arrival_s[scene.states == state]
-        axes.plot(
-            times_s,
-            np.full(len(times_s), lane),
-            linestyle="none",
-            marker="D" if state == NEWCOMER else "|" if state in (DELIVERED, DROPPED) else "s",
-            markersize=9 if state in (DELIVERED, DROPPED) else 5,
-            markeredgewidth=1.2,
-            color=COLOURS[state],
-        )
+    lanes = np.array((3, 2, 1, 0, 1))  # the newcomer stands in line with the queue
+    _draw_messages(axes, scene, lanes[scene.states], "|ss|D", (9, 5, 5, 9, 5), 1.2)
     axes.set_ylim(-0.6, 3.6)
     axes.set_yticks((3, 2, 1, 0), STATES[:NEWCOMER])
     for tick, colour in zip(axes.get_yticklabels(), COLOURS[:NEWCOMER], strict=True):
@@ -124,21 +100,11 @@ def _draw_timeline(axes: Any, scene: Scene) -> None:
 
 def _draw_lanes(axes: Any, scene: Scene) -> None:
     """One lane for each topic: dropped messages below the line, waiting ones on it, sent ones above."""
-    arrival_s, lanes = scene.arrivals["arrival_us"] / 1e6, len(scene.topics)
+    lanes = len(scene.topics)
     lane_points = 190 / lanes  # height of a lane, a little less
-    offsets, sizes = (0.2, 0.2, 0.0, -0.24, 0.0), (0.4, 0.4, 0.25, 0.3, 0.3)
-    for state, (offset, size) in enumerate(zip(offsets, sizes, strict=True)):
-        chosen = scene.states == state
-        axes.plot(
-            arrival_s[chosen],
-            -scene.arrivals["topic"][chosen] + offset,
-            linestyle="none",
-            marker="D" if state == NEWCOMER else "s" if state == QUEUED else "|",
-            markersize=max(2.0, min(9.0, size * lane_points)),
-            markeredgewidth=1.2 if state != SENDING else 2.5,
-            color=COLOURS[state],
-            label=STATES[state],
-        )
+    offsets = np.array((0.2, 0.2, 0.0, -0.24, 0.0))
+    sizes = [max(2.0, min(9.0, share * lane_points)) for share in (0.4, 0.4, 0.25, 0.3, 0.3)]
+    _draw_messages(axes, scene, -scene.arrivals["topic"] + offsets[scene.states], "||s|D", sizes, 2.5)
     named = lanes <= _MOST_NAMES
     axes.set_ylim(-lanes + 0.4, 0.6)
     axes.set_yticks(-np.arange(lanes))
@@ -152,6 +118,28 @@ def _draw_lanes(axes: Any, scene: Scene) -> None:
     ).legend_handles
     for handle in handles:
         handle.set_markersize(6)
+
+
+def _draw_messages(
+    axes: Any, scene: Scene, heights: NDArray[Any], markers: str, sizes: Sequence[float], sending_width: float
+) -> None:
+    """A marker for each message at its time of arrival and ``heights``; markers and sizes (points) by state."""
+    arrival_s = scene.arrivals["arrival_us"] / 1e6
+    for state, name in enumerate(STATES):
+        chosen = scene.states == state
+        axes.plot(
+            arrival_s[chosen],
+            heights[chosen],
+            linestyle="none",
+            marker=markers[state],
+            markersize=sizes[state],
+            markeredgewidth=sending_width if state == SENDING else 1.2,
+            color=COLOURS[state],
+            label=name,
+        )
+    axes.grid(axis="y", color="#eeeeee")
+    axes.set_axisbelow(True)
+    axes.set_xlabel("time of arrival (s)", fontsize=8, labelpad=1)
 
 
 def _draw_slots(axes: Any, scene: Scene) -> None:
@@ -172,7 +160,7 @@ def _draw_slots(axes: Any, scene: Scene) -> None:
         axes.text(x, 0.5, words, ha="center", va="center", fontsize=size, color=colour)
 
     axes.set_xlim(-0.3, L + 1.4)
-    boxes = [(k, COLOURS[QUEUED] if k < occupancy else _EMPTY) for k in range(L)]
+    boxes: list[tuple[float, str]] = [(k, COLOURS[QUEUED] if k < occupancy else _EMPTY) for k in range(L)]
     boxes += [(L + 0.4, COLOURS[NEWCOMER]) for _ in scene.newcomers]
     for left, colour in boxes:
         axes.add_patch(Rectangle((left + 0.25, 0.15), 0.6, 0.7, facecolor=colour, edgecolor=_GREY))
