@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,9 @@ class Interruption:
     lengths: tuple[int, ...] = ()
     """If any are given: T is drawn again until it is one of these."""
 
+    topics: ClassVar[tuple[Topic, ...]] = ()
+    """None: one queue."""
+
     def __post_init__(self) -> None:
         if self.law not in LAWS:
             raise BufgymError(f"law = {self.law!r}: must be one of {', '.join(LAWS)}")
@@ -69,11 +72,6 @@ class Interruption:
     @functools.cached_property
     def _allowed(self) -> frozenset[int]:
         return frozenset(self.lengths)
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """None: one queue."""
-        return ()
 
     @property
     def max_messages(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,9 @@ class Uplink:
     workload: Workload | None = None
     """A recording to play; None for the stream."""
 
+    topics: ClassVar[tuple[Topic, ...]] = ()
+    """None: one queue."""
+
     def __post_init__(self) -> None:
         recordings(self)
         as_tuple(self, "scale", int | float, "a number > 0")
@@ -84,11 +87,6 @@ class Uplink:
         if not 1 <= self.max_messages <= 10**7:
             raise BufgymError(f"rate_hz x duration_s = {self.max_messages} messages: must lie between 1 and 10000000")
         check_value(self)
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """None: one queue."""
-        return ()
 
     @property
     def max_messages(self) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from env_cases import valid_action
 from gymnasium.vector import AutoresetMode
 
 from bufgym import policies
@@ -28,11 +29,6 @@ from bufgym.envs import FleetEnv, parallel_env
 L = 4
 SMALL: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 600_000}
 PARAMETERS = {"duration_s": 2.0, "size_bytes": 600_000}
-
-
-def some_action(mask: np.ndarray, rng: np.random.Generator) -> int:
-    """A possible action, at random."""
-    return int(rng.choice(np.flatnonzero(mask)))
 
 
 def oldest_goes(mask: np.ndarray) -> int:
@@ -60,7 +56,7 @@ def test_one_robot_is_the_single_environment():
     while not terminated:
         assert all(np.array_equal(seen["robot_0"][key], alone[key]) for key in alone)
         assert np.array_equal(infos["robot_0"]["action_mask"], info["action_mask"])
-        action = some_action(info["action_mask"], rng)
+        action = valid_action(info["action_mask"], rng)
         seen, rewards, ended, _, infos = fleet.step({"robot_0": action})
         alone, reward, terminated, _, info = single.step(action)
         assert rewards == {"robot_0": reward}
@@ -259,7 +255,7 @@ def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
     rng = np.random.default_rng(0)
     assert envs.num_envs == 6
     for _ in range(60):
-        actions = np.array([some_action(mask, rng) for mask in info["action_mask"]])
+        actions = np.array([valid_action(mask, rng) for mask in info["action_mask"]])
         for c, (observation, infos) in enumerate(each):
             for r, agent in enumerate(fleets[c].possible_agents):
                 i = c * robots + r

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import itertools
 from collections.abc import Iterable
 
@@ -12,9 +13,10 @@ from bufgym.sim import Senders
 
 _MARKS = "●▶■·?"
 """The character of each state."""
-_GREEN, _BLUE, _YELLOW, _RED, _MAGENTA, _CYAN, _PLAIN = "32", "34", "33", "31", "1;35", "36", "0"
+_GREEN, _BLUE, _YELLOW, _RED, _MAGENTA, _CYAN, _PLAIN = "32", "34", "33", "31", "1;35", "36", ""
+"""ANSI colours; plain text gets no codes."""
 _COLOURS = (_GREEN, _BLUE, _YELLOW, _RED, _MAGENTA)
-"""The ANSI colour of each state."""
+"""The colour of each state."""
 _LEVELS = "_▁▂▃▄▅▆▇█"
 _LABEL, _TOPIC_LABEL = 10, 16
 """Columns that a line's label takes; where labels are topics' names."""
@@ -33,7 +35,7 @@ def ansi(senders: Senders, i: int, width: int = 100) -> str:
     width, label = max(width, _NARROWEST), _TOPIC_LABEL if scene.topics else _LABEL
     latest = slice(max(0, len(scene.states) - (width - label)), None)
     counts = scene.counts
-    legend = "  ".join(f"{_mark(state)} {name}" for state, name in enumerate(STATES)) + "  _ empty"
+    legend = "  ".join(f"{_painted([_mark(state)])} {name}" for state, name in enumerate(STATES)) + "  _ empty"
     lines = [
         f"{scene.now_us / 1e6:8.3f} s  {sum(counts.values())} arrived: {counts['delivered']} delivered, "
         f"{counts['in transmission']} in transmission, {len(scene.queue)}/{scene.capacity} queued, "
@@ -49,14 +51,16 @@ def ansi(senders: Senders, i: int, width: int = 100) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _mark(state: int) -> str:
-    return _painted([(_COLOURS[state], _MARKS[state])])
+def _mark(state: int) -> tuple[str, str]:
+    return _COLOURS[state], _MARKS[state]
 
 
 def _painted(marks: Iterable[tuple[str, str]]) -> str:
     """(colour, text) pairs as text; neighbours of one colour share its codes."""
-    runs = itertools.groupby(marks, key=lambda mark: mark[0])
-    return "".join(f"\x1b[{colour}m{''.join(text for _, text in run)}\x1b[0m" for colour, run in runs)
+    runs = [
+        (colour, "".join(text for _, text in run)) for colour, run in itertools.groupby(marks, lambda mark: mark[0])
+    ]
+    return "".join(f"\x1b[{colour}m{text}\x1b[0m" if colour else text for colour, text in runs)
 
 
 def _speed(bytes_per_s: float) -> str:
@@ -78,7 +82,7 @@ def _capacity_line(senders: Senders, i: int, scene: Scene, latest: slice) -> str
 
 def _message_lines(scene: Scene, latest: slice, label: int) -> list[str]:
     """A mark for each message; a line for each topic."""
-    marks = [(_COLOURS[state], _MARKS[state]) for state in scene.states[latest]]
+    marks = [_mark(state) for state in scene.states[latest]]
     if not scene.topics:
         return ["messages".ljust(label) + _painted(marks)]
     numbers = scene.arrivals["topic"][latest].tolist()
@@ -92,37 +96,31 @@ def _message_lines(scene: Scene, latest: slice, label: int) -> list[str]:
 def _topic_queue_line(scene: Scene, columns: int) -> str:
     """The topics' letters: of the message that the socket took last, of the slots, and of the newcomer."""
     sent = [scene.dequeued] if scene.dequeued >= 0 else []
-    letters = [(_COLOURS[int(scene.states[seq])], scene.letter(seq)) for seq in sent]
-    letters += [(_COLOURS[QUEUED], scene.letter(seq)) for seq in scene.queue.tolist()]
+    letters = [(_COLOURS[int(scene.states[seq])], scene.letter(seq)) for seq in [*sent, *scene.queue.tolist()]]
     letters += [(_PLAIN, "_")] * (scene.capacity - len(scene.queue))
-    last = [(_COLOURS[NEWCOMER], scene.letter(seq)) for seq in scene.newcomers]
-    room = columns // 2 - len(last)
-    if len(letters) > room:
-        letters = [*letters[: room - 2], (_PLAIN, "...")]
-    return " ".join(_painted([mark]) for mark in letters + last)
+    return _fitted(letters, [(_COLOURS[NEWCOMER], scene.letter(seq)) for seq in scene.newcomers], columns)
 
 
 def _queue_line(scene: Scene, columns: int) -> str:
     """The message that the socket took last, the slots and the newcomer, and how many are missing between them."""
-    slots: list[tuple[int, str]] = []  # (columns, text)
-    last: list[tuple[int, str]] = []
+    slots: list[tuple[str, str]] = []
+    last: list[tuple[str, str]] = []
     if scene.dequeued >= 0:
-        slots.append((1, _mark(int(scene.states[scene.dequeued]))))
+        slots.append(_mark(int(scene.states[scene.dequeued])))
     for k, (_, missing) in enumerate(scene.missing()):
         queued = k < len(scene.queue)
         marks = slots if queued else last
         if missing > 0:
-            marks.append((len(str(missing)), _painted([(_RED, str(missing))])))
-        marks.append((1, _mark(QUEUED if queued else NEWCOMER)))
-    slots += [(1, "_")] * min(scene.capacity - len(scene.queue), columns)
-    room = columns - _columns(last) - len("... ")
-    if _columns(slots) > room:
-        while _columns(slots) > room:
-            slots.pop()
-        slots.append((3, "..."))
-    return " ".join(text for _, text in slots + last)
+            marks.append((_RED, str(missing)))
+        marks.append(_mark(QUEUED if queued else NEWCOMER))
+    slots += [(_PLAIN, "_")] * (scene.capacity - len(scene.queue))
+    return _fitted(slots, last, columns)
 
 
-def _columns(marks: list[tuple[int, str]]) -> int:
-    """What these marks take, with a space after each."""
-    return sum(columns + 1 for columns, _ in marks)
+def _fitted(marks: list[tuple[str, str]], last: list[tuple[str, str]], columns: int) -> str:
+    """``marks`` and then ``last`` with spaces between; where they do not fit, ``marks`` end with three dots."""
+    room = columns - sum(len(text) + 1 for _, text in last) - len("... ")
+    ends = list(itertools.accumulate(len(text) + 1 for _, text in marks))
+    if ends and ends[-1] > room:
+        marks = [*marks[: bisect.bisect_right(ends, room)], (_PLAIN, "...")]
+    return " ".join(_painted([mark]) for mark in marks + last)
