@@ -60,9 +60,9 @@ def run_agent(
     envs = SenderVectorEnv(len(episodes), world, capacity, decide_at=decide_at)
     envs.reset(options={"episodes": episodes})
     rows = envs.rows
-    while not rows.shown.ended.all():
-        seen = rows.observation(rows.shown.slots, rows.shown.context)
-        actions, _ = agent.predict(seen, deterministic=True, action_masks=rows.shown.mask)
+    while not rows.output.terminated.all():
+        seen = rows.observation(rows.output.slots, rows.output.context)
+        actions, _ = agent.predict(seen, deterministic=True, action_masks=rows.output.action_mask)
         rows.step(np.asarray(actions, np.int64))
     return [outcome(rows.senders, i) for i in range(len(episodes))]
 

@@ -40,7 +40,7 @@ from bufgym.benchmark import fleets
 from bufgym.benchmark.fleets import ROWS
 from bufgym.benchmark.fleets_summary import plain, summary
 from bufgym.benchmark.rows import Row
-from bufgym.envs.fleet_vec import FleetVecEnv
+from bufgym.envs import FleetVecEnv
 from bufgym.errors import BufgymError
 from bufgym.files import replaced, shipped
 from bufgym.policies import learned, weights

@@ -96,7 +96,7 @@ class World(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             accept = np.full(len(rows), rows.capacity + 1)
             for step in range(longest):
                 rows.step(accept)
-                rows.reset(np.flatnonzero((begins == step) | rows.shown.ended))
+                rows.reset(np.flatnonzero((begins == step) | rows.output.terminated))
         return self.observation(), {}
 
     def load(self, episodes: Sequence[Episode]) -> None:
@@ -108,7 +108,7 @@ class World(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self, actions: NDArray[np.int64]
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         self.act(actions)
-        rewards = np.concatenate([rows.shown.terms @ rows.weights for rows in self.groups])
+        rewards = np.concatenate([rows.output.reward_terms @ rows.weights for rows in self.groups])
         ended, info = self.ended(), {}
         seen = self.observation()
         if ended.any():
@@ -130,35 +130,26 @@ class World(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def ended(self) -> NDArray[np.bool_]:
         """bool[n]: the row's episode is over."""
-        return np.concatenate([rows.shown.ended for rows in self.groups])
+        return np.concatenate([rows.output.terminated for rows in self.groups])
 
     def observation(self) -> Observation:
         """Every row's, with its slots spread over the seats; fresh arrays."""
         slots = np.zeros((self.num_envs, len(SLOT_FIELDS), self.seats + 1), np.float32)
         context = np.empty((self.num_envs, len(CONTEXT_FIELDS)), np.float32)
         for rows, span in zip(self.groups, self.spans, strict=True):
-            slots[span, :, : rows.capacity] = rows.shown.slots[:, :, :-1]
-            slots[span, :, -1] = rows.shown.slots[:, :, -1]
-            context[span] = rows.shown.context
+            slots[span, :, : rows.capacity] = rows.output.slots[:, :, :-1]
+            slots[span, :, -1] = rows.output.slots[:, :, -1]
+            context[span] = rows.output.context
         return self._widest.observation(slots, context)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[n, seats + 2]: the actions that are possible now in each row."""
         masks = np.zeros((self.num_envs, self.seats + 2), np.bool_)
         for rows, span in zip(self.groups, self.spans, strict=True):
-            masks[span, : rows.capacity] = rows.shown.mask[:, :-2]
-            masks[span, -2:] = rows.shown.mask[:, -2:]
+            masks[span, : rows.capacity] = rows.output.action_mask[:, :-2]
+            masks[span, -2:] = rows.output.action_mask[:, -2:]
         return masks
 
 
 def _rows(cell: Cell, size: int, reward: str) -> Rows:
-    return Rows(
-        size,
-        scenario=cell.scenario,
-        capacity=cell.capacity,
-        max_bytes=None,
-        decide_at="arrival",
-        reward=reward,
-        fields=None,
-        parameters={},
-    )
+    return Rows(size, cell.scenario, cell.capacity, reward=reward)

@@ -16,7 +16,7 @@ ENVIRONMENTS = {
     "bufgym/Uplink-v0": ("lte", "a camera stream over bandwidth traces"),
     "bufgym/Topics-v0": ("topics", "many topics over one uplink: what to drop, and what to send next (Robofleet)"),
 }
-"""id -> (scenario, what it is)"""
+"""Id -> (name of the scenario, what it is)."""
 
 for _id, (_scenario, _) in ENVIRONMENTS.items():
     if _id not in _gym.registry:

@@ -10,8 +10,8 @@ import os
 import traceback
 from os import PathLike
 
-# Longer values are cut in messages: a broken file can hold a line of any length.
-_SHOWN_CHARACTERS = 60
+_MOST_CHARACTERS = 60
+"""Longer values are cut in messages: a broken file can hold a line of any length."""
 
 
 class BufgymError(ValueError):
@@ -45,20 +45,20 @@ def where(
     place = f"{path}" if line is None else f"{path}, line {line}"
     if value is None:
         return f"{place}: {rule}" if field is None else f"{place}: {field} {rule}"
-    shown = _shown(value)
-    return f"{place}: {shown}: {rule}" if field is None else f"{place}: {field} = {shown}: {rule}"
+    text = _quoted(value)
+    return f"{place}: {text}: {rule}" if field is None else f"{place}: {field} = {text}: {rule}"
 
 
-def _shown(value: object) -> str:
+def _quoted(value: object) -> str:
     """Plain words and numbers as they stand; blanks, spaces and control characters quoted; long text cut."""
     text = str(value)
-    cut = text if len(text) <= _SHOWN_CHARACTERS else text[: _SHOWN_CHARACTERS - 3] + "..."
+    cut = text if len(text) <= _MOST_CHARACTERS else text[: _MOST_CHARACTERS - 3] + "..."
     plain = cut.isprintable() and cut.isascii() and cut != "" and " " not in cut
     return cut if plain else repr(cut)
 
 
 def line_in(error: Exception, file: str) -> str | None:
-    """Where in that file the error came from ("mine.py, line 3", the innermost line), or None if it was elsewhere."""
+    """Where in that file the error came from ("mine.py, line 3", the innermost line), or None."""
     lines = [
         line
         for frame, line in traceback.walk_tb(error.__traceback__)

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 JIT = not cast(Any, numba.config).DISABLE_JIT
-"""False where compilation is off and every kernel is its Python source."""
+"""False where compilation is off and every kernel runs as its Python source."""
 
 # Arithmetic follows IEEE 754 to the letter (no fast maths): single = batch and compiled = uncompiled, bit for bit.
 # Kernels work on arrays that their caller holds, so reference counting (_nrt) is off and one kernel is inlined into the
-# next: together that is five times faster. In return a kernel must neither allocate nor hand an array to Python.
+# next: together that is five times faster. In return a kernel must neither allocate nor return an array to Python.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False, "forceinline": True}
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -51,7 +51,7 @@ def _cache_folder() -> str:
             state.update(source)
     folder = parent / f"kernels-{state.hexdigest()[:12]}"
     if not folder.exists():
-        # Earlier states are of no use, but a process that runs now may still be writing into the latest ones.
+        # Earlier states are useless, but a running process may still be writing into the latest ones.
         for old in sorted(parent.glob("kernels-*"), key=lambda path: path.stat().st_mtime)[:-8]:
             shutil.rmtree(old, ignore_errors=True)
     return str(folder)

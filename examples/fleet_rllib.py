@@ -1,9 +1,9 @@
-"""One policy for all robots of a cell, learned with Ray's RLlib (PPO, impossible actions masked).
+"""One policy for all robots of a cell, learned with Ray's RLlib (PPO, invalid actions masked).
 
     pip install "bufgym[rllib]" torch
     python examples/fleet_rllib.py --robots 4 --iterations 20
 
-Every robot decides from its own observation with the same weights, and is paid the team's mean information.
+Every robot decides from its own observation with the same weights, and is rewarded with the team's mean information.
 Written for Ray 2.60 (RLlib's RLModule API stack).
 """
 
@@ -22,7 +22,7 @@ from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
 from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
 from ray.tune.registry import register_env
 
-from bufgym.fleet import FleetEnv
+from bufgym.envs import FleetEnv
 
 SHARED = "every robot"
 """The one module that all agents are mapped to."""
@@ -57,10 +57,10 @@ class MaskedFleet(ParallelPettingZooEnv):
     def _masked(self, observations: dict[str, Any], infos: dict[str, Any]) -> dict[str, Any]:
         return {
             agent: {
-                "observations": flatten(self._fields, seen),
+                "observations": flatten(self._fields, observation),
                 "action_mask": infos[agent]["action_mask"].astype(np.float32),
             }
-            for agent, seen in observations.items()
+            for agent, observation in observations.items()
         }
 
 
@@ -88,10 +88,10 @@ def main() -> None:
     parser.add_argument("--runners", type=int, default=0, help="processes that sample")
     parser.add_argument("--ticks", type=int, default=4_000, help="ticks an iteration")
     parser.add_argument("--seconds", type=float, default=30.0, help="length of an episode")
-    given = parser.parse_args()
-    fleet = {"robots": given.robots, "capacity": 8, "duration_s": given.seconds}
-    algorithm = configuration(given.runners, given.ticks, **fleet).build_algo()
-    for iteration in range(given.iterations):
+    options = parser.parse_args()
+    fleet = {"robots": options.robots, "capacity": 8, "duration_s": options.seconds}
+    algorithm = configuration(options.runners, options.ticks, **fleet).build_algo()
+    for iteration in range(options.iterations):
         runs = algorithm.train()["env_runners"]
         print(f"iteration {iteration}: {runs['num_episodes']} episodes, return {runs['episode_return_mean']:.2f}")
     algorithm.stop()

@@ -19,6 +19,7 @@ REPO = Path(__file__).resolve().parent.parent
 
 ROOMS = [
     "errors",
+    "checks",
     "files",
     "kernel",
     "traces",
@@ -29,7 +30,6 @@ ROOMS = [
     "sim",
     "oracle",
     "envs",
-    "fleet",
     "sb3",
     "benchmark",
     "reproduce",

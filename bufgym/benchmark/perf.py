@@ -1,8 +1,8 @@
-"""How fast it goes: each figure with its definition and the target that bufgym sets itself, all from one run.
+"""bufgym's own speed: each figure with its definition and its target, all from one run.
 
 Every figure is the best of several repeats: other work on the machine can only slow a repeat down. Everything runs in
-one thread. Actions are drawn beforehand, uniform among the possible ones, by playing the same seeded episodes once;
-so the timed loop holds nothing but the environment's own work, its resets included.
+one thread. Actions are drawn beforehand, uniform among the valid ones, by playing the same seeded episodes once; so the
+timed loop holds nothing but the environment's own work, its resets included.
 """
 
 from __future__ import annotations
@@ -40,10 +40,15 @@ class Figure:
     """One measured figure."""
 
     name: str
+    """What was measured."""
     value: float
+    """Its result, in ``unit``."""
     unit: str
+    """Of ``value`` and ``target``."""
     target: float | None
+    """What bufgym aims at; None where there is no target."""
     definition: str
+    """How it was measured, in a sentence."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,7 @@ class Sizes:
     episodes: int = 1000
     """Episodes of a fixed-policy rollout."""
     repeats: int = 3
+    """Repeats of each figure, of which the best counts."""
     topic_slots: int = 32
     """L of the batch with several topics."""
 
@@ -85,7 +91,7 @@ def best_s(repeats: int, prepare: Callable[[], Any], work: Callable[[], Any]) ->
 
 
 def random_actions(mask: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.int64]:
-    """One possible action a row, uniform; ``mask`` is bool[n, L + 2]."""
+    """int64[n]: one valid action a row, uniform; ``mask`` is bool[n, L + 2]."""
     return np.asarray(np.argmax(rng.random(mask.shape) * mask, axis=1), np.int64)
 
 
@@ -104,31 +110,30 @@ def record(vector: Any, steps: int) -> tuple[NDArray[np.int64], int]:
     return actions, decisions
 
 
-def _play(vector: Any, actions: NDArray[np.int64]) -> None:
-    for row in actions:
-        vector.step(row)
-
-
 def _batch_rate(id: str, mode: str, steps: int, sizes: Sizes, capacity: int) -> float:
     """Decisions a second of one kind of vector environment."""
     vector: Any = gym.make_vec(id, sizes.batch, vectorization_mode=mode, capacity=capacity)
+
+    def play() -> None:
+        for row in actions:
+            vector.step(row)
+
     try:
         actions, decisions = record(vector, steps)
-        return decisions / best_s(sizes.repeats, lambda: vector.reset(seed=SEED), lambda: _play(vector, actions))
+        return decisions / best_s(sizes.repeats, lambda: vector.reset(seed=SEED), play)
     finally:
         vector.close()
 
 
 def _batches(sizes: Sizes) -> Iterable[Figure]:
-    of = f"n = {sizes.batch}, L = {sizes.capacity}, all observation fields, resets in the time"
+    call, rest = "gym.make_vec(vectorization_mode=", "all observation fields, resets in the time"
+    batch = f"n = {sizes.batch}, L = {sizes.capacity}, {rest}"
     for id in ENVIRONMENTS:
         native = _batch_rate(id, "vector_entry_point", sizes.steps, sizes, sizes.capacity)
         sync = _batch_rate(id, "sync", sizes.sync_steps, sizes, sizes.capacity)
-        kind = "gym.make_vec(vectorization_mode="
-        yield Figure(
-            f"native batch, {id}", native, "steps/s", 3e6, f"decisions a second of {kind}'vector_entry_point'), {of}"
-        )
-        yield Figure(f"SyncVectorEnv, {id}", sync, "steps/s", None, f"decisions a second of {kind}'sync'), {of}")
+        definition = f"decisions a second of {call}'vector_entry_point'), {batch}"
+        yield Figure(f"native batch, {id}", native, "steps/s", 3e6, definition)
+        yield Figure(f"SyncVectorEnv, {id}", sync, "steps/s", None, f"decisions a second of {call}'sync'), {batch}")
         yield Figure(f"native / SyncVectorEnv, {id}", native / sync, "times", 50.0, "the ratio of these two")
     topics = len(scenarios.get("topics").topics)
     yield Figure(
@@ -136,8 +141,8 @@ def _batches(sizes: Sizes) -> Iterable[Figure]:
         _batch_rate(TOPICS, "vector_entry_point", sizes.steps, sizes, sizes.topic_slots),
         "steps/s",
         1e6,
-        "decisions and choices of what to send a second of gym.make_vec(vectorization_mode='vector_entry_point'), "
-        f"n = {sizes.batch}, L = {sizes.topic_slots}, all observation fields, resets in the time",
+        f"decisions and choices of what to send a second of {call}'vector_entry_point'), "
+        f"n = {sizes.batch}, L = {sizes.topic_slots}, {rest}",
     )
 
 
@@ -162,12 +167,12 @@ def _single_rate(id: str, sizes: Sizes) -> float:
 
 
 def _singles(sizes: Sizes) -> Iterable[Figure]:
-    of = f"L = {sizes.capacity}, all observation fields, resets in the time"
+    definition = (
+        f"calls of Env.step a second, without wrappers, L = {sizes.capacity}, all observation fields, "
+        "resets in the time"
+    )
     for id in ENVIRONMENTS:
-        rate = _single_rate(id, sizes)
-        yield Figure(
-            f"single environment, {id}", rate, "steps/s", 1e5, f"calls of Env.step a second, without wrappers, {of}"
-        )
+        yield Figure(f"single environment, {id}", _single_rate(id, sizes), "steps/s", 1e5, definition)
 
 
 def _rollouts(sizes: Sizes) -> Iterable[Figure]:
@@ -175,6 +180,10 @@ def _rollouts(sizes: Sizes) -> Iterable[Figure]:
     episodes = [draw(scenario, seed) for seed in range(sizes.episodes)]
     arrivals = sum(len(episode.arrivals) for episode in episodes)
     senders = Senders(len(episodes), sizes.capacity, scenario.value, max_messages=scenario.max_messages)
+    definition = (
+        f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {sizes.capacity};"
+        " drawing, loading and scoring them not in the time"
+    )
 
     def load() -> None:
         for i, episode in enumerate(episodes):
@@ -184,15 +193,8 @@ def _rollouts(sizes: Sizes) -> Iterable[Figure]:
         run = functools.partial(senders.run, policies.get(name))
         load()
         run()  # compiled, or loaded from disk, before the clock starts
-        seconds = best_s(sizes.repeats, load, run)
-        yield Figure(
-            f"rollout, {name}",
-            arrivals / seconds,
-            "arrivals/s",
-            2e7,
-            f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {sizes.capacity};"
-            " drawing, loading and scoring them not in the time",
-        )
+        rate = arrivals / best_s(sizes.repeats, load, run)
+        yield Figure(f"rollout, {name}", rate, "arrivals/s", 2e7, definition)
 
 
 def human(number: float) -> str:
@@ -205,29 +207,30 @@ def human(number: float) -> str:
 
 def report(figures: list[Figure], repeats: int) -> str:
     """Figures beside their targets, then what each is."""
-    lines = [(figure.name, f"{human(figure.value)} {figure.unit}", _target(figure)) for figure in figures]
-    widths = [max(len(line[c]) for line in lines) for c in range(3)]
-    out = [f"{name:<{widths[0]}}  {value:>{widths[1]}}  {target}".rstrip() for name, value, target in lines]
-    out += ["", f"Best of {repeats} repeats each, one thread. Actions drawn beforehand among the possible ones."]
+    names, values = [figure.name for figure in figures], [f"{human(figure.value)} {figure.unit}" for figure in figures]
+    targets = ["" if f.target is None else f"(target {human(f.target)} {f.unit})" for f in figures]
+    widths = max(map(len, names)), max(map(len, values))
+    lines = [
+        f"{name:<{widths[0]}}  {value:>{widths[1]}}  {target}".rstrip()
+        for name, value, target in zip(names, values, targets, strict=True)
+    ]
+    lines += ["", f"Best of {repeats} repeats each, one thread. Actions drawn beforehand among the valid ones."]
     if not JIT:
-        out.append("Compilation is off (NUMBA_DISABLE_JIT): these figures say nothing about bufgym's speed.")
-    definitions = dict.fromkeys(f"{figure.name.split(',')[0]}: {figure.definition}" for figure in figures)
-    return "\n".join([*out, *(f"- {line}" for line in definitions)])
-
-
-def _target(figure: Figure) -> str:
-    return "" if figure.target is None else f"(target {human(figure.target)} {figure.unit})"
+        lines.append("Compilation is off (NUMBA_DISABLE_JIT): these figures say nothing about bufgym's speed.")
+    lines += dict.fromkeys(f"- {figure.name.split(',')[0]}: {figure.definition}" for figure in figures)
+    return "\n".join(lines)
 
 
 def write_json(figures: list[Figure], sizes: Sizes, path: Path) -> None:
     """Figures, sizes and what they were measured on."""
-    about = {
+    document = {
         "versions": {name: version(name) for name in ("bufgym", "numpy", "numba", "gymnasium")},
         "python": platform.python_version(),
         "machine": platform.machine(),
         "processors": os.cpu_count(),
         "compiled": JIT,
+        "sizes": asdict(sizes),
+        "figures": [asdict(figure) for figure in figures],
     }
-    made = {**about, "sizes": asdict(sizes), "figures": [asdict(figure) for figure in figures]}
     with replaced(path) as temporary:
-        temporary.write_text(json.dumps(made, indent=2) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")

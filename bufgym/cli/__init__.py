@@ -1,7 +1,7 @@
 """The command ``bufgym``. Thin: each command reads its options and calls the room that does the work.
 
 One module a command: its ``add`` puts the command and its options into the parser, and ``_parser`` calls each ``add``.
-Whatever is heavy is imported inside the function that needs it. A mistake of the caller's (an option, a file) ends in
+Heavy modules are imported inside the function that needs them. A mistake of the caller's (an option, a file) ends in
 one line on stderr and exit code 2; Ctrl-C in 130.
 """
 
@@ -24,14 +24,14 @@ __all__ = ["KINDS", "_LISTS", "environments", "main", "split_policies"]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit code."""
-    files: list[str] = []
+    policy_file: str | None = None
     try:
         options = _parser().parse_args(arguments)
-        files = [options.policy_file] if getattr(options, "policy_file", None) else []
+        policy_file = getattr(options, "policy_file", None)
         options.command(options)
         sys.stdout.flush()
     except BrokenPipeError:
-        # The reader (head, less) has gone; what the interpreter flushes at its end has nowhere to go either.
+        # The reader (head, less) has gone; what the interpreter flushes at its exit has nowhere to go either.
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), sys.stdout.fileno())
         return 141
@@ -40,15 +40,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BufgymError as error:
         return _failed(str(error))
     except OSError as error:
-        named = f"{error.filename}: " if error.filename is not None else ""
-        return _failed(f"{named}{error.strerror or error}")
+        file = f"{error.filename}: " if error.filename is not None else ""
+        return _failed(f"{file}{error.strerror or error}")
     except Exception as error:
-        place = next(filter(None, (line_in(error, file) for file in files)), None)
-        if place is None and files and _from_numba(error):
-            return _failed(f"{files[0]}: a policy with compile=True that Numba cannot compile: {_gist(error)}")
-        if place is None:
-            raise
-        return _failed(f"{place}: {type(error).__name__}: {error}")
+        place = line_in(error, policy_file) if policy_file else None
+        if place is not None:
+            return _failed(f"{place}: {type(error).__name__}: {error}")
+        if policy_file and type(error).__module__.startswith("numba."):
+            return _failed(f"{policy_file}: a policy with compile=True that Numba cannot compile: {_gist(error)}")
+        raise
     return 0
 
 
@@ -57,18 +57,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"bufgym {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     # In the order in which --help shows them.
-    listing.add(commands)
-    bench.add(commands)
-    topics.add(commands)
-    fleet.add(commands)
-    report.add(commands)
-    tune.add(commands)
-    leaderboard.add(commands)
-    traces.add(commands)
-    figures.add(commands)
-    perf.add(commands)
-    play.add(commands)
-    export.add(commands)
+    for module in (listing, bench, topics, fleet, report, tune, leaderboard, traces, figures, perf, play, export):
+        module.add(commands)
     return parser
 
 
@@ -80,15 +70,11 @@ def _failed(message: str) -> int:
     return 2
 
 
-def _from_numba(error: Exception) -> bool:
-    return type(error).__module__.startswith("numba.")
-
-
 def _gist(error: Exception) -> str:
-    """The part of Numba's many lines that tells most: what it did not know, and the line of the source."""
+    """The part of Numba's long message that helps: what it could not compile, and the line of the source."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     # "File "mine.py", line 4:" comes last of all.
     place = [line.rstrip(":") for line in lines if line.startswith("File ")][-1:]
-    telling = [line for line in lines if not line.startswith(("Failed in", "During:", "File ", "-", "^", "<"))][:1]
+    reason = [line for line in lines if not line.startswith(("Failed in", "During:", "File ", "-", "^", "<"))][:1]
     # Written out, the type of a buffer has some twenty fields.
-    return re.sub(r"\bBuffer\(.*\)", "Buffer", "; ".join([*telling, *place]))
+    return re.sub(r"\bBuffer\(.*\)", "Buffer", "; ".join([*reason, *place]))

@@ -1,9 +1,9 @@
-"""``bufgym list``: what there is."""
+"""``bufgym list``: environments, scenarios, suites, policies and more, by name."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from bufgym.cli.options import Commands, columns, command, load_policies, policy_file
@@ -32,10 +32,12 @@ def environments() -> dict[str, str]:
 def _list_environments() -> str:
     from bufgym.scenario import SCENARIOS
 
-    def what(scenario: str) -> str:
-        return SCENARIOS[scenario][1] if scenario in SCENARIOS else ""
-
-    return columns([(id, f"scenario {scenario}", what(scenario)) for id, scenario in sorted(environments().items())])
+    return columns(
+        [
+            (id, f"scenario {scenario}", SCENARIOS[scenario][1] if scenario in SCENARIOS else "")
+            for id, scenario in sorted(environments().items())
+        ]
+    )
 
 
 def _list_scenarios() -> str:
@@ -58,22 +60,18 @@ def _list_policies() -> str:
     from bufgym import oracle, policies  # noqa: F401  (the oracle registers the clairvoyant)
 
     width = max(map(len, policies.names()))
-    one_queue, schedulers = (_policy_lines(policies.names(for_topics=topics), width) for topics in (False, True))
-    return "\n".join([*one_queue, "  -- made for several topics side by side --", *schedulers])
-
-
-def _policy_lines(names: Iterable[str], width: int) -> list[str]:
-    from bufgym import policies
-
     lines = []
-    for name in names:
-        policy = policies.get(name)
-        lines.append(f"  {name:<{width}}  {policy.summary}".rstrip())
-        settings = ", ".join(f"{setting}={policy.memory[setting]:g}" for setting in policy.parameters)
-        if settings:
-            lines.append(f"  {'':<{width}}  settings: {settings}")
-        lines.append(f"  {'':<{width}}  from: {policy.source or 'a policy file'}")
-    return lines
+    for for_topics in (False, True):
+        if for_topics:
+            lines.append("  -- made for several topics side by side --")
+        for name in policies.names(for_topics=for_topics):
+            policy = policies.get(name)
+            lines.append(f"  {name:<{width}}  {policy.summary}".rstrip())
+            settings = ", ".join(f"{setting}={policy.memory[setting]:g}" for setting in policy.parameters)
+            if settings:
+                lines.append(f"  {'':<{width}}  settings: {settings}")
+            lines.append(f"  {'':<{width}}  from: {policy.source or 'a policy file'}")
+    return "\n".join(lines)
 
 
 def _list_values() -> str:
@@ -95,23 +93,21 @@ def _first_line(function: Any) -> str:
 def _list_rewards() -> str:
     from bufgym.observe import REWARD_TERMS, TOPIC_REWARD_TERMS
 
-    return _in_two_parts(
-        [[(term.name, term.unit, term.meaning) for term in terms] for terms in (REWARD_TERMS, TOPIC_REWARD_TERMS)]
-    )
+    rows = [(term.name, term.unit, term.meaning) for term in REWARD_TERMS + TOPIC_REWARD_TERMS]
+    return _in_two_parts(rows, len(REWARD_TERMS))
 
 
 def _list_observations() -> str:
     from bufgym.observe import FIELDS, TOPIC_FIELDS
 
-    return _in_two_parts(
-        [[(f.name, f.per, f.group, f.unit, f.meaning) for f in fields] for fields in (FIELDS, TOPIC_FIELDS)]
-    )
+    rows = [(field.name, field.per, field.group, field.unit, field.meaning) for field in FIELDS + TOPIC_FIELDS]
+    return _in_two_parts(rows, len(FIELDS))
 
 
-def _in_two_parts(parts: list[list[tuple[str, ...]]]) -> str:
-    """Rows that every environment has, then those that come with several topics, in the same columns."""
-    lines = columns([row for rows in parts for row in rows]).split("\n")
-    return "\n".join([*lines[: len(parts[0])], "  -- with several topics besides --", *lines[len(parts[0]) :]])
+def _in_two_parts(rows: Sequence[Sequence[str]], first: int) -> str:
+    """The ``first`` rows, which every environment has, then those of several topics, in the same columns."""
+    lines = columns(rows).split("\n")
+    return "\n".join([*lines[:first], "  -- with several topics besides --", *lines[first:]])
 
 
 def _list_traces() -> str:
@@ -136,4 +132,4 @@ _LISTS: dict[str, Callable[[], str]] = {
 }
 
 KINDS = tuple(_LISTS)
-"""What ``list`` can be asked for, in the order it shows."""
+"""The arguments of ``list``, in the order in which it prints them all."""

@@ -42,7 +42,7 @@ def _play(options: argparse.Namespace) -> None:
     env: Any = gymnasium.make(id, capacity=options.capacity, render_mode="ansi").unwrapped
     player = Player(policy)
     env.reset(options={"episode": draw(env.rows.scenario, options.seed)})
-    # On a terminal each picture takes the place of the one before, unless no escapes are wanted (no-color.org).
+    # On a terminal each picture replaces the one before, unless the user wants no escape codes (no-color.org).
     plain = not sys.stdout.isatty() or bool(os.environ.get("NO_COLOR"))
     clear = "" if plain else "\x1b[H\x1b[J"
 

@@ -1,7 +1,31 @@
-"""Gymnasium environments: a single sender, and n of them as one native batch."""
+"""Environments: a single sender, n of them as one native batch, and robots that share a cell.
+
+``FleetEnv`` and ``parallel_env`` are PettingZoo's and need the extra ``fleet``; all the rest does without it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 from bufgym import oracle  # noqa: F401  (registers the clairvoyant, so that it can play here)
+from bufgym.envs.fleet_vec import FleetVecEnv
 from bufgym.envs.single import SenderEnv
 from bufgym.envs.vector import SenderVectorEnv
+from bufgym.errors import BufgymError
 
-__all__ = ["SenderEnv", "SenderVectorEnv"]
+if TYPE_CHECKING:
+    from bufgym.envs.fleet import FleetEnv, parallel_env
+
+__all__ = ["FleetEnv", "FleetVecEnv", "SenderEnv", "SenderVectorEnv", "parallel_env"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in ("FleetEnv", "parallel_env"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        from bufgym.envs import fleet
+    except ModuleNotFoundError as error:
+        if error.name != "pettingzoo":
+            raise
+        raise BufgymError(f'{name} needs pettingzoo: pip install "bufgym[fleet]"') from None
+    return getattr(fleet, name)

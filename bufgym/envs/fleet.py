@@ -12,18 +12,16 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from bufgym.envs.fleet_rows import FleetRows, check_reward
-from bufgym.envs.rows import DELIVERED, RETAINED
+from bufgym.envs.rows import FleetRows, Observation, check_render_mode
 from bufgym.errors import BufgymError
 from bufgym.scenario import FleetScenario, Uplink
 
-Observation = dict[str, NDArray[Any]]
 Infos = dict[str, dict[str, Any]]
 Spaces = dict[str, spaces.Space[Any]]
 
 _QUEUED, _FREE = "■", "·"
 _WIDEST = 32
-"""Up to this L every slot of the buffer is a sign of its own in a picture."""
+"""Up to this L a picture has a character for every slot of the buffer, beyond it two numbers."""
 
 
 class FleetEnv(ParallelEnv[str, Observation, int]):
@@ -32,20 +30,30 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     **A step is one frame tick**: all cameras tick together, so at every step each robot decides about its newcomer at
     the same moment, knowing nothing of the others' decisions; then the cell carries what it can until the next tick.
 
-    **Agents** ``robot_0`` .. ``robot_{N-1}``, N up to 256; all of them live until the episode's last message has left.
+    **Agents** ``robot_0`` .. ``robot_{N-1}``, N up to 256.
 
-    **Action, observation, end** of each are those of ``SenderEnv``: ``Discrete(L + 2)``; a Dict with one key for each
-    field of ``bufgym.observe``, of what that robot has on board. ``infos[agent]["action_mask"]`` bool[L + 2] says
-    which actions are possible; with ``mask_in_observation`` so does ``observation["action_mask"]``, int8[L + 2].
-    ``state()`` is every field of every robot, for critics that may see them all.
+    **Action, observation** of each are those of ``SenderEnv``: ``Discrete(L + 2)``; a Dict with one key for each field
+    of ``bufgym.observe``, of what that robot has on board. ``infos[agent]["action_mask"]`` bool[L + 2] says which
+    actions are valid; with ``mask_in_observation`` so does ``observation["action_mask"]``, int8[L + 2]. ``state()`` is
+    every field of every robot, for critics that may see them all.
 
     **Reward** "team": each robot gets the mean over all robots of the ``term`` (or weighted terms) that ``SenderEnv``
     calls reward; "own": its own. ``infos[agent]["reward_terms"]`` has each robot's own terms in any case.
 
-    **Arguments** ``robots`` N; ``scenario``: the name of an uplink, an ``Uplink`` (what each robot would have if it
-    were alone) or a ``FleetScenario``; ``capacity`` L; ``max_bytes`` B; ``fields``: names to observe; any further
-    argument replaces a parameter of the uplink. ``reset(options={"episode": e})`` plays a given ``FleetEpisode``;
-    PettingZoo lets other options pass.
+    **Episode end** all agents are ``terminated`` together, when the last message of the episode has left; none is ever
+    ``truncated``. The last infos have what those of ``SenderEnv`` have.
+
+    **Arguments**
+
+    - ``robots``: N.
+    - ``scenario``: the name of an uplink, an ``Uplink`` (what each robot would have if it were alone) or a
+      ``FleetScenario``.
+    - ``capacity``: L of every robot, messages; ``max_bytes``: B, bytes.
+    - ``reward`` and ``term``: see above; ``fields``: names of the fields to observe.
+    - ``mask_in_observation``: see above; ``render_mode``: "ansi".
+    - any further argument replaces a parameter of the uplink.
+
+    ``reset(options={"episode": e})`` plays the ``FleetEpisode`` e; other options are ignored, as PettingZoo has it.
     """
 
     metadata = {"name": "bufgym_fleet_v0", "render_modes": ["ansi"], "is_parallelizable": True, "render_fps": 10}
@@ -56,34 +64,25 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         scenario: str | Uplink | FleetScenario = "lte",
         capacity: int = 8,
         *,
-        max_bytes: int | None = None,
         reward: str = "team",
         term: str | Mapping[str, float] = "retained",
+        max_bytes: int | None = None,
         fields: Sequence[str] | None = None,
         mask_in_observation: bool = False,
         render_mode: str | None = None,
         **parameters: Any,
     ) -> None:
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise BufgymError(f"render_mode = {render_mode!r}: must be one of {self.metadata['render_modes']}")
-        self.rows = FleetRows(
-            1,
-            scenario=FleetScenario.of(robots, scenario, **parameters),
-            capacity=capacity,
-            max_bytes=max_bytes,
-            term=term,
-            fields=fields,
-        )
-        self.reward = check_reward(reward)
+        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
+        fleet = FleetScenario.of(robots, scenario, **parameters)
+        self.rows = FleetRows(1, fleet, capacity, reward=reward, term=term, max_bytes=max_bytes, fields=fields)
         self.mask_in_observation = mask_in_observation
-        self.render_mode = render_mode
         self.possible_agents = [f"robot_{i}" for i in range(len(self.rows))]
         self.agents: list[str] = []
         # PettingZoo's way to seed an agent's actions is to seed its space: each has one of its own.
         self.observation_spaces: Spaces = {agent: self._space() for agent in self.possible_agents}
         actions = self.rows.capacity + 2
         self.action_spaces: Spaces = {agent: spaces.Discrete(actions) for agent in self.possible_agents}
-        self.state_space = spaces.Box(0.0, 1.0, (self._fields().size,), np.float32)
+        self.state_space = spaces.Box(0.0, 1.0, self.state().shape, np.float32)
         self._actions = np.zeros(len(self.rows), np.int64)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -100,7 +99,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
             rows.seed(0, seeding.np_random(seed)[0])
         rows.reset(np.arange(len(rows)), [(options or {}).get("episode")])
         self.agents = list(self.possible_agents)
-        masks = rows.shown.mask.copy()
+        masks = rows.output.action_mask.copy()
         infos = {agent: {"action_mask": masks[i], "invalid": 0} for i, agent in enumerate(self.agents)}
         return self._observations(masks), infos
 
@@ -115,30 +114,28 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
             if action is None:
                 raise BufgymError(f"actions: none for {agent!r}; every robot decides at every tick")
             if not 0 <= action < rows.capacity + 2:
-                raise BufgymError(f"actions[{agent!r}] = {action}: must lie in 0..{rows.capacity + 1}")
+                raise rows.bad_action(f"actions[{agent!r}]", action)
             self._actions[i] = action
         rows.step(self._actions)
-        terms, masks = rows.shown.terms, rows.shown.mask.copy()
-        earned = rows.weights[DELIVERED] * terms[:, DELIVERED] + rows.weights[RETAINED] * terms[:, RETAINED]
-        rewards = rows.shared(earned, self.reward).tolist()
-        ended = bool(rows.shown.ended[0])
-        infos = self._infos(masks, terms.tolist(), ended)
-        if ended:
+        masks = rows.output.action_mask.copy()
+        terminated = bool(rows.output.terminated[0])
+        if terminated:
             self.agents = []
         return (
             self._observations(masks),
-            dict(zip(agents, rewards, strict=True)),
-            dict.fromkeys(agents, ended),
+            dict(zip(agents, rows.rewards().tolist(), strict=True)),
+            dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, False),
-            infos,
+            {agent: rows.info(i, masks[i]) for i, agent in enumerate(agents)},
         )
 
     def state(self) -> NDArray[np.float32]:
         """float32[N x fields]: robot by robot, every slot field, then every context field; chosen or not."""
-        return self._fields().ravel()
+        output = self.rows.output
+        return np.concatenate([output.slots.reshape(len(self.rows), -1), output.context], axis=1).ravel()
 
     def render(self) -> str | None:
-        """One line a robot: its buffer, what it is sending, and what has become of its messages."""
+        """One line a robot: its buffer, whether it is sending, and what has become of its messages."""
         if self.render_mode is None:
             gym.logger.warn("render() needs a render_mode: parallel_env(..., render_mode='ansi')")
             return None
@@ -153,12 +150,12 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         """Nothing to close."""
 
     def _line(self, i: int) -> str:
-        sender, told = self.rows.senders.batch.senders[i], self.rows.summary(i)
+        sender, summary = self.rows.senders.batch.senders[i], self.rows.summary(i)
         queued, L = int(sender["occupancy"]), self.rows.capacity
-        shown = _QUEUED * queued + _FREE * (L - queued) if L <= _WIDEST else f"{queued}/{L}"
+        buffer = _QUEUED * queued + _FREE * (L - queued) if L <= _WIDEST else f"{queued}/{L}"
         sending = "▶" if sender["busy"] else " "
-        counts = f"delivered {told['delivered']:>4}  dropped {told['dropped']:>4}  H {told['qoi']:.2f}"
-        return f"{self.possible_agents[i]:<9} {shown} {sending} {counts}"
+        counts = f"delivered {summary['delivered']:>4}  dropped {summary['dropped']:>4}  H {summary['qoi']:.2f}"
+        return f"{self.possible_agents[i]:<9} {buffer} {sending} {counts}"
 
     def _space(self) -> spaces.Dict:
         space = dict(self.rows.observation_space.spaces)
@@ -168,30 +165,12 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
 
     def _observations(self, masks: NDArray[np.bool_]) -> dict[str, Observation]:
         rows = self.rows
-        slots, context = rows.shown.slots.copy(), rows.shown.context.copy()
-        seen: dict[str, Observation] = {
-            agent: rows.observation(slots[i], context[i]) for i, agent in enumerate(self.possible_agents)
-        }
+        slots, context = rows.output.slots.copy(), rows.output.context.copy()
+        observations = {agent: rows.observation(slots[i], context[i]) for i, agent in enumerate(self.possible_agents)}
         if self.mask_in_observation:
-            as_int8 = masks.astype(np.int8)
-            for i, agent in enumerate(self.possible_agents):
-                seen[agent]["action_mask"] = as_int8[i]
-        return seen
-
-    def _infos(self, masks: NDArray[np.bool_], terms: list[list[float]], ended: bool) -> Infos:
-        invalid = self.rows.senders.batch.senders["invalid"].tolist()
-        infos: Infos = {}
-        for i, agent in enumerate(self.possible_agents):
-            earned = {"delivered": terms[i][DELIVERED], "retained": terms[i][RETAINED]}
-            infos[agent] = {"action_mask": masks[i], "invalid": invalid[i], "reward_terms": earned}
-            if ended:
-                infos[agent] |= {name: number.item() for name, number in self.rows.summary(i).items()}
-        return infos
-
-    def _fields(self) -> NDArray[np.float32]:
-        """[N, slot fields x (L + 1) + context fields]"""
-        shown = self.rows.shown
-        return np.concatenate([shown.slots.reshape(len(self.rows), -1), shown.context], axis=1)
+            for observation, mask in zip(observations.values(), masks.astype(np.int8), strict=True):
+                observation["action_mask"] = mask
+        return observations
 
 
 def parallel_env(**arguments: Any) -> FleetEnv:

@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from bufgym.envs.fleet_rows import FleetRows, check_reward
-from bufgym.envs.single import Observation
+from bufgym.checks import whole
+from bufgym.envs.rows import FleetRows, Rows
 from bufgym.envs.vector import SenderVectorEnv
-from bufgym.errors import BufgymError
 from bufgym.scenario import FleetScenario, Uplink
 
 
@@ -27,13 +23,13 @@ class FleetVecEnv(SenderVectorEnv):
         envs = GymVecEnv(FleetVecEnv(cells=16, robots=4, autoreset_mode="SameStep"))
         MaskablePPO("MultiInputPolicy", envs).learn(1_000_000)
 
-    All is as in ``SenderVectorEnv``, but: the robots of a cell begin and end together; ``reset(seed=s)`` seeds cell c
-    with s + c N; ``options["episodes"]`` holds a ``FleetEpisode`` for each cell; ``reward`` is "team" (each robot gets
-    the mean over its cell) or "own", of the ``term`` that the other environments call reward. ``reward_terms`` in the
-    infos stay each robot's own.
-    """
+    **Action, observation, episode end** of each row are those of ``SenderVectorEnv``, and so are the other arguments,
+    but: the robots of a cell begin and end together; ``reset(seed=s)`` seeds cell c with s + c N;
+    ``options["episodes"]`` holds a ``FleetEpisode`` for each cell; ``parameters`` replace those of the uplink.
 
-    rows: FleetRows
+    **Reward** "team": each robot gets the mean over its cell of the ``term`` (or weighted terms) that the other
+    environments call reward; "own": its own. ``info["reward_terms"]`` has each robot's own in any case.
+    """
 
     def __init__(
         self,
@@ -42,21 +38,11 @@ class FleetVecEnv(SenderVectorEnv):
         scenario: str | Uplink | FleetScenario = "lte",
         capacity: int = 8,
         *,
-        reward: str = "team",
-        term: str | Mapping[str, float] = "retained",
         parameters: Mapping[str, Any] | None = None,
-        **vector: Any,
+        **options: Any,
     ) -> None:
-        if isinstance(cells, bool) or not isinstance(cells, int | np.integer) or cells < 1:
-            raise BufgymError(f"cells = {cells!r}: must be a whole number >= 1")
-        fleet = FleetScenario.of(robots, scenario, **(parameters or {}))
-        limits = {name: vector.get(name) for name in ("max_bytes", "fields")}
-        self.reward = check_reward(reward)
-        super().__init__(int(cells) * fleet.robots, fleet.uplink, capacity, reward=term, **vector)
-        self.rows = FleetRows(int(cells), scenario=fleet, capacity=capacity, term=term, **limits)
+        fleet: Any = FleetScenario.of(robots, scenario, **(parameters or {}))
+        super().__init__(whole("cells", cells, 1), fleet, capacity, **options)
 
-    def step(
-        self, actions: NDArray[np.int64]
-    ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        observation, rewards, terminated, truncated, info = super().step(actions)
-        return observation, self.rows.shared(rewards, self.reward), terminated, truncated, info
+    def _make_rows(self, n: int, scenario: Any, capacity: int, **options: Any) -> Rows:
+        return FleetRows(n, scenario, capacity, **options)

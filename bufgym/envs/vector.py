@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -13,23 +13,32 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import Rows, Shown
-from bufgym.envs.single import Observation, SenderEnv
+from bufgym.checks import whole
+from bufgym.envs.rows import Observation, Rows, check_render_mode
+from bufgym.envs.step import StepOutput
 from bufgym.errors import BufgymError
 from bufgym.scenario import Scenario
 
-_ENDED = ("qoi", "arrived", "delivered", "dropped")
+_SUMMARY = ("qoi", "arrived", "delivered", "dropped")
+"""What the info of an ended row has besides that of every step."""
 
 
 class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
-    """A batch of ``SenderEnv``: same arguments, same episodes row by row, one compiled step for all rows.
+    """A batch of ``SenderEnv``: the same actions, observations, rewards, episode ends and arguments, row by row.
 
-    With several topics some rows may ask what to drop and others what to send: ``socket_asks`` says which.
+    With several topics some rows may ask what to drop and others what to send: the field ``socket_asks`` says which.
 
-    ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do. ``info`` follows their form
-    too: ``info["action_mask"]`` bool[n, L + 2], ``info["impossible"]``, ``info["reward_terms"]``; with SAME_STEP
-    autoreset ``info["final_obs"]`` and ``info["final_info"]`` for rows that ended (``info["_final_obs"]`` says which).
-    Arrays that a step hands out are never written again while anyone holds them.
+    ``num_envs``: n, rows. ``max_episode_steps`` truncates episodes, as Gymnasium's ``TimeLimit`` does.
+    ``autoreset_mode``: one of Gymnasium's. ``options``: the other arguments of ``SenderEnv``.
+
+    ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do; a sequence seeds row by row.
+    Options of ``reset``: ``reset_mask`` (bool[n], rows to reset) and ``episodes`` (one a row, None where the next is
+    drawn).
+
+    ``info`` has Gymnasium's form: ``info["action_mask"]`` bool[n, L + 2], ``info["invalid"]`` int64[n],
+    ``info["reward_terms"]`` float64[n] by name; with SAME_STEP autoreset ``info["final_obs"]`` and
+    ``info["final_info"]`` for rows that ended (``info["_final_obs"]`` says which). Arrays that a step hands out are
+    never written again while anyone holds them.
     """
 
     metadata = {
@@ -44,48 +53,35 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         scenario: str | Scenario = "lte",
         capacity: int = 8,
         *,
-        max_bytes: int | None = None,
-        decide_at: str = "arrival",
-        reward: str | Mapping[str, float] = "retained",
-        fields: Sequence[str] | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
-        **parameters: Any,
+        **options: Any,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-            raise BufgymError(f"num_envs = {num_envs!r}: must be a whole number >= 1")
+        rows = self._make_rows(whole("num_envs", num_envs, 1), scenario, capacity, **options)
         if max_episode_steps is not None and max_episode_steps < 1:
             raise BufgymError(f"max_episode_steps = {max_episode_steps}: must be >= 1, or None for no limit")
-        if render_mode is not None and render_mode not in SenderEnv.metadata["render_modes"]:
-            raise BufgymError(f"render_mode = {render_mode!r}: must be one of {SenderEnv.metadata['render_modes']}")
-        self.rows = Rows(
-            int(num_envs),
-            scenario=scenario,
-            capacity=capacity,
-            max_bytes=max_bytes,
-            decide_at=decide_at,
-            reward=reward,
-            fields=fields,
-            parameters=parameters,
-        )
-        self.num_envs = int(num_envs)
-        self.max_episode_steps = max_episode_steps
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)
             raise BufgymError(f"autoreset_mode = {autoreset_mode!r}: must be one of {known}") from None
+        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.render_mode = render_mode
-        self.single_observation_space = self.rows.observation_space
-        self.single_action_space = self.rows.action_space
+        self.rows = rows
+        self.num_envs = len(rows)
+        self.max_episode_steps = max_episode_steps
+        self.single_observation_space = rows.observation_space
+        self.single_action_space = rows.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done = np.zeros(self.num_envs, np.bool_)
         self._every_row = np.ones(self.num_envs, np.bool_)
-        self._pool: list[Shown] = []
+        self._pool: list[StepOutput] = []
+
+    def _make_rows(self, n: int, scenario: Any, capacity: int, **options: Any) -> Rows:
+        return Rows(n, scenario, capacity, **options)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -105,7 +101,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise BufgymError(f"options['reset_mask'] has shape {mask.shape}: must be ({self.num_envs},)")
         if any(self.rows.senders.episodes[i] is None for i in np.flatnonzero(~mask)):
             raise gym.error.ResetNeeded("options['reset_mask'] leaves out rows that have no episode yet")
-        self._turn_page(keep=True)
+        self._renew_output(keep=True)
         chosen = np.flatnonzero(mask)
         for i in chosen.tolist():
             if seeds[i] is not None:
@@ -124,114 +120,104 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise BufgymError(f"actions have shape {actions.shape}: must be ({self.num_envs},)")
         if actions.min() < 0 or actions.max() >= rows.capacity + 2:
             wrong = int(np.argmax((actions < 0) | (actions >= rows.capacity + 2)))
-            raise BufgymError(f"actions[{wrong}] = {actions[wrong]}: must lie in 0..{rows.capacity + 1}")
+            raise rows.bad_action(f"actions[{wrong}]", actions[wrong])
         if rows.senders.episodes[-1] is None:
             raise gym.error.ResetNeeded("call reset() before step()")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._done.any():
             raise gym.error.ResetNeeded("rows have ended: call reset(options={'reset_mask': done}) first")
         restart = self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any()
-        self._turn_page()
+        self._renew_output()
         rows.step(actions)  # rows that have ended stay as they are
         self._steps += 1
         if restart:
             rows.reset(np.flatnonzero(self._done))
-            rows.shown.terms[self._done] = 0.0
+            rows.output.reward_terms[self._done] = 0.0
             self._steps[self._done] = 0
-        shown = rows.shown
-        # Written out as in the single environment: a matrix product may round differently.
-        rewards = np.zeros(self.num_envs)
-        for k, weight in enumerate(rows.weights.tolist()):
-            rewards += weight * shown.terms[:, k]
-        terminated = shown.ended & ~self._done if restart else shown.ended.copy()
+        rewards = rows.rewards()
+        terminated = rows.output.terminated & ~self._done if restart else rows.output.terminated.copy()
         truncated = np.zeros(self.num_envs, np.bool_)
         if self.max_episode_steps is not None:
             truncated = self._steps >= self.max_episode_steps  # as Gymnasium's TimeLimit: also where it ends anyway
         self._done = terminated | truncated
-        info: dict[str, Any] = {}
-        if self._done.any():
-            info = self._end(self._done)
+        info = self._end(self._done) if self._done.any() else {}
         info |= self._info()
         return self._observation(), rewards, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """bool[n, L + 2]: the actions that are possible now in each row."""
-        return self.rows.shown.mask.copy()
+        """bool[n, L + 2]: the actions that are valid now in each row."""
+        return self.rows.output.action_mask.copy()
 
     def render(self) -> Any:
         """Each row as the single environment renders it."""
-        from bufgym.envs import render
-
         if self.render_mode is None:
             gym.logger.warn("render() needs a render_mode: gym.make_vec(..., render_mode='ansi' or 'rgb_array')")
             return None
-        draw = render.ansi if self.render_mode == "ansi" else render.rgb_array
-        return tuple(draw(self.rows.senders, i) for i in range(self.num_envs))
+        from bufgym.envs import render  # loaded by those who draw only
+
+        return tuple(render.draw(self.rows.senders, i, self.render_mode) for i in range(self.num_envs))
 
     def _end(self, done: NDArray[np.bool_]) -> dict[str, Any]:
-        """What ended rows report; with SAME_STEP they begin anew at once."""
+        """The infos of rows that have ended; with SAME_STEP autoreset these rows begin anew at once."""
         rows = self.rows
-        summary = rows.summary(slice(None))
-        ended = done & rows.shown.ended
-        report: dict[str, Any] = {}
-        for name in _ENDED:
-            report[name] = np.where(ended, summary[name], 0)
-            report[f"_{name}"] = ended
+        ended = done & rows.output.terminated
+        summaries: dict[str, Any] = {}
+        if ended.any():
+            columns = rows.summary(slice(None))
+            for name in _SUMMARY:
+                summaries |= {name: np.where(ended, columns[name], 0), f"_{name}": ended}
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
-            return report if ended.any() else {}
-        if not ended.any():
-            report = {}
+            return summaries
         # One observation for each row that ended, None for the others, as in Gymnasium's SyncVectorEnv.
-        final: NDArray[Any] = np.full(self.num_envs, None, object)
+        observations: NDArray[Any] = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(done):
-            final[i] = rows.observation(rows.shown.slots[i].copy(), rows.shown.context[i].copy())
-        mask = np.where(done[:, None], rows.shown.mask, False)
-        last = self._info() | {"action_mask": mask, "_action_mask": done, "_invalid": done, "_reward_terms": done}
+            observations[i] = rows.observation(rows.output.slots[i].copy(), rows.output.context[i].copy())
+        last = self._info() | {"_action_mask": done, "_invalid": done, "_reward_terms": done}
+        last["action_mask"] = last["action_mask"] & done[:, None]
         last["invalid"] = np.where(done, last["invalid"], 0)
         rows.reset(np.flatnonzero(done))
         self._steps[done] = 0
-        return {"final_obs": final, "_final_obs": done, "final_info": report | last, "_final_info": done}
+        return {"final_obs": observations, "_final_obs": done, "final_info": summaries | last, "_final_info": done}
 
     def _info(self, terms: bool = True) -> dict[str, Any]:
-        shown, everywhere = self.rows.shown, self._every_row
+        every_row = self._every_row
         info: dict[str, Any] = {
-            "action_mask": shown.mask,
-            "_action_mask": everywhere,
+            "action_mask": self.rows.output.action_mask,
+            "_action_mask": every_row,
             "invalid": self.rows.senders.batch.senders["invalid"].copy(),
-            "_invalid": everywhere,
+            "_invalid": every_row,
         }
         if terms:
-            info["reward_terms"] = {}
+            columns: dict[str, Any] = {}
             for k, term in enumerate(self.rows.terms):
-                info["reward_terms"][term.name] = shown.terms[:, k]
-                info["reward_terms"][f"_{term.name}"] = everywhere
-            info["_reward_terms"] = everywhere
+                columns |= {term.name: self.rows.output.reward_terms[:, k], f"_{term.name}": every_row}
+            info |= {"reward_terms": columns, "_reward_terms": every_row}
         return info
 
     def _observation(self) -> Observation:
-        return self.rows.observation(self.rows.shown.slots, self.rows.shown.context)
+        return self.rows.observation(self.rows.output.slots, self.rows.output.context)
 
-    def _turn_page(self, keep: bool = False) -> None:
-        """Let the next step write where nobody looks: arrays that are still held outside stay as they are."""
-        rows, before = self.rows, self.rows.shown
-        if not any(before is shown for shown in self._pool):
+    def _renew_output(self, keep: bool = False) -> None:
+        """Let the next step write into arrays that nobody holds outside; ``keep``: with what the last step wrote."""
+        rows, before = self.rows, self.rows.output
+        if not any(before is output for output in self._pool):
             self._pool.append(before)
-        for shown in self._pool:
+        for output in self._pool:
             # Held by its own tuple and by this loop's call only: no view of it is left outside.
-            if all(sys.getrefcount(array) <= _OWN_REFERENCES for array in shown):
-                rows.shown = shown
+            if all(sys.getrefcount(array) <= _OWN_REFERENCES for array in output):
+                rows.output = output
                 break
         else:
-            rows.shown = rows.new_shown()
-            self._pool.append(rows.shown)
-        if keep and rows.shown is not before:
-            for new, old in zip(cast(Any, rows.shown), before, strict=True):
+            rows.output = rows.new_output()
+            self._pool.append(rows.output)
+        if keep and rows.output is not before:
+            for new, old in zip(cast(Any, rows.output), before, strict=True):
                 new[...] = old
 
 
 def _count_own() -> int:
-    """References to an array that only a Shown tuple holds, as seen from the loop in ``_turn_page``."""
-    shown = Shown(*(np.zeros(1) for _ in Shown._fields))  # type: ignore[arg-type]
-    return max(sys.getrefcount(array) for array in shown)
+    """References to an array that only a StepOutput holds, as seen from the loop in ``_renew_output``."""
+    output = StepOutput(*(np.zeros(1) for _ in StepOutput._fields))  # type: ignore[arg-type]
+    return max(sys.getrefcount(array) for array in output)
 
 
 _OWN_REFERENCES = _count_own()

@@ -4,8 +4,9 @@ For the received messages in order, with coordinates x_1 <= x_2 <= ...,
 
     H = 1 + sum of V(x_i - x_{i-1}),
 
-where V says what a message adds that comes a distance d after the one before it. The coordinate is the frame index
-(time-based QoI, as in the paper) or the accumulated motion of the camera (motion-based QoI); V does not care which.
+where V(d) is what a message adds at a distance d after the one before it: V(0) = 0, V <= 1, V does not decrease, and
+V is concave (Eq. 3-6). The coordinate is the frame index (time-based QoI, as in the paper) or the accumulated motion
+of the camera (motion-based QoI); V is the same for both.
 """
 
 from __future__ import annotations
@@ -65,11 +66,15 @@ def information(v: NDArray[np.float64], x: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True)
 class Value:
-    """A concave V with V(0) = 0, non-decreasing, at most 1. Build one with the functions below."""
+    """A concave V with V(0) = 0, non-decreasing, at most 1: made by ``exponential``, ``saturating``, ``tabulated``.
+
+    Call it for V(d); BufgymError for a d that is negative or no number.
+    """
 
     name: str
+    """As ``parse`` reads it, except for tables."""
     array: NDArray[np.float64] = field(repr=False, compare=False)
-    """What the kernels read."""
+    """What the kernels read: see ``value``."""
 
     def __call__(self, d: float) -> float:
         if not d >= 0:
@@ -85,25 +90,25 @@ class Value:
 
 
 def _checked(name: str, array: list[float], distances: NDArray[np.float64]) -> Value:
-    """A ``Value`` that keeps Eq. 3-6 at the given distances, or an error that says which one it breaks."""
-    made = Value(name, np.array(array, np.float64))
-    made.array.flags.writeable = False
-    levels = np.array([made(d) for d in distances])
+    """A ``Value`` that satisfies Eq. 3-6 at the given distances, or an error that says which one it breaks."""
+    v = Value(name, np.array(array, np.float64))
+    v.array.flags.writeable = False
+    levels = np.array([v(d) for d in distances])
     slopes = np.diff(levels) / np.diff(distances)
     if levels[0] != 0:
         raise BufgymError(f"V = {name}: V(0) = {levels[0]:g}, but V(0) must be 0 (Eq. 3)")
     if (slopes < 0).any():
         at = int(np.argmax(slopes < 0))
-        raise BufgymError(f"V = {name}: V falls from d = {distances[at]:g} on, but must not decrease (Eq. 4)")
+        raise BufgymError(f"V = {name}: V falls from d = {distances[at]:g} on, but must not decrease (Eq. 5)")
     if levels.max() > 1:
-        raise BufgymError(f"V = {name}: V reaches {levels.max():g}, but must not exceed 1 (Eq. 5)")
+        raise BufgymError(f"V = {name}: V reaches {levels.max():g}, but must not exceed 1 (Eq. 4)")
     rising = np.diff(slopes) > 1e-9 * np.abs(slopes).max()
     if rising.any():
         at = int(np.argmax(rising)) + 1
         raise BufgymError(f"V = {name}: V grows faster after d = {distances[at]:g}, but must be concave (Eq. 6)")
     if levels.max() == 0:
         raise BufgymError(f"V = {name}: V is 0 everywhere, so no message is worth sending")
-    return made
+    return v
 
 
 def exponential(base: float = 0.618) -> Value:
@@ -137,13 +142,14 @@ def tabulated(distances: Sequence[float], values: Sequence[float]) -> Value:
 
 def parse(text: str) -> Value:
     """``exponential:0.618`` or ``saturating:4``, as written on the command line."""
-    makers: dict[str, Callable[..., Value]] = {"exponential": exponential, "saturating": saturating}
+    kinds: dict[str, Callable[..., Value]] = {"exponential": exponential, "saturating": saturating}
     kind, _, number = text.partition(":")
-    if kind not in makers:
-        raise BufgymError(f"V = {text!r}: unknown kind {kind!r}; known: {', '.join(makers)} (as in exponential:0.618)")
+    if kind not in kinds:
+        raise BufgymError(f"V = {text!r}: unknown kind {kind!r}; known: {', '.join(kinds)} (as in exponential:0.618)")
+    if kind == "exponential" and not number:
+        return exponential()
     try:
-        return makers[kind](float(number)) if number or kind == "saturating" else exponential()
-    except ValueError as error:
-        if isinstance(error, BufgymError):
-            raise
+        parameter = float(number)
+    except ValueError:
         raise BufgymError(f"V = {text!r}: {number!r} is not a number") from None
+    return kinds[kind](parameter)

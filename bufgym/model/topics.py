@@ -1,8 +1,8 @@
 """Topics: what a robot publishes side by side over one uplink, and what its operator asks for each.
 
 The terms are Robofleet's (github ut-amrl/robofleet_client): a topic has a priority, may have a rate limit, and may be
-``no_drop``. Beyond it, every topic has a weight and a V of its own, so that H = sum of weight x H of the topic, and a
-deadline for those who count late messages.
+``no_drop``. Beyond Robofleet, every topic has a weight and a V of its own, so that H = sum of weight x H of the topic,
+and may have a deadline, after which its messages count as late.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.checks import is_number, whole
 from bufgym.errors import BufgymError
 from bufgym.kernel import records
 from bufgym.model.buffer import MAX_CAPACITY, TOPIC
@@ -22,7 +23,9 @@ from bufgym.model.qoi import Value
 MAX_TOPICS = 256
 MAX_WINDOW = 10**6
 MAX_NUMBER = 1e12
+"""The largest priority, weight, rate limit (Hz) and deadline (s)."""
 NO_DEADLINE_US = 2**62
+MAX_ACK_DELAY_US = NO_DEADLINE_US // 2 - 1
 
 
 @dataclass(frozen=True)
@@ -30,62 +33,60 @@ class Topic:
     """One topic of a client's configuration."""
 
     name: str
+    """Unique among the topics of a client."""
     priority: float = 1.0
-    """p of Robofleet's schedulers; the higher, the sooner."""
+    """p of Robofleet's schedulers: of two topics that wait equally long, the higher priority is sent first."""
     rate_limit_hz: float | None = None
     """Messages that come sooner than 1 / rate after the last one kept are dropped; None for no limit."""
     no_drop: bool = False
-    """Whether its messages may not be dropped."""
+    """Its messages may not be dropped."""
     limit: int | None = None
-    """Messages of it in the buffer at most (a publisher's queue size); None for as many as the buffer holds."""
+    """Its messages in the buffer at most (a publisher's queue size); None for as many as the buffer holds."""
     weight: float | None = None
-    """Of its H in the weighted sum; None for its priority."""
+    """What its H counts in the weighted sum; None for its priority."""
     value: Value | None = None
-    """V over its coordinate; None for that of the scenario."""
+    """V over its coordinate x; None for that of the scenario."""
     deadline_s: float | None = None
     """A message older than this when it reaches the server is late; None for never."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise BufgymError(f"topic {self.name!r}: a name must be a non-empty text")
-        self._number("priority", self.priority, zero=False)
-        self._number("weight", self.weight, zero=True)
-        self._number("rate_limit_hz", self.rate_limit_hz, zero=False)
-        self._number("deadline_s", self.deadline_s, zero=False)
-        if not isinstance(self.no_drop, bool):
-            raise self._wrong("no_drop", self.no_drop, "must be true or false")
-        if self.limit is not None and (
-            isinstance(self.limit, bool) or not isinstance(self.limit, int) or not 1 <= self.limit <= MAX_CAPACITY
+        for name, zero, optional in (
+            ("priority", False, False),
+            ("weight", True, True),
+            ("rate_limit_hz", False, True),
+            ("deadline_s", False, True),
         ):
-            raise self._wrong("limit", self.limit, f"must be a whole number from 1 to {MAX_CAPACITY}, or none")
+            number = getattr(self, name)
+            if optional and number is None:
+                continue
+            if not is_number(number) or not 0 <= number <= MAX_NUMBER or (number == 0 and not zero):
+                raise self._wrong(name, f"must be a number {'>= 0' if zero else '> 0'}, at most {MAX_NUMBER:g}")
+        if not isinstance(self.no_drop, bool):
+            raise self._wrong("no_drop", "must be true or false")
+        if self.limit is not None:
+            whole(f"topic {self.name!r}: limit", self.limit, 1, MAX_CAPACITY)
         if self.value is not None and not isinstance(self.value, Value):
-            raise self._wrong("value", self.value, "must be a V of bufgym.model.qoi")
-        if self.no_drop and self.rate_limit_hz is not None:
-            raise self._wrong("rate_limit_hz", self.rate_limit_hz, "a no_drop topic can't have a rate limit: it drops")
-        if self.no_drop and self.limit is not None:
-            raise self._wrong("limit", self.limit, "a no_drop topic can't have a limit: it drops")
+            raise self._wrong("value", "must be a V of bufgym.model.qoi")
+        for name, limit in (("rate_limit_hz", "rate limit"), ("limit", "limit")):
+            if self.no_drop and getattr(self, name) is not None:
+                raise self._wrong(name, f"a no_drop topic can't have a {limit}, which drops messages")
 
-    def _number(self, name: str, number: Any, *, zero: bool) -> None:
-        if number is None and name != "priority":
-            return
-        usable = isinstance(number, int | float) and not isinstance(number, bool) and 0 <= number <= MAX_NUMBER
-        if not usable or (number == 0 and not zero):
-            raise self._wrong(name, number, f"must be a number {'>= 0' if zero else '> 0'}, at most {MAX_NUMBER:g}")
-
-    def _wrong(self, name: str, given: Any, rule: str) -> BufgymError:
-        return BufgymError(f"topic {self.name!r}: {name} = {given!r}: {rule}")
+    def _wrong(self, name: str, rule: str) -> BufgymError:
+        return BufgymError(f"topic {self.name!r}: {name} = {getattr(self, name)!r}: {rule}")
 
     @property
     def period_us(self) -> int:
-        """Least time between two messages that are kept, us, rounded down: who keeps to the limit loses none.
+        """Least time between two kept messages, us; 0 without a rate limit.
 
-        0 without a rate limit.
+        Rounded down, so that a publisher at exactly the rate limit loses no message.
         """
         return int(min(1e6 / self.rate_limit_hz, NO_DEADLINE_US)) if self.rate_limit_hz else 0
 
     @property
     def share(self) -> float:
-        """Its weight in the sum of H."""
+        """What its H counts in the weighted sum."""
         return self.priority if self.weight is None else self.weight
 
 
@@ -114,25 +115,17 @@ def copies_of(topics: Sequence[Topic], consumers: int) -> list[Topic]:
 
 def check_window(window: Any) -> int:
     """n_T, or an error."""
-    if isinstance(window, bool) or not isinstance(window, int | np.integer) or not 1 <= window <= MAX_WINDOW:
-        raise BufgymError(f"window = {window!r}: n_T must be a whole number from 1 to {MAX_WINDOW}")
-    return int(window)
+    return whole("window", window, 1, MAX_WINDOW, symbol="n_T")
 
 
 def check_ack_delay(ack_delay_us: Any) -> int:
-    """The time from a message's crossing to its pong, us, or an error."""
-    if (
-        isinstance(ack_delay_us, bool)
-        or not isinstance(ack_delay_us, int | np.integer)
-        or not 0 <= ack_delay_us < NO_DEADLINE_US // 2
-    ):
-        raise BufgymError(f"ack_delay_us = {ack_delay_us!r}: must be a whole number >= 0, us")
-    return int(ack_delay_us)
+    """The time from a message's last byte on the link to its ack, us, or an error."""
+    return whole("ack_delay_us", ack_delay_us, 0, MAX_ACK_DELAY_US)
 
 
 def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """(TOPIC[topics] with their settings, all their V in one array); without topics, one that sets no limits."""
-    # A single topic with rules gets a silent companion: one row means "no rules, whatever the messages' topics".
+    """(TOPIC[topics] with their settings, all their V in one array); without topics, one row that sets no limits."""
+    # A single topic with rules gets a companion without messages: one row means "no rules, whatever the topic number".
     table = records(max(2, len(topics)) if topics else 1, TOPIC)
     arrays: list[NDArray[np.float64]] = [v.array]
     starts = {id(v): 0}
@@ -150,7 +143,7 @@ def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArr
         if topic.deadline_s is not None:
             row["deadline_us"] = round(topic.deadline_s * 1e6)
     if topics:
-        table["priority"][len(topics) :] = table["weight"][len(topics) :] = 0.0  # the companion counts for nothing
+        table["priority"][len(topics) :] = table["weight"][len(topics) :] = 0.0  # the companion has no weight
     values = v.array if len(arrays) == 1 else np.concatenate(arrays)
     values.flags.writeable = False
     return table, values

@@ -1,16 +1,16 @@
 """The clairvoyant: the best QoI that any policy could reach on an episode, knowing the whole link and workload.
 
-Let C(t) be the bytes that the link can carry by time t, c_i = C(arrival time of message i), b_i its size. A policy is,
-in hindsight, the set of messages that it sent. Message i of that set begins at byte s_i = max(c_i, e) of the link and
+Let C(t) be the bytes that the link can carry by time t, c_i = C(arrival time of message i), b_i its size. In hindsight
+a policy is the set of messages that it sent. Message i of that set begins at byte s_i = max(c_i, e) of the link and
 ends at e_i = s_i + b_i, where e is the end of the message sent before it: the socket is serial and never idle while
-something waits. Whatever else arrives may as well be rejected at once, which keeps the queue shortest. With equal
-sizes b, the queue (message i included) then holds ceil((s_i - c_i) / b) messages after arrival i, so i finds room if
-and only if
+a message waits. Rejecting all other messages at their arrival keeps the queue shortest. With equal sizes b, the queue
+(message i included) then holds ceil((s_i - c_i) / b) messages after arrival i, so there is room for i if and only if
 
     s_i - c_i <= L b.
 
 ``labels.py`` finds the best set under that condition. With unequal sizes the room left depends on which messages wait;
-the condition is relaxed to one that every set within L messages and B bytes keeps, and the result is an upper bound.
+the condition is relaxed to one that every set within L messages and B bytes satisfies, and the result is an upper
+bound.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from bufgym.scenario import Episode
 
 @dataclass(frozen=True)
 class Plan:
-    """What the clairvoyant would do with one episode."""
+    """The clairvoyant's decisions for one episode."""
 
     qoi: float
     """The best H: no policy with this L and B reaches more."""
     kept: NDArray[np.bool_]
-    """[messages]: what to accept; the rest is rejected at its arrival."""
+    """bool[messages]: which to accept; the others are rejected at their arrival."""
     certified: bool
-    """Whether a sender that asks at every arrival, and does so, reaches ``qoi``; if not, that is an upper bound."""
+    """Whether these decisions, at every arrival of a sender, reach ``qoi``; if not, ``qoi`` is an upper bound."""
 
 
 def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | None = None) -> Plan:
@@ -65,10 +65,10 @@ def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | N
     qoi = 1.0 + gain if len(sent) else 0.0
     reached = v.information(x[sent]) >= qoi - 1e-9
     fits = bool(_fits(c[sent], size[sent], capacity, most_bytes, np.empty(len(sent), np.int64)))
-    # An arrival that asks nobody is accepted where there is room.
-    unasked = ~kept
-    unasked[episode.first_decision : episode.last_decision + 1] = False
-    return Plan(qoi, kept, reached and fits and not unasked.any())
+    # Arrivals without a decision are accepted where there is room.
+    undecided = ~kept
+    undecided[episode.first_decision : episode.last_decision + 1] = False
+    return Plan(qoi, kept, reached and fits and not undecided.any())
 
 
 @kernel
@@ -81,17 +81,17 @@ def _relaxed_limits(
     largest: NDArray[np.int64],
     limit: NDArray[np.int64],
 ) -> None:
-    """``limit[i]``: message i finds no room if it would have to wait for more bytes than this.
+    """``limit[i]``: there is no room for message i if more bytes than this have to pass before it.
 
-    Before i wait what is left of the message in transmission and at most L - 1 queued ones: together no more than
-    the L largest of those that can still be on their way, and no more than B less i besides the one in transmission.
-    ``reach`` and ``largest`` are room to work in, int64[messages] and int64[L].
+    What passes before i is the rest of the message in transmission and at most L - 1 queued ones: together no more
+    than the L largest of those that can still be on their way, and without the one in transmission no more than B less
+    the size of i. ``reach`` and ``largest`` are work space, int64[messages] and int64[L].
     """
     for i in range(len(c)):
-        held = 0  # so many of ``largest``, in falling order
+        held = 0  # entries of ``largest`` in use, in falling order
         for j in range(i - 1, -1, -1):
             if reach[j] <= c[i]:
-                break  # neither j nor what came before it can still be on its way
+                break  # neither j nor any message before it can still be on its way
             if limit[j] < 0 or c[j] + limit[j] + size[j] <= c[i]:
                 continue
             k = held
@@ -144,5 +144,5 @@ def privileged(episode: Episode, capacity: int, max_bytes: int, v: Value) -> NDA
 
 @register("clairvoyant", privileged=privileged, source="bufgym.oracle.clairvoyant", compile=True)
 def follow(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """Knows the whole link and workload beforehand: the bound that no other policy passes."""
+    """Knows the whole link and workload beforehand: the bound that no other policy exceeds."""
     return ACCEPT if memory[arrival.seq] > 0 else REJECT

@@ -1,10 +1,10 @@
-"""The best that anyone could do in one interruption whose length T is known (AFR paper, Sec. III-C).
+"""The best possible QoI in one interruption whose length T is known (AFR paper, Sec. III-C).
 
 Message 0 was sent before, message T + 1 is sent after, and L of the T between can be kept: L + 1 gaps that add up to
-T + 1. V is concave, so equal gaps are best. Both numbers count the information gained after message 0, as the paper
-does: they compare with H - 1 of a run.
+T + 1. V is concave, so equal gaps are best. ``ideal`` and ``integer`` count the information gained after message 0, as
+the paper does: they compare with H - 1 of a run.
 
-``by_length`` is what a policy made of every T at once: up to an arrival nothing that it sees depends on T, so the
+``by_length`` scores a policy for every T at once: up to an arrival nothing that a policy sees depends on T, so the
 longest interruption holds all shorter ones, and one run gives the exact mean over any law of T.
 """
 
@@ -41,8 +41,8 @@ def integer(capacity: int, T: int, v: Value) -> float:
 def by_length(dropped: NDArray[np.int64], v: Value) -> NDArray[np.float64]:
     """H of each interruption of T = 0..t_max messages (float64[t_max + 1]), from a run through the longest of them.
 
-    ``dropped``, int64[t_max + 2]: with which arrival message 0..t_max + 1 of that run was dropped (1 = the first of the
-    interruption); one after t_max if it never was.
+    ``dropped``, int64[t_max + 2]: for message 0..t_max + 1 of that run, at which arrival it was dropped (1 = the first
+    of the interruption); a number after t_max if it never was.
     """
     h, kept = np.ones(len(dropped) - 1), np.zeros(len(dropped), np.int64)
     _by_length(np.ascontiguousarray(dropped, np.int64), v.array, kept, h)
@@ -56,15 +56,15 @@ def _by_length(
     held = 0
     for T in range(len(h)):
         if T > 0:
-            still = 0
+            remaining = 0
             for k in range(held):
                 if dropped[kept[k]] > T:
-                    kept[still] = kept[k]
-                    still += 1
+                    kept[remaining] = kept[k]
+                    remaining += 1
             if dropped[T] > T:
-                kept[still] = T
-                still += 1
-            held = still
+                kept[remaining] = T
+                remaining += 1
+            held = remaining
         before = 0
         for k in range(held):
             h[T] += value(v, float(kept[k] - before))

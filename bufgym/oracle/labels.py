@@ -1,23 +1,23 @@
 """The dynamic programme behind the clairvoyant: which messages to send for the most information.
 
 Message i may be sent after message j, which ends at byte e of the link, if s = max(e, c_i) leaves s - c_i <= limit_i;
-it then ends at s + size_i and adds V(x_i - x_j). A *label* (end, gain) at message i is a way to send i last. One label
-is dropped for another at the same message that ends no later and has gained no less: whatever can follow the first can
-follow the second. Nothing that could matter is lost, so the best label of all is the optimum.
+it then ends at s + size_i and adds V(x_i - x_j). A *label* (end, gain) at message i is a way to send i last. A label
+is dominated by another at the same message that ends no later and has gained no less: whatever can follow the first
+can follow the second. Dropping dominated labels loses nothing, so the best label of all is the optimum.
 
 Two observations keep the labels few.
 
-*Idle time is never worth leaving out a message.* If some m between j and i would have crossed before i arrives, the
-way j, m, i ends where j, i ends and has gained no less: V(a) + V(b) >= V(a + b). So only such j count after which
+*Idle time is never worth leaving out a message.* If some m between j and i could be sent whole before i arrives, the
+plan j, m, i ends where j, i ends and has gained no less: V(a) + V(b) >= V(a + b). So only those j count after which
 nothing else could have been sent in time.
 
 *Bounds.* With ends rounded down to a grid, the labels at a message are a fixed array, filled backwards in one sweep:
 ``future``, an upper bound of what can still be gained. A label whose gain and future together stay below what is
-known to be reachable leads nowhere. What is reachable is first assumed to lie close to the upper bound; only if
-nothing is found there, one looks further down, at last from a plan that ``future`` itself has led to.
+known to be reachable can be dropped. The search first assumes that the optimum lies close to the upper bound; if it
+finds nothing there, it looks further down, at last from the gain of a plan that ``future`` itself has led to.
 
-Messages of unequal sizes end anywhere, and labels no longer meet: there ``future`` on a fine grid is the answer itself,
-an upper bound.
+Messages of unequal sizes end at arbitrary bytes, so that labels rarely dominate each other: there ``future`` on a fine
+grid is the answer itself, an upper bound.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from bufgym.kernel import kernel
 from bufgym.model.qoi import value
 
 NEVER = -1
-"""As a limit: the message never finds room."""
+"""As a limit: there is never room for the message."""
 
 GRID, FINE_GRID = 16, 256
-"""Grid steps to a mean message, where labels follow and where they do not."""
+"""Grid steps to a mean message: where labels find the optimum, and where the grid itself gives the bound."""
 
 MAX_CELLS = 1 << 23
 """Entries of ``future`` at most (8 bytes each); a coarser grid then does."""
@@ -43,32 +43,57 @@ SHARES = (1 / 16, 1 / 4, 1.0)
 """How far below the upper bound to look for the optimum: shares of the way down to a plan that is known."""
 
 LABELS = 1 << 14
-"""Room for so many labels at first; where it does not suffice, for twice as many."""
+"""Room for so many labels at first; it doubles whenever it runs out."""
 
 _ROUNDING = 1e-9
-"""The bounds add the same numbers in another order."""
+"""Tolerance: the bounds add the same numbers in another order."""
 
 
 class Problem(NamedTuple):
-    """One episode as the kernels read it; arrays over messages."""
+    """One episode as the kernels read it; arrays over messages.
+
+    Fields:
+        c: int64, bytes that the link can have carried when the message arrives.
+        size: int64, bytes of the message.
+        limit: int64, bytes that may still have to pass before it when it arrives, at most; or NEVER.
+        x: float64, coordinate of the message.
+        v: ``Value.array``.
+        ends: the link's last byte.
+        between: int64, the last message before it that could have been sent before it arrives; -1: none.
+        idle: int64, after a message before ``between`` that ends by this byte, ``between`` could be sent in time.
+        grid: bytes to a grid step.
+        future: float64[messages, steps], no plan gains more after message i, if that ends at byte
+            (c_i // grid + k) * grid or later.
+    """
 
     c: NDArray[np.int64]
-    """Bytes that the link can have carried when the message arrives."""
     size: NDArray[np.int64]
     limit: NDArray[np.int64]
-    """Bytes that it can wait for at most, or NEVER."""
     x: NDArray[np.float64]
     v: NDArray[np.float64]
     ends: int
-    """The link's last byte."""
     between: NDArray[np.int64]
-    """The last message before it that could have crossed before it arrives; -1: none."""
     idle: NDArray[np.int64]
-    """After a message before ``between`` that ends by this byte, ``between`` could be sent and cross in time."""
     grid: int
-    """Bytes to a grid step."""
     future: NDArray[np.float64]
-    """[messages, steps]: no plan gains more after message i, if that ends at byte (c_i // grid + k) * grid or later."""
+
+
+class Labels(NamedTuple):
+    """All labels, message by message: those of message i are ``first[i] : first[i + 1]``, by rising end and gain.
+
+    Fields:
+        first: int64[messages + 1], where the labels of a message begin.
+        latest: int64[messages + 1], the latest end of any label at the messages before it.
+        end: int64[room], the byte at which the label's last message ends.
+        gain: float64[room], what the messages so far have added to H.
+        parent: int64[room], the label before it; -1 at the first message of a plan.
+    """
+
+    first: NDArray[np.int64]
+    latest: NDArray[np.int64]
+    end: NDArray[np.int64]
+    gain: NDArray[np.float64]
+    parent: NDArray[np.int64]
 
 
 def best(
@@ -84,57 +109,53 @@ def best(
     equal = bool((size == size[0]).all())
     furthest = max(0, int((limit + size).max()))
     grid = max(1, int(size.mean()) // (GRID if equal else FINE_GRID), furthest * n // MAX_CELLS)
-    work = np.empty((3, n), np.int64)
-    p = Problem(c, size, limit, x, v, ends, work[0], work[1], grid, np.zeros((n, furthest // grid + 2)))
-    find_idle(p)
-    find_future(p)
-    length, low = guided(p, work[2])
-    high = most(p)
+    between, idle, guide = np.empty((3, n), np.int64)
+    problem = Problem(c, size, limit, x, v, ends, between, idle, grid, np.zeros((n, furthest // grid + 2)))
+    find_idle(problem)
+    find_future(problem)
+    length, low = guided(problem, guide)
+    high = most(problem)
     if not equal:
-        return work[2, :length], high
-    table = Table(n)
+        return guide[:length], high
+    labels = no_labels(n)
     for share in SHARES:
         enough = high - share * (high - low)
-        table.fill(p, enough)
-        found, gain = table.plan()
+        labels = fill(problem, enough, labels)
+        plan, gain = plan_of(labels)
         if gain >= enough:
             break
-    return found, gain
+    return plan, gain
 
 
-class Table:
-    """All labels, message by message: those of message i are ``first[i] : first[i + 1]``, by rising end and gain."""
+def no_labels(messages: int) -> Labels:
+    """Room for the labels of so many messages."""
+    first, latest = np.zeros((2, messages + 1), np.int64)
+    return Labels(first, latest, np.empty(LABELS, np.int64), np.empty(LABELS), np.empty(LABELS, np.int64))
 
-    def __init__(self, messages: int) -> None:
-        self.first = np.zeros(messages + 1, np.int64)
-        self.latest = np.zeros(messages + 1, np.int64)
-        self.end = np.empty(LABELS, np.int64)
-        self.gain = np.empty(LABELS, np.float64)
-        self.parent = np.empty(LABELS, np.int64)
 
-    def fill(self, p: Problem, enough: float) -> None:
-        """Find all labels that can lead to a gain of ``enough``."""
-        i = 0
-        while True:
-            i = extend(p, enough, i, self.first, self.latest, self.end, self.gain, self.parent)
-            if i == len(p.c):
-                return
-            room = 2 * len(self.end)
-            self.end, self.parent = np.resize(self.end, room), np.resize(self.parent, room)
-            self.gain = np.resize(self.gain, room)
+def fill(problem: Problem, enough: float, labels: Labels) -> Labels:
+    """All labels that can lead to a gain of ``enough``, in the arrays of ``labels`` or in larger ones."""
+    i = extend(problem, enough, 0, labels)
+    while i < len(problem.c):
+        room = 2 * len(labels.end)
+        end, parent = np.resize(labels.end, room), np.resize(labels.parent, room)
+        labels = labels._replace(end=end, gain=np.resize(labels.gain, room), parent=parent)
+        i = extend(problem, enough, i, labels)
+    return labels
 
-    def plan(self) -> tuple[NDArray[np.int64], float]:
-        """(messages on the way to the best label, the last of equals, its gain); none and 0 if nothing can be sent."""
-        count = int(self.first[-1])
-        if count == 0:
-            return np.zeros(0, np.int64), 0.0
-        # Of equals the last one: it may have sent more messages than the others.
-        label = count - 1 - int(np.argmax(self.gain[:count][::-1]))
-        gain, way = float(self.gain[label]), []
-        while label >= 0:
-            way.append(label)
-            label = int(self.parent[label])
-        return np.searchsorted(self.first, np.array(way[::-1]), side="right") - 1, gain
+
+def plan_of(labels: Labels) -> tuple[NDArray[np.int64], float]:
+    """(messages on the way to the best label, the last of equals, its gain); none and 0 if nothing can be sent."""
+    count = int(labels.first[-1])
+    if count == 0:
+        return np.zeros(0, np.int64), 0.0
+    # Of equals the last one: it may have sent more messages than the others.
+    label = count - 1 - int(np.argmax(labels.gain[:count][::-1]))
+    gain, way = float(labels.gain[label]), []
+    while label >= 0:
+        way.append(label)
+        label = int(labels.parent[label])
+    return np.searchsorted(labels.first, np.array(way[::-1]), side="right") - 1, gain
 
 
 # --- bounds ----------------------------------------------------------------------------------------------------------
@@ -162,7 +183,7 @@ def find_future(p: Problem) -> None:
             low = 0
             if p.between[j] > i:
                 if p.idle[j] >= reach:
-                    break  # every further message as well would be preceded by ``between``
+                    break  # ``between`` could be sent before every further message, too
                 low = max(0, p.idle[j] // p.grid - step_i)
             if p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
                 continue
@@ -223,20 +244,9 @@ def guided(p: Problem, plan: NDArray[np.int64]) -> tuple[int, float]:
 
 
 @kernel
-def extend(
-    p: Problem,
-    enough: float,
-    begin: int,
-    first: NDArray[np.int64],
-    latest: NDArray[np.int64],
-    end: NDArray[np.int64],
-    gain: NDArray[np.float64],
-    parent: NDArray[np.int64],
-) -> int:
-    """Find the labels of messages ``begin``, begin + 1, ...; return the one at which the room ran out, or n.
-
-    ``latest[j]``: the latest end of any label at messages before j.
-    """
+def extend(p: Problem, enough: float, begin: int, labels: Labels) -> int:
+    """Find the labels of messages ``begin``, begin + 1, ...; return the one at which the room ran out, or n."""
+    first, latest, end, gain = labels.first, labels.latest, labels.end, labels.gain
     room, enough = len(end), enough - _ROUNDING
     for i in range(begin, len(p.c)):
         at = stop = first[i]
@@ -244,7 +254,7 @@ def extend(
         if stop + 2 > room:
             return i
         if limit >= 0 and after(p, i, c_i + p.size[i]) >= enough:
-            end[stop], gain[stop], parent[stop] = c_i + p.size[i], 0.0, -1
+            end[stop], gain[stop], labels.parent[stop] = c_i + p.size[i], 0.0, -1
             stop += 1
         for j in range(i - 1, -1, -1):
             too_early = p.idle[i] if j < p.between[i] else -1
@@ -260,7 +270,7 @@ def extend(
                 if added < 0:
                     added = value(p.v, p.x[i] - p.x[j])
                 if gain[k] + added + after(p, i, s + p.size[i]) >= enough:
-                    stop = insert(at, stop, end, gain, parent, s + p.size[i], gain[k] + added, k)
+                    stop = insert(labels, at, stop, s + p.size[i], gain[k] + added, k)
                     if stop == room:
                         return i
                 if s == c_i:
@@ -271,20 +281,12 @@ def extend(
 
 
 @kernel
-def insert(
-    at: int,
-    stop: int,
-    end: NDArray[np.int64],
-    gain: NDArray[np.float64],
-    parent: NDArray[np.int64],
-    e: int,
-    g: float,
-    label: int,
-) -> int:
+def insert(labels: Labels, at: int, stop: int, e: int, g: float, label: int) -> int:
     """Put (e, g) among the labels ``at..stop``, unless one is better, and drop those that it beats: the new stop.
 
-    Of two that are the same the newcomer stays: its way there began with an older message.
+    ``label``: its parent. Of two that are the same the new one stays: its way there began with an older message.
     """
+    end, gain, parent = labels.end, labels.gain, labels.parent
     low, high = at, stop
     while low < high:  # the first that ends later than e
         middle = (low + high) // 2

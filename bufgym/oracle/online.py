@@ -1,15 +1,15 @@
 """The online optimum: the best that any policy can do in one interruption whose length T it does not know.
 
 The model is ``bufgym.scenario.Interruption``: message 0 is sent before, messages 1..T arrive one a period, T + 1 is
-sent after; at most L are kept meanwhile. T has a known law; a policy learns only, arrival by arrival, that T is not
-smaller. The optimum is exact, by dynamic programming backwards over the sets of kept messages.
+sent after; at most L are kept meanwhile. T has a known law; at each arrival a policy learns only that T is not smaller.
+The optimum is exact, by dynamic programming backwards over the sets of kept messages.
 
-Two facts keep it small. First, an arrival that finds room is best accepted: V is concave, so more messages never inform
-less, and whoever keeps a superset can imitate every later decision. So only full queues need a decision, L of the
-messages 1..t after t arrivals. Second, sets are numbered in colexicographic order (combinatorial number system): the
-set p_1 < ... < p_L is number C(p_1 - 1, 1) + ... + C(p_L - 1, L), whatever t is. The sets without message t + 1 come
-before those with it, so the values after t arrivals overwrite those after t + 1 where they stand, and the decision on
-message t + 1 is numbered like the set of L + 1 messages of which one must go.
+Two facts keep the programme small. First, an arrival for which there is room is best accepted: V is concave, so more
+messages never inform less, and a policy that keeps a superset can imitate every later decision. So only full queues
+need a decision: L of the messages 1..t after t arrivals. Second, sets are numbered in colexicographic order
+(combinatorial number system): the set p_1 < ... < p_L is number C(p_1 - 1, 1) + ... + C(p_L - 1, L), whatever t is. The
+sets without message t + 1 come before those with it, so the values after t arrivals overwrite those after t + 1 in
+place, and the decision on message t + 1 is numbered like the set of L + 1 messages of which one must go.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bufgym.checks import whole
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
@@ -34,8 +35,8 @@ from bufgym.scenario import Interruption
 
 OBJECTIVES = ("ratio", "qoi")
 
-# Binomial coefficients above this belong to no state that fits into memory.
 _MOST = 2**61
+"""Binomial coefficients are cut off here: larger ones belong to no state that fits into memory."""
 
 
 def law(scenario: Interruption) -> NDArray[np.float64]:
@@ -54,7 +55,7 @@ def law(scenario: Interruption) -> NDArray[np.float64]:
     else:
         stays = 1 - 1 / (scenario.t_mean - t_min + 1)
         p[t] = (1 - stays) * stays ** (t - t_min)
-        p[t_max] = stays ** (t_max - t_min)  # all that is cut off
+        p[t_max] = stays ** (t_max - t_min)  # every longer T is cut off to t_max
     if scenario.lengths:
         p[[T for T in range(t_max + 1) if T not in scenario.lengths]] = 0.0
         p /= p.sum()
@@ -68,13 +69,15 @@ class OnlineOptimum:
     capacity: int
     """L, messages."""
     value_function: Value
+    """V."""
     probabilities: NDArray[np.float64]
-    """P(T = t), t = 0..t_max, the longest possible length."""
+    """float64[t_max + 1]: P(T = t), t = 0..t_max, the longest possible length."""
     objective: str
+    """One of ``OBJECTIVES``."""
     value: float
     """The optimum: mean of (H - 1) / ``oracle.integer`` for "ratio", of H - 1 for "qoi" (H counts message 0)."""
     decisions: NDArray[Any] = field(repr=False)
-    """[C(t_max, L + 1)], by number of the set of L + 1 messages: which of them goes (0 = oldest, L = newcomer)."""
+    """int[C(t_max, L + 1)], by number of the set of L + 1 messages: which is dropped (0 = oldest, L = newcomer)."""
 
     @property
     def t_max(self) -> int:
@@ -82,7 +85,7 @@ class OnlineOptimum:
         return len(self.probabilities) - 1
 
     def decision(self, positions: Sequence[int]) -> int:
-        """What to do when the last of ``positions``, 1 <= p_1 < ... <= t_max, arrives and the others are queued.
+        """The decision when the last of ``positions``, 1 <= p_1 < ... <= t_max, arrives and the others are queued.
 
         A position counts arrivals: message p is the p-th of the interruption. Returns a slot to evict (0 = oldest),
         REJECT, or ACCEPT where there is room.
@@ -101,12 +104,12 @@ class OnlineOptimum:
         return rising and 0 < len(positions) <= self.capacity + 1 and 1 <= positions[0] and positions[-1] <= self.t_max
 
     def policy(self) -> Policy:
-        """The optimum as a policy of that L, for the simulator and the environments; it runs uncompiled.
+        """The optimum as a policy for this L, in the simulator and the environments; it runs uncompiled.
 
         A message's position is its arrival time after that of the message the socket took last, in periods (their
         running mean), rounded. Sequence numbers would do in ``Interruption`` alone: times also fit a link that stops
         in mid-stream. A full queue that the table lacks (an arrival after t_max, two messages in one period) is left
-        to min-gap. Another L than it was made for is an error.
+        to min-gap. A buffer with another L is an error.
         """
         return Policy(f"online-optimum:L={self.capacity}", self._on_arrival, source="dynamic programme, exact")
 
@@ -137,13 +140,11 @@ def online_optimum(
     ``objective``: "ratio" for the mean of (H - 1) / ``oracle.integer``, "qoi" for the mean of H - 1. There are
     C(t_max + 1, L + 1) states, at most 9 bytes each; more than ``max_states`` are refused.
     """
-    if isinstance(capacity, bool) or not isinstance(capacity, int | np.integer) or capacity < 1:
-        raise BufgymError(f"capacity = {capacity!r}: L must be a whole number >= 1")
+    L, p = whole("capacity", capacity, 1, symbol="L"), _checked(probabilities)
     if not isinstance(v, Value):
         raise BufgymError(f"v = {v!r}: must be a bufgym.model.qoi Value, such as qoi.exponential(0.618)")
     if objective not in OBJECTIVES:
         raise BufgymError(f"objective = {objective!r}: must be one of {', '.join(OBJECTIVES)}")
-    L, p = int(capacity), _checked(probabilities)
     t_max = len(p) - 1
     _check_states(L, t_max, max_states)
     weight = p / [integer(L, t, v) for t in range(t_max + 1)] if objective == "ratio" else p
@@ -216,7 +217,7 @@ def _binomials(t_max: int, L: int) -> NDArray[np.int64]:
 
 
 def _checked(probabilities: ArrayLike) -> NDArray[np.float64]:
-    """A copy without the lengths at its end that cannot happen."""
+    """A copy without the impossible lengths at its end; BufgymError if these are no probabilities."""
     try:
         p = np.array(probabilities, np.float64)
     except (TypeError, ValueError):

@@ -1,13 +1,14 @@
-"""Scenarios: what meets the sender. All randomness is drawn here, before the simulation, which has none.
+"""Scenarios: messages and links for the sender. All randomness is drawn here, before the simulation, which has none.
 
 ``Scenario.draw(streams) -> Episode`` draws one episode: when messages arrive, how large they are, how far the scene
-moves, which link carries them. Arrivals, link and policies draw from separate streams, so that two policies (or
-two policy seeds) meet the very same episode: common random numbers.
+moves, which link carries them. Arrivals, link and policies draw from separate random streams, so that two policies (or
+two policy seeds) meet the same episode: common random numbers.
 """
 
 from __future__ import annotations
 
-from bufgym.scenario.client import Client, Stream, read_client, robofleet_example
+from bufgym.scenario.client import Client, Stream
+from bufgym.scenario.configuration import read_client, robofleet_example
 from bufgym.scenario.episode import Episode, Scenario, Streams, messages
 from bufgym.scenario.fleet import MAX_ROBOTS, FleetEpisode, FleetScenario
 from bufgym.scenario.interruption import LAWS, Interruption

@@ -2,45 +2,59 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
+from bufgym.checks import above_0, between
 from bufgym.errors import BufgymError
 from bufgym.model.qoi import Value
+from bufgym.traces import Motion, Trace
+
+__all__ = ["above_0", "as_tuple", "check_stream", "check_value", "positive", "rate", "recordings"]
 
 MAX_RATE_HZ = 100_000
 """Arrivals are counted in whole microseconds: ten to a period at least."""
 
 
 def positive(scenario: object, *names: str) -> None:
+    """These parameters are finite numbers > 0."""
     for name in names:
         above_0(name, getattr(scenario, name))
 
 
-def above_0(name: str, number: Any) -> None:
-    if not (is_number(number) and math.isfinite(number) and number > 0):
-        raise BufgymError(f"{name} = {number!r}: must be a number > 0")
-
-
 def rate(rate_hz: Any) -> None:
+    """``rate_hz`` is a number > 0 and at most ``MAX_RATE_HZ``."""
     above_0("rate_hz", rate_hz)
     if rate_hz > MAX_RATE_HZ:
         raise BufgymError(f"rate_hz = {rate_hz}: must be at most {MAX_RATE_HZ}")
 
 
-def is_number(given: Any) -> bool:
-    return isinstance(given, int | float | np.number) and not isinstance(given, bool)
-
-
-def natural(name: str, number: Any) -> int:
-    if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 0:
-        raise BufgymError(f"{name} = {number!r}: must be a whole number >= 0")
-    return int(number)
+def check_stream(stream: Any) -> None:
+    """The parameters that every stream of messages has: rate_hz, size_bytes, jitter and size_cv."""
+    rate(stream.rate_hz)
+    above_0("size_bytes", stream.size_bytes)
+    between("jitter", stream.jitter, 0, 1, "of a period")
+    between("size_cv", stream.size_cv, 0, 10)
 
 
 def check_value(scenario: object) -> None:
-    given = getattr(scenario, "value")  # noqa: B009  (both kinds of scenario have it)
-    if not isinstance(given, Value):
-        raise BufgymError(f"value = {given!r}: must be a bufgym.model.qoi Value, such as qoi.exponential(0.618)")
+    """The parameter ``value`` is a ``Value``."""
+    value = getattr(scenario, "value")  # noqa: B009  (every kind of scenario has it)
+    if not isinstance(value, Value):
+        raise BufgymError(f"value = {value!r}: must be a bufgym.model.qoi Value, such as qoi.exponential(0.618)")
+
+
+def recordings(scenario: object) -> None:
+    """The parameters ``traces`` and ``motion`` become tuples of Trace and Motion; a single one becomes a tuple, too."""
+    as_tuple(scenario, "traces", Trace, "a bufgym.traces Trace")
+    as_tuple(scenario, "motion", Motion, "a bufgym.traces Motion")
+
+
+def as_tuple(scenario: object, name: str, kind: Any, what: str) -> None:
+    """The parameter becomes a tuple whose items are of that kind, ``what`` in words; a single one becomes a tuple."""
+    value = getattr(scenario, name)
+    items = value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
+    for item in items:
+        if not isinstance(item, kind):
+            raise BufgymError(f"{name}: {item!r} is not {what}")
+    object.__setattr__(scenario, name, tuple(items))

@@ -1,4 +1,4 @@
-"""What meets the robots of one cell: the same camera on each, every one with its own motion, and one link."""
+"""Robots in one cell: the same camera on each, each with a motion of its own, and one link that they share."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.checks import whole
 from bufgym.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
@@ -17,11 +18,12 @@ from bufgym.scenario.episode import Episode, Streams
 from bufgym.scenario.uplink import Uplink
 
 MAX_ROBOTS = 256
+"""Robots of a cell at most."""
 
 
 @dataclass(frozen=True, eq=False)
 class FleetEpisode:
-    """One drawn episode of a cell; nothing in it is left to chance."""
+    """One drawn episode of a cell; nothing in it is random any more."""
 
     arrivals: tuple[NDArray[Any], ...]
     """MESSAGE[n] of each robot, in order of arrival."""
@@ -37,6 +39,7 @@ class FleetEpisode:
 
     @property
     def robots(self) -> int:
+        """N."""
         return len(self.arrivals)
 
     @property
@@ -46,13 +49,13 @@ class FleetEpisode:
         return all(np.array_equal(first, arrivals["arrival_us"]) for arrivals in self.arrivals)
 
     def episode(self, robot: int) -> Episode:
-        """What that robot would meet if it had the cell for itself."""
+        """The episode of that robot if it had the cell to itself."""
         return Episode(self.arrivals[robot], self.link)
 
     def with_uniforms(self, rng: np.random.Generator) -> FleetEpisode:
-        """The same episode with fresh luck for randomised policies."""
-        episode_with_uniforms = [self.episode(i).with_uniforms(rng).arrivals for i in range(self.robots)]
-        return FleetEpisode(tuple(episode_with_uniforms), self.link)
+        """The same episode with a fresh uniform draw beside each arrival, for randomised policies."""
+        arrivals = [self.episode(i).with_uniforms(rng).arrivals for i in range(self.robots)]
+        return FleetEpisode(tuple(arrivals), self.link)
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,9 @@ class FleetScenario:
     """
 
     robots: int = 4
+    """N."""
     uplink: Uplink = field(default_factory=lambda: _uplink("lte"))
+    """What each robot would have if it were alone."""
 
     def __post_init__(self) -> None:
         check_robots(self.robots)
@@ -119,14 +124,12 @@ class FleetScenario:
 
 
 def _uplink(spec: str | Uplink, **parameters: Any) -> Uplink:
-    found = registry.get(spec, **parameters)
-    if not isinstance(found, Uplink):
-        raise BufgymError(f"scenario {spec!r}: a fleet needs an Uplink, whose link goes on; it is {found!r}")
-    return found
+    scenario = registry.get(spec, **parameters)
+    if not isinstance(scenario, Uplink):
+        raise BufgymError(f"scenario {spec!r}: a fleet needs an Uplink, whose link goes on; it is {scenario!r}")
+    return scenario
 
 
 def check_robots(robots: Any) -> int:
     """N, or an error."""
-    if isinstance(robots, bool) or not isinstance(robots, int | np.integer) or not 1 <= robots <= MAX_ROBOTS:
-        raise BufgymError(f"robots = {robots!r}: must be a whole number from 1 to {MAX_ROBOTS}")
-    return int(robots)
+    return whole("robots", robots, 1, MAX_ROBOTS)

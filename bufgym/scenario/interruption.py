@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.checks import whole
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
-from bufgym.scenario.checks import check_value, natural, positive, rate
+from bufgym.scenario.checks import check_value, positive, rate
 from bufgym.scenario.episode import Episode, Streams, messages
 from bufgym.traces import Trace
 
@@ -25,27 +26,37 @@ LAWS = ("fixed", "uniform", "log-uniform", "geometric")
 class Interruption:
     """One interruption of unknown length (AFR paper, Sec. III-B).
 
-    Message 0 is in transmission when the link stops; messages 1..T arrive, one a period, and meet the policy; then the
-    link resumes, all that is kept is delivered, and message T + 1 after it. T is hidden and drawn from ``law``:
-    ``fixed`` (t_max), ``uniform`` or ``log-uniform`` on t_min..t_max, ``geometric`` from t_min on with mean
+    Message 0 is in transmission when the link stops; for messages 1..T, which arrive one a period, the policy decides;
+    then the link resumes, all that is kept is delivered, and message T + 1 after it. T is hidden and drawn from
+    ``law``: ``fixed`` (t_max), ``uniform`` or ``log-uniform`` on t_min..t_max, ``geometric`` from t_min on with mean
     ``t_mean``, cut off at t_max.
     """
 
     law: str = "log-uniform"
+    """How T is drawn: one of ``LAWS``."""
     t_min: int = 1
+    """Shortest T, messages; not used by ``fixed``."""
     t_max: int = 400
+    """Longest T, messages."""
     t_mean: float = 100.0
+    """Mean T of ``geometric``, messages, before it is cut off."""
     rate_hz: float = 30.0
+    """Messages a second."""
     size_bytes: int = 230_000
+    """Bytes of every message."""
     value: Value = field(default_factory=qoi.exponential)
+    """V that QoI is measured with."""
     lengths: tuple[int, ...] = ()
     """If any are given: T is drawn again until it is one of these."""
+
+    topics: ClassVar[tuple[Topic, ...]] = ()
+    """None: one queue."""
 
     def __post_init__(self) -> None:
         if self.law not in LAWS:
             raise BufgymError(f"law = {self.law!r}: must be one of {', '.join(LAWS)}")
         for name in ("t_min", "t_max", "size_bytes"):
-            object.__setattr__(self, name, natural(name, getattr(self, name)))
+            object.__setattr__(self, name, whole(name, getattr(self, name)))
         if not 1 <= self.t_min <= self.t_max <= 10**6:
             raise BufgymError(f"t_min = {self.t_min}, t_max = {self.t_max}: need 1 <= t_min <= t_max <= 1000000")
         positive(self, "size_bytes", "t_mean")
@@ -53,7 +64,7 @@ class Interruption:
         if not self.t_mean >= self.t_min:
             raise BufgymError(f"t_mean = {self.t_mean}: must be at least t_min = {self.t_min}")
         check_value(self)
-        object.__setattr__(self, "lengths", tuple(natural("lengths", T) for T in self.lengths))
+        object.__setattr__(self, "lengths", tuple(whole("lengths", T) for T in self.lengths))
         shortest = self.t_max if self.law == "fixed" else self.t_min
         if self.lengths and not any(shortest <= T <= self.t_max for T in self._allowed):
             raise BufgymError(f"lengths = {self.lengths}: none lies between {shortest} and t_max = {self.t_max}")
@@ -63,11 +74,8 @@ class Interruption:
         return frozenset(self.lengths)
 
     @property
-    def topics(self) -> tuple[Topic, ...]:
-        return ()  # one queue
-
-    @property
     def max_messages(self) -> int:
+        """Arrivals of the longest episode."""
         return self.t_max + 2
 
     @property
@@ -78,11 +86,11 @@ class Interruption:
     def draw_length(self, rng: np.random.Generator) -> int:
         """T, messages."""
         while True:
-            T = self._drawn_length(rng)
+            T = self._draw_once(rng)
             if not self.lengths or T in self._allowed:
                 return T
 
-    def _drawn_length(self, rng: np.random.Generator) -> int:
+    def _draw_once(self, rng: np.random.Generator) -> int:
         if self.law == "fixed":
             return self.t_max
         if self.law == "uniform":
@@ -104,16 +112,17 @@ class Interruption:
         return self._episodes[T]
 
     def draw(self, streams: Streams) -> Episode:
+        """One episode."""
         return self.episode(self.draw_length(streams.link))
 
     @functools.cached_property
     def _episodes(self) -> dict[int, Episode]:
-        """Those drawn so far: the length is all that differs, so each is made once."""
+        """By length, those used so far: the length is all that differs, so each is made once."""
         return {}
 
     @functools.cached_property
     def _table(self) -> NDArray[Any]:
-        """Messages 0..t_max + 1: every episode is a beginning of this table."""
+        """MESSAGE[t_max + 2]: every episode is a prefix of this table."""
         return messages(np.arange(self.max_messages, dtype=np.int64) * self.period_us, int(self.size_bytes))
 
 

@@ -7,27 +7,18 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
-from bufgym import traces
 from bufgym.errors import BufgymError
-from bufgym.scenario.client import client_over_lte
+from bufgym.scenario.configuration import client_over_lte
 from bufgym.scenario.episode import Scenario
 from bufgym.scenario.interruption import Interruption
-from bufgym.scenario.uplink import Uplink
-
-
-def _lte() -> Uplink:
-    names = traces.shipped()
-    return Uplink(
-        traces=tuple(traces.load(name) for name in names if name.startswith("lte-")),
-        motion=tuple(traces.load_motion(name) for name in names if name.startswith("drive-")),
-    )
-
+from bufgym.scenario.uplink import uplink_over_lte
 
 SCENARIOS: dict[str, tuple[Callable[[], Scenario], str]] = {
     "interruption": (Interruption, "one interruption of unknown length (AFR paper, Sec. III-B)"),
-    "lte": (_lte, "30 Hz camera on a driving robot over the shipped synthetic LTE traces"),
+    "lte": (uplink_over_lte, "30 Hz camera on a driving robot over the shipped synthetic LTE traces"),
     "topics": (client_over_lte, "the topics of Robofleet's example client over the shipped synthetic LTE traces"),
 }
+"""Name -> (what makes it, one line about it)."""
 
 
 @functools.cache
@@ -36,7 +27,7 @@ def _named(name: str) -> Scenario:
 
 
 def get(spec: str | Scenario, **overrides: Any) -> Scenario:
-    """The scenario of that name (or the given one), with the given parameters changed."""
+    """The scenario of that name (or ``spec`` itself), with these parameters changed; BufgymError for unknown ones."""
     if isinstance(spec, str):
         if spec not in SCENARIOS:
             raise BufgymError(f"unknown scenario {spec!r}; known: {', '.join(SCENARIOS)}")

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.checks import whole
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
-from bufgym.scenario.checks import check_value, is_number, natural, positive, rate
+from bufgym.scenario.checks import as_tuple, check_stream, check_value, positive, recordings
+from bufgym.scenario.draws import place, scaled, shipped, sizes
 from bufgym.scenario.episode import Episode, Streams, unchecked_messages
 from bufgym.traces import Motion, Trace
 from bufgym.traces.workload import Workload
@@ -26,59 +27,55 @@ from bufgym.traces.workload import Workload
 class Uplink:
     """A camera stream over capacity traces.
 
-    Frames arrive at ``rate_hz``, each moved within its period by up to ``jitter`` of it; sizes are log-normal with
-    mean ``size_bytes`` and coefficient of variation ``size_cv`` (0: all equal). The link is one of ``traces``, chosen
-    at random, times ``scale`` (one of them at random where several are given), from a random offset on. ``motion``:
-    recordings that give x, from a random offset on; without one, x is the frame index.
+    Frames arrive at ``rate_hz``; the link is one of ``traces``, chosen at random, times one of ``scale``, from a random
+    offset on. x is one of the recordings in ``motion`` from a random offset on, or without one the frame index.
 
-    ``workload``: a robot's recording, played as it is, in place of the stream that ``rate_hz``, ``jitter``,
+    With a ``workload``, a robot's recording is played as it is in place of the stream that ``rate_hz``, ``jitter``,
     ``size_bytes``, ``size_cv`` and ``duration_s`` describe. All its topics share the queue; it gives x if it has one.
     """
 
     traces: tuple[Trace, ...] = ()
+    """Links; one of them carries an episode."""
     motion: tuple[Motion, ...] = ()
+    """Recordings that give x; without one x is the frame index."""
     rate_hz: float = 30.0
+    """Messages a second."""
     jitter: float = 0.1
+    """Each message is moved within its period by up to this part of it."""
     size_bytes: int = 230_000
+    """Mean bytes of a message."""
     size_cv: float = 0.0
+    """Coefficient of variation of the sizes, which are log-normal; 0: all equal."""
     duration_s: float = 30.0
+    """Length of an episode's arrivals, s."""
     scale: tuple[float, ...] = (1.0,)
+    """Factors on the link's capacity; one of them is drawn for an episode."""
     random_offset: bool = True
+    """Whether link and motion begin at a random place; else at their beginnings."""
     link_offset_s: tuple[float, float] | None = None
     """Where on the trace an episode begins, at random from..to, s; None: anywhere."""
     propagation_us: int = 20_000
+    """From a message's last byte on the link to the server, us."""
     value: Value = field(default_factory=lambda: qoi.exponential(math.exp(-1)))
+    """V that QoI is measured with."""
     workload: Workload | None = None
+    """A recording to play; None for the stream."""
+
+    topics: ClassVar[tuple[Topic, ...]] = ()
+    """None: one queue."""
 
     def __post_init__(self) -> None:
-        for name, kind, what in (
-            ("traces", Trace, "a bufgym.traces Trace"),
-            ("motion", Motion, "a bufgym.traces Motion"),
-            ("scale", int | float, "a number > 0"),
-        ):
-            given = getattr(self, name)
-            if isinstance(given, str) or not isinstance(given, Sequence):
-                given = (given,)
-            for item in given:
-                if not isinstance(item, kind):
-                    raise BufgymError(f"{name}: {item!r} is not {what}")
-            object.__setattr__(self, name, tuple(given))
+        recordings(self)
+        as_tuple(self, "scale", int | float, "a number > 0")
         if not self.traces:
             raise BufgymError("traces: an uplink needs at least one bandwidth trace")
         if not self.scale or not all(math.isfinite(s) and s > 0 for s in self.scale):
             raise BufgymError(f"scale = {self.scale}: every factor must be a number > 0")
-        positive(self, "size_bytes", "duration_s")
-        rate(self.rate_hz)
-        natural("propagation_us", self.propagation_us)
+        check_stream(self)
+        positive(self, "duration_s")
+        whole("propagation_us", self.propagation_us)
         if self.size_bytes < 1:
             raise BufgymError(f"size_bytes = {self.size_bytes}: must be at least 1")
-        for name in ("jitter", "size_cv"):
-            if not is_number(getattr(self, name)):
-                raise BufgymError(f"{name} = {getattr(self, name)!r}: must be a number")
-        if not 0 <= self.jitter <= 1:
-            raise BufgymError(f"jitter = {self.jitter}: must lie between 0 and 1 (of a period)")
-        if not 0 <= self.size_cv <= 10:
-            raise BufgymError(f"size_cv = {self.size_cv}: must lie between 0 and 10")
         if self.link_offset_s is not None and not (
             len(self.link_offset_s) == 2 and 0 <= self.link_offset_s[0] <= self.link_offset_s[1] < math.inf
         ):
@@ -92,18 +89,16 @@ class Uplink:
         check_value(self)
 
     @property
-    def topics(self) -> tuple[Topic, ...]:
-        return ()  # one queue
-
-    @property
     def max_messages(self) -> int:
+        """Arrivals of an episode."""
         return round(self.rate_hz * self.duration_s) if self.workload is None else len(self.workload)
 
     @functools.cached_property
     def _links(self) -> tuple[Trace, ...]:
-        return tuple(trace if s == 1 else trace.scaled(s) for trace in self.traces for s in self.scale)
+        return tuple(scaled(trace, factor) for trace in self.traces for factor in self.scale)
 
     def draw(self, streams: Streams) -> Episode:
+        """One episode."""
         arrivals = self._stream(streams.arrival) if self.workload is None else _replayed(self.workload)
         self.move(arrivals, streams.arrival)
         trace = self._links[int(streams.link.integers(len(self._links)))]
@@ -116,25 +111,19 @@ class Uplink:
     def move(self, arrivals: NDArray[Any], rng: np.random.Generator) -> None:
         """Give these messages the x of one of the recordings, if there are any, from a place drawn at random."""
         if self.motion:
-            motion = self.motion[int(rng.integers(len(self.motion)))]
-            start = int(rng.integers(motion.time_us[-1])) if self.random_offset else 0
-            x = motion.at(arrivals["arrival_us"] + start)
+            motion, start_us = place(self.motion, rng, self.random_offset)
+            x = motion.at(arrivals["arrival_us"] + start_us)
             arrivals["x"] = x - x[0]
 
     def _stream(self, rng: np.random.Generator) -> NDArray[Any]:
         """MESSAGE[n] of the camera, x being the frame index."""
         n, period_us = self.max_messages, 1e6 / self.rate_hz
-        moved = np.arange(n, dtype=np.float64)
+        periods = np.arange(n, dtype=np.float64)
         if self.jitter:
-            moved += self.jitter * rng.random(n)
-        arrival_us = (moved * period_us).astype(np.int64)
+            periods += self.jitter * rng.random(n)
+        arrival_us = (periods * period_us).astype(np.int64)
         arrival_us -= arrival_us[0]
-        size: NDArray[np.int64] | int = int(self.size_bytes)
-        if self.size_cv:
-            spread = math.sqrt(math.log1p(self.size_cv**2))
-            drawn = self.size_bytes * np.exp(spread * rng.standard_normal(n) - spread**2 / 2)
-            size = np.maximum(1, np.rint(drawn)).astype(np.int64)
-        return unchecked_messages(arrival_us, size, None)
+        return unchecked_messages(arrival_us, sizes(n, self.size_bytes, self.size_cv, rng), None)
 
 
 def _replayed(workload: Workload) -> NDArray[Any]:
@@ -142,3 +131,8 @@ def _replayed(workload: Workload) -> NDArray[Any]:
     arrivals = unchecked_messages(workload.arrival_us, workload.size_bytes, workload.x)
     arrivals["topic"] = workload.topic
     return arrivals
+
+
+def uplink_over_lte() -> Uplink:
+    """A camera on a driving robot over the shipped synthetic LTE links."""
+    return Uplink(**shipped())

@@ -291,9 +291,7 @@ def without_bounds(c, size, limit, x, v, ends) -> float:
     work, steps = np.empty((2, len(c)), np.int64), (limit + size).max() // 1_000 + 2
     p = labels.Problem(c, size, limit, x, v, ends, work[0], work[1], 1_000, np.zeros((len(c), steps)))
     labels.find_idle(p)
-    table = labels.Table(len(c))
-    table.fill(p, -np.inf)
-    return table.plan()[1]
+    return labels.plan_of(labels.fill(p, -np.inf, labels.no_labels(len(c))))[1]
 
 
 MIDDLING = range(24) if JIT else range(2)

@@ -71,9 +71,9 @@ def test_every_v_keeps_the_rules(v, a, b, share):
     ("distances", "values", "rule"),
     [
         ([0, 1, 2], [0, 0.2, 0.8], r"faster after d = 1, but must be concave \(Eq. 6\)"),
-        ([0, 1, 2], [0, 0.5, 0.4], r"falls from d = 1 on, but must not decrease \(Eq. 4\)"),
+        ([0, 1, 2], [0, 0.5, 0.4], r"falls from d = 1 on, but must not decrease \(Eq. 5\)"),
         ([0, 1], [0.1, 0.5], r"V\(0\) = 0.1, but V\(0\) must be 0 \(Eq. 3\)"),
-        ([0, 1, 2], [0, 0.9, 1.01], r"reaches 1.01, but must not exceed 1 \(Eq. 5\)"),
+        ([0, 1, 2], [0, 0.9, 1.01], r"reaches 1.01, but must not exceed 1 \(Eq. 4\)"),
         ([0, 1], [0, NAN], "must be a finite number"),
         ([0, INF], [0, 1], "must be a finite number"),
         ([0, 1], [0, 0], "0 everywhere"),

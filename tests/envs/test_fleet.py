@@ -8,12 +8,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from env_cases import valid_action
 from gymnasium.vector import AutoresetMode
 
 from bufgym import policies
-from bufgym.envs import SenderEnv
+from bufgym.envs import FleetVecEnv, SenderEnv
 from bufgym.errors import BufgymError
-from bufgym.fleet import FleetVecEnv
 from bufgym.model.link import Link
 from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
 from bufgym.scenario import FleetEpisode, FleetScenario, Streams, messages
@@ -24,16 +24,11 @@ pytest.importorskip("pettingzoo", reason="the extra [fleet] is not installed")
 
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-from bufgym.fleet import FleetEnv, parallel_env
+from bufgym.envs import FleetEnv, parallel_env
 
 L = 4
 SMALL: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 600_000}
 PARAMETERS = {"duration_s": 2.0, "size_bytes": 600_000}
-
-
-def some_action(mask: np.ndarray, rng: np.random.Generator) -> int:
-    """A possible action, at random."""
-    return int(rng.choice(np.flatnonzero(mask)))
 
 
 def oldest_goes(mask: np.ndarray) -> int:
@@ -61,7 +56,7 @@ def test_one_robot_is_the_single_environment():
     while not terminated:
         assert all(np.array_equal(seen["robot_0"][key], alone[key]) for key in alone)
         assert np.array_equal(infos["robot_0"]["action_mask"], info["action_mask"])
-        action = some_action(info["action_mask"], rng)
+        action = valid_action(info["action_mask"], rng)
         seen, rewards, ended, _, infos = fleet.step({"robot_0": action})
         alone, reward, terminated, _, info = single.step(action)
         assert rewards == {"robot_0": reward}
@@ -234,7 +229,6 @@ def half_reset():
 
 def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
     import bufgym.envs
-    import bufgym.fleet
 
     monkeypatch.delattr(bufgym.envs, "fleet", raising=False)
     for name in list(sys.modules):
@@ -242,10 +236,10 @@ def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pettingzoo", None)
     with pytest.raises(BufgymError, match=r'FleetEnv needs pettingzoo: pip install "bufgym\[fleet\]"'):
-        bufgym.fleet.__getattr__("FleetEnv")
+        bufgym.envs.__getattr__("FleetEnv")
     with pytest.raises(AttributeError, match="no_such_thing"):
-        bufgym.fleet.__getattr__("no_such_thing")
-    assert bufgym.fleet.FleetVecEnv is FleetVecEnv
+        bufgym.envs.__getattr__("no_such_thing")
+    assert bufgym.envs.FleetVecEnv is FleetVecEnv
 
 
 # --- robots as the rows of a batch -----------------------------------------------------------------------------------
@@ -261,7 +255,7 @@ def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
     rng = np.random.default_rng(0)
     assert envs.num_envs == 6
     for _ in range(60):
-        actions = np.array([some_action(mask, rng) for mask in info["action_mask"]])
+        actions = np.array([valid_action(mask, rng) for mask in info["action_mask"]])
         for c, (observation, infos) in enumerate(each):
             for r, agent in enumerate(fleets[c].possible_agents):
                 i = c * robots + r

@@ -9,18 +9,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from env_cases import text
 
 import bufgym
 from bufgym.envs import SenderEnv, SenderVectorEnv, render
+from bufgym.envs.render import scene
 from bufgym.kernel import JIT
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, Interruption, Uplink, messages
 from bufgym.traces import Trace
-
-
-def text(env: SenderEnv, width: int = 100) -> list[str]:
-    """The frame without colours, line by line."""
-    return re.sub(r"\x1b\[[0-9;]*m", "", render.ansi(env.rows.senders, 0, width)).splitlines()
 
 
 def test_a_frame_of_text_by_hand() -> None:
@@ -75,18 +72,18 @@ def check(frame: Any, mode: str) -> None:
         assert frame.std() > 5
 
 
-def test_image_shows_each_fate_in_its_colour() -> None:
+def test_image_shows_each_state_in_its_colour() -> None:
     env = SenderEnv(Interruption(law="fixed", t_max=30), 3, render_mode="rgb_array")
     env.reset(seed=0)
     for action in (4, 4, 4, 0, 0):
         env.step(action)
     image = env.render()
     shown = {tuple(pixel) for pixel in image.reshape(-1, 3).tolist()}
-    colour = [tuple(int(c[k : k + 2], 16) for k in (1, 3, 5)) for c in render._COLOURS]
-    assert colour[render.QUEUED] in shown
-    assert colour[render.SENDING] in shown
-    assert colour[render.NEWCOMER] in shown
-    assert colour[render.DROPPED] in shown
+    colour = [tuple(int(c[k : k + 2], 16) for k in (1, 3, 5)) for c in render.image.COLOURS]
+    assert colour[scene.QUEUED] in shown
+    assert colour[scene.SENDING] in shown
+    assert colour[scene.NEWCOMER] in shown
+    assert colour[scene.DROPPED] in shown
     assert tuple(image[2, 2]) == (255, 255, 255)
 
 

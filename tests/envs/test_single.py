@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from env_cases import same
 from gymnasium.utils.env_checker import check_env
 
 import bufgym
@@ -48,10 +49,6 @@ def seen(env: SenderEnv) -> tuple[Buffer, Any]:
     """The Buffer and the newcomer as a policy of plain Python gets them."""
     batch = Batch(*(a.view(np.recarray) if a.dtype.names else a for a in env.rows.senders.batch))
     return getattr(view, "py_func", view)(batch, 0), batch.arrivals[0, batch.senders[0].next]
-
-
-def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
 
 
 # --- Gymnasium -------------------------------------------------------------------------------------------------------
@@ -131,7 +128,7 @@ def test_rewards_worked_by_hand() -> None:
 
 
 def test_rejecting_all_and_weighted_rewards() -> None:
-    """T = 3, all rejected: 0 and 4 are delivered, V(4) is paid by the last step, at half and twice its worth."""
+    """T = 3, all rejected: 0 and 4 are delivered, V(4) comes with the last step, weighted 2 and 0.5."""
     env = SenderEnv(Interruption(law="fixed", t_max=3), 2, reward={"delivered": 2.0, "retained": 0.5})
     env.reset(seed=0)
     rewarded = [env.step(2)[1] for _ in range(3)]
@@ -141,7 +138,7 @@ def test_rejecting_all_and_weighted_rewards() -> None:
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_every_step_of_random_play(scenario: str, variant: str) -> None:
-    """Conservation, masks, bounds and sums of rewards under actions of which many are impossible."""
+    """Conservation, masks, bounds and sums of rewards under actions of which many are invalid."""
     env, rng = make(scenario, variant), np.random.default_rng(1)
     L, most = env.rows.capacity, VARIANTS[variant].get("max_bytes", UNLIMITED_BYTES)
     for k in range(EPISODES):
@@ -159,7 +156,7 @@ def test_every_step_of_random_play(scenario: str, variant: str) -> None:
                 assert env.action_masks().tolist() == allowed
                 assert variant == "arrival" or variant == "bytes" or not allowed[L + 1]
             else:
-                allowed = [True] * (L + 2)  # an episode that asks for nothing: whatever is said counts for nothing
+                allowed = [True] * (L + 2)  # an episode that asks for no decision: actions have no effect
             action = int(rng.integers(L + 2))
             invalid += not allowed[action]
             observation, reward, ended, truncated, info = env.step(action)
@@ -199,7 +196,7 @@ def test_an_episode_that_asks_for_no_decision_ends_with_the_first_step() -> None
 
 
 @pytest.mark.parametrize("variant", ["arrival", "bytes"])
-def test_an_impossible_action_does_what_a_queue_does(variant: str) -> None:
+def test_an_invalid_action_does_what_a_queue_does(variant: str) -> None:
     env, queue, rng = make("fading", variant), make("fading", variant), np.random.default_rng(0)
     (_, info), _ = env.reset(seed=2), queue.reset(seed=2)
     ended, invalid = False, 0

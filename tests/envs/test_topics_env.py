@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
+from env_cases import LINKS, client, same, text, valid_action
 
 from bufgym import scenario as scenarios
 from bufgym.benchmark import perf
 from bufgym.envs import SenderEnv, SenderVectorEnv, render
-from bufgym.envs.rows import decision_of
+from bufgym.envs.render import scene
+from bufgym.envs.step import decision_of
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.model import qoi
@@ -27,14 +27,7 @@ from bufgym.traces import Trace
 
 TERMS = [term.name for term in REWARD_TERMS + TOPIC_REWARD_TERMS]
 L = 5
-STREAMS = (
-    Stream(Topic("pose", priority=5, rate_limit_hz=18, deadline_s=0.05), 20, 400, jitter=0.5),
-    Stream(Topic("image", weight=2, limit=3, value=qoi.saturating(3), deadline_s=0.2), 15, 6_000, size_cv=0.6),
-    Stream(Topic("command", priority=2, no_drop=True), 4, 100),
-    Stream(Topic("log", weight=0), 10, 800),
-)
-LINKS = (Trace.steps([(0.4, 60_000), (0.5, 0), (0.6, 40_000)]), Trace.steps([(0.7, 90_000), (0.2, 0)], after="stop"))
-CLIENT = Client(STREAMS, LINKS, duration_s=2.0 if JIT else 1.0, scale=2.0)
+CLIENT = client(duration_s=2.0 if JIT else 1.0, scale=2.0)
 CASES: dict[str, dict[str, Any]] = {
     "plain": {},
     "bytes": {"max_bytes": 9_000},
@@ -58,20 +51,11 @@ def copied(env: SenderEnv) -> Batch:
     return batch._replace(**{name: getattr(batch, name).copy() for name in batch._fields if name != "v"})
 
 
-def possible(mask: np.ndarray, rng: np.random.Generator) -> int:
-    return int(rng.choice(np.flatnonzero(mask)))
-
-
-def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
-
-
 # --- Gymnasium -------------------------------------------------------------------------------------------------------
 
 
-def test_gymnasium_finds_nothing_to_complain_about() -> None:
-    env = gym.make("bufgym/Topics-v0", duration_s=1.0).unwrapped
-    check_env(env)
+def test_spaces_of_the_example_client() -> None:
+    env: Any = gym.make("bufgym/Topics-v0", duration_s=1.0).unwrapped
     assert env.action_space == gym.spaces.Discrete(34)
     assert len(env.rows.senders.topics) == 8
     assert set(env.observation_space) == {field.name for field in FIELDS + TOPIC_FIELDS}
@@ -88,22 +72,6 @@ def test_fields_choose_what_is_observed() -> None:
         SenderEnv("lte", fields=["silence"])
     with pytest.raises(BufgymError, match="unknown term 'age'"):
         SenderEnv("lte", reward="age")
-
-
-@pytest.mark.slow
-def test_same_seed_same_run_and_another_seed_another() -> None:
-    def play(seed: int) -> list[Any]:
-        env, rng, record = make(), np.random.default_rng(0), []
-        for k in range(2):
-            seen, info = env.reset(seed=seed if k == 0 else None)
-            ended = False
-            while not ended:
-                seen, reward, ended, _, info = env.step(int(rng.integers(L + 2)))
-                record.append((reward, info["action_mask"].tolist(), {key: seen[key].tolist() for key in seen}))
-        return record
-
-    assert play(5) == play(5)
-    assert play(5) != play(6)
 
 
 # --- by hand ---------------------------------------------------------------------------------------------------------
@@ -139,7 +107,7 @@ def test_an_episode_of_three_topics_by_hand() -> None:
     env = SenderEnv(BY_HAND, 3, reward={"retained": 1.0, "age": 1.0, "late": 10.0})
     accept, reject = 4, 3
     script = [
-        # who asks, at what time, which actions are possible, action, retained, delivered
+        # who asks, at what time, which actions are valid, action, retained, delivered
         (ARRIVAL_WAITS, 0, [0, 0, 0, 1, 1], accept, 0, 0),
         (SOCKET_WAITS, 0, [1, 0, 0, 1, 0], 0, 0, 0),
         (ARRIVAL_WAITS, 1, [0, 0, 0, 1, 1], accept, 0, 0),  # the first image: the 1 in its H
@@ -201,7 +169,7 @@ def test_an_episode_of_three_topics_by_hand() -> None:
     assert not any(array.any() for array in seen.values())
 
 
-def test_hold_waits_for_the_next_arrival_and_the_impossible_sends_the_oldest() -> None:
+def test_hold_waits_for_the_next_arrival_and_an_invalid_choice_sends_the_oldest() -> None:
     env = SenderEnv(BY_HAND, 3)
     env.reset(options={"episode": three_topics()})
     env.step(4)
@@ -217,8 +185,8 @@ def test_hold_waits_for_the_next_arrival_and_the_impossible_sends_the_oldest() -
         assert batch.senders["chosen"][0] == goes
 
 
-def test_hold_at_a_pong() -> None:
-    """n_T = 1 and 5 ms to the pong: after the last arrival the socket may wait for the pong, then no longer."""
+def test_hold_until_an_ack() -> None:
+    """n_T = 1 and 5 ms to the ack: after the last arrival the socket may wait for the ack, then no longer."""
     env = SenderEnv(BY_HAND, 6, window=2)
     _, info = env.reset(options={"episode": three_topics(window=2, ack_delay_us=5_000)})
     rng, ended, asked = np.random.default_rng(0), False, []
@@ -241,7 +209,7 @@ def test_hold_at_a_pong() -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_mask_is_what_does_not_count_as_impossible(case: str) -> None:
+def test_the_mask_is_what_does_not_count_as_imvalid_action(case: str) -> None:
     """Every action on a copy of the sender."""
     env, rng = make(case), np.random.default_rng(2)
     _, info = env.reset(seed=9)
@@ -262,14 +230,14 @@ def test_the_mask_is_what_does_not_count_as_impossible(case: str) -> None:
             assert info["action_mask"].tolist() == allowed
         # Full queues and holding are what is rare: accept where possible.
         mask = info["action_mask"]
-        _, _, ended, _, info = env.step(L + 1 if mask[L + 1] else possible(mask, rng))
+        _, _, ended, _, info = env.step(L + 1 if mask[L + 1] else valid_action(mask, rng))
     assert info["invalid"] == 0
     assert min(met.values()) > 3
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_every_step_of_random_play(case: str) -> None:
-    """Bounds, conservation and sums of rewards, also where many actions are impossible."""
+    """Bounds, conservation and sums of rewards, also where many actions are invalid."""
     env, rng = make(case, reward={"delivered": 1.0, "retained": 2.0, "age": 3.0, "late": 4.0}), np.random.default_rng(1)
     weights = np.array([topic.share for topic in CLIENT.topics])
     for k in range(6 if JIT else 1):
@@ -278,7 +246,7 @@ def test_every_step_of_random_play(case: str) -> None:
         while not ended:
             assert env.observation_space.contains(seen)
             assert info["action_mask"].any()
-            action = int(rng.integers(L + 2)) if careless else possible(info["action_mask"], rng)
+            action = int(rng.integers(L + 2)) if careless else valid_action(info["action_mask"], rng)
             seen, reward, ended, truncated, info = env.step(action)
             terms = info["reward_terms"]
             assert reward == pytest.approx(sum((i + 1) * terms[name] for i, name in enumerate(TERMS)))
@@ -303,7 +271,7 @@ def test_every_step_of_random_play(case: str) -> None:
         assert totals["late"] == pytest.approx(-(weights @ [made.late for made in outcomes]) / weights.sum())
 
 
-def test_topics_that_weigh_nothing_pay_nothing() -> None:
+def test_topics_without_weight_reward_nothing() -> None:
     streams = tuple(Stream(Topic(name, weight=0.0, deadline_s=0.01), 10, 100) for name in "ab")
     env = SenderEnv(Client(streams, LINKS, duration_s=1.0), 3, reward={name: 1.0 for name in TERMS})
     seen, _ = env.reset(seed=0)
@@ -329,7 +297,7 @@ def test_a_client_of_one_topic() -> None:
         met.add(waiting(env))
         assert env.observation_space.contains(seen)
         assert seen["occupied"][:4].sum() <= 2
-        seen, reward, ended, _, info = env.step(possible(info["action_mask"], rng))
+        seen, reward, ended, _, info = env.step(valid_action(info["action_mask"], rng))
         total += reward
     assert met == {ARRIVAL_WAITS, SOCKET_WAITS}
     assert info["invalid"] == 0 and 0 < info["dropped"]
@@ -342,57 +310,15 @@ def test_one_topic_is_the_largest_of_all() -> None:
     assert (seen["weight"][-1], seen["priority"][-1]) == (1, 1)
     ended, total = False, 0.0
     while not ended:
-        _, reward, ended, _, info = env.step(5 if info["action_mask"][5] else possible(info["action_mask"], np.random))
+        _, reward, ended, _, info = env.step(
+            5 if info["action_mask"][5] else valid_action(info["action_mask"], np.random)
+        )
         total += reward
     (made,) = topic_outcomes(env.rows.senders, 0)
     assert total == pytest.approx(-made.late)
 
 
 # --- the batch -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-@pytest.mark.parametrize("case", ["plain", "window"])
-def test_row_i_is_the_single_environment_with_seed_s_plus_i(case: str, mode: str) -> None:
-    n, rng, kinds = 3, np.random.default_rng(0), set()
-    given = CASES[case] | {"duration_s": 0.6}
-    envs = SenderVectorEnv(n, CLIENT, L, autoreset_mode=mode, **given)
-    alone = [SenderEnv(CLIENT, L, **given) for _ in range(n)]
-    seen, info = envs.reset(seed=40)
-    for i, env in enumerate(alone):
-        assert same({name: seen[name][i] for name in seen}, env.reset(seed=40 + i)[0])
-    over, episodes = [False] * n, 0
-    for _ in range(260 if JIT else 100):
-        actions = np.array([possible(mask, rng) for mask in envs.action_masks()])
-        actions = np.where(rng.random(n) < 0.2, rng.integers(L + 2, size=n), actions)
-        kinds.add(tuple(envs.rows.senders.batch.senders["waiting"].tolist()))
-        seen, rewards, terminated, truncated, info = envs.step(actions)
-        assert not truncated.any()
-        for i, env in enumerate(alone):
-            if over[i]:  # this step was the reset
-                observation, told = env.reset()
-                reward, over[i] = 0.0, False
-                assert all(not info["reward_terms"][name][i] for name in TERMS)
-            else:
-                observation, reward, over[i], _, told = env.step(actions[i])
-                if not over[i] or mode == "NextStep":
-                    assert {name: info["reward_terms"][name][i] for name in TERMS} == told["reward_terms"]
-            assert rewards[i] == reward
-            assert terminated[i] == over[i]
-            if over[i]:
-                episodes += 1
-                final = info if mode == "NextStep" else info["final_info"]
-                assert {key: final[key][i] for key in ("qoi", "arrived", "delivered", "dropped")} == {
-                    key: told[key] for key in ("qoi", "arrived", "delivered", "dropped")
-                }
-                if mode == "SameStep":
-                    assert same(info["final_obs"][i], observation)
-                    observation, over[i] = env.reset()[0], False
-            assert same({name: seen[name][i] for name in seen}, observation)
-            assert (envs.action_masks()[i] == env.action_masks()).all()
-    assert episodes > n
-    assert any(ARRIVAL_WAITS in kind and SOCKET_WAITS in kind for kind in kinds)  # both kinds in one step
 
 
 def test_given_episodes() -> None:
@@ -421,11 +347,6 @@ def test_masked_ppo_learns_on_it() -> None:
 
 
 # --- pictures --------------------------------------------------------------------------------------------------------
-
-
-def text(env: SenderEnv, width: int = 100) -> list[str]:
-    """The frame without colours, line by line."""
-    return re.sub(r"\x1b\[[0-9;]*m", "", render.ansi(env.rows.senders, 0, width)).splitlines()
 
 
 def test_a_frame_of_text_has_a_lane_a_topic() -> None:
@@ -462,24 +383,9 @@ def test_pictures_of_any_size(topics: int, capacity: int) -> None:
     frame = env.render()
     assert (frame.shape, frame.dtype) == ((400, 800, 3), np.uint8)
     shown = {tuple(pixel) for pixel in frame.reshape(-1, 3).tolist()}
-    queued = tuple(int(render._COLOURS[render.QUEUED][k : k + 2], 16) for k in (1, 3, 5))
+    queued = tuple(int(render.image.COLOURS[scene.QUEUED][k : k + 2], 16) for k in (1, 3, 5))
     assert queued in shown
     assert tuple(frame[2, 2]) == (255, 255, 255)
-
-
-def test_drawing_changes_nothing() -> None:
-    drawn, plain, rng = make(render_mode="rgb_array"), make(), np.random.default_rng(3)
-    drawn.reset(seed=1)
-    _, info = plain.reset(seed=1)
-    ended, k = False, 0
-    while not ended:
-        if k % 40 == 0:
-            drawn.render(), text(drawn)
-        action, k = possible(info["action_mask"], rng), k + 1
-        seen, reward, _, _, _ = drawn.step(action)
-        unseen, reward_unseen, ended, _, info = plain.step(action)
-        assert same(seen, unseen) and reward == reward_unseen
-    assert drawn.render().std() > 5
 
 
 def test_the_example_client_is_what_the_speed_report_measures() -> None:

@@ -1,0 +1,42 @@
+"""Rules for numbers that parameters share; each function raises a BufgymError that names the parameter and the rule."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from bufgym.errors import BufgymError
+
+
+def is_number(value: Any) -> bool:
+    """Whether ``value`` is an int or a float, Python's or numpy's; True and False are not."""
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
+def above_0(name: str, number: Any) -> None:
+    """``number`` is finite and > 0."""
+    if not (is_number(number) and math.isfinite(number) and number > 0):
+        raise BufgymError(f"{name} = {number!r}: must be a number > 0")
+
+
+def between(name: str, number: Any, low: float, high: float, unit: str = "") -> None:
+    """``number`` lies in [low, high]; ``unit`` is added to the message."""
+    if not is_number(number):
+        raise BufgymError(f"{name} = {number!r}: must be a number")
+    if not low <= number <= high:
+        raise BufgymError(f"{name} = {number!r}: must lie between {low:g} and {high:g}{unit and f' ({unit})'}")
+
+
+def whole(name: str, number: Any, least: int = 0, most: int | None = None, *, symbol: str = "") -> int:
+    """``number`` as an int, from ``least`` to ``most``; ``symbol``: what it is called in formulas, for the message."""
+    if (
+        isinstance(number, bool)
+        or not isinstance(number, int | np.integer)
+        or number < least
+        or (most is not None and number > most)
+    ):
+        bounds = f">= {least}" if most is None else f"from {least} to {most}"
+        raise BufgymError(f"{name} = {number!r}: {symbol and f'{symbol} '}must be a whole number {bounds}")
+    return int(number)

@@ -1,0 +1,114 @@
+"""What a picture of one sender shows, read from the sender's arrays."""
+
+from __future__ import annotations
+
+import string
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.envs.rows import delivered_qoi
+from bufgym.model.link import position_at
+from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, Senders
+
+DELIVERED, SENDING, QUEUED, DROPPED, NEWCOMER = range(5)
+"""The states that a message can be in."""
+STATES = ("delivered", "in transmission", "queued", "dropped", "newcomer")
+
+LETTERS = string.ascii_letters
+
+
+class Scene(NamedTuple):
+    """What the pictures show of one sender.
+
+    Fields:
+        now_us: its clock, us.
+        arrivals: MESSAGE[m], the messages that have arrived so far, the newcomer last.
+        states: int64[m], the state of each of them.
+        queue: int64[queued], sequence numbers of the queued messages, 0 = oldest.
+        dequeued: sequence number of the message that the socket took last; -1 if none.
+        capacity: L, messages.
+        demand: bytes that arrive per second; 0 where that has no meaning (one message).
+        counts: messages in each state but the newcomer's, by its name.
+        qoi: H of what was delivered so far.
+        topics: names of the topics; none where there is one queue.
+        question: who asks for a decision; empty where there is one queue, or nobody asks.
+    """
+
+    now_us: int
+    arrivals: NDArray[Any]
+    states: NDArray[np.int64]
+    queue: NDArray[np.int64]
+    dequeued: int
+    capacity: int
+    demand: float
+    counts: dict[str, int]
+    qoi: float
+    topics: tuple[str, ...]
+    question: str
+
+    @property
+    def newcomers(self) -> list[int]:
+        """The sequence number of the newcomer; none where no arrival waits."""
+        return [len(self.arrivals) - 1] if self.states[-1] == NEWCOMER else []
+
+    def letter(self, seq: int) -> str:
+        """The letter of a message's topic."""
+        return letter(int(self.arrivals["topic"][seq]))
+
+    def missing(self) -> list[tuple[int, int]]:
+        """(sequence number, messages missing before it) of the queued messages and the newcomer, in order."""
+        seqs = [*self.queue.tolist(), *self.newcomers]
+        return [(seq, seq - before - 1) for seq, before in zip(seqs, [self.dequeued, *seqs], strict=False)]
+
+
+def letter(topic: int) -> str:
+    """What stands for a topic where there is no room for its name."""
+    return LETTERS[topic % len(LETTERS)]
+
+
+def scene_of(senders: Senders, i: int) -> Scene:
+    """The scene of sender ``i``; ResetNeeded if it has no episode."""
+    episode = senders.episodes[i]
+    if episode is None:
+        raise gym.error.ResetNeeded("call reset() before render()")
+    sender, planned = senders.batch.senders[i], episode.arrivals
+    arrived, waiting = int(sender["next"]), int(sender["waiting"])
+    known = arrived + (waiting == ARRIVAL_WAITS)
+    log = senders.batch.log[i, :known]
+    states = np.full(known, QUEUED)
+    states[log["dequeued_us"] >= 0] = SENDING
+    states[log["transmitted_us"] >= 0] = DELIVERED
+    states[log["dropped_us"] >= 0] = DROPPED
+    states[arrived:] = NEWCOMER
+    first, slots = int(sender["first"]), senders.batch.slots["seq"][i]
+    span_us = int(planned["arrival_us"][-1] - planned["arrival_us"][0])
+    questions = {ARRIVAL_WAITS: "an arrival asks", SOCKET_WAITS: "the socket asks"} if senders.topics else {}
+    return Scene(
+        now_us=int(sender["now_us"]),
+        arrivals=planned[:known],
+        states=states,
+        queue=slots[first : first + int(sender["occupancy"])].copy(),
+        dequeued=int(slots[first - 1]) if sender["dequeued"] > 0 else -1,
+        capacity=senders.capacity,
+        # n messages span n - 1 periods.
+        demand=1e6 * float(planned["size_bytes"][:-1].sum()) / span_us if span_us > 0 else 0.0,
+        counts={name: int((states[:arrived] == state).sum()) for state, name in enumerate(STATES[:NEWCOMER])},
+        qoi=float(delivered_qoi(senders, i)),
+        topics=tuple(topic.name for topic in senders.topics),
+        question=questions.get(waiting, ""),
+    )
+
+
+def link_rates(senders: Senders, i: int, edges_us: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Mean link capacity of sender ``i`` between neighbouring ``edges_us``, bytes per second."""
+    batch, sender = senders.batch, senders.batch.senders[i]
+    first, last, after = int(sender["first_knot"]), int(sender["last_knot"]), int(sender["after"])
+    offset_us = int(sender["offset_us"])
+    carried = [
+        position_at(batch.knot_us, batch.knot_bytes, first, last, after, first, int(t_us) + offset_us)[0]
+        for t_us in edges_us
+    ]
+    return 1e6 * np.diff(np.array(carried, np.float64)) / np.maximum(1, np.diff(edges_us))

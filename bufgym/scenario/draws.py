@@ -1,0 +1,42 @@
+"""What uplinks and clients have in common: shipped recordings, places on them, and message sizes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import traces
+from bufgym.traces import Motion, Trace
+
+
+def place(recordings: tuple[Motion, ...], rng: np.random.Generator, random_offset: bool) -> tuple[Motion, int]:
+    """(one of the recordings, where on it an episode begins, us); at its beginning without ``random_offset``."""
+    motion = recordings[int(rng.integers(len(recordings)))]
+    return motion, int(rng.integers(motion.time_us[-1])) if random_offset else 0
+
+
+def sizes(n: int, mean_bytes: int, cv: float, rng: np.random.Generator) -> NDArray[np.int64]:
+    """int64[n] bytes: log-normal with that mean and coefficient of variation, at least 1; all equal for ``cv`` 0."""
+    if not cv:
+        return np.full(n, int(mean_bytes), np.int64)
+    spread = math.sqrt(math.log1p(cv**2))
+    drawn = mean_bytes * np.exp(spread * rng.standard_normal(n) - spread**2 / 2)
+    size: NDArray[np.int64] = np.maximum(1, np.rint(drawn)).astype(np.int64)
+    return size
+
+
+def shipped() -> dict[str, Any]:
+    """The synthetic LTE links and the drives that come with bufgym, as the parameters ``traces`` and ``motion``."""
+    names = traces.shipped()
+    return {
+        "traces": tuple(traces.load(name) for name in names if name.startswith("lte-")),
+        "motion": tuple(traces.load_motion(name) for name in names if name.startswith("drive-")),
+    }
+
+
+def scaled(trace: Trace, factor: float) -> Trace:
+    """The trace with ``factor`` times its capacity."""
+    return trace if factor == 1 else trace.scaled(factor)
