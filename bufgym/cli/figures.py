@@ -32,22 +32,18 @@ def _reproduce(options: argparse.Namespace) -> None:
     out = Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
     for k, name in enumerate(names):
-        needs = reproduce.NEEDS_DATA.get(name)
-        if needs is None:
-            text = _made(name, out, named=name in options.names)
-        elif data is None and name not in options.names:
-            text = f"{name}: left out; it needs a folder of recordings (--data DIR) with {needs}"
-        else:
-            text = reproduce.run(name, out, data=data)
-        print(("\n" if k else "") + text, flush=True)
+        print(("\n" if k else "") + _text(name, out, data, named=name in options.names), flush=True)
 
 
-def _made(name: str, out: Path, *, named: bool) -> str:
-    """The figure; one that nobody asked for by name is left out where it can't be made, such as without a library."""
+def _text(name: str, out: Path, data: Path | None, *, named: bool) -> str:
+    """The figure; one that was not asked for by name is left out where it can't be made, such as without a library."""
     from bufgym import reproduce
 
+    needs = reproduce.NEEDS_DATA.get(name)
+    if needs is not None and data is None and not named:
+        return f"{name}: left out; it needs a folder of recordings (--data DIR) with {needs}"
     try:
-        return reproduce.run(name, out)
+        return reproduce.run(name, out, **({} if needs is None else {"data": data}))
     except BufgymError as error:
         if named:
             raise

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies
-from bufgym import sim as sender
+from bufgym import policies, sim
 from bufgym.errors import BufgymError
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.policies.afr import C, P, R
-from bufgym.reproduce.report import COLOURS, Report
+from bufgym.reproduce.figure import COLOURS, Figure, finish, legend_below
+from bufgym.reproduce.rows import Rows, table
 from bufgym.scenario import Interruption
 
 PAPER_L = 8
@@ -35,7 +35,7 @@ class Step:
     T: int
     """Number of the arrival, and of the messages that came since the link stopped."""
     dropped: int | None
-    """Number of the message that went; T itself if the newcomer was rejected, None if all fitted."""
+    """Number of the dropped message; T itself if the newcomer was rejected, None if all fitted."""
     r: int
     """Dropping rate."""
     c: int
@@ -49,7 +49,7 @@ class Step:
 def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr") -> list[Step]:
     """AFR's decisions 1..``last_T`` with L = ``capacity``, taken from a run of the simulator."""
     afr = policies.get(policy)
-    seen: list[Step] = []
+    watched: list[Step] = []
 
     def watch(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
         decision = afr.on_arrival(buffer, arrival, memory)
@@ -61,67 +61,76 @@ def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr"
             if decision >= 0:
                 dropped = kept.pop(decision)
             kept.append(T)
-        seen.append(Step(T, dropped, int(memory[R]), int(memory[C]), int(memory[P]), tuple(kept)))
+        watched.append(Step(T, dropped, int(memory[R]), int(memory[C]), int(memory[P]), tuple(kept)))
         return decision
 
     # Uncompiled, so that the watcher sees each decision; the transition is the same.
-    watched = replace(afr, name=f"{afr.name}-watched", on_arrival=watch, compile=False)
+    watcher = replace(afr, name=f"{afr.name}-watched", on_arrival=watch, compile=False)
     episode = Interruption(law="fixed", t_max=last_T).episode(last_T)
-    sender.run(watched, [episode], capacity, Interruption().value)
-    return seen
+    sim.run(watcher, [episode], capacity, Interruption().value)
+    return watched
 
 
-def report(capacity: int = PAPER_L, last_T: int = PAPER_T[1]) -> Report:
+@dataclass(frozen=True)
+class Reproduction(Figure):
     """Fig. 4 for L = ``capacity`` and T from L to ``last_T`` (the paper: 8, and 8 to 18)."""
-    if last_T < capacity:
-        raise BufgymError(f"last_T = {last_T}: must be at least L = {capacity}")
-    shown = [step for step in steps(capacity, last_T) if step.T >= capacity]
-    as_paper = capacity == PAPER_L
-    lines = [
-        f"AFR paper, Fig. 4: what AFR keeps, L = {capacity}. State r, c, p is that after the decision.",
-        "",
-        "  T  drops  paper   r   c   p  kept",
-    ]
-    for step in shown:
-        paper = PAPER_DROPS.get(step.T) if as_paper else None
-        lines.append(
-            f"{step.T:3d}  {_or_dash(step.dropped):>5}  {_or_dash(paper):>5} {step.r:3d} {step.c:3d} {step.p:3d}  "
-            f"{' '.join(map(str, step.kept))}"
-            + ("  (newcomer rejected by the counter)" if step.dropped == step.T else "")
-        )
-    if as_paper:
-        compared = [step for step in shown if step.T in PAPER_DROPS]
-        same = sum(step.dropped == PAPER_DROPS[step.T] for step in compared)
-        lines += ["", f"{same} of {len(compared)} drops as in the paper"]
-    rows = [[s.T, _or_dash(s.dropped), s.r, s.c, s.p, " ".join(map(str, s.kept))] for s in shown]
 
-    def draw(figure: Any) -> None:
+    capacity: int = PAPER_L
+    last_T: int = PAPER_T[1]
+
+    def __post_init__(self) -> None:
+        if self.last_T < self.capacity:
+            raise BufgymError(f"last_T = {self.last_T}: must be at least L = {self.capacity}")
+
+    def simulate(self) -> Rows:
+        return Rows(
+            {"T": s.T, "dropped": s.dropped, "r": s.r, "c": s.c, "p": s.p, "kept": " ".join(map(str, s.kept))}
+            for s in steps(self.capacity, self.last_T)
+            if s.T >= self.capacity
+        )
+
+    @property
+    def paper_drops(self) -> dict[int, int]:
+        """T -> the message that the paper's figure strikes out, where it has this L."""
+        return PAPER_DROPS if self.capacity == PAPER_L else {}
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines: list[list[object]] = [["T", "drops", "paper", "r", "c", "p", "kept"]]
+        for row in rows:
+            T, dropped = row["T"], row["dropped"]
+            note = "  (newcomer rejected by the counter)" if dropped == T else ""
+            cells = [T, dropped or "-", self.paper_drops.get(T, "-"), row["r"], row["c"], row["p"]]
+            lines.append([*cells, row["kept"] + note])
+        return table(lines, left=7)
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        drops = self.paper_drops
+        same = [row["dropped"] == drops[row["T"]] for row in rows if row["T"] in drops]
+        return {"drops": all(same) if same else None, "same": sum(same), "compared": len(same)}
+
+    def size_inches(self, rows: Rows) -> tuple[float, float]:
+        return 7.5, 0.34 * len(rows) + 1.6
+
+    def draw(self, rows: Rows, figure: Any) -> None:
         axes = figure.add_subplot()
-        for step in shown:
-            axes.plot(step.kept, [step.T] * len(step.kept), "o", color=COLOURS["afr"], markersize=8)
-            if step.dropped is not None:
-                axes.plot(step.dropped, step.T, "x", color=COLOURS["drop-oldest"], markersize=8, markeredgewidth=2)
-            axes.annotate(
-                f"r={step.r} c={step.c} p={step.p}",
-                (last_T + 0.8, step.T),
-                va="center",
-                fontsize=8,
-                backgroundcolor="white",
-            )
+        for row in rows:
+            kept = [int(seq) for seq in row["kept"].split()]
+            axes.plot(kept, [row["T"]] * len(kept), "o", color=COLOURS["afr"], markersize=8)
+            if row["dropped"] is not None:
+                cross = {"color": COLOURS["drop-oldest"], "markersize": 8, "markeredgewidth": 2}
+                axes.plot(row["dropped"], row["T"], "x", **cross)
+            state, place = "r={r} c={c} p={p}".format(**row), (self.last_T + 0.8, row["T"])
+            axes.annotate(state, place, va="center", fontsize=8, backgroundcolor="white")
         axes.plot([], [], "o", color=COLOURS["afr"], label="kept")
         axes.plot([], [], "x", color=COLOURS["drop-oldest"], markeredgewidth=2, label="dropped at this T")
-        axes.set(xlim=(0.3, last_T + 3.6), xlabel="message", ylabel="T, messages since the link stopped")
-        axes.set_xticks(range(1, last_T + 1, 1 if last_T <= 24 else 4))
-        axes.set_yticks([s.T for s in shown][:: 1 if len(shown) <= 24 else 4])
+        finish(
+            axes,
+            f"AFR, L = {self.capacity}: messages kept as the interruption grows",
+            xlim=(0.3, self.last_T + 3.6),
+            xlabel="message",
+            ylabel="T, messages since the link stopped",
+            xticks=range(1, self.last_T + 1, 1 if self.last_T <= 24 else 4),
+            yticks=[row["T"] for row in rows][:: 1 if len(rows) <= 24 else 4],
+        )
         axes.invert_yaxis()
-        axes.set_title(f"AFR, L = {capacity}: messages kept as the interruption grows", loc="left")
-        axes.grid(alpha=0.25)
-        axes.set_axisbelow(True)
-        figure.legend(loc="outside lower center", ncols=2, frameon=False)
-
-    header = ["T", "dropped", "r", "c", "p", "kept"]
-    return Report("\n".join(lines), header, rows, draw, (7.5, 0.34 * len(shown) + 1.6))
-
-
-def _or_dash(number: int | None) -> str:
-    return "-" if number is None else str(number)
+        legend_below(figure, 2)

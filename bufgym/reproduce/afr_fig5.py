@@ -10,18 +10,18 @@ paper prints 18, 36, 72 for T; at those AFR is strictly below.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies
-from bufgym import sim as sender
-from bufgym.errors import BufgymError
+from bufgym import policies, sim
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
-from bufgym.reproduce.report import COLOURS, Report
+from bufgym.reproduce.figure import COLOURS, Figure, finish, whole
+from bufgym.reproduce.rows import Rows, listed, table
 from bufgym.scenario import Episode, Interruption
 
 PAPER_L = 8
@@ -37,11 +37,20 @@ EQUAL = 1e-12
 BATCH = 1000
 """Senders run at a time: a batch that fits in the processor's cache."""
 
+CURVES = {
+    "oracle-ideal": ("oracle-ideal", ":"),
+    "oracle": ("oracle", "--"),
+    "afr": ("AFR", "-"),
+    "drop-oldest": ("Drop Oldest", "-"),
+    "random": ("Random, mean ± 1 sd", "-"),
+}
+"""Column -> label and line style."""
+
 
 def gained(policy: str, episodes: Sequence[Episode], capacity: int, v: Value) -> NDArray[np.float64]:
     """H - 1 of each episode under ``policy``, float64[episodes]."""
-    done = sender.run(policies.get(policy), episodes, capacity, v)
-    return np.array(done.batch.senders["delivered_gain"])
+    senders = sim.run(policies.get(policy), episodes, capacity, v)
+    return np.array(senders.batch.senders["delivered_gain"])
 
 
 def gained_at_random(
@@ -61,71 +70,82 @@ def mean_score(policy: str, capacity: int, first: int, last: int) -> float:
     v = qoi.exponential(0.618)
     interruption = Interruption(law="fixed", t_max=last, value=v)
     lengths = range(first, last + 1)
-    ours = gained(policy, [interruption.episode(T) for T in lengths], capacity, v)
-    return float(np.mean(ours / [oracle.integer(capacity, T, v) for T in lengths]))
+    gains = gained(policy, [interruption.episode(T) for T in lengths], capacity, v)
+    return float(np.mean(gains / [oracle.integer(capacity, T, v) for T in lengths]))
 
 
-def report(runs: int = PAPER_RUNS, last_T: int = 80, seed: int = 0) -> Report:
+@dataclass(frozen=True)
+class Reproduction(Figure):
     """Fig. 5 for T = 1..``last_T``, with ``runs`` runs of Random for each T."""
-    if runs < 2 or last_T < 1:
-        raise BufgymError(f"runs = {runs}, last_T = {last_T}: need runs >= 2 and last_T >= 1")
-    L, v = PAPER_L, qoi.exponential(0.618)
-    interruption = Interruption(law="fixed", t_max=last_T, value=v)
-    lengths = np.arange(1, last_T + 1)
-    episodes = [interruption.episode(int(T)) for T in lengths]
-    rng = np.random.Generator(np.random.PCG64(seed))
-    random = [gained_at_random(interruption, int(T), L, runs, rng) for T in lengths]
-    curves: dict[str, NDArray[np.float64]] = {
-        "oracle-ideal": np.array([oracle.ideal(L, int(T), v) for T in lengths]),
-        "oracle": np.array([oracle.integer(L, int(T), v) for T in lengths]),
-        "afr": gained("afr", episodes, L, v),
-        "drop-oldest": gained("drop-oldest", episodes, L, v),
-        "random": np.array([sample.mean() for sample in random]),
-    }
-    spread = np.array([sample.std(ddof=1) for sample in random])
-    ideal, afr = curves["oracle-ideal"], curves["afr"]
-    equal = [int(T) for T in lengths[(ideal - afr <= EQUAL * ideal) & (lengths > L)]]
 
-    lines = [
-        f"AFR paper, Fig. 5: information gained, H - 1. L = {L}, V(d) = 1 - 0.618^d, {runs} runs of Random for each T.",
-        "",
-        f"  T {''.join(f'{name:>14}' for name in curves)}     sd random",
-    ]
-    wanted = sorted({1, 8, 9, 17, 18, 25, 35, 36, 50, 71, 72, last_T})
-    for i in (T - 1 for T in wanted if T <= last_T):
-        lines.append(f"{lengths[i]:3d} {''.join(f'{c[i]:14.4f}' for c in curves.values())} {spread[i]:13.4f}")
-    lines += ["", f"AFR = oracle-ideal beyond T = L: at T = {_join(equal)}; the paper prints T = {_join(PAPER_PEAKS)}."]
-    below = [f"{T}: {afr[T - 1] / ideal[T - 1]:.5f}" for T in PAPER_PEAKS if T <= last_T]
-    if below:
-        lines.append(f"AFR / oracle-ideal at the printed T = {', '.join(below)}: these are T + 1 of the equal ones.")
-    first, last = MEAN_OVER
-    lines.append(f"Mean of (H - 1) / oracle over T = {first}..{last} (not in the paper):")
-    lines += [f"  {name:12} {mean_score(name, L, first, last):.5f}" for name in ("afr", "drop-oldest")]
+    runs: int = PAPER_RUNS
+    last_T: int = 80
+    seed: int = 0
 
-    def draw(figure: Any) -> None:
+    RULES = {"runs": whole(2), "last_T": whole()}
+
+    def simulate(self) -> Rows:
+        v = qoi.exponential(0.618)
+        interruption = Interruption(law="fixed", t_max=self.last_T, value=v)
+        rng = np.random.Generator(np.random.PCG64(self.seed))
+        lengths = range(1, self.last_T + 1)
+        episodes = [interruption.episode(T) for T in lengths]
+        samples = [gained_at_random(interruption, T, PAPER_L, self.runs, rng) for T in lengths]
+        afr, drop_oldest = (gained(policy, episodes, PAPER_L, v) for policy in ("afr", "drop-oldest"))
+        return Rows(
+            {
+                "T": T,
+                "oracle-ideal": oracle.ideal(PAPER_L, T, v),
+                "oracle": oracle.integer(PAPER_L, T, v),
+                "afr": float(afr[T - 1]),
+                "drop-oldest": float(drop_oldest[T - 1]),
+                "random": float(samples[T - 1].mean()),
+                "random_sd": float(samples[T - 1].std(ddof=1)),
+            }
+            for T in lengths
+        )
+
+    def tables(self, rows: Rows) -> list[str]:
+        shown = sorted({1, 8, 9, 17, 18, 25, 35, 36, 50, 71, 72, self.last_T} & set(rows.distinct("T")))
+        lines = [[T, *(f"{number:.4f}" for number in list(rows[T - 1].values())[1:])] for T in shown]
+        return table([["T", *CURVES, "sd random"], *lines], left=0)
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        afr_mean, oldest_mean = (mean_score(policy, PAPER_L, *MEAN_OVER) for policy in ("afr", "drop-oldest"))
+        printed = [row for row in rows if row["T"] in PAPER_PEAKS]
+        peaks = equal_lengths(rows)
+        return {
+            "peaks": listed(peaks),
+            "paper_peaks": listed(PAPER_PEAKS),
+            "below": listed([f"{row['T']}: {row['afr'] / row['oracle-ideal']:.5f}" for row in printed]),
+            "first": MEAN_OVER[0],
+            "last": MEAN_OVER[1],
+            "afr_mean": afr_mean,
+            "oldest_mean": oldest_mean,
+        }
+
+    def draw(self, rows: Rows, figure: Any) -> None:
         axes = figure.add_subplot()
-        low, high = curves["random"] - spread, curves["random"] + spread
-        axes.fill_between(lengths, low, high, color=COLOURS["random"], alpha=0.2, linewidth=0)
-        styles = {"oracle-ideal": ":", "oracle": "--"}
-        for name, curve in curves.items():
-            label = {"afr": "AFR", "drop-oldest": "Drop Oldest", "random": "Random, mean ± 1 sd"}.get(name, name)
-            axes.plot(lengths, curve, styles.get(name, "-"), color=COLOURS[name], label=label, linewidth=1.6)
-        peaks = [T - 1 for T in equal]
-        axes.plot(lengths[peaks], afr[peaks], "o", color=COLOURS["afr"], markersize=6, label="AFR = oracle-ideal")
-        for i in peaks:
-            axes.annotate(f"T = {lengths[i]}", (lengths[i], afr[i]), (-5, 7), textcoords="offset points", ha="right")
-        axes.set(xlim=(0, last_T + 1), ylim=(0, L + 2), xlabel="T, messages during the interruption")
-        axes.set_ylabel("information gained, H − 1")
-        axes.set_title("Information gained in one interruption, L = 8, V(d) = 1 − 0.618$^d$", loc="left")
-        axes.grid(alpha=0.25)
+        lengths, random, spread = (rows.column(name) for name in ("T", "random", "random_sd"))
+        axes.fill_between(lengths, random - spread, random + spread, color=COLOURS["random"], alpha=0.2, linewidth=0)
+        for name, (label, line) in CURVES.items():
+            axes.plot(lengths, rows.column(name), line, color=COLOURS[name], label=label, linewidth=1.6)
+        peaks = equal_lengths(rows)
+        heights = [rows[T - 1]["afr"] for T in peaks]
+        axes.plot(peaks, heights, "o", color=COLOURS["afr"], markersize=6, label="AFR = oracle-ideal")
+        for place in zip(peaks, heights, strict=True):
+            axes.annotate(f"T = {place[0]}", place, (-5, 7), textcoords="offset points", ha="right")
+        finish(
+            axes,
+            "Information gained in one interruption, L = 8, V(d) = 1 − 0.618$^d$",
+            xlim=(0, self.last_T + 1),
+            ylim=(0, PAPER_L + 2),
+            xlabel="T, messages during the interruption",
+            ylabel="information gained, H − 1",
+        )
         axes.legend(loc="lower right", frameon=False, ncols=2)
 
-    header = ["T", *curves, "random_sd"]
-    rows = [
-        [int(T), *(repr(float(c[i])) for c in curves.values()), repr(float(spread[i]))] for i, T in enumerate(lengths)
-    ]
-    return Report("\n".join(lines), header, rows, draw)
 
-
-def _join(numbers: Sequence[int]) -> str:
-    return ", ".join(map(str, numbers)) or "none"
+def equal_lengths(rows: Rows) -> list[int]:
+    """The T above L at which AFR equals oracle-ideal."""
+    return [r["T"] for r in rows if r["T"] > PAPER_L and r["oracle-ideal"] - r["afr"] <= EQUAL * r["oracle-ideal"]]

@@ -6,17 +6,18 @@ a low-quality JPEG.
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bufgym.errors import BufgymError
-from bufgym.reproduce.afr_evaluation import PAPER_CEILING, PAPER_FRAMES, load_link, share_carried, streamed
-from bufgym.reproduce.report import COLOURS, Report
-from bufgym.scenario.suites import RATE_HZ, SIZE_BYTES
+from bufgym.reproduce.afr_evaluation import PAPER_CEILING, LinkFigure
+from bufgym.reproduce.figure import COLOURS, finish, legend_below
+from bufgym.reproduce.rows import Rows, listed
+from bufgym.scenario.checks import above_0
+from bufgym.scenario.suites import RATE_HZ
 
-PAPER_LOW = (21, 23)
+PAPER_LOW = [21, 23]
 """The seconds under 500 KB/s that the paper names, counted from 0."""
 LOW = 500e3
 """Bytes/s."""
@@ -24,111 +25,93 @@ NEAR = 0.1
 """A ceiling within so much of the paper's "about 15 MB/s" counts as the same."""
 
 
-def report(
-    data: Path | None = None,
-    trace: str | None = None,
-    frames: int = PAPER_FRAMES,
-    size_bytes: int = SIZE_BYTES,
-    show_s: float = 60.0,
-) -> Report:
-    """Fig. 6 for ``frames`` frames of ``size_bytes``; the figure shows the first ``show_s`` seconds and the whole.
+@dataclass(frozen=True)
+class Reproduction(LinkFigure):
+    """Fig. 6; the picture shows the first ``show_s`` seconds and the whole."""
 
-    Args:
-        data: folder of recordings, with belgium_4g/csv/report_car_0002.csv.
-        trace: another trace in its place, a shipped name or a file.
-    """
-    if size_bytes < 1 or not show_s > 0:
-        raise BufgymError(f"size_bytes = {size_bytes}, show_s = {show_s}: must be above 0")
-    link = load_link(trace, data)
-    lengths_us, rates = link.samples()
-    ends_s = np.cumsum(lengths_us) / 1e6
-    starts_s = ends_s - lengths_us / 1e6
-    n = len(streamed(link, frames)[1])
-    stream_s, demand = frames / RATE_HZ, RATE_HZ * size_bytes
-    low = np.flatnonzero(rates < LOW)
-    low_streamed = tuple(int(k) for k in low[low < n])
-    best, best_of_all = float(rates[:n].max()), float(rates.max())
+    show_s: float = 60.0
 
-    table = [
-        (
-            "seconds under 500 KB/s",
-            " and ".join(map(str, PAPER_LOW)),
-            _numbers(low_streamed),
-            low_streamed == PAPER_LOW,
-        ),
-        (
-            "ceiling of the link, MB/s",
-            f"about {PAPER_CEILING / 1e6:g}",
-            f"{best / 1e6:.2f} ({best_of_all / 1e6:.2f} in all {link.duration_us / 1e6:.0f} s)",
-            abs(best / PAPER_CEILING - 1) <= NEAR or abs(best_of_all / PAPER_CEILING - 1) <= NEAR,
-        ),
-    ]
-    lines = [
-        f"AFR paper, Fig. 6: bandwidth of {link.name} while {frames} frames come at {RATE_HZ:g} Hz ({stream_s:.1f} s).",
-        "",
-        f"{'':27} {'paper':10} ours",
-        *(f"{what:27} {paper:10} {ours}: {'as there' if same else 'DIFFERS'}" for what, paper, ours, same in table),
-        f"{'demand, MB/s':27} {'-':10} {demand / 1e6:.2f} ({RATE_HZ:g} x {size_bytes / 1000:g} kB)",
-        f"{'seconds under the demand':27} {'-':10} {int((rates[:n] < demand).sum())} of {n}",
-        f"{'carried of the demand':27} {'-':10} {share_carried(link, frames, size_bytes):.0%}",
-        "",
-        *(
-            f"Second {k}: {rates[k] / 1e3:.1f} KB/s, from {starts_s[k]:.2f} to {ends_s[k]:.2f} s of the trace."
-            for k in low_streamed
-        ),
-        f"{len(low)} of all {len(rates)} seconds lie under 500 KB/s: {_numbers(low)}.",
-    ]
-    if not table[1][3]:
-        lines.append(
-            f"The ceiling differs by a factor of {PAPER_CEILING / best:.2f} in the stream, "
-            f"{PAPER_CEILING / best_of_all:.2f} in the whole trace; we do not know why.\n"
-            "afr-fig7-qoi and afr-fig8-gap run both links: as recorded, and scaled to the paper's ceiling."
-        )
-    if (rates[:n] < demand).all():
-        lines.append(
-            "As recorded, the link never carries the demand during the stream: a lasting overload, not an interruption."
+    RULES = {"show_s": above_0}
+    SIZE_INCHES = (7.5, 5.2)
+
+    def simulate(self) -> Rows:
+        lengths_us, rates = self.link.samples()
+        ends_s = np.cumsum(lengths_us) / 1e6
+        return Rows(
+            {
+                "second": k,
+                "start_s": round(float(end_s - length_us / 1e6), 6),
+                "end_s": round(float(end_s), 6),
+                "bytes_per_s": float(rate),
+                "under_500KBps": bool(rate < LOW),
+                "streamed": k < len(self.streamed[1]),
+            }
+            for k, (length_us, end_s, rate) in enumerate(zip(lengths_us, ends_s, rates, strict=True))
         )
 
-    def draw(figure: Any) -> None:
+    @property
+    def demand(self) -> float:
+        """Bytes/s."""
+        return RATE_HZ * self.size_bytes
+
+    def tables(self, rows: Rows) -> list[str]:
+        return [
+            f"Second {row['second']}: {row['bytes_per_s'] / 1e3:.1f} KB/s, from {row['start_s']:.2f} to "
+            f"{row['end_s']:.2f} s of the trace."
+            for row in rows.where(under_500KBps=True, streamed=True)
+        ]
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        rates = rows.column("bytes_per_s", streamed=True)
+        best, best_of_all = float(rates.max()), float(rows.column("bytes_per_s").max())
+        low_seconds = [row["second"] for row in rows.where(under_500KBps=True, streamed=True)]
+        low_of_all = rows.where(under_500KBps=True).distinct("second")
+        return {
+            "low-seconds": low_seconds == PAPER_LOW,
+            "ceiling": any(abs(rate / PAPER_CEILING - 1) <= NEAR for rate in (best, best_of_all)),
+            "overload": bool((rates < self.demand).all()),
+            "link": self.link.name,
+            "duration_s": self.link.duration_us / 1e6,
+            "rate_hz": RATE_HZ,
+            "stream_s": self.frames / RATE_HZ,
+            "low_seconds": listed(low_seconds),
+            "low_of_all": len(low_of_all),
+            "all_low_seconds": listed(low_of_all),
+            "seconds": len(rates),
+            "seconds_of_all": len(rows),
+            "best": best / 1e6,
+            "best_of_all": best_of_all / 1e6,
+            "factor": PAPER_CEILING / best,
+            "factor_of_all": PAPER_CEILING / best_of_all,
+            "demand": self.demand / 1e6,
+            "frame_kb": self.size_bytes / 1e3,
+            "under": int((rates < self.demand).sum()),
+            "carried": self.share_carried(),
+        }
+
+    def draw(self, rows: Rows, figure: Any) -> None:
         near, whole = figure.subplots(2, 1, height_ratios=[2, 1])
-        for axes, until_s in ((near, min(show_s, ends_s[-1])), (whole, ends_s[-1])):
-            axes.stairs(
-                rates / 1e6, np.append(starts_s, ends_s[-1]), color=COLOURS["afr"], linewidth=1.2, label=link.name
-            )
-            axes.axhline(
-                demand / 1e6, color=COLOURS["drop-oldest"], linewidth=1.4, label=f"demand {demand / 1e6:g} MB/s"
-            )
-            axes.axhline(
-                PAPER_CEILING / 1e6, color=COLOURS["oracle"], linestyle=":", label="ceiling in the paper, about 15 MB/s"
-            )
-            axes.axvspan(0, stream_s, color=COLOURS["other"], alpha=0.13, linewidth=0, label="stream")
-            for k in low[starts_s[low] < until_s]:
-                axes.axvspan(starts_s[k], ends_s[k], color=COLOURS["drop-oldest"], alpha=0.35, linewidth=0)
-            top = max(PAPER_CEILING, best_of_all, demand) / 1e6
-            axes.set(xlim=(0, until_s), ylim=(0, 1.06 * top), ylabel="MB/s")
-            axes.grid(alpha=0.25)
-        for k in low_streamed:
-            left = k == low_streamed[0]
-            near.annotate(
-                f"second {k}\n{rates[k] / 1e3:.0f} KB/s",
-                (starts_s[k] if left else ends_s[k], demand / 1e6),
-                (-3 if left else 3, 8),
-                textcoords="offset points",
-                ha="right" if left else "left",
-                fontsize=8,
-            )
-        near.axvspan(-2, -1, color=COLOURS["drop-oldest"], alpha=0.35, linewidth=0, label="under 500 KB/s")
-        near.set_title(f"{link.name}: the first {min(show_s, ends_s[-1]):.0f} s, and all of it", loc="left")
+        rates, edges = rows.column("bytes_per_s") / 1e6, np.append(rows.column("start_s"), rows[-1]["end_s"])
+        until_s = min(self.show_s, edges[-1])
+        dark, light = ({"color": COLOURS["drop-oldest"], "alpha": a, "linewidth": 0} for a in (0.35, 0.13))
+        light["color"] = COLOURS["other"]
+        for axes, right_s in ((near, until_s), (whole, edges[-1])):
+            axes.stairs(rates, edges, color=COLOURS["afr"], linewidth=1.2, label=self.link.name)
+            demand = self.demand / 1e6
+            axes.axhline(demand, color=COLOURS["drop-oldest"], linewidth=1.4, label=f"demand {demand:g} MB/s")
+            ceiling = {"color": COLOURS["oracle"], "linestyle": ":", "label": "ceiling in the paper, about 15 MB/s"}
+            axes.axhline(PAPER_CEILING / 1e6, **ceiling)
+            axes.axvspan(0, self.frames / RATE_HZ, label="stream", **light)
+            for row in rows.where(under_500KBps=True):
+                axes.axvspan(row["start_s"], row["end_s"], **dark)
+            top = max(PAPER_CEILING / 1e6, rates.max(), demand)
+            finish(axes, xlim=(0, right_s), ylim=(0, 1.06 * top), ylabel="MB/s")
+        for k, row in enumerate(rows.where(under_500KBps=True, streamed=True)):
+            side, place = ("right", "start_s") if k == 0 else ("left", "end_s")
+            text = f"second {row['second']}\n{row['bytes_per_s'] / 1e3:.0f} KB/s"
+            shift = {"xytext": (-3 if k == 0 else 3, 8), "textcoords": "offset points", "fontsize": 8}
+            near.annotate(text, (row[place], demand), ha=side, **shift)
+        near.axvspan(-2, -1, label="under 500 KB/s", **dark)
+        near.set_title(f"{self.link.name}: the first {until_s:.0f} s, and all of it", loc="left", fontsize=10)
         whole.set_xlabel("time since the trace's start, s")
-        figure.legend(*near.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
-
-    header = ["second", "start_s", "end_s", "bytes_per_s", "under_500KBps", "streamed"]
-    rows = [
-        [k, f"{starts_s[k]:.6f}", f"{ends_s[k]:.6f}", repr(float(rates[k])), bool(rates[k] < LOW), k < n]
-        for k in range(len(rates))
-    ]
-    return Report("\n".join(lines), header, rows, draw, (7.5, 5.2))
-
-
-def _numbers(seconds: Any) -> str:
-    return ", ".join(str(int(k)) for k in seconds) or "none"
+        legend_below(figure, 3, near)

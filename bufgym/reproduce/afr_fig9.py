@@ -10,27 +10,29 @@ from __future__ import annotations
 
 import functools
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies
-from bufgym import sim as sender
-from bufgym.errors import BufgymError
+from bufgym import policies, sim
 from bufgym.kernel import JIT, compile_for, records
 from bufgym.model.buffer import ACCEPT, MESSAGE, Buffer
 from bufgym.policies.registry import Policy, signatures
-from bufgym.reproduce.report import COLOURS, Report
+from bufgym.reproduce.figure import COLOURS, Figure, finish, legend_below, whole
+from bufgym.reproduce.rows import Rows, listed, table
 from bufgym.scenario import Interruption
 
 PAPER = {"afr": "< 10 us", "drop-oldest": "< 10 us", "random": "< 10 us", "orbbuf": "~ 10 ms"}
 """The paper's figure; ORBBuf's with features recomputed."""
 LIMIT_COMPILED_US, LIMIT_PYTHON_US = 1.0, 10.0
 """Ours for the paper's three fast policies: inside compiled code, and called from Python (median)."""
+HOW = "compiled loop" if JIT else "Python loop (compilation is off)"
+"""What ``inside_us`` times."""
 REPEATS = 5
-"""Compiled loops timed; the fastest counts, as the others met something else on the machine."""
+"""Compiled loops timed; the fastest counts, as the others shared the machine with something else."""
 
 
 def decide_often(
@@ -66,22 +68,20 @@ def full_queue(capacity: int, arrivals: int) -> tuple[Buffer, NDArray[Any]]:
     """A full queue in an interruption, as a policy sees it, and MESSAGE[``arrivals``], the next to come."""
     interruption = Interruption(law="fixed", t_max=capacity + arrivals)
     episode = interruption.episode(capacity + arrivals).with_uniforms(np.random.Generator(np.random.PCG64(0)))
-    seen: list[Buffer] = []
+    captured: list[Buffer] = []
 
     def watch(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
         if len(buffer.slots) < capacity:
             return ACCEPT
-        if not seen:
+        if not captured:
             slots = records(capacity, MESSAGE)
             slots[:] = buffer.slots  # a copy: the sender goes on
-            numbers = {
-                f: getattr(buffer, f).item() for f in Buffer._fields if isinstance(getattr(buffer, f), np.generic)
-            }
-            seen.append(buffer._replace(slots=slots, **numbers))
+            scalars = {f: v.item() for f, v in buffer._asdict().items() if isinstance(v, np.generic)}
+            captured.append(buffer._replace(slots=slots, **scalars))
         return 0
 
-    sender.run(Policy("watch", watch), [episode], capacity, interruption.value)
-    return seen[0], np.ascontiguousarray(episode.arrivals[capacity + 1 : -1])
+    sim.run(Policy("watch", watch), [episode], capacity, interruption.value)
+    return captured[0], np.ascontiguousarray(episode.arrivals[capacity + 1 : -1])
 
 
 def inside_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], decisions: int) -> float:
@@ -92,9 +92,9 @@ def inside_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], decisions:
     loop(buffer, arrivals, memory, start, on_arrival, 1)
     fastest = np.inf
     for _ in range(REPEATS):
-        begin_ns = time.perf_counter_ns()
+        start_ns = time.perf_counter_ns()
         loop(buffer, arrivals, memory, start, on_arrival, rounds)
-        fastest = min(fastest, time.perf_counter_ns() - begin_ns)
+        fastest = min(fastest, time.perf_counter_ns() - start_ns)
     return float(fastest) / (rounds * len(arrivals)) / 1e3
 
 
@@ -102,72 +102,78 @@ def called_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], calls: int
     """Median and 99th percentile of one call from Python, the clock's own time included, us."""
     on_arrival, (start, memory) = policy.compiled[0], policy.new_memory(2, buffer.capacity)
     one_by_one = [arrivals[k] for k in range(len(arrivals))]
-    taken_ns = np.zeros(calls, np.int64)
+    times_ns = np.zeros(calls, np.int64)
     for i in range(calls):
         k = i % len(one_by_one)
         if k == 0:
             memory[:] = start
-        begin_ns = time.perf_counter_ns()
+        start_ns = time.perf_counter_ns()
         on_arrival(buffer, one_by_one[k], memory)
-        taken_ns[i] = time.perf_counter_ns() - begin_ns
-    return float(np.median(taken_ns)) / 1e3, float(np.percentile(taken_ns, 99)) / 1e3
+        times_ns[i] = time.perf_counter_ns() - start_ns
+    return float(np.median(times_ns)) / 1e3, float(np.percentile(times_ns, 99)) / 1e3
 
 
-def report(capacity: int = 8, decisions: int = 1_000_000, calls: int = 20_000) -> Report:
+@dataclass(frozen=True)
+class Reproduction(Figure):
     """Fig. 9 with L = ``capacity``: ``decisions`` in the compiled loop and ``calls`` from Python for each policy."""
-    if decisions < 1 or calls < 1:
-        raise BufgymError(f"decisions = {decisions}, calls = {calls}: must be whole numbers >= 1")
-    buffer, arrivals = full_queue(capacity, 400)
-    # Built-in ones alone: a user's policy names no source.
-    known = map(policies.get, policies.names(for_topics=False))
-    measured = [p for p in known if p.compile and p.source and p.privileged is None]
-    rows: list[list[Any]] = []
-    for policy in measured:
-        inside, (median, p99) = (
-            inside_us(policy, buffer, arrivals, decisions),
-            called_us(policy, buffer, arrivals, calls),
-        )
-        rows.append([policy.name, inside, median, p99, PAPER.get(policy.name, "-")])
-    how = "compiled loop" if JIT else "Python loop (compilation is off)"
-    lines = [
-        f"AFR paper, Fig. 9: time of one decision on this machine, full queue, L = {capacity}, us.",
-        f"Inside: {decisions:,} decisions in a {how}. Called: {calls:,} single calls from Python, median and p99.",
-        "",
-        f"{'policy':16} {'inside':>9} {'called':>9} {'p99':>9}  paper",
-        *(f"{name:16} {inside:9.4f} {median:9.2f} {p99:9.2f}  {paper}" for name, inside, median, p99, paper in rows),
-        "",
-        "The paper's ORBBuf recomputes ORB features of images; ours compares recorded motion.",
-    ]
-    for name, inside, median, _, paper in rows:
-        if paper.startswith("<"):
-            lines.append(
-                f"{name}: inside under {LIMIT_COMPILED_US:g} us: {_yes(inside < LIMIT_COMPILED_US)}; "
-                f"called under {LIMIT_PYTHON_US:g} us: {_yes(median < LIMIT_PYTHON_US)}"
-            )
 
-    def draw(figure: Any) -> None:
+    capacity: int = 8
+    decisions: int = 1_000_000
+    calls: int = 20_000
+
+    RULES = {"capacity": whole(), "decisions": whole(), "calls": whole()}
+
+    def simulate(self) -> Rows:
+        buffer, arrivals = full_queue(self.capacity, 400)
+        rows = Rows()
+        for policy in map(policies.get, policies.names(for_topics=False)):
+            # Built-in ones alone: a user's policy names no source.
+            if policy.compile and policy.source and policy.privileged is None:
+                inside = inside_us(policy, buffer, arrivals, self.decisions)
+                median, p99 = called_us(policy, buffer, arrivals, self.calls)
+                times = {"inside_us": inside, "called_median_us": median, "called_p99_us": p99}
+                rows.append({"policy": policy.name, **times, "paper": PAPER.get(policy.name, "-")})
+        return rows
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines = [["policy", "inside", "called", "p99", "paper"]]
+        for row in rows:
+            median, p99 = row["called_median_us"], row["called_p99_us"]
+            lines.append([row["policy"], f"{row['inside_us']:.4f}", f"{median:.2f}", f"{p99:.2f}", row["paper"]])
+        return table(lines)
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        fast = [row for row in rows if row["paper"].startswith("<")]
+        inside = [f"{row['policy']} {_yes(row['inside_us'] < LIMIT_COMPILED_US)}" for row in fast]
+        called = [f"{row['policy']} {_yes(row['called_median_us'] < LIMIT_PYTHON_US)}" for row in fast]
+        return {
+            "how": HOW,
+            "limit_compiled": LIMIT_COMPILED_US,
+            "limit_python": LIMIT_PYTHON_US,
+            "inside": listed(inside),
+            "called": listed(called),
+        }
+
+    def size_inches(self, rows: Rows) -> tuple[float, float]:
+        return 7.0, 0.34 * len(rows) + 2.2
+
+    def draw(self, rows: Rows, figure: Any) -> None:
         axes = figure.add_subplot()
         at = np.arange(len(rows))
-        inside, median, p99 = (np.array([row[k] for row in rows]) for k in (1, 2, 3))
-        axes.plot(inside, at, "o", color=COLOURS["afr"], label=f"inside a {how}")
+        inside, median, p99 = (rows.column(f"{name}_us") for name in ("inside", "called_median", "called_p99"))
+        axes.plot(inside, at, "o", color=COLOURS["afr"], label=f"inside a {HOW}")
         axes.hlines(at, median, p99, color=COLOURS["random"], linewidth=1.5)
         axes.plot(median, at, "s", color=COLOURS["random"], label="called from Python, median to p99")
-        fast = [i for i, row in enumerate(rows) if row[4].startswith("<")]
-        slow = [i for i, row in enumerate(rows) if row[4].startswith("~")]
-        axes.plot([10.0] * len(fast), fast, "<", color=COLOURS["drop-oldest"], label="paper: under 10 us")
-        axes.plot(
-            [10e3] * len(slow), slow, "D", color=COLOURS["drop-oldest"], label="paper: ORBBuf, features recomputed"
-        )
-        axes.set(xscale="log", xlabel="time of one decision, us")
-        axes.set_yticks(at, [row[0] for row in rows])
+        of_paper = (("<", "<", 10.0, "paper: under 10 us"), ("~", "D", 10e3, "paper: ORBBuf, features recomputed"))
+        for sign, marker, us, label in of_paper:
+            lines = [i for i, row in enumerate(rows) if row["paper"].startswith(sign)]
+            axes.plot([us] * len(lines), lines, marker, color=COLOURS["drop-oldest"], label=label)
+        title = f"One decision on a full queue, L = {self.capacity}, this machine"
+        finish(axes, title, xscale="log", xlabel="time of one decision, us")
+        axes.set_yticks(at, [row["policy"] for row in rows])
         axes.invert_yaxis()
-        axes.set_title(f"One decision on a full queue, L = {capacity}, this machine", loc="left")
-        axes.grid(alpha=0.25)
-        figure.legend(loc="outside lower center", ncols=2, frameon=False)
-
-    header = ["policy", "inside_us", "called_median_us", "called_p99_us", "paper"]
-    return Report("\n".join(lines), header, rows, draw, (7.0, 0.34 * len(rows) + 2.2))
+        legend_below(figure, 2)
 
 
-def _yes(holds: bool) -> str:
-    return "yes" if holds else "NO"
+def _yes(claim: bool) -> str:
+    return "yes" if claim else "NO"

@@ -18,19 +18,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies
-from bufgym import sim as sender
-from bufgym.errors import BufgymError
+from bufgym import policies, sim
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
-from bufgym.reproduce.report import COLOURS, Report
+from bufgym.reproduce.figure import COLOURS, Figure, finish, whole
+from bufgym.reproduce.rows import Row, Rows, table
 from bufgym.scenario import Interruption
 from bufgym.sim import metrics
 
@@ -48,6 +48,9 @@ VALUES: dict[str, Callable[[], Value]] = {
 }
 """The V that are tried one by one, beside the worst of all."""
 
+VIOLATIONS = ("above_oracles", "below_paper_bound", "below_sharper_bound", "uneven", "equal_elsewhere")
+"""Columns that count violations of a statement each."""
+
 
 def bound(capacity: int) -> float:
     """Theorem 2 of the paper: AFR / oracle-ideal is at least this, for every T and V."""
@@ -62,8 +65,8 @@ def sharper_bound(capacity: int) -> float:
 def gaps_of(policy: str, capacity: int, lengths: Sequence[int]) -> list[NDArray[np.int64]]:
     """The gaps between the messages received, 0 and T + 1 included, for each T; they don't depend on V."""
     interruption = Interruption(law="fixed", t_max=max(lengths))
-    done = sender.run(policies.get(policy), [interruption.episode(T) for T in lengths], capacity, interruption.value)
-    return [np.diff(metrics.received(done, i)["seq"]) for i in range(len(lengths))]
+    senders = sim.run(policies.get(policy), [interruption.episode(T) for T in lengths], capacity, interruption.value)
+    return [np.diff(metrics.received(senders, i)["seq"]) for i in range(len(lengths))]
 
 
 def worst_ratio(gaps: NDArray[np.int64]) -> float:
@@ -78,74 +81,84 @@ def even_enough(gaps: NDArray[np.int64]) -> bool:
     return bool(gaps.max() <= 2 * inner.min() and edge <= inner.min())
 
 
-def report(max_capacity: int = 32, last_T: int = 400) -> Report:
+@dataclass(frozen=True)
+class Reproduction(Figure):
     """Theorems 1-3 over L = 1..``max_capacity``, T = 1..``last_T`` and every V."""
-    if max_capacity < 1 or last_T < 2:
-        raise BufgymError(f"max_capacity = {max_capacity}, last_T = {last_T}: need max_capacity >= 1 and last_T >= 2")
-    values = [make() for make in VALUES.values()]
-    # V of each whole-numbered gap, so that a sum of V is a look-up.
-    tables = np.array([[v(d) for d in range(last_T + 2)] for v in values])
-    lengths = range(1, last_T + 1)
-    cases, violations = 0, {"1": 0, "2": 0, "2, sharper": 0, "3": 0, "3, equality": 0}
-    rows: list[list[Any]] = []
-    for L in range(1, max_capacity + 1):
-        worst_any, at_any, worst_listed, at_listed = 1.0, 0, 1.0, (0, "")
-        for T, gaps in zip(lengths, gaps_of("afr", L, lengths), strict=True):
-            ideal = np.array([oracle.ideal(L, T, v) for v in values])
-            integer = np.array([oracle.integer(L, T, v) for v in values])
-            afr = tables[:, gaps].sum(axis=1)
-            ratios, any_v = afr / ideal, worst_ratio(gaps)
-            cases += len(values) + 1
-            violations["1"] += int((integer > ideal * (1 + ROUNDING)).sum() + (afr > integer * (1 + ROUNDING)).sum())
-            lowest = min(any_v, float(ratios.min()))
-            violations["2"] += lowest < bound(L) * (1 - ROUNDING)
-            violations["2, sharper"] += lowest < sharper_bound(L) * (1 - ROUNDING)
-            violations["3"] += not even_enough(gaps)
-            doublings = math.log2((T + 1) / (L + 1)) if T >= L else 0.0
-            violations["3, equality"] += (gaps.min() == gaps.max()) != (doublings == int(doublings))
-            if any_v < worst_any:
-                worst_any, at_any = any_v, T
-            if ratios.min() < worst_listed:
-                worst_listed, at_listed = float(ratios.min()), (T, list(VALUES)[int(ratios.argmin())])
-        rows.append([L, bound(L), sharper_bound(L), worst_any, at_any, worst_listed, *at_listed])
 
-    v, before_after = qoi.exponential(0.618), gaps_of("afr", 8, FALLS)
-    gained = [sum(v(float(g)) for g in gaps) for gaps in before_after]
-    lines = [
-        f"AFR paper, Theorems 1-3: L = 1..{max_capacity}, T = 1..{last_T}, {len(values)} V and the worst of all V; "
-        f"{cases:,} cases.",
-        "The wording of 1 and 3 is ours; 2 is the paper's bound 2(√2 - 1) L/(L + 1), and a sharper one.",
-        "",
-        f"1. AFR <= oracle <= oracle-ideal:                             {violations['1']} violations",
-        f"2. AFR / oracle-ideal >= 2(√2 - 1) L/(L + 1):                 {violations['2']} violations",
-        f"   AFR / oracle-ideal >= 2(√((2L + 1)/(L + 1)) - 1):          {violations['2, sharper']} violations",
-        f"3. largest gap <= 2 x smallest, gap at the edge <= smallest:  {violations['3']} violations",
-        f"   all gaps equal exactly where T <= L or T + 1 = (L + 1) 2^k: {violations['3, equality']} violations",
-        "",
-        "   L   paper  sharper  worst of any V (T)   worst of those tried (T, V)",
-    ]
-    for row in rows:
-        lines.append("{:4d} {:7.4f} {:8.4f} {:11.4f} ({:3d}) {:16.4f} ({:3d}, {})".format(*row))
-    lines += [
-        "",
-        "H is not monotone in T, here for L = 8 and V(d) = 1 - 0.618^d:",
-        *(
-            f"  T = {T}: H - 1 = {h:.3f}, gaps {' '.join(map(str, gaps))}"
-            for T, h, gaps in zip(FALLS, gained, before_after, strict=True)
-        ),
-    ]
+    max_capacity: int = 32
+    last_T: int = 400
 
-    def draw(figure: Any) -> None:
+    RULES = {"max_capacity": whole(), "last_T": whole(2)}
+
+    def simulate(self) -> Rows:
+        values = [make() for make in VALUES.values()]
+        # V of each whole-numbered gap, so that a sum of V is a look-up.
+        tables = np.array([[v(d) for d in range(self.last_T + 2)] for v in values])
+        lengths = range(1, self.last_T + 1)
+        rows = Rows()
+        for L in range(1, self.max_capacity + 1):
+            row: Row = {"L": L, "paper_bound": bound(L), "sharper_bound": sharper_bound(L)}
+            row |= {"worst_any_v": 1.0, "at_T": 0, "worst_listed_v": 1.0, "listed_at_T": 0, "listed_v": ""}
+            row |= dict.fromkeys(VIOLATIONS, 0)
+            for T, gaps in zip(lengths, gaps_of("afr", L, lengths), strict=True):
+                ideal = np.array([oracle.ideal(L, T, v) for v in values])
+                integer = np.array([oracle.integer(L, T, v) for v in values])
+                afr = tables[:, gaps].sum(axis=1)
+                ratios, any_v = afr / ideal, worst_ratio(gaps)
+                lowest = min(any_v, float(ratios.min()))
+                doublings = math.log2((T + 1) / (L + 1)) if T >= L else 0.0
+                row["above_oracles"] += int((integer > ideal * (1 + ROUNDING)).sum())
+                row["above_oracles"] += int((afr > integer * (1 + ROUNDING)).sum())
+                row["below_paper_bound"] += int(lowest < bound(L) * (1 - ROUNDING))
+                row["below_sharper_bound"] += int(lowest < sharper_bound(L) * (1 - ROUNDING))
+                row["uneven"] += int(not even_enough(gaps))
+                row["equal_elsewhere"] += int((gaps.min() == gaps.max()) != (doublings == int(doublings)))
+                if any_v < row["worst_any_v"]:
+                    row |= {"worst_any_v": any_v, "at_T": T}
+                if ratios.min() < row["worst_listed_v"]:
+                    listed = list(VALUES)[int(ratios.argmin())]
+                    row |= {"worst_listed_v": float(ratios.min()), "listed_at_T": T, "listed_v": listed}
+            rows.append(row)
+        return rows
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines: list[list[str]] = [["  L", "paper", "sharper", "worst of any V (T)", "worst of those tried (T, V)"]]
+        for row in rows:
+            bounds = [f"{row['L']:3d}", f"{row['paper_bound']:.4f}", f"{row['sharper_bound']:.4f}"]
+            any_v = "{worst_any_v:.4f} ({at_T:3d})".format(**row)
+            lines.append([*bounds, any_v, "{worst_listed_v:.4f} ({listed_at_T:3d}, {listed_v})".format(**row)])
+        return table(lines, left=5)
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        v = qoi.exponential(0.618)
+        counts = {name: int(rows.column(name).sum()) for name in VIOLATIONS}
+        falls = [
+            f"  T = {T}: H - 1 = {sum(v(float(g)) for g in gaps):.3f}, gaps {' '.join(map(str, gaps))}"
+            for T, gaps in zip(FALLS, gaps_of("afr", 8, FALLS), strict=True)
+        ]
+        return {
+            **{name: count == 0 for name, count in counts.items()},
+            **{f"{name}_count": count for name, count in counts.items()},
+            "values": len(VALUES),
+            "cases": self.max_capacity * self.last_T * (len(VALUES) + 1),
+            "falls": "\n\n".join(falls),
+        }
+
+    def draw(self, rows: Rows, figure: Any) -> None:
         axes = figure.add_subplot()
-        L = [row[0] for row in rows]
-        axes.plot(L, [row[5] for row in rows], "s", color=COLOURS["other"], markersize=4, label="worst of the listed V")
-        axes.plot(L, [row[3] for row in rows], "o", color=COLOURS["afr"], markersize=5, label="worst of any V")
-        axes.plot(L, [row[2] for row in rows], "-", color=COLOURS["oracle-ideal"], label="sharper bound")
-        axes.plot(L, [row[1] for row in rows], "--", color=COLOURS["drop-oldest"], label="paper's bound")
-        axes.set(xlim=(0, max_capacity + 1), xlabel="L, messages", ylabel="AFR / oracle-ideal, information gained")
-        axes.set_title(f"Theorem 2: AFR at its worst, T = 1..{last_T}", loc="left")
-        axes.grid(alpha=0.25)
+        looks = {
+            "worst_listed_v": ("s", "other", "worst of the listed V"),
+            "worst_any_v": ("o", "afr", "worst of any V"),
+            "sharper_bound": ("-", "oracle-ideal", "sharper bound"),
+            "paper_bound": ("--", "drop-oldest", "paper's bound"),
+        }
+        for name, (line, colour, label) in looks.items():
+            axes.plot(rows.column("L"), rows.column(name), line, color=COLOURS[colour], markersize=4, label=label)
+        finish(
+            axes,
+            f"Theorem 2: AFR at its worst, T = 1..{self.last_T}",
+            xlim=(0, self.max_capacity + 1),
+            xlabel="L, messages",
+            ylabel="AFR / oracle-ideal, information gained",
+        )
         axes.legend(loc="lower right", frameon=False)
-
-    header = ["L", "paper_bound", "sharper_bound", "worst_any_v", "at_T", "worst_listed_v", "listed_at_T", "listed_v"]
-    return Report("\n".join(lines), header, rows, draw)

@@ -54,7 +54,7 @@ def laser_scan(
     _whole("intensities", intensities, 4)
     if not 0 <= no_return <= 1:
         raise BufgymError(f"no_return = {no_return!r}: must be from 0 to 1")
-    uniform = _luck(seed)
+    uniform = _uniform(seed)
     ranges = uniform.uniform(0.1, 30.0, beams).astype(np.float32)
     ranges[uniform.permutation(beams)[: round(no_return * beams)]] = np.inf
     width = 1.5 * math.pi
@@ -70,7 +70,7 @@ def laser_scan(
 
 def nav_sat_fix(frame_id: str = "gps", seed: int = 0) -> Content:
     """A fix with 7 decimals of a degree, 3 of a metre, and a diagonal covariance."""
-    uniform = _luck(seed)
+    uniform = _uniform(seed)
     east, north, up = np.round(uniform.uniform(0.5, 9.0, 3), 4)
     return {
         "header": _header(frame_id),
@@ -86,7 +86,7 @@ def nav_sat_fix(frame_id: str = "gps", seed: int = 0) -> Content:
 def compressed_image(data_bytes: int = 75_000, format: str = "jpeg", frame_id: str = "cam", seed: int = 0) -> Content:
     """A JPEG by its bytes: a marker at each end, and between them noise in which 0 follows each 255, as JPEG has it."""
     _whole("data_bytes", data_bytes, 1, least=4)
-    data = _luck(seed).integers(0, 256, data_bytes).astype(np.uint8)
+    data = _uniform(seed).integers(0, 256, data_bytes).astype(np.uint8)
     data[1:][data[:-1] == 255] = 0
     data[:2], data[-2:] = (0xFF, 0xD8), (0xFF, 0xD9)
     return {"header": _header(frame_id), "format": _text("format", format), "data": data}
@@ -97,7 +97,7 @@ def point_cloud2(points: int = 10_000, point_step: int = 16, frame_id: str = "li
     _whole("point_step", point_step, 1, least=16)
     _whole("points", points, point_step)
     cloud = np.zeros((points, point_step), np.uint8)
-    cloud[:, :16] = _luck(seed).uniform(-50, 50, (points, 4)).astype("<f4").view(np.uint8)
+    cloud[:, :16] = _uniform(seed).uniform(-50, 50, (points, 4)).astype("<f4").view(np.uint8)
     names = ("x", "y", "z", "intensity")
     return {
         "header": _header(frame_id),
@@ -114,12 +114,12 @@ def point_cloud2(points: int = 10_000, point_step: int = 16, frame_id: str = "li
 
 def pose_stamped(frame_id: str = "map", seed: int = 0) -> Content:
     """A pose on the ground, in the full precision of float64."""
-    return {"header": _header(frame_id), "pose": _pose(_luck(seed))}
+    return {"header": _header(frame_id), "pose": _pose(_uniform(seed))}
 
 
 def odometry(frame_id: str = "odom", child_frame_id: str = "base_link", seed: int = 0) -> Content:
     """A pose and a twist on the ground, each with a diagonal covariance."""
-    uniform = _luck(seed)
+    uniform = _uniform(seed)
     ahead, turning = uniform.uniform(0, 2), uniform.uniform(-1, 1)
     twist = {"linear": {"x": ahead, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turning}}
     return {
@@ -132,7 +132,7 @@ def odometry(frame_id: str = "odom", child_frame_id: str = "base_link", seed: in
 
 def robofleet_status(status: str = "autonomous", location: str = "building 1, floor 2", seed: int = 0) -> Content:
     """What a robot tells the fleet about itself."""
-    battery = float(np.float32(_luck(seed).uniform(0, 1)))
+    battery = float(np.float32(_uniform(seed).uniform(0, 1)))
     status, location = _text("status", status), _text("location", location)
     return {"status": status, "is_ok": True, "battery_level": battery, "location": location}
 
@@ -213,7 +213,7 @@ def _typed(store: Any, type_name: str, value: Content) -> Any:
         if not isinstance(inner, str):  # a scalar, a text, an array of numbers
             fields[name] = value[name]
         elif isinstance(value[name], list):
-            fields[name] = [_typed(store, inner, each) for each in value[name]]
+            fields[name] = [_typed(store, inner, item) for item in value[name]]
         else:
             fields[name] = _typed(store, inner, value[name])
     return store.types[type_name](**fields)
@@ -248,7 +248,7 @@ def _table(builder: Any, type_name: str, value: Content, metadata: int = 0) -> i
         elif isinstance(item, np.ndarray):
             slots.append((4, "UOffsetTRelative", builder.CreateNumpyVector(item)))
         else:
-            tables = [_table(builder, of[0][1], each) for each in item]
+            tables = [_table(builder, of[0][1], item) for item in item]
             builder.StartVector(4, len(tables), 4)
             for offset in reversed(tables):
                 builder.PrependUOffsetTRelative(offset)
@@ -310,7 +310,7 @@ def _text(name: str, text: str) -> str:
     return text
 
 
-def _luck(seed: int) -> np.random.Generator:
+def _uniform(seed: int) -> np.random.Generator:
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise BufgymError(f"seed = {seed!r}: must be a whole number >= 0")
     return np.random.Generator(np.random.PCG64(seed))

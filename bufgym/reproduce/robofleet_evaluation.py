@@ -1,15 +1,14 @@
-"""What Robofleet's Fig. 3 to 7 share: the messages, who sends them, and what became of each.
+"""What Robofleet's Fig. 3 to 7 share: the messages, the programs that send them, and what became of each.
 
-The paper sends with n_T = 1 in its experiments; so do we. What it leaves open is an argument of each figure. Arrivals
+The paper sends with n_T = 1 in its experiments; so do we. What it leaves open is an option of each figure. Arrivals
 are jittered by up to a tenth of their period, which is what differs from run to run; every sender meets the same ones.
 
-Left out on purpose: TCP (a link that stands still is found again at once, unless a figure takes a silence as argument),
+Left out on purpose: TCP (a link that stands still is found again at once, unless a figure takes a silence as option),
 the bytes of pings and pongs, encoding time, and whatever lies behind the server.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,15 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies
+from bufgym import policies, sim
 from bufgym.benchmark.run import draw
-from bufgym.errors import BufgymError
 from bufgym.model.topics import Topic
-from bufgym.reproduce.report import COLOURS
+from bufgym.reproduce.figure import COLOURS, Figure, at_least_0, several, whole
+from bufgym.reproduce.rows import Rows
 from bufgym.scenario import Client, Stream
 from bufgym.scenario.checks import above_0
-from bufgym.sim import NEVER
-from bufgym.sim import run as run_policy
 from bufgym.traces import Trace
 
 POINTS = 10_000
@@ -44,46 +41,58 @@ _CLOUD_JSON = 562_376 / POINTS
 
 JITTER = 0.1
 ROUND_TRIP_MS = 10.0
-"""Our choice. With n_T = 1 it bounds what crosses: one message per (transmission + round trip)."""
+"""Our choice. With n_T = 1 it bounds the throughput: one message per (transmission + round trip)."""
 QUEUE_SIZE = 10
 """Of a native ROS publisher, messages; our choice, as in ROS's own tutorials."""
 MBIT = 125_000
 """Bytes/s in a Mbit/s."""
 
 
-Row = dict[str, Any]
-
-
 @dataclass(frozen=True)
-class Rival:
+class Program:
     """Who sends: a policy, and what its operator asks of the topics."""
 
     policy: str
+    """Its name in ``bufgym.policies``."""
     label: str
+    """What legends call it."""
+    short: str
+    """What tables call it."""
     colour: str
     marker: str
     all_no_drop: bool = False
+    """Whether every topic is no_drop."""
     queued: bool = False
     """Whether each topic has a queue of its own, of ``queue_size`` messages."""
 
+    @property
+    def style(self) -> dict[str, Any]:
+        """How this program's line is drawn."""
+        return {"color": self.colour, "marker": self.marker, "markersize": 4.5, "linewidth": 1.4}
 
-RIVALS = {
-    "robofleet": Rival("robofleet", "Robofleet, n_T = 1", COLOURS["afr"], "o"),
-    "no-drop": Rival("robofleet", "Robofleet, all no_drop", COLOURS["drop-oldest"], "s", all_no_drop=True),
-    "no-drop-released": Rival("robofleet-released", "released, all no_drop", "#e69f00", "^", all_no_drop=True),
-    "rosbridge": Rival("rosbridge", "rosbridge", COLOURS["random"], "D"),
-    "ros-native": Rival("ros-native", "native ROS", "#cc79a7", "v", queued=True),
+
+PROGRAMS = {
+    "robofleet": Program("robofleet", "Robofleet, n_T = 1", "n_T = 1", COLOURS["afr"], "o"),
+    "no-drop": Program("robofleet", "Robofleet, all no_drop", "no_drop", COLOURS["drop-oldest"], "s", all_no_drop=True),
+    "no-drop-released": Program(
+        "robofleet-released", "released, all no_drop", "released", COLOURS["orange"], "^", all_no_drop=True
+    ),
+    "rosbridge": Program("rosbridge", "rosbridge", "rosbridge", COLOURS["random"], "D"),
+    "ros-native": Program("ros-native", "native ROS", "native ROS", COLOURS["pink"], "v", queued=True),
 }
+SHORT = {name: program.short for name, program in PROGRAMS.items()}
 
 
 @dataclass(frozen=True)
 class Sent:
-    """What became of every message of one run, in order of arrival."""
+    """What became of every message of one run, in order of arrival; arrays of shape [messages]."""
 
     topic: NDArray[np.int64]
+    """Index of the message's stream."""
     consumer: NDArray[np.int64]
     """Whose copy it is, where the sender makes copies; else 0."""
     arrival_s: NDArray[np.float64]
+    """At the sender."""
     received_s: NDArray[np.float64]
     """At the server; NaN for a message that was dropped."""
 
@@ -93,12 +102,13 @@ class Sent:
         return self.received_s - self.arrival_s
 
     @property
-    def got(self) -> Sent:
+    def received(self) -> Sent:
         """Those that reached the server, in the order in which they did."""
         in_order = np.argsort(self.received_s, kind="stable")  # NaN comes last
         return self._only(in_order[: int((~np.isnan(self.received_s)).sum())])
 
     def on(self, topic: int) -> Sent:
+        """Those of one stream."""
         return self._only(np.flatnonzero(self.topic == topic))
 
     def between(self, from_s: float, until_s: float) -> Sent:
@@ -119,19 +129,17 @@ class Sent:
 def stream(kind: str, rate_hz: float, *, points: int = POINTS, jitter: float = JITTER, **topic: Any) -> Stream:
     """What publishes messages of this kind; ``topic``: what ``Topic`` takes."""
     ros, flatbuffer, json = cloud_bytes(points) if kind == "PointCloud2" else BYTES[kind]
-    rules = Topic(kind, **topic)
-    return Stream(rules, rate_hz, flatbuffer, jitter=jitter, encodings={"ros": ros, "json": json})
+    return Stream(Topic(kind, **topic), rate_hz, flatbuffer, jitter=jitter, encodings={"ros": ros, "json": json})
 
 
 def cloud_bytes(points: int) -> tuple[int, int, int]:
     """Bytes of a PointCloud2 as ROS binary, Robofleet flatbuffer and JSON."""
-    if isinstance(points, bool) or not isinstance(points, int) or not 1 <= points <= 10**7:
-        raise BufgymError(f"points = {points!r}: must be a whole number from 1 to 10000000")
+    whole(1, 10**7)("points", points)
     ros, flatbuffer = (points * POINT_BYTES + extra for extra in _CLOUD_EXTRA)
     return ros, flatbuffer, round(points * _CLOUD_JSON)
 
 
-def meet(
+def send(
     name: str,
     streams: Sequence[Stream],
     link: Trace,
@@ -142,10 +150,10 @@ def meet(
     queue_size: int = QUEUE_SIZE,
     consumers: int = 1,
 ) -> Sent:
-    """What becomes of the streams' messages when one of ``RIVALS`` sends them; ``link`` begins with the first."""
-    rival = RIVALS[name]
-    rules: dict[str, Any] = {"no_drop": True} if rival.all_no_drop else {}
-    if rival.queued:
+    """What becomes of the streams' messages when one of ``PROGRAMS`` sends them; ``link`` begins with the first."""
+    program = PROGRAMS[name]
+    rules: dict[str, Any] = {"no_drop": True} if program.all_no_drop else {}
+    if program.queued:
         rules = {"limit": queue_size, "no_drop": False}
     round_trip_us = round(round_trip_ms * 1000)
     client = Client(
@@ -159,60 +167,62 @@ def meet(
     )
     # Room for all: a no_drop queue knows no limit.
     room = client.max_messages * consumers
-    senders = run_policy(policies.get(rival.policy), [draw(client, seed)], room, client.value, topics=client.topics)
+    senders = sim.run(policies.get(program.policy), [draw(client, seed)], room, client.value, topics=client.topics)
     sender = senders.batch.senders[0]
     arrivals = np.asarray(senders.batch.arrivals[0])[: sender["arrivals"]]
     transmitted_us = np.asarray(senders.batch.log[0])[: sender["arrivals"]]["transmitted_us"]
-    received_s = np.where(transmitted_us == NEVER, np.nan, (transmitted_us + sender["propagation_us"]) / 1e6)
+    received_s = np.where(transmitted_us == sim.NEVER, np.nan, (transmitted_us + sender["propagation_us"]) / 1e6)
     consumer, topic = np.divmod(arrivals["topic"], len(streams))
     return Sent(topic, consumer, arrivals["arrival_us"] / 1e6, received_s)
 
 
-# --- statistics ------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class ClientFigure(Figure):
+    """A figure of programs that send the same topics over one link; the mean of ``runs`` runs."""
+
+    round_trip_ms: float = ROUND_TRIP_MS
+    """Half of it to the server, the whole from the end of a message's transmission to its pong."""
+    runs: int = 5
+    """Differ by arrival jitter."""
+
+    RULES = {
+        "round_trip_ms": at_least_0,
+        "queue_size": whole(),
+        "queue_sizes": several(whole()),
+        "rate_hz": above_0,
+        "rates_hz": several(above_0),
+        "mbit_per_s": above_0,
+        "duration_s": above_0,
+    }
+
+    def send(
+        self, name: str, streams: Sequence[Stream], link: Trace, duration_s: float, seed: int, **client: Any
+    ) -> Sent:
+        """``send`` with the figure's own options."""
+        if "queue_size" not in client:
+            client["queue_size"] = getattr(self, "queue_size", QUEUE_SIZE)
+        return send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, **client)
 
 
-def mean_of(rows: Sequence[Row], column: str, **where: object) -> float:
-    """Mean of a column over the rows in which the columns of ``where`` are so; NaN of nothing."""
-    known = [row[column] for row in rows if all(row[name] == given for name, given in where.items())]
-    return float(np.mean(known)) if known else math.nan
+@dataclass(frozen=True)
+class CloudFigure(ClientFigure):
+    """A figure of one PointCloud2 topic."""
+
+    points: int = POINTS
+    """Of a cloud, 16 bytes each."""
+    queue_size: int = QUEUE_SIZE
+    """Of native ROS, messages."""
 
 
 def p95(numbers: NDArray[np.float64]) -> float:
-    return float(np.percentile(numbers, 95)) if len(numbers) else math.nan
+    """95th percentile; NaN of nothing."""
+    return float(np.percentile(numbers, 95)) if len(numbers) else np.nan
 
 
-def columns(rows: Sequence[Row]) -> tuple[list[str], list[list[object]]]:
-    """(header, lines) of a report, with every digit."""
-    header = list(rows[0])
-    return header, [[repr(float(v)) if isinstance(v, float) else v for v in map(row.get, header)] for row in rows]
-
-
-def style(name: str) -> dict[str, Any]:
-    """How this sender's line is drawn."""
-    rival = RIVALS[name]
-    return {"color": rival.colour, "marker": rival.marker, "markersize": 4.5, "linewidth": 1.4}
-
-
-# --- options ---------------------------------------------------------------------------------------------------------
-
-
-def all_above_0(name: str, given: Sequence[float]) -> None:
-    """An error unless these are numbers > 0, at least one."""
-    if isinstance(given, str) or not isinstance(given, Sequence) or not given:
-        raise BufgymError(f"{name} = {given!r}: need at least one number")
-    for number in given:
-        above_0(name, number)
-
-
-def at_least_0(name: str, number: float) -> None:
-    if isinstance(number, bool) or not isinstance(number, int | float) or not 0 <= number < math.inf:
-        raise BufgymError(f"{name} = {number!r}: must be a number >= 0")
-
-
-def whole(name: str, number: int) -> None:
-    if isinstance(number, bool) or not isinstance(number, int) or number < 1:
-        raise BufgymError(f"{name} = {number!r}: must be a whole number >= 1")
-
-
-def holds(claim: bool) -> str:
-    return "holds here" if claim else "DOES NOT HOLD here"
+def curves(axes: Any, rows: Rows, x: str, y: str, names: Sequence[str], **styles: Any) -> None:
+    """The mean of column ``y`` against column ``x``: one line a sender; ``styles`` change every line."""
+    for k, name in enumerate(names):
+        means = {at: rows.mean(y, **{x: at}, sender=name) for at in rows.where(sender=name).distinct(x)}
+        program = PROGRAMS[name]
+        style = {**program.style, "markersize": 4 + 2 * k, "zorder": 3 - 0.1 * k, **styles}  # equal lines stay visible
+        axes.plot(list(means), list(means.values()), label=program.label, **style)

@@ -12,36 +12,27 @@ paper's Fig. 6 and 7 have.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 
 from bufgym.errors import BufgymError
-from bufgym.reproduce.report import COLOURS, Report
-from bufgym.reproduce.robofleet_evaluation import (
-    MBIT,
-    POINTS,
-    QUEUE_SIZE,
-    RIVALS,
-    ROUND_TRIP_MS,
-    Row,
-    Sent,
-    all_above_0,
-    at_least_0,
-    columns,
-    mean_of,
-    meet,
-    stream,
-    style,
-    whole,
-)
+from bufgym.reproduce.figure import COLOURS, at_least_0, finish, legend_below, several
+from bufgym.reproduce.robofleet_evaluation import MBIT, PROGRAMS, CloudFigure, Sent, stream
+from bufgym.reproduce.rows import Rows, table
 from bufgym.scenario.checks import above_0
 from bufgym.traces import Trace
 
 SENDERS = ("robofleet", "rosbridge", "ros-native")
 RATES_HZ = {"PointCloud2": 5.0, "CompressedImage": 2.0, "LaserScan": 10.0}
+KIND_COLOURS = {
+    "PointCloud2": COLOURS["afr"],
+    "CompressedImage": COLOURS["drop-oldest"],
+    "LaserScan": COLOURS["random"],
+}
 PAPER_RATIO = 5.0
 ABOUT = (4.0, 6.0)
 """What we let pass as "about 5 times"."""
@@ -51,99 +42,133 @@ WATCHED = 12.0
 LEAST_WATCHED_S = 30.0
 
 
-def report(
-    dropouts_s: Sequence[float] = (1, 2, 5, 10, 20, 30),
-    links_mbit_per_s: Sequence[float] = (12, 25, 50, 100),
-    kinds: Sequence[str] = tuple(RATES_HZ),
-    factor: float = 2.0,
-    round_trip_ms: float = ROUND_TRIP_MS,
-    silence_s: float = 0.0,
-    queue_size: int = QUEUE_SIZE,
-    points: int = POINTS,
-    runs: int = 5,
-    shown_s: float | None = None,
-) -> Report:
-    """Fig. 4 for these lengths of the dropout and these links; the figure shows the fastest link.
+@dataclass(frozen=True)
+class Reproduction(CloudFigure):
+    """Fig. 4 for these lengths of the dropout and these links; the picture shows the fastest link."""
 
-    Args:
-        kinds: of messages, one topic each time.
-        factor: latency within so many times nominal counts as nominal.
-        round_trip_ms: half of it to the server, the whole from a message's crossing to its pong.
-        silence_s: how long nothing is sent yet although the link is back, as TCP may be between two retransmissions.
-        queue_size: of native ROS, messages.
-        points: of a cloud, 16 bytes each.
-        runs: differ by arrival jitter and by when within a period the link drops out.
-        shown_s: which dropout the left panel shows; by default the one nearest to 10 s.
-    """
-    all_above_0("dropouts_s", dropouts_s)
-    all_above_0("links_mbit_per_s", links_mbit_per_s)
-    for name, given in (("round_trip_ms", round_trip_ms), ("silence_s", silence_s)):
-        at_least_0(name, given)
-    for name, number in (("runs", runs), ("queue_size", queue_size)):
-        whole(name, number)
-    if not kinds or isinstance(kinds, str) or not set(kinds) <= set(RATES_HZ):
-        raise BufgymError(f"kinds = {kinds!r}: must be some of {', '.join(RATES_HZ)}")
-    above_0("factor", factor)
-    if factor <= 1:
-        raise BufgymError(f"factor = {factor!r}: must be above 1")
-    shown = min(dropouts_s, key=lambda s: abs(s - 10)) if shown_s is None else shown_s
-    if shown not in dropouts_s:
-        raise BufgymError(f"shown_s = {shown!r}: must be one of dropouts_s")
-    rows: list[Row] = []
-    seen: dict[str, tuple[float, Sent]] = {}
-    for kind in kinds:
-        for mbit in links_mbit_per_s:
-            for dropout in dropouts_s:
-                for seed in range(runs):
-                    away_s = BEFORE_S + float(np.random.default_rng(seed).random()) / RATES_HZ[kind]
-                    watch_s = max(LEAST_WATCHED_S, WATCHED * (dropout + silence_s))
-                    outage_s = dropout + silence_s
-                    link = Trace.steps([(away_s, mbit * MBIT), (outage_s, 0), (watch_s, mbit * MBIT)], after="hold")
-                    for name in SENDERS:
-                        sent = meet(
-                            name,
-                            (stream(kind, RATES_HZ[kind], points=points),),
-                            link,
-                            away_s + outage_s + watch_s,
-                            seed,
-                            round_trip_ms=round_trip_ms,
-                            queue_size=queue_size,
-                        )
-                        took_s = recovery_s(sent, away_s, away_s + dropout, factor)
-                        key = {"message": kind, "link_mbit_per_s": mbit, "dropout_s": dropout, "run": seed}
-                        rows.append({**key, "sender": name, "recovery_s": took_s})
-                        if (kind, mbit, dropout, seed) == (kinds[0], max(links_mbit_per_s), shown, 0):
-                            seen[name] = (away_s + dropout, sent)
+    dropouts_s: Sequence[float] = (1, 2, 5, 10, 20, 30)
+    links_mbit_per_s: Sequence[float] = (12, 25, 50, 100)
+    kinds: Sequence[str] = tuple(RATES_HZ)
+    """Of messages, one topic each time."""
+    factor: float = 2.0
+    """Latency within so many times nominal counts as nominal."""
+    silence_s: float = 0.0
+    """How long nothing is sent yet although the link is back, as TCP may be between two retransmissions."""
+    shown_s: float | None = None
+    """Which dropout the left panel shows; by default the one nearest to 10 s."""
 
-    cells = {
-        (kind, mbit, dropout): tuple(
-            mean_of(rows, "recovery_s", message=kind, link_mbit_per_s=mbit, dropout_s=dropout, sender=name)
-            for name in SENDERS
-        )
-        for kind in kinds
-        for mbit in links_mbit_per_s
-        for dropout in dropouts_s
+    RULES = {
+        "dropouts_s": several(above_0),
+        "links_mbit_per_s": several(above_0),
+        "silence_s": at_least_0,
+        "factor": above_0,
     }
-    text = [
-        f"Robofleet paper, Fig. 4: recovery after a dropout, until latency stays within {factor:g} times nominal; mean "
-        f"of {runs} runs.",
-        f"n_T = 1, round trip {round_trip_ms:g} ms, native ROS with a queue of {queue_size}, the socket silent for "
-        f"{silence_s:g} s after the link's return.",
-        "",
-        *_table(cells, points),
-        f"inf: not back to nominal within {WATCHED:g} times the dropout after it. 5x at: between the nearest lengths.",
-        "",
-        *_claims(cells, queue_size),
-    ]
+    SIZE_INCHES = (11.0, 4.8)
 
-    def draw(figure: Any) -> None:
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.kinds or isinstance(self.kinds, str) or not set(self.kinds) <= set(RATES_HZ):
+            raise BufgymError(f"kinds = {self.kinds!r}: must be some of {', '.join(RATES_HZ)}")
+        if self.factor <= 1:
+            raise BufgymError(f"factor = {self.factor!r}: must be above 1")
+        if self.shown_s is not None and self.shown_s not in self.dropouts_s:
+            raise BufgymError(f"shown_s = {self.shown_s!r}: must be one of dropouts_s")
+
+    def run(self, kind: str, mbit: float, dropout_s: float, name: str, seed: int) -> tuple[float, Sent]:
+        """(when the link goes away, what became of the messages) for one dropout."""
+        away_s = BEFORE_S + float(np.random.default_rng(seed).random()) / RATES_HZ[kind]
+        outage_s = dropout_s + self.silence_s
+        watched_s = max(LEAST_WATCHED_S, WATCHED * outage_s)
+        link = Trace.steps([(away_s, mbit * MBIT), (outage_s, 0), (watched_s, mbit * MBIT)], after="hold")
+        streams = (stream(kind, RATES_HZ[kind], points=self.points),)
+        return away_s, self.send(name, streams, link, away_s + outage_s + watched_s, seed)
+
+    def simulate(self) -> Rows:
+        rows = Rows()
+        for kind, mbit, dropout_s, seed, name in product(
+            self.kinds, self.links_mbit_per_s, self.dropouts_s, range(self.runs), SENDERS
+        ):
+            away_s, sent = self.run(kind, mbit, dropout_s, name, seed)
+            key = {"message": kind, "link_mbit_per_s": mbit, "dropout_s": dropout_s, "run": seed, "sender": name}
+            rows.append(key | {"recovery_s": recovery_s(sent, away_s, away_s + dropout_s, self.factor)})
+        return rows
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        cells = by_cell(rows)
+        ratios = {key: ratio(cell) for key, cell in cells.items()}
+        about = [key for key, r in ratios.items() if ABOUT[0] <= r <= ABOUT[1]]
+        less = sum(r < ABOUT[0] for r in ratios.values())
+        finite = [cell for cell in cells.values() if min(cell) > 0 and math.isfinite(cell[0])]
+        nearer = [abs(math.log(cell[2] / cell[0])) < abs(math.log(cell[1] / cell[2])) for cell in finite]
+        lengths = {group: ", ".join(f"{d:g} s" for *g, d in about if tuple(g) == group) for group in groups(about)}
+        return {
+            "paper_ratio": PAPER_RATIO,
+            "about_from": ABOUT[0],
+            "about_to": ABOUT[1],
+            "watched": WATCHED,
+            "cells": len(cells),
+            "sooner_cells": sum(r > 1 for r in ratios.values()),
+            "about_cells": len(about),
+            "less": less,
+            "more": len(cells) - less - len(about),
+            "about": "; ".join(f"{kind} at {mbit:g} Mbit/s {shown}" for (kind, mbit), shown in lengths.items()),
+            "nearer": sum(nearer),
+            "finite": len(finite),
+        }
+
+    def tables(self, rows: Rows) -> list[str]:
+        cells = by_cell(rows)
+        dropouts = list(self.dropouts_s)
+        lines = [["", "load", "Robofleet", "native ROS", *(f"{d:g} s" for d in dropouts), "5x at"]]
+        for kind, mbit in groups(cells):
+            json = stream(kind, RATES_HZ[kind], points=self.points).encodings["json"]
+            group = [cells[kind, mbit, dropout] for dropout in dropouts]
+            ratios = [ratio(cell) for cell in group]
+            own, native = (f"{min(c[k] for c in group):.3f} to {max(c[k] for c in group):.3f}" for k in (0, 2))
+            load = f"{json * RATES_HZ[kind] / (mbit * MBIT):.0%}"
+            length = length_for(dropouts, ratios)
+            lines.append([f"{kind}, {mbit:g} Mbit/s", load, own, native, *(f"{r:.1f}" for r in ratios), length])
+        return table(lines)
+
+    def draw(self, rows: Rows, figure: Any) -> None:
         left, right = figure.subplots(1, 2)
-        _draw_latency(left, seen, shown, f"{kinds[0]}, {max(links_mbit_per_s):g} Mbit/s, dropout of {shown:g} s")
-        _draw_ratios(right, cells)
+        shown_s = min(self.dropouts_s, key=lambda s: abs(s - 10)) if self.shown_s is None else self.shown_s
+        kind, mbit = self.kinds[0], max(self.links_mbit_per_s)
+        for name in reversed(SENDERS):
+            away_s, sent = self.run(kind, mbit, shown_s, name, 0)
+            received = sent.received
+            at_s = received.received_s - away_s - shown_s
+            style = PROGRAMS[name].style | {"markersize": 3}
+            for part in ((-shown_s - 3 < at_s) & (at_s < 0), (0 <= at_s) & (at_s < shown_s + 3)):
+                left.plot(at_s[part], received.latency_s[part], **style)
+            left.plot([], [], label=PROGRAMS[name].label, **style)
+        left.axvspan(-shown_s, 0, color=COLOURS["other"], alpha=0.2, linewidth=0)
+        left.annotate("no link", (-shown_s / 2, 0.02), xycoords=("data", "axes fraction"), ha="center", fontsize=8)
+        title = f"{kind}, {mbit:g} Mbit/s, dropout of {shown_s:g} s"
+        finish(left, title, yscale="log", xlabel="receipt, s after the link's return", ylabel="latency, s")
         left.legend(loc="upper left", frameon=False)
-        figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+        self._draw_ratios(right, by_cell(rows))
+        legend_below(figure, 4, right)
 
-    return Report("\n".join(text), *columns(rows), draw, (11.0, 4.8))
+    def _draw_ratios(self, axes: Any, cells: Cells) -> None:
+        links = list(self.links_mbit_per_s)
+        for kind, mbit in groups(cells):
+            k = links.index(mbit)
+            style = {"color": KIND_COLOURS[kind], "marker": "osD^vPX*"[k % 8], "markersize": 4.5, "linewidth": 1.2}
+            ratios = [ratio(cells[kind, mbit, dropout]) for dropout in self.dropouts_s]
+            axes.plot(self.dropouts_s, ratios, alpha=0.4 + 0.6 * (k + 1) / len(links), **style)
+        axes.axhspan(*ABOUT, color=COLOURS["other"], alpha=0.35, linewidth=0, label="paper, about 5")
+        for kind in self.kinds:
+            axes.plot([], [], color=KIND_COLOURS[kind], label=kind)
+        for k, mbit in enumerate(links):
+            label = f"{mbit:g} Mbit/s"
+            axes.plot([], [], color=COLOURS["oracle"], marker="osD^vPX*"[k % 8], linestyle="", label=label)
+        title = "Rosbridge's recovery time to Robofleet's"
+        finish(axes, title, xscale="log", yscale="log", xlabel="length of the dropout, s")
+        lengths = sorted(self.dropouts_s)
+        axes.set_xticks(lengths, [f"{d:g}" for d in lengths])
+        axes.set_xticks([], minor=True)
+        axes.set_yticks([1, 5, 10, 50, 100, 500], ["1", "5", "10", "50", "100", "500"])
 
 
 def recovery_s(sent: Sent, away_s: float, back_s: float, factor: float) -> float:
@@ -151,18 +176,18 @@ def recovery_s(sent: Sent, away_s: float, back_s: float, factor: float) -> float
 
     Nominal: the median of what was received before ``away_s``, when the link went away.
     """
-    got = sent.got
-    latency_s = got.latency_s
-    before = got.received_s <= away_s
+    received = sent.received
+    latency_s = received.latency_s
+    before = received.received_s <= away_s
     if not before.any():
         raise BufgymError("nothing was received before the dropout: no latency to call nominal")
     late = np.flatnonzero(latency_s > factor * np.median(latency_s[before]))
-    late = late[got.received_s[late] > away_s]
+    late = late[received.received_s[late] > away_s]
     if len(late) == 0:
         return 0.0
-    if late[-1] + 1 == len(got):
+    if late[-1] + 1 == len(received):
         return math.inf
-    return max(0.0, float(got.received_s[late[-1] + 1]) - back_s)
+    return max(0.0, float(received.received_s[late[-1] + 1]) - back_s)
 
 
 Cells = dict[tuple[str, float, float], tuple[float, ...]]
@@ -174,117 +199,28 @@ def ratio(cell: Sequence[float]) -> float:
     return cell[1] / cell[0] if cell[0] > 0 and math.isfinite(cell[0]) else math.nan
 
 
-def length_for(dropouts_s: Sequence[float], ratios: Sequence[float], wanted: float = PAPER_RATIO) -> str:
-    """The dropout for which the ratio is ``wanted``, by a line between the two lengths around it."""
-    known = sorted((d, r) for d, r in zip(dropouts_s, ratios, strict=True) if math.isfinite(r))
-    for (d, r), (e, q) in pairwise(known):
-        if r <= wanted <= q:
-            return f"{d + (e - d) * (wanted - r) / (q - r) if q > r else d:.3g} s"
-    if not known:
+def length_for(dropouts_s: Sequence[float], ratios: Sequence[float], target: float = PAPER_RATIO) -> str:
+    """The dropout for which the ratio is ``target``, by a line between the two lengths around it."""
+    finite = sorted((d, r) for d, r in zip(dropouts_s, ratios, strict=True) if math.isfinite(r))
+    for (d, r), (e, q) in pairwise(finite):
+        if r <= target <= q:
+            return f"{d + (e - d) * (target - r) / (q - r) if q > r else d:.3g} s"
+    if not finite:
         return "none"
-    return f"< {known[0][0]:g} s" if known[0][1] > wanted else f"> {known[-1][0]:g} s"
+    return f"< {finite[0][0]:g} s" if finite[0][1] > target else f"> {finite[-1][0]:g} s"
 
 
-def _groups(cells: Cells) -> dict[tuple[str, float], dict[float, tuple[float, ...]]]:
-    """The cells by kind and link."""
-    made: dict[tuple[str, float], dict[float, tuple[float, ...]]] = {}
-    for (kind, mbit, dropout), cell in cells.items():
-        made.setdefault((kind, mbit), {})[dropout] = cell
-    return made
-
-
-def _table(cells: Cells, points: int) -> list[str]:
-    groups = _groups(cells)
-    dropouts = list(next(iter(groups.values())))
-    lines = [
-        f"{'':26}{'rosbridge':>10}{'recovery, s, from to':^28}  rosbridge's recovery to Robofleet's, dropout of",
-        f"{'':26}{'load':>10}{'Robofleet':>14}{'native ROS':>14}  "
-        + "".join(f"{f'{d:g} s':>8}" for d in dropouts)
-        + f"{'5x at':>10}",
-    ]
-    for (kind, mbit), found in groups.items():
-        json = stream(kind, RATES_HZ[kind], points=points).encodings["json"]
-        load = json * RATES_HZ[kind] / (mbit * MBIT)
-        ratios = [ratio(cell) for cell in found.values()]
-        own, native = ([cell[k] for cell in found.values()] for k in (0, 2))
-        lines.append(
-            f"{kind:15}{mbit:4g} Mbit/s{load:10.0%}  {min(own):>6.3f} {max(own):<6.3f} {min(native):>6.3f} "
-            f"{max(native):<6.3f} " + "".join(f"{r:8.1f}" for r in ratios) + f"{length_for(dropouts, ratios):>10}"
+def by_cell(rows: Rows) -> Cells:
+    """The mean recovery of each of ``SENDERS`` for each message, link and dropout."""
+    return {
+        (kind, mbit, dropout): tuple(
+            rows.mean("recovery_s", message=kind, link_mbit_per_s=mbit, dropout_s=dropout, sender=name)
+            for name in SENDERS
         )
-    return lines
+        for kind, mbit, dropout in rows.distinct("message", "link_mbit_per_s", "dropout_s")
+    }
 
 
-def _claims(cells: Cells, queue_size: int) -> list[str]:
-    ratios = {key: ratio(cell) for key, cell in cells.items()}
-    about = [key for key, r in ratios.items() if ABOUT[0] <= r <= ABOUT[1]]
-    less = sum(r < ABOUT[0] for r in ratios.values())
-    known = [cell for cell in cells.values() if min(cell) > 0 and math.isfinite(cell[0])]
-    nearer = sum(abs(math.log(cell[2] / cell[0])) < abs(math.log(cell[1] / cell[2])) for cell in known)
-    return [
-        f"Paper: Robofleet is back about {PAPER_RATIO:g} times sooner than rosbridge. Here sooner in "
-        f"{sum(r > 1 for r in ratios.values())} of {len(cells)} cells;",
-        f"about {PAPER_RATIO:g} times ({ABOUT[0]:g} to {ABOUT[1]:g}) in {len(about)}, less in {less}, more in "
-        f"{len(cells) - less - len(about)}. About {PAPER_RATIO:g} times:",
-        *(
-            f"  {kind} at {mbit:g} Mbit/s: {', '.join(f'{d:g} s' for k, m, d in about if (k, m) == (kind, mbit))}"
-            for kind, mbit in dict.fromkeys((kind, mbit) for kind, mbit, _ in about)
-        ),
-        "Rosbridge must first send what it queued: about dropout x load / (1 - load). Robofleet's slot holds one "
-        "message,",
-        "so its recovery does not depend on the length. The ratio grows with the length: no one number, and the length",
-        "that gives 5 is another for every message and link. The paper does not give its own.",
-        f"Native ROS is nearer to Robofleet in {nearer} of {len(known)} cells: its queue of {queue_size} bounds what "
-        "is left over;",
-        "an unbounded one would be as rosbridge's, in smaller messages. To which of the two the paper found it similar "
-        "we",
-        "do not know.",
-        "Not here: TCP's retransmission timer (silence_s stands in for it), sockets' own buffers, a ping after 2 s and",
-        "a new connection.",
-    ]
-
-
-# --- the figure ------------------------------------------------------------------------------------------------------
-
-
-def _draw_latency(axes: Any, seen: dict[str, tuple[float, Sent]], dropout_s: float, title: str) -> None:
-    """Latency of what is received, against the time of receipt; 0 is the link's return."""
-    for name in reversed(SENDERS):
-        back_s, sent = seen[name]
-        got = sent.got
-        at_s = got.received_s - back_s
-        look = {**style(name), "markersize": 3}
-        for part in ((-dropout_s - 3 < at_s) & (at_s < 0), (0 <= at_s) & (at_s < dropout_s + 3)):
-            axes.plot(at_s[part], got.latency_s[part], **look)
-        axes.plot([], [], label=RIVALS[name].label, **look)
-    axes.axvspan(-dropout_s, 0, color=COLOURS["other"], alpha=0.2, linewidth=0)
-    axes.annotate("no link", (-dropout_s / 2, 0.02), xycoords=("data", "axes fraction"), ha="center", fontsize=8)
-    axes.set(yscale="log", xlabel="receipt, s after the link's return", ylabel="latency, s")
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.grid(alpha=0.25)
-
-
-def _draw_ratios(axes: Any, cells: Cells) -> None:
-    colours = dict(zip(RATES_HZ, (COLOURS["afr"], COLOURS["drop-oldest"], COLOURS["random"]), strict=True))
-    links = list(dict.fromkeys(mbit for _, mbit, _ in cells))
-    for (kind, mbit), found in _groups(cells).items():
-        axes.plot(
-            list(found),
-            [ratio(cell) for cell in found.values()],
-            color=colours[kind],
-            marker="osD^vPX*"[links.index(mbit) % 8],
-            markersize=4.5,
-            linewidth=1.2,
-            alpha=0.4 + 0.6 * (links.index(mbit) + 1) / len(links),
-        )
-    axes.axhspan(*ABOUT, color=COLOURS["other"], alpha=0.35, linewidth=0, label="paper, about 5")
-    for kind in dict.fromkeys(kind for kind, _, _ in cells):
-        axes.plot([], [], color=colours[kind], label=kind)
-    for k, mbit in enumerate(links):
-        axes.plot([], [], color=COLOURS["oracle"], marker="osD^vPX*"[k % 8], linestyle="", label=f"{mbit:g} Mbit/s")
-    axes.set(xscale="log", yscale="log", xlabel="length of the dropout, s")
-    lengths = sorted({dropout for _, _, dropout in cells})
-    axes.set_xticks(lengths, [f"{d:g}" for d in lengths])
-    axes.set_xticks([], minor=True)
-    axes.set_yticks([1, 5, 10, 50, 100, 500], ["1", "5", "10", "50", "100", "500"])
-    axes.set_title("Rosbridge's recovery time to Robofleet's", loc="left", fontsize=10)
-    axes.grid(alpha=0.25)
+def groups(cells: Iterable[tuple[str, float, float]]) -> list[tuple[str, float]]:
+    """(kind, Mbit/s) of these cells, each once."""
+    return list(dict.fromkeys((kind, mbit) for kind, mbit, _ in cells))

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import itertools
 import json
-import textwrap
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from bufgym.errors import BufgymError
 from bufgym.reproduce.encodings import ENCODINGS, KINDS, Content, content, encode
-from bufgym.reproduce.report import COLOURS, Report
+from bufgym.reproduce.figure import COLOURS, Figure, finish, legend_below
+from bufgym.reproduce.rows import Rows, table
 
 PAPER = {
     "LaserScan": (7_260, 7_328, 28_000),
@@ -26,45 +28,155 @@ PAPER = {
 """Bytes as ROS binary, Robofleet flatbuffer and rosbridge JSON."""
 COLUMN = {"ros1": 0, "robofleet": 1, "robofleet-bare": 1, "json": 2, "json-numbers": 2}
 """Encoding -> the column of ``PAPER`` that it stands beside."""
+SHOWN = {
+    "cdr": ("ROS 2 CDR", COLOURS["other"]),
+    "robofleet": ("Robofleet, type and topic inside", COLOURS["afr"]),
+    "robofleet-bare": ("Robofleet, without them", COLOURS["sky"]),
+    "json": ("JSON, bytes in base64", COLOURS["random"]),
+    "json-numbers": ("JSON, bytes as numbers", COLOURS["orange"]),
+}
+"""Encoding -> label and colour of its bars."""
 MAX_FRAME_ID = 64
 """Longest frame_id, in letters, that we take for likely."""
 
 
-def report(
-    beams: int = 1800, points: int = 10_000, point_step: int = 16, topic: str = "/robot/topic", seed: int = 0
-) -> Report:
-    """Table I for every kind of message in ``encodings``.
+@dataclass(frozen=True)
+class Reproduction(Figure):
+    """Table I for every kind of message in ``encodings``."""
 
-    Args:
-        beams: of the LaserScan; its frame_id is made as long as the paper's size needs.
-        points: of the PointCloud2, which the paper's table leaves out.
-        point_step: bytes of one of these points.
-        topic: goes into the flatbuffer and the JSON.
-        seed: of every message's content.
-    """
-    messages = fitted(beams, seed)
-    for kind in KINDS:
-        parameters = {"points": points, "point_step": point_step} if kind == "PointCloud2" else {}
-        messages.setdefault(kind, content(kind, seed=seed, **parameters))
-    ours = {
-        kind: {encoding: len(encode(kind, message, encoding, topic)) for encoding in ENCODINGS}
-        for kind, message in messages.items()
-    }
-    rows = [
-        [kind, encoding, ours[kind][encoding], paper or "", f"{ours[kind][encoding] / paper:.4f}" if paper else ""]
-        for kind in ours
-        for encoding in ENCODINGS
-        for paper in [of_paper(kind, encoding)]
-    ]
-    told = [_chosen(messages, topic), *_flatbuffer_told(messages, ours), *_json_told(messages, ours, topic)]
-    text = [
-        "Robofleet paper, Table I: bytes of one message, ours encoded here.",
-        "",
-        *_table(ours),
-        *(f"\n{textwrap.fill(paragraph, 110)}" for paragraph in told),
-    ]
-    header = ["message", "encoding", "bytes", "paper_bytes", "ours_to_paper"]
-    return Report("\n".join(text), header, rows, lambda figure: _draw(figure, ours), (9.0, 4.8))
+    beams: int = 1800
+    """Of the LaserScan; its frame_id is made as long as the paper's size needs."""
+    points: int = 10_000
+    """Of the PointCloud2, which the paper's table leaves out."""
+    point_step: int = 16
+    """Bytes of one of these points."""
+    topic: str = "/robot/topic"
+    """Goes into the flatbuffer and the JSON."""
+    seed: int = 0
+    """Of every message's content."""
+
+    SIZE_INCHES = (9.0, 4.8)
+
+    @cached_property
+    def messages(self) -> dict[str, Content]:
+        """Kind -> the message that is encoded."""
+        messages = fitted(self.beams, self.seed)
+        for kind in KINDS:
+            parameters = {"points": self.points, "point_step": self.point_step} if kind == "PointCloud2" else {}
+            messages.setdefault(kind, content(kind, seed=self.seed, **parameters))
+        return messages
+
+    def simulate(self) -> Rows:
+        rows = Rows()
+        for (kind, message), encoding in itertools.product(self.messages.items(), ENCODINGS):
+            bytes_, paper = len(encode(kind, message, encoding, self.topic)), of_paper(kind, encoding)
+            ratio = None if paper is None else f"{bytes_ / paper:.4f}"
+            rows.append(
+                {"message": kind, "encoding": encoding, "bytes": bytes_, "paper_bytes": paper, "ours_to_paper": ratio}
+            )
+        return rows
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines = [["", "", *ENCODINGS]]
+        for kind in rows.distinct("message"):
+            labels = {"ours": "bytes", "paper": "paper_bytes", "ratio": "ours_to_paper"}
+            for label, name in labels.items() if kind in PAPER else [("ours", "bytes")]:
+                numbers = [row[name] for row in rows.where(message=kind)]
+                texts = ["-" if n is None else n if isinstance(n, str) else f"{n:,}" for n in numbers]
+                lines.append([kind if label == "ours" else "", label, *texts])
+        return table(lines, left=2)
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        sizes = sizes_of(rows)
+        others = {"others": ", ".join(kind for kind in sizes if kind not in PAPER)}
+        return others | self._contents() | self._flatbuffers(sizes) | self._json(sizes)
+
+    def _contents(self) -> dict[str, Any]:
+        """What was chosen so that the ROS binaries have the paper's bytes."""
+        scan, fix, image = (self.messages[kind] for kind in PAPER)
+        beams, letters = len(scan["ranges"]), len(scan["header"]["frame_id"])
+        others = (f"{beams + (letters - n) // 4:,} and {n}" for n in range(letters % 4, 17, 4) if n != letters)
+        return {
+            "scan_letters": letters,
+            "other_scans": " or ".join(others),
+            "fix_letters": len(fix["header"]["frame_id"]),
+            "jpeg_bytes": len(image["data"]),
+        }
+
+    def _flatbuffers(self, sizes: dict[str, dict[str, int]]) -> dict[str, Any]:
+        """The flatbuffers beside the paper's, and by how much an image's can be longer than its ROS binary."""
+        added = [sizes[kind]["robofleet"] - sizes[kind]["robofleet-bare"] for kind in PAPER]
+        scan = self.messages["LaserScan"]
+        zero = len(encode("LaserScan", {**scan, "header": {**scan["header"], "seq": 0}}, "robofleet-bare"))
+        # Nothing in this table is aligned to more than 4 bytes: these are all the lengths that can differ.
+        longer = []
+        for a, b, c, seq in itertools.product(*[range(4)] * 3, range(2)):
+            image = content("CompressedImage", frame_id="c" * a, format="f" * b, data_bytes=100 + c)
+            image["header"]["seq"] = seq
+            flat, ros = (len(encode("CompressedImage", image, encoding)) for encoding in ("robofleet-bare", "ros1"))
+            longer.append(flat - ros)
+        gap = PAPER["CompressedImage"][1] - PAPER["CompressedImage"][0]
+        return {
+            "least_added": min(added),
+            "most_added": max(added),
+            "over": ", ".join(f"{k} {sizes[k]['robofleet-bare'] - PAPER[k][1]:+d} bytes" for k in PAPER),
+            "zero_scan": zero,
+            "zero_over": zero - PAPER["LaserScan"][1],
+            "image_gap": gap,
+            "least_longer": min(longer),
+            "most_longer": max(longer),
+            "possible": "They can" if min(longer) <= gap <= max(longer) else "So the paper's two numbers cannot",
+        }
+
+    def _json(self, sizes: dict[str, dict[str, int]]) -> dict[str, Any]:
+        """The JSON beside the paper's, and what of a message's content would make them equal."""
+
+        def bytes_(kind: str, **changed: Any) -> int:
+            return len(encode(kind, self.messages[kind] | changed, "json-numbers", self.topic))
+
+        image, (ros, _, paper) = sizes["CompressedImage"], PAPER["CompressedImage"]
+        nearest = min(("json", "json-numbers"), key=lambda encoding: abs(image[encoding] - paper))
+        full = sizes["LaserScan"]["json-numbers"]
+        null = bytes_("LaserScan", ranges=np.full_like(self.messages["LaserScan"]["ranges"], np.inf))
+        envelope = len(json.dumps({"op": "publish", "topic": self.topic, "msg": 0}, separators=(",", ":"))) - 1
+        return {
+            "paper_json": paper / ros,
+            "base64_json": image["json"] / ros,
+            "number_json": image["json-numbers"] / ros,
+            "nearest": nearest,
+            "nearest_ratio": image[nearest] / paper,
+            "paper_scan_json": PAPER["LaserScan"][2],
+            "no_return": (full - PAPER["LaserScan"][2]) / (full - null),
+            "fix_json": sizes["NavSatFix"]["json-numbers"] - envelope,
+            "zero_fix_json": bytes_("NavSatFix", position_covariance=np.zeros(9)) - envelope,
+        }
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        sizes = sizes_of(rows)
+        axes = figure.add_subplot()
+        width, ticks = 0.8 / len(SHOWN), np.arange(len(sizes))
+        for i, (encoding, (label, colour)) in enumerate(SHOWN.items()):
+            at = ticks + (i - (len(SHOWN) - 1) / 2) * width
+            axes.bar(at, [s[encoding] / s["ros1"] for s in sizes.values()], width, color=colour, label=label)
+            for x, kind in zip(at, sizes, strict=True):
+                if (paper := of_paper(kind, encoding)) is not None:
+                    name = "paper" if (i, kind) == (1, "LaserScan") else None
+                    line = {"color": COLOURS["oracle-ideal"], "linewidth": 2.2, "label": name}
+                    axes.hlines(paper / PAPER[kind][0], x - width / 2, x + width / 2, **line)
+        axes.axhline(1, color=COLOURS["oracle"], linewidth=1, linestyle=":")
+        axes.set_xticks(ticks, [f"{kind}\n{s['ros1']:,} B" for kind, s in sizes.items()], fontsize=8)
+        title = "Size of a message by its encoding; below each, its bytes as ROS 1 binary"
+        finish(axes, title, ylabel="bytes / bytes as ROS 1 binary")
+        axes.grid(False, axis="x")
+        legend_below(figure, 3)
+
+
+def sizes_of(rows: Rows) -> dict[str, dict[str, int]]:
+    """Kind -> encoding -> bytes."""
+    sizes: dict[str, dict[str, int]] = {}
+    for row in rows:
+        sizes.setdefault(row["message"], {})[row["encoding"]] = row["bytes"]
+    return sizes
 
 
 def of_paper(kind: str, encoding: str) -> int | None:
@@ -89,114 +201,3 @@ def fitted(beams: int, seed: int = 0) -> dict[str, Content]:
     data_bytes = PAPER["CompressedImage"][0] - bytes_("CompressedImage", data_bytes=least) + least
     image = content("CompressedImage", data_bytes=data_bytes, seed=seed)
     return {"LaserScan": scan, "NavSatFix": fix, "CompressedImage": image}
-
-
-# --- the text --------------------------------------------------------------------------------------------------------
-
-
-def _table(ours: dict[str, dict[str, int]]) -> list[str]:
-    lines = [f"{'':24}" + "".join(f"{encoding:>15}" for encoding in ENCODINGS)]
-    for kind, bytes_ in ours.items():
-        lines.append(f"{kind:16} {'ours':7}" + "".join(f"{bytes_[encoding]:15,}" for encoding in ENCODINGS))
-        if kind in PAPER:
-            papers = [of_paper(kind, encoding) for encoding in ENCODINGS]
-            ratios = [p and f"{bytes_[encoding] / p:.4f}" for p, encoding in zip(papers, ENCODINGS, strict=True)]
-            lines.append(f"{'':16} {'paper':7}" + "".join(f"{(p and format(p, ',')) or '-':>15}" for p in papers))
-            lines.append(f"{'':16} {'ratio':7}" + "".join(f"{r or '-':>15}" for r in ratios))
-    others = ", ".join(kind for kind in ours if kind not in PAPER)
-    return [*lines, f"Not in the paper's table: {others}."]
-
-
-def _chosen(messages: dict[str, Content], topic: str) -> str:
-    scan, fix, image = (messages[kind] for kind in PAPER)
-    beams, letters = len(scan["ranges"]), len(scan["header"]["frame_id"])
-    others = " or ".join(f"{beams + (letters - n) // 4:,} and {n}" for n in range(letters % 4, 17, 4) if n != letters)
-    cloud = messages["PointCloud2"]
-    return (
-        f"Chosen for the paper's bytes as ROS binary: LaserScan of {beams:,} ranges, no intensities and a frame_id of "
-        f"{letters} letters ({others} do as well, ranges and intensities together); NavSatFix with a frame_id of "
-        f"{len(fix['header']['frame_id'])} letters; CompressedImage of {len(image['data']):,} JPEG bytes. "
-        f"Chosen freely: PointCloud2 of {cloud['width']:,} points of {cloud['point_step']} bytes; topic {topic}."
-    )
-
-
-def _flatbuffer_told(messages: dict[str, Content], ours: dict[str, dict[str, int]]) -> list[str]:
-    added = [ours[kind]["robofleet"] - ours[kind]["robofleet-bare"] for kind in PAPER]
-    over = {kind: ours[kind]["robofleet-bare"] - PAPER[kind][1] for kind in PAPER}
-    scan = messages["LaserScan"]
-    zero = len(encode("LaserScan", {**scan, "header": {**scan["header"], "seq": 0}}, "robofleet-bare"))
-    # Nothing in this table is aligned to more than 4 bytes: these are all the lengths that can differ.
-    longer = []
-    for a, b, c, seq in itertools.product(*[range(4)] * 3, range(2)):
-        image = content("CompressedImage", frame_id="c" * a, format="f" * b, data_bytes=100 + c)
-        image["header"]["seq"] = seq
-        flat, ros = (len(encode("CompressedImage", image, encoding)) for encoding in ("robofleet-bare", "ros1"))
-        longer.append(flat - ros)
-    gap = PAPER["CompressedImage"][1] - PAPER["CompressedImage"][0]
-    possible = "They can" if min(longer) <= gap <= max(longer) else "So the paper's two numbers cannot"
-    return [
-        f"Flatbuffer: the released client puts type and topic into every message (robofleet), {min(added)} to "
-        f"{max(added)} bytes here. The paper's bytes are nearer to messages without them (robofleet-bare): "
-        + ", ".join(f"{kind} {more:+d} bytes" for kind, more in over.items())
-        + f". A number that is 0 is not written, and the paper does not give its numbers: the LaserScan with seq = 0 "
-        f"has {zero:,} bytes, {zero - PAPER['LaserScan'][1]:+d}.",
-        f"The paper's CompressedImage is {gap} bytes longer as a flatbuffer than as ROS binary, ours {min(longer)} to "
-        f"{max(longer)}, whatever the lengths of its texts and data. {possible} be of one message in the released "
-        "schema.",
-    ]
-
-
-def _json_told(messages: dict[str, Content], ours: dict[str, dict[str, int]], topic: str) -> list[str]:
-    def bytes_(kind: str, **changed: Any) -> int:
-        return len(encode(kind, messages[kind] | changed, "json-numbers", topic))
-
-    image, (ros, _, paper) = ours["CompressedImage"], PAPER["CompressedImage"]
-    nearer = min(("json", "json-numbers"), key=lambda encoding: abs(image[encoding] - paper))
-    full = ours["LaserScan"]["json-numbers"]
-    null = bytes_("LaserScan", ranges=np.full_like(messages["LaserScan"]["ranges"], np.inf))
-    share = (full - PAPER["LaserScan"][2]) / (full - null)
-    envelope = len(json.dumps({"op": "publish", "topic": topic, "msg": 0}, separators=(",", ":"))) - 1
-    zeros = bytes_("NavSatFix", position_covariance=np.zeros(9))
-    return [
-        f"JSON: the paper's CompressedImage takes {paper / ros:.2f} times its ROS binary; ours "
-        f"{image['json'] / ros:.2f} in base64, as rosbridge_suite sends uint8[] (json), and "
-        f"{image['json-numbers'] / ros:.2f} as a list of decimal numbers without spaces (json-numbers). Nearest to "
-        f"the paper's is {nearer}, {image[nearer] / paper:.4f} of it.",
-        f"LaserScan: a float32 becomes up to 18 characters, as it is written as a double. The paper's "
-        f"{PAPER['LaserScan'][2]:,} bytes would be json-numbers with {share:.0%} of the beams meeting nothing, as "
-        "infinity becomes null; all of ours meet something. The paper does not say what its scan saw.",
-        f"NavSatFix: {ours['NavSatFix']['json-numbers'] - envelope} bytes without op and topic, {zeros - envelope} "
-        "with a covariance of zeros as well; the rest is digits of the fix, which the paper does not give.",
-    ]
-
-
-# --- the figure ------------------------------------------------------------------------------------------------------
-
-
-def _draw(figure: Any, ours: dict[str, dict[str, int]]) -> None:
-    shown = {
-        "cdr": ("ROS 2 CDR", COLOURS["other"]),
-        "robofleet": ("Robofleet, type and topic inside", COLOURS["afr"]),
-        "robofleet-bare": ("Robofleet, without them", "#56b4e9"),
-        "json": ("JSON, bytes in base64", COLOURS["random"]),
-        "json-numbers": ("JSON, bytes as numbers", "#e69f00"),
-    }
-    axes = figure.add_subplot()
-    width = 0.8 / len(shown)
-    for i, (encoding, (label, colour)) in enumerate(shown.items()):
-        at = np.arange(len(ours)) + (i - (len(shown) - 1) / 2) * width
-        axes.bar(at, [bytes_[encoding] / bytes_["ros1"] for bytes_ in ours.values()], width, color=colour, label=label)
-        for x, kind in zip(at, ours, strict=True):
-            if (paper := of_paper(kind, encoding)) is not None:
-                name = "paper" if (i, kind) == (1, "LaserScan") else None
-                ends = (x - width / 2, x + width / 2)
-                axes.hlines(paper / PAPER[kind][0], *ends, color=COLOURS["oracle-ideal"], linewidth=2.2, label=name)
-    axes.axhline(1, color=COLOURS["oracle"], linewidth=1, linestyle=":")
-    axes.set_xticks(
-        np.arange(len(ours)), [f"{kind}\n{bytes_['ros1']:,} B" for kind, bytes_ in ours.items()], fontsize=8
-    )
-    axes.set(ylabel="bytes / bytes as ROS 1 binary")
-    axes.grid(axis="y", alpha=0.25)
-    axes.set_axisbelow(True)
-    axes.set_title("Size of a message by its encoding; below each, its bytes as ROS 1 binary", loc="left")
-    figure.legend(loc="outside lower center", ncols=3, frameon=False)

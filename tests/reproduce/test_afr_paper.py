@@ -9,13 +9,12 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from bufgym import policies
-from bufgym import sim as sender
+from bufgym import policies, sim
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
-from bufgym.reproduce import afr_fig4, afr_fig5, afr_fig9, afr_theorems
+from bufgym.reproduce import afr_fig4, afr_fig5, afr_fig9, afr_theorems, run
 from bufgym.scenario import Interruption
 from bufgym.sim import NEVER
 
@@ -108,8 +107,8 @@ def test_random_keeps_each_message_as_eq_9_says(L: int, T: int) -> None:
     runs = 20_000 if JIT else 200
     rng = np.random.default_rng(7)
     episode = Interruption(law="fixed", t_max=T).episode(T)
-    done = sender.run(policies.get("random"), [episode.with_uniforms(rng) for _ in range(runs)], L, qoi.exponential())
-    kept = (np.array(done.batch.log["dropped_us"]) == NEVER).mean(axis=0)
+    senders = sim.run(policies.get("random"), [episode.with_uniforms(rng) for _ in range(runs)], L, qoi.exponential())
+    kept = (np.array(senders.batch.log["dropped_us"]) == NEVER).mean(axis=0)
     assert kept[0] == kept[T + 1] == 1
     for i in range(1, T + 1):
         expected = (L / (L + 1)) ** min(T - i + 1, T - L)
@@ -183,8 +182,8 @@ def test_a_worst_ratio_worked_by_hand() -> None:
 
 
 def test_the_grid_has_no_violation() -> None:
-    text = afr_theorems.report(5, 80).text
-    assert text.count(" 0 violations") == text.count("violations") == 5
+    text = run("afr-theorems", max_capacity=5, last_T=80)
+    assert text.count(" 0 violations") == text.count("violations") == text.count("holds") == 5
 
 
 def test_properties_can_fail() -> None:

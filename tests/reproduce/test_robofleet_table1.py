@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import base64
-import csv
 import json
 import math
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,9 +18,9 @@ from flatbuffers import number_types as fbtypes
 from flatbuffers.table import Table
 
 from bufgym.errors import BufgymError
-from bufgym.reproduce import encodings
+from bufgym.reproduce import encodings, run
 from bufgym.reproduce.encodings import ENCODINGS, KINDS, content, encode, sizes, stores
-from bufgym.reproduce.robofleet_table1 import PAPER, fitted, of_paper, report
+from bufgym.reproduce.robofleet_table1 import PAPER, Reproduction, fitted, of_paper
 
 HEADER = 4 + 8 + 4  # seq, stamp, length of frame_id
 
@@ -270,10 +268,10 @@ def test_the_fitted_messages_have_the_papers_bytes_as_ros_binary(beams: int) -> 
 
 
 def test_table1_stands_beside_the_papers() -> None:
-    table = report()
-    ours = {(row[0], row[1]): row[2] for row in table.rows}
-    ratio = {(row[0], row[1]): row[4] for row in table.rows}
-    assert len(table.rows) == len(KINDS) * len(ENCODINGS)
+    rows = Reproduction().simulate()
+    ours = {(row["message"], row["encoding"]): row["bytes"] for row in rows}
+    ratio = {(row["message"], row["encoding"]): row["ours_to_paper"] for row in rows}
+    assert len(rows) == len(KINDS) * len(ENCODINGS)
     assert ours["NavSatFix", "robofleet-bare"] == PAPER["NavSatFix"][1]
     assert ours["LaserScan", "robofleet-bare"] == PAPER["LaserScan"][1] + 4
     assert ours["CompressedImage", "robofleet-bare"] == PAPER["CompressedImage"][1] + 24
@@ -286,31 +284,21 @@ def test_table1_stands_beside_the_papers() -> None:
     assert float(ratio["CompressedImage", "json"]) < 0.4
     assert 1 < float(ratio["LaserScan", "json-numbers"]) < 1.25
     assert 1 < float(ratio["NavSatFix", "json-numbers"]) < 1.35
-    assert ratio["PoseStamped", "json"] == ratio["LaserScan", "cdr"] == ""
+    assert ratio["PoseStamped", "json"] == ratio["LaserScan", "cdr"] is None
     assert of_paper("PoseStamped", "ros1") is None
     for said in (
         "Not in the paper's table: PointCloud2, PoseStamped",
         "with seq = 0 has 7,328 bytes, +0",
         "cannot be of",
     ):
-        assert said in " ".join(table.text.split())
+        assert said in " ".join(run("robofleet-table1").split())
 
 
 def test_the_share_of_beams_without_return_that_the_text_names_has_the_papers_json() -> None:
-    text = " ".join(report().text.split())
+    text = " ".join(run("robofleet-table1").split())
     share = float(text.split("json-numbers with ")[1].split("%")[0]) / 100
     size = sizes("LaserScan", beams=1800, frame_id="l" * 8, no_return=share)["json-numbers"]
     assert size == pytest.approx(PAPER["LaserScan"][2], rel=0.01)  # it names whole per cent
-
-
-def test_numbers_and_figure_are_saved(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    table = report(points=50)
-    with table.save_numbers(tmp_path / "t.csv").open(newline="", encoding="utf-8") as file:
-        header, *rows = csv.reader(file)
-    assert header == ["message", "encoding", "bytes", "paper_bytes", "ours_to_paper"]
-    assert ["NavSatFix", "ros1", "127", "127", "1.0000"] in rows
-    assert table.save_figure(tmp_path / "t.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
 
 
 # --- bad input -------------------------------------------------------------------------------------------------------
@@ -350,7 +338,7 @@ def test_an_unknown_encoding_lists_the_known() -> None:
 def test_beams_that_cannot_make_the_papers_size_are_refused() -> None:
     for beams in (1785, 1803):
         with pytest.raises(BufgymError, match=f"beams = {beams}: 7260 bytes would need a frame_id of"):
-            report(beams=beams)
+            Reproduction(beams=beams).simulate()
 
 
 @pytest.mark.parametrize(
