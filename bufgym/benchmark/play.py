@@ -38,7 +38,7 @@ class Player:
 
         Where the socket asks: 0..L-1 send, L hold.
         """
-        batch = named(senders.batch)
+        batch = named(senders.batch._replace(parameters=self.policy.parameter_array))
         sender = batch.senders[i]
         if sender.waiting not in (ARRIVAL_WAITS, SOCKET_WAITS):
             raise BufgymError(f"sender {i}: no decision is due")

@@ -133,6 +133,13 @@ class Policy:
         """What it does: the first line of the function's docstring, unless ``about`` says it."""
         return self.about or (inspect.getdoc(self.on_arrival) or "").split("\n")[0]
 
+    @functools.cached_property
+    def parameter_array(self) -> NDArray[np.float64]:
+        """What its functions read as ``buffer.parameters``: float64[parameters], read-only."""
+        numbers = np.array([self.memory[name] for name in self.parameters], np.float64)
+        numbers.flags.writeable = False
+        return numbers
+
     def new_memory(self, senders: int = 1, capacity: int = 0) -> NDArray[np.float64]:
         """Fresh memory for so many senders with L = ``capacity``, float64[senders, entries]."""
         start = np.array(list(self.memory.values()) or [0.0], np.float64)
@@ -178,10 +185,11 @@ def signatures() -> tuple[Any, Any, Any, Any]:
     """Numba types of ``on_arrival``, ``on_departure``, ``on_dequeue`` and ``on_send``."""
     message, topic = numba.from_dtype(MESSAGE), numba.from_dtype(TOPIC)
     int_, real = numba.types.int64, numba.types.float64
-    reals = numba.types.Array(real, 1, "C")
+    reals, constants = numba.types.Array(real, 1, "C"), numba.types.Array(real, 1, "C", readonly=True)
     types = {
         "slots": numba.types.Array(message, 1, "C"),
-        "v": numba.types.Array(real, 1, "C", readonly=True),
+        "v": constants,
+        "parameters": constants,
         "topics": numba.types.Array(topic, 1, "C"),
     }
     reals_of = {"dequeued_x", "previous_x", "left_fraction", "period_us", "service_ratio"}
