@@ -19,8 +19,6 @@ from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.afr import MEMORY, C, P, R, afr_departure, thin
 from bufgym.policies.registry import register
 
-ALPHA = len(MEMORY)
-
 
 @kernel
 def growing_gap(r: float, p: float, L: int, alpha: float) -> float:
@@ -33,15 +31,15 @@ def growing_gap(r: float, p: float, L: int, alpha: float) -> float:
 
 @register(
     "linear-alpha",
-    memory={**MEMORY, "alpha": 1.302},
-    parameters=("alpha",),
+    parameters={"alpha": 1.302},
+    memory=MEMORY,
     on_departure=afr_departure,
     source="LINEAR, Bringmann et al., Online Checkpointing with Improved Worst-Case Guarantees, arXiv 1302.4216",
     compile=True,
 )
 def linear_alpha(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """LINEAR: evicts 1, 3, 5, ... pass after pass as AFR does, but keeps arrivals at times i^alpha."""
-    r, c, p, alpha = memory[R], memory[C], memory[P], memory[ALPHA]
+    r, c, p, alpha = memory[R], memory[C], memory[P], buffer.parameters[0]
     L, s = buffer.capacity, len(buffer.slots)
     lowered = r > 1 and 3 * s <= 2 * L
     if lowered:

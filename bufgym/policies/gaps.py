@@ -1,4 +1,4 @@
-"""Policies that look at the gaps between messages: drop what its neighbours say best.
+"""Policies that look at the gaps between messages: drop the one whose neighbours replace it best.
 
 Dropping slot k merges its two gaps into one; the smaller the merged gap, the less is lost. Time gaps need a clock only,
 motion gaps the robot's odometry.
@@ -19,7 +19,7 @@ from bufgym.policies.registry import register
 
 @kernel
 def smallest_time_gap(buffer: Buffer, arrival: Any, slots: int) -> int:
-    """The first of so many slots that would leave the smallest merged time gap, oldest first."""
+    """Among the first ``slots`` slots, the one that would leave the smallest merged time gap; of equals the oldest."""
     victim, smallest = 0, np.inf
     for k in range(slots):
         before, after = time_gaps(buffer, arrival, k)
@@ -40,17 +40,16 @@ def min_gap(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 
 @register(
     "even-reject",
-    memory={"beta": 1.3},
-    parameters=("beta",),
-    source="online checkpointing, a newcomer too close to the tail goes first (own rule; beta 1.2 to 1.39)",
+    parameters={"beta": 1.3},
+    source="online checkpointing, a newcomer too close to the tail is rejected (own rule; beta 1.2 to 1.39)",
     compile=True,
 )
 def even_reject(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """A full queue rejects a newcomer nearer than beta even gaps T / (L + 1) to the tail, else as min-gap.
 
-    T is the time since the message that the socket took last arrived: what L messages have to divide evenly.
+    T is the time from the arrival of the message dequeued last to now, which L messages should divide evenly.
     """
-    beta, L, s = memory[0], buffer.capacity, len(buffer.slots)
+    beta, L, s = buffer.parameters[0], buffer.capacity, len(buffer.slots)
     if s < L:
         return ACCEPT
     T = arrival.arrival_us - buffer.dequeued_arrival_us
@@ -93,10 +92,10 @@ def orbbuf(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 
 @register("greedy-qoi", source="one-step greedy, as a warning", compile=True)
 def greedy_qoi(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """A full queue does what leaves the most information this very moment: a trap.
+    """A full queue takes the decision that leaves the most information at this moment: a trap.
 
     Rejecting adds nothing; evicting slot k adds the newcomer's gain less the loss of k. Once the gaps are even,
-    replacing the tail costs least, arrival after arrival: the old prefix stays, nothing of what follows it is kept.
+    replacing the tail costs least, arrival after arrival: the old prefix stays, and nothing that follows it is kept.
     """
     if len(buffer.slots) < buffer.capacity:
         return ACCEPT

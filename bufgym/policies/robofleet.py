@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
-from bufgym.policies.registry import Client, register
+from bufgym.policies.registry import ClientSettings, register
 from bufgym.policies.schedulers import fits, make_room, oldest, oldest_of_own, topic_of
 
 
@@ -106,7 +106,7 @@ def shortest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     on_send=shortest_wait,
     for_topics=True,
     source="Robofleet, released code (ut-amrl/robofleet_client_lib)",
-    client=Client(limit_at_send=True, flush_no_drop=True),
+    client=ClientSettings(limit_at_send=True, flush_no_drop=True),
     compile=True,
 )
 def robofleet_released(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
@@ -136,7 +136,7 @@ def longest_ago(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     on_send=longest_ago,
     for_topics=True,
     source="ROS publishers, a queue a topic (queue_size: the topic's limit)",
-    client=Client(encoding="ros", awaits_acks=False, copies=True),
+    client=ClientSettings(encoding="ros", awaits_acks=False, copies=True),
     compile=True,
 )
 def ros_native(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:

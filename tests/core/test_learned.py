@@ -160,7 +160,7 @@ def test_a_linear_scorer_of_merged_gaps_is_the_fixed_policy(field, fixed, case, 
 def test_what_the_memory_held_before_does_not_matter(case, v, made):
     policy = learned.policy("random-weights", made)
     memory = policy.new_memory(1, case.capacity)
-    memory[0, len(policy.memory) :] = np.nan
+    memory[:] = np.nan
     senders = case.senders(v)
     senders.run(policy, memory)
     assert same(senders, case.run(policy, v))

@@ -289,12 +289,12 @@ def keep_even(buffer, arrival, memory):
     """Drops every second arrival that finds the queue full, the oldest otherwise."""
     if len(buffer.slots) < buffer.capacity:
         return -2
-    memory[0] += memory[1]
+    memory[0] += buffer.parameters[0]
     return 0 if memory[0] % 2 else -1
 
 
 def test_a_policy_of_your_own(own_registry):
-    layout = {"memory": {"count": 0, "by": 1}, "parameters": ("by",)}
+    layout = {"memory": {"count": 0}, "parameters": {"by": 1}}
     assert register("keep-even", **layout)(keep_even) is keep_even
     register("keep-even-compiled", compile=True, **layout)(keep_even)
     assert list(policies.names())[-2:] == ["keep-even", "keep-even-compiled"]
@@ -324,9 +324,10 @@ def test_parameters():
     # One in two: arrivals 1, 3, 5 of the outage.
     assert kept(interruption("decimate:every=2", 8, 6)) == [1, 3, 5]
     made = policies.get("decimate:every=2")
-    assert (made.name, dict(made.memory)) == ("decimate:every=2", {"every": 2, "count": 0})
+    assert (made.name, dict(made.parameters)) == ("decimate:every=2", {"every": 2})
+    assert made.parameter_array.tolist() == [2] and not made.parameter_array.flags.writeable
     assert policies.get(made) is made
-    assert policies.get("decimate").memory["every"] == 3  # its own stays
+    assert policies.get("decimate").parameters["every"] == 3  # its own stays
 
 
 @pytest.mark.parametrize(
@@ -359,8 +360,9 @@ def test_bad_names(name, own_registry):
 
 
 def test_bad_registrations(own_registry):
-    with pytest.raises(BufgymError, match=r"parameters \['speed'\] are not entries of its memory"):
-        register("mine", parameters=("speed",))
+    for what in ("parameters", "memory"):
+        with pytest.raises(BufgymError, match=rf"{what} = \('speed',\): must map names to numbers"):
+            register("mine", **{what: ("speed",)})(keep_even)
     with pytest.raises(BufgymError, match="3 is not a function"):
         register("mine")(3)
 

@@ -130,7 +130,7 @@ def test_a_loaded_policy_is_one_like_any_other(path):
         ({"name": "ok", "sha256": "0"}, "sha256: written by save itself"),
         ({"name": "ok", "scores": float("nan")}, "metadata that JSON cannot hold"),
         ({"name": "ok", "scores": {1, 2}}, "metadata that JSON cannot hold"),
-        ({"name": "ok", "notes": "x" * learned.MAX_BYTES}, "larger than"),
+        ({"name": "ok", "notes": "x" * weights.MAX_BYTES}, "larger than"),
     ],
 )
 def test_metadata_that_could_not_be_read_are_not_written(path, about, rule):
@@ -170,7 +170,7 @@ def test_a_missing_file_or_a_folder_is_refused(path):
 def test_a_file_too_large_is_refused_and_not_read_to_its_end(path):
     with open(path, "wb") as file:
         file.truncate(1 << 40)
-    refused(path, f"larger than the {learned.MAX_BYTES} bytes")
+    refused(path, f"larger than the {weights.MAX_BYTES} bytes")
 
 
 @pytest.mark.parametrize("keep", [0, 7, 8, 100, -1])
@@ -224,7 +224,7 @@ def test_metadata_that_are_no_json_object_are_refused(path, parts, text, rule):
         ("fields", [], "must be a list of at least one field"),
         ("fields", ["time_merged", "speed"], "field = speed: unknown; known: occupied, rank"),
         ("fields", ["time_merged", ["service_ratio"]], "unknown; known: occupied, rank"),
-        ("fields", ["service_ratio", "service_ratio"], "field = drain: given more than once"),
+        ("fields", ["service_ratio", "service_ratio"], "field = service_ratio: given more than once"),
         ("fields", ["service_ratio"], "must be [1] for 1 fields and hidden layers of [3]"),
     ],
 )
@@ -332,7 +332,7 @@ def test_mixing_weights_come_back_as_they_were(path):
     mixed = replace(made(3), mix=np.float32([[-1.5]]))
     weights.save(path, mixed, ABOUT)
     again = weights.read(path)[0]
-    assert again.mix.tolist() == [[-1.5]] and (again.memory() == mixed.memory()).all()
+    assert again.mix.tolist() == [[-1.5]] and (again.parameters() == mixed.parameters()).all()
 
 
 def test_a_second_scorer_comes_back_too_or_not_at_all(path):
@@ -340,7 +340,7 @@ def test_a_second_scorer_comes_back_too_or_not_at_all(path):
     weights.save(path, both, ABOUT)
     again, metadata = weights.read(path)
     assert again.mix is None and again.still.mix.tolist() == [[2.5]] and again.still.still is None
-    assert (again.memory() == both.memory()).all()
+    assert (again.parameters() == both.parameters()).all()
     tensors = tensors_of(path.read_bytes())
     del tensors["still.drop.skip"]
     put(path, tensors, metadata)
@@ -353,7 +353,7 @@ def test_the_second_scorer_has_hidden_layers_of_its_own(path, widths, others):
     weights.save(path, both, ABOUT)
     again = weights.read(path)[0]
     assert (len(again.drop.layers), len(again.still.drop.layers)) == (len(widths), len(others))
-    assert (again.memory() == both.memory()).all()
+    assert (again.parameters() == both.parameters()).all()
 
 
 @pytest.mark.parametrize(
