@@ -19,8 +19,8 @@ _SECOND_US = 1_000_000
 
 @kernel
 def largest(buffer: Buffer) -> tuple[float, float]:
-    """The highest priority and the largest weight of all topics."""
-    priority, weight = 0.0, 0.0
+    """The highest priority and the largest weight of all topics, to divide by."""
+    priority, weight = TINY, TINY
     for k in range(len(buffer.topics)):
         priority = max(priority, buffer.topics[k].priority)
         weight = max(weight, buffer.topics[k].weight)
@@ -37,38 +37,6 @@ def even_gaps(topic: Any, last_us: int, last_x: float) -> tuple[float, float]:
 
 
 @kernel
-def fill_message(
-    buffer: Buffer,
-    message: Any,
-    k: int,
-    gain: float,
-    before: tuple[int, float],
-    scale: tuple[float, float],
-    rows: NDArray[np.floating[Any]],
-) -> None:
-    """The fields of ``message`` in column ``k`` that need no successor; its gaps are squashed by ``fill_gaps``.
-
-    ``before``: time (us) and x of the message kept before it on its topic; ``scale``: as ``largest``.
-    """
-    topic = buffer.topics[message.topic]
-    age_us = buffer.now_us - message.arrival_us
-    rows[fields.OCCUPIED, k] = 1.0
-    rows[fields.TIME_BEFORE, k] = message.arrival_us - before[0]
-    rows[fields.MOTION_BEFORE, k] = message.x - before[1]
-    rows[fields.SIZE, k] = message.size_bytes
-    rows[fields.PRIORITY, k] = topic.priority / max(scale[0], TINY)
-    rows[fields.WEIGHT, k] = topic.weight / max(scale[1], TINY)
-    rows[fields.NO_DROP, k] = topic.no_drop
-    rows[fields.WAITED, k] = squash(age_us, _SECOND_US)
-    known_us = topic.dequeued_arrival_us if topic.dequeued > 0 else 0
-    rows[fields.SILENCE, k] = squash(max(buffer.now_us - known_us, 0), _SECOND_US)
-    rows[fields.LATENESS, k] = squash(age_us, topic.deadline_us) if topic.deadline_us < NO_DEADLINE_US else 0.0
-    rows[fields.QUEUED, k] = topic.queued / buffer.capacity
-    rows[fields.GAIN, k] = gain / max(scale[1], TINY)
-    rows[fields.GAIN_PER_BYTE, k] = rows[fields.GAIN, k] / message.size_bytes
-
-
-@kernel
 def fill_gaps(
     buffer: Buffer,
     arrival: Any,
@@ -77,10 +45,13 @@ def fill_gaps(
     k: int,
     step_us: int,
     step_x: float,
-    scale: tuple[float, float],
+    weight: float,
     rows: NDArray[np.floating[Any]],
 ) -> None:
-    """The gaps and losses of the message in column ``k``, of topic ``number``, whose successor is one step after it."""
+    """The gaps and losses of the message in column ``k``, of topic ``number``, whose successor is one step after it.
+
+    Its row holds the plain gaps to its predecessor; ``weight``: the largest of all topics.
+    """
     topic = buffer.topics[number]
     v = buffer.v[topic.v_start :]
     before_us, before_x = float(rows[fields.TIME_BEFORE, k]), float(rows[fields.MOTION_BEFORE, k])
@@ -91,7 +62,7 @@ def fill_gaps(
     lost = max(merging_loss(v, before_x, value(v, before_x), step_x, value(v, step_x)), 0.0)
     even_gain = value(v, even_x)
     even_loss = max(merging_loss(v, even_x, even_gain, even_x, even_gain), ROUNDING)
-    rows[fields.LOSS, k] = lost * topic.weight / max(scale[1], TINY)
+    rows[fields.LOSS, k] = lost * topic.weight / weight
     rows[fields.RELATIVE_LOSS, k] = squash(lost, even_loss)
     rows[fields.TIME_MERGED, k] = squash(before_us + step_us, 2 * even_us)
     rows[fields.MOTION_MERGED, k] = squash(before_x + step_x, 2 * even_x)
@@ -106,7 +77,7 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
     Empty slots are 0. The newcomer is last; when the socket asks (not ``arriving``) its column is empty too.
     """
     s, capacity = len(buffer.slots), buffer.capacity
-    scale = largest(buffer)
+    priority, weight = largest(buffer)
     for number in range(len(buffer.topics)):
         buffer.topics[number].mark = -1  # the column of the topic's message before the one at hand
     rows[:, s:] = 0.0
@@ -116,20 +87,34 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
         message, column = (buffer.slots[k], k) if k < s else (arrival, capacity)
         topic = buffer.topics[message.topic]
         j = topic.mark
-        gain, before = message.gain, (message.arrival_us, message.x)
+        before_us, before_x = message.arrival_us, message.x
         if j >= 0:
-            before = (buffer.slots[j].arrival_us, buffer.slots[j].x)
-            step_us, step_x = message.arrival_us - before[0], message.x - before[1]
-            fill_gaps(buffer, arrival, arriving, message.topic, j, step_us, step_x, scale, rows)
+            before_us, before_x = buffer.slots[j].arrival_us, buffer.slots[j].x
+            step_us, step_x = message.arrival_us - before_us, message.x - before_x
+            fill_gaps(buffer, arrival, arriving, message.topic, j, step_us, step_x, weight, rows)
         elif topic.dequeued > 0:
-            before = (topic.dequeued_arrival_us, topic.dequeued_x)
+            before_us, before_x = topic.dequeued_arrival_us, topic.dequeued_x
+        gain = message.gain
         if k == s:
             known = j >= 0 or topic.dequeued > 0
-            gain = topic.weight * value(buffer.v[topic.v_start :], message.x - before[1]) if known else 0.0
-        fill_message(buffer, message, column, gain, before, scale, rows)
+            gain = topic.weight * value(buffer.v[topic.v_start :], arrival.x - before_x) if known else 0.0
+        age_us, known_us = buffer.now_us - message.arrival_us, topic.dequeued_arrival_us if topic.dequeued > 0 else 0
+        rows[fields.OCCUPIED, column] = 1.0
         rows[fields.RANK, column] = (k + 1) / (s + 1)
+        rows[fields.TIME_BEFORE, column] = message.arrival_us - before_us
+        rows[fields.MOTION_BEFORE, column] = message.x - before_x
+        rows[fields.SIZE, column] = message.size_bytes
+        rows[fields.PRIORITY, column] = topic.priority / priority
+        rows[fields.WEIGHT, column] = topic.weight / weight
+        rows[fields.NO_DROP, column] = topic.no_drop
         rows[fields.OLDEST, column] = 1.0 if j < 0 and k < s else 0.0
         rows[fields.OWN, column] = 1.0 if arriving and message.topic == arrival.topic else 0.0
+        rows[fields.WAITED, column] = squash(age_us, _SECOND_US)
+        rows[fields.SILENCE, column] = squash(max(buffer.now_us - known_us, 0), _SECOND_US)
+        rows[fields.LATENESS, column] = squash(age_us, topic.deadline_us) if topic.deadline_us < NO_DEADLINE_US else 0.0
+        rows[fields.QUEUED, column] = topic.queued / capacity
+        rows[fields.GAIN, column] = gain / weight
+        rows[fields.GAIN_PER_BYTE, column] = rows[fields.GAIN, column] / message.size_bytes
         topic.mark = column
         size_sum += message.size_bytes
         gain_sum += rows[fields.GAIN_PER_BYTE, column]
@@ -146,7 +131,7 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
             step_x = max(topic.previous_x - tail.x, 0.0) + topic.step_x
         else:
             continue
-        fill_gaps(buffer, arrival, arriving, number, j, step_us, step_x, scale, rows)
+        fill_gaps(buffer, arrival, arriving, number, j, step_us, step_x, weight, rows)
     squash_row(rows[fields.SIZE], size_sum / max(count, 1))
     squash_row(rows[fields.GAIN_PER_BYTE], gain_sum / max(count, 1))
 
@@ -164,7 +149,7 @@ def observe_topic_context(buffer: Buffer, arrival: Any, arriving: bool, context:
         context[fields.ARRIVAL_TIME_GAP] = squash(arrival.arrival_us - buffer.previous_us, even_us)
         context[fields.ARRIVAL_MOTION_GAP] = squash(arrival.x - buffer.previous_x, even_x)
         gain = value(v, even_x)
-        context[fields.EVEN_VALUE] = topic.weight * gain / max(largest(buffer)[1], TINY)
+        context[fields.EVEN_VALUE] = topic.weight * gain / largest(buffer)[1]
         context[fields.BEND] = min(merging_loss(v, even_x, gain, even_x, gain) / max(gain, TINY), 1.0)
     context[fields.SOCKET_ASKS] = 0.0 if arriving else 1.0
     context[fields.IN_FLIGHT] = squash(buffer.in_flight, buffer.window)

@@ -6,15 +6,11 @@ Both drop early to tell TCP senders to slow down. A camera does not slow down, s
 from __future__ import annotations
 
 import math
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.policies.classic import keep_first
-from bufgym.policies.registry import register
+from bufgym.policies.registry import Arrival, Memory, register
 
 TARGET_MS, INTERVAL_MS = range(2)  # where CoDel's parameters lie
 FIRST_ABOVE, DROP_NEXT, DROPS, LAST_DROPS, DROPPING, AGAIN, MAX_PACKET = range(7)  # and its memory
@@ -27,7 +23,7 @@ def control_law(t_us: float, count: float, interval_us: float) -> float:
 
 
 @kernel
-def ok_to_drop(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
+def ok_to_drop(buffer: Buffer, memory: Memory) -> bool:
     """RFC 8289, 5.6 (dodequeue): whether sojourn times have been above target for a whole interval.
 
     Never where at most one message ("maxpacket", the largest seen) waits behind the head: the link must not starve.
@@ -44,7 +40,7 @@ def ok_to_drop(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
     return bool(now_us >= memory[FIRST_ABOVE])
 
 
-def codel_dequeue(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
+def codel_dequeue(buffer: Buffer, memory: Memory) -> bool:
     """RFC 8289, 5.5 (dequeue), one head a call: the RFC's loop goes on for as long as the answer is True.
 
     ``AGAIN`` marks that the loop has just dropped the head before this one. After the first drop of a dropping state
@@ -84,7 +80,7 @@ def codel_dequeue(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
     source="CoDel, RFC 8289",
     compile=True,
 )
-def codel(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def codel(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """CoDel: drops heads while sojourn times stay above `target_ms` for `interval_ms`; a full queue drops the tail.
 
     The defaults are the RFC's, for packets of 1500 bytes. For messages, choose a target of at least the time that
@@ -104,7 +100,7 @@ AVERAGE, COUNT = range(2)  # and its memory
     source="Random Early Detection, Floyd and Jacobson 1993",
     compile=True,
 )
-def red(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def red(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """RED: rejects at random, the more the higher the average occupancy; a full queue drops the tail.
 
     Thresholds are fractions of L. The paper's term for idle times needs the link's bandwidth and is left out: an

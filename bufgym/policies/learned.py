@@ -19,17 +19,17 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.observe import CONTEXT_FIELDS, FIELDS, SLOT_FIELDS, observe_context, observe_slots
-from bufgym.policies.registry import Policy
+from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.scoring import DROP, KEEP, Network, ScorerWeights, begin, divide, read_context, score, unpack
 
-__all__ = ["NAMES", "Network", "Weights", "drop_best", "policy", "random_weights"]
+__all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 
 SLOTS, CONTEXT = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
 NAMES = tuple(field.name for field in FIELDS)
@@ -39,8 +39,9 @@ STILL = 0.07
 arrival of an interruption on (1/16), or 41 arrivals after a link that kept up has stopped."""
 
 
-def drop_best(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """A trained slot scorer."""
+@kernel
+def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """The decision that scores highest."""
     s, L = len(buffer.slots), buffer.capacity
     scorer = unpack(buffer.parameters, 0, 2)
     if scorer.end < len(buffer.parameters) and buffer.service_ratio < STILL:
@@ -63,6 +64,11 @@ def drop_best(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
         if score(scorer, KEEP, common, L, scratch) >= best:
             decision = ACCEPT
     return decision
+
+
+def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A trained slot scorer."""
+    return best_drop(buffer, arrival, memory)
 
 
 # --- weights ---------------------------------------------------------------------------------------------------------
@@ -92,7 +98,7 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
     """The policy that these weights make; it works for every L."""
     scratch = max(scorer.scratch for scorer in (weights, weights.still or weights))
     numbers = tuple(weights.parameters().tolist())
-    return Policy(name, drop_best, weights=numbers, work=(scratch, SLOTS), source=source, about=summary, compile=True)
+    return Policy(name, on_arrival, weights=numbers, work=(scratch, SLOTS), source=source, about=summary, compile=True)
 
 
 def random_weights(fields: tuple[str, ...], widths: tuple[int, ...], rng: np.random.Generator) -> Weights:

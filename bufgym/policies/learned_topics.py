@@ -13,7 +13,6 @@ queue holds nothing else, and no better score is worth that risk.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,79 +27,80 @@ from bufgym.observe import (
     observe_topic_context,
     observe_topic_slots,
 )
-from bufgym.policies.registry import Policy
+from bufgym.policies import scoring
+from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.robofleet import next_no_drop
 from bufgym.policies.schedulers import fits, make_room, makes_room
-from bufgym.policies.scoring import (
-    DROP,
-    KEEP,
-    SEND,
-    Network,
-    Scorer,
-    ScorerWeights,
-    Scratch,
-    begin,
-    divide,
-    read_context,
-    score,
-    unpack,
-)
+from bufgym.policies.scoring import DROP, KEEP, SEND, Network, Scorer, ScorerWeights, Scratch
 
 SLOTS, CONTEXT = len(SLOT_FIELDS + TOPIC_SLOT_FIELDS), len(CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS)
 NAMES = tuple(field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS + CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS)
 
 
 @kernel
-def observed(buffer: Buffer, arrival: Any, arriving: bool, memory: NDArray[np.float64]) -> tuple[Scorer, Scratch]:
+def observed(buffer: Buffer, arrival: Arrival, arriving: bool, memory: Memory) -> tuple[Scorer, Scratch]:
     """The scorer, and the memory with all that it observes in it."""
-    scorer = unpack(buffer.parameters, 0, 3)
-    scratch = divide(memory, scorer, CONTEXT, SLOTS, buffer.capacity)
+    scorer = scoring.unpack(buffer.parameters, 0, 3)
+    scratch = scoring.divide(memory, scorer, CONTEXT, SLOTS, buffer.capacity)
     observe_topic_context(buffer, arrival, arriving, scratch.context)
     observe_topic_slots(buffer, arrival, arriving, scratch.rows)
-    read_context(scorer, scratch)
+    scoring.read_context(scorer, scratch)
     return scorer, scratch
 
 
-def drop_best(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """A trained scheduler."""
-    if len(buffer.topics) == 1:
-        return make_room(buffer, arrival)  # one queue has no topics to tell apart
+@kernel
+def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """The decision that scores highest."""
     scorer, scratch = observed(buffer, arrival, True, memory)
     newcomer, no_drop = buffer.capacity, buffer.topics[arrival.topic].no_drop == 1
-    common = begin(scorer, DROP, scratch)
+    common = scoring.begin(scorer, DROP, scratch)
     best, decision = -np.inf, REJECT
     for k in range(len(buffer.slots)):
         if makes_room(buffer, arrival, k):
-            dropped = score(scorer, DROP, common, k, scratch)
+            dropped = scoring.score(scorer, DROP, common, k, scratch)
             if dropped > best:
                 best, decision = dropped, k
     if not no_drop:
-        rejected = score(scorer, DROP, common, newcomer, scratch)
+        rejected = scoring.score(scorer, DROP, common, newcomer, scratch)
         if rejected > best:
             best, decision = rejected, REJECT
     if fits(buffer, arrival):
-        common = begin(scorer, KEEP, scratch)
-        if no_drop or score(scorer, KEEP, common, newcomer, scratch) >= best:
+        common = scoring.begin(scorer, KEEP, scratch)
+        if no_drop or scoring.score(scorer, KEEP, common, newcomer, scratch) >= best:
             decision = ACCEPT
     return decision
 
 
-def send_best(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+@kernel
+def best_send(buffer: Buffer, memory: Memory) -> int:
     """The oldest message of the topic that scores highest."""
-    if len(buffer.topics) == 1:
-        return 0
-    kept = next_no_drop(buffer, 0)
-    if kept != HOLD:
-        return kept
     scorer, scratch = observed(buffer, buffer.slots[0], False, memory)
-    common = begin(scorer, SEND, scratch)
+    common = scoring.begin(scorer, SEND, scratch)
     best, choice = -np.inf, HOLD
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
-            sent = score(scorer, SEND, common, k, scratch)
+            sent = scoring.score(scorer, SEND, common, k, scratch)
             if sent > best:
                 best, choice = sent, k
     return choice
+
+
+# Kernels return numbers alone to Python: the scorer's views stay inside them.
+
+
+def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A trained scheduler."""
+    if len(buffer.topics) == 1:
+        return make_room(buffer, arrival)  # one queue has no topics to tell apart
+    return best_drop(buffer, arrival, memory)
+
+
+def on_send(buffer: Buffer, memory: Memory) -> int:
+    """The oldest no_drop message if there is one; else what scores highest."""
+    if len(buffer.topics) == 1:
+        return 0
+    kept = next_no_drop(buffer, 0)
+    return kept if kept != HOLD else best_send(buffer, memory)
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ def policy(name: str, weights: TopicWeights, summary: str = "", source: str = ""
     """The policy that these weights make; it works for every L and any topics."""
     return Policy(
         name,
-        drop_best,
-        on_send=send_best,
+        on_arrival,
+        on_send=on_send,
         weights=tuple(weights.parameters().tolist()),
         work=(weights.scratch, SLOTS),
         source=source,

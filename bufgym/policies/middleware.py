@@ -6,14 +6,9 @@ here so that their users find them in a table. None knows what a message is wort
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first, keep_last
-from bufgym.policies.registry import ClientSettings, register
+from bufgym.policies.registry import Arrival, ClientSettings, Memory, register
 
 
 @register(
@@ -22,18 +17,18 @@ from bufgym.policies.registry import ClientSettings, register
     source="ROS 2 QoS history KEEP_LAST(depth), default 10",
     compile=True,
 )
-def ros_keep_last(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def ros_keep_last(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ROS 2 KEEP_LAST: the oldest unsent message goes when `depth` wait (at most L)."""
     return keep_last(len(buffer.slots), min(buffer.parameters[0], buffer.capacity))
 
 
 @register("dds-keep-all", source="DDS QoS HISTORY KEEP_ALL with best-effort RELIABILITY", compile=True)
-def dds_keep_all(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def dds_keep_all(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS KEEP_ALL, best effort: a full queue rejects the newcomer; reliable would block the publisher instead."""
     return keep_first(len(buffer.slots), buffer.capacity)
 
 
-def expired(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
+def expired(buffer: Buffer, memory: Memory) -> bool:
     """Whether the head has outlived its lifespan; the messages behind it are younger."""
     return bool(buffer.now_us - buffer.slots[0].arrival_us > 1e6 * buffer.parameters[0])
 
@@ -45,7 +40,7 @@ def expired(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
     source="DDS QoS LIFESPAN",
     compile=True,
 )
-def lifespan(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def lifespan(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS LIFESPAN: nothing older than `lifespan_s` is sent; the head goes when full.
 
     DDS removes a message when it expires; here it goes when it would be sent. Until then it is the next to go anyway.
@@ -59,7 +54,7 @@ def lifespan(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     source="DDS QoS TIME_BASED_FILTER, minimum_separation",
     compile=True,
 )
-def time_filter(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def time_filter(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS TIME_BASED_FILTER: accepts at most one message in `separation_s`; the head goes when full."""
     s, separation_us = len(buffer.slots), 1e6 * buffer.parameters[0]
     # The message accepted last: the tail is never dropped before the head.
@@ -70,13 +65,13 @@ def time_filter(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> in
 
 
 @register("zenoh-drop", source="Zenoh congestion control DROP", compile=True)
-def zenoh_drop(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Zenoh DROP: put drops the newcomer when full; the 1 ms that it first waits for room is left out."""
     return keep_first(len(buffer.slots), buffer.capacity)
 
 
 @register("zenoh-ring", source="Zenoh RingChannel(L)", compile=True)
-def zenoh_ring(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def zenoh_ring(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Zenoh RingChannel: keeps the newest L."""
     return keep_last(len(buffer.slots), buffer.capacity)
 
@@ -87,7 +82,7 @@ def zenoh_ring(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int
     source="foxglove-sdk, message backlog of a client, default 1024",
     compile=True,
 )
-def foxglove_sdk(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def foxglove_sdk(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Foxglove SDK: a client's oldest message goes when `depth` wait (at most L)."""
     return keep_last(len(buffer.slots), min(buffer.parameters[0], buffer.capacity))
 
@@ -98,7 +93,7 @@ def foxglove_sdk(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> i
     source="ros-foxglove-bridge, send_buffer_limit, default 10 MB",
     compile=True,
 )
-def foxglove_backlog(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def foxglove_backlog(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ros-foxglove-bridge: drops the newcomer when all bytes not yet sent, with it, reach `limit_mb`, or none fits."""
     buffered_bytes = buffer.backlog_bytes + buffer.left_bytes
     if buffered_bytes + arrival.size_bytes >= 1e6 * buffer.parameters[0]:
@@ -113,6 +108,6 @@ def foxglove_backlog(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) 
     client=ClientSettings(encoding="json", awaits_acks=False),
     compile=True,
 )
-def rosbridge(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def rosbridge(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """rosbridge: accepts everything, however long the queue grows; JSON, first in, first out, without acks."""
     return ACCEPT

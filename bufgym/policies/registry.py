@@ -42,25 +42,29 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import compile_for
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 
-OnArrival = Callable[[Buffer, Any, NDArray[np.float64]], int]
-OnDeparture = Callable[[Buffer, NDArray[np.float64]], None]
-OnDequeue = Callable[[Buffer, NDArray[np.float64]], bool]
-OnSend = Callable[[Buffer, NDArray[np.float64]], int]
-Privileged = Callable[[Any, int, int, Any], NDArray[np.float64]]
+Arrival = Any
+"""A MESSAGE record."""
+Memory = NDArray[np.float64]
+"""float64[entries]: a policy's state at one sender."""
+OnArrival = Callable[[Buffer, Arrival, Memory], int]
+OnDeparture = Callable[[Buffer, Memory], None]
+OnDequeue = Callable[[Buffer, Memory], bool]
+OnSend = Callable[[Buffer, Memory], int]
+Privileged = Callable[[Any, int, int, Any], Memory]
 Functions = tuple[OnArrival, OnDeparture, OnDequeue, OnSend]
 Fields = ParamSpec("Fields")
 
 
-def _ignore(buffer: Buffer, memory: NDArray[np.float64]) -> None:
+def _ignore(buffer: Buffer, memory: Memory) -> None:
     """The ``on_departure`` of a policy that does not track departures."""
 
 
-def _keep(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
+def _keep(buffer: Buffer, memory: Memory) -> bool:
     """The ``on_dequeue`` of a policy that drops nothing there."""
     return False
 
 
-def _send_head(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+def _send_head(buffer: Buffer, memory: Memory) -> int:
     """The ``on_send`` of a policy that is no scheduler: first in, first out."""
     return 0
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_last
-from bufgym.policies.registry import register
+from bufgym.policies.registry import Arrival, Memory, register
 
 SEEN = 0
 
 
-def reservoir_departure(buffer: Buffer, memory: NDArray[np.float64]) -> None:
+def reservoir_departure(buffer: Buffer, memory: Memory) -> None:
     """The link moves again: what is still queued is the sample that a new interruption begins with."""
     memory[SEEN] = len(buffer.slots)
 
@@ -26,7 +21,7 @@ def reservoir_departure(buffer: Buffer, memory: NDArray[np.float64]) -> None:
     source="Vitter, Random sampling with a reservoir, 1985 (algorithm R)",
     compile=True,
 )
-def reservoir(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def reservoir(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Reservoir sampling: every arrival of the interruption is kept with the same probability."""
     # With decide_at="overflow" messages enter unasked; all of them are still queued at the first decision.
     memory[SEEN] = max(memory[SEEN], len(buffer.slots)) + 1
@@ -46,7 +41,7 @@ COUNT = 0
     source="fixed decimation, 30 to 10 frames/s (Golodetz et al. 2018)",
     compile=True,
 )
-def decimate(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def decimate(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Fixed decimation: of the arrivals it is asked about, one in `every` is queued; the head goes when full."""
     n, every = memory[COUNT], buffer.parameters[0]
     memory[COUNT] += 1
@@ -61,7 +56,7 @@ def decimate(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     source="motion keyframes, a threshold on distance or angle (Dong et al.)",
     compile=True,
 )
-def keyframe(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def keyframe(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Motion keyframes: accepts what is `step` in x beyond the keyframe before it; the head goes when full."""
     s, step = len(buffer.slots), buffer.parameters[0]
     last_x = buffer.slots[s - 1].x if s > 0 else buffer.dequeued_x  # the tail is never dropped before the head
