@@ -166,11 +166,11 @@ class Steady(Policy):
         if not queue:
             self.first = newcomer["seq"]
         places = [self.place(m["seq"] - self.first + 1, L) for m in [*queue, newcomer]]
-        wanted = places.pop()
-        if wanted is None:
+        place = places.pop()
+        if place is None:
             return REJECT
-        if wanted in places:
-            return places.index(wanted)
+        if place in places:
+            return places.index(place)
         return ACCEPT if len(queue) < L else 0
 
 

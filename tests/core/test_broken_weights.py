@@ -54,7 +54,7 @@ def test_what_is_no_safetensors_is_refused(path, data):
     refused(path, "no safetensors file, or a broken one")
 
 
-def test_a_safetensors_file_of_somebody_elses_is_refused(path):
+def test_a_safetensors_file_of_another_program_is_refused(path):
     path.write_bytes(safetensors({"weight": np.zeros(3, np.float32)}))
     refused(path, "no metadata of bufgym's")
     path.write_bytes(safetensors({"weight": np.zeros(3, np.float32)}, metadata={"format": "pt"}))

@@ -189,7 +189,7 @@ def test_reservoir_is_uniform_when_asked_at_overflow_only():
     assert np.abs(share - L / T).max() < 4.5 * np.sqrt(L / T * (1 - L / T) / RUNS)
 
 
-def test_luck_decides_and_nothing_else():
+def test_the_uniform_draws_decide_and_nothing_else():
     assert drops(interruption("random", 3, 40, uniform=1)) == drops(interruption("random", 3, 40, uniform=1))
     assert drops(interruption("random", 3, 40, uniform=1)) != drops(interruption("random", 3, 40, uniform=2))
 

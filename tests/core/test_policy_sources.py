@@ -170,7 +170,7 @@ def test_lifespan():
     assert longest_wait_us("drop-oldest") > 2.5e6
     # Exactly 0.5 s old is not too old: the link rests for as long, 1 us less and 1 us more.
     for lifespan_s, dropped in ((0.499999, 1), (0.5, 0), (0.500001, 0)):
-        arrivals = messages(np.array([0, 0]), 500_000)  # the second waits until the first has crossed, at 0.5 s
+        arrivals = messages(np.array([0, 0]), 500_000)  # the second waits until the first is transmitted, at 0.5 s
         episode = Episode(arrivals, Link(Trace.constant(1e6, 20)))
         result = run(policies.get(f"lifespan:lifespan_s={lifespan_s}"), [episode], 4, V)
         assert len(log(result)["dropped_us"]) == dropped

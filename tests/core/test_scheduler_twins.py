@@ -71,14 +71,14 @@ def beside_its_twin(name, case, topics):
 
     def on_arrival(buffer, arrival, memory):
         decision, queue = policy.on_arrival(buffer, arrival, memory), listed(buffer.slots)
-        theirs = twin.decide(queue, listed([arrival])[0])
-        assert theirs == {ACCEPT: ACCEPTED, REJECT: REJECTED}.get(decision, queue[decision] if decision >= 0 else None)
+        expected, victim = twin.decide(queue, listed([arrival])[0]), queue[decision] if decision >= 0 else None
+        assert expected == {ACCEPT: ACCEPTED, REJECT: REJECTED}.get(decision, victim)
         return decision
 
     def on_send(buffer, memory):
         k, queue = policy.on_send(buffer, memory), listed(buffer.slots)
-        theirs = twin.choose(queue, int(buffer.now_us), int(buffer.in_flight), int(buffer.window))
-        assert theirs == (None if k == HOLD else queue[k])
+        expected = twin.choose(queue, int(buffer.now_us), int(buffer.in_flight), int(buffer.window))
+        assert expected == (None if k == HOLD else queue[k])
         return k
 
     return replace(policy, on_arrival=on_arrival, on_send=on_send, compile=False)
@@ -123,7 +123,7 @@ def test_on_one_queue_robofleet_keeps_one_slot(name, case):
 
 
 def accounts(senders, topics):
-    """For each topic, how many messages there are of each fate; no message has two."""
+    """For each topic, how many messages were transmitted, are being sent, are queued and were dropped; each is one."""
     sender, batch = np.asarray(senders.batch.senders)[0], senders.batch
     n = int(sender["arrivals"])
     rows, topic = np.asarray(batch.log[0])[:n], np.asarray(batch.arrivals[0])["topic"][:n]

@@ -61,7 +61,7 @@ def topics(a=1.0, b=2.0, c=3.0, **more):
     return [*(Topic(name, **given) for name, given in rules.items()), Topic("N", no_drop=True, **more)]
 
 
-# --- who goes next ---------------------------------------------------------------------------------------------------
+# --- what goes next --------------------------------------------------------------------------------------------------
 
 
 def test_fifo_takes_them_as_they_come():
@@ -105,7 +105,7 @@ def test_edf():
     assert order(played("edf", "0 A, 5 A, 10 B, 20 B, 35 C, 45 C", timed)) == [0, 4, 2, 5, 3, 1]
 
 
-# --- who goes for a newcomer -----------------------------------------------------------------------------------------
+# --- what makes room for a newcomer ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["fifo", "strict-priority", "age-greedy", "edf"])
