@@ -65,7 +65,7 @@ def test_weights_are_a_vector_and_back() -> None:
     begin = scheduling.start()
     vector = scheduling.to_vector(begin)
     assert len(vector) == (n - c) + n + 1 + (n - c)
-    assert scheduling.from_vector(vector).memory().tobytes() == begin.memory().tobytes()
+    assert scheduling.from_vector(vector).parameters().tobytes() == begin.parameters().tobytes()
     counted = np.arange(len(vector), dtype=float)
     made = scheduling.from_vector(counted)
     assert (scheduling.to_vector(made) == counted).all()

@@ -26,6 +26,7 @@ class Player:
             reason = "drops at dequeue" if policy.drops_at_dequeue else "has an unbounded queue"
             raise BufgymError(f"policy {policy.name} {reason}: it can be benchmarked, but not play in an environment")
         self.policy = policy
+        self._parameters = policy.parameter_array
         self._memory: list[NDArray[np.float64] | None] = [None] * n
         self._dequeued = np.zeros(n, np.int64)
 
@@ -39,7 +40,7 @@ class Player:
 
         Where the socket asks: 0..L-1 send, L hold. BufgymError where no decision is due, or the policy gave none.
         """
-        batch = named(senders.batch)
+        batch = named(senders.batch._replace(parameters=self._parameters))
         sender = batch.senders[i]
         if sender.waiting not in (ARRIVAL_WAITS, SOCKET_WAITS):
             raise BufgymError(f"sender {i}: no decision is due")

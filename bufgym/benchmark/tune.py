@@ -95,7 +95,7 @@ def settings(policy: str) -> list[str]:
     specs = [policy]
     for numbers in product(*axes.values()):
         made = default.with_parameters(**dict(zip(axes, numbers, strict=True)))
-        if made.memory != default.memory:
+        if made.parameters != default.parameters:
             specs.append(made.name)
     return specs
 
@@ -312,7 +312,7 @@ def tuned(suite: str) -> list[str]:
             setting, default = policies.get(entry["setting"]), policies.get(policy)
         except BufgymError as error:
             raise BufgymError(f"{FILE}: {suite}.{policy}: {error}") from None
-        if setting.memory != default.memory:
+        if setting.parameters != default.parameters:
             found.append(setting.name)
     return found
 

@@ -67,7 +67,7 @@ def _list_policies() -> str:
         for name in policies.names(for_topics=for_topics):
             policy = policies.get(name)
             lines.append(f"  {name:<{width}}  {policy.summary}".rstrip())
-            settings = ", ".join(f"{setting}={policy.memory[setting]:g}" for setting in policy.parameters)
+            settings = ", ".join(f"{setting}={number:g}" for setting, number in policy.parameters.items())
             if settings:
                 lines.append(f"  {'':<{width}}  settings: {settings}")
             lines.append(f"  {'':<{width}}  from: {policy.source or 'a policy file'}")

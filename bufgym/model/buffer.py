@@ -68,6 +68,8 @@ REJECT, ACCEPT = -1, -2
 HOLD = -1
 
 UNLIMITED_BYTES = 2**62
+NO_PARAMETERS: NDArray[np.float64] = np.zeros(0)
+NO_PARAMETERS.flags.writeable = False
 MAX_CAPACITY = 10**6
 
 
@@ -130,6 +132,8 @@ class Buffer(NamedTuple):
     """n_T: messages that may be sent and not yet answered by a pong."""
     in_flight: int
     """Messages sent and not yet answered by a pong (without pongs: not yet across)."""
+    parameters: NDArray[np.float64] = NO_PARAMETERS
+    """float64[parameters], read-only: the policy's own settings, in the order of its registration, or its weights."""
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""What an agent observes and what it is paid for: tables of fields, and what fills them from a robot's view."""
+"""What an agent observes and is rewarded for: tables of fields, and the kernels that fill them from a robot's view."""
 
 from bufgym.observe.fields import (
     CONTEXT_FIELDS,

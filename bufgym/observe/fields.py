@@ -1,16 +1,16 @@
-"""What an agent observes and what it is paid for: one table each, from which spaces, code and docs are made.
+"""What an agent observes and what it is rewarded for: one table each, from which spaces, code and docs are made.
 
-Every field is computed from the ``Buffer`` view and the arrival alone, that is from what a robot has on board (its
-buffer, clock, odometry, and what its own socket still holds); nothing comes from the server or the link's future.
+Every field is computed from the ``Buffer`` view and the arrival alone, that is from what a robot has on board: its
+buffer, clock and odometry, and what its own socket still holds. Nothing comes from the server or the link's future.
 
 Every field lies in [0, 1] and is free of scale. Lengths g (of time, motion, bytes) appear as g / (g + r) with a
 stated reference r, so 0.5 means "as long as the reference". For gaps r is the *even spacing*: the distance from the
-message that the socket took last to the newcomer, divided by L + 1, which is what an even thinning of that stretch
-to L kept messages would leave between neighbours (AFR's aim). So one set of weights serves every L and frame rate.
+message dequeued last to the newcomer, divided by L + 1. That is the gap between neighbours if L messages thin this
+stretch evenly (AFR's aim). So one set of weights serves every L and frame rate.
 
-With several topics a message's neighbours are those of its own topic, the even spacing is the distance from the one
-that the socket took last to the topic's last arrival divided by one more than the topic's queued messages, and values
-are weighted: QoI is in units of the largest weight. Then there are further fields, about topics.
+With several topics a message's neighbours are those of its own topic; the even spacing is the distance from the topic's
+message dequeued last to its last arrival, divided by one more than its queued messages; and values are weighted: QoI is
+in units of the largest weight. Further fields describe the topics.
 """
 
 from __future__ import annotations
@@ -20,16 +20,23 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Field:
-    """One observed quantity. ``per``: "slot" fields have L + 1 entries, the newcomer last; "context" fields one."""
+    """One observed quantity."""
 
     name: str
+    """Unique over all tables."""
     per: str
+    """"slot": L + 1 entries, the newcomer's last; "context": one."""
     group: str
-    """What it takes to know it: queue (counting), time (a clock), motion (odometry), value (V), link (its socket)."""
+    """What it takes to know it: queue (counting), time (a clock), motion (odometry), value (V), link (its own socket)
+    or topic (the topics' settings and past)."""
     unit: str
+    """Its unit, or how it is scaled to [0, 1]."""
     meaning: str
+    """What it says."""
     low: float = 0.0
+    """Least value."""
     high: float = 1.0
+    """Largest value."""
 
 
 SLOT_FIELDS = (
@@ -51,9 +58,9 @@ CONTEXT_FIELDS = (
     Field("arrival_time_gap", "context", "time", "g/(g+r), r = even time spacing", "time since the previous arrival"),
     Field("arrival_motion_gap", "context", "motion", "g/(g+r), r = even motion spacing", "motion since then"),
     Field("busy", "context", "link", "flag", "1 while a message is in transmission"),
-    Field("left", "context", "link", "fraction", "part of the message in transmission that has not crossed yet"),
-    Field("stalled", "context", "link", "g/(g+r), r = L + 1 arrival periods", "time since the socket took a message"),
-    Field("departures", "context", "link", "n/(n+1)", "messages the socket took since the previous arrival"),
+    Field("left", "context", "link", "fraction", "part of the message in transmission that is still to be transmitted"),
+    Field("stalled", "context", "link", "g/(g+r), r = L + 1 arrival periods", "time since a message was last dequeued"),
+    Field("departures", "context", "link", "n/(n+1)", "messages dequeued since the previous arrival"),
     Field("service_ratio", "context", "link", "g/(g+r), r = 1", "running mean of departures per arrival"),
     Field("even_value", "context", "value", "QoI", "V of the even motion spacing e"),
     Field("bend", "context", "value", "fraction", "(2 V(e) - V(2e)) / V(e): 0 where V is straight, 1 where it is flat"),
@@ -64,10 +71,12 @@ TOPIC_SLOT_FIELDS = (
     Field("priority", "slot", "topic", "fraction of the highest", "priority of its topic"),
     Field("weight", "slot", "topic", "fraction of the largest", "weight of its topic in the sum of H"),
     Field("no_drop", "slot", "topic", "flag", "1 where it may not be dropped"),
-    Field("oldest", "slot", "topic", "flag", "1 where it is the oldest of its topic: the only one that may be sent"),
+    Field("oldest", "slot", "topic", "flag", "1 where it is the oldest of its topic, the only one that may be sent"),
     Field("own", "slot", "topic", "flag", "1 where its topic is the newcomer's; 0 when the socket asks"),
     Field("waited", "slot", "topic", "g/(g+r), r = 1 s", "time since its arrival"),
-    Field("silence", "slot", "topic", "g/(g+r), r = 1 s", "age of what the server may know of its topic"),
+    Field(
+        "silence", "slot", "topic", "g/(g+r), r = 1 s", "time since the arrival of its topic's message dequeued last"
+    ),
     Field("lateness", "slot", "topic", "g/(g+r), r = its deadline", "time since its arrival; 0 without a deadline"),
     Field("queued", "slot", "topic", "fraction of L", "messages of its topic in the buffer"),
     Field("gain", "slot", "topic", "QoI, weighted", "what its delivery adds to H"),
@@ -75,44 +84,51 @@ TOPIC_SLOT_FIELDS = (
 )
 TOPIC_CONTEXT_FIELDS = (
     Field("socket_asks", "context", "topic", "flag", "1 where the socket asks what to send, 0 at an arrival"),
-    Field("in_flight", "context", "topic", "n/(n+r), r = n_T", "messages sent and not yet answered by a pong"),
+    Field("in_flight", "context", "topic", "n/(n+r), r = n_T", "messages sent and not yet acknowledged"),
 )
 TOPIC_FIELDS = TOPIC_SLOT_FIELDS + TOPIC_CONTEXT_FIELDS
-"""What is observed besides ``FIELDS`` where there are several topics."""
+"""Observed besides ``FIELDS`` where there are several topics."""
 
-_NUMBER = {field.name: i for i, field in enumerate(SLOT_FIELDS + TOPIC_SLOT_FIELDS)} | {
-    field.name: i for i, field in enumerate(CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS)
+_COLUMN = {
+    field.name: column
+    for fields in (SLOT_FIELDS + TOPIC_SLOT_FIELDS, CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS)
+    for column, field in enumerate(fields)
 }
-OCCUPIED, RANK, SIZE, LOSS = (_NUMBER[name] for name in ("occupied", "rank", "size", "loss"))
-TIME_BEFORE, TIME_MERGED = _NUMBER["time_before"], _NUMBER["time_merged"]
-MOTION_BEFORE, MOTION_MERGED = _NUMBER["motion_before"], _NUMBER["motion_merged"]
-OCCUPANCY, BACKLOG, BUSY, LEFT = (_NUMBER[name] for name in ("occupancy", "backlog", "busy", "left"))
-ARRIVAL_TIME_GAP, ARRIVAL_MOTION_GAP = _NUMBER["arrival_time_gap"], _NUMBER["arrival_motion_gap"]
-STALLED, DEPARTURES, DRAIN = _NUMBER["stalled"], _NUMBER["departures"], _NUMBER["service_ratio"]
-RELATIVE_LOSS, EVEN_VALUE, BEND = _NUMBER["relative_loss"], _NUMBER["even_value"], _NUMBER["bend"]
-PRIORITY, WEIGHT, NO_DROP, OLDEST, OWN = (_NUMBER[n] for n in ("priority", "weight", "no_drop", "oldest", "own"))
-WAITED, SILENCE, LATENESS, QUEUED = (_NUMBER[name] for name in ("waited", "silence", "lateness", "queued"))
-GAIN, GAIN_PER_BYTE = _NUMBER["gain"], _NUMBER["gain_per_byte"]
-SOCKET_ASKS, IN_FLIGHT = _NUMBER["socket_asks"], _NUMBER["in_flight"]
+# Where each field stands in the observation of its kind: constants for kernels.
+OCCUPIED, RANK, SIZE = _COLUMN["occupied"], _COLUMN["rank"], _COLUMN["size"]
+TIME_BEFORE, TIME_MERGED = _COLUMN["time_before"], _COLUMN["time_merged"]
+MOTION_BEFORE, MOTION_MERGED = _COLUMN["motion_before"], _COLUMN["motion_merged"]
+LOSS, RELATIVE_LOSS = _COLUMN["loss"], _COLUMN["relative_loss"]
+OCCUPANCY, BACKLOG, BUSY, LEFT = (_COLUMN[name] for name in ("occupancy", "backlog", "busy", "left"))
+ARRIVAL_TIME_GAP, ARRIVAL_MOTION_GAP = _COLUMN["arrival_time_gap"], _COLUMN["arrival_motion_gap"]
+STALLED, DEPARTURES, SERVICE_RATIO = _COLUMN["stalled"], _COLUMN["departures"], _COLUMN["service_ratio"]
+EVEN_VALUE, BEND = _COLUMN["even_value"], _COLUMN["bend"]
+PRIORITY, WEIGHT, NO_DROP, OLDEST, OWN = (_COLUMN[n] for n in ("priority", "weight", "no_drop", "oldest", "own"))
+WAITED, SILENCE, LATENESS, QUEUED = (_COLUMN[name] for name in ("waited", "silence", "lateness", "queued"))
+GAIN, GAIN_PER_BYTE = _COLUMN["gain"], _COLUMN["gain_per_byte"]
+SOCKET_ASKS, IN_FLIGHT = _COLUMN["socket_asks"], _COLUMN["in_flight"]
 
 
 @dataclass(frozen=True)
 class RewardTerm:
-    """One named reward; an env pays a weighted sum of them and reports each by name in ``info``."""
+    """One named reward; an environment rewards a weighted sum of them and reports each by name in ``info``."""
 
     name: str
+    """Unique over all terms."""
     unit: str
+    """Its unit."""
     meaning: str
+    """What it rewards."""
 
 
 REWARD_TERMS = (
     RewardTerm("delivered", "QoI", "V gained when a message arrives at the server; sums to H - 1"),
     RewardTerm("retained", "QoI", "change of the H that delivering all that is kept would give; sums to H - 1 too"),
 )
+"""``retained`` is ``delivered`` shaped by a potential (Ng, Harada and Russell 1999): the QoI held, not yet delivered.
+It gives at once what a decision costs or gains, and telescopes to the same total."""
 TOPIC_REWARD_TERMS = (
     RewardTerm("age", "s", "minus the weighted mean age of information at the server, integrated over time"),
     RewardTerm("late", "messages", "minus the weight of each message that reaches the server after its deadline"),
 )
-"""What an env with several topics can pay for besides; weights are fractions of their sum over the topics."""
-"""``retained`` is ``delivered`` shaped by a potential (Ng, Harada and Russell 1999): the QoI held, not yet delivered.
-It pays at the moment of the decision what the decision costs or gains, and telescopes to the same total."""
+"""Further terms with several topics; weights are fractions of their sum over the topics."""

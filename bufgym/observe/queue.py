@@ -10,32 +10,11 @@ from numpy.typing import NDArray
 from bufgym.kernel import kernel
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain
 from bufgym.model.qoi import merging_loss, value
-from bufgym.observe.fields import (
-    ARRIVAL_MOTION_GAP,
-    ARRIVAL_TIME_GAP,
-    BACKLOG,
-    BEND,
-    BUSY,
-    DEPARTURES,
-    DRAIN,
-    EVEN_VALUE,
-    LEFT,
-    LOSS,
-    MOTION_BEFORE,
-    MOTION_MERGED,
-    OCCUPANCY,
-    OCCUPIED,
-    RANK,
-    RELATIVE_LOSS,
-    SIZE,
-    STALLED,
-    TIME_BEFORE,
-    TIME_MERGED,
-)
+from bufgym.observe import fields
 
 # So that 0 / (0 + reference) is 0 where nothing moved at all.
 TINY = 1e-30
-# Where V is straight a merger loses nothing but rounding errors, which are not to be told from one another.
+# Where V is straight a merger loses nothing but rounding errors, whose differences mean nothing.
 ROUNDING = 1e-12
 
 
@@ -62,29 +41,35 @@ def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
 
 
 @kernel
+def observe_link(buffer: Buffer, context: NDArray[np.floating[Any]]) -> None:
+    """Write what does not depend on the arrival into ``context``: how full the buffer is, how its link does."""
+    context[fields.OCCUPANCY] = len(buffer.slots) / buffer.capacity
+    context[fields.BACKLOG] = buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0
+    context[fields.BUSY] = buffer.busy
+    context[fields.LEFT] = buffer.left_fraction
+    context[fields.STALLED] = squash(buffer.stalled_us, (buffer.capacity + 1) * buffer.period_us)
+    context[fields.DEPARTURES] = squash(buffer.departures, 1.0)
+    context[fields.SERVICE_RATIO] = squash(buffer.service_ratio, 1.0)
+
+
+@kernel
 def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
     """Write every CONTEXT_FIELDS value into ``context`` (float[fields])."""
+    observe_link(buffer, context)
     spread = buffer.capacity + 1
-    context[OCCUPANCY] = len(buffer.slots) / buffer.capacity
-    context[BACKLOG] = buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0
     time_gap, motion_gap = arrival.arrival_us - buffer.previous_us, arrival.x - buffer.previous_x
-    context[ARRIVAL_TIME_GAP] = squash(time_gap, (arrival.arrival_us - buffer.dequeued_arrival_us) / spread)
-    context[ARRIVAL_MOTION_GAP] = squash(motion_gap, (arrival.x - buffer.dequeued_x) / spread)
-    context[BUSY] = buffer.busy
-    context[LEFT] = buffer.left_fraction
-    context[STALLED] = squash(buffer.stalled_us, spread * buffer.period_us)
-    context[DEPARTURES] = squash(buffer.departures, 1.0)
-    context[DRAIN] = squash(buffer.service_ratio, 1.0)
-    context[EVEN_VALUE], even_loss = even_gap(buffer, arrival)
-    context[BEND] = even_loss / max(context[EVEN_VALUE], TINY)
+    context[fields.ARRIVAL_TIME_GAP] = squash(time_gap, (arrival.arrival_us - buffer.dequeued_arrival_us) / spread)
+    context[fields.ARRIVAL_MOTION_GAP] = squash(motion_gap, (arrival.x - buffer.dequeued_x) / spread)
+    context[fields.EVEN_VALUE], even_loss = even_gap(buffer, arrival)
+    context[fields.BEND] = even_loss / max(context[fields.EVEN_VALUE], TINY)
 
 
 @kernel
 def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
     """Write every SLOT_FIELDS value into ``rows`` (float[fields, L + 1]); empty slots are 0, the newcomer is last.
 
-    The gaps are those of ``buffer.time_gaps`` and ``motion_gaps``, the loss that of ``buffer.loss``, found in one walk
-    along the queue; gaps and relative losses are squashed row by row afterwards.
+    The gaps are those of ``buffer.time_gaps`` and ``motion_gaps``, the loss is that of ``buffer.loss``, computed in one
+    pass along the queue; gaps and relative losses are squashed row by row afterwards.
     """
     s, last = len(buffer.slots), buffer.capacity
     per_rank = 1 / (s + 1)
@@ -92,40 +77,42 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
     newcomer_gain = arrival_gain(buffer, arrival)
     for k in range(s):
         slot = buffer.slots[k]
-        here_us, here_x, gain = slot.arrival_us, slot.x, slot.gain
+        slot_us, slot_x, gain = slot.arrival_us, slot.x, slot.gain
         if k + 1 < s:
             after = buffer.slots[k + 1]
             after_us, after_x, after_gain = after.arrival_us, after.x, after.gain
         else:
             after_us, after_x, after_gain = arrival.arrival_us, arrival.x, newcomer_gain
-        rows[OCCUPIED, k] = 1.0
-        rows[RANK, k] = (k + 1) * per_rank
-        rows[TIME_BEFORE, k] = here_us - before_us
-        rows[TIME_MERGED, k] = after_us - before_us
-        rows[MOTION_BEFORE, k] = here_x - before_x
-        rows[MOTION_MERGED, k] = after_x - before_x
-        rows[LOSS, k] = merging_loss(buffer.v, here_x - before_x, gain, after_x - here_x, after_gain)
-        rows[RELATIVE_LOSS, k] = max(rows[LOSS, k], 0.0)
-        rows[SIZE, k] = slot.size_bytes
-        before_us, before_x = here_us, here_x
+        rows[fields.OCCUPIED, k] = 1.0
+        rows[fields.RANK, k] = (k + 1) * per_rank
+        rows[fields.TIME_BEFORE, k] = slot_us - before_us
+        rows[fields.TIME_MERGED, k] = after_us - before_us
+        rows[fields.MOTION_BEFORE, k] = slot_x - before_x
+        rows[fields.MOTION_MERGED, k] = after_x - before_x
+        rows[fields.LOSS, k] = merging_loss(buffer.v, slot_x - before_x, gain, after_x - slot_x, after_gain)
+        rows[fields.RELATIVE_LOSS, k] = max(rows[fields.LOSS, k], 0.0)
+        rows[fields.SIZE, k] = slot.size_bytes
+        before_us, before_x = slot_us, slot_x
     for k in range(s, last):
         for field in range(len(rows)):
             rows[field, k] = 0.0
     step_us, step_x = arrival.arrival_us - buffer.previous_us, arrival.x - buffer.previous_x
-    rows[OCCUPIED, last] = 1.0
-    rows[RANK, last] = 1.0
-    rows[TIME_BEFORE, last] = arrival.arrival_us - before_us
-    rows[TIME_MERGED, last] = arrival.arrival_us - before_us + step_us
-    rows[MOTION_BEFORE, last] = arrival.x - before_x
-    rows[MOTION_MERGED, last] = arrival.x - before_x + step_x
-    rows[LOSS, last] = merging_loss(buffer.v, arrival.x - before_x, newcomer_gain, step_x, value(buffer.v, step_x))
-    rows[RELATIVE_LOSS, last] = max(rows[LOSS, last], 0.0)
-    rows[SIZE, last] = arrival.size_bytes
+    rows[fields.OCCUPIED, last] = 1.0
+    rows[fields.RANK, last] = 1.0
+    rows[fields.TIME_BEFORE, last] = arrival.arrival_us - before_us
+    rows[fields.TIME_MERGED, last] = arrival.arrival_us - before_us + step_us
+    rows[fields.MOTION_BEFORE, last] = arrival.x - before_x
+    rows[fields.MOTION_MERGED, last] = arrival.x - before_x + step_x
+    rows[fields.LOSS, last] = merging_loss(
+        buffer.v, arrival.x - before_x, newcomer_gain, step_x, value(buffer.v, step_x)
+    )
+    rows[fields.RELATIVE_LOSS, last] = max(rows[fields.LOSS, last], 0.0)
+    rows[fields.SIZE, last] = arrival.size_bytes
     even = 1 / (buffer.capacity + 1)
     even_us, even_x = even * (arrival.arrival_us - buffer.dequeued_arrival_us), even * (arrival.x - buffer.dequeued_x)
-    squash_row(rows[TIME_BEFORE], even_us)
-    squash_row(rows[TIME_MERGED], 2 * even_us)
-    squash_row(rows[MOTION_BEFORE], even_x)
-    squash_row(rows[MOTION_MERGED], 2 * even_x)
-    squash_row(rows[RELATIVE_LOSS], max(even_gap(buffer, arrival)[1], ROUNDING))
-    squash_row(rows[SIZE], (buffer.backlog_bytes + arrival.size_bytes) * per_rank)
+    squash_row(rows[fields.TIME_BEFORE], even_us)
+    squash_row(rows[fields.TIME_MERGED], 2 * even_us)
+    squash_row(rows[fields.MOTION_BEFORE], even_x)
+    squash_row(rows[fields.MOTION_MERGED], 2 * even_x)
+    squash_row(rows[fields.RELATIVE_LOSS], max(even_gap(buffer, arrival)[1], ROUNDING))
+    squash_row(rows[fields.SIZE], (buffer.backlog_bytes + arrival.size_bytes) * per_rank)

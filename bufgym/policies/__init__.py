@@ -17,14 +17,14 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     sampling,
     schedulers,
 )
-from bufgym.policies.registry import Client, Policy, get, names, register, register_later, runs_compiled
+from bufgym.policies.registry import ClientSettings, Policy, get, names, register, register_later, runs_compiled
 from bufgym.policies.schedulers import make_room
 
 __all__ = [
     "ACCEPT",
     "HOLD",
     "REJECT",
-    "Client",
+    "ClientSettings",
     "Policy",
     "after",
     "before",

@@ -10,21 +10,16 @@ code moves p along with the queue, the text says nothing about it.
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
-from bufgym.policies.registry import register
+from bufgym.policies.registry import Arrival, Memory, register
 
 R, C, P = range(3)  # where r, c and p lie in the memory
 MEMORY = {"r": 1.0, "c": 0.0, "p": 0.0}
 
 
 @kernel
-def thin(r: float, c: float, p: float, gap: float, s: int, L: int, memory: NDArray[np.float64]) -> int:
+def thin(r: float, c: float, p: float, gap: float, s: int, L: int, memory: Memory) -> int:
     """The part that code and text share, after r was halved or not: count, and evict at p when full.
 
     ``gap``: arrivals until the next one is kept; r in AFR (``checkpointing.py`` has another).
@@ -44,7 +39,7 @@ def thin(r: float, c: float, p: float, gap: float, s: int, L: int, memory: NDArr
     return decision
 
 
-def afr_departure(buffer: Buffer, memory: NDArray[np.float64]) -> None:
+def afr_departure(buffer: Buffer, memory: Memory) -> None:
     """The head is gone, so the same message is now one slot further to the front."""
     memory[P] = max(0.0, memory[P] - 1)
 
@@ -52,7 +47,7 @@ def afr_departure(buffer: Buffer, memory: NDArray[np.float64]) -> None:
 @register(
     "afr", memory=MEMORY, on_departure=afr_departure, source="AFR paper, released code (Jrdevil-Wang/AFR)", compile=True
 )
-def afr(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def afr(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Adaptive Frame Rate as released: an even, adaptive frame rate."""
     r, c, p = memory[R], memory[C], memory[P]
     L, s = buffer.capacity, len(buffer.slots)
@@ -63,7 +58,7 @@ def afr(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 
 
 @register("afr-paper", memory=MEMORY, source="AFR paper, Sec. III (literal text)", compile=True)
-def afr_paper(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def afr_paper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Adaptive Frame Rate by the letter of the paper: s/L < 2/3, p not moved at departures."""
     r, c, p = memory[R], memory[C], memory[P]
     L, s = buffer.capacity, len(buffer.slots)

@@ -1,22 +1,19 @@
 """Active queue management of the Internet: CoDel and RED, made to keep a router's queue short.
 
-Both drop early to tell TCP senders to slow down. A camera does not slow down, so here they show what is lost by it.
+Both drop early to tell TCP senders to slow down. A camera does not slow down, so here they show what early drops cost.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.policies.classic import keep_first
-from bufgym.policies.registry import register
+from bufgym.policies.registry import Arrival, Memory, register
 
-TARGET_MS, INTERVAL_MS, FIRST_ABOVE, DROP_NEXT, DROPS, LAST_DROPS, DROPPING, AGAIN, MAX_PACKET = range(9)
+TARGET_MS, INTERVAL_MS = range(2)  # where CoDel's parameters lie
+FIRST_ABOVE, DROP_NEXT, DROPS, LAST_DROPS, DROPPING, AGAIN, MAX_PACKET = range(7)  # and its memory
 
 
 @kernel
@@ -26,30 +23,30 @@ def control_law(t_us: float, count: float, interval_us: float) -> float:
 
 
 @kernel
-def ok_to_drop(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
+def ok_to_drop(buffer: Buffer, memory: Memory) -> bool:
     """RFC 8289, 5.6 (dodequeue): whether sojourn times have been above target for a whole interval.
 
-    Not where no more than one message ("maxpacket", the largest seen) waits behind the head: the link must not starve.
+    Never where at most one message ("maxpacket", the largest seen) waits behind the head: the link must not starve.
     """
     now_us, head = buffer.now_us, buffer.slots[0]
     memory[MAX_PACKET] = max(memory[MAX_PACKET], head.size_bytes)
     sojourn_us, behind_bytes = now_us - head.arrival_us, buffer.backlog_bytes - head.size_bytes
-    if sojourn_us < 1e3 * memory[TARGET_MS] or behind_bytes <= memory[MAX_PACKET]:
+    if sojourn_us < 1e3 * buffer.parameters[TARGET_MS] or behind_bytes <= memory[MAX_PACKET]:
         memory[FIRST_ABOVE] = 0.0
         return False
     if memory[FIRST_ABOVE] == 0:
-        memory[FIRST_ABOVE] = now_us + 1e3 * memory[INTERVAL_MS]
+        memory[FIRST_ABOVE] = now_us + 1e3 * buffer.parameters[INTERVAL_MS]
         return False
     return bool(now_us >= memory[FIRST_ABOVE])
 
 
-def codel_dequeue(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
+def codel_dequeue(buffer: Buffer, memory: Memory) -> bool:
     """RFC 8289, 5.5 (dequeue), one head a call: the RFC's loop goes on for as long as the answer is True.
 
-    ``AGAIN`` marks that the head before this one was dropped within the loop. What follows the first drop of a dropping
-    state the RFC sends without looking at drop_next; here it is sent because drop_next still lies ahead.
+    ``AGAIN`` marks that the loop has just dropped the head before this one. After the first drop of a dropping state
+    the RFC sends the next packet without looking at drop_next; here it is sent because drop_next still lies ahead.
     """
-    now_us, interval_us = buffer.now_us, 1e3 * memory[INTERVAL_MS]
+    now_us, interval_us = buffer.now_us, 1e3 * buffer.parameters[INTERVAL_MS]
     ok, again = ok_to_drop(buffer, memory), memory[AGAIN] == 1
     memory[AGAIN] = 0.0
     if memory[DROPPING] == 1:
@@ -75,53 +72,46 @@ def codel_dequeue(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
 
 @register(
     "codel",
-    memory={
-        "target_ms": 5.0,
-        "interval_ms": 100.0,
-        "first_above_us": 0.0,
-        "drop_next_us": 0.0,
-        "count": 0.0,
-        "lastcount": 0.0,
-        "dropping": 0.0,
-        "again": 0.0,
-        "maxpacket_bytes": 0.0,
-    },
-    parameters=("target_ms", "interval_ms"),
+    parameters={"target_ms": 5.0, "interval_ms": 100.0},
+    memory=dict.fromkeys(
+        ("first_above_us", "drop_next_us", "count", "lastcount", "dropping", "again", "maxpacket_bytes"), 0.0
+    ),
     on_dequeue=codel_dequeue,
     source="CoDel, RFC 8289",
     compile=True,
 )
-def codel(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def codel(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """CoDel: drops heads while sojourn times stay above `target_ms` for `interval_ms`; a full queue drops the tail.
 
-    The defaults are the RFC's, for packets of 1500 bytes. Messages want a target of at least the time that one of them
-    needs to cross (200 kB at 6 MB/s: 33 ms), and an interval in proportion.
+    The defaults are the RFC's, for packets of 1500 bytes. For messages, choose a target of at least the time that
+    one of them takes to transmit (200 kB at 6 MB/s: 33 ms), and an interval in proportion.
     """
     return keep_first(len(buffer.slots), buffer.capacity)
 
 
-MIN_TH, MAX_TH, MAX_P, WEIGHT, AVERAGE, COUNT = range(6)
+MIN_TH, MAX_TH, MAX_P, WEIGHT = range(4)  # where RED's parameters lie
+AVERAGE, COUNT = range(2)  # and its memory
 
 
 @register(
     "red",
-    memory={"min_th": 0.25, "max_th": 0.75, "max_p": 0.1, "weight": 0.2, "average": 0.0, "count": -1.0},
-    parameters=("min_th", "max_th", "max_p", "weight"),
+    parameters={"min_th": 0.25, "max_th": 0.75, "max_p": 0.1, "weight": 0.2},
+    memory={"average": 0.0, "count": -1.0},
     source="Random Early Detection, Floyd and Jacobson 1993",
     compile=True,
 )
-def red(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def red(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """RED: rejects at random, the more the higher the average occupancy; a full queue drops the tail.
 
     Thresholds are fractions of L. The paper's term for idle times needs the link's bandwidth and is left out: an
     arrival at an empty queue is one sample of 0.
     """
-    memory[AVERAGE] += memory[WEIGHT] * (len(buffer.slots) - memory[AVERAGE])
+    min_th, max_th, max_p = buffer.parameters[MIN_TH], buffer.parameters[MAX_TH], buffer.parameters[MAX_P]
+    memory[AVERAGE] += buffer.parameters[WEIGHT] * (len(buffer.slots) - memory[AVERAGE])
     average = memory[AVERAGE] / buffer.capacity
-    min_th, max_th = memory[MIN_TH], memory[MAX_TH]
     if min_th <= average < max_th:
         memory[COUNT] += 1  # arrivals since the last drop: spreads the drops evenly
-        p_b = memory[MAX_P] * (average - min_th) / (max_th - min_th)
+        p_b = max_p * (average - min_th) / (max_th - min_th)
         if arrival.uniform * (1 - memory[COUNT] * p_b) < p_b:  # with probability p_b / (1 - count p_b)
             memory[COUNT] = 0.0
             return REJECT

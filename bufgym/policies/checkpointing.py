@@ -9,17 +9,10 @@ the least that any rule can reach (Bringmann et al., arXiv 1302.4216; Bar-On et 
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.afr import MEMORY, C, P, R, afr_departure, thin
-from bufgym.policies.registry import register
-
-ALPHA = len(MEMORY)
+from bufgym.policies.registry import Arrival, Memory, register
 
 
 @kernel
@@ -33,15 +26,15 @@ def growing_gap(r: float, p: float, L: int, alpha: float) -> float:
 
 @register(
     "linear-alpha",
-    memory={**MEMORY, "alpha": 1.302},
-    parameters=("alpha",),
+    parameters={"alpha": 1.302},
+    memory=MEMORY,
     on_departure=afr_departure,
     source="LINEAR, Bringmann et al., Online Checkpointing with Improved Worst-Case Guarantees, arXiv 1302.4216",
     compile=True,
 )
-def linear_alpha(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def linear_alpha(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """LINEAR: evicts 1, 3, 5, ... pass after pass as AFR does, but keeps arrivals at times i^alpha."""
-    r, c, p, alpha = memory[R], memory[C], memory[P], memory[ALPHA]
+    r, c, p, alpha = memory[R], memory[C], memory[P], buffer.parameters[0]
     L, s = buffer.capacity, len(buffer.slots)
     lowered = r > 1 and 3 * s <= 2 * L
     if lowered:
@@ -86,7 +79,7 @@ FIRST = 0
     source="Moreno et al., steady algorithm of the package downstream (PyPI)",
     compile=True,
 )
-def steady(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def steady(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Steady curation: the n-th arrival since the queue was empty has a fixed site, or none; S = 2^s <= L sites."""
     L = buffer.capacity
     if len(buffer.slots) == 0:

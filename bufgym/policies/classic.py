@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
-from bufgym.policies.registry import register
+from bufgym.policies.registry import Arrival, Memory, register
 
 
 @kernel
@@ -25,31 +20,31 @@ def keep_first(s: int, L: int) -> int:
 
 
 @register("drop-oldest", source="ROS 1 roscpp subscriber link; ROS 2 / DDS KEEP_LAST", compile=True)
-def drop_oldest(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def drop_oldest(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ROS: a full queue loses its head."""
     return keep_last(len(buffer.slots), buffer.capacity)
 
 
 @register("drop-newest", source="drop tail; DDS KEEP_ALL, best effort", compile=True)
-def drop_newest(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def drop_newest(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Drop tail: a full queue rejects the newcomer."""
     return keep_first(len(buffer.slots), buffer.capacity)
 
 
 @register("replace-newest", source="replace tail", compile=True)
-def replace_newest(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def replace_newest(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Replace tail: the newcomer overwrites the newest queued message."""
     return ACCEPT if len(buffer.slots) < buffer.capacity else buffer.capacity - 1
 
 
 @register("latest-only", source="mailbox of one message, as KEEP_LAST(1), the default depth of DDS", compile=True)
-def latest_only(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def latest_only(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A queue of one: the newest replaces what waits."""
     return keep_last(len(buffer.slots), 1)
 
 
 @register("random", source="AFR paper, Eq. 9", compile=True)
-def random(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def random(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Random Drop: the victim is uniform over the L queued messages and the newcomer."""
     L = buffer.capacity
     if len(buffer.slots) < L:

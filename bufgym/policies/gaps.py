@@ -1,4 +1,4 @@
-"""Policies that look at the gaps between messages: drop what its neighbours say best.
+"""Policies that look at the gaps between messages: drop the one whose neighbours replace it best.
 
 Dropping slot k merges its two gaps into one; the smaller the merged gap, the less is lost. Time gaps need a clock only,
 motion gaps the robot's odometry.
@@ -6,20 +6,17 @@ motion gaps the robot's odometry.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, loss, motion_gaps, time_gaps
 from bufgym.model.qoi import value
-from bufgym.policies.registry import register
+from bufgym.policies.registry import Arrival, Memory, register
 
 
 @kernel
-def smallest_time_gap(buffer: Buffer, arrival: Any, slots: int) -> int:
-    """The first of so many slots that would leave the smallest merged time gap, oldest first."""
+def smallest_time_gap(buffer: Buffer, arrival: Arrival, slots: int) -> int:
+    """Among the first ``slots`` slots, the one that would leave the smallest merged time gap; of equals the oldest."""
     victim, smallest = 0, np.inf
     for k in range(slots):
         before, after = time_gaps(buffer, arrival, k)
@@ -29,7 +26,7 @@ def smallest_time_gap(buffer: Buffer, arrival: Any, slots: int) -> int:
 
 
 @register("min-gap", source="online checkpointing, smallest merged gap", compile=True)
-def min_gap(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def min_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged time gap (newcomer included, ties to the oldest)."""
     s = len(buffer.slots)
     if s < buffer.capacity:
@@ -40,17 +37,16 @@ def min_gap(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 
 @register(
     "even-reject",
-    memory={"beta": 1.3},
-    parameters=("beta",),
-    source="online checkpointing, a newcomer too close to the tail goes first (own rule; beta 1.2 to 1.39)",
+    parameters={"beta": 1.3},
+    source="online checkpointing, a newcomer too close to the tail is rejected (own rule; beta 1.2 to 1.39)",
     compile=True,
 )
-def even_reject(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue rejects a newcomer nearer than beta even gaps T / (L + 1) to the tail, else as min-gap.
 
-    T is the time since the message that the socket took last arrived: what L messages have to divide evenly.
+    T is the time from the arrival of the message dequeued last to now, which L messages should divide evenly.
     """
-    beta, L, s = memory[0], buffer.capacity, len(buffer.slots)
+    beta, L, s = buffer.parameters[0], buffer.capacity, len(buffer.slots)
     if s < L:
         return ACCEPT
     T = arrival.arrival_us - buffer.dequeued_arrival_us
@@ -60,7 +56,7 @@ def even_reject(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> in
 
 
 @register("min-motion-gap", source="as min-gap, on the robot's odometry", compile=True)
-def min_motion_gap(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged motion gap (newcomer included, ties to the oldest)."""
     s = len(buffer.slots)
     if s < buffer.capacity:
@@ -74,7 +70,7 @@ def min_motion_gap(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) ->
 
 
 @register("orbbuf", source="ORBBuf (IROS 2021), Jrdevil-Wang/ORBBuf, with Sim = 1 - V(motion gap)", compile=True)
-def orbbuf(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def orbbuf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops the message whose two queued neighbours are most similar; the newcomer is always kept.
 
     The released similarity compares images (and is a random stub there); without images, Sim = 1 - V(motion gap).
@@ -92,11 +88,11 @@ def orbbuf(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 
 
 @register("greedy-qoi", source="one-step greedy, as a warning", compile=True)
-def greedy_qoi(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """A full queue does what leaves the most information this very moment: a trap.
+def greedy_qoi(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A full queue takes the decision that leaves the most information at this moment: a trap.
 
     Rejecting adds nothing; evicting slot k adds the newcomer's gain less the loss of k. Once the gaps are even,
-    replacing the tail costs least, arrival after arrival: the old prefix stays, nothing of what follows it is kept.
+    replacing the tail costs least, arrival after arrival: the old prefix stays, and nothing that follows it is kept.
     """
     if len(buffer.slots) < buffer.capacity:
         return ACCEPT

@@ -1,113 +1,102 @@
-"""What robots' middleware does today: ROS, DDS, Zenoh, Foxglove and rosbridge, by their settings' own names.
+"""What robots' middleware does today: ROS, DDS, Zenoh, Foxglove and rosbridge, with their own names for settings.
 
-Most keep the newest or reject the newcomer, as `drop-oldest` and `drop-newest` do; they have names of their own here so
-that a table can be read by those who run them. None knows what a message is worth.
+Most keep the newest messages or reject the newcomer, as `drop-oldest` and `drop-newest` do; they have their own names
+here so that their users find them in a table. None knows what a message is worth.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first, keep_last
-from bufgym.policies.registry import Client, register
+from bufgym.policies.registry import Arrival, ClientSettings, Memory, register
 
 
 @register(
     "ros-keep-last",
-    memory={"depth": 10.0},
-    parameters=("depth",),
+    parameters={"depth": 10.0},
     source="ROS 2 QoS history KEEP_LAST(depth), default 10",
     compile=True,
 )
-def ros_keep_last(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def ros_keep_last(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ROS 2 KEEP_LAST: the oldest unsent message goes when `depth` wait (at most L)."""
-    return keep_last(len(buffer.slots), min(memory[0], buffer.capacity))
+    return keep_last(len(buffer.slots), min(buffer.parameters[0], buffer.capacity))
 
 
 @register("dds-keep-all", source="DDS QoS HISTORY KEEP_ALL with best-effort RELIABILITY", compile=True)
-def dds_keep_all(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def dds_keep_all(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS KEEP_ALL, best effort: a full queue rejects the newcomer; reliable would block the publisher instead."""
     return keep_first(len(buffer.slots), buffer.capacity)
 
 
-def expired(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
-    """Whether the head has outlived its lifespan; those behind it are younger."""
-    return bool(buffer.now_us - buffer.slots[0].arrival_us > 1e6 * memory[0])
+def expired(buffer: Buffer, memory: Memory) -> bool:
+    """Whether the head has outlived its lifespan; the messages behind it are younger."""
+    return bool(buffer.now_us - buffer.slots[0].arrival_us > 1e6 * buffer.parameters[0])
 
 
 @register(
     "lifespan",
-    memory={"lifespan_s": 0.5},
-    parameters=("lifespan_s",),
+    parameters={"lifespan_s": 0.5},
     on_dequeue=expired,
     source="DDS QoS LIFESPAN",
     compile=True,
 )
-def lifespan(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def lifespan(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS LIFESPAN: nothing older than `lifespan_s` is sent; the head goes when full.
 
-    DDS removes a message when it expires, here it goes when it would be sent: until then it is the next to go anyway.
+    DDS removes a message when it expires; here it goes when it would be sent. Until then it is the next to go anyway.
     """
     return keep_last(len(buffer.slots), buffer.capacity)
 
 
 @register(
     "time-filter",
-    memory={"separation_s": 0.1},
-    parameters=("separation_s",),
+    parameters={"separation_s": 0.1},
     source="DDS QoS TIME_BASED_FILTER, minimum_separation",
     compile=True,
 )
-def time_filter(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def time_filter(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS TIME_BASED_FILTER: accepts at most one message in `separation_s`; the head goes when full."""
-    s, separation_us = len(buffer.slots), 1e6 * memory[0]
-    last_us = (
-        buffer.slots[s - 1].arrival_us if s > 0 else buffer.dequeued_arrival_us
-    )  # the tail is never dropped before the head
+    s, separation_us = len(buffer.slots), 1e6 * buffer.parameters[0]
+    # The message accepted last: the tail is never dropped before the head.
+    last_us = buffer.slots[s - 1].arrival_us if s > 0 else buffer.dequeued_arrival_us
     if s + buffer.dequeued > 0 and arrival.arrival_us - last_us < separation_us:
         return REJECT
     return keep_last(s, buffer.capacity)
 
 
 @register("zenoh-drop", source="Zenoh congestion control DROP", compile=True)
-def zenoh_drop(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """Zenoh DROP: put drops the newcomer when full; the 1 ms that it waits for room first is left out."""
+def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """Zenoh DROP: put drops the newcomer when full; the 1 ms that it first waits for room is left out."""
     return keep_first(len(buffer.slots), buffer.capacity)
 
 
 @register("zenoh-ring", source="Zenoh RingChannel(L)", compile=True)
-def zenoh_ring(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def zenoh_ring(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Zenoh RingChannel: keeps the newest L."""
     return keep_last(len(buffer.slots), buffer.capacity)
 
 
 @register(
     "foxglove-sdk",
-    memory={"depth": 1024.0},
-    parameters=("depth",),
+    parameters={"depth": 1024.0},
     source="foxglove-sdk, message backlog of a client, default 1024",
     compile=True,
 )
-def foxglove_sdk(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def foxglove_sdk(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Foxglove SDK: a client's oldest message goes when `depth` wait (at most L)."""
-    return keep_last(len(buffer.slots), min(memory[0], buffer.capacity))
+    return keep_last(len(buffer.slots), min(buffer.parameters[0], buffer.capacity))
 
 
 @register(
     "foxglove-backlog",
-    memory={"limit_mb": 10.0},
-    parameters=("limit_mb",),
+    parameters={"limit_mb": 10.0},
     source="ros-foxglove-bridge, send_buffer_limit, default 10 MB",
     compile=True,
 )
-def foxglove_backlog(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def foxglove_backlog(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ros-foxglove-bridge: drops the newcomer when all bytes not yet sent, with it, reach `limit_mb`, or none fits."""
     buffered_bytes = buffer.backlog_bytes + buffer.left_bytes
-    if buffered_bytes + arrival.size_bytes >= 1e6 * memory[0]:
+    if buffered_bytes + arrival.size_bytes >= 1e6 * buffer.parameters[0]:
         return REJECT
     return keep_first(len(buffer.slots), buffer.capacity)
 
@@ -116,9 +105,9 @@ def foxglove_backlog(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) 
     "rosbridge",
     unbounded=True,
     source="rosbridge_server, unbounded outgoing queue",
-    client=Client(encoding="json", awaits_acks=False),
+    client=ClientSettings(encoding="json", awaits_acks=False),
     compile=True,
 )
-def rosbridge(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """rosbridge: accepts everything, however long the queue grows; JSON, first in, first out, no pongs."""
+def rosbridge(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """rosbridge: accepts everything, however long the queue grows; JSON, first in, first out, without acks."""
     return ACCEPT

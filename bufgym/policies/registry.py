@@ -1,23 +1,28 @@
 """The one registry of drop policies, by name.
 
-A policy is a plain function ``on_arrival(buffer, arrival, memory) -> decision`` and, where it keeps score of what
-leaves, ``on_departure(buffer, memory)``; a queue discipline that drops at the head as well, as CoDel does, has
-``on_dequeue(buffer, memory) -> drop it?``; a scheduler ``on_send(buffer, memory) -> slot or HOLD``. ``buffer`` is
-``bufgym.model.buffer.Buffer``; ``arrival`` a MESSAGE record; ``memory`` a float64 array of the policy's own, laid out
-and initialised as its registration says; the decision a slot to evict for the newcomer (0 = oldest), REJECT or ACCEPT.
-``arrival.uniform`` is a uniform draw in [0, 1) for policies that randomise; the functions themselves are deterministic.
+A policy is a plain function ``on_arrival(buffer, arrival, memory) -> decision``, with up to three further functions:
 
-    from bufgym.policies import ACCEPT, register
+    on_departure(buffer, memory)           is told of each message that leaves the buffer for the socket
+    on_dequeue(buffer, memory) -> bool     says whether to drop the head that the socket is about to take, as CoDel does
+    on_send(buffer, memory) -> slot        chooses the message to send next, or HOLD: a scheduler
 
-    @register("keep-even", memory={"count": 0})
+``buffer`` is a ``bufgym.model.buffer.Buffer``, ``arrival`` a MESSAGE record. A decision is the slot to evict for the
+newcomer (0 = oldest), REJECT or ACCEPT. The policy's settings are its ``parameters``: read-only, set by name
+(``keep-even:every=3``), read as ``buffer.parameters``. Its state is ``memory``, a float64 array of its own for each
+sender. Both are laid out in the order of the registration. ``arrival.uniform`` is a uniform draw in [0, 1) for policies
+that randomise; the functions themselves are deterministic.
+
+    from bufgym.policies import ACCEPT, REJECT, register
+
+    @register("keep-even", parameters={"every": 2}, memory={"count": 0})
     def keep_even(buffer, arrival, memory):
-        "Drops every second arrival that finds the queue full, the oldest otherwise."
+        "When the queue is full, every second newcomer replaces the oldest message; the others are rejected."
         if len(buffer.slots) < buffer.capacity:
             return ACCEPT
         memory[0] += 1
-        return 0 if memory[0] % 2 else REJECT
+        return REJECT if memory[0] % buffer.parameters[0] else 0
 
-That name now works wherever the built-in ones do. Given ``compile=True`` the same function runs compiled.
+That name now works wherever the built-in ones do. With ``compile=True`` the same function runs compiled.
 """
 
 from __future__ import annotations
@@ -26,8 +31,8 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, Concatenate, NamedTuple, ParamSpec, cast
 
 import numba
 import numpy as np
@@ -37,35 +42,41 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import compile_for
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 
-OnArrival = Callable[[Buffer, Any, NDArray[np.float64]], int]
-OnDeparture = Callable[[Buffer, NDArray[np.float64]], None]
-OnDequeue = Callable[[Buffer, NDArray[np.float64]], bool]
-OnSend = Callable[[Buffer, NDArray[np.float64]], int]
-Foresee = Callable[[Any, int, int, Any], NDArray[np.float64]]
+Arrival = Any
+"""A MESSAGE record."""
+Memory = NDArray[np.float64]
+"""float64[entries]: a policy's state at one sender."""
+OnArrival = Callable[[Buffer, Arrival, Memory], int]
+OnDeparture = Callable[[Buffer, Memory], None]
+OnDequeue = Callable[[Buffer, Memory], bool]
+OnSend = Callable[[Buffer, Memory], int]
+Privileged = Callable[[Any, int, int, Any], Memory]
+Functions = tuple[OnArrival, OnDeparture, OnDequeue, OnSend]
+Fields = ParamSpec("Fields")
 
 
-def _nothing(buffer: Buffer, memory: NDArray[np.float64]) -> None:
-    """The departure hook of a policy that keeps no score of departures."""
+def _ignore(buffer: Buffer, memory: Memory) -> None:
+    """The ``on_departure`` of a policy that does not track departures."""
 
 
-def _keep(buffer: Buffer, memory: NDArray[np.float64]) -> bool:
-    """The dequeue hook of a policy that drops nothing there."""
+def _keep(buffer: Buffer, memory: Memory) -> bool:
+    """The ``on_dequeue`` of a policy that drops nothing there."""
     return False
 
 
-def _send_head(buffer: Buffer, memory: NDArray[np.float64]) -> int:
-    """The scheduler of a policy that has none: first in, first out."""
+def _send_head(buffer: Buffer, memory: Memory) -> int:
+    """The ``on_send`` of a policy that is no scheduler: first in, first out."""
     return 0
 
 
 @dataclass(frozen=True)
-class Client:
-    """How the program around a policy sends, where that is not the policy's to decide."""
+class ClientSettings:
+    """How the client program around a policy sends, where that is not the policy's to decide."""
 
     encoding: str = ""
-    """Which of an episode's encodings its messages have; empty for their own sizes."""
+    """Which of an episode's encodings its messages use; empty for their own sizes."""
     awaits_acks: bool = True
-    """Whether it keeps to the scenario's in-flight window n_T; else the socket takes whenever the link is free."""
+    """Whether it keeps to the scenario's in-flight window n_T; if not, it sends whenever the link is free."""
     limit_at_send: bool = False
     """Whether rate limits hold messages back at the socket, keeping the latest, instead of dropping at arrival."""
     flush_no_drop: bool = False
@@ -76,30 +87,41 @@ class Client:
 
 @dataclass(frozen=True)
 class Policy:
-    """One drop policy: what decides, what it remembers, where it comes from."""
+    """One drop policy: the functions that decide, their parameters and memory, and where it comes from."""
 
     name: str
+    """Unique in the registry; after ``with_parameters`` it also names the settings."""
     on_arrival: OnArrival
-    on_departure: OnDeparture = _nothing
+    """(buffer, arrival, memory) -> the slot to evict for the newcomer, REJECT or ACCEPT."""
+    _: KW_ONLY
+    on_departure: OnDeparture = _ignore
+    """(buffer, memory): is told of each message that the socket has taken."""
     on_dequeue: OnDequeue = _keep
-    """Whether to drop the head that the socket is about to take; asked again about the next one if so."""
+    """(buffer, memory) -> whether to drop the head that the socket is about to take; if so, it is asked again."""
     on_send: OnSend = _send_head
-    """Which slot the free socket takes, or HOLD: a scheduler."""
+    """(buffer, memory) -> the slot that the free socket takes, or HOLD."""
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    """Names and values of its settings, which its functions read as ``buffer.parameters``."""
+    weights: tuple[float, ...] = ()
+    """A learned policy's numbers: its functions read these as ``buffer.parameters``, and it has no settings."""
     memory: Mapping[str, float] = field(default_factory=dict)
-    """Names and initial values of the memory's entries; those in ``parameters`` are its settings."""
-    parameters: tuple[str, ...] = ()
+    """Names and initial values of the memory's entries."""
+    work: tuple[int, int] = (0, 0)
+    """Scratch entries behind those of the memory: so many, and so many more for each of L + 1 candidates."""
     source: str = ""
+    """The paper, specification or program that it follows."""
+    about: str = ""
+    """What it does, in a sentence; empty to take the first line of ``on_arrival``'s docstring."""
     compile: bool = False
+    """Promises that Numba can compile its functions; if not, they run as ordinary Python."""
     unbounded: bool = False
     """Whether its queue grows without limit, whatever L is; no bound for L messages holds for it."""
-    privileged: Foresee | None = None
-    """(episode, L, B, V) -> memory: for policies that know what is coming, which no robot does."""
-    work: tuple[int, int] = (0, 0)
-    """Room to work in behind the memory's entries: so many numbers, and so many more for each of L + 1 candidates."""
-    about: str = ""
-    client: Client = Client()
+    privileged: Privileged | None = None
+    """(episode, L, B, V) -> memory, for policies that know the future, which no robot does."""
+    client: ClientSettings = ClientSettings()
+    """How the program around it sends."""
     for_topics: bool = False
-    """Whether it is made for several topics; in one queue it says little, and is left out unless it is named."""
+    """Whether it is made for several topics; on one queue it says little, and is left out unless it is named."""
 
     @property
     def schedules(self) -> bool:
@@ -108,8 +130,8 @@ class Policy:
 
     @property
     def hears_departures(self) -> bool:
-        """Whether departures change what it remembers."""
-        return self.on_departure is not _nothing
+        """Whether it is told of departures."""
+        return self.on_departure is not _ignore
 
     @property
     def drops_at_dequeue(self) -> bool:
@@ -130,14 +152,23 @@ class Policy:
 
     @property
     def summary(self) -> str:
-        """What it does: the first line of the function's docstring, unless ``about`` says it."""
+        """What it does: ``about``, or the first line of the function's docstring."""
         return self.about or (inspect.getdoc(self.on_arrival) or "").split("\n")[0]
+
+    @property
+    def parameter_array(self) -> NDArray[np.float64]:
+        """What its functions read as ``buffer.parameters``: float64[parameters], read-only."""
+        numbers = np.array(self.weights or list(self.parameters.values()), np.float64)
+        numbers.flags.writeable = False
+        return numbers
 
     def new_memory(self, senders: int = 1, capacity: int = 0) -> NDArray[np.float64]:
         """Fresh memory for so many senders with L = ``capacity``, float64[senders, entries]."""
-        start = np.array(list(self.memory.values()) or [0.0], np.float64)
-        room = self.work[0] + self.work[1] * (capacity + 1)
-        return np.tile(np.concatenate([start, np.zeros(room)]), (senders, 1))
+        scratch, per_candidate = self.work
+        entries = len(self.memory) + scratch + per_candidate * (capacity + 1)
+        memory = np.zeros((senders, max(1, entries)))
+        memory[:, : len(self.memory)] = list(self.memory.values())
+        return memory
 
     def with_parameters(self, **settings: float) -> Policy:
         """This policy with other settings, named accordingly; an error for an unknown name or an unusable number."""
@@ -150,27 +181,19 @@ class Policy:
         if not settings:
             return self
         label = ",".join(f"{name}={number:g}" for name, number in settings.items())
-        memory = {**self.memory, **{name: float(number) for name, number in settings.items()}}
-        return replace(self, name=f"{self.name}:{label}", memory=memory)
+        parameters = {**self.parameters, **{name: float(number) for name, number in settings.items()}}
+        return replace(self, name=f"{self.name}:{label}", parameters=parameters)
 
     @functools.cached_property
-    def compiled(self) -> tuple[OnArrival, OnDeparture, OnDequeue, OnSend]:
+    def compiled(self) -> Functions:
         """Its functions compiled for one signature each, so that one rollout kernel serves every policy."""
         return _compiled(self.on_arrival, self.on_departure, self.on_dequeue, self.on_send)
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled(
-    on_arrival: OnArrival, on_departure: OnDeparture, on_dequeue: OnDequeue, on_send: OnSend
-) -> tuple[OnArrival, OnDeparture, OnDequeue, OnSend]:
+def _compiled(*functions: Any) -> Functions:
     """Once for all policies that share these functions, whatever their parameters or weights."""
-    arrival, departure, dequeue, send = signatures()
-    return (
-        compile_for(arrival, on_arrival),
-        compile_for(departure, on_departure),
-        compile_for(dequeue, on_dequeue),
-        compile_for(send, on_send),
-    )
+    return cast(Functions, tuple(map(compile_for, signatures(), functions)))
 
 
 @functools.cache
@@ -178,16 +201,15 @@ def signatures() -> tuple[Any, Any, Any, Any]:
     """Numba types of ``on_arrival``, ``on_departure``, ``on_dequeue`` and ``on_send``."""
     message, topic = numba.from_dtype(MESSAGE), numba.from_dtype(TOPIC)
     int_, real = numba.types.int64, numba.types.float64
-    reals = numba.types.Array(real, 1, "C")
+    reals, constants = numba.types.Array(real, 1, "C"), numba.types.Array(real, 1, "C", readonly=True)
     types = {
         "slots": numba.types.Array(message, 1, "C"),
-        "v": numba.types.Array(real, 1, "C", readonly=True),
+        "v": constants,
+        "parameters": constants,
         "topics": numba.types.Array(topic, 1, "C"),
+        **dict.fromkeys(("dequeued_x", "previous_x", "left_fraction", "period_us", "service_ratio"), real),
     }
-    reals_of = {"dequeued_x", "previous_x", "left_fraction", "period_us", "service_ratio"}
-    view = cast(Any, numba.types).NamedTuple(
-        tuple(types.get(name, real if name in reals_of else int_) for name in Buffer._fields), Buffer
-    )
+    view = cast(Any, numba.types).NamedTuple(tuple(types.get(name, int_) for name in Buffer._fields), Buffer)
     return (
         int_(view, message, reals),
         numba.types.void(view, reals),
@@ -196,74 +218,61 @@ def signatures() -> tuple[Any, Any, Any, Any]:
     )
 
 
-_REGISTRY: dict[str, Policy | Callable[[], Policy]] = {}
-"""By name: a policy, or what makes it when it is first asked for."""
-_LATER_FOR_TOPICS: set[str] = set()
-"""Names of those to be made that are for topics."""
+class Later(NamedTuple):
+    """A policy that is made when it is first asked for."""
+
+    make: Callable[[], Policy]
+    """Makes it."""
+    for_topics: bool
+    """As in ``Policy``."""
 
 
-def register(
-    name: str,
-    *,
-    memory: Mapping[str, float] | None = None,
-    parameters: tuple[str, ...] = (),
-    on_departure: OnDeparture = _nothing,
-    on_dequeue: OnDequeue = _keep,
-    on_send: OnSend = _send_head,
-    source: str = "",
-    compile: bool = False,
-    unbounded: bool = False,
-    privileged: Foresee | None = None,
-    client: Client | None = None,
-    for_topics: bool = False,
-) -> Callable[[OnArrival], OnArrival]:
-    """Register the decorated function as the policy ``name``; it comes back unchanged.
+_REGISTRY: dict[str, Policy | Later] = {}
 
-    ``compile=True`` promises that Numba can compile it; else it runs as ordinary Python wherever policies run.
-    """
-    known = _REGISTRY.get(name)
-    if known and (not isinstance(known, Policy) or known.on_arrival.__module__.startswith("bufgym.")):
-        raise BufgymError(f"policy {name!r}: a built-in policy has this name")
-    if not name or any(c in ":,= \t\n" for c in name):
-        raise BufgymError(f"policy {name!r}: a name must be non-empty, without spaces, ':', ',' or '='")
-    unknown = set(parameters) - set(memory or {})
-    if unknown:
-        raise BufgymError(f"policy {name!r}: parameters {sorted(unknown)} are not entries of its memory")
 
-    def add(on_arrival: OnArrival) -> OnArrival:
-        if not callable(on_arrival):
-            raise BufgymError(f"policy {name!r}: {on_arrival!r} is not a function")
-        _REGISTRY[name] = Policy(
-            name,
-            on_arrival,
-            on_departure,
-            on_dequeue,
-            on_send,
-            dict(memory or {}),
-            parameters,
-            source,
-            compile,
-            unbounded,
-            privileged,
-            client=client or Client(),
-            for_topics=for_topics,
-        )
-        return on_arrival
+def _registration(
+    make: Callable[Concatenate[str, OnArrival, Fields], Policy],
+) -> Callable[Concatenate[str, Fields], Callable[[OnArrival], OnArrival]]:
+    def register(name: str, /, *args: Fields.args, **kwargs: Fields.kwargs) -> Callable[[OnArrival], OnArrival]:
+        """Register the decorated function as the policy ``name``; it comes back unchanged.
 
-    return add
+        Keywords are the fields of ``Policy``: ``parameters``, ``memory``, ``on_departure``, ``compile`` and so on.
+
+        Raises:
+            BufgymError: the name is empty, holds one of ``:,=`` or a blank, or is a built-in policy's.
+        """
+        entry = _REGISTRY.get(name)
+        if entry and (isinstance(entry, Later) or entry.on_arrival.__module__.startswith("bufgym.")):
+            raise BufgymError(f"policy {name!r}: a built-in policy has this name")
+        if not name or any(c in ":,= \t\n" for c in name):
+            raise BufgymError(f"policy {name!r}: a name must be non-empty, without spaces, ':', ',' or '='")
+
+        def add(on_arrival: OnArrival) -> OnArrival:
+            if not callable(on_arrival):
+                raise BufgymError(f"policy {name!r}: {on_arrival!r} is not a function")
+            policy = make(name, on_arrival, *args, **kwargs)
+            for what, entries in (("parameters", policy.parameters), ("memory", policy.memory)):
+                if not isinstance(entries, Mapping):
+                    raise BufgymError(f"policy {name!r}: {what} = {entries!r}: must map names to numbers")
+            _REGISTRY[name] = policy
+            return on_arrival
+
+        return add
+
+    return register
+
+
+register = _registration(Policy)
 
 
 def register_later(name: str, make: Callable[[], Policy], *, for_topics: bool = False) -> None:
-    """Register a policy that is made when it is first asked for; a name that is taken stays as it is."""
-    if _REGISTRY.setdefault(name, make) is make and for_topics:
-        _LATER_FOR_TOPICS.add(name)
+    """Register a policy that is made when it is first asked for; an entry of this name stays as it is."""
+    _REGISTRY.setdefault(name, Later(make, for_topics))
 
 
 def names(*, for_topics: bool | None = None) -> Iterator[str]:
     """All registered names, in the order of their registration; True: those made for topics only, False: the others."""
-    made = {name for name, known in _REGISTRY.items() if isinstance(known, Policy) and known.for_topics}
-    made |= _LATER_FOR_TOPICS
-    return iter([name for name in _REGISTRY if for_topics in (None, name in made)])
+    return iter([name for name, entry in _REGISTRY.items() if for_topics in (None, entry.for_topics)])
 
 
 def get(spec: str | Policy) -> Policy:
@@ -280,10 +289,10 @@ def get(spec: str | Policy) -> Policy:
             numbers[key.strip()] = float(number)
         except ValueError:
             raise BufgymError(f"policy {spec!r}: {setting!r} is not of the form parameter=number") from None
-    found = _REGISTRY[name]
-    if not isinstance(found, Policy):
-        found = _REGISTRY[name] = found()
-    return found.with_parameters(**numbers)
+    entry = _REGISTRY[name]
+    if isinstance(entry, Later):
+        entry = _REGISTRY[name] = entry.make()
+    return entry.with_parameters(**numbers)
 
 
 def runs_compiled(policy: Policy) -> bool:

@@ -1,30 +1,26 @@
 """Robofleet's client, as published and as released, and native ROS; `rosbridge` is in ``middleware.py``.
 
-Robofleet (Sikand et al. 2021) limits each topic's rate, queues what is ``no_drop``, keeps one slot for any other topic,
-and sends while fewer than n_T messages are on their way: sent, and not yet answered by a pong. The paper lets the topic
-with the largest priority x wait go first. The released scheduler (github ut-amrl/robofleet_client_lib,
-MessageSchedulerLib.hpp) sorts by the same product upwards, so that the smallest goes first.
+Robofleet (Sikand et al. 2021) limits each topic's rate, queues ``no_drop`` messages, keeps one slot for any other
+topic, and sends while fewer than n_T messages are in flight: sent, and not yet acknowledged (by a pong, in its terms).
+In the paper the topic with the largest priority x wait goes first. The released scheduler (MessageSchedulerLib.hpp of
+github ut-amrl/robofleet_client_lib) sorts by the same product in ascending order, so that the smallest goes first.
 
-Robofleet's queue of ``no_drop`` messages knows no limit. Here it has the sender's L, and makes room as the other
+Robofleet's queue of ``no_drop`` messages has no limit. Here it has the sender's L, and makes room as the other
 schedulers do. On a sender that knows one topic only, both clients keep one slot, and native ROS drops its oldest.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
-from bufgym.policies.registry import Client, register
+from bufgym.policies.registry import Arrival, ClientSettings, Memory, register
 from bufgym.policies.schedulers import fits, make_room, oldest, oldest_of_own, topic_of
 
 
 @kernel
-def overwrite(buffer: Buffer, arrival: Any) -> int:
+def overwrite(buffer: Buffer, arrival: Arrival) -> int:
     """One slot a topic, overwritten by the newcomer; ``no_drop`` messages are not overwritten but queued."""
     own = oldest_of_own(buffer, arrival)
     return own if own != REJECT else make_room(buffer, arrival)
@@ -46,7 +42,13 @@ def prioritised_wait(buffer: Buffer, k: int) -> float:
     return float(topic.priority * (buffer.now_us - topic.last_dequeue_us))
 
 
-def longest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+@kernel
+def goes_before(buffer: Buffer, k: int, rank: float, other: int, other_rank: float) -> bool:
+    """Whether slot ``k`` goes before slot ``other``: by the smaller rank, of equals the first topic."""
+    return rank < other_rank or (rank == other_rank and buffer.slots[k].topic < buffer.slots[other].topic)
+
+
+def longest_wait(buffer: Buffer, memory: Memory) -> int:
     """All ``no_drop`` first, in order of arrival; then the largest priority x wait, of equals the first topic."""
     best = next_no_drop(buffer, 0)
     if best != HOLD:
@@ -55,7 +57,7 @@ def longest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
             wait = prioritised_wait(buffer, k)
-            if wait > longest or (wait == longest and buffer.slots[k].topic < buffer.slots[best].topic):
+            if goes_before(buffer, k, -wait, best, -longest):
                 best, longest = k, wait
     return best
 
@@ -67,7 +69,7 @@ def longest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     source="Robofleet, Sikand et al. 2021, as published",
     compile=True,
 )
-def robofleet(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def robofleet(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Robofleet as published: one slot a topic, no_drop queued and sent first, then the largest priority x wait."""
     return overwrite(buffer, arrival)
 
@@ -75,11 +77,11 @@ def robofleet(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 FLUSHING = 0
 
 
-def shortest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
-    """One pass of the released scheduler, at an arrival or a pong; of equals the first topic.
+def shortest_wait(buffer: Buffer, memory: Memory) -> int:
+    """One pass of the released scheduler, at an arrival or an ack; of equals the first topic.
 
-    It begins only while fewer than n_T are in flight. Then all ``no_drop`` messages go, however many that makes; after
-    them, for as long as n_T allows, the smallest priority x wait of the topics that their rate limits let go.
+    It begins only while fewer than n_T are in flight. Then all ``no_drop`` messages go, however many there are; after
+    them, for as long as n_T allows, the smallest priority x wait of the topics whose rate limits allow it.
     """
     full = buffer.in_flight >= buffer.window
     if not full or memory[FLUSHING] == 1:
@@ -95,7 +97,7 @@ def shortest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
         held_back = topic.dequeued > 0 and buffer.now_us - topic.last_dequeue_us < topic.period_us
         if is_first(buffer, k) and not held_back:
             wait = prioritised_wait(buffer, k)
-            if wait < shortest or (wait == shortest and buffer.slots[k].topic < buffer.slots[best].topic):
+            if goes_before(buffer, k, wait, best, shortest):
                 best, shortest = k, wait
     return best
 
@@ -106,27 +108,26 @@ def shortest_wait(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     on_send=shortest_wait,
     for_topics=True,
     source="Robofleet, released code (ut-amrl/robofleet_client_lib)",
-    client=Client(limit_at_send=True, flush_no_drop=True),
+    client=ClientSettings(limit_at_send=True, flush_no_drop=True),
     compile=True,
 )
-def robofleet_released(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def robofleet_released(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Robofleet as released: rate limits at the socket, no_drop flushed past n_T, the smallest priority x wait first.
 
-    Not here: the code counts a topic's first wait from its first message instead of time 0, in whole milliseconds, and
-    lets a topic go only later than 1 / rate after the last time, not at it; ping again and reconnect after 2 s.
+    Left out: the code counts a topic's first wait from its first message instead of time 0, in whole milliseconds; it
+    sends from a topic only later than 1 / rate after the last time, not exactly then; it pings again and reconnects
+    after 2 s.
     """
     return overwrite(buffer, arrival)
 
 
-def longest_ago(buffer: Buffer, memory: NDArray[np.float64]) -> int:
-    """The oldest message of the topic that was sent from longest ago, never being time 0; of equals the first topic."""
+def longest_ago(buffer: Buffer, memory: Memory) -> int:
+    """The oldest message of the topic served longest ago, where never is time 0; of equals the first topic."""
     best, earliest_us = 0, buffer.now_us + 1
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
             last_dequeue_us = topic_of(buffer, buffer.slots[k]).last_dequeue_us
-            if last_dequeue_us < earliest_us or (
-                last_dequeue_us == earliest_us and buffer.slots[k].topic < buffer.slots[best].topic
-            ):
+            if goes_before(buffer, k, last_dequeue_us, best, earliest_us):
                 best, earliest_us = k, last_dequeue_us
     return best
 
@@ -136,16 +137,16 @@ def longest_ago(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     on_send=longest_ago,
     for_topics=True,
     source="ROS publishers, a queue a topic (queue_size: the topic's limit)",
-    client=Client(encoding="ros", awaits_acks=False, copies=True),
+    client=ClientSettings(encoding="ros", awaits_acks=False, copies=True),
     compile=True,
 )
-def ros_native(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """Native ROS: each topic drops its oldest; topics take turns; one copy a consumer; nobody waits for pongs.
+def ros_native(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """Native ROS: each topic drops its oldest; topics take turns; one copy for each consumer; no acks.
 
-    ROS has a TCP connection per subscriber, which share the link. The nearest that one socket comes to that is round
-    robin by message: the topic (a copy to each consumer is a topic of its own) that was sent from longest ago goes
-    next. Not here: fairness by bytes (a topic of large messages gets more of the link than one of small ones, which
-    wait for whole large ones), and the sockets' own buffers.
+    ROS has a TCP connection per subscriber, and these share the link. With one socket the closest model is round robin
+    by message: the topic served longest ago goes next (a copy to each consumer is a topic of its own). Left out are
+    fairness by bytes (a topic of large messages gets more of the link than one of small ones, which wait for whole
+    large ones) and the sockets' own buffers.
 
     Topics have queues of their own in ROS. Where L is too small for all of them, the oldest message of any goes.
     """

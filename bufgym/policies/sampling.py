@@ -1,21 +1,16 @@
-"""Policies that sample the stream and do not look at what the queue holds."""
+"""Policies that sample the stream, whatever the queue holds."""
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_last
-from bufgym.policies.registry import register
+from bufgym.policies.registry import Arrival, Memory, register
 
 SEEN = 0
 
 
-def reservoir_departure(buffer: Buffer, memory: NDArray[np.float64]) -> None:
-    """The link moves again: what is still queued is the whole sample of a new interruption."""
+def reservoir_departure(buffer: Buffer, memory: Memory) -> None:
+    """The link moves again: what is still queued is the sample that a new interruption begins with."""
     memory[SEEN] = len(buffer.slots)
 
 
@@ -26,9 +21,9 @@ def reservoir_departure(buffer: Buffer, memory: NDArray[np.float64]) -> None:
     source="Vitter, Random sampling with a reservoir, 1985 (algorithm R)",
     compile=True,
 )
-def reservoir(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def reservoir(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Reservoir sampling: every arrival of the interruption is kept with the same probability."""
-    # What was accepted unasked (decide_at="overflow") is still queued here when the first victim is sought.
+    # With decide_at="overflow" messages enter unasked; all of them are still queued at the first decision.
     memory[SEEN] = max(memory[SEEN], len(buffer.slots)) + 1
     if len(buffer.slots) < buffer.capacity:
         return ACCEPT
@@ -36,19 +31,19 @@ def reservoir(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     return place if place < buffer.capacity else REJECT
 
 
-EVERY, COUNT = range(2)
+COUNT = 0
 
 
 @register(
     "decimate",
-    memory={"every": 3.0, "count": 0.0},
-    parameters=("every",),
+    parameters={"every": 3.0},
+    memory={"count": 0.0},
     source="fixed decimation, 30 to 10 frames/s (Golodetz et al. 2018)",
     compile=True,
 )
-def decimate(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def decimate(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Fixed decimation: of the arrivals it is asked about, one in `every` is queued; the head goes when full."""
-    n, every = memory[COUNT], memory[EVERY]
+    n, every = memory[COUNT], buffer.parameters[0]
     memory[COUNT] += 1
     if n > 0 and n // every == (n - 1) // every:
         return REJECT
@@ -57,14 +52,13 @@ def decimate(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 
 @register(
     "keyframe",
-    memory={"step": 0.05},
-    parameters=("step",),
+    parameters={"step": 0.05},
     source="motion keyframes, a threshold on distance or angle (Dong et al.)",
     compile=True,
 )
-def keyframe(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def keyframe(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Motion keyframes: accepts what is `step` in x beyond the keyframe before it; the head goes when full."""
-    s, step = len(buffer.slots), memory[0]
+    s, step = len(buffer.slots), buffer.parameters[0]
     last_x = buffer.slots[s - 1].x if s > 0 else buffer.dequeued_x  # the tail is never dropped before the head
     if s + buffer.dequeued > 0 and arrival.x - last_x < step:
         return REJECT

@@ -1,8 +1,8 @@
-"""Schedulers for several topics over one uplink: which message the free socket takes, and who makes room for whom.
+"""Schedulers for several topics over one uplink: which message goes next, and which one makes room for a newcomer.
 
-`fifo`, `strict-priority`, `age-greedy` and `edf` differ in what goes next alone; at an arrival all four follow
-``make_room``. A topic's messages are sent in the order of their arrival, so that the candidates are the oldest queued
-of each topic. On a sender that knows one topic only, each is a queue that drops its oldest.
+`fifo`, `strict-priority`, `age-greedy` and `edf` differ only in what goes next; at an arrival all four follow
+``make_room``. A topic's messages are sent in the order of their arrival, so the candidates are the oldest queued
+message of each topic. On a sender that knows one topic only, each is a queue that drops its oldest message.
 """
 
 from __future__ import annotations
@@ -10,14 +10,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, is_first
-from bufgym.policies.registry import register
+from bufgym.policies.registry import Arrival, Memory, register
 
-# --- who goes for a newcomer -----------------------------------------------------------------------------------------
+# --- what a newcomer drives out --------------------------------------------------------------------------------------
 
 
 @kernel
@@ -33,7 +30,7 @@ def same_topic(buffer: Buffer, a: Any, b: Any) -> bool:
 
 
 @kernel
-def fits(buffer: Buffer, arrival: Any) -> bool:
+def fits(buffer: Buffer, arrival: Arrival) -> bool:
     """Whether the newcomer fits without a drop: by messages, by bytes, and by its topic's limit."""
     topic = topic_of(buffer, arrival)
     enough_bytes = buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes
@@ -41,8 +38,8 @@ def fits(buffer: Buffer, arrival: Any) -> bool:
 
 
 @kernel
-def makes_room(buffer: Buffer, arrival: Any, k: int) -> bool:
-    """Whether slot ``k`` may be dropped and the newcomer fits once it is."""
+def makes_room(buffer: Buffer, arrival: Arrival, k: int) -> bool:
+    """Whether slot ``k`` may be dropped and the newcomer fits once it is gone."""
     slot, topic = buffer.slots[k], topic_of(buffer, arrival)
     enough_bytes = buffer.backlog_bytes - slot.size_bytes + arrival.size_bytes <= buffer.max_bytes
     within_limit = same_topic(buffer, slot, arrival) or topic.queued < topic.limit
@@ -50,7 +47,7 @@ def makes_room(buffer: Buffer, arrival: Any, k: int) -> bool:
 
 
 @kernel
-def oldest(buffer: Buffer, arrival: Any) -> int:
+def oldest(buffer: Buffer, arrival: Arrival) -> int:
     """The oldest message that makes room, REJECT if none does."""
     for k in range(len(buffer.slots)):
         if makes_room(buffer, arrival, k):
@@ -59,7 +56,7 @@ def oldest(buffer: Buffer, arrival: Any) -> int:
 
 
 @kernel
-def oldest_of_own(buffer: Buffer, arrival: Any) -> int:
+def oldest_of_own(buffer: Buffer, arrival: Arrival) -> int:
     """The oldest message of the newcomer's topic that makes room, REJECT if none does."""
     for k in range(len(buffer.slots)):
         if same_topic(buffer, buffer.slots[k], arrival) and makes_room(buffer, arrival, k):
@@ -68,7 +65,7 @@ def oldest_of_own(buffer: Buffer, arrival: Any) -> int:
 
 
 @kernel
-def oldest_of_lowest(buffer: Buffer, arrival: Any) -> int:
+def oldest_of_lowest(buffer: Buffer, arrival: Arrival) -> int:
     """The oldest message of the lowest priority that makes room, unless it ranks above the newcomer: then REJECT.
 
     A ``no_drop`` newcomer enters whatever its priority.
@@ -83,7 +80,7 @@ def oldest_of_lowest(buffer: Buffer, arrival: Any) -> int:
 
 
 @kernel
-def make_room(buffer: Buffer, arrival: Any) -> int:
+def make_room(buffer: Buffer, arrival: Arrival) -> int:
     """Accept what fits; else the oldest of the newcomer's topic goes, else the oldest of the lowest priority."""
     if fits(buffer, arrival):
         return ACCEPT
@@ -95,12 +92,12 @@ def make_room(buffer: Buffer, arrival: Any) -> int:
 
 
 @register("fifo", for_topics=True, source="first come, first served over all topics", compile=True)
-def fifo(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def fifo(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """First in, first out, whatever the topic; a full queue drops the oldest of the newcomer's topic."""
     return make_room(buffer, arrival)
 
 
-def highest_priority(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+def highest_priority(buffer: Buffer, memory: Memory) -> int:
     """The highest priority; of equals the oldest."""
     best, highest = 0, -math.inf
     for k in range(len(buffer.slots)):
@@ -117,13 +114,13 @@ def highest_priority(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     source="strict priority queueing, as IEEE 802.1Q transmission selection",
     compile=True,
 )
-def strict_priority(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """Highest priority first, first in, first out among equals; low ones starve while high ones keep the link busy."""
+def strict_priority(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """Highest priority first, first in, first out among equals; low priorities starve while high ones fill the link."""
     return make_room(buffer, arrival)
 
 
-def most_aged(buffer: Buffer, memory: NDArray[np.float64]) -> int:
-    """Of the oldest of each topic the one with the largest weight x age; of equals the oldest."""
+def most_aged(buffer: Buffer, memory: Memory) -> int:
+    """Among the oldest of each topic, the one with the largest weight x age; of equals the oldest."""
     best, most = 0, -math.inf
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
@@ -142,19 +139,19 @@ def most_aged(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     source="age of information: Kaul et al. 2012; greedy by weighted age: Kadota et al. 2018",
     compile=True,
 )
-def age_greedy(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def age_greedy(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The topic with the largest weight x age of information first.
 
-    The age of a topic is the time since its newest *sent* message arrived at the sender: the age at the server once all
-    that was sent is there (S. Kaul, R. Yates, M. Gruteser, "Real-time status: how often should one update?", 2012). A
-    topic of which nothing was sent is as old as its oldest queued message. Candidates are the oldest of each topic.
-    That is the greedy policy, which sends where the age is highest, of I. Kadota et al., "Scheduling Policies for
-    Minimizing Age of Information in Broadcast Wireless Networks", 2018, the ages weighted as in their sum.
+    The age of a topic is the time since its newest *sent* message arrived at the sender: the age at the server once
+    everything sent is there (S. Kaul, R. Yates, M. Gruteser, "Real-time status: how often should one update?", 2012). A
+    topic that has sent nothing is as old as its oldest queued message. Candidates are the oldest of each topic. This is
+    the greedy policy, which sends where the age is highest, of I. Kadota et al., "Scheduling Policies for Minimizing
+    Age of Information in Broadcast Wireless Networks", 2018, with the ages weighted as in their sum.
     """
     return make_room(buffer, arrival)
 
 
-def earliest_deadline(buffer: Buffer, memory: NDArray[np.float64]) -> int:
+def earliest_deadline(buffer: Buffer, memory: Memory) -> int:
     """The earliest absolute deadline; of equals, and of those without one, the oldest."""
     best, earliest_us = 0, 0
     for k in range(len(buffer.slots)):
@@ -171,6 +168,6 @@ def earliest_deadline(buffer: Buffer, memory: NDArray[np.float64]) -> int:
     source="earliest deadline first, Liu and Layland 1973",
     compile=True,
 )
-def edf(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """Earliest deadline first: arrival + its topic's deadline; a message that is late already is sent all the same."""
+def edf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """Earliest deadline first: arrival + its topic's deadline; a message that is already late is still sent."""
     return make_room(buffer, arrival)

@@ -87,6 +87,7 @@ def full_queue(capacity: int, arrivals: int) -> tuple[Buffer, NDArray[Any]]:
 def inside_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], decisions: int) -> float:
     """Time of one decision in a compiled loop (in a Python loop where compilation is off), us."""
     loop, on_arrival = compiled_loop(), policy.compiled[0]
+    buffer = buffer._replace(parameters=policy.parameter_array)
     rounds = max(1, decisions // len(arrivals))
     start, memory = policy.new_memory(2, buffer.capacity)
     loop(buffer, arrivals, memory, start, on_arrival, 1)
@@ -101,6 +102,7 @@ def inside_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], decisions:
 def called_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], calls: int) -> tuple[float, float]:
     """Median and 99th percentile of one call from Python, the clock's own time included, us."""
     on_arrival, (start, memory) = policy.compiled[0], policy.new_memory(2, buffer.capacity)
+    buffer = buffer._replace(parameters=policy.parameter_array)
     one_by_one = [arrivals[k] for k in range(len(arrivals))]
     times_ns = np.zeros(calls, np.int64)
     for i in range(calls):

@@ -126,7 +126,7 @@ class Fleet:
             raise BufgymError(f"policy {policy.name}: it plans with a link of its own, which no robot in a cell has")
         if memory is None:
             memory = policy.new_memory(len(self.senders), self.senders.capacity)
-        batch = self.senders.batch
+        batch = self.senders.batch._replace(parameters=policy.parameter_array)
         batch.senders["ask_at_dequeue"], batch.senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
         if runs_compiled(policy):
             compiled_fleet_rollout()(batch, self.shares, memory, *policy.compiled, policy.hears_departures)

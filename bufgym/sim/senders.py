@@ -149,10 +149,11 @@ class Senders:
         senders["limit_at_send"], senders["flush_no_drop"] = policy.client.limit_at_send, policy.client.flush_no_drop
         if not policy.client.awaits_acks:
             senders["window"], senders["ack_delay_us"] = 1, 0
+        batch = self.batch._replace(parameters=policy.parameter_array)
         if runs_compiled(policy):
-            compiled_rollout()(self.batch, memory, *policy.compiled, policy.hears_departures)
+            compiled_rollout()(batch, memory, *policy.compiled, policy.hears_departures)
         else:
-            python_rollout(self.batch, memory, policy)
+            python_rollout(batch, memory, policy)
 
 
 def padded(rows: Sequence[NDArray[Any]]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.model.buffer import MESSAGE, TOPIC
+from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC
 
 END, DEPARTURE, DECISION, DEQUEUE, SEND = range(5)
 ARRIVAL_WAITS, SOCKET_WAITS = 1, 2
@@ -113,6 +113,8 @@ class Batch(NamedTuple):
     v: NDArray[np.float64]
     topics: NDArray[Any]
     """TOPIC[n, topics]"""
+    parameters: NDArray[np.float64] = NO_PARAMETERS
+    """float64[parameters], read-only: those of the policy at hand, which ``view`` shows it."""
 
 
 @functools.cache
@@ -122,7 +124,7 @@ def batch_type() -> Any:
     record = {
         name: numba.from_dtype(dtype) for name, dtype in (("s", SENDER), ("m", MESSAGE), ("f", LOG_ENTRY), ("t", TOPIC))
     }
-    ints = array(int_, 1, "C")
+    ints, constants = array(int_, 1, "C"), array(numba.types.float64, 1, "C", readonly=True)
     return cast(Any, numba.types).NamedTuple(
         (
             array(record["s"], 1, "C"),
@@ -132,8 +134,9 @@ def batch_type() -> Any:
             array(int_, 2, "C"),
             ints,
             ints,
-            array(numba.types.float64, 1, "C", readonly=True),
+            constants,
             array(record["t"], 2, "C"),
+            constants,
         ),
         Batch,
     )

@@ -76,6 +76,7 @@ def view(batch: Batch, i: int) -> Buffer:
         batch.topics[i],
         sender.window,
         sender.dequeued - sender.acked,
+        batch.parameters,
     )
 
 

@@ -118,8 +118,8 @@ def test_every_built_in_policy_with_parameters_is_tuned_or_says_why_not() -> Non
 def test_a_grid_begins_with_the_default_and_repeats_nothing(name: str) -> None:
     specs = tune.settings(name)
     assert specs[0] == name
-    memories = [tuple(policies.get(spec).memory.items()) for spec in specs]
-    assert len(set(memories)) == len(specs) > 1
+    parameters = [tuple(policies.get(spec).parameters.items()) for spec in specs]
+    assert len(set(parameters)) == len(specs) > 1
 
 
 # --- the comparison, on rows made by hand ----------------------------------------------------------------------------

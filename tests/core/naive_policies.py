@@ -166,11 +166,11 @@ class Steady(Policy):
         if not queue:
             self.first = newcomer["seq"]
         places = [self.place(m["seq"] - self.first + 1, L) for m in [*queue, newcomer]]
-        wanted = places.pop()
-        if wanted is None:
+        place = places.pop()
+        if place is None:
             return REJECT
-        if wanted in places:
-            return places.index(wanted)
+        if place in places:
+            return places.index(place)
         return ACCEPT if len(queue) < L else 0
 
 
@@ -213,9 +213,9 @@ class Anything(Policy):
         return one_of([ACCEPT, REJECT, *range(L + 2)], newcomer["uniform"])
 
 
-def policy(spec, v):
-    """The twin of the built-in policy of that name, with settings as in ``decimate:every=2``."""
-    makers = {
+def twins(v):
+    """What makes the twin of each built-in policy, by name."""
+    return {
         "drop-oldest": DropOldest,
         "drop-newest": DropNewest,
         "replace-newest": ReplaceNewest,
@@ -248,6 +248,10 @@ def policy(spec, v):
         **dict.fromkeys(["robofleet", "robofleet-released"], lambda: OldestThatHelps(1)),
         "test-anything": Anything,
     }
+
+
+def policy(spec, v):
+    """The twin of the built-in policy of that name, with settings as in ``decimate:every=2``."""
     name, _, settings = spec.partition(":")
     pairs = [setting.split("=") for setting in settings.split(",") if setting]
-    return makers[name](**{key: float(number) for key, number in pairs})
+    return twins(v)[name](**{key: float(number) for key, number in pairs})

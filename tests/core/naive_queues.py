@@ -167,7 +167,7 @@ class Red(Policy):
         if self.min_th <= filled < self.max_th:
             self.count += 1
             p = self.max_p * (filled - self.min_th) / (self.max_th - self.min_th)
-            # luck < p / (1 - count p), or certain where that is no probability
+            # uniform < p / (1 - count p), or certain where that is no probability
             if newcomer["uniform"] * (1 - self.count * p) < p:
                 self.count = 0
                 return REJECT

@@ -61,6 +61,7 @@ def buffer(times_us, x, v=None, *, dequeued_arrival_us=0, dequeued_x=0.0, previo
         dequeued_arrival_us=dequeued_arrival_us, dequeued_x=dequeued_x, previous_us=previous_us, previous_x=previous_x
     )
     others.update(left_fraction=0.0, period_us=0.0, service_ratio=0.0, topics=records(1, TOPIC))
+    others.pop("parameters")
     return Buffer(**others)
 
 

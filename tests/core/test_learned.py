@@ -12,6 +12,7 @@ import pytest
 from cases import VALUES, cases, log, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from weight_cases import network
 
 from bufgym import policies
 from bufgym import scenario as scenarios
@@ -38,26 +39,13 @@ SLOT_NAMES = [field.name for field in SLOT_FIELDS]
 CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS]
 
 
-def network(rng, inputs, widths):
-    """A network whose every number is random."""
-
-    def some(*shape):
-        return rng.normal(0, 1, shape).astype(np.float32)
-
-    layers, last = [], inputs
-    for width in widths:
-        layers.append((some(last, width), some(width)))
-        last = width
-    return Network(some(inputs), some(1), tuple(layers), some(last if widths else 0))
-
-
 @st.composite
 def weights(draw):
     """Any fields in any order; no, one or two hidden layers, others in the scorer for a link that stands still."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     fields = tuple(draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True)))
     made, other = (
-        Weights(fields, network(rng, len(fields), widths), network(rng, len(fields), widths))
+        Weights(fields, network(rng, len(fields), *widths), network(rng, len(fields), *widths))
         for widths in (draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)])) for _ in range(2))
     )
     mix = rng.normal(0, 1, (len(made.context), len(made.slot))).astype(np.float32)
@@ -160,7 +148,7 @@ def test_a_linear_scorer_of_merged_gaps_is_the_fixed_policy(field, fixed, case, 
 def test_what_the_memory_held_before_does_not_matter(case, v, made):
     policy = learned.policy("random-weights", made)
     memory = policy.new_memory(1, case.capacity)
-    memory[0, len(policy.memory) :] = np.nan
+    memory[:] = np.nan
     senders = case.senders(v)
     senders.run(policy, memory)
     assert same(senders, case.run(policy, v))
@@ -243,7 +231,7 @@ def test_an_exported_agent_decides_as_it_did(tmp_path):
     while not rows.shown.ended.all():
         observation = rows.observation(rows.shown.slots, rows.shown.context)
         actions, _ = model.predict(observation, deterministic=True, action_masks=rows.shown.mask)
-        batch = named(rows.senders.batch)
+        batch = named(rows.senders.batch._replace(parameters=policy.parameter_array))
         for i in np.flatnonzero(~rows.shown.ended):
             arrival = batch.arrivals[i, batch.senders[i].next]
             decision = policy.on_arrival(python_view(batch, i), arrival, memory)

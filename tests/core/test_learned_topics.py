@@ -1,10 +1,7 @@
-"""Learned schedulers decide as their weights say, and their files are refused where anything is wrong."""
+"""Learned schedulers decide as their weights say; ``test_weights`` has their files."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,12 +9,10 @@ import pytest
 from cases import VALUES, cases, log, order, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from safetensors.numpy import load as tensors_of
-from safetensors.numpy import save as safetensors
 from topic_cases import topic_cases
+from weight_cases import ABOUT, made, random_weights
 
 from bufgym import policies
-from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
@@ -31,10 +26,10 @@ from bufgym.observe import (
     observe_topic_context,
     observe_topic_slots,
 )
-from bufgym.policies import learned, learned_topics, weights
-from bufgym.policies.learned import Network, Weights
+from bufgym.policies import learned_topics, weights
+from bufgym.policies.learned import Network
 from bufgym.policies.learned_topics import NAMES, TopicWeights
-from bufgym.policies.registry import Client, Policy
+from bufgym.policies.registry import ClientSettings, Policy
 from bufgym.scenario import Episode, messages
 from bufgym.sim import run
 from bufgym.traces import Trace
@@ -42,29 +37,14 @@ from bufgym.traces import Trace
 V = qoi.exponential(0.618)
 SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
 CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
-NETWORKS = ("drop", "accept", "send")
-
-
-def network(rng, inputs, width):
-    """Every number random; ``width`` 0: without a hidden layer."""
-
-    def some(*shape):
-        return rng.normal(0, 1, shape).astype(np.float32)
-
-    layers = ((some(inputs, width), some(width)),) if width else ()
-    return Network(some(inputs), some(1), layers, some(width))
-
-
-def made(fields, width, seed=0):
-    rng = np.random.default_rng(seed)
-    return TopicWeights(tuple(fields), *(network(rng, len(fields), width) for _ in NETWORKS))
 
 
 @st.composite
 def schedulers(draw):
     """Any fields in any order, the context's alone included; with and without a hidden layer."""
     fields = draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True))
-    return made(fields, draw(st.sampled_from([0, 0, 1, 3, 8])), draw(st.integers(0, 2**32)))
+    widths = draw(st.sampled_from([(), (), (1,), (3,), (8,)]))
+    return random_weights(TopicWeights, fields, *widths, seed=draw(st.integers(0, 2**32)))
 
 
 # --- the twin --------------------------------------------------------------------------------------------------------
@@ -138,7 +118,7 @@ def played(case, policy):
 @given(topic_cases(min_topics=2), schedulers(), st.integers(1, 40))
 @settings(max_examples=120 if JIT else 15)
 def test_decides_as_its_twin_compiled_and_not(case, whole, capacity):
-    case = replace(case, case=replace(case.case, capacity=capacity), client=Client())
+    case = replace(case, case=replace(case.case, capacity=capacity), client=ClientSettings())
     policy = learned_topics.policy("random-weights", whole)
     ours = played(case, policy)
     assert same(ours, played(case, twin(whole)))
@@ -152,7 +132,7 @@ def test_decides_as_its_twin_compiled_and_not(case, whole, capacity):
 def test_what_the_memory_held_before_does_not_matter(case, whole):
     policy = learned_topics.policy("random-weights", whole)
     memory = policy.new_memory(1, case.case.capacity)
-    memory[0, len(policy.memory) :] = np.nan
+    memory[:] = np.nan
     senders = case.senders()
     senders.run(policy, memory)
     assert same(senders, played(case, policy))
@@ -181,7 +161,7 @@ def test_a_score_by_hand():
 def linear(**skips):
     """No hidden layer: what each network makes of a field, as drop_loss=-10; what fits is accepted."""
     fields = tuple(dict.fromkeys(name.split("_", 1)[1] for name in skips)) or ("rank",)
-    whole = made(fields, 0)
+    whole = random_weights(TopicWeights, fields)
     for net in (whole.drop, whole.accept, whole.send):
         net.skip[:], net.bias[:] = 0, 0
     for name, number in skips.items():
@@ -222,154 +202,14 @@ def test_one_set_of_weights_serves_every_capacity():
         assert senders.batch.senders["invalid"][0] == 0
 
 
-# --- files -----------------------------------------------------------------------------------------------------------
-
-FIELDS = ("waited", "service_ratio", "gain")
-ABOUT = {"name": "small", "about": "Sends something.", "seeds": [3]}
-
-
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "small.safetensors"
-
-
-@pytest.fixture
-def parts(path):
-    """The tensors and the metadata of a valid file with a hidden layer of 4."""
-    weights.save(path, made(FIELDS, 4), ABOUT)
-    return tensors_of(path.read_bytes()), weights.read_any(path)[1]
-
-
-def put(path, tensors, metadata):
-    path.write_bytes(safetensors(tensors, metadata={weights.KEY: json.dumps(metadata)}))
-
-
-def refused(path, *told):
-    """One line that names the file and says all this, whoever reads it."""
-    for reads in (weights.read_any, policies.load):
-        with pytest.raises(BufgymError) as error:
-            reads(path)
-        assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
-        for each in told:
-            assert each in str(error.value)
-
-
-@pytest.mark.parametrize("width", [0, 1, 8, 256])
-def test_what_is_written_comes_back_bit_for_bit(path, width):
-    before = made(FIELDS, width)
-    weights.save(path, before, ABOUT)
-    after, metadata = weights.read_any(path)
-    assert isinstance(after, TopicWeights)
-    assert (after.fields, after.width) == (before.fields, width)
-    assert after.memory().tobytes() == before.memory().tobytes()
-    assert {key: metadata[key] for key in ABOUT} == ABOUT
-    first = path.read_bytes()
-    weights.save(path, after, ABOUT)
-    assert path.read_bytes() == first
-
-
-def test_a_loaded_scheduler_is_a_policy_like_any_other(path):
-    whole = made(FIELDS, 4)
+def test_a_loaded_scheduler_is_a_policy_like_any_other(tmp_path):
+    whole, path = made(4, kind=TopicWeights), tmp_path / "small.safetensors"
     weights.save(path, whole, ABOUT)
     policy = policies.load(path)
-    assert (policy.name, policy.summary) == ("small", "Sends something.")
+    assert (policy.name, policy.summary) == ("small", ABOUT["about"])
     assert policy.schedules and policy.for_topics and policy.ranked
-    runs = [
-        run(each, [ten_messages()], 3, V, topics=HIGH_AND_LOW) for each in (policy, learned_topics.policy("x", whole))
-    ]
-    assert same(*runs)
-
-
-def test_who_wants_a_policy_for_one_queue_is_told_that_this_is_none(path):
-    weights.save(path, made(FIELDS, 4), ABOUT)
-    with pytest.raises(BufgymError, match=r"small\.safetensors: a scheduler for several topics, not a policy for one"):
-        weights.read(path)
-
-
-def test_reading_a_scheduler_needs_no_torch(path):
-    weights.save(path, made(FIELDS, 4), ABOUT)
-    program = f"import sys; from bufgym import policies; policies.load({str(path)!r}); print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False"]
-
-
-@pytest.mark.parametrize("keep", [0, 7, 8, 100, -1])
-def test_a_truncated_file_is_refused(path, parts, keep):
-    path.write_bytes(path.read_bytes()[:keep])
-    refused(path, "no safetensors file, or a broken one")
-
-
-def test_a_changed_number_is_refused(path, parts):
-    data = bytearray(path.read_bytes())
-    data[-4] ^= 1
-    path.write_bytes(data)
-    refused(path, "sha256", "the file was changed")
-
-
-@pytest.mark.parametrize(
-    ("name", "tensor", "rule"),
-    [
-        ("send.skip", None, "tensor send.skip is missing"),
-        ("send.0.weight", None, "tensor send.0.weight is missing"),
-        ("drop.0.bias", None, "tensor drop.0.bias is missing"),
-        ("accept.out", None, "tensor accept.out is missing"),
-        ("send.skip", np.zeros(4, np.float32), "shape of tensor send.skip = [4]: must be [3]"),
-        ("send.0.weight", np.zeros((3, 5), np.float32), "shape of tensor send.0.weight = '[3, 5]': must be [3, 4]"),
-        ("send.out", np.zeros(0, np.float32), "shape of tensor send.out = [0]: must be [4]"),
-        ("send.1.weight", np.zeros((4, 2), np.float32), "tensor send.1.weight has no place"),
-        ("drop.1.bias", np.zeros(2, np.float32), "has no place in networks of 1 hidden layers (1 at most)"),
-        ("critic.skip", np.zeros(3, np.float32), "tensor critic.skip has no place"),
-        ("drop.mix", np.zeros((1, 2), np.float32), "tensor drop.mix has no place"),
-        ("still.drop.bias", np.zeros(1, np.float32), "tensor still.drop.bias has no place"),
-        ("still.send.bias", np.zeros(1, np.float32), "tensor still.send.bias has no place"),
-        ("send.bias", np.zeros(1, np.float64), "type of tensor send.bias = F64: must be F32"),
-        ("send.bias", np.float32([np.nan]), "tensor send.bias must hold finite numbers alone"),
-    ],
-)
-def test_tensors_that_break_a_rule_are_refused(path, parts, name, tensor, rule):
-    tensors, metadata = parts
-    tensors = {**tensors, name: tensor} if tensor is not None else {k: v for k, v in tensors.items() if k != name}
-    put(path, tensors, metadata)
-    refused(path, rule)
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "rule"),
-    [
-        ("fields", ["waited", "service_ratio", "speed"], "field = speed: unknown; known: occupied"),
-        ("fields", ["waited", "service_ratio", "service_ratio"], "field = drain: given more than once"),
-        ("fields", ["waited", "service_ratio"], "must be [2] for 2 fields"),
-        ("fields", ["service_ratio", "waited", "gain"], "the file was changed"),
-        ("fields", [], "must be a list of at least one field"),
-        ("observation", weights.observation_hash(), "trained on other observations than this bufgym's"),
-        ("format", 2, "this bufgym reads format 1"),
-    ],
-)
-def test_metadata_that_break_a_rule_are_refused(path, parts, key, value, rule):
-    tensors, metadata = parts
-    put(path, tensors, {**metadata, key: value})
-    refused(path, rule)
-
-
-def test_a_scheduler_without_its_third_network_is_no_policy_for_one_queue(path, parts):
-    tensors, metadata = parts
-    put(path, {name: tensor for name, tensor in tensors.items() if not name.startswith("send.")}, metadata)
-    refused(path, "trained on other observations")
-
-
-def test_a_policy_for_one_queue_may_not_read_what_only_topics_have(path):
-    nets = [network(np.random.default_rng(0), 1, 0) for _ in range(2)]
-    with pytest.raises(BufgymError, match="field = waited: unknown"):
-        weights.save(path, Weights(("waited",), *nets), ABOUT)
-    weights.save(path, Weights(("service_ratio",), *nets), ABOUT)
-    assert isinstance(weights.read_any(path)[0], Weights)
-    assert not policies.load(path).schedules
-
-
-def test_a_scheduler_of_unequal_networks_is_not_written(path):
-    whole = made(FIELDS, 4)
-    with pytest.raises(BufgymError, match=r"send\.0\.weight = .*must be \[3, 4\]"):
-        weights.save(path, replace(whole, send=made(FIELDS, 5).send), ABOUT)
-    with pytest.raises(BufgymError, match="1 to 256 hidden units"):
-        weights.save(path, made(FIELDS, learned.MAX_WIDTH + 1), ABOUT)
-    assert not path.exists()
+    first, other = (
+        run(scheduler, [ten_messages()], 3, V, topics=HIGH_AND_LOW)
+        for scheduler in (policy, learned_topics.policy("x", whole))
+    )
+    assert same(first, other)

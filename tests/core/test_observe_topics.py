@@ -197,10 +197,10 @@ def test_every_field_is_its_twins(case):
     batch, L = senders.batch, case.case.capacity
     seen = named(batch)
     origin, events = with_origins(twin), case.twin_events(twin)
-    told = next(events)
+    event_name = next(events)
     while True:
         event = next_event(batch, 0)
-        assert NAMES[event] == told
+        assert NAMES[event] == event_name
         if event == END:
             break
         sender = seen.senders[0]
@@ -209,9 +209,9 @@ def test_every_field_is_its_twins(case):
             by_definition = Twin(case, twin, buffer, origin)
             slots, context = observed(seen, buffer, event == DECISION)
             for name, numbers in (by_definition.slots() | by_definition.context()).items():
-                found = (slots | context)[name]
-                np.testing.assert_allclose(found, numbers, rtol=1e-6, atol=1e-6, err_msg=f"{name} at a {told}")
-                assert ((found >= 0) & (found <= 1)).all(), name
+                kernels = (slots | context)[name]
+                np.testing.assert_allclose(kernels, numbers, rtol=1e-6, atol=1e-6, err_msg=f"{name} at a {event_name}")
+                assert ((kernels >= 0) & (kernels <= 1)).all(), name
         answer = None
         if event == DECISION:
             answer = decision(seen.arrivals[0, sender.next].uniform, L)
@@ -222,7 +222,7 @@ def test_every_field_is_its_twins(case):
         elif event == DEQUEUE:
             answer = unwanted(twin.now, len(twin.slots()))
             answer_dequeue(batch, 0, answer)
-        told = events.send(answer)
+        event_name = events.send(answer)
 
 
 def test_the_twin_knows_every_field():

@@ -170,7 +170,7 @@ def test_lifespan():
     assert longest_wait_us("drop-oldest") > 2.5e6
     # Exactly 0.5 s old is not too old: the link rests for as long, 1 us less and 1 us more.
     for lifespan_s, dropped in ((0.499999, 1), (0.5, 0), (0.500001, 0)):
-        arrivals = messages(np.array([0, 0]), 500_000)  # the second waits until the first has crossed, at 0.5 s
+        arrivals = messages(np.array([0, 0]), 500_000)  # the second waits until the first is transmitted, at 0.5 s
         episode = Episode(arrivals, Link(Trace.constant(1e6, 20)))
         result = run(policies.get(f"lifespan:lifespan_s={lifespan_s}"), [episode], 4, V)
         assert len(log(result)["dropped_us"]) == dropped
@@ -227,33 +227,39 @@ def test_codel_leaves_a_good_queue_alone():
     assert int(slow.batch.senders["evicted"][0]) == 0
 
 
+def red_and_memory(spec):
+    """RED as a function of the occupancy of a queue with L = 8, the arrival and the memory; and its fresh memory."""
+    policy = policies.get(spec)
+
+    def red(s, arrival, memory):
+        buffer = SimpleNamespace(capacity=8, slots=[None] * s, parameters=policy.parameter_array)
+        return policy.on_arrival(buffer, arrival, memory)
+
+    return red, policy.new_memory()[0]
+
+
 def test_red_drops_with_p_over_1_minus_count_p():
     # Half full, between 1/4 and 3/4: p_b = 0.1 x 1/2 = 0.05. Then 0.05 / (1 - 0.05 count): uniform over 20 arrivals.
-    red, memory = policies.get("red").on_arrival, policies.get("red").new_memory()[0]
-    memory[3], half = 1.0, SimpleNamespace(capacity=8, slots=[None] * 4)  # weight 1: the average is the occupancy
-    unlucky, episode_with_uniforms = SimpleNamespace(uniform=0.0), SimpleNamespace(uniform=1 - 1e-9)
+    red, memory = red_and_memory("red:weight=1")  # the average is the occupancy
+    least, most = SimpleNamespace(uniform=0.0), SimpleNamespace(uniform=1 - 1e-9)
     for count in range(19):
         p = 0.05 / (1 - 0.05 * count)
         for uniform, decision in ((p - 1e-9, REJECT), (p + 1e-9, ACCEPT)):
-            assert red(half, SimpleNamespace(uniform=uniform), memory.copy()) == decision
-        assert red(half, episode_with_uniforms, memory) == ACCEPT
-    assert red(half, episode_with_uniforms, memory) == REJECT  # the 20th in any case
+            assert red(4, SimpleNamespace(uniform=uniform), memory.copy()) == decision
+        assert red(4, most, memory) == ACCEPT
+    assert red(4, most, memory) == REJECT  # the 20th in any case
     # Below 1/4 none, from 3/4 on all.
-    for s, arrival, decision in (
-        (1, unlucky, ACCEPT),
-        (6, episode_with_uniforms, REJECT),
-        (8, episode_with_uniforms, REJECT),
-    ):
-        assert red(SimpleNamespace(capacity=8, slots=[None] * s), arrival, memory.copy()) == decision
+    for s, arrival, decision in ((1, least, ACCEPT), (6, most, REJECT), (8, most, REJECT)):
+        assert red(s, arrival, memory.copy()) == decision
 
 
 def test_red_averages():
     # Weight 0.2, a queue of 4 from now on: 0.8, 1.44, 1.952, 2.3616, ...: over 1/4 of L = 8 with the fourth arrival.
-    red, memory = policies.get("red").on_arrival, policies.get("red").new_memory()[0]
-    seen = []
+    red, memory = red_and_memory("red")
+    averages = []
     for _ in range(4):
-        red(SimpleNamespace(capacity=8, slots=[None] * 4), SimpleNamespace(uniform=0.9), memory)
-        seen.append((memory[4], memory[5]))
-    assert seen == [
+        red(4, SimpleNamespace(uniform=0.9), memory)
+        averages.append(tuple(memory))
+    assert averages == [
         (pytest.approx(average), count) for average, count in ((0.8, -1), (1.44, -1), (1.952, -1), (2.3616, 0))
     ]

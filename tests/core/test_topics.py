@@ -29,7 +29,7 @@ from bufgym.model.buffer import (
 )
 from bufgym.model.link import FOREVER, Link
 from bufgym.model.topics import Topic, check_topics, check_window
-from bufgym.policies.registry import Client
+from bufgym.policies.registry import ClientSettings
 from bufgym.scenario import Episode, messages
 from bufgym.sim import (
     DECISION,
@@ -83,7 +83,7 @@ def scripted(*answers):
 
 
 def after_run(played, topics=(), *, capacity=5, on_arrival=take_all, client=None, **hooks):
-    policy = policies.Policy("by-hand", on_arrival, client=client or Client(), **hooks)
+    policy = policies.Policy("by-hand", on_arrival, client=client or ClientSettings(), **hooks)
     return run(policy, [played], capacity, V, topics=topics)
 
 
@@ -110,7 +110,7 @@ def test_one_in_flight_leaves_the_link_idle():
 
 
 def test_a_client_that_awaits_no_pongs():
-    senders = after_run(episode([0, 0, 0], window=2, ack_delay_us=50 * MS), client=Client(awaits_acks=False))
+    senders = after_run(episode([0, 0, 0], window=2, ack_delay_us=50 * MS), client=ClientSettings(awaits_acks=False))
     assert log(senders)["dequeued_us"] == {0: 0, 1: 1 * MS, 2: 2 * MS}
 
 
@@ -149,7 +149,7 @@ def test_rate_limits_at_the_socket(hooks, invalid):
     # 10 Hz: 0 goes at once. At 1 and 60 ms nothing may go, at 120 ms it may: 1, the oldest. It crosses at 121 ms, which
     # is too soon for 2; no arrival or pong comes after that, so 2 and 3 stay.
     topics = (Topic("status", rate_limit_hz=10), Topic("other"))
-    senders = after_run(episode([0, 1, 60, 120]), topics, client=Client(limit_at_send=True), **hooks)
+    senders = after_run(episode([0, 1, 60, 120]), topics, client=ClientSettings(limit_at_send=True), **hooks)
     held_first = invalid == 1  # who always holds must let one go when nothing is to come, 0 at 120 ms; then nothing may
     assert log(senders)["dequeued_us"] == ({0: 120 * MS} if held_first else {0: 0, 1: 120 * MS})
     assert log(senders)["dropped_us"] == {}
@@ -239,7 +239,7 @@ def test_flushing_no_drop():
         senders = after_run(
             episode([0] * 4, [1, 0, 1, 0], window=1, ack_delay_us=50 * MS),
             topics,
-            client=Client(flush_no_drop=True),
+            client=ClientSettings(flush_no_drop=True),
             **hooks,
         )
         assert log(senders)["dequeued_us"] == {0: 0, 1: 0, 3: 0, 2: 53 * MS}
@@ -247,7 +247,7 @@ def test_flushing_no_drop():
 
 def test_flushing_is_for_no_drop_alone():
     # A plain sender has no no_drop messages: its window holds.
-    senders = after_run(episode([0] * 3, window=1, ack_delay_us=50 * MS), client=Client(flush_no_drop=True))
+    senders = after_run(episode([0] * 3, window=1, ack_delay_us=50 * MS), client=ClientSettings(flush_no_drop=True))
     assert log(senders)["dequeued_us"] == {0: 0, 1: 51 * MS, 2: 102 * MS}
 
 
@@ -681,7 +681,7 @@ def holds_sometimes(buffer, memory):
 PLAIN = [
     p
     for p in (*map(policies.get, policies.names()), policies.Policy("test-anything", anything, compile=True))
-    if p.privileged is None and not p.unbounded and not any(p.work) and not p.schedules and p.client == Client()
+    if p.privileged is None and not p.unbounded and not any(p.work) and not p.schedules and p.client == ClientSettings()
 ]
 """All policies of one queue that know nothing beforehand, and one that decides at random."""
 

@@ -15,7 +15,7 @@ from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.buffer import HOLD
 from bufgym.model.topics import Topic
-from bufgym.policies.registry import Client
+from bufgym.policies.registry import ClientSettings
 from bufgym.sim import Senders
 
 TWIN_V = {
@@ -65,7 +65,7 @@ class TopicCase:
     v: qoi.Value
     schedules: bool
     drops_heads: bool
-    client: Client
+    client: ClientSettings
 
     def senders(self) -> Senders:
         """With the episode loaded and the policy's flags set, as ``Senders.run`` does."""
@@ -161,7 +161,7 @@ def topic_cases(draw: st.DrawFn, min_topics: int = 0, max_messages: int = 60) ->
         ],
     )
     topics = tuple(draw(topic_rules(f"topic {k}")) for k in range(n))
-    client = Client(limit_at_send=draw(st.booleans()), flush_no_drop=draw(st.booleans()))
+    client = ClientSettings(limit_at_send=draw(st.booleans()), flush_no_drop=draw(st.booleans()))
     return TopicCase(
         case,
         topics,

@@ -47,8 +47,8 @@ def waiting(env: SenderEnv) -> int:
 
 def copied(env: SenderEnv) -> Batch:
     """A snapshot, to try something on."""
-    batch = env.rows.senders.batch
-    return batch._replace(**{name: getattr(batch, name).copy() for name in batch._fields if name != "v"})
+    batch, shared = env.rows.senders.batch, ("v", "parameters")  # read-only arrays
+    return batch._replace(**{name: getattr(batch, name).copy() for name in batch._fields if name not in shared})
 
 
 # --- Gymnasium -------------------------------------------------------------------------------------------------------

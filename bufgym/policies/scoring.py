@@ -1,0 +1,261 @@
+"""The slot scorer that learned policies share: its networks, their layout as parameters, and the forward pass.
+
+A candidate (a queued message, or the newcomer) has features f: the context's fields first, then its own. A network
+scores it as
+
+    h = relu(W1 f + b1), then once more if there is a second layer;  score = w h + skip f + b
+
+The parameters of a scorer are one row of numbers: a header, the fields that it reads, its networks one after another,
+and the mixing weights if it has any. ``ScorerWeights.pack`` writes this layout and ``unpack`` reads it; no other code
+depends on it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.kernel import kernel
+
+HEADER = 5
+"""Numbers before the fields: fields read, those of the context among them, widths of both layers, 1 if it mixes."""
+DROP, KEEP, SEND = range(3)
+"""The networks of a scorer, in the order of its parameters: of dropping a candidate, accepting it, sending it."""
+
+
+class Scorer(NamedTuple):
+    """A scorer's parameters, unpacked: sizes and views."""
+
+    context: int
+    """Fields that are the context's."""
+    first: int
+    """Width of the first hidden layer; 0 if there is none."""
+    second: int
+    """Width of the second hidden layer; 0 if there is none."""
+    fields: NDArray[np.float64]
+    """[inputs]: where each field stands in the observation of its kind, the context's fields first."""
+    networks: NDArray[np.float64]
+    """[networks, numbers]: skip and b; W1 (a row for each input) and b1; W2 and b2; w."""
+    mix: NDArray[np.float64]
+    """[context fields, slot fields], or nothing."""
+    end: int
+    """Where these parameters end."""
+
+
+class Scratch(NamedTuple):
+    """A policy's memory while it decides."""
+
+    f: NDArray[np.float64]
+    """[inputs]: the features of the candidate at hand, the context's fields first."""
+    skip: NDArray[np.float64]
+    """[slot fields]: how much each of the candidate's own fields counts directly."""
+    h: NDArray[np.float64]
+    """[2 first + second]: sums of the hidden layers; those of the first for the context alone come first."""
+    context: NDArray[np.float64]
+    """[context fields in all]: the observed context."""
+    rows: NDArray[np.float64]
+    """[slot fields in all, L + 1]: the observed slots, the newcomer's last."""
+
+
+@kernel
+def network_size(inputs: int, first: int, second: int) -> int:
+    """Numbers of one network."""
+    if first == 0:
+        return inputs + 1
+    if second == 0:
+        return inputs + 1 + (inputs + 1) * first + first
+    return inputs + 1 + (inputs + 1) * first + (first + 1) * second + second
+
+
+@kernel
+def unpack(parameters: NDArray[np.float64], begin: int, networks: int) -> Scorer:
+    """The scorer of so many networks whose parameters begin at ``begin``."""
+    inputs, context = int(parameters[begin]), int(parameters[begin + 1])
+    first, second = int(parameters[begin + 2]), int(parameters[begin + 3])
+    size = network_size(inputs, first, second)
+    nets = begin + HEADER + inputs
+    mix = nets + networks * size
+    end = mix + int(parameters[begin + 4]) * context * (inputs - context)
+    table = parameters[nets:mix].reshape((networks, size))
+    return Scorer(context, first, second, parameters[begin + HEADER : nets], table, parameters[mix:end], end)
+
+
+@kernel
+def divide(memory: NDArray[np.float64], scorer: Scorer, contexts: int, slots: int, capacity: int) -> Scratch:
+    """The memory as room for one decision: ``contexts`` and ``slots`` fields are observed in all."""
+    skip = len(scorer.fields)
+    h = skip + len(scorer.fields) - scorer.context
+    context = h + 2 * scorer.first + scorer.second
+    rows = context + contexts
+    table = memory[rows : rows + slots * (capacity + 1)].reshape((slots, capacity + 1))
+    return Scratch(memory[:skip], memory[skip:h], memory[h:context], memory[context:rows], table)
+
+
+@kernel
+def read_context(scorer: Scorer, scratch: Scratch) -> None:
+    """Take the context's features from the observation."""
+    for i in range(scorer.context):
+        scratch.f[i] = scratch.context[int(scorer.fields[i])]
+
+
+@kernel
+def begin(scorer: Scorer, which: int, scratch: Scratch) -> float:
+    """What the context adds to every score by network ``which``; its part of the first layer goes to ``scratch.h``."""
+    net, f, h, skip = scorer.networks[which], scratch.f, scratch.h, scratch.skip
+    n, c, first = len(f), scorer.context, scorer.first
+    for i in range(n - c):
+        skip[i] = net[c + i]
+    if which == DROP and len(scorer.mix) > 0:
+        for j in range(c):
+            for i in range(n - c):
+                skip[i] += f[j] * scorer.mix[j * (n - c) + i]
+    score = net[n]
+    for i in range(c):
+        score += net[i] * f[i]
+    weights = n + 1
+    for o in range(first):
+        h[o] = net[weights + n * first + o]
+    # Inputs in the outer loop: each is added to all sums side by side.
+    for i in range(c):
+        for o in range(first):
+            h[o] += f[i] * net[weights + i * first + o]
+    return float(score)
+
+
+@kernel
+def score(scorer: Scorer, which: int, common: float, k: int, scratch: Scratch) -> float:
+    """The score of candidate ``k`` (L: the newcomer) by network ``which``, whose ``begin`` gave ``common``."""
+    net, f, h = scorer.networks[which], scratch.f, scratch.h
+    n, c, first, second = len(f), scorer.context, scorer.first, scorer.second
+    for i in range(c, n):
+        f[i] = scratch.rows[int(scorer.fields[i]), k]
+    own = 0.0
+    for i in range(n - c):
+        own += scratch.skip[i] * f[c + i]
+    weights, sums, width = n + 1, first, first
+    for o in range(first):
+        h[sums + o] = h[o]
+    for i in range(c, n):
+        for o in range(first):
+            h[sums + o] += f[i] * net[weights + i * first + o]
+    if first > 0:
+        weights += (n + 1) * first
+    if second > 0:
+        sums, width = 2 * first, second
+        for o in range(second):
+            h[sums + o] = net[weights + first * second + o]
+        for i in range(first):
+            unit = max(h[first + i], 0.0)
+            for o in range(second):
+                h[sums + o] += unit * net[weights + i * second + o]
+        weights += (first + 1) * second
+    for o in range(width):
+        own += net[weights + o] * max(h[sums + o], 0.0)
+    return common + own
+
+
+# --- weights ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Network:
+    """The weights of one network, float32."""
+
+    skip: NDArray[np.float32]
+    """[inputs]: the direct part of the score."""
+    bias: NDArray[np.float32]
+    """[1]"""
+    layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
+    """Weights [inputs, outputs] and bias [outputs] of each hidden layer."""
+    out: NDArray[np.float32]
+    """[outputs of the last hidden layer]; empty if there is none."""
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Units of each hidden layer."""
+        return tuple(len(bias) for _, bias in self.layers)
+
+    def flat(self, order: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
+        """All its numbers as in ``Scorer.networks``, inputs in this order."""
+        parts = [self.skip[order], self.bias.reshape(1)]
+        for k, (weight, bias) in enumerate(self.layers):
+            parts += [(weight if k else weight[order]).reshape(-1), bias]
+        return np.concatenate([*parts, self.out]).astype(np.float64)
+
+    def tensors(self) -> dict[str, NDArray[np.float32]]:
+        """By name: skip, bias, 0.weight, 0.bias, 1.weight, ..., out."""
+        tensors = {"skip": self.skip, "bias": self.bias}
+        for k, (weight, bias) in enumerate(self.layers):
+            tensors |= {f"{k}.weight": weight, f"{k}.bias": bias}
+        return tensors | {"out": self.out}
+
+    @staticmethod
+    def of(tensors: Mapping[str, NDArray[np.float32]]) -> Network:
+        """The network of these ``tensors``."""
+        hidden = sum(name.endswith(".weight") for name in tensors)
+        layers = tuple((tensors[f"{k}.weight"], tensors[f"{k}.bias"]) for k in range(hidden))
+        return Network(tensors["skip"], tensors["bias"], layers, tensors["out"])
+
+    @staticmethod
+    def shapes(inputs: int, widths: Sequence[int]) -> dict[str, tuple[int, ...]]:
+        """The shapes of ``tensors``, by name."""
+        shapes: dict[str, tuple[int, ...]] = {"skip": (inputs,), "bias": (1,)}
+        for k, shape in enumerate(itertools.pairwise([inputs, *widths])):
+            shapes |= {f"{k}.weight": shape, f"{k}.bias": shape[1:]}
+        return shapes | {"out": (widths[-1] if widths else 0,)}
+
+
+@dataclass(frozen=True)
+class ScorerWeights:
+    """Which fields a scorer reads, and its networks."""
+
+    SLOT_NAMES: ClassVar[tuple[str, ...]]
+    """All fields that a candidate has of its own, in the order of the observation."""
+    CONTEXT_NAMES: ClassVar[tuple[str, ...]]
+    """All fields of the context."""
+    NETWORKS: ClassVar[tuple[str, ...]]
+    """The fields here that are networks, in the order of the parameters."""
+    LAYERS: ClassVar[int]
+    """Hidden layers at most."""
+
+    fields: tuple[str, ...]
+    """Names of the fields read, in the order of the networks' inputs."""
+    drop: Network
+    """Scores dropping a candidate."""
+    accept: Network
+    """Scores accepting the newcomer, where there is room."""
+
+    @property
+    def context(self) -> tuple[str, ...]:
+        """The fields that are the context's."""
+        return tuple(name for name in self.fields if name in self.CONTEXT_NAMES)
+
+    @property
+    def slot(self) -> tuple[str, ...]:
+        """The fields that each candidate has of its own."""
+        return tuple(name for name in self.fields if name in self.SLOT_NAMES)
+
+    @property
+    def widths(self) -> tuple[int, int]:
+        """Of the two hidden layers; 0: none."""
+        first, second, *_ = *self.drop.widths, 0, 0
+        return first, second
+
+    @property
+    def scratch(self) -> int:
+        """Numbers that a decision needs room for, besides the observed slots (see ``divide``)."""
+        first, second = self.widths
+        return 2 * len(self.fields) - len(self.context) + 2 * first + second + len(self.CONTEXT_NAMES)
+
+    def pack(self, mix: NDArray[np.float32] | None = None) -> NDArray[np.float64]:
+        """The scorer as parameters (see ``unpack``)."""
+        order = [self.fields.index(name) for name in (*self.context, *self.slot)]
+        places = [*map(self.CONTEXT_NAMES.index, self.context), *map(self.SLOT_NAMES.index, self.slot)]
+        networks = [getattr(self, name).flat(order) for name in self.NETWORKS]
+        header = [len(self.fields), len(self.context), *self.widths, 0 if mix is None else 1]
+        return np.concatenate([header, places, *networks, *([] if mix is None else [mix.reshape(-1)])])

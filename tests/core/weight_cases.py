@@ -1,0 +1,72 @@
+"""Random weights of learned policies and their files, for the tests of both kinds."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+from safetensors.numpy import load as tensors_of
+from safetensors.numpy import save as safetensors
+
+from bufgym import policies
+from bufgym.errors import BufgymError
+from bufgym.policies import weights
+from bufgym.policies.learned import Network, Weights
+from bufgym.policies.learned_topics import TopicWeights
+
+
+def network(rng, inputs, *widths):
+    """A network whose every number is random, with hidden layers of these widths."""
+
+    def some(*shape):
+        return rng.normal(size=shape).astype(np.float32)
+
+    layers = tuple((some(a, b), some(b)) for a, b in itertools.pairwise([inputs, *widths]))
+    return Network(some(inputs), some(1), layers, some(widths[-1] if widths else 0))
+
+
+def random_weights(kind, fields, *widths, seed=0):
+    """``kind``: Weights or TopicWeights."""
+    rng = np.random.default_rng(seed)
+    return kind(tuple(fields), *(network(rng, len(fields), *widths) for _ in kind.NETWORKS))
+
+
+KINDS = QUEUE, TOPICS = Weights, TopicWeights
+FIELDS = {QUEUE: ("time_merged", "service_ratio"), TOPICS: ("waited", "service_ratio", "gain")}
+ABOUT = {"name": "small", "about": "Drops what is in its way.", "seeds": [0, 1], "scores": {"regret": 0.25}}
+
+
+def made(*widths, kind=QUEUE, fields=None, seed=0):
+    """Weights over the ``FIELDS`` of their kind."""
+    return random_weights(kind, fields or FIELDS[kind], *widths, seed=seed)
+
+
+def parts_of(path):
+    """The tensors and the metadata of a valid file, to be changed and written again by ``put``."""
+    return tensors_of(path.read_bytes()), weights.read_any(path)[1]
+
+
+def put(path, tensors, metadata):
+    """Any tensors with any metadata."""
+    text = metadata if isinstance(metadata, str) else json.dumps(metadata)
+    path.write_bytes(safetensors(tensors, metadata={weights.KEY: text}))
+
+
+def put_changed(path, name, tensor):
+    """The file again with another tensor of that name, or without it (None)."""
+    tensors, metadata = parts_of(path)
+    tensors.pop(name, None)
+    put(path, tensors if tensor is None else {**tensors, name: tensor}, metadata)
+
+
+def refused(path, *phrases):
+    """Whoever reads it gets one line that names the file and holds these phrases."""
+    for reads in (weights.read, weights.read_any, policies.load):
+        with pytest.raises(BufgymError) as error:
+            reads(path)
+        message = str(error.value)
+        assert message.startswith(f"{path}: ") and "\n" not in message
+        for phrase in phrases:
+            assert phrase in message
