@@ -6,7 +6,8 @@ capacity of the scenario (common random numbers), so policies are compared episo
 Every interval is a paired percentile bootstrap over episodes (Efron and Tibshirani 1993, chapter 13): the episodes of
 a scenario are drawn with replacement, the same draw for all its capacities and all policies, and the statistic is
 computed again. For a policy trained several times its training seeds are drawn as well, before the episodes. The draws
-depend on the seed and the names alone: neither the order of the rows nor the other policies change an interval. It speaks of fresh episodes on the traces at hand, not of other traces.
+depend on the seed and the names alone: neither the order of the rows nor the other policies change an interval. It
+speaks of fresh episodes on the traces at hand, not of other traces.
 
 Interquartile mean and probability of improvement are those of Agarwal et al. (NeurIPS 2021) and their library rliable.
 """

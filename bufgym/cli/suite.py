@@ -50,7 +50,8 @@ def out_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
 
 def given(options: argparse.Namespace, names: tuple[str, ...]) -> dict[str, Any]:
     """Those of the options that the user gave."""
-    return {name: getattr(options, name) for name in names if getattr(options, name) not in (None, False)}
+    values = {name: getattr(options, name) for name in names}
+    return {name: value for name, value in values.items() if value is not None and value is not False}
 
 
 def refuse(options: argparse.Namespace, names: tuple[str, ...], why: str) -> None:

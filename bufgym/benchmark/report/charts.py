@@ -98,11 +98,8 @@ def _summary_panels(context: Context) -> list[Figure]:
         spread = 4 * max(high - low, 1e-3)
         near = [value for value in values if low - spread <= value <= high + spread] or [0.0]
         base = context.summary.standings[context.summary.baseline][quantity.key].value
-        figures.append(
-            _dots(
-                context, quantity, "", (base,), (float(low - spread), max(near), float(high + spread)), start=min(near)
-            )
-        )
+        limits = float(low - spread), max(near), float(high + spread)
+        figures.append(_dots(context, quantity, "", (base,), limits, start=min(near)))
     return figures
 
 
@@ -188,11 +185,9 @@ def outages(context: Context) -> Chart | None:
     sizes = middle_first({cell.capacity for cell in cells})
     x = {"title": "length of the outage, s", "type": "log"}
     for value in values:
+        same = [c for c in cells if str(scenarios[c.scenario].get("value", "")) == value]
         for capacity in sizes:
-            chosen = [
-                c for c in cells if (str(scenarios[c.scenario].get("value", "")), c.capacity) == (value, capacity)
-            ]
-            curves = _curves(chosen, lambda c: lengths[c.scenario])
+            curves = _curves([c for c in same if c.capacity == capacity], lambda c: lengths[c.scenario])
             panels[(value, str(capacity))] = [_regret_curves(context, curves, x)] if curves else []
     if len({lengths[cell.scenario] for cell in cells}) < 2 or not any(panels.values()):
         return None
@@ -222,7 +217,7 @@ def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]
         xs = [at for at, _ in curve]
         if out:
             band = [c.regret.low for _, c in curve] + [c.regret.high for _, c in curve][::-1]
-            area = {"fill": "toself", "fillcolor": colour, "opacity": 0.16, "line": {"width": 0}}
+            area: dict[str, Any] = {"fill": "toself", "fillcolor": colour, "opacity": 0.16, "line": {"width": 0}}
             data.append(style.scatter(xs + xs[::-1], [max(y, low) for y in band], mode="lines", **area))
         data.append(
             style.scatter(
@@ -235,10 +230,7 @@ def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]
                 line={"color": colour, "width": 2 if out else 1, "dash": "dot" if policy == "clairvoyant" else "solid"},
                 opacity=1 if out else 0.55,
                 marker={"size": 6 if out else 4, "color": colour},
-                text=[
-                    f"{with_interval(c.regret, percent)}<br>QoI {with_interval(c.qoi, '{:.2f}'.format)}"
-                    for _, c in curve
-                ],
+                text=[f"{with_interval(c.regret, percent)}<br>QoI {with_interval(c.qoi, _fine)}" for _, c in curve],
             )
         )
     ticks = sorted({at for curve in curves.values() for at, _ in curve})
@@ -248,6 +240,10 @@ def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]
     layout["annotations"] = _end_labels(context, curves, (low, high), 370)
     layout["margin"] = {**layout["margin"], "r": 120}
     return {"data": data, "layout": layout}
+
+
+def _fine(number: float) -> str:
+    return f"{number:.2f}"
 
 
 def _end_labels(context: Context, curves: dict[str, Curve], span: tuple[float, float], pixels: int) -> list[Any]:

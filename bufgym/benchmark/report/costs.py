@@ -89,7 +89,9 @@ def memory(context: Context) -> Chart | None:
             by_size[row["capacity"]] = max(by_size.get(row["capacity"], 0.0), float(peak))
     if not peaks:
         return None
-    panels = {(scenario,): [_peaks(context, by_policy)] for scenario, by_policy in peaks.items()}
+    panels: dict[tuple[str, ...], list[Figure]] = {
+        (scenario,): [_peaks(context, by_policy)] for scenario, by_policy in peaks.items()
+    }
     alt = "Largest backlog of each policy in bytes, one dot for each capacity"
     return Chart("memory", alt, [("Scenario", list(peaks))], panels)
 

@@ -24,7 +24,7 @@ MUTED = "var(--muted)"
 
 
 def colours(ranked: Sequence[str], baseline: str) -> dict[str, str]:
-    """A colour for each policy that stands out: the fixed ones, the baseline and the best of ``ranked`` (best first)."""
+    """A colour for each policy that stands out: fixed ones, the baseline, the best of ``ranked`` (best first)."""
     fixed = {baseline: FIXED["drop-oldest"], **FIXED}
     others = [name for name in ranked if name not in fixed]
     return {**fixed, **dict(zip(others, SPARE, strict=False))}
@@ -96,7 +96,7 @@ def layout(height: int, **changes: Any) -> dict[str, Any]:
 def scatter(
     x: Sequence[Any], y: Sequence[Any], hover: str = "", mode: str = "markers", **changes: Any
 ) -> dict[str, Any]:
-    """Points or lines in a chart, with numbers rounded; no hover text: they do not answer to the pointer."""
+    """Points or lines in a chart, with numbers rounded; without hover text they ignore the pointer."""
     answer = {"hovertemplate": f"{hover}<extra></extra>"} if hover else {"hoverinfo": "skip"}
     return {"type": "scatter", "mode": mode, "x": rounded(x), "y": rounded(y), **answer, **changes}
 

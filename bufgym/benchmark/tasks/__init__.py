@@ -20,9 +20,9 @@ TASKS: dict[str, Task] = {task.kind: task for task in (QueueTask(), TopicsTask()
 
 
 def of(scenario: Any, **settings: Any) -> Task:
-    """The task that a scenario is for, with the task's own settings changed (of one queue: max_bytes, decide_at, bound).
+    """The task that a scenario is for; a scenario of no known kind is for one queue.
 
-    A scenario of no known kind is one of one queue.
+    ``settings`` are the task's own, such as max_bytes, decide_at and bound of ``QueueTask``.
     """
     task = next((task for task in TASKS.values() if isinstance(scenario, task.scenarios)), TASKS["queue"])
     return replace(task, **settings)

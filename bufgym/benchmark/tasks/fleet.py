@@ -123,9 +123,9 @@ def _runs(rows: Sequence[Row]) -> dict[Run, list[float]]:
         if row["robot"] in run:
             raise BufgymError(f"rows[{number}]: robot {row['robot']} of one run has more than one row")
         run[row["robot"]] = row["qoi"]
-    robots = {scenario: run.keys() for (scenario, *_), run in by_robot.items()}
+    robots: dict[str, set[int]] = {}
     for (scenario, capacity, policy, trace, seed), run in by_robot.items():
-        if odd := sorted(robots[scenario] ^ run.keys()):
+        if odd := sorted(robots.setdefault(scenario, set(run)) ^ run.keys()):
             place = f"{policy} at {scenario}, L = {capacity}, trace {trace}, seed {seed}"
             raise BufgymError(f"{place}: robot {odd[0]} is not in every episode; all must have the same robots")
     return {key: [run[robot] for robot in sorted(run)] for key, run in by_robot.items()}

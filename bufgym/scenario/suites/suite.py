@@ -1,4 +1,4 @@
-"""What a suite is: a name, scenarios in three splits, capacities and a number of episodes; never changed once published."""
+"""What a suite is: a name, scenarios in three splits, capacities, and a number of episodes."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ DEMAND_BYTES_PER_S = RATE_HZ * SIZE_BYTES
 EPISODE_S = 60.0
 
 
-# A Value is checked with compiled code, which is slow to load: it is made when first asked for, not for ``bufgym list``.
+# Checking a Value takes compiled code, which is slow to load: it is made when first asked for, not for `bufgym list`.
 
 
 @functools.cache
