@@ -262,7 +262,7 @@ def test_bad_traces(
         (["trace", "info", "missing.csv"], "missing.csv"),
         (["trace", "plot", "lte-synthetic-0", "--out", "x.doc"], "x.doc"),
         (["play", "--env", "Moon-v0"], "'Moon-v0'"),
-        (["play", "--policy", "guess"], "'guess'"),
+        (["play", "--policies", "guess"], "'guess'"),
         (["play", "--seed", "-1"], "-1"),
         (["perf", "--repeats", "0"], "0: must be"),
         (["reproduce", "fig99"], "'fig99'"),
@@ -273,7 +273,9 @@ def test_bad_commands(command: list[str], naming: str, capsys: pytest.CaptureFix
 
 
 def test_an_output_folder_that_cannot_be_made(trace: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fails(["bench", "--trace", trace, *QUICK, "--out", trace], "link.csv: File exists", capsys)
+    (tmp_path / "taken").touch()
+    fails(["bench", "--trace", trace, *QUICK, "--out", str(tmp_path / "taken")], "taken: File exists", capsys)
+    fails(["bench", "--trace", trace, *QUICK, "--out", "rows.csv"], "rows.csv: without --suite it must be", capsys)
 
 
 def test_ctrl_c_and_a_reader_that_left(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -345,7 +347,19 @@ def test_perf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
 
 
 def test_play_ends_where_bench_does(capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["play", "--env", "Interruption-v0", "--policy", "afr", "--speed", "0", "--seed", "3", "--capacity", "4"]
+    command = [
+        "play",
+        "--env",
+        "Interruption-v0",
+        "--policies",
+        "afr",
+        "--speed",
+        "0",
+        "--seed",
+        "3",
+        "--capacity",
+        "4",
+    ]
     assert main([*command, "--steps", "400"]) == 0
     over = capsys.readouterr().out.splitlines()[-1]
     from bufgym import scenario

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,15 +18,31 @@ from bufgym.errors import BufgymError
 
 
 class Interval(NamedTuple):
-    """A statistic and its bootstrap interval; all NaN where it is undefined, the interval where no sample tells it."""
+    """A statistic and its bootstrap interval; all NaN where it is undefined, the bounds alone where none is known."""
 
     value: float
+    """Of the sample."""
     low: float
+    """Lower bound of the interval."""
     high: float
+    """Upper bound of the interval."""
+
+
+UNKNOWN = Interval(math.nan, math.nan, math.nan)
+
+
+def written(interval: Interval, write: Callable[[float], str]) -> tuple[str, str]:
+    """(value, interval in brackets) as text: 1.03 and [1.01, 1.05]; a dash and nothing where there is no value."""
+    if math.isnan(interval.value):
+        return "–", ""
+    if math.isnan(interval.low):
+        return write(interval.value), "[–]"
+    low, high = (write(bound).removesuffix(" %") for bound in (interval.low, interval.high))
+    return write(interval.value), f"[{low}, {high}]"
 
 
 def stream(seed: int, label: str) -> np.random.Generator:
-    """The chance by which what is called ``label`` is resampled, whatever else is."""
+    """The random generator by which what is called ``label`` is resampled, whatever else is."""
     return np.random.default_rng([seed, zlib.crc32(label.encode())])
 
 
@@ -39,27 +56,15 @@ def percentile_interval(numbers: Numbers, confidence: float) -> Interval:
     """The interval of [1 + resamples] numbers; resamples in which the statistic is undefined (NaN) are left out."""
     drawn = numbers[1:][~np.isnan(numbers[1:])]
     if np.isnan(numbers[0]) or not len(drawn):
-        return Interval(math.nan, math.nan, math.nan)
+        return UNKNOWN
     low, high = np.percentile(drawn, [50 * (1 - confidence), 50 * (1 + confidence)]).tolist()
     return Interval(float(numbers[0]), low, high)
 
 
-def without_interval(x: Interval) -> Interval:
-    """The statistic alone: each resample of a single episode is that episode, which says nothing of its chance."""
-    return Interval(x.value, math.nan, math.nan)
-
-
-def written(x: Interval, form: str) -> str:
-    """``x`` as text, such as 1.03 [1.01, 1.05]; 1.03 [-] without an interval, - where it is undefined."""
-    if math.isnan(x.value):
-        return "-"
-    return f"{x.value:{form}} " + ("[-]" if math.isnan(x.low) else f"[{x.low:{form}}, {x.high:{form}}]")
-
-
 def ratio(above: Numbers, below: Numbers, defined: NDArray[np.bool_]) -> Numbers:
     """above / below where that is defined, NaN elsewhere."""
-    made: Numbers = np.divide(above, below, out=np.full(below.shape, np.nan), where=defined)
-    return made
+    quotient: Numbers = np.divide(above, below, out=np.full(below.shape, np.nan), where=defined)
+    return quotient
 
 
 def check_resampling(resamples: int, confidence: float) -> None:

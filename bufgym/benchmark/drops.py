@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bufgym.benchmark.run import cells, draw, met
+from bufgym.benchmark.bound import meet
+from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.table import aligned
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
@@ -57,13 +58,13 @@ def drops(
     workload = scenario.workload
     if workload is None:
         raise BufgymError("drops: the scenario must play a recording (workload=...)")
-    for trace, cell in cells(scenario):
+    for trace, part in by_trace(scenario):
         for seed in range(seeds):
-            episode = draw(cell, seed)
+            episode = draw(part, seed)
             arrivals = np.asarray(episode.arrivals)
             for capacity in capacities:
                 for policy in policies:
-                    senders = met(policy, [episode], capacity, cell, [None], max_bytes, decide_at)
+                    senders = meet(policy, [episode], capacity, part, [None], max_bytes, decide_at)
                     dropped_us = np.asarray(senders.batch.log[0])["dropped_us"][: len(arrivals)]
                     for k in np.flatnonzero(dropped_us != NEVER).tolist():
                         arrival = arrivals[k]
@@ -81,12 +82,12 @@ def drops(
                         )
 
 
-def write_drops(found: Iterable[Drop], path: Path | None) -> Counter[tuple[str, int, str]]:
+def write_drops(drops: Iterable[Drop], path: Path | None) -> Counter[tuple[str, int, str]]:
     """Write them as CSV (nowhere for None), one at a time; how many there were by (policy, capacity, topic)."""
     counts: Counter[tuple[str, int, str]] = Counter()
 
     def counted() -> Iterator[Drop]:
-        for drop in found:
+        for drop in drops:
             counts[drop.policy, drop.capacity, drop.topic] += 1
             yield drop
 

@@ -1,4 +1,4 @@
-"""The rows of a benchmark as arrays, once it is sure that every policy has met the same episodes."""
+"""The rows of a benchmark as arrays, checked: every policy has met the same episodes."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ class Table:
     """The rows as arrays, everything in sorted order."""
 
     cells: list[Cell]
+    """Every (scenario, capacity)."""
     episodes: dict[str, list[Episode]]
     """By scenario."""
     training_seeds: dict[str, list[int | None]]
@@ -39,6 +40,7 @@ class Table:
     best: dict[Cell, Numbers]
     """Clairvoyant H[episodes]; NaN where unknown."""
     exact: dict[Cell, bool]
+    """Whether every clairvoyant H of the cell is certified."""
     unbounded: set[str]
     """Policies whose rows have a clairvoyant's H but no regret: that bound does not hold for them."""
 
@@ -47,57 +49,59 @@ def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Ru
     """The rows by (policy, cell), then (training seed, episode)."""
     if not rows:
         raise BufgymError("no rows to score")
-    found: dict[tuple[str, Cell], dict[Run, Mapping[str, Any]]] = {}
+    groups: dict[tuple[str, Cell], dict[Run, Mapping[str, Any]]] = {}
     for number, row in enumerate(rows):
         for key in ("scenario", "trace", "seed", "capacity", "policy", "qoi"):
             if row.get(key) is None:
                 raise BufgymError(f"rows[{number}]: no {key}")
         cell, episode = (row["scenario"], row["capacity"]), (row["trace"], row["seed"])
-        runs = found.setdefault((row["policy"], cell), {})
+        runs = groups.setdefault((row["policy"], cell), {})
         run = (row.get("training_seed"), episode)
         if run in runs:
             raise BufgymError(f"{_place(row['policy'], cell, run)}: more than one row")
         runs[run] = row
-    return found
+    return groups
 
 
 def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Table:
-    """The rows as arrays, once it is sure that every policy met the same episodes. Errors: ``score.scores``."""
-    found = _by_run(rows)
-    cells = sorted({cell for _, cell in found})
+    """The rows as arrays, checked as ``score.scores`` says."""
+    groups = _by_run(rows)
+    cells = sorted({cell for _, cell in groups})
     met: dict[str, set[Episode]] = {scenario: set() for scenario, _ in cells}
-    seeds: dict[str, set[int | None]] = {policy: set() for policy, _ in sorted(found)}
-    for (policy, cell), runs in found.items():
-        met[cell[0]].update(episode for _, episode in runs)
+    seeds: dict[str, set[int | None]] = {policy: set() for policy, _ in sorted(groups)}
+    for (policy, (scenario, _)), runs in groups.items():
+        met[scenario].update(episode for _, episode in runs)
         seeds[policy].update(training_seed for training_seed, _ in runs)
-    episodes = {scenario: sorted(those) for scenario, those in met.items()}
-    training_seeds = {policy: sorted(those, key=lambda s: -1 if s is None else s) for policy, those in seeds.items()}
+    episodes = {scenario: sorted(numbers) for scenario, numbers in met.items()}
+    training_seeds = {
+        policy: sorted(numbers, key=lambda s: -1 if s is None else s) for policy, numbers in seeds.items()
+    }
     for cell in cells:
-        if (baseline, cell) not in found:
+        if (baseline, cell) not in groups:
             raise BufgymError(f"{cell[0]}, L = {cell[1]}: no row of the baseline {baseline!r}")
     for (policy, trained), cell in product(training_seeds.items(), cells):
-        runs = found.get((policy, cell), {})
+        runs = groups.get((policy, cell), {})
         for run in product(trained, episodes[cell[0]]):
             if run not in runs:
                 raise BufgymError(f"{_place(policy, cell, run)}: no row; every policy must meet the same episodes")
     unbounded = {row["policy"] for row in rows if row.get("clairvoyant") is not None and row.get("regret", 0.0) is None}
     table = Table(cells, episodes, training_seeds, {}, {}, {}, unbounded)
     for cell in cells:
-        truth = {episode: found[baseline, cell][training_seeds[baseline][0], episode] for episode in episodes[cell[0]]}
-        best = {episode: _known(row) for episode, row in truth.items()}
+        truth = {episode: groups[baseline, cell][training_seeds[baseline][0], episode] for episode in episodes[cell[0]]}
+        best = {episode: _clairvoyant(row) for episode, row in truth.items()}
         table.best[cell] = np.array(list(best.values()))
         table.exact[cell] = all(bool(row.get("certified")) for row in truth.values())
         for policy, trained in training_seeds.items():
-            runs = found[policy, cell]
+            runs = groups[policy, cell]
             for run, row in runs.items():
-                if abs(_known(row) - best[run[1]]) > TIE * abs(best[run[1]]):
-                    what = f"clairvoyant = {_known(row)}, but {best[run[1]]} for {baseline}: not the same episode"
+                if abs(_clairvoyant(row) - best[run[1]]) > TIE * abs(best[run[1]]):
+                    what = f"clairvoyant = {_clairvoyant(row)}, but {best[run[1]]} for {baseline}: not the same episode"
                     raise BufgymError(f"{_place(policy, cell, run)}: {what}")
             table.qoi[policy, cell] = np.array([[runs[s, e]["qoi"] for e in best] for s in trained], np.float64)
     return table
 
 
-def _known(row: Mapping[str, Any]) -> float:
+def _clairvoyant(row: Mapping[str, Any]) -> float:
     """The clairvoyant H of the row's episode, NaN where unknown."""
     best = row.get("clairvoyant")
     return math.nan if best is None else float(best)

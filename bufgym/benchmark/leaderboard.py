@@ -1,4 +1,4 @@
-"""The leaderboard: a row for each suite and policy, with the command that makes it again, and a check that it does."""
+"""The leaderboard: what each policy reached on each suite, with the command that makes it again, and a check of it."""
 
 from __future__ import annotations
 
@@ -6,103 +6,94 @@ import csv
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bufgym import __version__
-from bufgym.benchmark import folder, sweep
-from bufgym.benchmark.report import style, tables
-from bufgym.benchmark.score import Interval, Standing, scores
+from bufgym.benchmark import manifest, table
+from bufgym.benchmark.bootstrap import Interval, written
+from bufgym.benchmark.rows import Row
+from bufgym.benchmark.sweep import Sweep, run_sweep
+from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.errors import BufgymError, where
 from bufgym.files import replaced
 from bufgym.scenario import suites
 
+COLUMNS = ("suite", "policy", "rank", "cells", "quantity", "value", "low", "high", "bufgym", "command")
+"""Of the file, which has one line for each quantity of an entry."""
+
 
 @dataclass(frozen=True)
 class Entry:
-    """One row."""
+    """One policy on one suite."""
 
     suite: str
+    """Its name."""
     policy: str
     """As ``bufgym bench --policies`` takes it."""
-    score: float
-    score_low: float
-    score_high: float
-    regret: float
-    regret_low: float
-    regret_high: float
-    better_than_afr: float
-    cells: int
-    """Those that bite: the others are not scored."""
     rank: int
-    """0: not ranked."""
+    """1 for the best; 0 for a policy that is not ranked."""
+    cells: int
+    """How many cells the values are over; of one queue, those that are discriminative."""
+    values: Mapping[str, Interval]
+    """The quantities that the suite's task lists, by key."""
     bufgym: str
     """The version that made it."""
-    command: str
 
     @property
     def name(self) -> str:
         """What ``bufgym validate`` calls it."""
         return f"{self.suite}/{self.policy}"
 
+    @property
+    def command(self) -> str:
+        """What makes it again."""
+        needs = " --data DIR" if suites.get(self.suite).needs else ""
+        return f"bufgym bench --suite {self.suite} --policies {self.policy}{needs}"
 
-def command(suite: str, policy: str) -> str:
-    """The command that makes one entry again."""
-    needs = " --data DIR" if suites.get(suite).needs else ""
-    return f"bufgym bench --suite {suite} --policies {policy}{needs}"
+
+def task_of(suite: str) -> Task:
+    """The task of the suite."""
+    return TASKS[suites.get(suite).kind]
 
 
-def entries(rows: Sequence[Mapping[str, Any]], suite: str, unranked: Mapping[str, str]) -> list[Entry]:
+def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> list[Entry]:
     """One entry for each policy of a suite's rows, best first."""
-    made = []
-    for rank, standing in enumerate(scores(rows, unranked=unranked).standings, 1):
-        ranked = standing.ranked and not math.isnan(standing.score.value)
-        made.append(_entry(standing, suite, rank if ranked else 0))
-    return made
-
-
-def _entry(standing: Standing, suite: str, rank: int) -> Entry:
-    return Entry(
-        suite,
-        standing.policy,
-        *standing.score,
-        *standing.regret,
-        standing.improvement.value,
-        standing.cells,
-        rank,
-        __version__,
-        command(suite, standing.policy),
-    )
+    task = task_of(suite)
+    summary = task.summary(rows, unranked)
+    board = []
+    for rank, standing in enumerate(summary.overall, 1):
+        known = standing.ranked and not math.isnan(standing[summary.rank_by].value)
+        values = {key: standing[key] for key in task.listed}
+        board.append(Entry(suite, standing.policy, rank if known else 0, summary.counted_cells, values, __version__))
+    return board
 
 
 def make(path: Path, names: Sequence[str], specs: Mapping[str, Sequence[str]], **options: Any) -> list[Entry]:
     """Run the suites with their policies (``specs``, by suite) and write the file, whole or not at all."""
-    made: list[Entry] = []
-    for name in names:
-        made += _run(name, specs[name], **options)
-    write(made, path)
-    return made
+    board = [entry for name in names for entry in _run(name, specs[name], **options)]
+    write(board, path)
+    return board
 
 
-def _run(suite: str, specs: Sequence[str], data: str | None = None, jobs: int = -1) -> list[Entry]:
-    plan = sweep.Plan(suite, tuple(specs), data=data)
+def _run(suite: str, specs: Sequence[str], data: str | None = None, jobs: int | None = None) -> list[Entry]:
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "run"
-        rows = sweep.run_sweep(plan, out, jobs=jobs)
-        return entries(rows, suite, folder.read_manifest(out / "manifest.json")["unranked"])
+        rows = run_sweep(Sweep(suite, tuple(specs), data=data), out, jobs=jobs)
+        return entries(rows, suite, manifest.read(out / "manifest.json")["unranked"])
 
 
 def validate(entry: Entry, **options: Any) -> Entry:
-    """The entry made anew; an error if its score or its regret has left the interval that the file states."""
-    (again,) = (e for e in _run(entry.suite, [entry.policy, "afr"], **options) if e.policy == entry.policy)
-    for what in ("score", "regret"):
-        low, stated, high = (getattr(entry, what + end) for end in ("_low", "", "_high"))
-        found = getattr(again, what)
-        inside = math.isnan(stated) if math.isnan(found) else low - 1e-9 <= found <= high + 1e-9
+    """The entry made anew; an error if one of its values has left the interval that the file states."""
+    specs = dict.fromkeys([entry.policy, task_of(entry.suite).reference])
+    (again,) = (e for e in _run(entry.suite, list(specs), **options) if e.policy == entry.policy)
+    for key, (stated, low, high) in entry.values.items():
+        value = again.values[key].value
+        inside = math.isnan(stated) if math.isnan(value) else low - 1e-9 <= value <= high + 1e-9
         if not inside:
             raise BufgymError(
-                f"{entry.name}: {what} is {found:.6f}, outside [{low:.6f}, {high:.6f}] (stated: {stated:.6f})"
+                f"{entry.name}: {key} is {value:.6f}, outside [{low:.6f}, {high:.6f}] (stated: {stated:.6f})"
             )
     return again
 
@@ -110,67 +101,70 @@ def validate(entry: Entry, **options: Any) -> Entry:
 # --- the file --------------------------------------------------------------------------------------------------------
 
 
-def write(made: Sequence[Entry], path: Path) -> None:
+def write(board: Sequence[Entry], path: Path) -> None:
     """A CSV file, and beside it the same as Markdown."""
     if path.suffix != ".csv":
         raise BufgymError(f"{path}: a leaderboard is written to a .csv file")
     with replaced(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, [f.name for f in fields(Entry)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(asdict(entry) for entry in made)
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for entry in board:
+            for key, interval in entry.values.items():
+                place = entry.suite, entry.policy, entry.rank, entry.cells
+                writer.writerow([*place, key, *interval, entry.bufgym, entry.command])
     with replaced(path.with_suffix(".md")) as temporary:
-        temporary.write_text(markdown(made), encoding="utf-8")
+        temporary.write_text(markdown(board), encoding="utf-8")
 
 
 def read(path: Path) -> dict[str, Entry]:
     """The entries by name; an error that names the file, the line and the value if one can't be read."""
-    found: dict[str, Entry] = {}
-    kinds: dict[str, Any] = {f.name: {"str": str, "int": int, "float": float}[str(f.type)] for f in fields(Entry)}
+    kinds = {**dict.fromkeys(COLUMNS, str), "rank": int, "cells": int, "value": float, "low": float, "high": float}
+    board: dict[str, Entry] = {}
     with open(path, encoding="utf-8", newline="") as file:
         reader = csv.DictReader(file)
-        if reader.fieldnames != list(kinds):
-            raise BufgymError(where(path, 1, None, f"must have the columns {', '.join(kinds)}"))
+        if reader.fieldnames != list(COLUMNS):
+            raise BufgymError(where(path, 1, None, f"must have the columns {', '.join(COLUMNS)}"))
         for line in reader:
-            values = {}
+            row: dict[str, Any] = {}
             for name, kind in kinds.items():
                 try:
-                    values[name] = kind(line[name])
+                    row[name] = kind(line[name])
                 except (TypeError, ValueError):
-                    raise BufgymError(
-                        where(path, reader.line_num, line[name], "must be a number", field=name)
-                    ) from None
-            entry = Entry(**values)
-            found[entry.name] = entry
-    return found
+                    rule = "must be a number"
+                    raise BufgymError(where(path, reader.line_num, line[name], rule, field=name)) from None
+            entry = Entry(row["suite"], row["policy"], row["rank"], row["cells"], {}, row["bufgym"])
+            values = board.get(entry.name, entry).values
+            interval = Interval(row["value"], row["low"], row["high"])
+            board[entry.name] = replace(entry, values={**values, row["quantity"]: interval})
+    return board
 
 
 def find(path: Path, name: str) -> Entry:
     """The entry of that name."""
-    held = read(path)
-    if name not in held:
-        raise BufgymError(f"{path}: no row {name!r}; rows are named suite/policy, such as {next(iter(held), 'none')}")
-    return held[name]
+    board = read(path)
+    if name not in board:
+        raise BufgymError(f"{path}: no row {name!r}; rows are named suite/policy, such as {next(iter(board), 'none')}")
+    return board[name]
 
 
-def markdown(made: Sequence[Entry]) -> str:
-    """A table a suite."""
-    head = ["#", "policy", "score", "regret", "better than afr", "command"]
+def markdown(board: Sequence[Entry]) -> str:
+    """A table for each suite."""
     out = [
         "# Leaderboard",
         "",
-        "Score: 0 is Drop Oldest (what ROS does), 1 the clairvoyant, which no policy can pass; regret: what was lost",
-        "against the clairvoyant. 95 % bootstrap intervals over test episodes. `bufgym leaderboard` makes the file,",
-        "`bufgym validate SUITE/POLICY` checks a row.",
+        "Made by `bufgym leaderboard`; `bufgym validate SUITE/POLICY` checks a row. In brackets: 95 % bootstrap",
+        "intervals over test episodes.",
     ]
-    for suite in dict.fromkeys(entry.suite for entry in made):
+    for suite in dict.fromkeys(entry.suite for entry in board):
+        group = [entry for entry in board if entry.suite == suite]
+        task = task_of(suite)
+        quantities = [quantity for quantity in task.quantities() if quantity.key in task.listed]
         lines = []
-        for entry in made:
-            if entry.suite == suite:
-                score = " ".join(tables.pair(Interval(entry.score, entry.score_low, entry.score_high), style.score))
-                lost = Interval(entry.regret, entry.regret_low, entry.regret_high)
-                regret = " ".join(tables.pair(lost, style.percent))
-                better = style.score(entry.better_than_afr)
-                rank = str(entry.rank) if entry.rank else "–"
-                lines.append([rank, entry.policy, score, regret, better, f"`{entry.command}`"])
-        out += ["", f"## {suite}", "", f"{suites.get(suite).about}.", "", *tables.markdown_table(head, lines, left=2)]
+        for entry in group:
+            values = [" ".join(filter(None, written(entry.values[q.key], q.write))) for q in quantities]
+            lines.append([str(entry.rank) if entry.rank else "–", entry.policy, *values, f"`{entry.command}`"])
+        head = ["#", "policy", *(quantity.title for quantity in quantities), "command"]
+        meanings = "; ".join(f"{quantity.title}: {quantity.about}" for quantity in quantities)
+        out += ["", f"## {suite}", "", f"{suites.get(suite).about}. {meanings[0].upper()}{meanings[1:]}.", ""]
+        out += table.markdown_table(head, lines, left=2)
     return "\n".join(out) + "\n"

@@ -5,9 +5,9 @@ capacity of the scenario (common random numbers), so policies are compared episo
 
 Every interval is a paired percentile bootstrap over episodes (Efron and Tibshirani 1993, chapter 13): the episodes of
 a scenario are drawn with replacement, the same draw for all its capacities and all policies, and the statistic is
-computed again. A policy trained several times has its training seeds drawn as well, before the episodes. The draws
-follow from the seed and the names alone: neither the order of the rows nor the company of other policies changes an
-interval. It speaks of fresh episodes on the traces at hand, not of traces nobody has seen.
+computed again. For a policy trained several times its training seeds are drawn as well, before the episodes. The draws
+depend on the seed and the names alone: neither the order of the rows nor the other policies change an interval. It
+speaks of fresh episodes on the traces at hand, not of other traces.
 
 Interquartile mean and probability of improvement are those of Agarwal et al. (NeurIPS 2021) and their library rliable.
 """
@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bufgym.benchmark import episodes
 from bufgym.benchmark.bootstrap import (
+    UNKNOWN,
     Interval,
     check_resampling,
     percentile_interval,
@@ -45,7 +46,6 @@ __all__ = [
     "interquartile_mean",
     "normalised_score",
     "paired_difference",
-    "probability_of_improvement",
     "regret",
     "scores",
 ]
@@ -62,10 +62,13 @@ class CellScore:
     """One policy in one cell."""
 
     scenario: str
+    """Its label."""
     capacity: int
     """L, messages."""
     policy: str
+    """Its name."""
     episodes: int
+    """How many it has met."""
     qoi: Interval
     """Mean H."""
     score: Interval
@@ -85,6 +88,7 @@ class Standing:
     """One policy over all discriminative cells; NaN where there is none. Resampling does not choose cells anew."""
 
     policy: str
+    """Its name."""
     score: Interval
     """Mean of its scores in the discriminative cells."""
     iqm: Interval
@@ -96,8 +100,9 @@ class Standing:
     """Paired probability of improvement over the reference: the share of episodes with H above the reference's, plus
     half of those with the same H, mean over the discriminative cells."""
     cells: int
-    """How many cells bite."""
+    """How many cells are discriminative."""
     ranked: bool
+    """Whether it competes with the others."""
 
 
 @dataclass(frozen=True)
@@ -109,9 +114,13 @@ class Scores:
     cells: list[CellScore]
     """By scenario, capacity, policy."""
     baseline: str
+    """The policy whose score is 0."""
     reference: str
+    """The policy that improvements and differences are over."""
     confidence: float
+    """Of the intervals."""
     resamples: int
+    """Of the bootstrap."""
 
 
 # --- the statistics --------------------------------------------------------------------------------------------------
@@ -137,41 +146,16 @@ def interquartile_mean(x: ArrayLike) -> float:
     return float(_interquartile_means(values, np.ones_like(values))[0])
 
 
-def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
-    """Mean over tasks of P(X > Y) + P(X = Y) / 2 over all pairs of runs (Mann-Whitney's U / nm): the unpaired form.
-
-    Args:
-        x: [runs] on one task, or [runs, tasks].
-        y: the same of what is improved upon; it may have another number of runs.
-
-    Returns:
-        In [0, 1]; NaN for no runs, no tasks or a NaN among them.
-    """
-    xs, ys = (np.asarray(given, np.float64) for given in (x, y))
-    xs, ys = (given[:, np.newaxis] if given.ndim == 1 else given for given in (xs, ys))
-    if xs.ndim != 2 or ys.ndim != 2 or xs.shape[1] != ys.shape[1]:
-        raise BufgymError(f"shapes {np.shape(x)} and {np.shape(y)}: must be [runs] or [runs, tasks], of the same tasks")
-    if not (xs.size and ys.size) or np.isnan(xs).any() or np.isnan(ys).any():
-        return math.nan
-    shares = []
-    for k in range(xs.shape[1]):
-        task = np.sort(ys[:, k])
-        # How many are below x, and how many are not above it: their mean counts a tie as one half.
-        twice = np.searchsorted(task, xs[:, k], "left") + np.searchsorted(task, xs[:, k], "right")
-        shares.append(twice.mean() / (2 * len(task)))
-    return float(np.mean(shares))
-
-
 def paired_difference(
     h: ArrayLike, h_ref: ArrayLike, *, resamples: int = 2000, confidence: float = 0.95, seed: int = 0
 ) -> Interval:
     """Mean of H - H_ref over the episodes that both met, in the same order; NaN for none."""
-    ours, theirs = (np.asarray(given, np.float64) for given in (h, h_ref))
+    ours, theirs = (np.asarray(numbers, np.float64) for numbers in (h, h_ref))
     if ours.ndim != 1 or ours.shape != theirs.shape:
         raise BufgymError(f"shapes {ours.shape} and {theirs.shape}: must be one H an episode, of the same episodes")
     check_resampling(resamples, confidence)
     if not len(ours):
-        return Interval(math.nan, math.nan, math.nan)
+        return UNKNOWN
     weights = times_drawn(len(ours), resamples, np.random.default_rng(seed))
     return percentile_interval(weights @ (ours - theirs) / len(ours), confidence)
 
@@ -186,7 +170,7 @@ def scores(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> Scores:
-    """Scores of every policy in every cell, and the standings over the cells that bite.
+    """Scores of every policy in every cell, and the standings over the discriminative cells.
 
     Args:
         rows: from ``bufgym.benchmark.run``. Those of a trained agent may carry a "training_seed": the H of an episode
@@ -206,39 +190,39 @@ def scores(
     table = episodes.read(rows, baseline)
     drawn = {name: times_drawn(len(e), resamples, stream(seed, name)) for name, e in table.episodes.items()}
     base = _resampled(table, baseline, resamples, seed)
-    grounds = {cell: _ground(table, cell, base[cell], drawn[cell[0]]) for cell in table.cells}
-    theirs: dict[Cell, Numbers] = {}
+    samples = {cell: _Sample.of(table, cell, base[cell], drawn[cell[0]]) for cell in table.cells}
+    discriminative = [cell for cell in table.cells if samples[cell].discriminative]
+    compared: dict[Cell, Numbers] = {}
     if reference in table.training_seeds:
-        theirs = _resampled(table, reference, resamples, seed)
+        compared = _resampled(table, reference, resamples, seed)
     interval = partial(percentile_interval, confidence=confidence)
     cell_scores, standings = [], []
     for policy in table.training_seeds:
-        here = {
-            cell: _statistics(h, theirs.get(cell), grounds[cell])
+        by_cell = {
+            cell: _statistics(h, compared.get(cell), samples[cell])
             for cell, h in _resampled(table, policy, resamples, seed).items()
         }
         if policy in table.unbounded:
-            here = {cell: s.without_bound() for cell, s in here.items()}
-        for cell, s in here.items():
-            made = CellScore(
-                scenario=cell[0],
-                capacity=cell[1],
-                policy=policy,
-                episodes=len(table.episodes[cell[0]]),
-                qoi=interval(s.qoi),
-                score=interval(s.score),
-                regret=interval(s.regret),
-                difference=interval(s.difference),
-                discriminative=grounds[cell].discriminative,
-                exact=table.exact[cell],
+            by_cell = {cell: s.without_bound() for cell, s in by_cell.items()}
+        for cell, s in by_cell.items():
+            cell_scores.append(
+                CellScore(
+                    scenario=cell[0],
+                    capacity=cell[1],
+                    policy=policy,
+                    episodes=len(table.episodes[cell[0]]),
+                    qoi=interval(s.qoi),
+                    score=interval(s.score),
+                    regret=interval(s.regret),
+                    difference=interval(s.difference),
+                    discriminative=samples[cell].discriminative,
+                    exact=table.exact[cell],
+                )
             )
-            cell_scores.append(made)
-        discriminative = [cell for cell in here if grounds[cell].discriminative]
-        overall = _overall([here[cell] for cell in discriminative], [grounds[cell] for cell in discriminative])
+        overall = _overall([by_cell[cell] for cell in discriminative], [samples[cell] for cell in discriminative])
         score, iqm, regrets, improvement = map(interval, overall)
-        standings.append(
-            Standing(policy, score, iqm, regrets, improvement, len(discriminative), policy not in unranked)
-        )
+        ranked = policy not in unranked
+        standings.append(Standing(policy, score, iqm, regrets, improvement, len(discriminative), ranked))
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
     standings.sort(key=lambda s: (not s.ranked, math.isnan(s.score.value), -s.score.value, s.policy))
     return Scores(standings, cell_scores, baseline, reference, confidence, resamples)
@@ -248,8 +232,8 @@ def scores(
 
 
 @dataclass(frozen=True)
-class _Ground:
-    """What the statistics of every policy in one cell are computed from."""
+class _Sample:
+    """The episodes of one cell as they were drawn: what the statistics of every policy there are computed from."""
 
     weights: Numbers
     """[1 + resamples, episodes]: how often each episode was drawn."""
@@ -259,21 +243,22 @@ class _Ground:
     """[1 + resamples, traces]: sum H of the baseline."""
     best: Numbers
     """The same of the clairvoyant; NaN where unknown."""
-    discriminative: bool
+
+    @classmethod
+    def of(cls, table: Table, cell: Cell, base: Numbers, weights: Numbers) -> _Sample:
+        """``base``: H of the baseline, [1 or 1 + resamples, episodes]."""
+        starts = np.unique([trace for trace, _ in table.episodes[cell[0]]], return_index=True)[1]
+        best = table.best[cell][np.newaxis]
+        return cls(weights, starts, *(np.add.reduceat(weights * h, starts, axis=1) for h in (base, best)))
+
+    @property
+    def discriminative(self) -> bool:
+        """Whether the baseline loses enough."""
+        return bool(regret(self.base[:1].sum(axis=1), self.best[:1].sum(axis=1))[0] >= DISCRIMINATIVE)
 
     def sums(self, h: Numbers) -> Numbers:
         """[1 + resamples, traces]: sum H over the episodes drawn, from h[1 or 1 + resamples, episodes]."""
         return np.asarray(np.add.reduceat(self.weights * h, self.starts, axis=1))
-
-
-def _ground(table: Table, cell: Cell, baseline: Numbers, weights: Numbers) -> _Ground:
-    traces = [trace for trace, _ in table.episodes[cell[0]]]
-    starts = np.unique(traces, return_index=True)[1]
-    base, best = (
-        np.asarray(np.add.reduceat(weights * h, starts, axis=1)) for h in (baseline, table.best[cell][np.newaxis])
-    )
-    discriminative = bool(regret(base[:1].sum(axis=1), best[:1].sum(axis=1))[0] >= DISCRIMINATIVE)
-    return _Ground(weights, starts, base, best, discriminative)
 
 
 class _Statistics(NamedTuple):
@@ -293,36 +278,36 @@ class _Statistics(NamedTuple):
         return self._replace(**none)
 
 
-def _statistics(h: Numbers, h_ref: Numbers | None, ground: _Ground) -> _Statistics:
-    sums = ground.sums(h)
-    total, base, best = sums.sum(axis=1), ground.base.sum(axis=1), ground.best.sum(axis=1)
-    episodes = ground.weights.shape[1]
+def _statistics(h: Numbers, h_ref: Numbers | None, sample: _Sample) -> _Statistics:
+    sums = sample.sums(h)
+    total, base, best = sums.sum(axis=1), sample.base.sum(axis=1), sample.best.sum(axis=1)
+    episodes = sample.weights.shape[1]
     difference = improvement = np.full(len(total), np.nan)
     if h_ref is not None:
         minus = h - h_ref
         tied = np.abs(minus) <= TIE * np.abs(h_ref)
         better = np.where(tied, 0.5, minus > 0)
-        difference, improvement = (ground.sums(each).sum(axis=1) / episodes for each in (minus, better))
+        difference, improvement = (sample.sums(numbers).sum(axis=1) / episodes for numbers in (minus, better))
     return _Statistics(
         qoi=total / episodes,
         score=normalised_score(total, base, best),
         regret=regret(total, best),
         difference=difference,
         improvement=improvement,
-        by_trace=normalised_score(sums, ground.base, ground.best),
+        by_trace=normalised_score(sums, sample.base, sample.best),
     )
 
 
-def _overall(cells: list[_Statistics], grounds: list[_Ground]) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+def _overall(cells: Sequence[_Statistics], samples: Sequence[_Sample]) -> tuple[Numbers, Numbers, Numbers, Numbers]:
     """(score, IQM, regret, improvement) over the discriminative cells, [1 + resamples] each."""
     if not cells:
         none = np.full(1, np.nan)
         return none, none, none, none
-    values = np.hstack([s.by_trace for s in cells])
-    weights = np.hstack([np.add.reduceat(g.weights, g.starts, axis=1) for g in grounds])
+    values = np.hstack([cell.by_trace for cell in cells])
+    weights = np.hstack([np.add.reduceat(sample.weights, sample.starts, axis=1) for sample in samples])
     iqm = _interquartile_means(values, weights / weights[0])
     score, regrets, improvement = (
-        np.mean([getattr(s, name) for s in cells], axis=0) for name in ("score", "regret", "improvement")
+        np.mean([getattr(cell, name) for cell in cells], axis=0) for name in ("score", "regret", "improvement")
     )
     return score, iqm, regrets, improvement
 
@@ -331,14 +316,14 @@ def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:
     """[n] from [n, tasks]: the interquartile mean of each row, a task counting ``weights`` times. Row 0 sets the share
     that is cut off at either end; NaN weighs nothing."""
     unknown = np.isnan(values)
-    values, weights = (np.where(unknown, 0.0, given) for given in (values, weights))
+    values, weights = (np.where(unknown, 0.0, numbers) for numbers in (values, weights))
     order = np.argsort(values, axis=1)
-    values, weights = (np.take_along_axis(given, order, axis=1) for given in (values, weights))
+    values, weights = (np.take_along_axis(numbers, order, axis=1) for numbers in (values, weights))
     tasks = np.count_nonzero(weights[0])
     until = np.cumsum(weights, axis=1)
-    all_of_it = weights.sum(axis=1, keepdims=True)
-    cut = all_of_it * (tasks // 4) / max(tasks, 1)
-    kept = np.clip(np.minimum(until, all_of_it - cut) - np.maximum(until - weights, cut), 0, None)
+    total = weights.sum(axis=1, keepdims=True)
+    cut = total * (tasks // 4) / max(tasks, 1)
+    kept = np.clip(np.minimum(until, total - cut) - np.maximum(until - weights, cut), 0, None)
     left = kept.sum(axis=1)
     return ratio((kept * values).sum(axis=1), left, left > 0)
 

@@ -2,86 +2,120 @@
 
 The work is cut into shards (one scenario, one trace, some seeds; all policies and capacities). The rows of a finished
 shard lie in a file of their own under ``parts/``; a run that is started again skips them. When all are there, they
-become ``rows.parquet`` (or ``rows.csv``) beside ``manifest.json``, which says what was run, and ``timeline.json``, one
-episode in full. The rows do not depend on where or in which order the shards ran.
+become ``rows.parquet`` (or ``rows.csv``) beside ``manifest.json``, which says what was run, and for one queue
+``timeline.json``, one episode in full. The rows do not depend on where or in which order the shards ran.
 """
 
 from __future__ import annotations
 
-import datetime
-import hashlib
+import importlib.util
 import itertools
-import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from bufgym import __version__, policies
-from bufgym.benchmark import cluster, timeline
+from bufgym import policies
+from bufgym.benchmark import cluster, manifest, tasks
 from bufgym.benchmark.cluster import BACKENDS
-from bufgym.benchmark.folder import FORMAT, read_manifest
-from bufgym.benchmark.rows import COLUMNS, Row, has_pyarrow, read_rows, write_rows
-from bufgym.benchmark.run import bar, distinct, run
-from bufgym.benchmark.score import BASELINE
+from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
+from bufgym.benchmark.run import bar, by_trace, check_distinct, run
+from bufgym.benchmark.seeds import SEEDS_PER_TRACE, seeds_of, seeds_per_trace
+from bufgym.benchmark.tasks import Task
 from bufgym.errors import BufgymError, line_in
-from bufgym.files import replaced
-from bufgym.scenario import Scenario, Uplink, suites
+from bufgym.scenario import suites
+from bufgym.scenario.suites import Setting
 
-_SEEDS_A_TRACE = 1000
-"""Episode s of trace k has the seed 1000 k + s: no two traces of a scenario share an episode's chance."""
+_SEEDS_PER_SHARD = 25
 
-_SEEDS_A_SHARD = 25
+Load = Callable[[str | None], None]
+"""Runs a policy file."""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What to run."""
+class Sweep:
+    """What to run of a suite."""
 
     suite: str
+    """Its name."""
     specs: tuple[str, ...]
-    """Policies, as ``bufgym.policies.get`` takes them."""
+    """Policies, as ``bufgym.policies.get`` takes them; the task's baseline is added if it is missing."""
     split: str = "test"
+    """"train", "validation" or "test"."""
     capacities: tuple[int, ...] = ()
-    """Empty: those of the suite."""
+    """L, messages; empty: those of the suite."""
     seeds: int | None = None
-    """Episodes a trace; None: as many as the suite says."""
+    """Episodes on each trace; None: as many as the suite says."""
     data: str | None = None
     """Folder of recordings, for suites that need one."""
     policy_file: str | None = None
     """A Python file that registers policies; it is run wherever shards run."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
 
-    def checked(self) -> Plan:
+    @property
+    def task(self) -> Task:
+        """The task that the suite is for."""
+        return tasks.TASKS[suites.get(self.suite).kind]
+
+    @property
+    def policies(self) -> list[policies.Policy]:
+        """Those of ``specs``."""
+        return [policies.get(spec) for spec in self.specs]
+
+    def settings(self) -> dict[str, Setting]:
+        """The suite's settings of the split, with the changes."""
+        settings = suites.get(self.suite).settings(self.split, self.data)
+        if not self.changes:
+            return settings
+        return {
+            label: replace(setting, scenario=replace(setting.scenario, **self.changes))
+            for label, setting in settings.items()
+        }
+
+    def setting(self, label: str, trace: int) -> Setting:
+        """One of them, its scenario on one trace alone."""
+        setting = self.settings()[label]
+        return replace(setting, scenario=by_trace(setting.scenario)[trace][1])
+
+    def checked(self) -> Sweep:
         """The same with nothing left open; a mistake in it ends in an error here, before any work."""
-        suite = suites.get(self.suite)
-        if suite.name in suites.TOPIC_SUITES:
-            raise BufgymError(f"suite {suite.name} has several topics: bufgym topics --suite {suite.name}")
-        suite.settings(self.split, self.data)
-        seeds = seeds_a_trace(suite, self.seeds)
+        suite, task = suites.get(self.suite), self.task
+        self.settings()
+        seeds = seeds_per_trace(suite, self.seeds)
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
-        specs = list(dict.fromkeys([*self.specs, BASELINE]))
-        distinct([policies.get(spec) for spec in specs])
-        return replace(self, specs=tuple(specs), capacities=self.capacities or suite.capacities, seeds=seeds)
+        specs = self.specs if task.baseline in self.specs else (*self.specs, task.baseline)
+        complete = replace(self, specs=specs, capacities=self.capacities or suite.capacities, seeds=seeds)
+        check_distinct(complete.policies)
+        for policy in complete.policies:
+            task.check(policy)
+        return complete
 
-
-def seeds_a_trace(suite: suites.Suite, seeds: int | None) -> int:
-    """So many, or as many as the suite says."""
-    seeds = suite.seeds if seeds is None else seeds
-    if not 1 <= seeds <= _SEEDS_A_TRACE:
-        raise BufgymError(f"seeds = {seeds}: must lie between 1 and {_SEEDS_A_TRACE}")
-    return seeds
+    def shards(self) -> list[Shard]:
+        """All pieces of a checked sweep, in the order of the rows."""
+        shards = []
+        for label, setting in self.settings().items():
+            for trace in range(len(by_trace(setting.scenario))):
+                numbers = seeds_of(trace, int(self.seeds or 0))
+                for k in range(0, len(numbers), _SEEDS_PER_SHARD):
+                    shards.append(Shard(self, label, trace, tuple(numbers[k : k + _SEEDS_PER_SHARD])))
+        return shards
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One piece of the work."""
+    """One piece of a sweep: one scenario on one trace, with some seeds."""
 
-    plan: Plan
+    sweep: Sweep
+    """What it is a piece of."""
     label: str
+    """Of the scenario."""
     trace: int
+    """The number of the trace in the scenario."""
     seeds: tuple[int, ...]
+    """Of its episodes."""
 
     @property
     def name(self) -> str:
@@ -89,45 +123,21 @@ class Shard:
         return f"{self.label}-{self.trace}-{self.seeds[0]}"
 
 
-def shards(plan: Plan) -> list[Shard]:
-    """All pieces of a checked plan, in the order of the rows."""
-    made = []
-    seeds = int(plan.seeds or 0)
-    for label, setting in suites.get(plan.suite).settings(plan.split, plan.data).items():
-        traces = len(setting.scenario.traces) if isinstance(setting.scenario, Uplink) else 1
-        for trace in range(traces):
-            numbers = seeds_of(trace, seeds)
-            for k in range(0, seeds, _SEEDS_A_SHARD):
-                made.append(Shard(plan, label, trace, tuple(numbers[k : k + _SEEDS_A_SHARD])))
-    return made
-
-
-def seeds_of(trace: int, seeds: int) -> list[int]:
-    """Of so many episodes on the trace of that number."""
-    return [_SEEDS_A_TRACE * trace + s for s in range(seeds)]
-
-
-def cell(scenario: Scenario, trace: int) -> Scenario:
-    """The scenario on one of its traces."""
-    return replace(scenario, traces=(scenario.traces[trace],)) if isinstance(scenario, Uplink) else scenario
-
-
 _LOADED: set[str] = set()
 """Policy files that this process has run for a shard."""
 
 
-def run_shard(shard: Shard, load: Callable[[str | None], None] | None = None) -> list[Row]:
-    """The rows of one shard; ``load`` runs the plan's policy file where that has not been done yet."""
-    plan = shard.plan
-    if load is not None and plan.policy_file is not None and plan.policy_file not in _LOADED:
-        load(plan.policy_file)
-        _LOADED.add(plan.policy_file)
-    setting = suites.get(plan.suite).settings(plan.split, plan.data)[shard.label]
-    chosen = [policies.get(spec) for spec in plan.specs]
-    return run(chosen, cell(setting.scenario, shard.trace), plan.capacities, shard.seeds, label=shard.label)
+def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
+    """The rows of one shard; ``load`` runs the sweep's policy file where that has not been done yet."""
+    sweep = shard.sweep
+    if load is not None and sweep.policy_file is not None and sweep.policy_file not in _LOADED:
+        load(sweep.policy_file)
+        _LOADED.add(sweep.policy_file)
+    scenario = sweep.setting(shard.label, shard.trace).scenario
+    return run(sweep.policies, scenario, sweep.capacities, shard.seeds, label=shard.label)
 
 
-def _attempt(number: int, shard: Shard, load: Callable[[str | None], None] | None) -> tuple[int, list[Row] | Exception]:
+def _attempt(number: int, shard: Shard, load: Load | None) -> tuple[int, list[Row] | Exception]:
     """The shard's number and its rows, or what went wrong: joblib throws finished shards away when one raises."""
     try:
         return number, run_shard(shard, load)
@@ -135,117 +145,88 @@ def _attempt(number: int, shard: Shard, load: Callable[[str | None], None] | Non
         return number, error
     except Exception as error:
         # A traceback stays behind in the process; where in the user's own file it was must be said here.
-        place = line_in(error, shard.plan.policy_file or "")
-        if place is None:
-            return number, error
-        return number, BufgymError(f"{place}: {type(error).__name__}: {error}")
+        place = line_in(error, shard.sweep.policy_file or "")
+        return number, error if place is None else BufgymError(f"{place}: {type(error).__name__}: {error}")
 
 
 # --- the folder ------------------------------------------------------------------------------------------------------
 
 
 def run_sweep(
-    plan: Plan,
+    sweep: Sweep,
     out: Path,
     *,
-    jobs: int = -1,
+    jobs: int | None = None,
     backend: str = "loky",
     address: str | None = None,
     command: str = "",
     form: str | None = None,
-    load: Callable[[str | None], None] | None = None,
+    load: Load | None = None,
     progress: bool = True,
 ) -> list[Row]:
-    """Run what of the plan is not yet in ``out``, and write the folder's files; all its rows.
+    """Run what of the sweep is not yet in ``out``, and write the folder's files; all its rows.
 
     Args:
-        plan: what to run.
-        out: a folder that does not exist, is empty, or holds an earlier (perhaps unfinished) run of the same plan.
-        jobs: processes side by side; -1: one a core.
+        sweep: what to run.
+        out: a folder that does not exist, is empty, or holds an earlier (perhaps unfinished) run of the same sweep.
+        jobs: processes side by side; -1: one for each core; None: the same, or one where joblib is missing.
         backend: one of ``BACKENDS`` (joblib's); "ray" and "dask" use the cluster at ``address``, or a local one.
         address: of the cluster's head.
         command: what the report shows as the way to run it again.
         form: "parquet" or "csv"; by default parquet if pyarrow is there.
-        load: runs a policy file (``Plan.policy_file``) in a worker.
+        load: runs a policy file (``Sweep.policy_file``) in a worker.
         progress: show a bar on stderr, where that is a terminal.
     """
-    plan = plan.checked()
+    sweep = sweep.checked()
+    if jobs is None:
+        jobs = -1 if backend != "loky" or importlib.util.find_spec("joblib") else 1
     if jobs < -1 or jobs == 0:
         raise BufgymError(f"jobs = {jobs}: must be a whole number >= 1, or -1 for one a core")
     if backend not in BACKENDS:
         raise BufgymError(f"backend = {backend!r}: must be one of {', '.join(BACKENDS)}")
+    layout = sweep.task.layout
     form = form or _form(out)
-    whole = out / f"rows.{form}"
-    wanted = manifest(plan, command)
-    parts = out / "parts"
-    _claim(out, wanted)
-    if not whole.exists():
-        parts.mkdir(exist_ok=True)
-        todo = shards(plan)
-        files = [parts / f"{shard.name}.{form}" for shard in todo]
-        missing = [(shard, file) for shard, file in zip(todo, files, strict=True) if not file.exists()]
-        with bar(len(todo), progress, unit="shard", done=len(todo) - len(missing)) as advance:
-            for k, rows in _spread([shard for shard, _ in missing], jobs, backend, address, load):
-                write_rows(rows, missing[k][1])
-                advance(1)
-        rows = [row for shard, file in zip(todo, files, strict=True) for row in _read(file, shard)]
-        write_rows(rows, whole)
+    whole, parts = out / f"rows.{form}", out / "parts"
+    shards = sweep.shards()
+    manifest.claim(out, _manifest(sweep, shards, command))
+    if whole.exists():
+        rows = read_rows(whole, layout)
     else:
-        rows = read_rows(whole)
+        parts.mkdir(exist_ok=True)
+        files = [parts / f"{shard.name}.{form}" for shard in shards]
+        missing = [(shard, file) for shard, file in zip(shards, files, strict=True) if not file.exists()]
+        with bar(len(shards), progress, unit="shard", done=len(shards) - len(missing)) as advance:
+            for k, part in _spread([shard for shard, _ in missing], jobs, backend, address, load):
+                write_rows(part, missing[k][1], layout)
+                advance(1)
+        rows = [row for shard, file in zip(shards, files, strict=True) for row in _read(file, shard)]
+        write_rows(rows, whole, layout)
     if not (out / "timeline.json").exists():
-        shown = timeline.choose(rows)
-        if shown is not None:
-            setting = suites.get(plan.suite).settings(plan.split, plan.data)[shown["scenario"]]
-            trace = shown["seed"] // _SEEDS_A_TRACE
-            chosen = [policies.get(spec) for spec in plan.specs]
-            one = timeline.timeline(chosen, cell(setting.scenario, trace), shown)
-            _write_json(out / "timeline.json", {**one, "about": setting.about})
+        example = sweep.task.example(
+            sweep.policies, rows, lambda row: sweep.setting(row["scenario"], row["seed"] // SEEDS_PER_TRACE)
+        )
+        if example is not None:
+            manifest.write_json(out / "timeline.json", example)
     shutil.rmtree(parts, ignore_errors=True)
     return rows
 
 
-def manifest(plan: Plan, command: str = "") -> dict[str, Any]:
-    """What ``manifest.json`` says about a checked plan."""
-    suite = suites.get(plan.suite)
-    chosen = [policies.get(spec) for spec in plan.specs]
-    return {
-        "format": FORMAT,
-        "bufgym": __version__,
-        "made": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "suite": suite.name,
-        "split": plan.split,
-        "about": suite.about,
-        "command": command,
-        "policies": [policy.name for policy in chosen],
-        "unranked": {policy.name: policy.unranked_because for policy in chosen if not policy.ranked},
-        "capacities": list(plan.capacities),
-        "seeds": plan.seeds,
-        "policy_file": plan.policy_file and hashlib.sha256(Path(plan.policy_file).read_bytes()).hexdigest()[:16],
-        "scenarios": {
-            label: {
-                "about": setting.about,
-                "value": setting.scenario.value.name,
-                **({} if setting.outage_s is None else {"outage_s": setting.outage_s}),
-                **({"recordings": _fingerprint(setting.scenario)} if suite.needs else {}),
-            }
-            for label, setting in suite.settings(plan.split, plan.data).items()
-        },
-    }
-
-
-def _fingerprint(scenario: Scenario) -> str:
-    """Tells recordings apart that go by the same names."""
-    digest = hashlib.sha256()
-    if isinstance(scenario, Uplink):
-        for trace in scenario.traces:
-            digest.update(trace.time_us.tobytes() + trace.cumulative_bytes.tobytes())
-        for motion in scenario.motion:
-            digest.update(motion.time_us.tobytes())
-    return digest.hexdigest()[:16]
-
-
-_SAME = ("format", "bufgym", "suite", "split", "policies", "policy_file", "capacities", "seeds", "scenarios")
-"""What two runs that share a folder must have in common."""
+def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, Any]:
+    settings = sweep.settings()
+    episodes = sum(len(shard.seeds) for shard in shards)
+    described = sweep.task.describe([setting.scenario for setting in settings.values()], episodes)
+    return manifest.describe(
+        suites.get(sweep.suite),
+        settings,
+        sweep.policies,
+        split=sweep.split,
+        command=command,
+        episodes=described,
+        capacities=list(sweep.capacities),
+        seeds=sweep.seeds,
+        changes=dict(sweep.changes),
+        policy_file=sweep.policy_file,
+    )
 
 
 def _form(out: Path) -> str:
@@ -254,72 +235,43 @@ def _form(out: Path) -> str:
     return "csv" if not has_pyarrow() or (".csv" in held and ".parquet" not in held) else "parquet"
 
 
-def _claim(out: Path, wanted: dict[str, Any]) -> None:
-    """Make the folder ours, or an error if something else is in it."""
-    out.mkdir(parents=True, exist_ok=True)
-    file = out / "manifest.json"
-    if not file.exists():
-        if (out / "parts").exists() or any(out.glob("rows.*")):
-            raise BufgymError(f"{out}: holds rows without a manifest.json; choose another --out")
-        _write_json(file, wanted)
-        return
-    held = read_manifest(file)
-    for key in _SAME:
-        if held.get(key) != wanted[key]:
-            raise BufgymError(
-                f"{file}: {key} is {_short(held.get(key))}, but this run has {_short(wanted[key])};"
-                " choose another --out (finished rows are never mixed)"
-            )
-
-
-def _short(given: object) -> str:
-    text = json.dumps(given)
-    return text if len(text) <= 80 else f"{text[:77]}..."
-
-
 def _read(file: Path, shard: Shard) -> list[Row]:
-    """The rows of a finished shard; an error if the file is not what this plan would have written."""
+    """The rows of a finished shard; an error if the file is not what this sweep would have written."""
     again = "delete this file and run the command again: only its rows are made anew"
+    sweep, layout = shard.sweep, shard.sweep.task.layout
     try:
-        rows = read_rows(file)
+        rows = read_rows(file, layout)
     except BufgymError as error:
         raise BufgymError(f"{error}; {again}") from None
-    expected = len(shard.plan.specs) * len(shard.plan.capacities) * len(shard.seeds)
-    if len(rows) != expected or any(tuple(row) != COLUMNS for row in rows):
-        raise BufgymError(f"{file}: {len(rows)} rows where {expected} of {len(COLUMNS)} columns were written; {again}")
+    scenario = sweep.settings()[shard.label].scenario
+    runs = len(sweep.specs) * len(sweep.capacities) * len(shard.seeds)
+    expected, columns = runs * sweep.task.rows_per_run(scenario), layout.columns
+    if len(rows) != expected or any(tuple(row) != columns for row in rows):
+        raise BufgymError(f"{file}: {len(rows)} rows where {expected} of {len(columns)} columns were written; {again}")
     return rows
-
-
-def _write_json(file: Path, content: dict[str, Any]) -> None:
-    with replaced(file) as temporary:
-        temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 # --- where it runs ---------------------------------------------------------------------------------------------------
 
 
 def _spread(
-    work: Sequence[Shard],
-    jobs: int,
-    backend: str,
-    address: str | None,
-    load: Callable[[str | None], None] | None,
+    shards: Sequence[Shard], jobs: int, backend: str, address: str | None, load: Load | None
 ) -> Iterator[tuple[int, list[Row]]]:
     """(number, rows) of each shard, as they become ready; after an error no further ones are begun."""
-    if not work:
+    if not shards:
         return
     if backend == "sequential" or (backend == "loky" and jobs == 1):
-        for k, shard in enumerate(work):
+        for k, shard in enumerate(shards):
             yield k, run_shard(shard)
         return
     if backend == "threading":
         load = None  # this process has run the policy file
     failed: list[Exception] = []
-    calls = ((_attempt, (k, u, load)) for k, u in itertools.takewhile(lambda _: not failed, enumerate(work)))
-    for k, found in cluster.spread(calls, len(work), jobs, backend, address):
-        if isinstance(found, Exception):
-            failed.append(found)
+    calls = ((_attempt, (k, u, load)) for k, u in itertools.takewhile(lambda _: not failed, enumerate(shards)))
+    for k, result in cluster.spread(calls, len(shards), jobs, backend, address):
+        if isinstance(result, Exception):
+            failed.append(result)
         else:
-            yield k, found
+            yield k, result
     if failed:
         raise failed[0]

@@ -7,46 +7,46 @@ from typing import Any
 
 import numpy as np
 
+from bufgym.benchmark import bound
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.run import best, draw, met, row
 from bufgym.benchmark.score import BASELINE
+from bufgym.benchmark.seeds import draw
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
 from bufgym.sim import NEVER
+from bufgym.sim.metrics import outcome
 
 _STEP_S = 0.25
 """The capacity curve is drawn in steps of so many seconds."""
 
 
 def choose(rows: Sequence[Row]) -> Row | None:
-    """The row of the episode to show: at the middle capacity, the one that costs Drop Oldest most over a real link."""
-    capacities = sorted({each["capacity"] for each in rows})
+    """The row of the episode to show: at the middle capacity, the one on which Drop Oldest has the largest regret."""
+    capacities = sorted({row["capacity"] for row in rows})
     middle = capacities[len(capacities) // 2]
-    shown = [
-        each
-        for each in rows
-        if each["policy"] == BASELINE and each["capacity"] == middle and each["regret"] is not None
+    candidates = [
+        row for row in rows if row["policy"] == BASELINE and row["capacity"] == middle and row["regret"] is not None
     ]
-    return max(shown, key=lambda each: (each["regret"], each["scenario"], each["trace"], each["seed"]), default=None)
+    return max(candidates, key=lambda row: (row["regret"], row["scenario"], row["trace"], row["seed"]), default=None)
 
 
 def timeline(policies: Sequence[Policy], scenario: Scenario, shown: Row) -> dict[str, Any]:
-    """The episode of that row under every policy; times in s, rates in bytes/s."""
+    """The episode of the row ``shown`` under every policy; times in s, rates in bytes/s."""
     episode = draw(scenario, shown["seed"])
     capacity = shown["capacity"]
-    plan = best(episode, capacity, scenario)
+    plan = bound.best(episode, capacity, scenario)
     arrivals = np.asarray(episode.arrivals)
-    told: dict[str, Any] = {}
+    lanes: dict[str, Any] = {}
     last_us = int(arrivals["arrival_us"][-1])
     for policy in policies:
-        senders = met(policy, [episode], capacity, scenario, [plan])
+        senders = bound.meet(policy, [episode], capacity, scenario, [plan])
         log = np.asarray(senders.batch.log[0])[: len(arrivals)]
-        found = row({}, policy, capacity, senders, 0, plan)
+        h = outcome(senders, 0).qoi
         received = np.flatnonzero(log["transmitted_us"] != NEVER)
         dropped = np.flatnonzero(log["dropped_us"] != NEVER)
-        told[policy.name] = {
-            "qoi": found["qoi"],
-            "regret": found["regret"],
+        lanes[policy.name] = {
+            "qoi": h,
+            "regret": bound.columns(policy, h, plan)["regret"],
             "received": [
                 [int(k), int(log["dequeued_us"][k]) / 1e6, int(log["transmitted_us"][k]) / 1e6] for k in received
             ],
@@ -63,5 +63,5 @@ def timeline(policies: Sequence[Policy], scenario: Scenario, shown: Row) -> dict
         "x": arrivals["x"].tolist(),
         "rate": {"t_s": (edges_us[:-1] / 1e6).tolist(), "bytes_per_s": (carried / _STEP_S).tolist()},
         "demand_bytes_per_s": float(arrivals["size_bytes"][:-1].sum() / offered_s),
-        "policies": told,
+        "policies": lanes,
     }

@@ -1,16 +1,15 @@
 """``bufgym tune``: which setting of a policy does best on a suite's validation episodes.
 
-Many a policy has a number in it that its source chose for another stream than a robot's. So that such a policy is not
-judged by it alone, each meets a suite in two forms: at its source's numbers, and at those that a grid search finds on
-the validation split. The test split is never looked at here.
+Many policies have a parameter that their source chose for another stream than a robot's. To judge them fairly, each
+meets a suite in two forms: with its source's parameters, and with those that a grid search finds on the validation
+split. The test split is never used here.
 
 A setting replaces the default only if its score is higher by more than chance: if the paired bootstrap interval of the
-difference (see ``score``) lies above 0. What was found is kept in ``tuned.json``, which ``bufgym bench --suite`` reads.
+difference (see ``score``) lies above 0. The choices are kept in ``tuned.json`` (see ``tuned``).
 """
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -20,16 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import __version__, policies
-from bufgym.benchmark import table
+from bufgym.benchmark import table, tuned
+from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.episodes import TIE
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.score import BASELINE, Interval, Scores, scores
-from bufgym.benchmark.sweep import Plan, run_sweep
-from bufgym.errors import BufgymError, where
-from bufgym.files import replaced
-
-FILE = Path(__file__).with_name("tuned.json")
-"""What was found: {suite: {policy: {"setting", "score", "default_score", "split", "command", "bufgym", ...}}}."""
+from bufgym.benchmark.score import BASELINE, Scores, scores
+from bufgym.benchmark.sweep import Sweep, run_sweep
+from bufgym.errors import BufgymError
+from bufgym.scenario import suites
 
 
 @dataclass(frozen=True)
@@ -37,6 +34,7 @@ class Grid:
     """Settings to try for one policy: every combination, and the default."""
 
     axes: Mapping[str, tuple[float, ...]]
+    """Values by parameter."""
     why: str
     """Where the range comes from."""
 
@@ -94,9 +92,9 @@ def settings(policy: str) -> list[str]:
     default, axes = policies.get(policy), GRIDS[policy].axes
     specs = [policy]
     for numbers in product(*axes.values()):
-        made = default.with_parameters(**dict(zip(axes, numbers, strict=True)))
-        if made.parameters != default.parameters:
-            specs.append(made.name)
+        setting = default.with_parameters(**dict(zip(axes, numbers, strict=True)))
+        if setting.parameters != default.parameters:
+            specs.append(setting.name)
     return specs
 
 
@@ -108,12 +106,13 @@ class Tried:
     """One setting on the validation episodes."""
 
     spec: str
+    """As ``bufgym.policies.get`` takes it."""
     score: Interval
-    """Mean over the discriminative cells; NaN where none discriminative."""
+    """Mean over the discriminative cells; NaN where there is none."""
     regret: Interval
-    """Mean over the same cells, or over all where none discriminative."""
+    """Mean over the same cells, or over all where none is discriminative."""
     gain: Interval
-    """What it is better by than the default, paired: in score, or in regret where no cell discriminative."""
+    """How much better it is than the default, paired: in score, or in regret where no cell is discriminative."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +120,7 @@ class Choice:
     """What was tried for one policy."""
 
     policy: str
+    """Its plain name."""
     tried: tuple[Tried, ...]
     """The default first."""
 
@@ -131,7 +131,7 @@ class Choice:
 
     @property
     def best(self) -> Tried:
-        """The first of those with the highest score (lowest regret, where no cell discriminative)."""
+        """The first of those with the highest score (lowest regret, where no cell is discriminative)."""
         return max(self.tried, key=lambda tried: tried.gain.value)
 
     @property
@@ -150,39 +150,41 @@ def tune(
     split: str = "validation",
     data: str | None = None,
     seeds: int | None = None,
-    jobs: int = -1,
+    jobs: int | None = None,
 ) -> list[Choice]:
-    """Try the grids of the policies (default: of all that have one) on a suite; one choice a policy.
+    """Try the grids of the policies (default: of all that have one) on a suite; one choice for each policy.
 
     Args:
         suite: its name.
         names: policies of ``GRIDS``.
         split: "validation" or "train".
         data: folder of recordings, for suites that need one.
-        seeds: episodes a trace; None: as many as the suite says.
-        jobs: processes side by side; -1: one a core.
+        seeds: episodes on each trace; None: as many as the suite says.
+        jobs: see ``run_sweep``.
 
     Raises:
         BufgymError: for the split "test", a policy without a grid, and as for ``run_sweep``.
     """
     if split == "test":
         raise BufgymError("split = 'test': must be validation or train; parameters are never chosen on test episodes")
+    if suites.get(suite).kind != "queue":
+        raise BufgymError(f"suite {suite}: only policies of one queue are tuned")
     specs = {name: settings(name) for name in dict.fromkeys(names or GRIDS)}
-    plan = Plan(suite, tuple(spec for those in specs.values() for spec in those), split, seeds=seeds, data=data)
+    sweep = Sweep(suite, tuple(spec for those in specs.values() for spec in those), split, seeds=seeds, data=data)
     with tempfile.TemporaryDirectory() as scratch:
-        rows = run_sweep(plan, Path(scratch) / "run", jobs=jobs)
+        rows = run_sweep(sweep, Path(scratch) / "run", jobs=jobs)
     return [compare(name, rows, those) for name, those in specs.items()]
 
 
 def compare(policy: str, rows: Sequence[Row], specs: Sequence[str]) -> Choice:
     """Score the settings ``specs`` of one policy, the default first, from rows that hold theirs and the baseline's."""
-    mine = [row for row in rows if row["policy"] in (*specs, BASELINE)]
-    made = scores(mine)
-    discriminative = any(cell.discriminative for cell in made.cells)
-    gains = scores([*_only(mine, BASELINE), *_gains(mine, specs, discriminative)])
+    rows = [row for row in rows if row["policy"] in (*specs, BASELINE)]
+    scored = scores(rows)
+    discriminative = any(cell.discriminative for cell in scored.cells)
+    gains = scores(_gains(rows, specs, discriminative))
     tried = []
     for spec in specs:
-        score, regret = _overall(made, spec)
+        score, regret = _overall(scored, spec)
         better, worse = _overall(gains, spec)
         gain = better if discriminative else Interval(-worse.value, -worse.high, -worse.low)
         tried.append(Tried(spec, score, regret, gain))
@@ -193,56 +195,50 @@ def _gains(rows: Sequence[Row], specs: Sequence[str], discriminative: bool) -> l
     """Rows whose score is that of a setting less that of the default, so that ``scores`` gives its paired interval.
 
     (H - H_baseline) / (H_clairvoyant - H_baseline) is linear in H: for H = H_baseline + H_setting - H_default it is the
-    difference of the two scores. Likewise the regret for H = H_clairvoyant + H_setting - H_default.
+    difference of the two scores. Likewise the regret for H = H_clairvoyant + H_setting - H_default. The baseline's own
+    rows come first, as they are.
     """
-    base = _by_episode(rows, BASELINE)
-    default = _by_episode(rows, specs[0])
-    made = []
+    h = {(row["policy"], *_episode(row)): row["qoi"] for row in rows}
+    gains = [row for row in rows if row["policy"] == BASELINE]
     for row in rows:
         if row["policy"] in specs:
-            key = _episode(row)
-            start = base[key] if discriminative else row["clairvoyant"]
-            made.append({**row, "qoi": start + (row["qoi"] - default[key])})
-    return made
-
-
-def _only(rows: Sequence[Row], policy: str) -> list[Row]:
-    return [row for row in rows if row["policy"] == policy]
-
-
-def _by_episode(rows: Sequence[Row], policy: str) -> dict[tuple[Any, ...], float]:
-    """H of one policy."""
-    return {_episode(row): row["qoi"] for row in _only(rows, policy)}
+            start = h[BASELINE, *_episode(row)] if discriminative else row["clairvoyant"]
+            gains.append({**row, "qoi": start + (row["qoi"] - h[specs[0], *_episode(row)])})
+    return gains
 
 
 def _episode(row: Row) -> tuple[Any, ...]:
     return tuple(row[key] for key in ("scenario", "capacity", "trace", "seed"))
 
 
-def _overall(made: Scores, policy: str) -> tuple[Interval, Interval]:
+def _overall(scored: Scores, policy: str) -> tuple[Interval, Interval]:
     """(score, regret) of one policy.
 
     Where no cell is discriminative there is no standing: the regret is then the mean over all cells, and so are the
     bounds of its interval, which makes that one a little too wide.
     """
-    standing = next(s for s in made.standings if s.policy == policy)
+    standing = next(s for s in scored.standings if s.policy == policy)
     if standing.cells:
         return standing.score, standing.regret
-    each = [cell.regret for cell in made.cells if cell.policy == policy]
-    return standing.score, Interval(*(math.fsum(part) / len(each) for part in zip(*each, strict=True)))
+    regrets = [cell.regret for cell in scored.cells if cell.policy == policy]
+    return standing.score, Interval(*(math.fsum(part) / len(regrets) for part in zip(*regrets, strict=True)))
 
 
-# --- what was found --------------------------------------------------------------------------------------------------
+# --- what was chosen -------------------------------------------------------------------------------------------------
 
 
 def plain(choices: Sequence[Choice]) -> str:
     """A table for each policy: every setting, best first."""
+
+    def text(interval: Interval, digits: int) -> str:
+        return " ".join(filter(None, written(interval, lambda number: table.decimal(number, digits))))
+
     out = []
     for choice in choices:
         lines = [["setting", "score", "regret", "better than the default", ""]]
         for tried in sorted(choice.tried, key=lambda tried: -tried.gain.value):
-            gain = "-" if tried is choice.default else _written(tried.gain, 3)
-            lines.append([tried.spec, _written(tried.score, 3), _written(tried.regret, 4), gain, _mark(choice, tried)])
+            gain = "–" if tried is choice.default else text(tried.gain, 3)
+            lines.append([tried.spec, text(tried.score, 3), text(tried.regret, 4), gain, _mark(choice, tried)])
         out += [f"{choice.policy}: {GRIDS[choice.policy].why}", *table.aligned(lines), ""]
     return "\n".join(out).rstrip()
 
@@ -252,74 +248,23 @@ def _mark(choice: Choice, tried: Tried) -> str:
     return ", ".join(mark for mark, marked in marks if marked is tried)
 
 
-def _written(interval: Interval, digits: int) -> str:
-    if math.isnan(interval.value):
-        return "-"
-    value, low, high = (f"{number:z.{digits}f}" for number in interval)
-    return f"{value} [{low}, {high}]"
-
-
 def write(suite: str, choices: Sequence[Choice], *, split: str, command: str) -> Path:
-    """Put the choices into ``tuned.json``, in place of earlier ones for the same policies; the file's path."""
-    found = read() if FILE.exists() else {}
-    entries = found.setdefault(suite, {})
-    for choice in choices:
-        chosen, default = choice.chosen, choice.default
-        entries[choice.policy] = {
-            "setting": chosen.spec,
-            "score": _kept(chosen.score.value),
-            "default_score": _kept(default.score.value),
-            "regret": _kept(chosen.regret.value),
-            "default_regret": _kept(default.regret.value),
+    """Keep the choices in ``tuned.json``, in place of earlier ones for the same policies; the file's path."""
+    entries = {
+        choice.policy: {
+            "setting": choice.chosen.spec,
+            "score": _rounded(choice.chosen.score.value),
+            "default_score": _rounded(choice.default.score.value),
+            "regret": _rounded(choice.chosen.regret.value),
+            "default_regret": _rounded(choice.default.regret.value),
             "split": split,
             "command": command,
             "bufgym": __version__,
         }
-    # Sorted, so that the file does not depend on the order of the runs.
-    with replaced(FILE) as temporary:
-        temporary.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    return FILE
+        for choice in choices
+    }
+    return tuned.write(suite, entries)
 
 
-def _kept(number: float) -> float | None:
+def _rounded(number: float) -> float | None:
     return None if math.isnan(number) else round(number, 6) + 0.0  # no -0.0
-
-
-def read() -> dict[str, dict[str, dict[str, Any]]]:
-    """What ``tuned.json`` holds; an error that names the rule where it is broken."""
-    try:
-        found = json.loads(FILE.read_text(encoding="utf-8"))
-    except UnicodeDecodeError:
-        raise BufgymError(f"{FILE}: must be UTF-8 text") from None
-    except json.JSONDecodeError as error:
-        raise BufgymError(where(FILE, error.lineno, None, f"must be JSON: {error.msg}")) from None
-    if not isinstance(found, dict) or not all(isinstance(entries, dict) for entries in found.values()):
-        raise BufgymError(f"{FILE}: must be a JSON object of suites, each an object of policies")
-    for suite, entries in found.items():
-        for policy, entry in entries.items():
-            setting = entry.get("setting") if isinstance(entry, dict) else None
-            if not isinstance(setting, str) or setting.partition(":")[0] != policy:
-                rule = f"must be a setting of that policy, such as {policy}:parameter=1"
-                raise BufgymError(where(FILE, None, setting or "", rule, field=f"{suite}.{policy}.setting"))
-    return found
-
-
-def tuned(suite: str) -> list[str]:
-    """The settings found for this suite that differ from the policies' defaults."""
-    found = []
-    for policy, entry in read().get(suite, {}).items():
-        try:
-            setting, default = policies.get(entry["setting"]), policies.get(policy)
-        except BufgymError as error:
-            raise BufgymError(f"{FILE}: {suite}.{policy}: {error}") from None
-        if setting.parameters != default.parameters:
-            found.append(setting.name)
-    return found
-
-
-def specs(suite: str) -> list[str]:
-    """Who meets a suite unless the caller says otherwise: every policy as its source has it, and the tuned variants.
-
-    Suites are about one queue: policies made for topics are left out.
-    """
-    return [*policies.names(for_topics=False), *tuned(suite)]

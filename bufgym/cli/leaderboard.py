@@ -15,20 +15,20 @@ def add(commands: Commands) -> None:
     make.add_argument("suites", nargs="*", metavar="SUITE", help="which (default: all that need no recordings)")
     check = command(commands, "validate", _validate, "run one row of the leaderboard again and compare")
     check.add_argument("row", metavar="SUITE/POLICY", help="which row")
-    for made in (make, check):
-        made.add_argument("--file", default=DEFAULT, metavar="FILE.csv", help="the leaderboard (%(default)s)")
-        made.add_argument("--data", metavar="DIR", help="folder of recordings, for suites over real links")
-        made.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes side by side (one a core)")
+    for parser in (make, check):
+        parser.add_argument("--file", default=DEFAULT, metavar="FILE.csv", help="the leaderboard (%(default)s)")
+        parser.add_argument("--data", metavar="DIR", help="folder of recordings, for suites over real links")
+        parser.add_argument("--jobs", type=int, metavar="N", help="processes side by side (one a core)")
 
 
 def _leaderboard(options: argparse.Namespace) -> None:
-    from bufgym.benchmark import leaderboard, tune
+    from bufgym.benchmark import leaderboard
     from bufgym.scenario import suites
 
     names = options.suites or [name for name, suite in suites.SUITES.items() if not suite.needs or options.data]
-    specs = {suites.get(name).name: tune.specs(name) for name in names}
-    made = leaderboard.make(Path(options.file), names, specs, data=options.data, jobs=options.jobs)
-    print(f"{len(made)} rows in {options.file}, as Markdown in {Path(options.file).with_suffix('.md')}")
+    specs = {name: leaderboard.task_of(name).default_policies(name) for name in names}
+    board = leaderboard.make(Path(options.file), names, specs, data=options.data, jobs=options.jobs)
+    print(f"{len(board)} rows in {options.file}, as Markdown in {Path(options.file).with_suffix('.md')}")
 
 
 def _validate(options: argparse.Namespace) -> None:
@@ -37,6 +37,5 @@ def _validate(options: argparse.Namespace) -> None:
     entry = leaderboard.find(Path(options.file), options.row)
     again = leaderboard.validate(entry, data=options.data, jobs=options.jobs)
     print(f"{entry.name}: holds")
-    for what in ("score", "regret"):
-        low, stated, high = (getattr(entry, what + end) for end in ("_low", "", "_high"))
-        print(f"  {what}: {getattr(again, what):.6f} now, {stated:.6f} [{low:.6f}, {high:.6f}] in {options.file}")
+    for key, (stated, low, high) in entry.values.items():
+        print(f"  {key}: {again.values[key].value:.6f} now, {stated:.6f} [{low:.6f}, {high:.6f}] in {options.file}")

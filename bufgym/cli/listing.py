@@ -47,13 +47,9 @@ def _list_scenarios() -> str:
 
 
 def _list_suites() -> str:
-    from bufgym.scenario.suites import FLEET_SUITES, SUITES, TOPIC_SUITES
+    from bufgym.scenario.suites import SUITES
 
-    listed = [
-        (suite.name, suite.about + (f"; needs {suite.needs}" if suite.needs else "")) for suite in SUITES.values()
-    ]
-    listed += [(suite.name, f"{suite.about} (bufgym topics)") for suite in TOPIC_SUITES.values()]
-    return columns(listed + [(suite.name, f"{suite.about} (bufgym fleet)") for suite in FLEET_SUITES.values()])
+    return columns([(s.name, s.kind, s.about + (f"; needs {s.needs}" if s.needs else "")) for s in SUITES.values()])
 
 
 def _list_policies() -> str:

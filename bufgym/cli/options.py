@@ -1,4 +1,4 @@
-"""What the commands' options share: the parser, the types of options, policies of the user's own, columns to print."""
+"""What the commands share: the parser, the types of options, policies by name and from files, columns to print."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bufgym.errors import BufgymError
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose complaints are raised as BufgymError, like every other mistake of the caller's."""
+    """A parser that raises BufgymError, like every other mistake of the caller's."""
 
     def error(self, message: str) -> NoReturn:
         raise BufgymError(f"{message} (see {self.prog} --help)")
@@ -25,9 +25,9 @@ Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 
 def command(commands: Commands, name: str, function: Callable[[argparse.Namespace], None], help: str) -> Parser:
     """Add the command ``name``, which calls ``function`` with its options; its own parser, to add them to."""
-    made = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
-    made.set_defaults(command=function)
-    return made
+    parser = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
+    parser.set_defaults(command=function)
+    return parser
 
 
 # --- types of options ------------------------------------------------------------------------------------------------
@@ -36,55 +36,55 @@ def command(commands: Commands, name: str, function: Callable[[argparse.Namespac
 def number(text: str) -> float:
     """A finite number."""
     try:
-        found = float(text)
+        value = float(text)
     except ValueError:
-        found = math.nan
-    if not math.isfinite(found):
+        value = math.nan
+    if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"{text!r}: must be a finite number")
-    return found
+    return value
 
 
 def positive(text: str) -> float:
     """A number > 0."""
-    found = number(text)
-    if found <= 0:
+    value = number(text)
+    if value <= 0:
         raise argparse.ArgumentTypeError(f"{text}: must be a number > 0")
-    return found
+    return value
 
 
 def least_0(text: str) -> float:
     """A number >= 0."""
-    found = number(text)
-    if found < 0:
+    value = number(text)
+    if value < 0:
         raise argparse.ArgumentTypeError(f"{text}: must be a number >= 0")
-    return found
+    return value
 
 
 def count(text: str) -> int:
     """A whole number >= 1."""
-    found = natural(text)
-    if found < 1:
+    value = natural(text)
+    if value < 1:
         raise argparse.ArgumentTypeError(f"{text}: must be a whole number >= 1")
-    return found
+    return value
 
 
 def natural(text: str) -> int:
     """A whole number >= 0."""
     try:
-        found = int(text)
+        value = int(text)
     except ValueError:
-        found = -1
-    if found < 0:
+        value = -1
+    if value < 0:
         raise argparse.ArgumentTypeError(f"{text}: must be a whole number >= 0")
-    return found
+    return value
 
 
 def capacities(text: str) -> list[int]:
     """Whole numbers >= 1, no two alike: ``"4,8,16"``."""
     numbers = [count(part) for part in text.split(",")]
-    for each in numbers:
-        if numbers.count(each) > 1:
-            raise argparse.ArgumentTypeError(f"{text}: {each} is given more than once")
+    for capacity in numbers:
+        if numbers.count(capacity) > 1:
+            raise argparse.ArgumentTypeError(f"{text}: {capacity} is given more than once")
     return numbers
 
 
@@ -97,6 +97,21 @@ def split_policies(text: str) -> list[str]:
         else:
             specs.append(part.strip())
     return specs
+
+
+def policies_option(parser: argparse._ActionsContainer, default: str) -> None:
+    """Add the option ``--policies``; ``policy_specs`` reads it."""
+    parser.add_argument(
+        "--policies",
+        nargs="+",
+        metavar="A,B:x=1,C",
+        help=f"policies, with settings as in decimate:every=2 (default: {default})",
+    )
+
+
+def policy_specs(texts: Sequence[str] | None) -> list[str]:
+    """The policies that ``--policies`` names, with commas or as several words; none if it was not given."""
+    return [spec for text in texts or () for spec in split_policies(text)]
 
 
 # --- a user's own policies -------------------------------------------------------------------------------------------

@@ -8,9 +8,9 @@ from bufgym.cli.options import Commands, command
 
 
 def add(commands: Commands) -> None:
-    made = command(commands, "report", _report, "the page of a suite's run: one HTML file that works offline")
-    made.add_argument("folder", metavar="DIR", help="what bench --suite wrote with --out")
-    made.add_argument("--markdown", action="store_true", help="print tables for a README instead")
+    parser = command(commands, "report", _report, "the page of a suite's run: one HTML file that works offline")
+    parser.add_argument("folder", metavar="DIR", help="what bench --suite wrote with --out")
+    parser.add_argument("--markdown", action="store_true", help="print tables for a README instead")
 
 
 def _report(options: argparse.Namespace) -> None:

@@ -5,25 +5,25 @@ from __future__ import annotations
 import argparse
 import shlex
 
-from bufgym.cli.options import Commands, command, count
+from bufgym.cli.options import Commands, command, count, policies_option, policy_specs
 
 
 def add(commands: Commands) -> None:
-    made = command(commands, "tune", _tune, "choose the policies' parameters on a suite's validation episodes")
-    option = made.add_argument
+    parser = command(commands, "tune", _tune, "choose the policies' parameters on a suite's validation episodes")
+    option = parser.add_argument
     option("suite", metavar="SUITE", help="which ('bufgym list suites')")
-    option("--policies", metavar="A,B", help="policies by name (default: all that have a grid of settings)")
+    policies_option(parser, "all that have a grid of settings, by their plain names")
     option("--split", default="validation", metavar="S", help="validation (default) or train; test is refused")
     option("--data", metavar="DIR", help="folder of recordings, for suites over real links")
-    option("--seeds", type=count, metavar="N", help="episodes a trace (default: the suite's)")
-    option("--jobs", type=int, default=-1, metavar="N", help="processes side by side (default: one a core)")
+    option("--seeds", type=count, metavar="N", help="episodes on each trace (default: the suite's)")
+    option("--jobs", type=int, metavar="N", help="processes side by side (default: one a core)")
     option("--write", action="store_true", help="keep what was chosen, for bufgym bench --suite")
 
 
 def _tune(options: argparse.Namespace) -> None:
     from bufgym.benchmark import tune
 
-    names = [] if options.policies is None else [name.strip() for name in options.policies.split(",")]
+    names = policy_specs(options.policies)
     choices = tune.tune(
         options.suite, names, split=options.split, data=options.data, seeds=options.seeds, jobs=options.jobs
     )
@@ -36,7 +36,8 @@ def _command(options: argparse.Namespace) -> str:
     """The command that runs this again; the folder of recordings lies elsewhere on another machine."""
     words = ["bufgym tune", options.suite]
     for name, default in (("policies", None), ("split", "validation"), ("seeds", None)):
-        given = getattr(options, name)
-        if given != default:
-            words.append(f"--{name} {shlex.quote(str(given))}")
+        value = getattr(options, name)
+        if value != default:
+            text = ",".join(value) if isinstance(value, list) else str(value)
+            words.append(f"--{name} {shlex.quote(text)}")
     return " ".join([*words, *(["--data DIR"] if options.data is not None else []), "--write"])

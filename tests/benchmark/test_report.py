@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from bufgym.benchmark import folder as inputs
-from bufgym.benchmark import report
+from bufgym.benchmark import report, table
 from bufgym.benchmark.report import style, timeline
 from bufgym.benchmark.rows import write_rows
 from bufgym.errors import BufgymError
@@ -26,7 +26,8 @@ QOI = {"clairvoyant": 100.0, "<b>": 95.0, "afr": 90.0, "drop-oldest": 80.0, "ran
 """H of each policy in every episode. Scores: 1, 3/4, 1/2, 0, -1; regrets 0, 5, 10, 20, 40 %."""
 
 MANIFEST = {
-    "format": 1,
+    "format": 2,
+    "task": "queue",
     "bufgym": "0.1.0",
     "suite": "tiny-v1",
     "split": "test",
@@ -37,6 +38,8 @@ MANIFEST = {
     "unranked": {"clairvoyant": "it knows the future"},
     "capacities": [2, 4],
     "seeds": 3,
+    "changes": {},
+    "episodes": "",
     "scenarios": {
         "short": {"about": "Out for 5 s.", "value": "exponential:0.618", "outage_s": 5.0},
         "long": {"about": "Out for 20 s.", "value": "exponential:0.618", "outage_s": 20.0},
@@ -118,7 +121,7 @@ def test_the_ranking_in_markdown(folder: Path) -> None:
     ]
 
 
-def test_cells_in_markdown_are_marked_where_they_do_not_bite_or_the_bound_is_not_exact(folder: Path) -> None:
+def test_cells_in_markdown_are_marked_where_they_are_not_discriminative_or_the_bound_is_not_exact(folder: Path) -> None:
     text = report.markdown(folder)
     assert "Score, short:\n\n| policy | L = 2 | L = 4 |" in text
     assert "Score, long:\n\n| policy | L = 2† | L = 4† |" in text
@@ -146,7 +149,7 @@ def test_no_notes_where_there_is_nothing_to_note(tmp_path: Path) -> None:
     ],
 )
 def test_per_cent_has_three_digits(share: float, written: str) -> None:
-    assert style.percent(share) == written
+    assert table.percent(share) == written
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
@@ -200,7 +203,7 @@ def test_what_a_run_does_not_have_has_no_chart(tmp_path: Path) -> None:
     folder = make(tmp_path / "b", rows=rows)
     (folder / "timeline.json").unlink()
     page = report.write(folder).read_text(encoding="utf-8")
-    assert set(figures(page)) == {"delays"}  # and as the good link does not bite, no ranking
+    assert set(figures(page)) == {"delays"}  # and as the good link is not discriminative, no ranking
     assert "there is no score" in page
 
 
@@ -220,7 +223,7 @@ def test_the_page_needs_an_extra_and_the_tables_do_not(folder: Path, monkeypatch
 # --- the timeline -----------------------------------------------------------------------------------------------------
 
 
-def test_fates_and_the_longest_gap_by_hand() -> None:
+def test_outcomes_and_the_longest_gap_by_hand() -> None:
     """0, 2 and 4 arrive: steps in x of 1.0 and 3.5. What was dropped between 2 and 4 lies in the longest gap."""
     lane = {"received": [[0, 0, 0], [2, 0, 0], [4, 0, 0]], "dropped": [[1, 2.0], [3, 3.0]]}
     gap = timeline.longest_gap(TIMELINE["x"], [0, 2, 4])
@@ -263,12 +266,13 @@ def test_a_folder_must_hold_a_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ('{"format": 1,\n', "manifest.json, line 2: must be JSON"),
+        ('{"format": 2,\n', "manifest.json, line 2: must be JSON"),
         ("[]", "manifest.json: must be a JSON object"),
-        ('{"format": 2}', "manifest.json: format = 2: must be 1"),
-        ('{"format": 1, "suite": 3}', "manifest.json: suite = 3: must be text"),
+        ('{"format": 1}', "manifest.json: format = 1: must be 2"),
+        (json.dumps({**MANIFEST, "suite": 3}), "manifest.json: suite = 3: must be text"),
         (json.dumps({**MANIFEST, "scenarios": {"a": 1}}), "manifest.json: scenarios.a must be an object"),
         (json.dumps({**MANIFEST, "scenarios": {"a": {"outage_s": "x"}}}), "scenarios.a.outage_s = x: must be a number"),
+        (json.dumps({**MANIFEST, "task": "chess"}), "manifest.json: task = chess: must be one of queue, topics, fleet"),
         (json.dumps({k: v for k, v in MANIFEST.items() if k != "command"}), "manifest.json: no command"),
     ],
 )

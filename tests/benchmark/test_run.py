@@ -39,7 +39,7 @@ def test_every_policy_and_capacity_meets_the_same_episodes() -> None:
     assert first == second
     half = len(first) // 2
     assert half == 2 * 3 * 20  # traces x seeds x messages
-    # Cells come one after the other, capacities within them.
+    # Traces come one after the other, capacities within them.
     per = 3 * 20
     assert first[:per] == first[per : 2 * per]
     assert len({uniform for *_, uniform in first[:per]}) == per
@@ -63,10 +63,10 @@ def test_many_seeds_run_in_several_batches(monkeypatch: pytest.MonkeyPatch) -> N
     assert run.run(chosen, UPLINK, [2], 5) == whole
 
 
-def test_every_trace_is_a_cell_even_under_one_name() -> None:
-    parts = run.cells(replace(UPLINK, traces=(SLOW, FAST, SLOW, SLOW)))
+def test_every_trace_is_met_on_its_own_even_under_one_name() -> None:
+    parts = run.by_trace(replace(UPLINK, traces=(SLOW, FAST, SLOW, SLOW)))
     assert [label for label, _ in parts] == ["slow", "fast", "slow#2", "slow#3"]
-    assert all(len(cell.traces) == 1 for _, cell in parts if isinstance(cell, Uplink))
+    assert all(len(part.traces) == 1 for _, part in parts if isinstance(part, Uplink))
 
 
 def test_an_interruption_has_a_bound_and_a_regret() -> None:

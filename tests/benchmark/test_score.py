@@ -1,4 +1,4 @@
-"""The statistics of a benchmark, by hand: scores, interquartile mean, improvement, paired bootstrap intervals."""
+"""The scores of one queue, by hand: scores, interquartile mean, improvement, paired bootstrap intervals."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_the_scale_is_fixed_at_both_ends_and_open_beyond() -> None:
     ]
 
 
-def test_a_cell_that_does_not_bite_is_shown_and_not_scored() -> None:
+def test_a_cell_that_is_not_discriminative_is_shown_and_not_scored() -> None:
     """At L = 9 Drop Oldest's regret is 1 / 200 < 1 %; at L = 8 it is 2 / 200."""
     quiet = rows_of({"drop-oldest": [99.5, 99.5], "afr": [99, 99], "mine": [9, 9]}, [100, 100], capacity=9)
     made = score.scores([*TWO_CELLS, *quiet])
@@ -122,7 +122,7 @@ def test_a_cell_that_does_not_bite_is_shown_and_not_scored() -> None:
     assert standing_of(made, "mine").cells == 3
 
 
-def test_where_nothing_bites_there_are_no_standings() -> None:
+def test_without_a_discriminative_cell_there_are_no_standings() -> None:
     """No clairvoyant at all, one missing episode of it, or Drop Oldest as good as the clairvoyant."""
     h = {"drop-oldest": [10, 20], "afr": [10, 20]}
     for best in ([None, None], [14, None], [10, 20]):
@@ -183,28 +183,6 @@ def test_a_resampled_trace_weighs_as_often_as_it_was_drawn() -> None:
     assert (made.iqm.low, made.iqm.high) == pytest.approx(np.percentile(naive, [2.5, 97.5]), abs=0.02)
 
 
-# rliable itself asks for versions of other packages that current pandas rules out: hence numbers worked by hand, and
-# the test statistic that it is made of.
-def test_probability_of_improvement_by_hand() -> None:
-    """x = 1, 3, 5 over y = 2, 3: pairs (1, .) lose both, (3, .) win and tie, (5, .) win both: 3.5 of 6."""
-    assert score.probability_of_improvement([1, 3, 5], [2, 3]) == pytest.approx(3.5 / 6)
-    assert score.probability_of_improvement([2, 3], [1, 3, 5]) == pytest.approx(2.5 / 6)
-    # A second task in which x always wins: the mean over tasks.
-    assert score.probability_of_improvement([[1, 9], [3, 9], [5, 9]], [[2, 8], [3, 8]]) == pytest.approx(9.5 / 12)
-    assert math.isnan(score.probability_of_improvement([], [1]))
-    assert math.isnan(score.probability_of_improvement([1], [math.nan]))
-    with pytest.raises(BufgymError, match=r"shapes \(1, 2\) and \(1, 3\)"):
-        score.probability_of_improvement([[1, 2]], [[1, 2, 3]])
-
-
-def test_probability_of_improvement_is_mann_whitneys() -> None:
-    stats = pytest.importorskip("scipy.stats")
-    rng = np.random.default_rng(0)
-    x, y = rng.integers(0, 9, (30, 4)), rng.integers(0, 8, (20, 4))
-    by_task = [stats.mannwhitneyu(x[:, k], y[:, k]).statistic / 600 for k in range(4)]
-    assert score.probability_of_improvement(x, y) == pytest.approx(np.mean(by_task))
-
-
 def test_equal_but_for_rounding_is_a_tie() -> None:
     rows = rows_of({"drop-oldest": [0.1], "afr": [0.1 + 0.2], "mine": [0.3]}, [1])
     assert standing_of(score.scores(rows), "mine").improvement == (0.5, 0.5, 0.5)
@@ -234,12 +212,12 @@ def test_intervals_hold_their_value_and_shrink_with_the_square_root() -> None:
     ]
     assert all(low < value < high for value, low, high in intervals)
     few, many, half = map(width, intervals)
-    assert 2.5 < few / many < 6.5  # 4 but for luck
+    assert 2.5 < few / many < 6.5  # 4 but for chance
     assert many / half == pytest.approx(1.96 / 0.674, rel=0.15)
 
 
 def test_the_interval_holds_the_truth_as_often_as_it_says() -> None:
-    """300 experiments of 40 normal differences of mean 1: 95 % but for what a bootstrap of 40 lacks, and luck."""
+    """300 experiments of 40 normal differences of mean 1: 95 % but for what a bootstrap of 40 lacks, and chance."""
     rng = np.random.default_rng(3)
     held = 0
     for k in range(300):

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from bufgym import policies
-from bufgym.benchmark import run, sweep
+from bufgym.benchmark import manifest, run, sweep
 from bufgym.benchmark.rows import read_rows, write_rows
-from bufgym.benchmark.sweep import Plan
+from bufgym.benchmark.sweep import Sweep
 from bufgym.cli import main
 from bufgym.cli.options import load_policies
 from bufgym.errors import BufgymError
@@ -28,7 +28,7 @@ from bufgym.traces import Trace
 pytest.importorskip("joblib", reason="a sweep needs joblib")
 
 THREE = ("afr", "random", "drop-oldest")
-TINY = Plan("interruption-v1", THREE, capacities=(2, 4), seeds=3)
+TINY = Sweep("interruption-v1", THREE, capacities=(2, 4), seeds=3)
 WORDS = ["bench", "--suite", "interruption-v1", "--policies", ",".join(THREE), "--capacity", "2,4", "--seeds", "3"]
 """The same as ``TINY``, typed."""
 
@@ -73,7 +73,7 @@ def expected() -> str:
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> Plan:
+def small(monkeypatch: pytest.MonkeyPatch) -> Sweep:
     """A suite of two traces, two labels and messages that one can count."""
 
     def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
@@ -85,8 +85,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Plan:
         return {label: suites.Setting(uplink, f"{label} here", outage_s=2.0) for label in ("one", "two")}
 
     monkeypatch.setitem(suites.SUITES, "small-v1", suites.Suite("small-v1", "small", build, (2, 3), 2))
-    suites._settings.cache_clear()
-    return Plan("small-v1", THREE)
+    return Sweep("small-v1", THREE)
 
 
 @pytest.fixture
@@ -145,7 +144,7 @@ def test_so_are_they_from_other_processes_which_know_a_users_policy(
     assert repr([row for row in rows if row["policy"] == "mine"]) == repr(own)
 
 
-def test_each_trace_has_seeds_of_its_own(tmp_path: Path, small: Plan) -> None:
+def test_each_trace_has_seeds_of_its_own(tmp_path: Path, small: Sweep) -> None:
     """2 labels x 2 traces x 2 capacities x 3 policies x 2 seeds; the second trace's seeds count from 1000."""
     rows = sweep.run_sweep(small, tmp_path, backend="sequential")
     assert len(rows) == 2 * 2 * 2 * 3 * 2
@@ -156,21 +155,21 @@ def test_each_trace_has_seeds_of_its_own(tmp_path: Path, small: Plan) -> None:
     assert rows[0]["trace"] != rows[-1]["trace"]
     wanted = []
     for label, setting in suites.get("small-v1").settings("test").items():
-        for k, (_, part) in enumerate(run.cells(setting.scenario)):
+        for k, (_, part) in enumerate(run.by_trace(setting.scenario)):
             chosen = [policies.get(name) for name in THREE]
             wanted += run.run(chosen, part, [2, 3], [1000 * k, 1000 * k + 1], label=label)
     assert repr(rows) == repr(wanted)
 
 
 @pytest.mark.slow
-def test_many_seeds_are_several_units_and_the_same_rows(
-    tmp_path: Path, small: Plan, monkeypatch: pytest.MonkeyPatch
+def test_many_seeds_are_several_shards_and_the_same_rows(
+    tmp_path: Path, small: Sweep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan = Plan(small.suite, small.specs, seeds=5)
+    plan = Sweep(small.suite, small.specs, seeds=5)
     whole = sweep.run_sweep(plan, tmp_path / "whole", backend="sequential")
-    monkeypatch.setattr(sweep, "_SEEDS_A_SHARD", 2)
-    assert [len(shard.seeds) for shard in sweep.shards(plan.checked())] == [2, 2, 1] * 4
-    assert len({shard.name for shard in sweep.shards(plan.checked())}) == 12
+    monkeypatch.setattr(sweep, "_SEEDS_PER_SHARD", 2)
+    assert [len(shard.seeds) for shard in plan.checked().shards()] == [2, 2, 1] * 4
+    assert len({shard.name for shard in plan.checked().shards()}) == 12
 
     def key(row: dict[str, Any]) -> tuple[Any, ...]:
         return (row["scenario"], row["trace"], row["seed"], row["capacity"], row["policy"])
@@ -179,10 +178,10 @@ def test_many_seeds_are_several_units_and_the_same_rows(
     assert repr(sorted(parted, key=key)) == repr(sorted(whole, key=key))
 
 
-def test_the_baseline_is_always_there_and_the_suite_fills_what_is_open(small: Plan) -> None:
-    plan = Plan("small-v1", ("afr",)).checked()
+def test_the_baseline_is_always_there_and_the_suite_fills_what_is_open(small: Sweep) -> None:
+    plan = Sweep("small-v1", ("afr",)).checked()
     assert (plan.specs, plan.capacities, plan.seeds) == (("afr", "drop-oldest"), (2, 3), 2)
-    assert Plan("small-v1", ("drop-oldest", "afr", "afr")).checked().specs == ("drop-oldest", "afr")
+    assert Sweep("small-v1", ("drop-oldest", "afr")).checked().specs == ("drop-oldest", "afr")
     assert plan.checked() == plan
 
 
@@ -225,7 +224,7 @@ def test_a_run_that_was_killed_goes_on_where_it_was(
     assert not (killed / "parts").exists()
 
 
-def test_a_second_call_runs_nothing(tmp_path: Path, small: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_call_runs_nothing(tmp_path: Path, small: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = sweep.run_sweep(small, tmp_path, backend="sequential", form="csv")
     before = contents(tmp_path)
     monkeypatch.setattr(sweep, "run_shard", None)
@@ -234,7 +233,7 @@ def test_a_second_call_runs_nothing(tmp_path: Path, small: Plan, monkeypatch: py
     assert contents(tmp_path) == before
 
 
-def test_parts_alone_say_the_format_too(tmp_path: Path, small: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_alone_say_the_format_too(tmp_path: Path, small: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(sweep, "_read", _interrupt)
         sweep.run_sweep(small, tmp_path, backend="sequential", form="csv")
@@ -244,7 +243,7 @@ def test_parts_alone_say_the_format_too(tmp_path: Path, small: Plan, monkeypatch
     assert sorted(path.name for path in tmp_path.iterdir()) == ["manifest.json", "rows.csv", "timeline.json"]
 
 
-def test_what_is_missing_of_a_finished_folder_is_made_anew(tmp_path: Path, small: Plan) -> None:
+def test_what_is_missing_of_a_finished_folder_is_made_anew(tmp_path: Path, small: Sweep) -> None:
     sweep.run_sweep(small, tmp_path, backend="sequential", form="csv")
     before = {name: content for name, (content, _) in contents(tmp_path).items()}
     for name in ("timeline.json", "rows.csv"):
@@ -254,8 +253,8 @@ def test_what_is_missing_of_a_finished_folder_is_made_anew(tmp_path: Path, small
 
 
 @pytest.mark.parametrize("backend", ["sequential", "threading"])
-def test_an_error_in_one_unit_loses_no_finished_rows(
-    tmp_path: Path, small: Plan, backend: str, monkeypatch: pytest.MonkeyPatch
+def test_an_error_in_one_shard_loses_no_finished_rows(
+    tmp_path: Path, small: Sweep, backend: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The second shard fails at once; a slower first one is finished and kept, and no shard is begun afterwards."""
     right, begun = sweep.run_shard, []
@@ -302,19 +301,19 @@ def test_a_mistake_in_a_users_policy_is_shown_where_it_is_even_from_other_proces
         ({"suite": "lte-v1"}, "suite"),
     ],
 )
-def test_another_plan_needs_another_folder(tmp_path: Path, change: dict[str, Any], key: str) -> None:
+def test_another_sweep_needs_another_folder(tmp_path: Path, change: dict[str, Any], key: str) -> None:
     sweep.run_sweep(TINY, tmp_path, backend="sequential")
     before = contents(tmp_path)
     with pytest.raises(BufgymError, match=rf"manifest\.json: {key} is .*, but this run has .*choose another --out"):
-        sweep.run_sweep(Plan(**{**vars(TINY), **change}), tmp_path, backend="sequential")
+        sweep.run_sweep(Sweep(**{**vars(TINY), **change}), tmp_path, backend="sequential")
     assert contents(tmp_path) == before
 
 
 def test_so_does_another_version_or_another_policy_file(
-    tmp_path: Path, small: Plan, mine: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small: Sweep, mine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     load_policies(str(mine))
-    plan = Plan("small-v1", ("mine",), policy_file=str(mine))
+    plan = Sweep("small-v1", ("mine",), policy_file=str(mine))
     sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
     before = contents(tmp_path / "out")
     text = mine.read_text()
@@ -322,7 +321,7 @@ def test_so_does_another_version_or_another_policy_file(
     with pytest.raises(BufgymError, match="policy_file is"):
         sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
     mine.write_text(text)
-    monkeypatch.setattr(sweep, "__version__", "0.0.0")
+    monkeypatch.setattr(manifest, "__version__", "0.0.0")
     with pytest.raises(BufgymError, match=r'bufgym is ".*", but this run has "0\.0\.0"'):
         sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
     assert contents(tmp_path / "out") == before
@@ -339,7 +338,7 @@ def test_so_do_other_recordings_of_the_same_names(tmp_path: Path, monkeypatch: p
     for name, rate in (("a", "500000"), ("b", "600000"), ("c", "500000")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "rate").write_text(rate)
-    first, other, same = (Plan("found-v1", ("afr",), data=str(tmp_path / name)) for name in "abc")
+    first, other, same = (Sweep("found-v1", ("afr",), data=str(tmp_path / name)) for name in "abc")
     rows = sweep.run_sweep(first, tmp_path / "out", backend="sequential")
     with pytest.raises(BufgymError, match="scenarios is"):
         sweep.run_sweep(other, tmp_path / "out", backend="sequential")
@@ -347,7 +346,7 @@ def test_so_do_other_recordings_of_the_same_names(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("name", ["rows.csv", "rows.parquet", "parts/one-0-0.csv"])
-def test_rows_without_a_manifest_are_left_alone(tmp_path: Path, small: Plan, name: str) -> None:
+def test_rows_without_a_manifest_are_left_alone(tmp_path: Path, small: Sweep, name: str) -> None:
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("someone else's")
     with pytest.raises(BufgymError, match=r"holds rows without a manifest\.json; choose another --out"):
@@ -360,17 +359,17 @@ def test_rows_without_a_manifest_are_left_alone(tmp_path: Path, small: Plan, nam
     [
         (lambda text: text[: len(text) // 2], "must be JSON"),
         (lambda text: "[]", "must be a JSON object"),
-        (lambda text: text.replace('"format": 1', '"format": 99'), "format = 99: must be 1"),
+        (lambda text: text.replace('"format": 2', '"format": 99'), "format = 99: must be 2"),
         (lambda text: text.replace('"suite"', '"sweet"'), "no suite"),
         (lambda text: text.replace('"seeds": 2', '"seeds": Infinity'), "Infinity: numbers must be finite"),
     ],
 )
-def test_a_broken_manifest_is_named(tmp_path: Path, small: Plan, change: Callable[[str], str], told: str) -> None:
+def test_a_broken_manifest_is_named(tmp_path: Path, small: Sweep, change: Callable[[str], str], told: str) -> None:
     sweep.run_sweep(small, tmp_path, backend="sequential")
-    manifest = tmp_path / "manifest.json"
-    text = manifest.read_text()
-    manifest.write_text(change(text))
-    assert manifest.read_text() != text
+    file = tmp_path / "manifest.json"
+    text = file.read_text()
+    file.write_text(change(text))
+    assert file.read_text() != text
     before = contents(tmp_path)
     with pytest.raises(BufgymError, match=rf"manifest\.json.*{told}"):
         sweep.run_sweep(small, tmp_path, backend="sequential")
@@ -380,7 +379,7 @@ def test_a_broken_manifest_is_named(tmp_path: Path, small: Plan, change: Callabl
 @pytest.mark.parametrize("form", ["csv", "parquet"])
 @pytest.mark.parametrize("harm", ["cut", "empty", "fewer", "columns", "noise"])
 def test_a_broken_part_is_named_and_made_anew_once_deleted(
-    tmp_path: Path, small: Plan, form: str, harm: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small: Sweep, form: str, harm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if form == "parquet":
         pytest.importorskip("pyarrow")
@@ -418,6 +417,7 @@ def _interrupt(*_: Any) -> Any:
     [
         ({"suite": "small-v0"}, "unknown suite 'small-v0'"),
         ({"split": "exam"}, "split = 'exam'"),
+        ({"specs": ("afr", "afr")}, "'afr' is given more than once"),
         ({"specs": ("afr", "nobody")}, "unknown policy 'nobody'"),
         ({"specs": ("decimate:every=2", "decimate:every=2.0")}, "'decimate:every=2' is given more than once"),
         ({"seeds": 0}, "seeds = 0: must lie between 1 and 1000"),
@@ -427,16 +427,16 @@ def _interrupt(*_: Any) -> Any:
         ({"suite": "mahimahi-v1"}, r"needs a folder of recordings \(--data DIR\)"),
     ],
 )
-def test_a_bad_plan_ends_before_anything_is_written(
-    tmp_path: Path, small: Plan, change: dict[str, Any], told: str
+def test_a_bad_sweep_ends_before_anything_is_written(
+    tmp_path: Path, small: Sweep, change: dict[str, Any], told: str
 ) -> None:
     with pytest.raises(BufgymError, match=told):
-        sweep.run_sweep(Plan(**{**vars(small), **change}), tmp_path / "out", backend="sequential")
+        sweep.run_sweep(Sweep(**{**vars(small), **change}), tmp_path / "out", backend="sequential")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("jobs", "backend"), [(0, "loky"), (-2, "loky"), (1, "sloky")])
-def test_so_do_a_bad_backend_and_number_of_jobs(tmp_path: Path, small: Plan, jobs: int, backend: str) -> None:
+def test_so_do_a_bad_backend_and_number_of_jobs(tmp_path: Path, small: Sweep, jobs: int, backend: str) -> None:
     with pytest.raises(BufgymError, match="backend = 'sloky': must be one of loky" if jobs == 1 else f"jobs = {jobs}:"):
         sweep.run_sweep(small, tmp_path / "out", jobs=jobs, backend=backend)
     assert not (tmp_path / "out").exists()
@@ -447,7 +447,7 @@ def test_so_do_a_bad_backend_and_number_of_jobs(tmp_path: Path, small: Plan, job
     [("ray", "ray", "ray"), ("dask", "distributed", "dask"), ("loky", "joblib", "bench")],
 )
 def test_a_backend_that_is_not_installed_names_the_extra(
-    tmp_path: Path, small: Plan, backend: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small: Sweep, backend: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)  # importing it now fails
     with pytest.raises(BufgymError, match=rf'{module} is missing: pip install "bufgym\[{extra}\]"'):
@@ -492,7 +492,7 @@ def test_options_of_a_suite_need_one(words: list[object], capsys: pytest.Capture
 
 
 def test_the_command_line_prints_scores_and_the_report_reads_them(
-    tmp_path: Path, small: Plan, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, small: Sweep, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("jinja2")
     pytest.importorskip("plotly")
@@ -512,7 +512,7 @@ def test_the_command_line_prints_scores_and_the_report_reads_them(
 
 
 def test_without_a_folder_nothing_is_left_behind(
-    tmp_path: Path, small: Plan, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, small: Sweep, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["bench", "--suite", "small-v1", "--policies", "afr", "--backend", "sequential"]) == 0
@@ -522,7 +522,7 @@ def test_without_a_folder_nothing_is_left_behind(
 @pytest.mark.parametrize("form", ["csv", "parquet"])
 @pytest.mark.parametrize("harm", ["cut", "noise", "empty"])
 def test_a_report_of_broken_rows_names_the_file(
-    tmp_path: Path, small: Plan, form: str, harm: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, small: Sweep, form: str, harm: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if form == "parquet":
         pytest.importorskip("pyarrow")

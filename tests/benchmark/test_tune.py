@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from bufgym import policies
-from bufgym.benchmark import tune
+from bufgym.benchmark import tune, tuned
+from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tune import Choice
 from bufgym.cli import tune as tune_command
 from bufgym.cli.options import Parser
@@ -40,10 +41,11 @@ def splits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str
 
     for name, T in LENGTHS.items():
         monkeypatch.setitem(suites.SUITES, name, suite(name, T))
-    monkeypatch.setattr(tune, "FILE", tmp_path / "tuned.json")
-    suites._settings.cache_clear()
+    monkeypatch.setattr(tuned, "FILE", tmp_path / "tuned.json")
     yield asked
-    suites._settings.cache_clear()
+
+
+default_policies = TASKS["queue"].default_policies
 
 
 def cli(*words: str) -> None:
@@ -97,6 +99,7 @@ def test_test_episodes_are_refused_before_any_is_drawn(splits: list[str]) -> Non
         ("tiny-twelve", ["afr"], {}, "policy 'afr': no grid"),
         ("tiny-twelve", ["decimate:every=2"], {}, "policy 'decimate:every=2': no grid"),
         ("tiny-twelve", ["ros-keep-last"], {}, "ros-keep-last: is not tuned: it stands for ROS 2"),
+        ("topics-v1", ["decimate"], {}, "suite topics-v1: only policies of one queue are tuned"),
         ("nowhere-v1", ["decimate"], {}, "unknown suite 'nowhere-v1'"),
         ("tiny-twelve", ["decimate"], {"split": "tomorrow"}, "split = 'tomorrow'"),
         ("tiny-twelve", ["decimate"], {"seeds": 0}, "seeds = 0"),
@@ -152,7 +155,7 @@ def test_a_gain_that_may_be_chance_is_none() -> None:
     assert choice.chosen is choice.default
 
 
-def test_where_no_cell_bites_regrets_are_compared() -> None:
+def test_where_no_cell_is_discriminative_regrets_are_compared() -> None:
     """Drop Oldest loses 0.5 %: no scores. Of 200, the default gets 180 and the other setting 190."""
     choice = compared([199, 199], [180, 180], [190, 190], 200)
     assert math.isnan(choice.best.score.value)
@@ -169,28 +172,28 @@ def test_the_command_writes_what_bench_then_reads(capsys: pytest.CaptureFixture[
     cli("tiny-twelve", "--policies", "decimate,lifespan", "--jobs", "1", "--seeds", "3", "--write")
     shown = capsys.readouterr().out
     assert "best, chosen" in shown and "default, best, chosen" in shown
-    entry = tune.read()["tiny-twelve"]["decimate"]
+    entry = tuned.read()["tiny-twelve"]["decimate"]
     assert entry["setting"] == "decimate:every=4"
     assert entry["score"] == pytest.approx(1) and entry["score"] > entry["default_score"]
     assert entry["split"] == "validation"
     assert entry["command"] == "bufgym tune tiny-twelve --policies decimate,lifespan --seeds 3 --write"
-    assert tune.tuned("tiny-twelve") == ["decimate:every=4"]  # lifespan stays at its default
-    assert tune.specs("tiny-twelve") == [*policies.names(for_topics=False), "decimate:every=4"]
+    assert tuned.tuned("tiny-twelve") == ["decimate:every=4"]  # lifespan stays at its default
+    assert default_policies("tiny-twelve") == [*policies.names(for_topics=False), "decimate:every=4"]
 
 
 def test_a_second_suite_leaves_the_first_alone() -> None:
     cli("tiny-twelve", "--policies", "decimate", "--jobs", "1", "--write")
     cli("tiny-nine", "--policies", "decimate", "--jobs", "1", "--write")
-    assert [tune.tuned(name) for name in LENGTHS] == [["decimate:every=4"], []]
-    assert tune.tuned("lte-v1") == []
+    assert [tuned.tuned(name) for name in LENGTHS] == [["decimate:every=4"], []]
+    assert tuned.tuned("lte-v1") == []
 
 
 def test_nothing_is_written_unasked() -> None:
     cli("tiny-twelve", "--policies", "decimate", "--jobs", "1")
-    assert not tune.FILE.exists()
+    assert not tuned.FILE.exists()
     with pytest.raises(BufgymError, match="never chosen on test episodes"):
         cli("tiny-twelve", "--split", "test", "--write")
-    assert not tune.FILE.exists()
+    assert not tuned.FILE.exists()
 
 
 @pytest.mark.parametrize(
@@ -207,22 +210,22 @@ def test_nothing_is_written_unasked() -> None:
     ],
 )
 def test_a_broken_file_is_named(text: bytes, message: str) -> None:
-    tune.FILE.write_bytes(text)
-    with pytest.raises(BufgymError, match=f"{tune.FILE.name}.*{message}"):
-        tune.specs("lte-v1")
+    tuned.FILE.write_bytes(text)
+    with pytest.raises(BufgymError, match=f"{tuned.FILE.name}.*{message}"):
+        default_policies("lte-v1")
 
 
 def test_what_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tune, "FILE", Path(tune.__file__).with_name("tuned.json"))
-    shipped = tune.read()
+    monkeypatch.setattr(tuned, "FILE", Path(tuned.__file__).with_name("tuned.json"))
+    shipped = tuned.read()
     assert shipped
     for suite, entries in shipped.items():
         assert suite in suites.SUITES
-        specs = tune.specs(suite)
+        specs = default_policies(suite)
         assert len(set(specs)) == len(specs)
         for policy, entry in entries.items():
             assert entry["setting"] in tune.settings(policy)
             assert entry["split"] == "validation"
             assert entry["command"].startswith(f"bufgym tune {suite}") and entry["command"].endswith("--write")
-            assert (entry["setting"] == policy) == (entry["setting"] not in tune.tuned(suite))
-    assert json.dumps(shipped, indent=1, sort_keys=True) + "\n" == tune.FILE.read_text(encoding="utf-8")
+            assert (entry["setting"] == policy) == (entry["setting"] not in tuned.tuned(suite))
+    assert json.dumps(shipped, indent=1, sort_keys=True) + "\n" == tuned.FILE.read_text(encoding="utf-8")

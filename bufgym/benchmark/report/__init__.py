@@ -1,7 +1,7 @@
-"""The report of a suite's run: one HTML page that needs no network, and tables for a README.
+"""The report of a suite's run: one HTML page that needs no network, and tables for a terminal or a README.
 
-It reads what ``bufgym bench --suite`` left in a folder. There is no simulator in here, and no statistic: those are
-``bufgym.benchmark.score``'s.
+It reads what ``bufgym bench --suite`` left in a folder. It simulates nothing and computes no statistic: the summary is
+the task's.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bufgym.benchmark.folder import Run, read
 from bufgym.benchmark.report import page, tables
-from bufgym.benchmark.score import Scores, scores
+from bufgym.benchmark.summary import Summary
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
 
@@ -26,29 +26,32 @@ def write(folder: str | Path) -> Path:
             Jinja is not installed.
     """
     run = read(Path(folder))
-    made = page.html(run, _scored(run))
+    html = page.html(run, _summary(run))
     target = run.folder / "report.html"
     with replaced(target) as temporary:
-        temporary.write_text(made, encoding="utf-8")
+        temporary.write_text(html, encoding="utf-8")
     return target
 
 
 def markdown(folder: str | Path) -> str:
-    """The command, the ranking and the scores of every cell as Markdown, for a README. Errors as for ``write``."""
+    """The command, the ranking and the tables of every cell as Markdown, for a README. Errors as for ``write``."""
     run = read(Path(folder))
-    return tables.markdown(run, _scored(run))
+    return tables.markdown(run, _summary(run))
 
 
 def plain(folder: str | Path) -> str:
-    """The ranking as text, for a terminal. Errors as for ``write``."""
+    """The summary as text, for a terminal. Errors as for ``write``."""
     run = read(Path(folder))
-    return tables.plain(run, _scored(run))
+    return tables.plain(run, _summary(run))
 
 
-def _scored(run: Run) -> Scores:
-    """The scores, scenarios in the order of the manifest."""
+def _summary(run: Run) -> Summary:
+    """The summary, scores in the order of the manifest's scenarios."""
     try:
-        found = scores(run.rows, unranked=run.manifest["unranked"])
+        summary = run.task.summary(run.rows, run.manifest["unranked"])
     except BufgymError as error:
         raise BufgymError(f"{run.rows_file}: {error}") from None
-    return replace(found, cells=sorted(found.cells, key=lambda c: (run.place(c.scenario), c.capacity, c.policy)))
+    if summary.scores is None:
+        return summary
+    cells = sorted(summary.scores.cells, key=lambda c: (run.place(c.scenario), c.capacity, c.policy))
+    return replace(summary, scores=replace(summary.scores, cells=cells))

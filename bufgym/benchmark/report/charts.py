@@ -1,4 +1,4 @@
-"""The charts, each a ``Chart`` of plain dictionaries that plotly draws; every statistic in them is ``score``'s."""
+"""The charts, each a ``Chart`` of plain dictionaries that plotly draws; every statistic in them is the summary's."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.folder import Run
 from bufgym.benchmark.report import style
 from bufgym.benchmark.report.style import Figure
-from bufgym.benchmark.score import CellScore, Interval, Scores, Standing
+from bufgym.benchmark.score import CellScore
+from bufgym.benchmark.summary import Quantity, Standing, Summary
+from bufgym.benchmark.table import percent
 
 
 @dataclass(frozen=True)
@@ -18,6 +23,7 @@ class Chart:
     """One place on the page."""
 
     id: str
+    """Of its section."""
     alt: str
     """What it shows, for those who can't see it."""
     choices: list[tuple[str, list[str]]]
@@ -31,12 +37,21 @@ class Context:
     """What every chart is made from."""
 
     run: Run
-    scores: Scores
+    """The run."""
+    summary: Summary
+    """What its rows say."""
     colours: dict[str, str]
+    """By policy, for those that stand out."""
 
     @classmethod
-    def of(cls, run: Run, scores: Scores) -> Context:
-        return cls(run, scores, style.colours([s.policy for s in scores.standings if s.ranked]))
+    def of(cls, run: Run, summary: Summary) -> Context:
+        ranked = [standing.policy for standing in summary.overall if standing.ranked]
+        return cls(run, summary, style.colours(ranked, summary.baseline))
+
+    @property
+    def cells(self) -> list[CellScore]:
+        """Scores of every cell; none where there are no scores."""
+        return [] if self.summary.scores is None else self.summary.scores.cells
 
     def colour(self, policy: str) -> str:
         return self.colours.get(policy, style.MUTED)
@@ -46,77 +61,98 @@ class Context:
         return sorted(policies, key=lambda name: name in self.colours)
 
 
+def with_interval(value: Interval, write: Callable[[float], str]) -> str:
+    """Both as text."""
+    return " ".join(filter(None, written(value, write)))
+
+
 # --- ranking ---------------------------------------------------------------------------------------------------------
 
 
 def ranking(context: Context) -> Chart | None:
-    """Score and probability of improvement, a dot and an interval for each policy; None where no policy has a score."""
-    scores = context.scores
-    if all(math.isnan(standing.score.value) for standing in scores.standings):
+    """A dot and an interval for each policy, by the quantities that matter; None where no policy has a value."""
+    summary = context.summary
+    quantities = {quantity.key: quantity for quantity in summary.quantities}
+    if summary.scores is None:
+        panels = _summary_panels(context)
+    else:
+        shown = quantities["score"], quantities["improvement"]
+        panels = [
+            _dots(context, shown[0], "0 = Drop Oldest, 1 = clairvoyant", (0, 1), (-1.0, 1.05, 2.1), quantities["iqm"]),
+            _dots(context, shown[1], "", (0.5,), (-1.0, 1.0, 2.0)),
+        ]
+        panels = [panel for panel, quantity in zip(panels, shown, strict=True) if _known(summary, quantity)]
+    if not _known(summary, quantities[summary.rank_by]):
         return None
-    one = _dots(context, "score", lambda s: s.score, lambda s: s.iqm, ("0 = Drop Oldest, 1 = clairvoyant", -1.0, 1.05))
-    one["layout"]["shapes"] = [style.line("x", 0), style.line("x", 1)]
-    two = _dots(
-        context, "probability of improvement", lambda s: s.improvement, None, (f"over {scores.reference}", -1.0, 1.0)
-    )
-    two["layout"]["shapes"] = [style.line("x", 0.5)]
-    panels = [one, two] if any(not math.isnan(s.improvement.value) for s in scores.standings) else [one]
-    alt = "Score of each policy, and its probability of improvement, with intervals; the numbers are in the table above"
+    alt = "Each policy's place in the ranking with intervals; the numbers are in the table above"
     return Chart("ranking", alt, [], {(): panels})
+
+
+def _summary_panels(context: Context) -> list[Figure]:
+    """The two quantities with intervals that come first; a line marks the baseline."""
+    figures = []
+    for quantity in [q for q in context.summary.quantities if q.interval][:2]:
+        values = [s[quantity.key].value for s in _known(context.summary, quantity)]
+        # What lies far out is written at the edge, or the others could not be told apart.
+        low, high = np.percentile(values, [25, 75]) if values else (0.0, 1.0)
+        spread = 4 * max(high - low, 1e-3)
+        near = [value for value in values if low - spread <= value <= high + spread] or [0.0]
+        base = context.summary.standings[context.summary.baseline][quantity.key].value
+        limits = float(low - spread), max(near), float(high + spread)
+        figures.append(_dots(context, quantity, "", (base,), limits, start=min(near)))
+    return figures
+
+
+def _known(summary: Summary, quantity: Quantity) -> list[Standing]:
+    """Those that have a value."""
+    return [standing for standing in summary.overall if not math.isnan(standing[quantity.key].value)]
 
 
 def _dots(
     context: Context,
-    title: str,
-    main: Callable[[Standing], Interval],
-    second: Callable[[Standing], Interval] | None,
-    axis: tuple[str, float, float],
+    quantity: Quantity,
+    about: str,
+    lines: Sequence[float],
+    limits: tuple[float, float, float],
+    second: Quantity | None = None,
+    start: float = 0.0,
 ) -> Figure:
-    about, floor, high = axis
-    ceiling = 2 * high  # a queue without a bound may do better than a clairvoyant with one
-    shown = [s for s in context.scores.standings if not math.isnan(main(s).value)]
-    low = min([main(s).low for s in shown if main(s).high >= floor] + [0.0]) - 0.04
-    high = max([main(s).high + 0.05 for s in shown if main(s).low <= ceiling] + [high])
-    data: list[dict[str, Any]] = []
-    notes = []
+    """One lane for each policy. ``limits``: what is below the first or above the last is written at the edge; the axis
+    reaches from ``start`` at least to the second."""
+    floor, high, ceiling = limits
+    shown = _known(context.summary, quantity)
+    inside = [s[quantity.key] for s in shown if s[quantity.key].high >= floor and s[quantity.key].low <= ceiling]
+    inside += [value._replace(low=value.value, high=value.value) for value in inside if math.isnan(value.low)]
+    margin = 0.04 * max(high - start, 1e-3)
+    low = min([value.low for value in inside if not math.isnan(value.low)] + [start]) - margin
+    high = max([value.high + margin for value in inside if not math.isnan(value.high)] + [high + margin / 4])
+    data, notes = [], []
     for s in shown:
-        value, colour = main(s), context.colour(s.policy)
-        if value.high < floor:  # far off: the number at the edge instead
-            words = f"◂ {style.score(value.value)}"
-            notes.append(style.note(words, x=low, y=style.text(s.policy), xanchor="left", xshift=2))
+        value, colour, name = s[quantity.key], context.colour(s.policy), style.text(s.policy)
+        if value.high < floor or value.value < floor:
+            notes.append(style.note(f"◂ {quantity.write(value.value)}", x=low, y=name, xanchor="left", xshift=2))
             continue
-        if value.low > ceiling:
-            words = f"{style.score(value.value)} ▸"
-            notes.append(style.note(words, x=high, y=style.text(s.policy), xanchor="right", xshift=-2))
+        if value.low > ceiling or value.value > ceiling:
+            notes.append(style.note(f"{quantity.write(value.value)} ▸", x=high, y=name, xanchor="right", xshift=-2))
             continue
-        arms = {"array": [value.high - value.value], "arrayminus": [value.value - value.low]}
-        words = f"<b>%{{y}}</b><br>{title} {with_interval(value, style.score)}<extra></extra>"
+        arms = [0.0 if math.isnan(arm) else arm for arm in (value.high - value.value, value.value - value.low)]
+        bars = {"type": "data", "symmetric": False, "array": arms[:1], "arrayminus": arms[1:], "color": colour}
+        hover = f"<b>%{{y}}</b><br>{quantity.title} {with_interval(value, quantity.write)}"
+        symbol = "circle" if s.ranked else "circle-open"
+        marker: dict[str, Any] = {"color": colour, "size": 9, "symbol": symbol}
         data.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "x": [style.rounded(value.value)],
-                "y": [style.text(s.policy)],
-                "marker": {"color": colour, "size": 9, "symbol": "circle" if s.ranked else "circle-open"},
-                "error_x": {"type": "data", "symmetric": False, **arms, "color": colour, "thickness": 2, "width": 0},
-                "hovertemplate": words,
-            }
+            style.scatter([value.value], [name], hover, marker=marker, error_x={**bars, "thickness": 2, "width": 0})
         )
-        if second is not None and not math.isnan(second(s).value):
-            words = f"<b>%{{y}}</b><br>IQM {with_interval(second(s), style.score)}<extra></extra>"
+        if second is not None and not math.isnan(s[second.key].value):
+            hover = f"<b>%{{y}}</b><br>{second.title} {with_interval(s[second.key], second.write)}"
             marker = {"color": colour, "size": 8, "symbol": "line-ns-open", "line": {"width": 1.5}}
-            at = {"x": [style.rounded(second(s).value)], "y": [style.text(s.policy)]}
-            data.append({"type": "scatter", "mode": "markers", **at, "marker": marker, "hovertemplate": words})
-    names = [style.text(s.policy) for s in reversed(shown)]
-    x = style.axis(f"{title} ({about})", range=[low, high], nticks=7)
-    y = style.axis(categoryorder="array", categoryarray=names, range=[-0.7, len(names) - 0.3], tickmode="array")
-    y |= {"tickvals": names, "showgrid": False, "ticks": "", "showline": False}
-    height = 70 + 20 * max(len(shown), 3)
-    return {"data": data, "layout": style.layout(height, xaxis=x, yaxis=y, annotations=notes)}
-
-
-def with_interval(value: Interval, write: Callable[[float], str]) -> str:
-    return f"{write(value.value)} [{write(value.low)}, {write(value.high)}]"
+            data.append(style.scatter([s[second.key].value], [name], hover, marker=marker))
+    axis = style.axis(f"{quantity.title} ({about})" if about else quantity.title, range=[low, high], nticks=7)
+    if quantity.write is percent:
+        axis["tickformat"] = ".0%"
+    layout = style.lanes([s.policy for s in reversed(shown)], xaxis=axis, annotations=notes)
+    layout["shapes"] = [style.line("x", at) for at in lines]
+    return {"data": data, "layout": layout}
 
 
 # --- regret against something -----------------------------------------------------------------------------------------
@@ -124,35 +160,34 @@ def with_interval(value: Interval, write: Callable[[float], str]) -> str:
 
 def capacities(context: Context) -> Chart | None:
     """Regret against L, a scenario at a time; None where there is but one capacity."""
-    cells = context.scores.cells
+    cells = context.cells
     if len({cell.capacity for cell in cells}) < 2:
         return None
+    x = {"title": "capacity L, messages", "type": "log"}
     panels: dict[tuple[str, ...], list[Figure]] = {}
     for scenario in dict.fromkeys(cell.scenario for cell in cells):
         curves = _curves([c for c in cells if c.scenario == scenario], lambda c: float(c.capacity))
-        x = {"title": "capacity L, messages", "type": "log"}
-        panels[(scenario,)] = [_regret_curves(context, curves, x)] if curves else []
-    panels = {key: figures for key, figures in panels.items() if figures}
+        if curves:
+            panels[(scenario,)] = [_regret_curves(context, curves, x)]
     if not panels:
         return None
-    options = [scenario for (scenario,) in panels]
     alt = "Regret of each policy against the capacity L, with intervals"
-    return Chart("capacities", alt, [("Scenario", options)], panels)
+    return Chart("capacities", alt, [("Scenario", [scenario for (scenario,) in panels])], panels)
 
 
 def outages(context: Context) -> Chart | None:
     """Regret against the length of the one outage, for each V and capacity; None with fewer than two lengths."""
-    about = context.run.manifest["scenarios"]
-    lengths = {name: float(s["outage_s"]) for name, s in about.items() if s.get("outage_s") is not None}
-    cells = [cell for cell in context.scores.cells if cell.scenario in lengths]
+    scenarios = context.run.manifest["scenarios"]
+    lengths = {name: float(s["outage_s"]) for name, s in scenarios.items() if s.get("outage_s") is not None}
+    cells = [cell for cell in context.cells if cell.scenario in lengths]
     panels: dict[tuple[str, ...], list[Figure]] = {}
-    values = list(dict.fromkeys(str(about[cell.scenario].get("value", "")) for cell in cells))
+    values = list(dict.fromkeys(str(scenarios[cell.scenario].get("value", "")) for cell in cells))
     sizes = middle_first({cell.capacity for cell in cells})
+    x = {"title": "length of the outage, s", "type": "log"}
     for value in values:
+        same = [c for c in cells if str(scenarios[c.scenario].get("value", "")) == value]
         for capacity in sizes:
-            chosen = [c for c in cells if (str(about[c.scenario].get("value", "")), c.capacity) == (value, capacity)]
-            curves = _curves(chosen, lambda c: lengths[c.scenario])
-            x = {"title": "length of the outage, s", "type": "log"}
+            curves = _curves([c for c in same if c.capacity == capacity], lambda c: lengths[c.scenario])
             panels[(value, str(capacity))] = [_regret_curves(context, curves, x)] if curves else []
     if len({lengths[cell.scenario] for cell in cells}) < 2 or not any(panels.values()):
         return None
@@ -161,10 +196,11 @@ def outages(context: Context) -> Chart | None:
 
 
 Curve = list[tuple[float, CellScore]]
+"""(position on the axis, cell), from left to right."""
 
 
 def _curves(cells: Sequence[CellScore], at: Callable[[CellScore], float]) -> dict[str, Curve]:
-    """By policy: where and what, from left to right; cells without a regret are left out."""
+    """By policy; cells without a regret are left out."""
     curves: dict[str, Curve] = {}
     for cell in sorted(cells, key=at):
         if not math.isnan(cell.regret.value):
@@ -181,25 +217,21 @@ def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]
         xs = [at for at, _ in curve]
         if out:
             band = [c.regret.low for _, c in curve] + [c.regret.high for _, c in curve][::-1]
-            ys = [style.rounded(max(y, low)) for y in band]
-            area = {"fill": "toself", "fillcolor": colour, "opacity": 0.16, "line": {"width": 0}, "hoverinfo": "skip"}
-            data.append({"type": "scatter", "mode": "lines", "x": xs + xs[::-1], "y": ys, **area})
-        lines = {"color": colour, "width": 2 if out else 1, "dash": "dot" if policy == "clairvoyant" else "solid"}
-        words = [with_interval(c.regret, style.percent) + f"<br>QoI {with_interval(c.qoi, _fine)}" for _, c in curve]
+            area: dict[str, Any] = {"fill": "toself", "fillcolor": colour, "opacity": 0.16, "line": {"width": 0}}
+            data.append(style.scatter(xs + xs[::-1], [max(y, low) for y in band], mode="lines", **area))
         data.append(
-            {
-                "type": "scatter",
-                "mode": "lines+markers",
-                "cliponaxis": False,
-                "name": style.text(policy),
-                "x": xs,
-                "y": [style.rounded(max(c.regret.value, low)) for _, c in curve],
-                "line": lines,
-                "opacity": 1 if out else 0.55,
-                "marker": {"size": 6 if out else 4, "color": colour},
-                "text": words,
-                "hovertemplate": "<b>%{fullData.name}</b>, %{x}<br>regret %{text}<extra></extra>",
-            }
+            style.scatter(
+                xs,
+                [max(c.regret.value, low) for _, c in curve],
+                "<b>%{fullData.name}</b>, %{x}<br>regret %{text}",
+                mode="lines+markers",
+                cliponaxis=False,
+                name=style.text(policy),
+                line={"color": colour, "width": 2 if out else 1, "dash": "dot" if policy == "clairvoyant" else "solid"},
+                opacity=1 if out else 0.55,
+                marker={"size": 6 if out else 4, "color": colour},
+                text=[f"{with_interval(c.regret, percent)}<br>QoI {with_interval(c.qoi, _fine)}" for _, c in curve],
+            )
         )
     ticks = sorted({at for curve in curves.values() for at, _ in curve})
     across = style.axis(**x, showgrid=False, tickvals=ticks, ticktext=[f"{tick:g}" for tick in ticks])
@@ -208,6 +240,10 @@ def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]
     layout["annotations"] = _end_labels(context, curves, (low, high), 370)
     layout["margin"] = {**layout["margin"], "r": 120}
     return {"data": data, "layout": layout}
+
+
+def _fine(number: float) -> str:
+    return f"{number:.2f}"
 
 
 def _end_labels(context: Context, curves: dict[str, Curve], span: tuple[float, float], pixels: int) -> list[Any]:
@@ -233,10 +269,6 @@ def regret_range(regrets: Sequence[float]) -> tuple[float, float]:
     if not positive:
         return 1e-4, 1.0
     return min(positive) / 1.4, min(max(positive) * 1.4, 1.0)
-
-
-def _fine(number: float) -> str:
-    return f"{number:.2f}"
 
 
 def middle_first(sizes: set[int]) -> list[int]:

@@ -1,4 +1,4 @@
-"""One page from a run and its scores: the template, the style sheet, the script, plotly and the charts' numbers."""
+"""One page from a run and its summary: the templates, the style sheet, the script, plotly and the charts' numbers."""
 
 from __future__ import annotations
 
@@ -7,54 +7,62 @@ import math
 from importlib.resources import files
 from typing import Any
 
+from bufgym.benchmark import table
 from bufgym.benchmark.folder import Run
-from bufgym.benchmark.report import charts, costs, style, tables
+from bufgym.benchmark.report import charts, costs, tables
 from bufgym.benchmark.report.charts import Chart, Context
 from bufgym.benchmark.report.timeline import timeline
-from bufgym.benchmark.score import DISCRIMINATIVE, CellScore, Scores, Standing
+from bufgym.benchmark.score import DISCRIMINATIVE, CellScore
+from bufgym.benchmark.summary import Summary, title
 from bufgym.errors import BufgymError
 
+CHARTS = (charts.ranking, charts.capacities, charts.outages, costs.delays, timeline, costs.memory)
+"""Each is None where the run has nothing to show in it."""
 
-def html(run: Run, scores: Scores) -> str:
+
+def html(run: Run, summary: Summary) -> str:
     """The whole page, in one file that asks for no other."""
     jinja2, graphs, plotly_js = _libraries()
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.FunctionLoader(_asset),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    environment.filters |= {"score": style.score, "percent": style.percent}
-    context = Context.of(run, scores)
-    made = {
-        chart.id: chart
-        for chart in (
-            charts.ranking(context),
-            charts.capacities(context),
-            charts.outages(context),
-            costs.delays(context),
-            timeline(context),
-            costs.memory(context),
-        )
-        if chart is not None
-    }
+    environment.filters |= {"score": table.score, "percent": table.percent}
+    markup = jinja2.utils.markupsafe.Markup
+    context = Context.of(run, summary)
+    drawn = {chart.id: chart for chart in (draw(context) for draw in CHARTS) if chart is not None}
+    cells = list(dict.fromkeys((row["scenario"], row["capacity"]) for row in run.rows))
+    template = "summary" if summary.scores is None else "scores"
     return str(
-        environment.from_string(_asset("page.html.jinja")).render(
+        environment.get_template(f"{template}.html.jinja").render(
             manifest=run.manifest,
-            scores=scores,
+            summary=summary,
+            intro=[run.manifest["about"]] if summary.scores else tables.intro(run)[1:],
             rows=len(run.rows),
             episodes=len({(row["scenario"], row["trace"], row["seed"]) for row in run.rows}),
-            places=tables.ranking(run, scores),
-            headings=tables.headings(scores),
-            best=_best(scores),
-            reference=next((s for s in scores.standings if s.policy == scores.reference), None),
-            heat=tables.heat_map(scores),
-            shade=_shade,
+            scenarios=len({scenario for scenario, _ in cells}),
+            sizes=sorted({capacity for _, capacity in cells}),
+            confidence=f"{summary.confidence:.0%}".replace("%", " %"),
             threshold=f"{DISCRIMINATIVE:.0%}".replace("%", " %"),
+            places=tables.ranking(run, summary),
+            cells=[
+                (title(cell, run.abouts), tables.ranking(run, summary, standings))
+                for cell, standings in summary.cells.items()
+            ],
+            best=next((s for s in summary.overall[:1] if s.ranked and not math.isnan(s[summary.rank_by].value)), None),
+            reference=None if summary.scores is None else summary.standings.get(summary.scores.reference),
+            heat=None if summary.scores is None else tables.heat_map(summary.scores),
+            shade=_shade,
             colour=context.colour,
-            charts=made,
+            charts=drawn,
             episode=run.timeline,
-            css=jinja2.utils.markupsafe.Markup(_asset("page.css")),
-            js=jinja2.utils.markupsafe.Markup(_asset("page.js")),
-            plotly=jinja2.utils.markupsafe.Markup(plotly_js),
-            figures=jinja2.utils.markupsafe.Markup(_figures(made, graphs)),
+            css=markup(_asset("page.css")),
+            js=markup(_asset("page.js")),
+            plotly=markup(plotly_js),
+            figures=markup(_figures(drawn, graphs)),
         )
     )
 
@@ -74,22 +82,16 @@ def _asset(name: str) -> str:
     return (files("bufgym.benchmark.report") / name).read_text(encoding="utf-8")
 
 
-def _figures(made: dict[str, Chart], graphs: Any) -> str:
+def _figures(drawn: dict[str, Chart], graphs: Any) -> str:
     """All charts as JSON that may stand in a script element; plotly checks every name and value on the way."""
-    found = {
+    figures = {
         id: {
-            "\n".join(options): [graphs.Figure(figure).to_plotly_json() for figure in figures]
-            for options, figures in chart.panels.items()
+            "\n".join(options): [graphs.Figure(figure).to_plotly_json() for figure in panel]
+            for options, panel in chart.panels.items()
         }
-        for id, chart in made.items()
+        for id, chart in drawn.items()
     }
-    return json.dumps(found, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-
-
-def _best(scores: Scores) -> Standing | None:
-    """The policy in the first place."""
-    first = scores.standings[0]
-    return first if first.ranked and not math.isnan(first.score.value) else None
+    return json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _shade(cell: CellScore) -> str:

@@ -1,7 +1,7 @@
-"""How things look in every chart: one colour a policy, one layout, one way to write numbers.
+"""How things look in every chart: one colour for each policy, one layout.
 
-Colours are names of CSS variables (``var(--ink)``); the page's script puts in what the style sheet says for light or
-dark. Text in a chart may hold some HTML, so names are escaped on their way in.
+Colours are names of CSS variables (``var(--ink)``); the page's script replaces them by those of the style sheet, light
+or dark. Chart text may hold HTML, so names are escaped.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ SPARE = ("var(--green)", "var(--orange)", "var(--purple)", "var(--sky)")
 MUTED = "var(--muted)"
 
 
-def colours(ranked: Sequence[str]) -> dict[str, str]:
-    """A colour for each policy that stands out: the fixed ones and the best of ``ranked`` (best first)."""
-    others = [name for name in ranked if name not in FIXED]
-    return {**FIXED, **dict(zip(others, SPARE, strict=False))}
+def colours(ranked: Sequence[str], baseline: str) -> dict[str, str]:
+    """A colour for each policy that stands out: fixed ones, the baseline, the best of ``ranked`` (best first)."""
+    fixed = {baseline: FIXED["drop-oldest"], **FIXED}
+    others = [name for name in ranked if name not in fixed]
+    return {**fixed, **dict(zip(others, SPARE, strict=False))}
 
 
 def text(name: str) -> str:
@@ -34,28 +35,11 @@ def text(name: str) -> str:
     return html.escape(name, quote=False)
 
 
-def score(number: float) -> str:
-    """0.713, or a dash where there is none."""
-    return _signed(number, 3)
-
-
-def percent(number: float) -> str:
-    """Three digits: 12.3 %, 1.23 %, 0.123 %."""
-    size = float(f"{abs(number * 100):.3g}")  # rounded first: 9.999 % is 10.0 %
-    return _signed(number * 100, 1 if size >= 10 else 2 if size >= 1 else 3) + ("" if math.isnan(number) else " %")
-
-
-def _signed(number: float, digits: int) -> str:
-    """A true minus sign, and none before a zero; a dash for NaN."""
-    if math.isnan(number):
-        return "–"
-    written = f"{abs(number):.{digits}f}"
-    return f"\N{MINUS SIGN}{written}" if number < 0 and float(written) else written
-
-
-def rounded(number: float | None) -> float | None:
-    """Six digits are enough for a screen; None where there is no number."""
-    return None if number is None or not math.isfinite(number) else float(f"{number:.6g}")
+def rounded(entries: Sequence[Any]) -> list[Any]:
+    """Numbers in six digits, enough for a screen, None where there is no number; text as it is."""
+    return [
+        e if isinstance(e, str) else None if e is None or not math.isfinite(e) else float(f"{e:.6g}") for e in entries
+    ]
 
 
 def axis(title: str = "", **changes: Any) -> dict[str, Any]:
@@ -107,6 +91,22 @@ def layout(height: int, **changes: Any) -> dict[str, Any]:
         "dragmode": "zoom",
         **changes,
     }
+
+
+def scatter(
+    x: Sequence[Any], y: Sequence[Any], hover: str = "", mode: str = "markers", **changes: Any
+) -> dict[str, Any]:
+    """Points or lines in a chart, with numbers rounded; without hover text they ignore the pointer."""
+    answer = {"hovertemplate": f"{hover}<extra></extra>"} if hover else {"hoverinfo": "skip"}
+    return {"type": "scatter", "mode": mode, "x": rounded(x), "y": rounded(y), **answer, **changes}
+
+
+def lanes(names: Sequence[str], grid: bool = False, **changes: Any) -> dict[str, Any]:
+    """A layout with one lane for each policy, the last on top; ``grid``: with a line through each."""
+    labels = [text(name) for name in names]
+    y = axis(categoryorder="array", categoryarray=labels, tickvals=labels, ticks="", showline=False, showgrid=grid)
+    y["range"] = [-0.7, len(names) - 0.3]
+    return layout(70 + 20 * max(len(names), 3), yaxis=y, **changes)
 
 
 def note(words: str, **place: Any) -> dict[str, Any]:

@@ -1,61 +1,42 @@
-"""The tables of the report: the ranking, and the score of every policy in every cell."""
+"""The tables of the report: the ranking, and every policy in every cell."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bufgym.benchmark import table
 from bufgym.benchmark.folder import Run
 from bufgym.benchmark.report import style
-from bufgym.benchmark.score import CellScore, Interval, Scores
-
-HEADINGS = ("score", "IQM", "regret")
+from bufgym.benchmark.score import CellScore, Scores
+from bufgym.benchmark.summary import Standing, Summary, pair, title
+from bufgym.benchmark.summary import plain as blocks
 
 
 @dataclass(frozen=True)
 class Place:
-    """One line of the ranking."""
+    """One line of a ranking."""
 
     rank: int | None
+    """1 for the best; None for a policy that is not ranked."""
     policy: str
+    """Its name."""
     values: list[tuple[str, str]]
-    """(value, interval) as text, a pair for each heading."""
+    """(value, interval) as text, a pair for each quantity of the summary."""
     reason: str
-    """Why there is no rank; empty where there is one."""
+    """Why it is not ranked; empty where it is."""
 
 
-def headings(scores: Scores) -> list[str]:
-    """Titles of the numbers in the ranking."""
-    return [*HEADINGS, f"better than {scores.reference}"]
-
-
-def ranking(run: Run, scores: Scores) -> list[Place]:
-    """Ranked policies best first, then the others, with the manifest's reasons."""
+def ranking(run: Run, summary: Summary, standings: Sequence[Standing] | None = None) -> list[Place]:
+    """Ranked policies best first, then the others with the manifest's reasons; by default over all cells."""
     places: list[Place] = []
-    for standing in scores.standings:
-        known = standing.ranked and not math.isnan(standing.score.value)
+    for standing in summary.overall if standings is None else standings:
+        known = standing.ranked and not math.isnan(standing[summary.rank_by].value)
         reason = "" if standing.ranked else run.manifest["unranked"][standing.policy]
-        numbers: list[tuple[Interval, Callable[[float], str]]] = [
-            (standing.score, style.score),
-            (standing.iqm, style.score),
-            (standing.regret, style.percent),
-            (standing.improvement, style.score),
-        ]
-        if standing.policy == scores.reference:
-            numbers[-1] = (Interval(math.nan, math.nan, math.nan), style.score)
-        values = [pair(interval, write) for interval, write in numbers]
+        values = [pair(standing, quantity) for quantity in summary.quantities]
         places.append(Place(len(places) + 1 if known else None, standing.policy, values, reason))
     return places
-
-
-def pair(interval: Interval, write: Callable[[float], str]) -> tuple[str, str]:
-    """(value, interval in brackets) as text; a dash and nothing where there is no value."""
-    if math.isnan(interval.value):
-        return "–", ""
-    low, high = write(interval.low), write(interval.high)
-    return write(interval.value), f"[{low.removesuffix(' %')}, {high.removesuffix(' %')}]"
 
 
 @dataclass(frozen=True)
@@ -65,11 +46,11 @@ class HeatMap:
     columns: list[tuple[str, list[int]]]
     """(scenario, its capacities)."""
     lines: list[tuple[str, list[CellScore]]]
-    """(policy, one cell a column), ranked policies first."""
+    """(policy, one cell for each column), ranked policies first."""
     inexact: set[tuple[str, int]]
-    """Cells whose clairvoyant is but an upper bound."""
+    """Cells where the clairvoyant is an upper bound only."""
     flat: set[tuple[str, int]]
-    """Cells that do not bite."""
+    """Cells that are not discriminative."""
 
 
 def heat_map(scores: Scores) -> HeatMap:
@@ -88,44 +69,70 @@ def heat_map(scores: Scores) -> HeatMap:
     )
 
 
-def plain(run: Run, scores: Scores) -> str:
-    """The ranking as aligned text."""
-    lines = [["policy", "rank", *headings(scores)]]
-    notes = []
-    for place in ranking(run, scores):
-        values = [" ".join(filter(None, pair)) for pair in place.values]
-        lines.append([place.policy, "-" if place.rank is None else str(place.rank), *values])
-        if place.reason:
-            notes.append(f"{place.policy} has no rank: {place.reason}.")
+def plain(run: Run, summary: Summary) -> str:
+    """Aligned text: the ranking where there are scores, else a block for each cell; then the notes."""
+    unranked = run.manifest["unranked"]
+    notes = [f"{s.policy} has no rank: {unranked[s.policy]}." for s in summary.overall if not s.ranked]
+    notes += table.invalid(run.task.senders(run.rows))
+    if summary.scores is None:
+        return "\n".join([*intro(run), "", blocks(summary, run.abouts), "", *run.task.legend, *notes])
+    lines = [["policy", "rank", *(quantity.title for quantity in summary.quantities)]]
+    for place in ranking(run, summary):
+        lines.append([place.policy, "-" if place.rank is None else str(place.rank), *_texts(place)])
     return "\n".join([*table.aligned(lines), *notes])
+
+
+def intro(run: Run) -> list[str]:
+    """What was run, a line each."""
+    manifest = run.manifest
+    lines = [f"Suite {manifest['suite']}, {manifest['split']}: {manifest['about']}.", manifest["episodes"]]
+    if manifest["changes"]:
+        changes = " and ".join(f"{name} = {value}" for name, value in manifest["changes"].items())
+        lines.append(f"Not the suite as it is: {changes}.")
+    return lines
+
+
+def _texts(place: Place) -> list[str]:
+    return [" ".join(filter(None, texts)) for texts in place.values]
 
 
 # --- Markdown ---------------------------------------------------------------------------------------------------------
 
 
-def markdown(run: Run, scores: Scores) -> str:
-    """The command, the ranking, then a table of scores for each scenario."""
-    names = ["#", "policy", *headings(scores)]
+def markdown(run: Run, summary: Summary) -> str:
+    """The command, the ranking, then a table for each scenario or cell."""
+    out = ["```", run.manifest["command"], "```", "", *_ranking(run, summary, summary.overall)]
+    if summary.scores is not None:
+        return "\n".join([*out, *_score_tables(summary.scores)]) + "\n"
+    for cell, standings in summary.cells.items():
+        out += ["", f"{_plain(title(cell, run.abouts))}:", "", *_ranking(run, summary, standings)]
+    return "\n".join(out) + "\n"
+
+
+def _ranking(run: Run, summary: Summary, standings: Sequence[Standing]) -> list[str]:
+    names = ["#", "policy", *(quantity.title for quantity in summary.quantities)]
     lines = []
-    for place in ranking(run, scores):
+    for place in ranking(run, summary, standings):
         rank = "–" if place.rank is None else str(place.rank)
-        values = [" ".join(filter(None, pair)) for pair in place.values]
-        lines.append([rank, _plain(place.policy) + (f" ({place.reason})" if place.reason else ""), *values])
-    out = ["```", run.manifest["command"], "```", "", *markdown_table(names, lines, left=2)]
+        lines.append([rank, _plain(place.policy) + (f" ({place.reason})" if place.reason else ""), *_texts(place)])
+    return table.markdown_table(names, lines, left=2)
+
+
+def _score_tables(scores: Scores) -> list[str]:
     heat = heat_map(scores)
+    out = []
     for scenario, sizes in heat.columns:
         head = ["policy", *(f"L = {size}{_marks(heat, scenario, size)}" for size in sizes)]
         lines = [
-            [_plain(policy), *(style.score(cell.score.value) for cell in cells if cell.scenario == scenario)]
+            [_plain(policy), *(table.score(cell.score.value) for cell in cells if cell.scenario == scenario)]
             for policy, cells in heat.lines
         ]
-        out += ["", f"Score, {_plain(scenario)}:", "", *markdown_table(head, lines, left=1)]
-    notes = []
+        out += ["", f"Score, {_plain(scenario)}:", "", *table.markdown_table(head, lines)]
     if heat.flat:
-        notes.append("\\* Drop Oldest loses under 1 % there: nothing to be gained, not counted in the ranking.")
+        out += ["", "\\* Drop Oldest loses under 1 % there: nothing to be gained, not counted in the ranking."]
     if heat.inexact:
-        notes.append("† The clairvoyant is an upper bound there: the true scores lie further from 0.")
-    return "\n".join([*out, *(line for note in notes for line in ("", note))]) + "\n"
+        out += ["", "† The clairvoyant is an upper bound there: the true scores lie further from 0."]
+    return out
 
 
 def _marks(heat: HeatMap, scenario: str, capacity: int) -> str:
@@ -136,9 +143,3 @@ def _marks(heat: HeatMap, scenario: str, capacity: int) -> str:
 def _plain(name: str) -> str:
     """A name that Markdown shows as it is written."""
     return style.text(name).replace("|", "\\|").replace("*", "\\*")
-
-
-def markdown_table(head: Sequence[str], lines: Sequence[Sequence[str]], *, left: int) -> list[str]:
-    """Lines of a Markdown table: ``left`` columns to the left, the others to the right."""
-    rule = "|" + "---|" * left + "---:|" * (len(head) - left)
-    return ["| " + " | ".join(head) + " |", rule, *("| " + " | ".join(line) + " |" for line in lines)]

@@ -20,11 +20,11 @@ COLOURS = ("var(--lane)", "var(--gap)", "var(--kept)", "var(--axis)")
 
 def timeline(context: Context) -> Chart | None:
     """The chart; None where the run left no timeline."""
-    found = context.run.timeline
-    if found is None:
+    episode = context.run.timeline
+    if episode is None:
         return None
     alt = "Capacity of the link over time, and for each policy which messages were delivered and which were dropped"
-    return Chart("timeline", alt, [], {(): [_figure(found)]})
+    return Chart("timeline", alt, [], {(): [_figure(episode)]})
 
 
 def longest_gap(x: Sequence[float], received: Sequence[int]) -> tuple[int, int] | None:
@@ -38,22 +38,21 @@ def longest_gap(x: Sequence[float], received: Sequence[int]) -> tuple[int, int] 
 
 def log(messages: int, lane: Mapping[str, Any], gap: tuple[int, int] | None) -> list[int]:
     """What became of each message, in the order of their arrival."""
-    found = np.full(messages, LEFT)
+    outcomes = np.full(messages, LEFT)
     dropped = [entry[0] for entry in lane["dropped"]]
-    found[dropped] = DROPPED
+    outcomes[dropped] = DROPPED
     if gap is not None:
-        within = [seq for seq in dropped if gap[0] < seq < gap[1]]
-        found[within] = IN_GAP
-    found[[entry[0] for entry in lane["received"]]] = KEPT
-    return [int(entry) for entry in found]
+        outcomes[[seq for seq in dropped if gap[0] < seq < gap[1]]] = IN_GAP
+    outcomes[[entry[0] for entry in lane["received"]]] = KEPT
+    return [int(outcome) for outcome in outcomes]
 
 
-def _figure(found: Mapping[str, Any]) -> Figure:
-    at, x = found["arrival_s"], found["x"]
-    names = sorted(found["policies"], key=lambda name: found["policies"][name]["qoi"])  # the best lane is on top
+def _figure(episode: Mapping[str, Any]) -> Figure:
+    at, x = episode["arrival_s"], episode["x"]
+    names = sorted(episode["policies"], key=lambda name: episode["policies"][name]["qoi"])  # the best lane is on top
     rows, hover, notes = [], [], []
     for name in names:
-        lane = found["policies"][name]
+        lane = episode["policies"][name]
         gap = longest_gap(x, [entry[0] for entry in lane["received"]])
         rows.append(log(len(at), lane, gap))
         hover.append(_hover(at, lane))
@@ -72,7 +71,7 @@ def _figure(found: Mapping[str, Any]) -> Figure:
     layout["yaxis"] = style.axis("Mbit/s", domain=[(lanes + 46) / inside, 1], rangemode="tozero", nticks=4)
     layout["yaxis2"] = style.axis(domain=[0, lanes / inside], showgrid=False, ticks="", showline=False, type="category")
     layout["yaxis2"]["fixedrange"] = True
-    return {"data": [*_link(found), _lanes(at, names, rows, hover)], "layout": layout}
+    return {"data": [*_link(episode), _lanes(at, names, rows, hover)], "layout": layout}
 
 
 def _columns(cells: Sequence[str], **place: Any) -> list[dict[str, Any]]:
@@ -91,32 +90,28 @@ def _hover(at: Sequence[float], lane: Mapping[str, Any]) -> list[str]:
     return words
 
 
-def _link(found: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _link(episode: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Capacity as a filled step curve, demand as a dashed line, Mbit/s."""
-    times = list(found["rate"]["t_s"])
-    rates = [rate * 8e-6 for rate in found["rate"]["bytes_per_s"]]
-    curve = {
-        "type": "scatter",
-        "mode": "lines",
-        "x": [style.rounded(t) for t in times],
-        "y": [style.rounded(rate) for rate in rates],
-        "line": {"shape": "hv", "width": 1, "color": "var(--link)"},
-        "fill": "tozeroy",
-        "fillcolor": "var(--link-fill)",
-        "hovertemplate": "link %{y:.2f} Mbit/s at %{x:.1f} s<extra></extra>",
-    }
-    demand = found.get("demand_bytes_per_s")
+    times = list(episode["rate"]["t_s"])
+    curve = style.scatter(
+        times,
+        [rate * 8e-6 for rate in episode["rate"]["bytes_per_s"]],
+        "link %{y:.2f} Mbit/s at %{x:.1f} s",
+        mode="lines",
+        line={"shape": "hv", "width": 1, "color": "var(--link)"},
+        fill="tozeroy",
+        fillcolor="var(--link-fill)",
+    )
+    demand = episode.get("demand_bytes_per_s")
     if demand is None or not times:
         return [curve]
-    ends = [found["arrival_s"][0], found["arrival_s"][-1]]
-    dashed = {
-        "type": "scatter",
-        "mode": "lines",
-        "x": ends,
-        "y": [style.rounded(demand * 8e-6)] * 2,
-        "line": {"dash": "dash", "width": 1.5, "color": "var(--vermillion)"},
-        "hovertemplate": "demand %{y:.2f} Mbit/s<extra></extra>",
-    }
+    dashed = style.scatter(
+        [episode["arrival_s"][0], episode["arrival_s"][-1]],
+        [demand * 8e-6] * 2,
+        "demand %{y:.2f} Mbit/s",
+        mode="lines",
+        line={"dash": "dash", "width": 1.5, "color": "var(--vermillion)"},
+    )
     return [curve, dashed]
 
 
@@ -125,7 +120,7 @@ def _lanes(at: Sequence[float], names: list[str], rows: list[list[int]], hover: 
     shades = [[edge, colour] for k, colour in enumerate(COLOURS) for edge in (k / 4, (k + 1) / 4)]
     return {
         "type": "heatmap",
-        "x": [style.rounded(t) for t in at],
+        "x": style.rounded(at),
         "y": [style.text(name) for name in names],
         "z": rows,
         "text": hover,

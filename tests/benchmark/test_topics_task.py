@@ -1,4 +1,4 @@
-"""The benchmark of topics: rows of an episode worked by hand, statistics of rows made by hand."""
+"""The task of several topics: rows of an episode worked by hand, statistics of rows made by hand."""
 
 from __future__ import annotations
 
@@ -8,19 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from summary_cases import exactly
 
 from bufgym import policies
-from bufgym.benchmark import topics
-from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Row, read_rows, write_rows
-from bufgym.benchmark.topics import ROWS, client_parts, default_policies, run, run_parts, suite_parts
-from bufgym.benchmark.topics_summary import by_topic, plain, summary
+from bufgym.benchmark.run import run
+from bufgym.benchmark.summary import Summary, plain
+from bufgym.benchmark.sweep import Sweep
+from bufgym.benchmark.tasks import TASKS, topics
+from bufgym.benchmark.tasks.topics import ROWS, by_topic
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
-from bufgym.scenario import Client, Interruption, Stream, suites
+from bufgym.scenario import Client, Stream
 from bufgym.sim.metrics import TopicOutcome
 from bufgym.traces import Trace
+
+TASK = TASKS["topics"]
 
 POSE = Stream(Topic("pose", priority=3, deadline_s=0.5), rate_hz=2, size_bytes=100, jitter=0)
 MAP = Stream(Topic("map", no_drop=True), rate_hz=1, size_bytes=1000, jitter=0)
@@ -130,44 +134,24 @@ def test_rows_come_back_to_the_last_bit(tmp_path: Path, ending: str) -> None:
 
 
 def test_a_suites_episodes_are_its_own() -> None:
-    suite = suites.get("topics-v1")
-    parts = suite_parts(suite, "validation", seeds=2, window=5)
+    sweep = Sweep("topics-v1", (), "validation", seeds=2, changes={"window": 5}).checked()
     labels = ("scarce", "scarce-window-5", "half", "half-window-5", "ample", "ample-window-5")
-    assert tuple(dict.fromkeys(part.scenario for part in parts)) == labels
-    assert {part.client.window for part in parts} == {5}
-    assert {len(part.client.traces) for part in parts} == {1}
-    # No two traces of a scenario share an episode's chance.
-    assert [list(part.seeds) for part in parts if part.scenario == "half"][:2] == [[0, 1], [1000, 1001]]
-    assert [len(part.seeds) for part in suite_parts(suite, "validation")] == [5] * len(parts)
+    assert tuple(dict.fromkeys(shard.label for shard in sweep.shards())) == labels
+    clients = [sweep.setting(shard.label, shard.trace).scenario for shard in sweep.shards()]
+    assert {(client.window, len(client.traces)) for client in clients} == {(5, 1)}
+    # No two traces of a scenario share a draw.
+    assert [shard.seeds for shard in sweep.shards() if shard.label == "half"][:2] == [(0, 1), (1000, 1001)]
 
 
 def test_who_runs_by_default() -> None:
-    names = default_policies()
+    names = TASK.default_policies("topics-v1")
     assert {"robofleet", "robofleet-released", "ros-native", "rosbridge", "drop-oldest", "fifo", "edf"} <= set(names)
     assert "afr" not in names and len(set(names)) == len(names)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"policies": []}, "policies = []: need at least one"),
-        ({"capacities": []}, "capacities = []: need at least one"),
-        ({"seeds": 0}, "seeds = .*: need at least one"),
-        ({"policies": ["fifo", "fifo"]}, "'fifo' is given more than once"),
-        ({"policies": ["fifo", "clairvoyant"]}, "policy clairvoyant: it plans with a queue of its own"),
-        ({"client": Interruption()}, "Interruption: must be a bufgym.scenario.Client"),
-    ],
-)
-def test_bad_arguments_are_named(change: dict[str, Any], message: str) -> None:
-    given = {"policies": ["fifo"], "client": CLIENT, "capacities": [4], "seeds": 1, **change}
-    given["policies"] = [policies.get(name) for name in given["policies"]]
-    with pytest.raises(BufgymError, match=message.replace("[", r"\[")):
-        run(**given)
-
-
-def test_suites_of_one_queue_are_refused() -> None:
-    with pytest.raises(BufgymError, match="suite lte-v1 has one queue, not topics: bufgym bench --suite lte-v1"):
-        suite_parts(suites.get("lte-v1"), "test")
+def test_a_policy_that_plans_for_one_queue_is_refused() -> None:
+    with pytest.raises(BufgymError, match="policy clairvoyant: it plans with a queue of its own"):
+        run([policies.get("fifo"), policies.get("clairvoyant")], CLIENT, [4], 1)
 
 
 # -------------------- the summary
@@ -186,9 +170,8 @@ def made(policy: str, seed: int, weighted_qoi: float, scenario: str = "s", **fir
     ]
 
 
-def exactly(x: float) -> Interval:
-    """Of a statistic that every episode agrees on."""
-    return Interval(pytest.approx(x), pytest.approx(x), pytest.approx(x))
+def summary(rows: list[Row], **options: Any) -> Summary:
+    return TASK.summary(rows, **options)
 
 
 HALF = [
@@ -203,18 +186,20 @@ def test_a_summary_worked_by_hand() -> None:
     found = summary(HALF)
     base, mine = found.overall
     assert (base.policy, mine.policy) == ("robofleet", "mine")
-    assert found.cells == {("s", 4): [base, mine]} and found.first == (5.0,)
+    assert found.cells == {("s", 4): [base, mine]}
+    assert found.quantities[3].title == "age, priority 5 (s)"
     # 80 / 160 in all, and half in every resample.
-    assert mine.relative == exactly(0.5) and base.relative == exactly(1.0)
-    assert mine.qoi.value == pytest.approx(80 / 3) and mine.qoi.low < 80 / 3 < mine.qoi.high
-    assert mine.age_first_s == exactly(1.0) and base.age_first_s == exactly(2.0)
+    assert mine["relative"] == exactly(0.5) and base["relative"] == exactly(1.0)
+    value, low, high = mine["qoi"]
+    assert value == pytest.approx(80 / 3) and low < 80 / 3 < high
+    assert mine["age_first_s"] == exactly(1.0) and base["age_first_s"] == exactly(2.0)
     # (6 + 2) / 2; two lost of the no_drop topic in each of three episodes, those of "second" do not count.
-    assert mine.age_others_s == exactly(4.0) and mine.lost == 6
+    assert mine["age_others_s"] == exactly(4.0) and mine["lost"] == exactly(6)
     # One late of 4 + 4 with a deadline; 12 delivered in 10 s.
-    assert mine.late == exactly(1 / 8) and base.late == exactly(0.0) and mine.rate_hz == exactly(1.2)
+    assert mine["late"] == exactly(1 / 8) and base["late"] == exactly(0.0) and mine["rate_hz"] == exactly(1.2)
 
 
-def test_over_all_cells_it_is_the_mean_of_theirs() -> None:
+def test_over_all_cells_shares_are_means_and_losses_add_up() -> None:
     more = [
         row
         for seed in (0, 1)
@@ -223,47 +208,25 @@ def test_over_all_cells_it_is_the_mean_of_theirs() -> None:
     found = summary([*HALF, *more])
     assert list(found.cells) == [("s", 4), ("other", 4)]  # as in the rows
     assert [standing.policy for standing in found.cells["other", 4]] == ["mine", "robofleet"]
-    (mine,) = (standing for standing in found.overall if standing.policy == "mine")
-    assert mine.relative == exactly((0.5 + 1.5) / 2) and mine.lost == 10
-    assert mine.age_first_s == exactly(1.5)
-
-
-def test_one_episode_has_no_interval() -> None:
-    found = summary([*made("robofleet", 0, 10.0), *made("mine", 0, 15.0)])
-    mine = found.overall[0]
-    assert mine.relative.value == 1.5 and math.isnan(mine.relative.low) and math.isnan(mine.relative.high)
-    assert plain(found).splitlines()[3].split()[:4] == ["mine", "15.0", "1.500", "[-]"]
-
-
-def test_intervals_are_paired_and_repeatable() -> None:
-    rows = [
-        row
-        for seed, (base, mine) in enumerate([(10, 11), (100, 108), (50, 57), (20, 23)])
-        for row in [*made("robofleet", seed, base), *made("mine", seed, mine)]
-    ]
-    (mine, _) = summary(rows, seed=1).overall
-    assert summary(list(reversed(rows)), seed=1).overall == summary(rows, seed=1).overall
-    assert mine.relative.value == pytest.approx(199 / 180)
-    # No resample leaves the range of the single ratios, though the episodes differ tenfold.
-    assert 1.08 <= mine.relative.low < mine.relative.value < mine.relative.high <= 1.15
+    mine = found.standings["mine"]
+    assert mine["relative"] == exactly((0.5 + 1.5) / 2) and mine["lost"].value == 10
+    assert mine["age_first_s"] == exactly(1.5)
 
 
 def test_unknown_ages_are_left_out() -> None:
     rows = [*made("robofleet", 0, 1.0, mean_age_s=math.nan), *made("robofleet", 1, 1.0, mean_age_s=3.0)]
-    assert summary(rows).overall[0].age_first_s == exactly(3.0)
+    assert summary(rows).overall[0]["age_first_s"] == exactly(3.0)
     same = [{**row, "priority": 1.0, "deadline_s": None} for row in made("robofleet", 0, 0.0)]
     (standing,) = summary(same).overall
-    assert math.isnan(standing.age_others_s.value) and math.isnan(standing.late.value)
-    assert math.isnan(standing.relative.value)  # of nothing
-    assert "  -  " in plain(summary(same))
+    assert math.isnan(standing["age_others_s"].value) and math.isnan(standing["late"].value)
+    assert math.isnan(standing["relative"].value)  # of nothing
+    assert "  –  " in plain(summary(same))
 
 
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
         ([], "no rows to score"),
-        (HALF[3:6], "no row of the baseline 'robofleet'"),
-        (HALF[:-3], "mine at s, L = 4, trace t, seed 2: no row; every policy must meet the same episodes"),
         ([HALF[0], HALF[0]], r"rows\[1\]: topic 'first' of one run has more than one row"),
         ([{**HALF[0], "weighted_qoi": None}], r"rows\[0\]: no weighted_qoi"),
     ],
@@ -273,26 +236,14 @@ def test_rows_that_cannot_be_summed_up(rows: list[Row], message: str) -> None:
         summary(rows)
 
 
-def test_unranked_policies_come_last() -> None:
-    rows = [*made("robofleet", 0, 1.0), *made("endless", 0, 9.0)]
-    assert [s.policy for s in summary(rows).overall] == ["endless", "robofleet"]
-    assert [s.policy for s in summary(rows, unranked=["endless"]).overall] == ["robofleet", "endless"]
-
-
 def test_the_tables_as_text() -> None:
     lines = plain(summary(HALF), {"s": "a story"}).splitlines()
     assert lines[0].split("  ")[0] == "policy" and "age, priority 5 (s)" in lines[0] and "QoI / robofleet" in lines[0]
     assert lines[2] == "s: a story, L = 4"
     assert lines[3].split()[:5] == ["robofleet", "53.3", "1.000", "[1.000,", "1.000]"]
-    assert lines[4].split()[-2:] == ["12.5%", "1.2"] and len(lines) == 5
+    assert lines[4].split()[-2:] == ["%", "1.2"] and len(lines) == 5
     lines = by_topic(HALF, "mine").splitlines()
     assert lines[2] == "s, L = 4"
     assert lines[3].split() == ["first", "5", "1.00", "9.0", "0.0", "0.0", "4.0", "1.0", "1.000", "3.000", "0.500", "-"]
     with pytest.raises(BufgymError, match="no row of the policy 'nobody'"):
         by_topic(HALF, "nobody")
-
-
-def test_run_parts_takes_several_clients() -> None:
-    parts = [*client_parts("a", CLIENT, 1), *client_parts("b", replace(CLIENT, scale=2.0), [5])]
-    rows = run_parts([policies.get("fifo")], parts, [4])
-    assert [(row["scenario"], row["seed"]) for row in rows] == [("a", 0)] * 2 + [("b", 5)] * 2

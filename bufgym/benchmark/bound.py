@@ -1,0 +1,49 @@
+"""A policy's runs on one queue, beside the clairvoyant's bound on the same episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from bufgym.benchmark.rows import Row
+from bufgym.oracle import Plan, clairvoyant
+from bufgym.policies import Policy
+from bufgym.scenario import Episode, Scenario
+from bufgym.sim import Senders, padded, run
+
+
+def best(
+    episode: Episode, capacity: int, scenario: Scenario, max_bytes: int | None = None, decide_at: str = "arrival"
+) -> Plan:
+    """The clairvoyant's plan; where only a full buffer asks, no more than an upper bound."""
+    plan = clairvoyant(episode, capacity, scenario.value, max_bytes=max_bytes)
+    return plan if decide_at == "arrival" or plan.kept.all() else replace(plan, certified=False)
+
+
+def meet(
+    policy: Policy,
+    episodes: Sequence[Episode],
+    capacity: int,
+    scenario: Scenario,
+    plans: Sequence[Plan | None],
+    max_bytes: int | None = None,
+    decide_at: str = "arrival",
+) -> Senders:
+    """The senders after ``policy`` met the episodes; a privileged policy reads the plans that are known already."""
+    memory = None
+    if policy.privileged is not None and all(plan is not None for plan in plans):
+        memory = padded([plan.kept for plan in plans if plan is not None])
+    return run(policy, episodes, capacity, scenario.value, max_bytes=max_bytes, decide_at=decide_at, memory=memory)
+
+
+def columns(policy: Policy, h: float, plan: Plan | None) -> Row:
+    """What a row has besides the policy's ``Outcome``: clairvoyant, certified, regret (see ``rows.COLUMNS``)."""
+    if plan is None:
+        return {"clairvoyant": None, "certified": None, "regret": None}
+    lost = None if policy.unbounded else regret(h, plan.qoi)
+    return {"clairvoyant": plan.qoi, "certified": plan.certified, "regret": lost}
+
+
+def regret(h: float, most: float) -> float:
+    """1 - H / H of the clairvoyant; 0 where nothing could be delivered at all."""
+    return 1 - h / most if most > 0 else 0.0

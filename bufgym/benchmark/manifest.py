@@ -1,0 +1,123 @@
+"""``manifest.json``: what was run into a folder, so that no other run's rows get mixed in, and a report can say it."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bufgym import __version__
+from bufgym.benchmark.checked_json import check, read_object
+from bufgym.benchmark.tasks import TASKS
+from bufgym.errors import BufgymError, where
+from bufgym.files import replaced
+from bufgym.policies import Policy
+from bufgym.scenario.suites import Setting, Suite
+
+FORMAT = 2
+"""The version of the folder's layout: raised when manifest, rows or timeline change their meaning."""
+
+_KINDS = {
+    **dict.fromkeys(("task", "suite", "split", "about", "episodes", "bufgym", "command"), str),
+    **dict.fromkeys(("unranked", "scenarios", "changes"), dict),
+}
+
+_SAME = (
+    *("format", "bufgym", "suite", "split", "policies", "policy_file", "capacities", "seeds", "changes"),
+    "scenarios",
+)
+"""What two runs that share a folder must have in common."""
+
+
+def describe(
+    suite: Suite,
+    settings: Mapping[str, Setting],
+    policies: Sequence[Policy],
+    *,
+    policy_file: str | None,
+    **entries: Any,
+) -> dict[str, Any]:
+    """The manifest of a run; ``entries`` go into it as they are."""
+    return {
+        "format": FORMAT,
+        "bufgym": __version__,
+        "made": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "task": suite.kind,
+        "suite": suite.name,
+        "about": suite.about,
+        "policies": [policy.name for policy in policies],
+        "unranked": {policy.name: policy.unranked_because for policy in policies if not policy.ranked},
+        "policy_file": policy_file and hashlib.sha256(Path(policy_file).read_bytes()).hexdigest()[:16],
+        "scenarios": {
+            label: {
+                "about": setting.about,
+                "value": setting.scenario.value.name,
+                **({} if setting.outage_s is None else {"outage_s": setting.outage_s}),
+                **({"recordings": _fingerprint(setting.scenario)} if suite.needs else {}),
+            }
+            for label, setting in settings.items()
+        },
+        **entries,
+    }
+
+
+def _fingerprint(scenario: Any) -> str:
+    """Tells recordings apart that go by the same names."""
+    stream = getattr(scenario, "uplink", scenario)
+    digest = hashlib.sha256()
+    for trace in getattr(stream, "traces", ()):
+        digest.update(trace.time_us.tobytes() + trace.cumulative_bytes.tobytes())
+    for motion in getattr(stream, "motion", ()):
+        digest.update(motion.time_us.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def claim(out: Path, manifest: dict[str, Any]) -> None:
+    """Write the manifest into the folder, or an error if another run's rows are in it."""
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / "manifest.json"
+    if not file.exists():
+        if (out / "parts").exists() or any(out.glob("rows.*")):
+            raise BufgymError(f"{out}: holds rows without a manifest.json; choose another --out")
+        write_json(file, manifest)
+        return
+    held = read(file)
+    for key in _SAME:
+        if held.get(key) != manifest[key]:
+            raise BufgymError(
+                f"{file}: {key} is {_short(held.get(key))}, but this run has {_short(manifest[key])};"
+                " choose another --out (finished rows are never mixed)"
+            )
+
+
+def read(path: Path) -> Mapping[str, Any]:
+    """What was run; an error that names the file and the rule where it is not a manifest of this version."""
+    if not path.exists():
+        raise BufgymError(f"{path.parent}: no {path.name}; it must be a folder that `bufgym bench --suite` wrote")
+    manifest = read_object(path)
+    if manifest.get("format") != FORMAT:
+        rule = f"must be {FORMAT}; another version of bufgym wrote this folder"
+        raise BufgymError(where(path, None, manifest.get("format"), rule, field="format"))
+    check(path, "", manifest, _KINDS)
+    if manifest["task"] not in TASKS:
+        raise BufgymError(where(path, None, manifest["task"], f"must be one of {', '.join(TASKS)}", field="task"))
+    for label, scenario in manifest["scenarios"].items():
+        check(path, f"scenarios.{label}", scenario, {})
+        if not isinstance(scenario.get("outage_s", 0.0), int | float):
+            rule = "must be a number of seconds"
+            raise BufgymError(where(path, None, scenario["outage_s"], rule, field=f"scenarios.{label}.outage_s"))
+    return manifest
+
+
+def write_json(file: Path, content: dict[str, Any]) -> None:
+    """Write the file, whole or not at all."""
+    with replaced(file) as temporary:
+        temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+
+def _short(entry: object) -> str:
+    text = json.dumps(entry)
+    return text if len(text) <= 80 else f"{text[:77]}..."

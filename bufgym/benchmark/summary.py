@@ -1,0 +1,199 @@
+"""What the rows of a benchmark say of each policy: quantities with intervals, by cell and over all cells.
+
+A *cell* is (scenario, capacity). Within a cell a statistic is computed over its episodes; over all cells it is the mean
+of theirs. Every interval is the paired bootstrap over episodes that ``score`` describes: one draw serves all policies
+and all capacities of a scenario.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from bufgym.benchmark import episodes
+from bufgym.benchmark.bootstrap import (
+    UNKNOWN,
+    Interval,
+    check_resampling,
+    percentile_interval,
+    stream,
+    times_drawn,
+    written,
+)
+from bufgym.benchmark.episodes import Cell, Numbers
+from bufgym.benchmark.score import Scores
+from bufgym.benchmark.table import in_blocks
+
+
+class Quantity(NamedTuple):
+    """One number that a summary shows of a policy."""
+
+    key: str
+    """Its name in ``Standing.values``."""
+    title: str
+    """Its heading."""
+    write: Callable[[float], str]
+    """A number of it as text."""
+    about: str
+    """Its definition, for the reader of a report."""
+    interval: bool = True
+    """Whether printed tables show the interval; a report always does."""
+    versus: str = ""
+    """The policy it compares with, which has none of its own."""
+    total: bool = False
+    """Whether it adds up over cells; else it is the mean over them."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One policy in one cell, or over all."""
+
+    policy: str
+    """Its name."""
+    ranked: bool
+    """Whether it competes with the others."""
+    values: Mapping[str, Interval]
+    """By ``Quantity.key``."""
+
+    def __getitem__(self, key: str) -> Interval:
+        return self.values[key]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a task makes of its rows."""
+
+    quantities: tuple[Quantity, ...]
+    """What is shown, in this order."""
+    rank_by: str
+    """The key of the quantity that orders the policies, largest first."""
+    overall: list[Standing]
+    """Over all cells; ranked policies first, best first."""
+    cells: dict[Cell, list[Standing]]
+    """The same in each cell, cells in the order of the rows; empty where ``scores`` holds them."""
+    baseline: str
+    """The policy that the others are measured against."""
+    confidence: float
+    """Of the intervals."""
+    resamples: int
+    """Of the bootstrap."""
+    scores: Scores | None = None
+    """Scores between the baseline and the clairvoyant, where one is known."""
+
+    @property
+    def counted_cells(self) -> int:
+        """How many cells ``overall`` is over: where there are scores the discriminative ones."""
+        if self.scores is None:
+            return len(self.cells)
+        return len({(cell.scenario, cell.capacity) for cell in self.scores.cells if cell.discriminative})
+
+    @property
+    def standings(self) -> dict[str, Standing]:
+        """Over all cells, by policy."""
+        return {standing.policy: standing for standing in self.overall}
+
+
+Run = tuple[str, int, str, str, int]
+"""(scenario, capacity, policy, trace, seed)."""
+Statistics = Callable[[Numbers, Numbers, Numbers], dict[str, Numbers]]
+"""(a policy's numbers, the baseline's, weights) -> each statistic of the sample and its resamples, [1 + resamples].
+
+The numbers are [episodes, entries], the same episodes of both; weights[1 + resamples, episodes] say how often each
+episode was drawn.
+"""
+
+
+def summarise(
+    runs: Mapping[Run, Sequence[float]],
+    statistics: Statistics,
+    quantities: tuple[Quantity, ...],
+    *,
+    rank_by: str,
+    baseline: str,
+    unranked: Collection[str] = (),
+    resamples: int = 2000,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> Summary:
+    """Every policy beside ``baseline``, by cell and over all cells.
+
+    Args:
+        runs: the numbers that ``statistics`` takes of each run, with as many entries each in one cell.
+        statistics: computes the quantities of one policy in one cell.
+        quantities: what the statistics are called and how they are shown.
+        rank_by: the key of the quantity that orders the policies.
+        baseline: the policy that the others are measured against.
+        unranked: policies that come last, such as an unbounded queue.
+        resamples: of the bootstrap.
+        confidence: of the intervals, such as 0.95.
+        seed: of the draws.
+
+    Raises:
+        BufgymError: for no runs, a cell without the baseline, policies that have not met the same episodes.
+    """
+    check_resampling(resamples, confidence)
+    # ``read`` makes sure that all met the same episodes, and orders them.
+    keys = ("scenario", "capacity", "policy", "trace", "seed")
+    rows = [{**dict(zip(keys, run, strict=True)), "qoi": numbers[0]} for run, numbers in runs.items()]
+    table = episodes.read(rows, baseline)
+    drawn = {name: times_drawn(len(e), resamples, stream(seed, name)) for name, e in table.episodes.items()}
+    cells = list(dict.fromkeys((scenario, capacity) for scenario, capacity, *_ in runs))
+
+    def numbers_of(policy: str, cell: Cell) -> Numbers:
+        return np.array([runs[*cell, policy, *episode] for episode in table.episodes[cell[0]]], np.float64)
+
+    by_policy = {
+        policy: {
+            cell: statistics(numbers_of(policy, cell), numbers_of(baseline, cell), drawn[cell[0]]) for cell in cells
+        }
+        for policy in table.training_seeds
+    }
+
+    def standings(over: Sequence[Cell]) -> list[Standing]:
+        # Each resample of a single episode is that episode, which says nothing of chance.
+        alone = any(len(table.episodes[scenario]) == 1 for scenario, _ in over)
+        entries = []
+        for policy, by_cell in by_policy.items():
+            values = {}
+            for quantity in quantities:
+                pooled = (np.sum if quantity.total else np.mean)([by_cell[cell][quantity.key] for cell in over], axis=0)
+                interval = percentile_interval(pooled, confidence)
+                values[quantity.key] = Interval(interval.value, math.nan, math.nan) if alone else interval
+            entries.append(Standing(policy, policy not in unranked, values))
+        return sorted(entries, key=lambda s: (not s.ranked, math.isnan(s[rank_by].value), -s[rank_by].value, s.policy))
+
+    by_cell = {cell: standings([cell]) for cell in cells}
+    return Summary(quantities, rank_by, standings(cells), by_cell, baseline, confidence, resamples)
+
+
+# --- as text ---------------------------------------------------------------------------------------------------------
+
+
+def pair(standing: Standing, quantity: Quantity) -> tuple[str, str]:
+    """(value, interval in brackets) as text; a dash and nothing where the policy has no value."""
+    return written(UNKNOWN if standing.policy == quantity.versus else standing[quantity.key], quantity.write)
+
+
+def title(cell: Cell, abouts: Mapping[str, str]) -> str:
+    """What one cell is; ``abouts``: what each scenario is, by its label."""
+    scenario, capacity = cell
+    scenario = ": ".join(filter(None, (scenario, abouts.get(scenario, ""))))
+    return ", ".join(filter(None, (scenario, f"L = {capacity}")))
+
+
+def plain(summary: Summary, abouts: Mapping[str, str] | None = None) -> str:
+    """Aligned text: a block for each cell, and one over all where there are several."""
+    blocks = [(title(cell, abouts or {}), standings) for cell, standings in summary.cells.items()]
+    if len(blocks) > 1:
+        blocks.append((f"mean of these {len(blocks)}", summary.overall))
+
+    def line(standing: Standing) -> list[str]:
+        pairs = [(pair(standing, quantity), quantity.interval) for quantity in summary.quantities]
+        return [standing.policy, *(" ".join(filter(None, texts if both else texts[:1])) for texts, both in pairs)]
+
+    head = ["policy", *(quantity.title for quantity in summary.quantities)]
+    return in_blocks(head, [(name, [line(standing) for standing in standings]) for name, standings in blocks])

@@ -1,0 +1,28 @@
+"""The kinds of experiment, each behind the protocol ``Task``: one queue, the topics of one client, a fleet of robots.
+
+A new kind of task is one more file here and one more entry of ``TASKS``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from bufgym.benchmark.tasks.fleet import FleetTask
+from bufgym.benchmark.tasks.queue import QueueTask
+from bufgym.benchmark.tasks.task import Task
+from bufgym.benchmark.tasks.topics import TopicsTask
+
+__all__ = ["TASKS", "FleetTask", "QueueTask", "Task", "TopicsTask", "of"]
+
+TASKS: dict[str, Task] = {task.kind: task for task in (QueueTask(), TopicsTask(), FleetTask())}
+"""By ``Suite.kind``."""
+
+
+def of(scenario: Any, **settings: Any) -> Task:
+    """The task that a scenario is for; a scenario of no known kind is for one queue.
+
+    ``settings`` are the task's own, such as max_bytes, decide_at and bound of ``QueueTask``.
+    """
+    task = next((task for task in TASKS.values() if isinstance(scenario, task.scenarios)), TASKS["queue"])
+    return replace(task, **settings)

@@ -1,0 +1,270 @@
+"""Several topics of one client over one uplink: every policy beside Robofleet's client as published."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from bufgym.benchmark.bootstrap import ratio
+from bufgym.benchmark.episodes import Numbers
+from bufgym.benchmark.rows import Layout, Row
+from bufgym.benchmark.summary import Quantity, Run, Summary, summarise, title
+from bufgym.benchmark.table import Column, Rows, decimal, in_blocks, mean, percent, score, written
+from bufgym.benchmark.tasks.task import Result, Task, counted
+from bufgym.errors import BufgymError
+from bufgym.policies import Policy, names
+from bufgym.scenario import Client, Episode
+from bufgym.sim import Senders, run
+from bufgym.sim.metrics import TopicOutcome, received, topic_outcomes, weighted_qoi
+
+BASELINE = "robofleet"
+"""Robofleet's client as published."""
+
+_RIVALS = ("drop-oldest", "rosbridge")
+"""Made for one queue, but what a robot's topics meet today."""
+
+_OUTCOME = tuple(field.name for field in fields(TopicOutcome))[1:]
+
+ROWS = Layout(
+    columns=(
+        *("scenario", "trace", "seed", "window", "consumers", "policy", "capacity"),
+        *("topic", "priority", "weight", "no_drop", "deadline_s"),
+        *_OUTCOME,
+        *("weighted_qoi", "seconds", "invalid"),
+    ),
+    text=("scenario", "trace", "policy", "topic"),
+    whole=("seed", "window", "consumers", "capacity", "arrived", "invalid"),
+    yes_no=("no_drop",),
+)
+"""One row for each topic of a run.
+
+It has the rules of the topic (``deadline_s`` is None where it has none) and its ``TopicOutcome`` (means over the
+consumers where each gets a copy of its own, so not always whole numbers). Of the run as a whole it has
+``weighted_qoi``, the sum of weight x H over the topics; ``seconds``, its length until the last arrival or the last
+receipt, whichever is later; and ``invalid``, the decisions that could not be carried out.
+"""
+
+
+@dataclass(frozen=True)
+class TopicsTask(Task):
+    """A client whose topics share one buffer and one uplink."""
+
+    kind = "topics"
+    scenarios = (Client,)
+    layout = ROWS
+    needed = ROWS.columns
+    baseline = BASELINE
+    reference = BASELINE
+    listed = ("relative", "lost", "age_relative")
+    legend = (
+        "QoI: sum over topics of weight x H, mean over episodes; [low, high]: 95 % intervals, resampling episodes.",
+        "no_drop lost: messages, all episodes together. Age: of information, at the server, mean over topics and time.",
+        "Late: of what was delivered on topics with a deadline. Delivered a second: until the last arrival or receipt.",
+        "The QoI of an unbounded queue counts messages that arrive long after the others.",
+    )
+
+    def default_policies(self, suite: str) -> list[str]:
+        """All that are made for topics, and what is in use without them."""
+        return [*_RIVALS, *names(for_topics=True)]
+
+    def check(self, policy: Policy) -> None:
+        if policy.privileged is not None:
+            raise BufgymError(f"policy {policy.name}: it plans with a queue of its own, which no topic of a client has")
+
+    def messages(self, scenario: Client) -> int:
+        return scenario.max_messages * scenario.consumers
+
+    def rows_per_run(self, scenario: Client) -> int:
+        return len(scenario.topics)
+
+    def play(
+        self, policies: Sequence[Policy], scenario: Client, episodes: Sequence[Episode], capacity: int
+    ) -> Iterator[list[Result]]:
+        for policy in policies:
+            senders = run(policy, episodes, capacity, scenario.value, topics=scenario.topics)
+            yield [_rows(scenario, senders, i) for i in range(len(episodes))]
+
+    def quantities(self, baseline: str = BASELINE, first: str = "first") -> tuple[Quantity, ...]:
+        """``first``: what the topics of the highest priority are called."""
+
+        def seconds(number: float) -> str:
+            return decimal(number, 2)
+
+        def one_digit(number: float) -> str:
+            return decimal(number, 1)
+
+        paired = "sum over sum, on the episodes that both met"
+        first_age = "mean age of information at the server of the topics with the highest priority, s"
+        others_age = "mean age of information of all other topics, s"
+        lost = "messages of no_drop topics that were dropped, in all episodes together"
+        late = "of the messages delivered on topics with a deadline, the share after it"
+        rate = "messages delivered a second, until the last arrival or receipt"
+        return (
+            Quantity("qoi", "QoI", one_digit, "sum over topics of weight x H, mean over episodes", interval=False),
+            Quantity("relative", f"QoI / {baseline}", score, f"QoI over that of {baseline}: {paired}"),
+            Quantity("lost", "no_drop lost", "{:g}".format, lost, interval=False, total=True),
+            Quantity("age_first_s", f"age, {first} (s)", seconds, first_age, interval=False),
+            Quantity("age_relative", f"age / {baseline}", score, f"that age over the one under {baseline}: {paired}"),
+            Quantity("age_others_s", "age, others (s)", seconds, others_age),
+            Quantity("late", "late", percent, late, interval=False),
+            Quantity("rate_hz", "msg/s", one_digit, rate, interval=False),
+        )
+
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
+        runs, priorities = _runs(rows)
+        options = {"baseline": self.baseline, **options}
+        first = f"priority {priorities[0]:g}" if len(priorities) == 1 else "first"
+        quantities = self.quantities(options["baseline"], first)
+        return summarise(runs, _statistics, quantities, rank_by="relative", unranked=unranked, **options)
+
+    def senders(self, rows: Sequence[Row]) -> Sequence[Row]:
+        return list({_run_of(row): row for row in rows}.values())
+
+    def describe(self, scenarios: Sequence[Client], episodes: int) -> str:
+        client, many = scenarios[0], counted(episodes, "episode")
+        windows = " and ".join(f"{n}" for n in dict.fromkeys(client.window for client in scenarios))
+        acks = f"acks {client.ack_delay_us / 1000:g} ms after a message is transmitted"
+        consumers = counted(client.consumers, "consumer")
+        return f"{many} of {client.duration_s:g} s; n_T = {windows}, {acks}, {consumers}."
+
+
+# --- rows ------------------------------------------------------------------------------------------------------------
+
+
+def _rows(client: Client, senders: Senders, i: int) -> Result:
+    """What became of each topic at sender ``i``."""
+    sender, messages = np.asarray(senders.batch.senders)[i], received(senders, i)
+    log = np.asarray(senders.batch.log[i])
+    last_us = int(np.asarray(senders.batch.arrivals[i])["arrival_us"][sender["arrivals"] - 1])
+    if len(messages):
+        last_us = max(last_us, int(log["transmitted_us"][messages["seq"][-1]] + sender["propagation_us"]))
+    of_the_run = {
+        "window": client.window,
+        "consumers": client.consumers,
+        "weighted_qoi": weighted_qoi(senders, i, messages),
+        "seconds": last_us / 1e6,
+        "invalid": int(sender["invalid"]),
+    }
+    outcomes = topic_outcomes(senders, i)
+    return [
+        {
+            "topic": topic.name,
+            "priority": float(topic.priority),
+            "weight": float(topic.share),
+            "no_drop": topic.no_drop,
+            "deadline_s": None if topic.deadline_s is None else float(topic.deadline_s),
+            # Where each consumer gets a copy, copy c of topic k is topic c x (number of topics) + k.
+            **_folded(outcomes[k :: len(client.topics)]),
+            **of_the_run,
+        }
+        for k, topic in enumerate(client.topics)
+    ]
+
+
+def _folded(copies: Sequence[TopicOutcome]) -> Row:
+    """The means of a topic's copies, one for each consumer."""
+    outcomes = [asdict(copy) for copy in copies]
+    means: Row = {name: mean([outcome[name] for outcome in outcomes]) for name in _OUTCOME}
+    return {**means, "arrived": int(means["arrived"])}
+
+
+# --- the summary -----------------------------------------------------------------------------------------------------
+
+
+def _run_of(row: Mapping[str, Any]) -> Run:
+    return row["scenario"], row["capacity"], row["policy"], row["trace"], row["seed"]
+
+
+def _runs(rows: Rows) -> tuple[dict[Run, list[float]], list[float]]:
+    """The numbers of each run, and the highest priority of each scenario without repetition."""
+    groups: dict[Run, list[Mapping[str, Any]]] = {}
+    for number, row in enumerate(rows):
+        for name in ("scenario", "capacity", "policy", "trace", "seed", "topic", "weighted_qoi"):
+            if row.get(name) is None:
+                raise BufgymError(f"rows[{number}]: no {name}")
+        group = groups.setdefault(_run_of(row), [])
+        if any(other["topic"] == row["topic"] for other in group):
+            raise BufgymError(f"rows[{number}]: topic {row['topic']!r} of one run has more than one row")
+        group.append(row)
+    priorities = dict.fromkeys(max(row["priority"] for row in group) for group in groups.values())
+    return {run: _numbers(group) for run, group in groups.items()}, list(priorities)
+
+
+def _numbers(topics: Rows) -> list[float]:
+    """What ``_statistics`` takes of one run: QoI, no_drop messages lost, age of the first topics and of the others,
+    messages late, delivered with a deadline and delivered in all, seconds."""
+    highest = max(row["priority"] for row in topics)
+    with_deadline = [row for row in topics if row["deadline_s"] is not None]
+    return [
+        topics[0]["weighted_qoi"],
+        sum(row["lost"] + row["limited"] for row in topics if row["no_drop"]),
+        mean([row["mean_age_s"] for row in topics if row["priority"] == highest]),
+        mean([row["mean_age_s"] for row in topics if row["priority"] < highest]),
+        sum(row["late"] for row in with_deadline),
+        sum(row["delivered"] for row in with_deadline),
+        sum(row["delivered"] for row in topics),
+        topics[0]["seconds"],
+    ]
+
+
+def _statistics(ours: Numbers, theirs: Numbers, weights: Numbers) -> dict[str, Numbers]:
+    """See ``summary.Statistics``."""
+
+    def share(above: Numbers, below: Numbers) -> Numbers:
+        total = weights @ below
+        return ratio(weights @ above, total, total > 0)
+
+    def average(numbers: Numbers) -> Numbers:
+        known = ~np.isnan(numbers)
+        return share(np.where(known, numbers, 0.0), known.astype(np.float64))
+
+    qoi, lost, age_first, age_others, late, due, delivered, seconds = ours.T
+    return {
+        "qoi": average(qoi),
+        "relative": share(qoi, theirs.T[0]),
+        "lost": weights @ lost,
+        "age_first_s": average(age_first),
+        "age_relative": share(age_first, theirs.T[2]),
+        "age_others_s": average(age_others),
+        "late": share(late, due),
+        "rate_hz": share(delivered, seconds),
+    }
+
+
+# --- one policy, topic by topic --------------------------------------------------------------------------------------
+
+TOPIC_COLUMNS = (
+    Column("topic", "topic", str),
+    Column("priority", "priority", "{:g}".format),
+    Column("QoI", "qoi", "{:.2f}".format),
+    *(Column(name, name, "{:.1f}".format) for name in ("arrived", "limited", "lost", "delivered", "late")),
+    Column("age mean (s)", "mean_age_s", "{:.3f}".format),
+    Column("age peak (s)", "peak_age_s", "{:.3f}".format),
+    Column("delay mean (s)", "mean_sojourn_s", "{:.3f}".format),
+    Column("delay p95 (s)", "p95_sojourn_s", "{:.3f}".format),
+)
+
+
+def by_topic(rows: Rows, policy: str) -> str:
+    """The means over episodes of each topic's outcome under one policy, as aligned text, a block for each cell."""
+    cells: dict[tuple[str, int], dict[str, list[Mapping[str, Any]]]] = {}
+    for row in rows:
+        if row["policy"] == policy:
+            topics = cells.setdefault((row["scenario"], row["capacity"]), {})
+            topics.setdefault(row["topic"], []).append(row)
+    if not cells:
+        raise BufgymError(f"no row of the policy {policy!r}")
+    blocks = [
+        (
+            title(cell, {}),
+            [
+                [topic, *(written(mean([row[c.key] for row in outcomes]), c) for c in TOPIC_COLUMNS[1:])]
+                for topic, outcomes in topics.items()
+            ],
+        )
+        for cell, topics in cells.items()
+    ]
+    return in_blocks([column.title for column in TOPIC_COLUMNS], blocks)

@@ -1,0 +1,57 @@
+"""What ``bufgym tune`` chose: ``tuned.json``, from which ``bufgym bench --suite`` takes its variants of policies."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bufgym import policies
+from bufgym.errors import BufgymError, where
+from bufgym.files import replaced
+
+FILE = Path(__file__).with_name("tuned.json")
+"""{suite: {policy: {"setting", "score", "default_score", "split", "command", "bufgym", ...}}}."""
+
+
+def read() -> dict[str, dict[str, dict[str, Any]]]:
+    """What ``tuned.json`` holds; an error that names the file and the rule that it breaks."""
+    try:
+        suites = json.loads(FILE.read_text(encoding="utf-8"))
+    except UnicodeDecodeError:
+        raise BufgymError(f"{FILE}: must be UTF-8 text") from None
+    except json.JSONDecodeError as error:
+        raise BufgymError(where(FILE, error.lineno, None, f"must be JSON: {error.msg}")) from None
+    if not isinstance(suites, dict) or not all(isinstance(entries, dict) for entries in suites.values()):
+        raise BufgymError(f"{FILE}: must be a JSON object of suites, each an object of policies")
+    for suite, entries in suites.items():
+        for policy, entry in entries.items():
+            setting = entry.get("setting") if isinstance(entry, dict) else None
+            if not isinstance(setting, str) or setting.partition(":")[0] != policy:
+                rule = f"must be a setting of that policy, such as {policy}:parameter=1"
+                raise BufgymError(where(FILE, None, setting or "", rule, field=f"{suite}.{policy}.setting"))
+    return suites
+
+
+def tuned(suite: str) -> list[str]:
+    """The settings chosen for this suite that differ from the policies' defaults."""
+    settings = []
+    for policy, entry in read().get(suite, {}).items():
+        try:
+            setting, default = policies.get(entry["setting"]), policies.get(policy)
+        except BufgymError as error:
+            raise BufgymError(f"{FILE}: {suite}.{policy}: {error}") from None
+        if setting.parameters != default.parameters:
+            settings.append(setting.name)
+    return settings
+
+
+def write(suite: str, entries: Mapping[str, Mapping[str, Any]]) -> Path:
+    """Put the entries, by policy, in place of earlier ones of this suite; the file's path."""
+    suites = read() if FILE.exists() else {}
+    suites.setdefault(suite, {}).update({policy: dict(entry) for policy, entry in entries.items()})
+    # Sorted, so that the file does not depend on the order of the runs.
+    with replaced(FILE) as temporary:
+        temporary.write_text(json.dumps(suites, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    return FILE

@@ -1,0 +1,41 @@
+"""Benchmark suites: frozen, versioned sets of episodes that results are quoted on.
+
+A suite has scenarios, capacities, and episodes in three splits: ``train`` to learn from, ``validation`` to choose
+parameters by, ``test`` to report. Splits share no bandwidth trace and no motion recording (no length T, where there is
+one interruption): a policy that knows a trace by heart gains nothing elsewhere. A suite never changes; an improved one
+gets the next version.
+
+``Suite.kind`` names the task that the scenarios are for: one queue, the topics of one client, or a fleet of robots.
+Messages of one queue have equal sizes, so that the clairvoyant's bound is exact.
+"""
+
+from __future__ import annotations
+
+from bufgym.errors import BufgymError
+from bufgym.scenario.suites import recorded, shared_uplinks, synthetic
+from bufgym.scenario.suites.suite import CAPACITIES, SPLITS, Setting, Suite
+from bufgym.scenario.suites.synthetic import EPISODE_S, RATE_HZ, SIZE_BYTES, motion_value, time_value
+
+__all__ = [
+    "CAPACITIES",
+    "EPISODE_S",
+    "RATE_HZ",
+    "SIZE_BYTES",
+    "SPLITS",
+    "SUITES",
+    "Setting",
+    "Suite",
+    "get",
+    "motion_value",
+    "time_value",
+]
+
+SUITES = {suite.name: suite for suite in (*synthetic.SUITES, *recorded.SUITES, *shared_uplinks.SUITES)}
+"""Every suite by name."""
+
+
+def get(name: str) -> Suite:
+    """The suite of that name."""
+    if name not in SUITES:
+        raise BufgymError(f"unknown suite {name!r}; known: {', '.join(SUITES)}")
+    return SUITES[name]

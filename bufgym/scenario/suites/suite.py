@@ -1,0 +1,73 @@
+"""What a suite is: a name, scenarios in three splits, capacities, and a number of episodes."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bufgym.errors import BufgymError
+
+SPLITS = ("train", "validation", "test")
+
+CAPACITIES = (5, 10, 15, 20, 25)
+"""L of AFR's evaluation (Fig. 7, 8)."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One scenario of a suite, for one split."""
+
+    scenario: Any
+    """A ``Scenario``; for a suite of fleets a ``FleetScenario``."""
+    about: str
+    """What it is, in one line without a full stop."""
+    outage_s: float | None = None
+    """Length of the episode's one blackout, s; None where it has none of a known length."""
+
+
+Build = Callable[[str, Path | None], dict[str, Setting]]
+"""(split, folder of recordings or None) -> settings by label."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A named set of episodes that results are quoted on."""
+
+    name: str
+    """With its version, such as ``lte-v1``."""
+    about: str
+    """What it is, in one line without a full stop."""
+    build: Build
+    """Makes the scenarios of a split; ``settings`` calls it and remembers what it made."""
+    capacities: tuple[int, ...] = CAPACITIES
+    """L, messages; of a fleet: of each robot."""
+    seeds: int = 5
+    """Episodes on each trace."""
+    needs: str = ""
+    """What a folder of recordings must hold; empty if the suite brings all it needs."""
+    kind: str = "queue"
+    """The task that its scenarios are for: a name in ``bufgym.benchmark.tasks``."""
+
+    def settings(self, split: str, data: str | Path | None = None) -> dict[str, Setting]:
+        """The scenarios of one split by label.
+
+        Args:
+            split: one of ``SPLITS``.
+            data: the folder of recordings, for suites that need one.
+
+        Raises:
+            BufgymError: for another split, or recordings that are missing.
+        """
+        if split not in SPLITS:
+            raise BufgymError(f"split = {split!r}: must be one of {', '.join(SPLITS)}")
+        if self.needs and data is None:
+            raise BufgymError(f"suite {self.name} needs a folder of recordings (--data DIR) with {self.needs}")
+        return _built(self.build, split, None if data is None else Path(data))
+
+
+@functools.lru_cache(maxsize=16)
+def _built(build: Build, split: str, data: Path | None) -> dict[str, Setting]:
+    return build(split, data)

@@ -1,0 +1,181 @@
+"""Suites over links that are made up: LTE, generated like recordings, blackouts, steady links, one interruption."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from bufgym.model import qoi
+from bufgym.model.qoi import Value
+from bufgym.scenario.interruption import Interruption
+from bufgym.scenario.suites.suite import Setting, Suite
+from bufgym.scenario.uplink import Uplink
+from bufgym.traces import Motion, Trace, drive_motion, markov_link, synthetic_lte
+from bufgym.traces.generate.lte import LTE_MODES
+
+RATE_HZ = 30.0
+"""Messages a second of the camera."""
+SIZE_BYTES = 230_000
+"""AFR's RGB-D frames: about 200 kB of depth and a JPEG."""
+DEMAND_BYTES_PER_S = RATE_HZ * SIZE_BYTES
+EPISODE_S = 60.0
+
+
+# Checking a Value takes compiled code, which is slow to load: it is made when first asked for, not for `bufgym list`.
+
+
+@functools.cache
+def time_value() -> Value:
+    """V over frame indices, as in AFR's Fig. 5."""
+    return qoi.exponential(0.618)
+
+
+@functools.cache
+def motion_value() -> Value:
+    """V = 1 - exp(-motion), over fields of view."""
+    return qoi.exponential(math.exp(-1))
+
+
+FIRST_SEED = {"train": 1000, "validation": 2000, "test": 3000}
+"""Seeds of generated traces and motions count up from here; those of the shipped ones are 0..7."""
+
+TRACES = {"train": 24, "validation": 6, "test": 12}
+"""Links in a split; some suites have a half or a third of them for each of their scenarios."""
+
+
+def motions_of(split: str, count: int = 4) -> tuple[Motion, ...]:
+    """The drives of a split."""
+    return tuple(drive_motion(FIRST_SEED[split] + k) for k in range(count))
+
+
+def both_values(
+    traces: Sequence[Trace], motions: tuple[Motion, ...], size_bytes: int = SIZE_BYTES, suffix: str = ""
+) -> dict[str, Setting]:
+    """The same links, once with time-based and once with motion-based QoI."""
+    about = f"{RATE_HZ:g} messages/s of {size_bytes / 1000:g} kB for {EPISODE_S:g} s"
+    timed = Uplink(
+        traces=tuple(traces), rate_hz=RATE_HZ, size_bytes=size_bytes, duration_s=EPISODE_S, value=time_value()
+    )
+    return {
+        f"time{suffix}": Setting(timed, f"{about}; x is the frame index"),
+        f"motion{suffix}": Setting(
+            replace(timed, motion=motions, value=motion_value()),
+            f"{about}; x is the camera's motion, in fields of view",
+        ),
+    }
+
+
+def both_sizes(traces: Sequence[Trace], motions: tuple[Motion, ...]) -> dict[str, Setting]:
+    """Both values, once with AFR's frames and once with large ones."""
+    return both_values(traces, motions, 230_000, "-230kB") | both_values(traces, motions, 900_000, "-900kB")
+
+
+def _lte(split: str, data: Path | None) -> dict[str, Setting]:
+    """Means of 3, 5, 7 and 9 MB/s around the demand of 6.9 MB/s, in turn; modes likewise."""
+    first, modes = FIRST_SEED[split], list(LTE_MODES)
+    traces = [
+        synthetic_lte(first + k, mean_bytes_per_s=(3e6, 5e6, 7e6, 9e6)[k % 4], mode=modes[k % 3])
+        for k in range(TRACES[split])
+    ]
+    return both_values(traces, motions_of(split))
+
+
+_MOVING = ("foot", "bicycle", "bus", "tram", "train", "car")
+
+
+def _generated(split: str, data: Path | None) -> dict[str, Setting]:
+    """The settings of lte-belgium-v1 over generated links and motions; the ways of moving take turns."""
+    traces = [markov_link(_MOVING[k % 6], FIRST_SEED[split] + k) for k in range(TRACES[split])]
+    return both_sizes(traces, motions_of(split))
+
+
+OUTAGES_S = (5, 10, 20, 40, 60)
+_AROUND_S = 60
+"""Seconds of the episode outside the blackout."""
+
+
+def _outage(split: str, data: Path | None) -> dict[str, Setting]:
+    settings = {}
+    for outage_s in OUTAGES_S:
+        traces = [_blackout(FIRST_SEED[split] + k, outage_s) for k in range(TRACES[split] // 3)]
+        settings[f"outage-{outage_s}s"] = Setting(
+            Uplink(
+                traces=tuple(traces),
+                motion=motions_of(split),
+                rate_hz=RATE_HZ,
+                size_bytes=SIZE_BYTES,
+                duration_s=float(outage_s + _AROUND_S),
+                link_offset_s=(0.0, 10.0),
+                value=motion_value(),
+            ),
+            f"one blackout of {outage_s} s within {outage_s + _AROUND_S} s; x is the camera's motion",
+            float(outage_s),
+        )
+    return settings
+
+
+def _blackout(seed: int, outage_s: int) -> Trace:
+    """A good LTE link (mean 12 MB/s) of 75 s that stands still from its 30th second on for ``outage_s`` seconds."""
+    lengths_us, rates = synthetic_lte(seed, _AROUND_S + 15, mean_bytes_per_s=12e6).samples()
+    steps = [(float(us) / 1e6, float(rate)) for us, rate in zip(lengths_us, rates, strict=True)]
+    return Trace.steps([*steps[:30], (float(outage_s), 0.0), *steps[30:]], name=f"blackout-{outage_s}s-{seed}")
+
+
+SHARES = {"quarter": 0.25, "half": 0.5, "three-quarters": 0.75}
+_SHIFT = {"train": 0.0, "validation": 1 / 3, "test": 5 / 6}
+"""Shifts the rates of a split by this part of their spacing, so that no two splits share a rate."""
+
+
+def _sustained(split: str, data: Path | None) -> dict[str, Setting]:
+    """Steady links, spread evenly within 6 % of the named share of the demand."""
+    first, count = FIRST_SEED[split], TRACES[split] // 3
+    settings: dict[str, Setting] = {}
+    for label, share in SHARES.items():
+        traces = [
+            Trace.constant(
+                share * (0.94 + 0.12 * (k + _SHIFT[split]) / count) * DEMAND_BYTES_PER_S,
+                300.0,
+                name=f"steady-{label}-{first + k}",
+            )
+            for k in range(count)
+        ]
+        settings |= both_values(traces, motions_of(split), suffix=f"-{label}")
+    return settings
+
+
+def _interruption(split: str, data: Path | None) -> dict[str, Setting]:
+    """T up to 400; lengths with T mod 5 = 3 are for validation, 4 for testing, the others for training."""
+    rests = {"train": (0, 1, 2), "validation": (3,), "test": (4,)}[split]
+    lengths = tuple(T for T in range(1, 401) if T % 5 in rests)
+    values: dict[str, Value] = {
+        "exponential-0.618": time_value(),
+        "exponential-0.9": qoi.exponential(0.9),
+        "saturating-8": qoi.saturating(8),
+    }
+    return {
+        label: Setting(
+            Interruption(lengths=lengths, value=v),
+            f"one interruption of T messages, T log-uniform on 1..400 with T mod 5 in {rests}; V = {v.name}",
+        )
+        for label, v in values.items()
+    }
+
+
+LTE = Suite("lte-v1", "30 Hz camera over synthetic LTE links", _lte)
+
+SUITES = (
+    Suite(
+        "interruption-v1",
+        "one interruption of unknown length (AFR paper, Sec. III-B)",
+        _interruption,
+        capacities=(4, 5, 8, 10, 15, 16, 20, 25, 32),
+        seeds=200,
+    ),
+    LTE,
+    Suite("outage-v1", "one blackout of 5 to 60 s on a good link", _outage),
+    Suite("sustained-v1", "steady links of a quarter, half and three quarters of the demand", _sustained),
+    Suite("generated-v1", "30 Hz camera over links generated like recordings of six ways of moving", _generated),
+)
