@@ -23,7 +23,7 @@ from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, check_window
 from bufgym.scenario.checks import as_tuple, check_stream, check_value, positive, recordings
-from bufgym.scenario.draws import place, scaled, sizes
+from bufgym.scenario.draws import place, place_link, scaled, sizes
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace
 
@@ -153,11 +153,10 @@ class Client:
         arrivals["seq"] = np.arange(len(times))
         arrivals["arrival_us"] = times[order] - times[order[0]]
         arrivals["topic"], arrivals["size_bytes"], arrivals["x"] = numbers[order], sizes_bytes[order], xs[order]
-        trace = self._links[int(streams.link.integers(len(self._links)))]
-        offset = int(streams.link.integers(trace.duration_us)) if self.random_offset else 0
+        trace, offset_us = place_link(self._links, streams.link, self.random_offset)
         return Episode(
             arrivals,
-            Link(trace, offset, int(self.propagation_us)),
+            Link(trace, offset_us, int(self.propagation_us)),
             window=self.window,
             ack_delay_us=self.ack_delay_us,
             encodings={name: self._encoded_bytes(arrivals, name) for name in ENCODINGS},

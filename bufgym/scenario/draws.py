@@ -18,6 +18,17 @@ def place(recordings: tuple[Motion, ...], rng: np.random.Generator, random_offse
     return motion, int(rng.integers(motion.time_us[-1])) if random_offset else 0
 
 
+def place_link(
+    links: tuple[Trace, ...], rng: np.random.Generator, random_offset: bool, within_s: tuple[float, float] | None = None
+) -> tuple[Trace, int]:
+    """(one of the links, where on it an episode begins, us); ``within_s``: from..to, None for anywhere."""
+    trace = links[int(rng.integers(len(links)))]
+    if not random_offset:
+        return trace, 0
+    first, last = within_s or (0.0, trace.duration_us / 1e6)
+    return trace, int(rng.integers(round(first * 1e6), max(round(last * 1e6), 1 + round(first * 1e6))))
+
+
 def sizes(n: int, mean_bytes: int, cv: float, rng: np.random.Generator) -> NDArray[np.int64]:
     """int64[n] bytes: log-normal with that mean and coefficient of variation, at least 1; all equal for ``cv`` 0."""
     if not cv:

@@ -17,7 +17,7 @@ from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.checks import as_tuple, check_stream, check_value, positive, recordings
-from bufgym.scenario.draws import place, scaled, shipped, sizes
+from bufgym.scenario.draws import place, place_link, scaled, shipped, sizes
 from bufgym.scenario.episode import Episode, Streams, unchecked_messages
 from bufgym.traces import Motion, Trace
 from bufgym.traces.workload import Workload
@@ -101,12 +101,8 @@ class Uplink:
         """One episode."""
         arrivals = self._stream(streams.arrival) if self.workload is None else _replayed(self.workload)
         self.move(arrivals, streams.arrival)
-        trace = self._links[int(streams.link.integers(len(self._links)))]
-        offset = 0
-        if self.random_offset:
-            first, last = self.link_offset_s or (0.0, trace.duration_us / 1e6)
-            offset = int(streams.link.integers(round(first * 1e6), max(round(last * 1e6), 1 + round(first * 1e6))))
-        return Episode(arrivals, Link(trace, offset, int(self.propagation_us)))
+        trace, offset_us = place_link(self._links, streams.link, self.random_offset, self.link_offset_s)
+        return Episode(arrivals, Link(trace, offset_us, int(self.propagation_us)))
 
     def move(self, arrivals: NDArray[Any], rng: np.random.Generator) -> None:
         """Give these messages the x of one of the recordings, if there are any, from a place drawn at random."""
