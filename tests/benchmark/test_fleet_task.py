@@ -177,7 +177,7 @@ def test_rows_that_cannot_be_summed_up(rows: list[Row], message: str) -> None:
 def test_the_table_as_text() -> None:
     more = [*made("afr", (1.0,), (1.0,), capacity=9), *made("mine", (4.0,), (4.0,), capacity=9)]
     lines = plain(summary([*HAND, *[{**row, "scenario": "z"} for row in more]]), {"s": "a story"}).splitlines()
-    assert lines[0].split("  ")[0] == "policy" and "- afr's" in lines[0]
+    assert lines[0].split("  ")[0] == "policy" and "gain over afr" in lines[0]
     assert lines[2] == "s: a story, L = 4" and lines[6] == "z, L = 9" and lines[10] == "mean of these 2"
     assert lines[3].split()[:4] == ["mine", "6.000", "+1.000", "[+1.000,"]
     assert lines[3].split()[5:] == ["50.0", "%", "[50.0,", "50.0]", "25.0", "%", "4.500", "0.8200"]

@@ -78,8 +78,8 @@ def ranking(context: Context) -> Chart | None:
     else:
         shown = quantities["score"], quantities["improvement"]
         panels = [
-            _dots(context, shown[0], "0 = Drop Oldest, 1 = clairvoyant", (0, 1), (-1.0, 1.05, 2.1), quantities["iqm"]),
-            _dots(context, shown[1], "", (0.5,), (-1.0, 1.0, 2.0)),
+            _dots(context, shown[0], (0, 1), (-1.0, 1.05, 2.1), quantities["iqm"]),
+            _dots(context, shown[1], (0.5,), (-1.0, 1.0, 2.0)),
         ]
         panels = [panel for panel, quantity in zip(panels, shown, strict=True) if _known(summary, quantity)]
     if not _known(summary, quantities[summary.rank_by]):
@@ -99,7 +99,7 @@ def _summary_panels(context: Context) -> list[Figure]:
         near = [value for value in values if low - spread <= value <= high + spread] or [0.0]
         base = context.summary.standings[context.summary.baseline][quantity.key].value
         limits = float(low - spread), max(near), float(high + spread)
-        figures.append(_dots(context, quantity, "", (base,), limits, start=min(near)))
+        figures.append(_dots(context, quantity, (base,), limits, start=min(near)))
     return figures
 
 
@@ -111,7 +111,6 @@ def _known(summary: Summary, quantity: Quantity) -> list[Standing]:
 def _dots(
     context: Context,
     quantity: Quantity,
-    about: str,
     lines: Sequence[float],
     limits: tuple[float, float, float],
     second: Quantity | None = None,
@@ -147,7 +146,7 @@ def _dots(
             hover = f"<b>%{{y}}</b><br>{second.title} {with_interval(s[second.key], second.write)}"
             marker = {"color": colour, "size": 8, "symbol": "line-ns-open", "line": {"width": 1.5}}
             data.append(style.scatter([s[second.key].value], [name], hover, marker=marker))
-    axis = style.axis(f"{quantity.title} ({about})" if about else quantity.title, range=[low, high], nticks=7)
+    axis = style.axis(quantity.title, range=[low, high], nticks=7)
     if quantity.write is percent:
         axis["tickformat"] = ".0%"
     layout = style.lanes([s.policy for s in reversed(shown)], xaxis=axis, annotations=notes)
@@ -238,7 +237,8 @@ def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]
     across["range"] = [math.log10(ticks[0]) - 0.03, math.log10(ticks[-1]) + 0.03]
     layout = style.layout(430, xaxis=across, yaxis=style.log_axis("regret", low, high, style.short_percent))
     layout["annotations"] = _end_labels(context, curves, (low, high), 370)
-    layout["margin"] = {**layout["margin"], "r": 120}
+    longest = max([len(policy) for policy in curves if policy in context.colours], default=0)
+    layout["margin"] = {**layout["margin"], "r": max(120, 7 * longest + 12)}
     return {"data": data, "layout": layout}
 
 

@@ -40,7 +40,7 @@ def html(run: Run, summary: Summary) -> str:
         environment.get_template(f"{template}.html.jinja").render(
             manifest=run.manifest,
             summary=summary,
-            intro=[run.manifest["about"]] if summary.scores else tables.intro(run)[1:],
+            intro=[run.manifest["about"], *tables.intro(run)[1:]],
             rows=len(run.rows),
             episodes=len({(row["scenario"], row["trace"], row["seed"]) for row in run.rows}),
             scenarios=len({scenario for scenario, _ in cells}),

@@ -25,7 +25,9 @@ MUTED = "var(--muted)"
 
 def colours(ranked: Sequence[str], baseline: str) -> dict[str, str]:
     """A colour for each policy that stands out: fixed ones, the baseline, the best of ``ranked`` (best first)."""
-    fixed = {baseline: FIXED["drop-oldest"], **FIXED}
+    fixed = dict(FIXED)
+    if baseline not in fixed:
+        fixed[baseline] = fixed.pop("drop-oldest")
     others = [name for name in ranked if name not in fixed]
     return {**fixed, **dict(zip(others, SPARE, strict=False))}
 

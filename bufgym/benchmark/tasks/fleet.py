@@ -89,7 +89,7 @@ class FleetTask(Task):
         jain = "Jain's index of the robots' H, (sum H)^2 / (N sum H^2): 1 if all are equal, 1/N if one has everything"
         return (
             Quantity("team", "team QoI", score, "mean over the robots of H, mean over episodes", interval=False),
-            Quantity("gain", f"- {baseline}'s", gained, f"team QoI minus that of {baseline}", versus=baseline),
+            Quantity("gain", f"gain over {baseline}", gained, f"team QoI minus that of {baseline}", versus=baseline),
             Quantity(
                 "above", f"robots above {baseline}'s", percent, f"robots whose H is above {same}", versus=baseline
             ),

@@ -96,6 +96,9 @@ class TopicsTask(Task):
         def one_digit(number: float) -> str:
             return decimal(number, 1)
 
+        def messages(number: float) -> str:
+            return f"{round(number, 1):g}"
+
         paired = "sum over sum, on the episodes that both met"
         first_age = "mean age of information at the server of the topics with the highest priority, s"
         others_age = "mean age of information of all other topics, s"
@@ -105,7 +108,7 @@ class TopicsTask(Task):
         return (
             Quantity("qoi", "QoI", one_digit, "sum over topics of weight x H, mean over episodes", interval=False),
             Quantity("relative", f"QoI / {baseline}", score, f"QoI over that of {baseline}: {paired}"),
-            Quantity("lost", "no_drop lost", "{:g}".format, lost, interval=False, total=True),
+            Quantity("lost", "no_drop lost", messages, lost, interval=False, total=True),
             Quantity("age_first_s", f"age, {first} (s)", seconds, first_age, interval=False),
             Quantity("age_relative", f"age / {baseline}", score, f"that age over the one under {baseline}: {paired}"),
             Quantity("age_others_s", "age, others (s)", seconds, others_age),
