@@ -22,13 +22,13 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bufgym.sb3.networks import IgnoresMasks, SlotFeatures, SlotScorer
+from bufgym.sb3.networks import IgnoresMasks, SlotExtractor, SlotScorer
 
-IMPOSSIBLE = -1e9
+INVALID = -1e9
 """The value of an impossible action."""
 
 
-def possible(observation: Any) -> Tensor:
+def valid_actions(observation: Any) -> Tensor:
     """bool[n, L + 2]: evict where a slot holds a message, reject always, accept where there is room for one more."""
     held, room = (torch.as_tensor(observation[name]) for name in ("occupied", "occupancy"))
     return torch.cat([held > 0, room < 1], dim=1)
@@ -37,7 +37,7 @@ def possible(observation: Any) -> Tensor:
 class SlotQ(nn.Module):
     """Q of all L + 2 actions from a ``SlotScorer``'s two outputs."""
 
-    def __init__(self, features: SlotFeatures, width: int) -> None:
+    def __init__(self, features: SlotExtractor, width: int) -> None:
         super().__init__()
         self.scorer = SlotScorer(features, width, accept_bias=0.0)
         self.state = nn.Linear(width, 1)
@@ -49,11 +49,11 @@ class SlotQ(nn.Module):
 
 
 class MaskedQNetwork(QNetwork):
-    """Q of every action, ``IMPOSSIBLE`` for those that are."""
+    """Q of every action, ``INVALID`` for those that are."""
 
     def forward(self, obs: Any) -> Tensor:
         q = super().forward(obs)
-        return torch.where(possible(obs), q, IMPOSSIBLE)
+        return torch.where(valid_actions(obs), q, INVALID)
 
 
 class MaskedDQNPolicy(DQNPolicy):
@@ -61,12 +61,12 @@ class MaskedDQNPolicy(DQNPolicy):
 
     def __init__(self, *args: Any, width: int = 32, **kwargs: Any) -> None:
         self.width = width
-        kwargs.setdefault("features_extractor_class", SlotFeatures if width else CombinedExtractor)
+        kwargs.setdefault("features_extractor_class", SlotExtractor if width else CombinedExtractor)
         super().__init__(*args, **kwargs)
 
     def make_q_net(self) -> QNetwork:
         net = MaskedQNetwork(**self._update_features_extractor(self.net_args, features_extractor=None))
-        if isinstance(net.features_extractor, SlotFeatures):
+        if isinstance(net.features_extractor, SlotExtractor):
             net.q_net = SlotQ(net.features_extractor, self.width)  # type: ignore[assignment]
         return net.to(self.device)
 
@@ -90,7 +90,7 @@ class MaskedDQN(IgnoresMasks, DQN):
     ) -> tuple[NDArray[Any], NDArray[Any]]:
         """Every environment explores on its own: a possible action at random, all equally likely."""
         actions, _ = self.policy.predict(self._last_obs, deterministic=True)
-        can = possible(self._last_obs).numpy()
+        can = valid_actions(self._last_obs).numpy()
         anything = (np.random.random(can.shape) * can).argmax(axis=1)
         actions = np.where(np.random.random(n_envs) < self.exploration_rate, anything, actions)
         return actions, actions

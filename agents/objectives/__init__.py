@@ -1,0 +1,17 @@
+"""What evolution searches for, one module a kind of task: one queue, many topics, a fleet."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from agents.objectives.fleet import FleetObjective
+from agents.objectives.objective import Objective
+from agents.objectives.queue import QueueObjective
+from agents.objectives.topics import TopicsObjective
+
+OBJECTIVES: dict[str, type[Objective[Any]]] = {
+    "queue": QueueObjective,
+    "topics": TopicsObjective,
+    "fleet": FleetObjective,
+}
+"""``Settings.kind`` -> its objective."""
