@@ -18,7 +18,7 @@ from agents.evaluation import EvaluationSet, plan_for, play
 from agents.held_out import held_out_episodes, run_fixed, split_scenario, summarise
 from agents.mixed_env import Cell, MixedEnv
 from agents.objectives import fleet, topics
-from agents.runs import Run
+from agents.runs import Run, write_notes
 from agents.settings import Settings
 from agents.training import load, test_rows
 from bufgym.benchmark import fleets_summary, topics_summary
@@ -42,24 +42,30 @@ COLUMNS = (
 
 
 def report(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
-    """Evaluate the agents of all seeds; print and save the results, and keep the best agent."""
+    """Evaluate the agents of all seeds; print and save the results, and keep the best agent with its notes."""
     # Chosen by validation or training episodes: choosing by the reported ones would flatter it.
     best = max(runs, key=lambda run: run.merit)
     shutil.copyfile(best.model, folder / best.model.name)
-    seconds = ", ".join(f"{run.seconds:.0f}" for run in runs)
+    seeds, notes = [best.seed], {}
+    contents = "model, rows, figure and numbers"
     if settings.kind in ("topics", "fleet"):
+        seeds = [run.seed for run in runs]
         report_rows(settings, folder, runs)
         contents = f"best on validation: seed {best.seed}; model and rows"
-    elif settings.kind == "queue":
-        several = len(settings.suites) > 1
-        for suite in settings.suites:
-            if several:
-                print(f"\n{suite}")
-            report_suite(settings, suite, folder, folder / suite if several else folder, runs, best)
-        contents = "model, rows, figure and numbers"
-    else:
-        report_environment(settings, folder, runs, best)
+    elif settings.kind == "environment":
+        notes = report_environment(settings, folder, runs, best)
         contents = "model, figure and numbers"
+    elif len(settings.suites) == 1:
+        notes = report_suite(settings, settings.suite, folder, folder, runs, best)[0]
+    else:
+        seeds = [run.seed for run in runs]
+        for suite in settings.suites:
+            print(f"\n{suite}")
+            score = report_suite(settings, suite, folder, folder / suite, runs, best)[1]
+            if math.isfinite(score.value):
+                notes[suite] = {"score": score.value, "interval": [score.low, score.high]}
+    write_notes(folder, settings, seeds, notes)
+    seconds = ", ".join(f"{run.seconds:.0f}" for run in runs)
     print(f"\ntraining took {seconds} s; {contents} are in {folder}")
 
 
@@ -68,8 +74,8 @@ def agent_name(run: Run) -> str:
     return f"agent (seed {run.seed})"
 
 
-def _save(home: Path, settings: Settings, runs: Sequence[Run], best: Run, **results: Any) -> None:
-    """Write results.json."""
+def _save(home: Path, settings: Settings, runs: Sequence[Run], best: Run, **results: Any) -> dict[str, Any]:
+    """Write results.json; the best agent's QoI, for its notes."""
     content = {
         "settings": dataclasses.asdict(settings),
         "seeds": [run.seed for run in runs],
@@ -78,6 +84,8 @@ def _save(home: Path, settings: Settings, runs: Sequence[Run], best: Run, **resu
         **results,
     }
     (home / "results.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    qoi = {row["policy"]: row["qoi"] for row in results["scores"]}
+    return {"qoi": qoi[agent_name(best)], "drop-oldest": qoi["drop-oldest"], "held_out": results["held_out"]}
 
 
 # --- on many topics, or with many robots -----------------------------------------------------------------------------
@@ -100,8 +108,8 @@ def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
 # --- on one environment ----------------------------------------------------------------------------------------------
 
 
-def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], best: Run) -> None:
-    """All agents and fixed policies on the held-out episodes."""
+def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], best: Run) -> dict[str, Any]:
+    """All agents and fixed policies on the held-out episodes; the best agent's notes."""
     scenario = split_scenario(settings)[1]
     episodes = held_out_episodes(scenario, settings.episodes)
     outcomes = run_fixed(episodes, scenario, settings.capacity)
@@ -112,11 +120,13 @@ def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], be
     rows = summarise(outcomes, agent_name(best))
     print(table(rows, agent_name(best)))
     traces = [trace.name for trace in getattr(scenario, "traces", ())]
-    _save(folder, settings, runs, best, held_out={"episodes": len(episodes), "traces": traces}, scores=rows)
+    held_out = {"episodes": len(episodes), "traces": traces}
+    notes = _save(folder, settings, runs, best, held_out=held_out, scores=rows)
     measure = "QoI H, mean of the latest training episodes"
     qoi = {row["policy"]: row["qoi"] for row in rows}
     curves = [np.array(run.curve).reshape(-1, 3)[:, [0, 2]] for run in runs]
     draw(folder / "figure.png", runs, curves, measure, qoi, "QoI H, mean", "Held-out episodes")
+    return notes
 
 
 def table(rows: Sequence[dict[str, Any]], agent: str) -> str:
@@ -134,11 +144,16 @@ def table(rows: Sequence[dict[str, Any]], agent: str) -> str:
 # --- on a suite ------------------------------------------------------------------------------------------------------
 
 
-def report_suite(settings: Settings, suite: str, folder: Path, home: Path, runs: Sequence[Run], best: Run) -> Scores:
+def report_suite(
+    settings: Settings, suite: str, folder: Path, home: Path, runs: Sequence[Run], best: Run
+) -> tuple[dict[str, Any], Interval]:
     """All agents and fixed policies on the suite's test split, scored as ``bufgym bench`` does.
 
     The training seeds together are one entry, with intervals over them and over episodes. Nothing is chosen here: each
     seed's agent, and the one in the run's folder, are those that did best on validation.
+
+    Returns:
+        (the best agent's notes, the score of the agents together).
     """
     specs = tuple(registry.names(for_topics=False))
     plan = plan_for(settings, suite, "test", specs, settings.test_seeds or None)
@@ -155,7 +170,7 @@ def report_suite(settings: Settings, suite: str, folder: Path, home: Path, runs:
         qoi.setdefault(row["policy"], []).append(row["qoi"])
     qoi |= {name: [row["qoi"] for row in own] for name, own in agents.items()}
     means = {name: float(np.mean(numbers)) for name, numbers in qoi.items()}
-    _save(
+    notes = _save(
         home,
         settings,
         runs,
@@ -175,7 +190,7 @@ def report_suite(settings: Settings, suite: str, folder: Path, home: Path, runs:
     curves = [np.array(run.validation)[:, [0, -1]] for run in runs]
     measure = f"regret over {rival}, on validation"
     draw(home / "figure.png", runs, curves, measure, bars, "normalised score", "Test split")
-    return result
+    return notes, next(s.score for s in result.standings if s.policy == f"agent ({settings.algo})")
 
 
 def standings(result: Scores) -> str:

@@ -9,7 +9,7 @@ import json
 import multiprocessing
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,6 +92,16 @@ def prepare(settings: Settings) -> Path:
     return folder
 
 
+def write_notes(
+    folder: Path, settings: Settings, seeds: Sequence[int], scores: Mapping[str, Any] | None = None
+) -> None:
+    """Write what ``bufgym export`` says of the model in this folder: notes.json."""
+    notes: dict[str, Any] = {"training": settings.command, "seeds": list(seeds)}
+    if scores:
+        notes["scores"] = scores
+    (folder / "notes.json").write_text(json.dumps(notes, indent=2) + "\n", encoding="utf-8")
+
+
 def read_settings(folder: Path) -> dict[str, Any]:
     """The settings of the run in ``folder``, and its command."""
     file = folder / "settings.json"
@@ -111,6 +121,9 @@ def _default_name(resume: bool) -> str:
 def each_seed(train: Callable[[Settings, Path, int, int], Run], settings: Settings, folder: Path) -> list[Run]:
     """``train`` (settings, the run's folder, seed, line of its progress bar) for every seed, a process each."""
     seeds = range(settings.seed, settings.seed + settings.seeds)
+    for seed in seeds:
+        (folder / f"seed-{seed}").mkdir(exist_ok=True)
+        write_notes(folder / f"seed-{seed}", settings, [seed])
     if len(seeds) == 1:
         return [train(settings, folder, seeds[0], 0)]
     workers = min(len(seeds), os.cpu_count() or 1)

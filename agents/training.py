@@ -18,6 +18,7 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from agents import cma_es
 from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
@@ -113,7 +114,7 @@ def padded_slots_of(settings: Settings) -> int:
     return max(L for suite in settings.suites for L in settings.capacities_of(suite))
 
 
-def training_env(settings: Settings) -> GymVecEnv:
+def training_env(settings: Settings) -> VecEnv:
     """The batch of environments to train on: of one scenario, of whole train splits, or of robots as rows."""
     if settings.kind == "fleet":
         # Each robot is paid for its own information, at the middle capacity: scoring slots, it serves the others too.
@@ -153,7 +154,7 @@ class UnmaskedPPO(IgnoresMasks, PPO):
     """PPO without masks: an invalid action does what a queue does, and the agent has to find out."""
 
 
-def new_ppo(settings: Settings, env: GymVecEnv) -> MaskablePPO | PPO:
+def new_ppo(settings: Settings, env: VecEnv) -> MaskablePPO | PPO:
     """An untrained actor and critic."""
     masked = settings.algo == "maskable-ppo"
     policy, policy_settings = policy_of(settings.network, settings.width, masked)
@@ -188,7 +189,7 @@ REPLAY = 100_000
 """Decisions in DQN's replay; at 32 slots they take about 250 MB."""
 
 
-def new_dqn(settings: Settings, env: GymVecEnv) -> MaskedDQN:
+def new_dqn(settings: Settings, env: VecEnv) -> MaskedDQN:
     """An untrained Q network. It sees each decision as often as PPO (``epochs`` times), in smaller batches and steps.
 
     Little is explored: a message dropped at random is missing for the rest of the episode.
@@ -215,7 +216,7 @@ def new_dqn(settings: Settings, env: GymVecEnv) -> MaskedDQN:
     )
 
 
-LEARNERS: dict[str, tuple[Any, Callable[[Settings, GymVecEnv], Any]]] = {
+LEARNERS: dict[str, tuple[Any, Callable[[Settings, VecEnv], Any]]] = {
     "maskable-ppo": (MaskablePPO, new_ppo),
     "ppo": (UnmaskedPPO, new_ppo),
     "dqn": (MaskedDQN, new_dqn),

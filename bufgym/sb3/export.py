@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -129,44 +128,12 @@ def topics_qoi(policy: Policy) -> dict[str, float]:
 
 
 def run_notes(model: Path) -> dict[str, Any]:
-    """What the run of train.py says in its folder: command, seeds, and scores if it was evaluated; {} elsewhere."""
-    folder = model.parent if (model.parent / "settings.json").is_file() else model.parent.parent
-    if not (folder / "settings.json").is_file():
+    """What train.py noted beside the model (``notes.json``): command, seeds and scores; {} elsewhere."""
+    path = model.with_name("notes.json")
+    if not path.is_file():
         return {}
-    settings = _json(folder / "settings.json")
-    own = model.parent.name.removeprefix("seed-")
-    seeds = [int(own)] if own.isdigit() else [settings["seed"] + i for i in range(settings["seeds"])]
-    notes: dict[str, Any] = {"training": settings["command"], "seeds": seeds}
-    if folder != model.parent:
-        return notes
-    if scores := _suite_scores(folder, settings):
-        notes["scores"] = scores
-    if (folder / "results.json").is_file():
-        results = _json(folder / "results.json")
-        qoi = {row["policy"]: row["qoi"] for row in results["scores"]}
-        agent = results["agent"]
-        notes["seeds"] = [int(agent.removeprefix("agent (seed ").removesuffix(")"))]
-        notes["scores"] = {"qoi": qoi[agent], "drop-oldest": qoi["drop-oldest"], "held_out": results["held_out"]}
-    return notes
-
-
-def _suite_scores(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    """Of a run on several suites: each one's score with its interval over episodes and all training seeds."""
-    scores = {}
-    for suite in filter(None, settings["suite"].split(",")):
-        path = folder / suite / "results.json"
-        if not path.is_file():
-            continue
-        standings = _json(path)["standings"]
-        value, low, high = next(s for s in standings if s["policy"] == f"agent ({settings['algo']})")["score"]
-        if math.isfinite(value):
-            scores[suite] = {"score": value, "interval": [low, high]}
-    return scores
-
-
-def _json(path: Path) -> dict[str, Any]:
     try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        notes: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise BufgymError(f"{path}: cannot be read: {error}") from None
-    return content
+    return notes
