@@ -1,6 +1,6 @@
 """Evolution: a scorer's weights by CMA-ES over whole episodes, rolled out in compiled code.
 
-PPO learns from decisions one by one and pays for its updates; here a candidate is a vector of weights, and its fitness
+PPO learns from single decisions by costly updates; here a candidate is a vector of weights, and its fitness
 that of whole episodes (``objectives``). A rollout decides two million times a second, so a few minutes suffice. All
 candidates of a generation meet the same episodes, so that only what they decide tells them apart (common random
 numbers); the next generation meets others, and validation episodes say which mean to keep. The optimiser is pycma

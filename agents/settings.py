@@ -1,11 +1,11 @@
-"""What ``train.py`` can be told: the settings of a training run, and the rules that they keep."""
+"""The settings of a training run, which are the options of ``train.py``, and the rules they must keep."""
 
 from __future__ import annotations
 
 import math
 import shlex
-from dataclasses import asdict, dataclass, fields
-from typing import Literal, NoReturn, get_args, get_type_hints
+from dataclasses import asdict, dataclass
+from typing import Annotated, Literal, NamedTuple, NoReturn, get_args, get_origin, get_type_hints
 
 from bufgym import ENVIRONMENTS
 from bufgym.errors import BufgymError
@@ -27,20 +27,33 @@ SEES = {"time": TIME, "motion": MOTION}
 Kind = Literal["environment", "queue", "topics", "fleet"]
 """What a run trains on: one environment, suites of one queue, a suite of many topics, or one of many robots."""
 
-_INFINITY = math.inf
-_LEAST_1 = "seeds steps capacity size_bytes width num_envs n_steps epochs checkpoint_every validate_every"
-_RANGES: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(_LEAST_1.split(), (1, _INFINITY)),
-    **dict.fromkeys(("validation_episodes", "episodes"), (1, _INFINITY)),
-    **dict.fromkeys(("warm_up", "entropy"), (0, _INFINITY)),
-    **dict.fromkeys(("hidden", "still_hidden"), (0, MAX_WIDTH)),
-    **dict.fromkeys(("gamma", "gae_lambda"), (0, 1)),
-    "batch_size": (2, _INFINITY),
-    "seed": (0, 2**31 - 1),
-    "test_seeds": (0, 1000),
-}
-"""Setting -> the smallest and the largest value it may have."""
-_POSITIVE = ("duration_s", "learning_rate")
+_ALONE = {"topics": ("a scheduler", ("evolution",)), "fleet": ("a fleet's agent", ("evolution", "maskable-ppo"))}
+"""Kinds that are trained on one suite alone: what is trained, and by which algorithms."""
+
+
+class Range(NamedTuple):
+    """The numbers that a setting may be: from ``low`` to ``high``, and above 0 where ``positive``."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    positive: bool = False
+
+    def rule(self, value: float) -> str:
+        """The rule that a value breaks; empty if it breaks none."""
+        if not math.isfinite(value):
+            return "must be a finite number"
+        if self.positive and value <= 0:
+            return "must be > 0"
+        if self.low <= value <= self.high:
+            return ""
+        return f"must be >= {self.low}" if math.isinf(self.high) else f"must lie in {self.low}..{self.high}"
+
+
+Count = Annotated[int, Range(1)]
+Number = Annotated[int, Range(0)]
+Units = Annotated[int, Range(0, MAX_WIDTH)]
+Share = Annotated[float, Range(0, 1)]
+Positive = Annotated[float, Range(positive=True)]
 
 
 @dataclass(frozen=True)
@@ -64,58 +77,58 @@ class Settings:
     """What an evolved agent sees: odometry as well, or the clock alone."""
     fields: str = ""
     """Fields that an evolved agent reads, such as rank,motion_merged,stalled; by default those of --sees."""
-    hidden: int = 0
+    hidden: Units = 0
     """Hidden units of an evolved agent; with none, its scores are linear in what the context makes of the slots."""
-    still_hidden: int = 6
+    still_hidden: Units = 6
     """The same for its scorer of links that stand still (``warm_up``)."""
     name: str = ""
     """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
     resume: bool = False
     """Go on from the run's last checkpoint."""
-    seeds: int = 1
+    seeds: Count = 1
     """Train this many agents, each in a process of its own."""
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """The first seed."""
-    steps: int = 1_500_000
+    steps: Count = 1_500_000
     """Decisions to learn from, for each seed."""
-    capacity: int = 8
+    capacity: Count = 8
     """L, messages (without a suite)."""
-    size_bytes: int = 500_000
+    size_bytes: Count = 500_000
     """Mean message size (uplink only); 500 kB at 30 Hz is 1.5 times what the shipped traces carry."""
-    duration_s: float = 30.0
+    duration_s: Positive = 30.0
     """Length of an episode (uplink only)."""
     decide_at: Literal["overflow", "arrival"] = "overflow"
     """When the agent is asked: only when the buffer is full, or at every arrival."""
     reward: Literal["retained", "delivered"] = "retained"
     network: Literal["slots", "plain"] = "slots"
     """One small network for every slot, or one over all numbers at once."""
-    width: int = 32
+    width: Count = 32
     """Hidden units a layer."""
-    num_envs: int = 256
-    n_steps: int = 128
+    num_envs: Count = 256
+    n_steps: Count = 128
     """Steps in each environment between updates."""
-    batch_size: int = 4096
-    epochs: int = 4
+    batch_size: Annotated[int, Range(2)] = 4096
+    epochs: Count = 4
     """Passes over each batch of experience."""
-    learning_rate: float = 2e-3
+    learning_rate: Positive = 2e-3
     """At the start; falls linearly to 0."""
-    gamma: float = 0.9
+    gamma: Share = 0.9
     """``retained`` pays at once what a decision costs, so a short sight suffices and keeps the noise of motion out."""
-    gae_lambda: float = 0.9
-    entropy: float = 0.0
+    gae_lambda: Share = 0.9
+    entropy: Annotated[float, Range(0)] = 0.0
     """Weight of the entropy bonus."""
-    warm_up: int = 0
+    warm_up: Number = 0
     """Decisions for which evolution first learns a scorer of its own for links that stand still, from interruptions
     alone (their mean over T is exact and cheap); afterwards the one for all other links, from the other suites."""
-    checkpoint_every: int = 250_000
+    checkpoint_every: Count = 250_000
     """Steps."""
-    validate_every: int = 250_000
+    validate_every: Count = 250_000
     """Steps (with a suite)."""
-    validation_episodes: int = 300
+    validation_episodes: Count = 300
     """About so many in each validation, over all scenarios and capacities."""
-    test_seeds: int = 0
+    test_seeds: Annotated[int, Range(0, 1000)] = 0
     """Test episodes on each trace of a suite; 0: as many as the suite says."""
-    episodes: int = 200
+    episodes: Count = 200
     """Held-out episodes in the evaluation (without a suite)."""
 
     @property
@@ -162,37 +175,28 @@ class Settings:
 
     def checked(self) -> Settings:
         """These settings, or a BufgymError that names the first one that breaks a rule, and the rule."""
-        hints = get_type_hints(Settings)
-        for setting in fields(self):
-            value, choices = getattr(self, setting.name), get_args(hints[setting.name])
-            low, high = _RANGES.get(setting.name, (-_INFINITY, _INFINITY))
-            if choices and value not in choices:
-                self._refuse(setting.name, f"must be one of {', '.join(choices)}")
-            if isinstance(value, float) and not math.isfinite(value):
-                self._refuse(setting.name, "must be a finite number")
-            if isinstance(value, int | float) and not low <= value <= high:
-                self._refuse(setting.name, f"must be >= {low}" if high == _INFINITY else f"must lie in {low}..{high}")
-            if setting.name in _POSITIVE and value <= 0:
-                self._refuse(setting.name, "must be > 0")
-        if self.kind == "environment":
-            if self.env not in ENVIRONMENTS:
-                self._refuse("env", f"must be one of {', '.join(ENVIRONMENTS)}")
-            if self.algo == "evolution":
-                raise BufgymError("--algo evolution learns from a suite's episodes: name one (--suite)")
-        elif self.kind == "topics":
-            if len(self.suites) > 1 or self.algo != "evolution":
-                suite = next(suite for suite in self.suites if suite in TOPIC_SUITES)
-                raise BufgymError(f"suite {suite}: a scheduler learns from one suite alone, by --algo evolution")
-        elif self.kind == "fleet":
-            if len(self.suites) > 1 or self.algo not in ("evolution", "maskable-ppo"):
-                suite = next(suite for suite in self.suites if suite in FLEET_SUITES)
-                message = "a fleet's agent learns from one suite alone, by evolution or maskable-ppo"
-                raise BufgymError(f"suite {suite}: {message}")
-            if self.algo == "maskable-ppo" and self.network != "slots":
+        for name, hint in get_type_hints(Settings, include_extras=True).items():
+            value = getattr(self, name)
+            for part in getattr(hint, "__metadata__", ()):
+                if broken := part.rule(value):
+                    self._refuse(name, broken)
+            if get_origin(hint) is Literal and value not in get_args(hint):
+                self._refuse(name, f"must be one of {', '.join(get_args(hint))}")
+        if self.kind == "environment" and self.env not in ENVIRONMENTS:
+            self._refuse("env", f"must be one of {', '.join(ENVIRONMENTS)}")
+        if self.kind == "environment" and self.algo == "evolution":
+            raise BufgymError("--algo evolution learns from a suite's episodes: name one (--suite)")
+        if self.kind in _ALONE:
+            agent, algorithms = _ALONE[self.kind]
+            if len(self.suites) > 1 or self.algo not in algorithms:
+                rule = f"{agent} learns from one suite alone, by --algo {' or '.join(algorithms)}"
+                raise BufgymError(f"suite {self.suite}: {rule}")
+        if self.kind == "fleet" and self.algo == "maskable-ppo":
+            if self.network != "slots":
                 self._refuse("network", "a fleet's agent scores slots")
-            if self.algo == "maskable-ppo" and self.width > MAX_WIDTH:
+            if self.width > MAX_WIDTH:
                 self._refuse("width", f"a fleet's agent has at most {MAX_WIDTH} hidden units a layer")
-        else:
+        if self.kind == "queue":
             self._check_suites()
         if self.capacities:
             self.capacities_of("")

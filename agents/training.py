@@ -117,7 +117,7 @@ def padded_slots_of(settings: Settings) -> int:
 def training_env(settings: Settings) -> VecEnv:
     """The batch of environments to train on: of one scenario, of whole train splits, or of robots as rows."""
     if settings.kind == "fleet":
-        # Each robot is paid for its own information, at the middle capacity: scoring slots, it serves the others too.
+        # Each robot is rewarded for its own information, at the middle capacity; a slot network serves the others too.
         suite = suite_of(settings)
         batch = FleetVecEnv(
             max(1, settings.num_envs // suite.robots),

@@ -118,8 +118,8 @@ def test_fields_of_ones_own_begin_with_greed() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"suite": "fleet-v1,lte-v1"}, "suite fleet-v1: a fleet's agent learns from one suite alone"),
-        ({"algo": "dqn"}, "a fleet's agent learns from one suite alone, by evolution or maskable-ppo"),
+        ({"suite": "fleet-v1,lte-v1"}, "suite fleet-v1,lte-v1: a fleet's agent learns from one suite alone"),
+        ({"algo": "dqn"}, "a fleet's agent learns from one suite alone, by --algo evolution or maskable-ppo"),
         ({"algo": "maskable-ppo", "network": "plain"}, "network = 'plain': a fleet's agent scores slots"),
         ({"capacities": "5,x"}, "capacities = '5,x'"),
         ({"seeds": 0}, "seeds = 0: must be >= 1"),

@@ -293,8 +293,7 @@ def test_a_slot_network_serves_every_L_and_a_few_fields_are_enough(tmp_path: Pat
         assert policy.name == "slots" and policy.compile
         senders = run(policy, episodes, L, scenario.value)
         ours = [outcome(senders, i) for i in range(4)]
-        assert any(result.delivered and result.dropped for result in ours)
-    assert repr(ours) == repr(outcomes_in_env(model, scenario, True, False, FIELDS))
+        assert repr(ours) == repr(outcomes_in_env(model, scenario, True, False, FIELDS))
         assert all(result.delivered and result.dropped for result in ours)
         assert (run(policy, episodes, 20, scenario.value).batch.senders["invalid"] == 0).all()
 

@@ -297,7 +297,7 @@ EVOLUTION = {"algo": "evolution", "suite": "interruption-v1"}
         ({"suite": "lte-v1", "capacities": "5,x"}, "capacities = '5,x': must be whole numbers such as"),
         ({"suite": "lte-belgium-v1"}, "needs a folder of recordings"),
         ({"suite": "lte-belgium-v1", "data": "no-such"}, "no-such"),
-        ({"suite": "lte-v1,topics-v1"}, "suite topics-v1: a scheduler learns from one suite alone"),
+        ({"suite": "lte-v1,topics-v1"}, "suite lte-v1,topics-v1: a scheduler learns from one suite alone"),
         ({"suite": "fleet-v1", "algo": "dqn"}, "suite fleet-v1: a fleet's agent learns from one suite alone"),
         ({"algo": "evolution"}, "learns from a suite's episodes: name one"),
         ({**EVOLUTION, "fields": "rank"}, "fields = 'rank': must be rank, motion_merged or time_merged"),

@@ -156,7 +156,7 @@ def policy_of(network: str, width: int, masked: bool = True) -> tuple[Any, dict[
 
 
 class IgnoresMasks:
-    """For a learner of stable-baselines3: takes masks as MaskablePPO does, and leaves the possible to its policy."""
+    """For a learner of stable-baselines3: accepts masks as MaskablePPO does, and ignores them."""
 
     policy: Any
 
@@ -168,6 +168,6 @@ class IgnoresMasks:
         deterministic: bool = False,
         action_masks: NDArray[np.bool_] | None = None,
     ) -> tuple[NDArray[Any], Any]:
-        """(actions, state) of the policy; it explores only as far as the policy itself does."""
-        found: tuple[NDArray[Any], Any] = self.policy.predict(observation, state, episode_start, deterministic)
-        return found
+        """(actions, state) of the policy; random only where the policy itself is."""
+        prediction: tuple[NDArray[Any], Any] = self.policy.predict(observation, state, episode_start, deterministic)
+        return prediction
