@@ -8,7 +8,6 @@ Oldest, whichever is better (``objectives.queue.SuiteObjective``). ``--runs runs
 
 from __future__ import annotations
 
-import argparse
 import concurrent.futures
 import itertools
 import json
@@ -25,7 +24,7 @@ from agents import cma_es
 from agents.evaluation import ValidationSets
 from agents.objectives.objective import to_vector
 from agents.objectives.queue import EPISODES, suite_objectives
-from agents.page import columns_of, publish, table
+from agents.page import columns_of, command, publish, table
 from agents.runs import MODEL, RUNS, prepare, read_settings
 from agents.settings import MOTION, Settings
 from bufgym import policies
@@ -147,57 +146,59 @@ def train_variants(by_name: Mapping[str, Settings], seeds: int) -> dict[str, lis
         return {name: [job.result() for job in own] for name, own in jobs.items()}
 
 
-def page(options: argparse.Namespace) -> str:
-    """Train what is missing; the whole page."""
-    base = Settings(suite=options.suites, algo="evolution", name=options.name, steps=options.steps, hidden=4)
+def main(
+    name: str = "ablation",
+    steps: int = 40_000_000,
+    seeds: int = 2,
+    suites: str = SUITES,
+    runs: str = "",
+    out: Path | None = None,
+) -> None:
+    """What each part of an evolved agent is worth: train what is missing, and make the page.
+
+    Args:
+        name: folder under runs/.
+        steps: decisions a seed.
+        seeds: seeds a variant.
+        suites: what they are trained and tested on.
+        runs: folders of runs whose learning is shown beside.
+        out: Markdown file to write; the page is printed in any case.
+    """
+    base = Settings(suite=suites, algo="evolution", name=name, steps=steps, hidden=4)
     # Where there is nothing but interruptions, the link never moves.
-    share = 1 if options.suites == "interruption-v1" else 2
-    base = replace(base, validate_every=options.steps // 5, warm_up=options.steps // share)
+    share = 1 if suites == "interruption-v1" else 2
+    base = replace(base, validate_every=steps // 5, warm_up=steps // share)
     by_name = variants(base)
-    measured = train_variants(by_name, options.seeds)
+    measured = train_variants(by_name, seeds)
     sizes = {}
-    for name, variant in by_name.items():
+    for label, variant in by_name.items():
         kept, _ = weights.read(RUNS / variant.name / "seed-0" / MODEL)
-        sizes[name] = sum(len(to_vector(scorer)) for scorer in (kept, kept.still) if scorer)
-    chosen = f" --suites {options.suites}" if options.suites != SUITES else ""
-    chosen += f" --runs {options.runs}" if options.runs else ""
+        sizes[label] = sum(len(to_vector(scorer)) for scorer in (kept, kept.still) if scorer)
+    chosen = f" --suites {suites}" if suites != SUITES else ""
+    chosen += f" --runs {runs}" if runs else ""
     lines = [
         "# What each part is worth",
         "",
         "Test splits; regret over that of AFR or Drop Oldest, whichever is better. "
-        f"{options.steps:,} decisions a seed, {base.warm_up:,} of them for the scorer of a still link; "
-        f'{options.seeds} seeds, whose range is in parentheses: differences within it are noise. "Everything" has '
+        f"{steps:,} decisions a seed, {base.warm_up:,} of them for the scorer of a still link; "
+        f'{seeds} seeds, whose range is in parentheses: differences within it are noise. "Everything" has '
         f"{base.hidden} hidden units where the link moves and {base.still_hidden} where it stands still. Made by",
         "",
-        f"`python -m agents.ablation --steps {options.steps} --seeds {options.seeds}{chosen}`",
+        f"`python -m agents.ablation --steps {steps} --seeds {seeds}{chosen}`",
         "",
         *variants_table(measured, sizes, base.suites),
         "",
     ]
-    if options.runs:
-        runs = [Path(run) for run in options.runs.split(",")]
+    if runs:
+        folders = [Path(run) for run in runs.split(",")]
         about = "Best regret over AFR's on validation so far, mean over the suites; a run ends where it was stopped."
-        lines += ["## How they learned", "", about, "", *learning(runs), "", "## What more seeds are worth", ""]
-        for run in runs:
-            settings = read_settings(run)
+        lines += ["## How they learned", "", about, "", *learning(folders), "", "## What more seeds are worth", ""]
+        for folder in folders:
+            settings = read_settings(folder)
             if settings["algo"] == "evolution" and settings["seeds"] > 2:
-                lines += [*more_seeds(run), ""]
-    return "\n".join(lines)
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument("--name", default="ablation", help="folder under runs/")
-    parser.add_argument("--steps", type=int, default=40_000_000)
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--suites", default=SUITES)
-    parser.add_argument("--runs", default="", help="folders of runs whose learning is shown beside")
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """The command."""
-    publish("agents.ablation", __doc__, add_options, page, arguments)
+                lines += [*more_seeds(folder), ""]
+    publish("\n".join(lines), out)
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -79,7 +79,7 @@ class Evolution:
         """The agent so far."""
         return self.weights(self.average)
 
-    def generation(self, objective: Objective[Any]) -> float:
+    def generation(self, objective: Objective) -> float:
         """Ask for candidates, try them and tell their fitness, once; the best fitness."""
         vectors = self.strategy.ask()
         part = self.generations

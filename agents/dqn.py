@@ -1,7 +1,7 @@
 """Double DQN with action masks: stable-baselines3's DQN with another Q network, exploration and targets.
 
-Which actions are valid follows from the observation (a slot holds a message; there is room), so no masks are stored: the
-Q network itself gives invalid actions a value that no maximum picks, neither when it acts nor in a target.
+Which actions are valid follows from the observation (a slot holds a message; there is room), so no masks are stored:
+the Q network itself gives invalid actions a value that no maximum picks, neither when it acts nor in a target.
 
 Targets are those of van Hasselt, Guez and Silver (2016): the online network chooses the next action, the target network
 values it. Q is the sum of a state value and a score for each slot (after Wang et al., 2016), because one message makes
@@ -22,7 +22,7 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bufgym.sb3.networks import IgnoresMasks, SlotExtractor, SlotScorer
+from bufgym.sb3.networks import SlotExtractor, SlotScorer
 
 INVALID = -1e9
 """The value of an invalid action."""
@@ -79,7 +79,7 @@ def dqn_policy_of(network: str, width: int) -> dict[str, Any]:
     return {"width": width} if network == "slots" else {"width": 0, "net_arch": [2 * width, 2 * width]}
 
 
-class MaskedDQN(IgnoresMasks, DQN):
+class MaskedDQN(DQN):
     """Double DQN that never tries an invalid action, as its network knows the masks.
 
     A resumed learner starts with an empty replay.
@@ -89,6 +89,7 @@ class MaskedDQN(IgnoresMasks, DQN):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[NDArray[Any], NDArray[Any]]:
         """Each environment explores on its own: a valid action at random, all equally likely."""
+        assert self._last_obs is not None
         actions, _ = self.policy.predict(self._last_obs, deterministic=True)
         valid = valid_actions(self._last_obs).numpy()
         explored = (np.random.random(valid.shape) * valid).argmax(axis=1)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from bufgym.benchmark.score import BASELINE, DISCRIMINATIVE, normalised_score, r
 from bufgym.benchmark.sweep import Plan, cell, run_sweep, shards
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
+from bufgym.sb3 import takes_masks
 from bufgym.scenario import Episode, suites
 from bufgym.sim import run
 from bufgym.sim.metrics import Outcome, outcome
@@ -30,22 +31,18 @@ from bufgym.sim.metrics import Outcome, outcome
 Numbers = NDArray[np.float64]
 
 
-class Agent(Protocol):
-    """What can act: a trained MaskablePPO is one."""
+def play(agent: Any, env: MixedEnv, episodes: Sequence[Episode]) -> list[Outcome]:
+    """The outcome of each episode (one a row) under a learner's most likely action at every decision.
 
-    def predict(
-        self, observation: Any, *, deterministic: bool = False, action_masks: NDArray[np.bool_] | None = None
-    ) -> tuple[Any, Any]:
-        """(actions, state)."""
-
-
-def play(agent: Agent, env: MixedEnv, episodes: Sequence[Episode]) -> list[Outcome]:
-    """The outcome of each episode (one a row) under the agent's most likely action at every decision."""
+    ``agent``: a model of stable-baselines3, or what has its ``predict``.
+    """
+    masked = takes_masks(agent)
     env.load(episodes)
     actions = np.zeros(env.num_envs, np.int64)
     while (live := ~env.ended()).any():
         observation = {name: column[live] for name, column in env.observation().items()}
-        actions[live], _ = agent.predict(observation, deterministic=True, action_masks=env.action_masks()[live])
+        masks = {"action_masks": env.action_masks()[live]} if masked else {}
+        actions[live], _ = agent.predict(observation, deterministic=True, **masks)
         env.act(actions)
     return [outcome(rows.senders, i) for rows in env.groups for i in range(len(rows))]
 
@@ -87,7 +84,7 @@ class EvaluationSet:
         """[rows]: this column of a fixed policy's rows."""
         return np.array([self._fixed[*_name(key), policy][column] for key in self._keys], np.float64)
 
-    def play(self, agent: Agent, padded_slots: int) -> list[Outcome]:
+    def play(self, agent: Any, padded_slots: int) -> list[Outcome]:
         """What an agent that observes so many slots reaches in every row."""
         return play(agent, MixedEnv(self.cells, self._sizes, padded_slots), self._episodes)
 
@@ -159,7 +156,7 @@ class ValidationSets:
             for suite in settings.suites
         ]
 
-    def play(self, agent: Agent, padded_slots: int) -> Verdict:
+    def play(self, agent: Any, padded_slots: int) -> Verdict:
         """An agent's verdict, averaged over the suites."""
         return _mean([evaluation.verdict(evaluation.play(agent, padded_slots)) for evaluation in self._sets])
 

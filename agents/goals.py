@@ -9,16 +9,16 @@ the same ones for the agent and for AFR.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from tyro.conf import Positional
 
 from agents.evaluation import EvaluationSet, Numbers
-from agents.page import columns_of, publish, table
+from agents.page import columns_of, command, publish, table
 from agents.runs import MODEL, read_settings
 from bufgym import files, policies
 from bufgym.benchmark.bootstrap import written
@@ -27,7 +27,8 @@ from bufgym.benchmark.sweep import Plan
 from bufgym.errors import BufgymError
 from bufgym.oracle import EveryLength, law, online_optimum
 from bufgym.policies import Policy, registry
-from bufgym.scenario import Interruption, suites
+from bufgym.scenario import Interruption
+from bufgym.scenario.suites import get as suite_of
 
 RESAMPLES = 500
 RESAMPLES_OF_MANY = 200
@@ -98,7 +99,7 @@ def measure(
     shipped = files.shipped("agents", "agents/pretrained", "*.safetensors")
     fixed = [name for name in registry.names(for_topics=False) if name not in shipped]
     ranked = [name for name in fixed if registry.get(name).ranked]
-    plan = Plan(suite, tuple(ranked), "test", suites.get(suite).capacities, seeds, data)
+    plan = Plan(suite, tuple(ranked), "test", suite_of(suite).capacities, seeds, data)
     evaluation = EvaluationSet(plan, folder / "goals" / suite)
     cells = [(cell.label, cell.capacity) for cell in evaluation.cells]
     rows = [evaluation.benchmark_rows(evaluation.run(agent), AGENTS, seed) for seed, agent in enumerate(agents)]
@@ -155,7 +156,7 @@ SMALL = ((1, 400), (2, 300), (3, 120), (4, 70))
 def optimum(agents: Sequence[Policy]) -> list[str]:
     """Markdown: the agents, AFR and the exact optimum of a sender that does not know T, at small L."""
     rows = []
-    for label, setting in suites.get("interruption-v1").settings("test").items():
+    for label, setting in suite_of("interruption-v1").settings("test").items():
         for L, t_max in SMALL:
             scenario = Interruption(t_max=t_max, value=setting.scenario.value)
             lengths = EveryLength(scenario, [L])
@@ -176,7 +177,7 @@ def optimum(agents: Sequence[Policy]) -> list[str]:
 
 def exact(agents: Sequence[Policy]) -> list[str]:
     """Markdown: regret over AFR's on interruption-v1, exact over the test split's lengths, cell by cell."""
-    suite = suites.get("interruption-v1")
+    suite = suite_of("interruption-v1")
     rows = []
     for label, setting in suite.settings("test").items():
         lengths = EveryLength(setting.scenario, suite.capacities)
@@ -194,40 +195,40 @@ def exact(agents: Sequence[Policy]) -> list[str]:
     ]
 
 
-def page(options: argparse.Namespace) -> str:
-    """The whole page about a run."""
-    models = sorted(options.run.glob(f"seed-*/{MODEL}"))
+def main(
+    run: Positional[Path],
+    suites: str = "interruption-v1,lte-v1,outage-v1,sustained-v1",
+    data: str | None = None,
+    seeds: int | None = None,
+    out: Path | None = None,
+) -> None:
+    """How far the agents of a run are above AFR, as a page.
+
+    Args:
+        run: folder of a run of train.py --algo evolution.
+        suites: where they are tested.
+        data: folder of recordings.
+        seeds: episodes a trace, if not the suite's own.
+        out: Markdown file to write; the page is printed in any case.
+    """
+    models = sorted(run.glob(f"seed-*/{MODEL}"))
     if not models:
-        raise BufgymError(f"{options.run}: no seed-*/{MODEL}; a run of train.py --algo evolution has them")
+        raise BufgymError(f"{run}: no seed-*/{MODEL}; a run of train.py --algo evolution has them")
     agents = [policies.load(model) for model in models]
-    lines = [f"# {options.run.name}: {len(agents)} training seeds", ""]
-    if (options.run / "settings.json").exists():
+    lines = [f"# {run.name}: {len(agents)} training seeds", ""]
+    if (run / "settings.json").exists():
         steps = [max(row[0] for row in columns_of(model.parent / "curve.csv", "steps")) / 1e6 for model in models]
         decisions = ", ".join(f"{million:.0f} M" for million in steps)
-        command = read_settings(options.run)["command"]
-        lines += [f"Made by `{command}`; seeds stopped after {decisions} decisions.", ""]
-    data = " --data DIR" if options.data else ""
-    lines += [f"This page: `python -m agents.goals runs/{options.run.name} --suites {options.suites}{data}`.", ""]
+        lines += [f"Made by `{read_settings(run)['command']}`; seeds stopped after {decisions} decisions.", ""]
+    folder = " --data DIR" if data else ""
+    lines += [f"This page: `python -m agents.goals runs/{run.name} --suites {suites}{folder}`.", ""]
     lines += ["The figure is the regret over AFR's, with its 95 % interval over training seeds and episodes.", ""]
-    for suite in options.suites.split(","):
-        lines += section(measure(suite, agents, options.run, options.data, options.seeds))
+    for suite in suites.split(","):
+        lines += section(measure(suite, agents, run, data, seeds))
         if suite == "interruption-v1":
             lines += exact(agents) + optimum(agents)
-    return "\n".join(lines)
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument("run", type=Path, help="folder of a run of train.py --algo evolution")
-    parser.add_argument("--suites", default="interruption-v1,lte-v1,outage-v1,sustained-v1")
-    parser.add_argument("--data", default=None, help="folder of recordings")
-    parser.add_argument("--seeds", type=int, default=None, help="episodes a trace, if not the suite's own")
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """The command."""
-    publish("agents.goals", __doc__, add_options, page, arguments)
+    publish("\n".join(lines), out)
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+
+import tyro
 
 from bufgym.errors import BufgymError
 
@@ -25,30 +26,16 @@ def columns_of(file: Path, *names: str) -> list[tuple[float, ...]]:
         return [tuple(float(row[name]) for name in names) for row in csv.DictReader(lines)]
 
 
-def publish(
-    module: str,
-    doc: str | None,
-    add_options: Callable[[argparse.ArgumentParser], object],
-    page: Callable[[argparse.Namespace], str],
-    arguments: Sequence[str] | None,
-) -> None:
-    """The command ``python -m MODULE``: make the page, write it to ``--out``, and print it.
+def publish(text: str, out: Path | None) -> None:
+    """Write the page where that is asked for, and print it."""
+    if out:
+        out.write_text(text, encoding="utf-8")
+    print(text)
 
-    Args:
-        module: its dotted name.
-        doc: its docstring, for ``--help``.
-        add_options: adds the command's own options.
-        page: options -> the page's text.
-        arguments: those of the command line by default.
-    """
-    parser = argparse.ArgumentParser(prog=f"python -m {module}", description=doc)
-    add_options(parser)
-    parser.add_argument("--out", type=Path, default=None, help="Markdown file to write; printed in any case")
-    options = parser.parse_args(arguments)
+
+def command(page: Callable[..., None]) -> None:
+    """Run a page's function as a command: its arguments are the options; a mistake ends in one line."""
     try:
-        text = page(options)
+        tyro.cli(page)
     except BufgymError as error:
         raise SystemExit(f"error: {error}") from None
-    if options.out:
-        options.out.write_text(text, encoding="utf-8")
-    print(text)

@@ -7,24 +7,25 @@ import importlib.util
 import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agents import training
 from agents.evaluation import EvaluationSet, plan_for, play
 from agents.held_out import held_out_episodes, run_fixed, split_scenario, summarise
 from agents.mixed_env import Cell, MixedEnv
 from agents.objectives import fleet, topics
 from agents.runs import Run, write_notes
 from agents.settings import Settings
-from agents.training import load, test_rows
 from bufgym.benchmark import fleets_summary, topics_summary
+from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.fleets import ROWS as FLEET_ROWS
 from bufgym.benchmark.rows import Row, write_rows
-from bufgym.benchmark.score import Interval, Scores, scores
+from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.table import aligned
 from bufgym.benchmark.topics import ROWS as TOPICS_ROWS
 from bufgym.policies import registry, weights
@@ -91,16 +92,19 @@ def _save(home: Path, settings: Settings, runs: Sequence[Run], best: Run, **resu
 # --- on many topics, or with many robots -----------------------------------------------------------------------------
 
 
+BENCHMARKS: dict[str, tuple[Any, Any, Callable[[Sequence[Row]], str]]] = {
+    "topics": (topics.test_rows, TOPICS_ROWS, lambda rows: topics_summary.plain(topics_summary.summary(rows))),
+    "fleet": (fleet.test_rows, FLEET_ROWS, lambda rows: fleets_summary.plain(fleets_summary.summary(rows))),
+}
+"""Kind -> (the rows of agents and fixed policies, their layout, rows -> table)."""
+
+
 def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
     """Every seed's agent beside the fixed policies on the test split: rows.csv, and the table in results.txt."""
-    agents = [dataclasses.replace(weights.load(run.model), name=agent_name(run)) for run in runs]
-    if settings.kind == "topics":
-        rows, layout = topics.test_rows(settings, agents), TOPICS_ROWS
-        text = topics_summary.plain(topics_summary.summary(rows))
-    else:
-        rows, layout = fleet.test_rows(settings, agents), FLEET_ROWS
-        text = fleets_summary.plain(fleets_summary.summary(rows))
+    test_rows, layout, table_of = BENCHMARKS[settings.kind]
+    rows = test_rows(settings, [dataclasses.replace(weights.load(run.model), name=agent_name(run)) for run in runs])
     write_rows(rows, folder / "rows.csv", layout)
+    text = table_of(rows)
     (folder / "results.txt").write_text(text + "\n", encoding="utf-8")
     print(text)
 
@@ -116,7 +120,7 @@ def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], be
     cell = Cell("held-out", scenario, settings.capacity)
     for run in runs:
         env = MixedEnv([cell], [len(episodes)], decide_at=settings.decide_at)
-        outcomes[agent_name(run)] = play(load(settings, run), env, episodes)
+        outcomes[agent_name(run)] = play(training.load(settings, run), env, episodes)
     rows = summarise(outcomes, agent_name(best))
     print(table(rows, agent_name(best)))
     traces = [trace.name for trace in getattr(scenario, "traces", ())]
@@ -159,7 +163,7 @@ def report_suite(
     plan = plan_for(settings, suite, "test", specs, settings.test_seeds or None)
     evaluation = EvaluationSet(plan, folder / "test" / suite, progress=True)
     home.mkdir(exist_ok=True)
-    agents = {agent_name(run): test_rows(settings, run, evaluation) for run in runs}
+    agents = {agent_name(run): training.test_rows(settings, run, evaluation) for run in runs}
     rows: list[Row] = [{**row, "training_seed": None} for row in evaluation.rows]
     rows += [row for own in agents.values() for row in own]
     write_rows(rows, home / "rows.csv")
@@ -194,27 +198,17 @@ def report_suite(
 
 
 def standings(result: Scores) -> str:
-    """Ranked policies first, best score first, with the intervals of the benchmark."""
-    lines = [["policy", "score", "95 %", "regret", "95 %", "IQM", "P(better than AFR)", "95 %"]]
+    """Ranked policies first, best score first, with the 95 % intervals of the benchmark."""
+    lines = [["policy", "score [95 %]", "regret [95 %]", "IQM", "P(better than AFR) [95 %]"]]
     for standing in result.standings:
-        numbers = []
-        for interval, spec in ((standing.score, ".3f"), (standing.regret, ".2%")):
-            numbers += [_number(interval.value, spec), _span(interval, spec)]
-        better = [_number(standing.improvement.value, ".2f"), _span(standing.improvement, ".2f")]
         name = standing.policy if standing.ranked else f"{standing.policy} (not ranked)"
-        lines.append([name, *numbers, _number(standing.iqm.value, ".3f"), *better])
+        iqm = "-" if math.isnan(standing.iqm.value) else f"{standing.iqm.value:.3f}"
+        score, regret = written(standing.score, ".3f"), written(standing.regret, ".2%")
+        lines.append([name, score, regret, iqm, written(standing.improvement, ".2f")])
     counted = max((standing.cells for standing in result.standings), default=0)
     total = len({(cell.scenario, cell.capacity) for cell in result.cells})
     note = f"{counted} of {total} cells (scenario, L) count; score: 0 is {result.baseline}, 1 the clairvoyant"
     return "\n".join([*aligned(lines), note])
-
-
-def _number(number: float, spec: str) -> str:
-    return "-" if math.isnan(number) else format(number, spec)
-
-
-def _span(interval: Interval, spec: str) -> str:
-    return "" if math.isnan(interval.low) else f"[{interval.low:{spec}}, {interval.high:{spec}}]"
 
 
 # --- the figure ------------------------------------------------------------------------------------------------------

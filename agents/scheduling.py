@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
-from agents.page import publish
+from tyro.conf import Positional
+
+from agents.page import command, publish
 from agents.runs import MODEL, read_settings
 from bufgym import policies
 from bufgym.benchmark.bootstrap import written
@@ -45,15 +45,19 @@ information at the server, of the topics of priority 20 ("first") and of the oth
 """
 
 
-def page(options: argparse.Namespace) -> str:
-    """What a finished run reached, as Markdown."""
-    folder = options.run
-    if not (folder / "rows.csv").is_file():
-        raise BufgymError(f"{folder / 'rows.csv'}: no such file; the run has not ended")
-    rows = read_rows(folder / "rows.csv", ROWS)
+def main(run: Positional[Path], out: Path | None = None) -> None:
+    """What a finished run's schedulers reached, as a page.
+
+    Args:
+        run: its folder, runs/NAME.
+        out: Markdown file to write; the page is printed in any case.
+    """
+    if not (run / "rows.csv").is_file():
+        raise BufgymError(f"{run / 'rows.csv'}: no such file; the run has not ended")
+    rows = read_rows(run / "rows.csv", ROWS)
     results = summary(rows)
-    kept = (folder / MODEL).read_bytes()
-    best = next(path.parent.name[5:] for path in sorted(folder.glob(f"seed-*/{MODEL}")) if path.read_bytes() == kept)
+    kept = (run / MODEL).read_bytes()
+    best = next(path.parent.name[5:] for path in sorted(run.glob(f"seed-*/{MODEL}")) if path.read_bytes() == kept)
     unbounded = {name for name in policies.names() if not policies.get(name).ranked}
     # Unbounded queues come last: their messages arrive long after.
     standings = sorted(results.overall, key=lambda standing: standing.policy in unbounded)
@@ -65,15 +69,16 @@ def page(options: argparse.Namespace) -> str:
         f"messages lost, the topics of priority 20 at most {older:.3f} times as old (upper end of the interval). "
         "`rosbridge` has an unbounded queue: it loses nothing and delivers it long after."
     )
-    return PAGE.format(
+    text = PAGE.format(
         best=best,
-        command=read_settings(folder)["command"],
+        command=read_settings(run)["command"],
         settings=len(results.cells),
         episodes=len({(row["trace"], row["seed"]) for row in rows if row["scenario"] == rows[0]["scenario"]}),
         overall="\n".join(_line(standing) for standing in standings),
         notes=notes,
         text=plain(results),
     )
+    publish(text, out)
 
 
 def _line(standing: Standing) -> str:
@@ -89,14 +94,5 @@ def _line(standing: Standing) -> str:
     return f"| {' | '.join(columns)} |"
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """The command."""
-
-    def add_options(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("run", type=Path, help="its folder, runs/NAME")
-
-    publish("agents.scheduling", __doc__, add_options, page, arguments)
-
-
 if __name__ == "__main__":
-    main()
+    command(main)

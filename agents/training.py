@@ -36,7 +36,7 @@ from bufgym.errors import BufgymError
 from bufgym.policies import load as load_policy
 from bufgym.policies import weights
 from bufgym.sb3 import GymVecEnv, make_vec_env, weights_of
-from bufgym.sb3.networks import IgnoresMasks, policy_of
+from bufgym.sb3.networks import policy_of
 
 
 def train_all(settings: Settings, folder: Path) -> list[Run]:
@@ -150,15 +150,11 @@ def training_env(settings: Settings) -> VecEnv:
 # --- learners --------------------------------------------------------------------------------------------------------
 
 
-class UnmaskedPPO(IgnoresMasks, PPO):
-    """PPO without masks: an invalid action does what a queue does, and the agent has to find out."""
-
-
 def new_ppo(settings: Settings, env: VecEnv) -> MaskablePPO | PPO:
-    """An untrained actor and critic."""
+    """An untrained actor and critic. Without masks an invalid action does what a queue does; the agent finds out."""
     masked = settings.algo == "maskable-ppo"
     policy, policy_settings = policy_of(settings.network, settings.width, masked)
-    return (MaskablePPO if masked else UnmaskedPPO)(
+    return (MaskablePPO if masked else PPO)(
         policy,
         env,
         learning_rate=LinearSchedule(settings.learning_rate, 0.0, 1.0),
@@ -218,7 +214,7 @@ def new_dqn(settings: Settings, env: VecEnv) -> MaskedDQN:
 
 LEARNERS: dict[str, tuple[Any, Callable[[Settings, VecEnv], Any]]] = {
     "maskable-ppo": (MaskablePPO, new_ppo),
-    "ppo": (UnmaskedPPO, new_ppo),
+    "ppo": (PPO, new_ppo),
     "dqn": (MaskedDQN, new_dqn),
 }
 """Algorithm -> (its class, what makes an untrained one)."""

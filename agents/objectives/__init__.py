@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from agents.objectives.fleet import FleetObjective
 from agents.objectives.objective import Objective
 from agents.objectives.queue import QueueObjective
 from agents.objectives.topics import TopicsObjective
 
-OBJECTIVES: dict[str, type[Objective[Any]]] = {
+OBJECTIVES: dict[str, type[Objective]] = {
     "queue": QueueObjective,
     "topics": TopicsObjective,
     "fleet": FleetObjective,

@@ -120,7 +120,7 @@ def validation_episodes(suite: FleetSuite) -> list[FleetEpisodes]:
 # --- the objective ---------------------------------------------------------------------------------------------------
 
 
-class FleetObjective(Objective[FleetEpisodes]):
+class FleetObjective(Objective):
     """The robots of one suite."""
 
     name = "fleet"

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +19,7 @@ from bufgym.policies.learned_topics import TopicWeights
 Vector = NDArray[np.float64]
 
 
-class Episodes(Protocol):
-    """Training or validation episodes that a candidate runs on."""
-
-    decisions: int
-    """About how many decisions one candidate takes there."""
-
-
-Sample = TypeVar("Sample", bound=Episodes)
-
-
-class Objective(ABC, Generic[Sample]):
+class Objective(ABC):
     """One kind of task: where a search begins, how candidates are compared, how the agent to keep is chosen.
 
     Training episodes come in parts, one a generation in turn, so that many episodes cost no more than a few.
@@ -51,28 +40,22 @@ class Objective(ABC, Generic[Sample]):
     """That measure in words, as a format."""
     sigma: Mapping[bool, float]
     """First step size; True: for the scorer of links that stand still."""
+    training: Any
+    """The training episodes, part by part; each set of episodes has ``decisions``, about how many a candidate takes."""
+    judges: Any
+    """The validation episodes."""
     warm_up = False
     """Whether the scorer for links that stand still is searched first."""
 
     def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
         self.settings, self.folder, self.seed = settings, folder, seed
 
-    @functools.cached_property
-    @abstractmethod
-    def training(self) -> list[list[Sample]]:
-        """The training episodes, part by part."""
-
-    @functools.cached_property
-    @abstractmethod
-    def judges(self) -> list[Sample]:
-        """The validation episodes."""
-
     @abstractmethod
     def start(self) -> Weights | TopicWeights:
         """Where the search begins."""
 
     @abstractmethod
-    def measure(self, policy: Policy, episodes: Sequence[Sample]) -> float:
+    def measure(self, policy: Policy, episodes: Any) -> float:
         """The measure that candidates are compared by, on these episodes."""
 
     def fitness(self, policy: Policy, part: int, still: bool) -> float:

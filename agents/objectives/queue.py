@@ -195,7 +195,7 @@ def _suite_objective(
     return SuiteObjective(ExactRegrets(suite_cells))
 
 
-class QueueObjective(Objective[SuiteObjective]):
+class QueueObjective(Objective):
     """All suites of a run; with a warm-up first those of interruptions, then the others."""
 
     name = "evolved"

@@ -164,7 +164,7 @@ def varied(client: Client, rng: np.random.Generator) -> Client:
 # --- the objective ---------------------------------------------------------------------------------------------------
 
 
-class TopicsObjective(Objective[ClientEpisodes]):
+class TopicsObjective(Objective):
     """The clients of one suite."""
 
     name = "evolved"

@@ -14,7 +14,7 @@ from bufgym.errors import BufgymError
 try:
     from bufgym.sb3.export import export, weights_of
     from bufgym.sb3.networks import SlotExtractor, SlotPolicy, SlotScorer
-    from bufgym.sb3.policies import as_policy
+    from bufgym.sb3.policies import as_policy, takes_masks
     from bufgym.sb3.vec_env import GymVecEnv, make_vec_env
 except ModuleNotFoundError as error:
     if (error.name or "").split(".")[0] not in ("stable_baselines3", "sb3_contrib", "torch"):
@@ -29,5 +29,6 @@ __all__ = [
     "as_policy",
     "export",
     "make_vec_env",
+    "takes_masks",
     "weights_of",
 ]

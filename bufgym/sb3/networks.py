@@ -15,10 +15,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -153,21 +151,3 @@ def policy_of(network: str, width: int, masked: bool = True) -> tuple[Any, dict[
         return SlotPolicy, {"width": width, "masked": masked}
     plain = MaskableMultiInputActorCriticPolicy if masked else MultiInputActorCriticPolicy
     return plain, {"net_arch": [2 * width, 2 * width], "activation_fn": nn.ReLU}
-
-
-class IgnoresMasks:
-    """For a learner of stable-baselines3: accepts masks as MaskablePPO does, and ignores them."""
-
-    policy: Any
-
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = False,
-        action_masks: NDArray[np.bool_] | None = None,
-    ) -> tuple[NDArray[Any], Any]:
-        """(actions, state) of the policy; random only where the policy itself is."""
-        prediction: tuple[NDArray[Any], Any] = self.policy.predict(observation, state, episode_start, deterministic)
-        return prediction

@@ -63,13 +63,18 @@ def as_policy(
     if getattr(network, "lstm_actor", None) is not None:
         raise BufgymError(f"model {name}: has a recurrent network, whose state a policy cannot keep")
     about = f"A trained {type(agent).__name__}."
-    masked = "action_masks" in inspect.signature(agent.predict).parameters and getattr(network, "masked", True)
+    masked = takes_masks(agent) and getattr(network, "masked", True)
     decisions = _Decisions(name, agent, masked, fields)
     if masked and isinstance(getattr(network, "mlp_extractor", None), SlotScorer) and not decisions.for_topics:
         return slot_policy(name, weights_of(network), about)
     if not decisions.for_topics:
         return Policy(name, decisions.on_arrival, about=about)
     return Policy(name, decisions.on_arrival, on_send=decisions.on_send, about=about, for_topics=True)
+
+
+def takes_masks(agent: Any) -> bool:
+    """Whether the agent's ``predict`` takes ``action_masks``, as MaskablePPO's does."""
+    return "action_masks" in inspect.signature(agent.predict).parameters
 
 
 class _Decisions:
