@@ -2,36 +2,33 @@
 
 ``python -m agents.ablation --steps 40000000 --seeds 2 --out docs/ablation.md`` trains every variant, a process a core
 (a finished one is not trained again), and measures the kept agents on the test splits: regret over that of AFR or Drop
-Oldest, whichever is better (``grounds.Yard``). ``--runs runs/a,runs/b`` adds how those runs of ``train.py`` learned, by
-whatever algorithm, and what more seeds are worth to the evolved ones.
+Oldest, whichever is better (``objectives.queue.SuiteObjective``). ``--runs runs/a,runs/b`` adds how those runs of
+``train.py`` learned, by whatever algorithm, and what more seeds are worth to the evolved ones.
 """
 
 from __future__ import annotations
 
-import argparse
 import concurrent.futures
-import csv
 import itertools
 import json
 import multiprocessing
 import os
 import shutil
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from agents import evolution
-from agents.export import command
-from agents.grounds import EPISODES
-from agents.training import ALGORITHMS, prepare
-from agents.trials import ValidationSet
+from agents import cma_es
+from agents.evaluation import ValidationSets
+from agents.objectives.objective import to_vector
+from agents.objectives.queue import EPISODES, suite_objectives
+from agents.page import columns_of, command, publish, table
+from agents.runs import MODEL, RUNS, prepare, read_settings
+from agents.settings import MOTION, Settings
 from bufgym import policies
-from bufgym.errors import BufgymError
 from bufgym.policies import weights
-from train import Arguments
 
 SUITES = "interruption-v1,lte-v1,outage-v1,sustained-v1"
 TEST_SEED = 2
@@ -40,53 +37,57 @@ WITHOUT = {
     "everything": (),
     "without value (loss, relative_loss, even_value, bend)": ("loss", "relative_loss", "even_value", "bend"),
     "without its curvature (relative_loss, even_value, bend)": ("relative_loss", "even_value", "bend"),
-    "without link (stalled, drain)": ("stalled", "service_ratio"),
+    "without link (stalled, service_ratio)": ("stalled", "service_ratio"),
     "without context, so nothing is mixed": ("occupancy", "stalled", "service_ratio", "even_value", "bend"),
-    "rank and motion_merged alone": tuple(name for name in evolution.MOTION if name not in ("rank", "motion_merged")),
+    "rank and motion_merged alone": tuple(name for name in MOTION if name not in ("rank", "motion_merged")),
 }
-"""Fields left out of ``evolution.MOTION``."""
+"""Fields left out of ``settings.MOTION``."""
 HIDDEN = ((4, 0), (4, 3), (4, 12))
 """Hidden units beside the mixing: those of the scorer of links that move, and of links that stand still."""
 
 
-def variants(given: Arguments) -> dict[str, Arguments]:
+def variants(base: Settings) -> dict[str, Settings]:
     """Name -> how to train it."""
-    made = {}
+    by_name = {}
     for name, left_out in WITHOUT.items():
-        fields = [field for field in evolution.MOTION if field not in left_out]
-        made[name] = replace(given, fields=",".join(fields))
-    made["on time alone (--sees time)"] = replace(given, sees="time")
+        by_name[name] = replace(base, fields=",".join(field for field in MOTION if field not in left_out))
+    by_name["on time alone (--sees time)"] = replace(base, sees="time")
     for hidden, still in HIDDEN:
-        units = replace(given, hidden=hidden, still_hidden=still)
-        made[f"{hidden} hidden units where the link moves, {still} where it stands still"] = units
-    if len(given.suites) > 1:
-        made["one scorer for all links"] = replace(given, warm_up=0, hidden=given.still_hidden)
-    return {name: replace(arguments, name=f"{given.name}/{k:02d}") for k, (name, arguments) in enumerate(made.items())}
+        units = replace(base, hidden=hidden, still_hidden=still)
+        by_name[f"{hidden} hidden units where the link moves, {still} where it stands still"] = units
+    if len(base.suites) > 1:
+        by_name["one scorer for all links"] = replace(base, warm_up=0, hidden=base.still_hidden)
+    return {name: replace(variant, name=f"{base.name}/{k:02d}") for k, (name, variant) in enumerate(by_name.items())}
 
 
-def trained(arguments: Arguments, seed: int) -> list[float]:
-    """Train one variant with one seed, or find what was trained; its measure on the test split of every suite."""
-    folder = Path("runs") / arguments.name
-    result = folder / f"seed-{seed}" / "test.json"
-    if not result.exists():
-        run = ALGORITHMS["evolution"].train(arguments, folder, seed, 0)
-        agent = policies.load(run.model)
-        yards = evolution.yards(arguments, "test", TEST_SEED, 3 * EPISODES)
-        result.write_text(json.dumps([yard.over_rivals(agent) for yard in yards]), encoding="utf-8")
-    found: list[float] = json.loads(result.read_text(encoding="utf-8"))
-    return found
+def tested(settings: Settings, model: Path) -> list[float]:
+    """The kept agent's regret over the rivals' on the test split of every suite."""
+    agent = policies.load(model)
+    objectives = suite_objectives(settings, "test", TEST_SEED, 3 * EPISODES)
+    return [objective.over_rivals(agent) for objective in objectives]
 
 
-def table(found: dict[str, list[list[float]]], sizes: dict[str, int], suites: Sequence[str]) -> list[str]:
+def trained(settings: Settings, seed: int) -> list[float]:
+    """Train one variant with one seed and test it, or read what an earlier call measured."""
+    folder = RUNS / settings.name
+    file = folder / f"seed-{seed}" / "test.json"
+    if not file.exists():
+        run = cma_es.train(settings, folder, seed)
+        file.write_text(json.dumps(tested(settings, run.model)), encoding="utf-8")
+    measured: list[float] = json.loads(file.read_text(encoding="utf-8"))
+    return measured
+
+
+def variants_table(
+    measured: Mapping[str, Sequence[Sequence[float]]], sizes: Mapping[str, int], suites: Sequence[str]
+) -> list[str]:
     """Markdown: a row a variant, mean over its seeds, and the range of the mean over the suites."""
-    lines = [f"| variant | numbers | {' | '.join(suites)} | mean (seeds) |", "|---" * (len(suites) + 3) + "|"]
-    for name, seeds in found.items():
-        by_suite = " | ".join(f"{number:.2f}" for number in np.mean(seeds, axis=0))
+    rows = []
+    for name, seeds in measured.items():
         means = np.mean(seeds, axis=1)
-        lines.append(
-            f"| {name} | {sizes[name]} | {by_suite} | {means.mean():.3f} ({means.min():.3f}-{means.max():.3f}) |"
-        )
-    return lines
+        overall = f"{means.mean():.3f} ({means.min():.3f}-{means.max():.3f})"
+        rows.append([name, sizes[name], *(f"{number:.2f}" for number in np.mean(seeds, axis=0)), overall])
+    return table(["variant", "numbers", *suites, "mean (seeds)"], rows)
 
 
 MOMENTS_S = (0, 15, 30, 60, 120, 180)
@@ -94,27 +95,20 @@ MOMENTS_S = (0, 15, 30, 60, 120, 180)
 
 def learning(runs: Sequence[Path]) -> list[str]:
     """Markdown: the best regret over AFR's on validation after so many seconds, for every seed of these runs."""
-    lines = [
-        f"| run | algorithm | seed | {' | '.join(f'{s} s' for s in MOMENTS_S)} | at the end |",
-        "|---" * (len(MOMENTS_S) + 4) + "|",
-    ]
+    rows = []
     for run in runs:
         for path in sorted(run.glob("seed-*/validation.csv")):
-            with path.open(newline="", encoding="utf-8") as file:
-                rows = [(float(row["seconds"]), float(row["over_afr"])) for row in csv.DictReader(file)]
-            cells = []
+            validations = columns_of(path, "seconds", "over_afr")
+            end_s = validations[-1][0]
+            bests = []
             for moment in MOMENTS_S:
-                reached = [over for seconds, over in rows if seconds <= moment + 2]
-                cells.append(f"{min(reached):.2f}" if reached and rows[-1][0] >= moment - 2 else "")
-            end = f"{min(over for _, over in rows):.2f} ({rows[-1][0]:.0f} s)"
-            algo = _settings(run)["algo"]
-            lines.append(f"| {run.name} | {algo} | {path.parent.name[5:]} | {' | '.join(cells)} | {end} |")
-    return [*lines, "", "```", *(f"{command(_settings(run))} --name {run.name}" for run in runs), "```"]
-
-
-def _settings(run: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((run / "settings.json").read_text(encoding="utf-8"))
-    return found
+                reached = [over for seconds, over in validations if seconds <= moment + 2]
+                bests.append(f"{min(reached):.2f}" if reached and end_s >= moment - 2 else "")
+            end = f"{min(over for _, over in validations):.2f} ({end_s:.0f} s)"
+            rows.append([run.name, read_settings(run)["algo"], path.parent.name[5:], *bests, end])
+    head = ["run", "algorithm", "seed", *(f"{s} s" for s in MOMENTS_S), "at the end"]
+    commands = [f"{read_settings(run)['command']} --name {run.name}" for run in runs]
+    return [*table(head, rows), "", "```", *commands, "```"]
 
 
 def more_seeds(run: Path) -> list[str]:
@@ -122,83 +116,89 @@ def more_seeds(run: Path) -> list[str]:
 
     Both as the regret over that of AFR or Drop Oldest, whichever is better, mean over the run's suites.
     """
-    given = Arguments(**_settings(run))
-    found = []
+    values = read_settings(run)
+    settings = Settings(**{field.name: values[field.name] for field in fields(Settings)})
+    pairs = []
     for path in sorted(run.glob("seed-*/validation.csv")):
-        with path.open(newline="", encoding="utf-8") as file:
-            chosen_by = min(float(row["over_rivals"]) for row in csv.DictReader(file))
-        agent = policies.load(path.parent / evolution.MODEL)
-        yards = evolution.yards(given, "test", TEST_SEED, 3 * EPISODES)
-        found.append((chosen_by, float(np.mean([yard.over_rivals(agent) for yard in yards]))))
-    lines = [f"| {run.name}: seeds | validation | test |", "|---|---|---|"]
-    for n in range(1, len(found) + 1):
-        best = [min(some) for some in itertools.combinations(found, n)]
-        validation, test = np.mean(best, axis=0)
-        lines.append(f"| best of {n} | {validation:.3f} | {test:.3f} |")
-    return lines
+        chosen_by = min(over for (over,) in columns_of(path, "over_rivals"))
+        pairs.append((chosen_by, float(np.mean(tested(settings, path.parent / MODEL)))))
+    rows = []
+    for n in range(1, len(pairs) + 1):
+        validation, test = np.mean([min(some) for some in itertools.combinations(pairs, n)], axis=0)
+        rows.append([f"best of {n}", f"{validation:.3f}", f"{test:.3f}"])
+    return table([f"{run.name}: seeds", "validation", "test"], rows)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(prog="python -m agents.ablation", description=__doc__)
-    parser.add_argument("--name", default="ablation", help="folder under runs/")
-    parser.add_argument("--steps", type=int, default=40_000_000)
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--suites", default=SUITES)
-    parser.add_argument("--runs", default="", help="folders of runs whose learning is shown beside")
-    parser.add_argument("--out", type=Path, default=None, help="Markdown file to write; printed otherwise")
-    options = parser.parse_args(arguments)
-    given = Arguments(suite=options.suites, algo="evolution", name=options.name, steps=options.steps, hidden=4)
+def train_variants(by_name: Mapping[str, Settings], seeds: int) -> dict[str, list[list[float]]]:
+    """What every variant's seeds measure on the test splits."""
+    first, *others = by_name.values()
+    validation = RUNS / first.name / "validation"
+    if not validation.exists():
+        ValidationSets(first, prepare(first))
+    for variant in others:  # all meet the same validation episodes, whose bounds are found once
+        if not (RUNS / variant.name).exists():
+            shutil.copytree(validation, prepare(variant) / "validation")
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
+        jobs = {
+            name: [pool.submit(trained, variant, seed) for seed in range(seeds)] for name, variant in by_name.items()
+        }
+        return {name: [job.result() for job in own] for name, own in jobs.items()}
+
+
+def main(
+    name: str = "ablation",
+    steps: int = 40_000_000,
+    seeds: int = 2,
+    suites: str = SUITES,
+    runs: str = "",
+    out: Path | None = None,
+) -> None:
+    """What each part of an evolved agent is worth: train what is missing, and make the page.
+
+    Args:
+        name: folder under runs/.
+        steps: decisions a seed.
+        seeds: seeds a variant.
+        suites: what they are trained and tested on.
+        runs: folders of runs whose learning is shown beside.
+        out: Markdown file to write; the page is printed in any case.
+    """
+    base = Settings(suite=suites, algo="evolution", name=name, steps=steps, hidden=4)
     # Where there is nothing but interruptions, the link never moves.
-    share = 1 if options.suites == "interruption-v1" else 2
-    given = replace(given, validate_every=options.steps // 5, warm_up=options.steps // share)
-    try:
-        todo = variants(given)
-        first, *others = todo.values()
-        solved = Path("runs") / first.name / "validation"
-        if not solved.exists():
-            ValidationSet(first, prepare(first))
-        for chosen in others:  # all meet the same validation episodes, whose bounds are found once
-            if not (Path("runs") / chosen.name).exists():
-                shutil.copytree(solved, prepare(chosen) / "validation")
-        context = multiprocessing.get_context("spawn")
-        with concurrent.futures.ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
-            jobs = {name: [pool.submit(trained, a, s) for s in range(options.seeds)] for name, a in todo.items()}
-            found = {name: [job.result() for job in each] for name, each in jobs.items()}
-    except BufgymError as error:
-        raise SystemExit(f"error: {error}") from None
+    share = 1 if suites == "interruption-v1" else 2
+    base = replace(base, validate_every=steps // 5, warm_up=steps // share)
+    by_name = variants(base)
+    measured = train_variants(by_name, seeds)
     sizes = {}
-    for name, chosen in todo.items():
-        kept, _ = weights.read(Path("runs") / chosen.name / "seed-0" / evolution.MODEL)
-        sizes[name] = sum(len(evolution.to_vector(each)) for each in (kept, kept.still) if each)
-    seen = f" --suites {options.suites}" if options.suites != SUITES else ""
-    seen += f" --runs {options.runs}" if options.runs else ""
+    for label, variant in by_name.items():
+        kept, _ = weights.read(RUNS / variant.name / "seed-0" / MODEL)
+        sizes[label] = sum(len(to_vector(scorer)) for scorer in (kept, kept.still) if scorer)
+    chosen = f" --suites {suites}" if suites != SUITES else ""
+    chosen += f" --runs {runs}" if runs else ""
     lines = [
         "# What each part is worth",
         "",
         "Test splits; regret over that of AFR or Drop Oldest, whichever is better. "
-        f"{options.steps:,} decisions a seed, {given.warm_up:,} of them for the scorer of a still link; "
-        f'{options.seeds} seeds, whose range is in parentheses: what lies within it is luck. "Everything" has '
-        f"{given.hidden} hidden units where the link moves and {given.still_hidden} where it stands still. Made by",
+        f"{steps:,} decisions a seed, {base.warm_up:,} of them for the scorer of a still link; "
+        f'{seeds} seeds, whose range is in parentheses: differences within it are noise. "Everything" has '
+        f"{base.hidden} hidden units where the link moves and {base.still_hidden} where it stands still. Made by",
         "",
-        f"`python -m agents.ablation --steps {options.steps} --seeds {options.seeds}{seen}`",
+        f"`python -m agents.ablation --steps {steps} --seeds {seeds}{chosen}`",
         "",
-        *table(found, sizes, given.suites),
+        *variants_table(measured, sizes, base.suites),
         "",
     ]
-    if options.runs:
-        runs = [Path(run) for run in options.runs.split(",")]
-        told = "Best regret over AFR's on validation so far, mean over the suites; a run ends where it was stopped."
-        lines += ["## How they learned", "", told, ""]
-        lines += [*learning(runs), "", "## What more seeds are worth", ""]
-        for run in runs:
-            if _settings(run)["algo"] == "evolution" and _settings(run)["seeds"] > 2:
-                lines += [*more_seeds(run), ""]
-    text = "\n".join(lines)
-    if options.out:
-        options.out.write_text(text, encoding="utf-8")
-    print(text)
+    if runs:
+        folders = [Path(run) for run in runs.split(",")]
+        about = "Best regret over AFR's on validation so far, mean over the suites; a run ends where it was stopped."
+        lines += ["## How they learned", "", about, "", *learning(folders), "", "## What more seeds are worth", ""]
+        for folder in folders:
+            settings = read_settings(folder)
+            if settings["algo"] == "evolution" and settings["seeds"] > 2:
+                lines += [*more_seeds(folder), ""]
+    publish("\n".join(lines), out)
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

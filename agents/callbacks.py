@@ -1,19 +1,18 @@
-"""What happens between updates: checkpoints, the learning curve, validation, a progress bar."""
+"""What happens between a learner's updates: checkpoints, the learning curve, validation, a progress bar."""
 
 from __future__ import annotations
 
-import csv
-import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from tqdm import tqdm
 
-from agents.trials import ValidationSet, Verdict
+from agents.runs import Numbers, Record, Validations, seed_bar
+from agents.settings import Settings
 from bufgym.files import replaced
 
 
@@ -35,46 +34,14 @@ def save(model: BaseAlgorithm, home: Path) -> None:
         model.save(unfinished)
 
 
-class Record:
-    """Rows (steps, seconds, ...) in a CSV file that grows; a resumed run keeps those up to its checkpoint."""
-
-    def __init__(self, path: Path, columns: tuple[str, ...], steps: int) -> None:
-        self.path = path
-        self.rows: list[tuple[float, ...]] = []
-        if path.exists():
-            with path.open(newline="", encoding="utf-8") as file:
-                read = [tuple(float(row[name]) for name in columns) for row in csv.DictReader(file)]
-            self.rows = [(int(row[0]), *row[1:]) for row in read if row[0] <= steps]
-        with path.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([columns, *self.rows])
-
-    def append(self, *row: float) -> None:
-        self.rows.append(row)
-        with self.path.open("a", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerow(row)
-
-
-def seed_bar(steps: int, done: int, seed: int, line: int) -> Any:
-    """A seed's progress bar, on a terminal alone; ``line``: where it goes."""
-    return tqdm(
-        total=steps,
-        initial=done,
-        desc=f"seed {seed}",
-        unit=" steps",
-        unit_scale=True,
-        position=line,
-        disable=not sys.stderr.isatty(),
-    )
-
-
-class Between(BaseCallback):
-    """A callback that asks nothing of single steps."""
+class BetweenUpdates(BaseCallback):
+    """A callback that needs no call at single steps."""
 
     def _on_step(self) -> bool:
         return True
 
 
-class Checkpoints(Between):
+class Checkpoints(BetweenUpdates):
     """Saves the learner every so many steps, between updates."""
 
     def __init__(self, home: Path, every: int) -> None:
@@ -91,7 +58,7 @@ class Checkpoints(Between):
             save(self.model, self.home)
 
 
-class Curve(Between):
+class Curve(BetweenUpdates):
     """Mean QoI of the latest training episodes, a row an update."""
 
     def __init__(self, path: Path, steps: int) -> None:
@@ -104,78 +71,90 @@ class Curve(Between):
         """Seconds of training, over all sessions."""
         return round(self.before + time.perf_counter() - self.began, 3)
 
-    def told(self) -> str:
-        """The latest, for people."""
+    def latest(self) -> str:
+        """The latest row, for people."""
         return f"QoI {self.record.rows[-1][2]:.3f}" if self.record.rows else ""
 
     def _on_training_start(self) -> None:
         self.began = time.perf_counter()
 
     def _on_rollout_end(self) -> None:
-        ended = [episode["r"] for episode in self.model.ep_info_buffer or ()]
-        qoi = 1 + float(np.mean(ended)) if ended else float("nan")
+        returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
+        qoi = 1 + float(np.mean(returns)) if returns else float("nan")
         self.record.append(self.num_timesteps, self.spent(), qoi)
         self.logger.record("rollout/qoi", qoi)
 
 
-class Validation(Between):
-    """Every so many steps, plays the validation split and saves what did; the best of these is the one to keep."""
+class Validation(BetweenUpdates):
+    """Validates when it is due and saves what was validated: a row of validation.csv always has its checkpoint.
 
-    def __init__(self, home: Path, every: int, trials: ValidationSet, seats: int, curve: Curve, steps: int) -> None:
+    Args:
+        home: the seed's folder.
+        validations: the seed's validations so far.
+        measure: model -> the measures in ``validations``' columns.
+        describe: the measures, for people.
+        curve: tells the seconds of training.
+    """
+
+    def __init__(
+        self,
+        home: Path,
+        validations: Validations,
+        measure: Callable[[Any], Numbers],
+        describe: Callable[[Numbers], str],
+        curve: Curve,
+    ) -> None:
         super().__init__()
-        self.home, self.every, self.trials, self.seats, self.curve = home, every, trials, seats, curve
-        self.record = Record(home / "validation.csv", ("steps", "seconds", *Verdict._fields), steps)
+        self.home, self.validations, self.measure, self.describe, self.curve = (
+            home,
+            validations,
+            measure,
+            describe,
+            curve,
+        )
 
-    @property
-    def rows(self) -> list[tuple[float, ...]]:
-        return self.record.rows
-
-    def best(self) -> tuple[float, ...]:
-        """The row with the least regret over AFR's; the earliest of several."""
-        return min(self.rows, key=lambda row: row[4])
-
-    def told(self) -> str:
-        """The latest, for people."""
-        return f"validation score {self.rows[-1][2]:.4f}, regret {self.rows[-1][4]:.3f} x AFR's" if self.rows else ""
+    def latest(self) -> str:
+        """The latest validation, for people."""
+        rows = self.validations.rows
+        return self.describe(rows[-1][2:]) if rows else ""
 
     def _on_rollout_start(self) -> None:
-        if not self.rows or self.model.num_timesteps - self.rows[-1][0] >= self.every:
-            self.validate(self.model)
+        self.validate(self.model)
 
     def validate(self, model: Any) -> None:
-        """Once for each number of steps. Saved first: a row always has its checkpoint."""
-        if self.rows and self.rows[-1][0] == model.num_timesteps:
+        """Where it is due."""
+        if not self.validations.due(model.num_timesteps):
             return
         save(model, self.home)
-        verdict = self.trials.verdict(model, self.seats)
-        self.record.append(model.num_timesteps, self.curve.spent(), *verdict)
-        for name, number in zip(verdict._fields, verdict, strict=True):
+        measures = self.measure(model)
+        self.validations.add(model.num_timesteps, self.curve.spent(), measures)
+        for name, number in zip(self.validations.columns, measures, strict=True):
             model.logger.record(f"validation/{name}", number)
 
 
-class Progress(Between):
+class Progress(BetweenUpdates):
     """A bar with the time left on a terminal, a plain line every tenth of the way elsewhere."""
 
-    def __init__(self, shown: Curve | Validation, steps: int, seed: int, line: int) -> None:
+    def __init__(self, source: Curve | Validation, settings: Settings, seed: int, line: int) -> None:
         super().__init__()
-        self.shown, self.steps, self.seed, self.line = shown, steps, seed, line
+        self.source, self.steps, self.seed, self.line = source, settings.steps, seed, line
         self.bar: Any = None
-        self.told = self.first = 0
+        self.printed = self.first = 0
         self.began = 0.0
 
     def _on_training_start(self) -> None:
-        self.told = self.first = self.num_timesteps
+        self.printed = self.first = self.num_timesteps
         self.began = time.perf_counter()
         self.bar = seed_bar(self.steps, self.num_timesteps, self.seed, self.line)
 
     def _on_rollout_end(self) -> None:
         self.bar.update(self.num_timesteps - self.bar.n)
-        self.bar.set_postfix_str(self.shown.told(), refresh=False)
-        if self.bar.disable and (self.num_timesteps - self.told) * 10 >= self.steps:
-            self.told = self.num_timesteps
+        self.bar.set_postfix_str(self.source.latest(), refresh=False)
+        if self.bar.disable and (self.num_timesteps - self.printed) * 10 >= self.steps:
+            self.printed = self.num_timesteps
             spent = time.perf_counter() - self.began
-            left = max(0.0, spent / (self.told - self.first) * (self.steps - self.told))
-            progress = f"{self.told:,} of {self.steps:,} steps, {self.shown.told()}"
+            left = max(0.0, spent / (self.printed - self.first) * (self.steps - self.printed))
+            progress = f"{self.printed:,} of {self.steps:,} steps, {self.source.latest()}"
             print(f"seed {self.seed}: {progress}, {left:.0f} s left", flush=True)
 
     def _on_training_end(self) -> None:

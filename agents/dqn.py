@@ -1,11 +1,11 @@
-"""Double DQN with action masks: stable-baselines3's DQN, but for what it values, how it explores, what it aims at.
+"""Double DQN with action masks: stable-baselines3's DQN with another Q network, exploration and targets.
 
-Which actions are possible follows from the observation (a slot holds a message; there is room), so no masks are stored:
-the Q network itself gives impossible actions a value that no maximum picks, neither when it acts nor in a target.
+Which actions are valid follows from the observation (a slot holds a message; there is room), so no masks are stored:
+the Q network itself gives invalid actions a value that no maximum picks, neither when it acts nor in a target.
 
 Targets are those of van Hasselt, Guez and Silver (2016): the online network chooses the next action, the target network
-values it. Q is the sum of what the state is worth and a score for each slot (after Wang et al., 2016), because the
-difference that one message makes is small beside what is to come whatever one does.
+values it. Q is the sum of a state value and a score for each slot (after Wang et al., 2016), because one message makes
+little difference beside all the reward that is still to come.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bufgym.sb3.networks import IgnoresMasks, SlotFeatures, SlotScorer
+from bufgym.sb3.networks import SlotExtractor, SlotScorer
 
-IMPOSSIBLE = -1e9
-"""The value of an impossible action."""
+INVALID = -1e9
+"""The value of an invalid action."""
 
 
-def possible(observation: Any) -> Tensor:
+def valid_actions(observation: Any) -> Tensor:
     """bool[n, L + 2]: evict where a slot holds a message, reject always, accept where there is room for one more."""
     held, room = (torch.as_tensor(observation[name]) for name in ("occupied", "occupancy"))
     return torch.cat([held > 0, room < 1], dim=1)
@@ -37,7 +37,7 @@ def possible(observation: Any) -> Tensor:
 class SlotQ(nn.Module):
     """Q of all L + 2 actions from a ``SlotScorer``'s two outputs."""
 
-    def __init__(self, features: SlotFeatures, width: int) -> None:
+    def __init__(self, features: SlotExtractor, width: int) -> None:
         super().__init__()
         self.scorer = SlotScorer(features, width, accept_bias=0.0)
         self.state = nn.Linear(width, 1)
@@ -49,11 +49,11 @@ class SlotQ(nn.Module):
 
 
 class MaskedQNetwork(QNetwork):
-    """Q of every action, ``IMPOSSIBLE`` for those that are."""
+    """Q of every action, ``INVALID`` for invalid ones."""
 
     def forward(self, obs: Any) -> Tensor:
         q = super().forward(obs)
-        return torch.where(possible(obs), q, IMPOSSIBLE)
+        return torch.where(valid_actions(obs), q, INVALID)
 
 
 class MaskedDQNPolicy(DQNPolicy):
@@ -61,12 +61,12 @@ class MaskedDQNPolicy(DQNPolicy):
 
     def __init__(self, *args: Any, width: int = 32, **kwargs: Any) -> None:
         self.width = width
-        kwargs.setdefault("features_extractor_class", SlotFeatures if width else CombinedExtractor)
+        kwargs.setdefault("features_extractor_class", SlotExtractor if width else CombinedExtractor)
         super().__init__(*args, **kwargs)
 
     def make_q_net(self) -> QNetwork:
         net = MaskedQNetwork(**self._update_features_extractor(self.net_args, features_extractor=None))
-        if isinstance(net.features_extractor, SlotFeatures):
+        if isinstance(net.features_extractor, SlotExtractor):
             net.q_net = SlotQ(net.features_extractor, self.width)  # type: ignore[assignment]
         return net.to(self.device)
 
@@ -79,20 +79,21 @@ def dqn_policy_of(network: str, width: int) -> dict[str, Any]:
     return {"width": width} if network == "slots" else {"width": 0, "net_arch": [2 * width, 2 * width]}
 
 
-class MaskedDQN(IgnoresMasks, DQN):
-    """Double DQN that never tries the impossible, as its network knows the masks.
+class MaskedDQN(DQN):
+    """Double DQN that never tries an invalid action, as its network knows the masks.
 
-    A resumed one collects its replay anew.
+    A resumed learner starts with an empty replay.
     """
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Every environment explores on its own: a possible action at random, all equally likely."""
+        """Each environment explores on its own: a valid action at random, all equally likely."""
+        assert self._last_obs is not None
         actions, _ = self.policy.predict(self._last_obs, deterministic=True)
-        can = possible(self._last_obs).numpy()
-        anything = (np.random.random(can.shape) * can).argmax(axis=1)
-        actions = np.where(np.random.random(n_envs) < self.exploration_rate, anything, actions)
+        valid = valid_actions(self._last_obs).numpy()
+        explored = (np.random.random(valid.shape) * valid).argmax(axis=1)
+        actions = np.where(np.random.random(n_envs) < self.exploration_rate, explored, actions)
         return actions, actions
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
@@ -101,12 +102,12 @@ class MaskedDQN(IgnoresMasks, DQN):
         losses = []
         for _ in range(gradient_steps):
             assert self.replay_buffer is not None
-            met = self.replay_buffer.sample(batch_size)
+            sample = self.replay_buffer.sample(batch_size)
             with torch.no_grad():
-                chosen = self.q_net(met.next_observations).argmax(dim=1, keepdim=True)
-                ahead = self.q_net_target(met.next_observations).gather(1, chosen)
-                target = met.rewards + (1 - met.dones) * self.gamma * ahead
-            q = self.q_net(met.observations).gather(1, met.actions.long())
+                best = self.q_net(sample.next_observations).argmax(dim=1, keepdim=True)
+                value = self.q_net_target(sample.next_observations).gather(1, best)
+                target = sample.rewards + (1 - sample.dones) * self.gamma * value
+            q = self.q_net(sample.observations).gather(1, sample.actions.long())
             loss = functional.smooth_l1_loss(q, target)
             self.policy.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]

@@ -11,21 +11,21 @@ import pytest
 for extra in ("sb3_contrib", "tqdm", "tensorboard", "cma"):
     pytest.importorskip(extra, reason="the extra [train] is not installed")
 
-import train  # noqa: E402  (these need the extra)
-from agents import ablation, evolution  # noqa: E402
+from agents import ablation  # noqa: E402  (these need the extra)
+from agents.settings import MOTION, Settings  # noqa: E402
 from bufgym.policies import learned  # noqa: E402
 
-GIVEN = train.Arguments(suite=ablation.SUITES, algo="evolution", name="parts", hidden=4, warm_up=10)
+GIVEN = Settings(suite=ablation.SUITES, algo="evolution", name="parts", hidden=4, warm_up=10)
 HEAD = "steps,seconds,score,regret,over_afr,over_rivals\n"
 
 
 def test_each_variant_lacks_what_its_name_says() -> None:
     made = ablation.variants(GIVEN)
     assert len({variant.name for variant in made.values()}) == len(made)
-    everything = evolution.fields_of(made["everything"])
-    assert everything == evolution.MOTION
+    everything = made["everything"].observed
+    assert everything == MOTION
     for name, left_out in ablation.WITHOUT.items():
-        fields = evolution.fields_of(made[name])
+        fields = made[name].observed
         assert {*everything} - {*fields} == {*left_out} <= {*learned.NAMES}
     for hidden, still in ablation.HIDDEN:
         variant = made[f"{hidden} hidden units where the link moves, {still} where it stands still"]
@@ -36,12 +36,14 @@ def test_each_variant_lacks_what_its_name_says() -> None:
 def run_of(folder: Path, name: str, algo: str, validations: dict[int, str]) -> Path:
     """A run's folder, as train.py leaves it, but for the agents."""
     run = folder / name
-    arguments = dataclasses.replace(train.Arguments(suite="interruption-v1", name=name), algo=algo, seeds=3)
+    settings = dataclasses.replace(Settings(suite="interruption-v1", name=name), algo=algo, seeds=3)
     for seed, rows in validations.items():
         home = run / f"seed-{seed}"
         home.mkdir(parents=True)
         (home / "validation.csv").write_text(HEAD + rows, encoding="utf-8")
-    (run / "settings.json").write_text(json.dumps(dataclasses.asdict(arguments)), encoding="utf-8")
+    (run / "settings.json").write_text(
+        json.dumps({"command": settings.command, **dataclasses.asdict(settings)}), encoding="utf-8"
+    )
     return run
 
 
@@ -61,12 +63,7 @@ def test_the_best_of_n_seeds_is_chosen_by_validation_and_shown_on_the_test(
     run = run_of(tmp_path, "mine", "evolution", validations)
     tested = {"seed-0": 0.58, "seed-1": 0.55, "seed-2": 0.9}
 
-    class OneYard:
-        def over_rivals(self, agent: str) -> float:
-            return tested[agent]
-
-    monkeypatch.setattr(ablation.policies, "load", lambda path: path.parent.name)
-    monkeypatch.setattr(ablation.evolution, "yards", lambda *given: [OneYard()])
+    monkeypatch.setattr(ablation, "tested", lambda settings, model: [tested[model.parent.name]])
     rows = ablation.more_seeds(run)[2:]
     assert rows == [
         "| best of 1 | 0.600 | 0.677 |",
@@ -76,6 +73,6 @@ def test_the_best_of_n_seeds_is_chosen_by_validation_and_shown_on_the_test(
 
 
 def test_a_table_has_the_mean_of_the_seeds_and_their_range() -> None:
-    found = {"everything": [[0.5, 0.6, 0.4, 0.9], [0.7, 0.6, 0.4, 0.5]]}
-    row = ablation.table(found, {"everything": 130}, ablation.SUITES.split(","))[-1]
+    measured = {"everything": [[0.5, 0.6, 0.4, 0.9], [0.7, 0.6, 0.4, 0.5]]}
+    row = ablation.variants_table(measured, {"everything": 130}, ablation.SUITES.split(","))[-1]
     assert row == "| everything | 130 | 0.60 | 0.60 | 0.40 | 0.70 | 0.575 (0.550-0.600) |"

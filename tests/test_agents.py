@@ -1,4 +1,4 @@
-"""The parts of training on a suite: rows of different L side by side, networks that do not mind, double DQN, trials."""
+"""The parts of training on a suite: rows of different L side by side, the slot network, double DQN, evaluation sets."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard"):
 
 import torch  # noqa: E402  (these need the extra)
 
-import train  # noqa: E402
-from agents import callbacks, training, worlds  # noqa: E402
-from agents.dqn import IMPOSSIBLE, possible  # noqa: E402
-from agents.trials import Trials, plan, seeds_for  # noqa: E402
+from agents import mixed_env, runs, training  # noqa: E402
+from agents.dqn import INVALID, valid_actions  # noqa: E402
+from agents.evaluation import EvaluationSet, plan_for, seeds_for  # noqa: E402
+from agents.settings import Settings  # noqa: E402
 from bufgym import policies  # noqa: E402
 from bufgym.benchmark.run import draw  # noqa: E402
 from bufgym.benchmark.sweep import Plan  # noqa: E402
 from bufgym.errors import BufgymError  # noqa: E402
 from bufgym.model.qoi import exponential  # noqa: E402
 from bufgym.sb3 import GymVecEnv  # noqa: E402
-from bufgym.sb3.networks import SlotFeatures, SlotScorer  # noqa: E402
+from bufgym.sb3.networks import SlotExtractor, SlotScorer  # noqa: E402
 from bufgym.scenario import Interruption  # noqa: E402
 from bufgym.sim import run  # noqa: E402
 
 SHORT = Interruption(law="uniform", t_min=6, t_max=30)
 STEEP = dataclasses.replace(SHORT, value=exponential(0.2))
-MIXED = [worlds.Cell("short", SHORT, 3), worlds.Cell("steep", STEEP, 5)]
-SUITE = train.Arguments(suite="interruption-v1", capacities="4,8", validation_episodes=60)
+MIXED = [mixed_env.Cell("short", SHORT, 3), mixed_env.Cell("steep", STEEP, 5)]
+SUITE = Settings(suite="interruption-v1", capacities="4,8", validation_episodes=60)
 
 
 class DropOldest:
@@ -43,57 +43,57 @@ class DropOldest:
         return np.where(action_masks[:, last], last, np.where(action_masks[:, 0], 0, last - 1)), None
 
 
-def mixed_world(rows: int = 4, seats: int = 7) -> worlds.World:
-    """So many rows of each cell of MIXED, each with an episode of its own."""
-    world = worlds.World(MIXED, [rows] * 2, seats)
-    world.load([draw(cell.scenario, seed) for cell in MIXED for seed in range(rows)])
-    return world
+def mixed_rows(rows: int = 4, slots: int = 7) -> mixed_env.MixedEnv:
+    """So many rows of each cell of MIXED, each with its own episode, padded to so many slots."""
+    env = mixed_env.MixedEnv(MIXED, [rows] * 2, slots)
+    env.load([draw(cell.scenario, seed) for cell in MIXED for seed in range(rows)])
+    return env
 
 
 # --- rows of different L side by side --------------------------------------------------------------------------------
 
 
-def test_seats_beyond_a_rows_own_L_are_empty_and_masked() -> None:
-    world = mixed_world()
+def test_padded_slots_are_empty_and_masked() -> None:
+    env = mixed_rows()
     for _ in range(6):  # as many arrivals as any episode has fill both kinds of buffer
-        world.act(np.full(8, 8))
-    live = ~world.ended()
-    seen, masks = world.observation(), world.action_masks()
+        env.act(np.full(8, 8))
+    live = ~env.ended()
+    seen, masks = env.observation(), env.action_masks()
     assert live[:4].any() and live[4:].any()
     for rows, L in ((slice(0, 4), 3), (slice(4, 8), 5)):
-        wanted = [1.0] * L + [0.0] * (7 - L) + [1.0]  # the newcomer stays last
-        assert (seen["occupied"][rows][live[rows]] == wanted).all()
-        assert (masks[rows][live[rows]] == [*map(bool, wanted), False]).all()  # no room to accept
+        expected = [1.0] * L + [0.0] * (7 - L) + [1.0]  # the newcomer stays last
+        assert (seen["occupied"][rows][live[rows]] == expected).all()
+        assert (masks[rows][live[rows]] == [*map(bool, expected), False]).all()  # no room to accept
         assert (seen["occupancy"][rows][live[rows]] == 1.0).all()
 
 
 @pytest.mark.parametrize("name", ["drop-oldest", "drop-newest"])
 def test_a_padded_row_is_the_same_sender(name: str) -> None:
-    """With 7 seats, 8 accepts, 7 rejects and 0 evicts the oldest, whatever the row's own L."""
-    world = mixed_world()
-    while not world.ended().all():
-        world.act(np.where(world.action_masks()[:, 8], 8, 0 if name == "drop-oldest" else 7))
-    reached = [rows.summary(slice(None))["qoi"] for rows in world.groups]
+    """With 7 slots, 8 accepts, 7 rejects and 0 evicts the oldest, whatever the row's own L."""
+    env = mixed_rows()
+    while not env.ended().all():
+        env.act(np.where(env.action_masks()[:, 8], 8, 0 if name == "drop-oldest" else 7))
+    reached = [rows.summary(slice(None))["qoi"] for rows in env.groups]
     for cell, ours in zip(MIXED, reached, strict=True):
         senders = run(
             policies.get(name), [draw(cell.scenario, s) for s in range(4)], cell.capacity, cell.scenario.value
         )
         assert ours == pytest.approx(1 + senders.batch.senders["delivered_gain"])
-    assert not any(rows.summary(slice(None))["invalid"].any() for rows in world.groups)
+    assert not any(rows.summary(slice(None))["invalid"].any() for rows in env.groups)
 
 
-def test_evicting_a_seat_beyond_L_does_what_a_queue_does() -> None:
-    world, queue = mixed_world(), mixed_world()
-    while not world.ended().all():
-        world.act(np.full(8, 6))  # a seat that no row has
+def test_evicting_a_padded_slot_does_what_a_queue_does() -> None:
+    env, queue = mixed_rows(), mixed_rows()
+    while not env.ended().all():
+        env.act(np.full(8, 6))  # a slot that no row has
         queue.act(np.where(queue.action_masks()[:, 8], 8, 7))
-    for ours, theirs in zip(world.groups, queue.groups, strict=True):
+    for ours, theirs in zip(env.groups, queue.groups, strict=True):
         assert (ours.summary(slice(None))["qoi"] == theirs.summary(slice(None))["qoi"]).all()
         assert ours.summary(slice(None))["invalid"].any()
 
 
 def test_rewards_add_up_to_the_information_and_rows_begin_anew() -> None:
-    env = GymVecEnv(worlds.World(MIXED, [3, 3], reward="retained"))
+    env = GymVecEnv(mixed_env.MixedEnv(MIXED, [3, 3], reward="retained"))
     env.seed(0)
     env.reset()
     ends = 0
@@ -112,47 +112,45 @@ def test_rewards_add_up_to_the_information_and_rows_begin_anew() -> None:
 
 
 def test_rows_begin_at_different_points_of_their_episodes() -> None:
-    world = worlds.World([worlds.Cell("long", Interruption(law="fixed", t_max=60), 4)], [16])
-    world.reset(seed=1)
-    arrived = world.groups[0].senders.batch.senders["next"]
+    env = mixed_env.MixedEnv([mixed_env.Cell("long", Interruption(law="fixed", t_max=60), 4)], [16])
+    env.reset(seed=1)
+    arrived = env.groups[0].senders.batch.senders["next"]
     assert len(np.unique(arrived)) > 8
     assert arrived.max() > 30
-    again = worlds.World([worlds.Cell("long", Interruption(law="fixed", t_max=60), 4)], [16])
+    again = mixed_env.MixedEnv([mixed_env.Cell("long", Interruption(law="fixed", t_max=60), 4)], [16])
     again.reset(seed=1)
     assert (again.groups[0].senders.batch.senders["next"] == arrived).all()
 
 
 def test_mistakes_are_named() -> None:
-    assert worlds.capacities_of("lte-v1", "") == (5, 10, 15, 20, 25)
-    assert worlds.capacities_of("lte-v1", "25,5") == (25, 5)
+    assert Settings().capacities_of("lte-v1") == (5, 10, 15, 20, 25)
+    assert Settings(capacities="25,5").capacities_of("lte-v1") == (25, 5)
     for wrong in ("5,x", "0", "5,5"):
         with pytest.raises(BufgymError, match="capacities"):
-            worlds.capacities_of("lte-v1", wrong)
-    with pytest.raises(BufgymError, match="2 seats: a cell has L = 5"):
-        worlds.World(MIXED, [1, 1], seats=2)
+            Settings(capacities=wrong).capacities_of("lte-v1")
+    with pytest.raises(BufgymError, match="2 padded slots: a cell has L = 5"):
+        mixed_env.MixedEnv(MIXED, [1, 1], padded_slots=2)
 
 
 # --- networks --------------------------------------------------------------------------------------------------------
 
 
-def scorer_of(world: worlds.World, masked: bool = True) -> tuple[SlotFeatures, SlotScorer]:
+def scorer_of(env: mixed_env.MixedEnv, masked: bool = True) -> tuple[SlotExtractor, SlotScorer]:
     torch.manual_seed(0)
-    features = SlotFeatures(world.single_observation_space)
+    features = SlotExtractor(env.single_observation_space)
     return features, SlotScorer(features, 8, masked)
 
 
-def test_scores_and_values_do_not_change_with_the_seats() -> None:
+def test_scores_and_values_do_not_change_with_padding() -> None:
     logits, values = [], []
-    for seats in (5, 9):
-        world = mixed_world(seats=seats)
-        world.act(np.full(8, seats + 1))
-        world.act(np.full(8, seats + 1))
-        features, scorer = scorer_of(world)
+    for slots in (5, 9):
+        env = mixed_rows(slots=slots)
+        env.act(np.full(8, slots + 1))
+        env.act(np.full(8, slots + 1))
+        features, scorer = scorer_of(env)
         with torch.no_grad():
-            scores, value = scorer(
-                features({name: torch.as_tensor(seen) for name, seen in world.observation().items()})
-            )
-        possible_now = torch.as_tensor(world.action_masks())
+            scores, value = scorer(features({name: torch.as_tensor(seen) for name, seen in env.observation().items()}))
+        possible_now = torch.as_tensor(env.action_masks())
         logits.append(scores[possible_now])
         values.append(value)
     assert torch.allclose(*logits, atol=1e-6)
@@ -161,13 +159,13 @@ def test_scores_and_values_do_not_change_with_the_seats() -> None:
 
 
 def test_leaving_empty_slots_out_changes_no_score_that_counts() -> None:
-    world = mixed_world()
-    world.act(np.full(8, 8))
-    seen = {name: torch.as_tensor(column) for name, column in world.observation().items()}
-    features, packed = scorer_of(world)
-    _, full = scorer_of(world, masked=False)
+    env = mixed_rows()
+    env.act(np.full(8, 8))
+    seen = {name: torch.as_tensor(column) for name, column in env.observation().items()}
+    features, packed = scorer_of(env)
+    _, full = scorer_of(env, masked=False)
     full.load_state_dict(packed.state_dict())
-    masks = torch.as_tensor(world.action_masks())
+    masks = torch.as_tensor(env.action_masks())
     ours, theirs = packed.forward_actor(features(seen)), full.forward_actor(features(seen))
     assert torch.allclose(ours[masks], theirs[masks], atol=1e-6)
     assert not torch.allclose(ours[~masks][:, None], theirs[~masks][:, None])
@@ -184,7 +182,7 @@ def test_leaving_empty_slots_out_changes_no_score_that_counts() -> None:
 @pytest.fixture
 def dqn() -> Iterator[Any]:
     arguments = dataclasses.replace(SUITE, algo="dqn", width=8, num_envs=8, n_steps=16, batch_size=64, gamma=0.5)
-    env = GymVecEnv(worlds.World(MIXED, [4, 4]))
+    env = GymVecEnv(mixed_env.MixedEnv(MIXED, [4, 4]))
     model = training.new_dqn(arguments, env)
     model.set_random_seed(0)
     yield model
@@ -196,13 +194,13 @@ def test_the_observation_tells_the_masks(dqn: Any) -> None:
     seen = env.reset()
     for _ in range(60):
         masks = np.stack(env.env_method("action_masks"))
-        assert (possible(seen).numpy() == masks).all()
+        assert (valid_actions(seen).numpy() == masks).all()
         q = dqn.q_net({name: torch.as_tensor(column) for name, column in seen.items()}).detach().numpy()
-        assert ((q == IMPOSSIBLE) == ~masks).all()
+        assert ((q == INVALID) == ~masks).all()
         seen, _, _, _ = env.step((rng.random(masks.shape) * masks).argmax(axis=1))
 
 
-def test_exploration_tries_all_that_is_possible_and_nothing_else(dqn: Any) -> None:
+def test_exploration_tries_all_valid_actions_and_no_others(dqn: Any) -> None:
     dqn.exploration_rate = 1.0
     dqn._last_obs = dqn.env.reset()
     masks = np.stack(dqn.env.env_method("action_masks"))
@@ -251,28 +249,28 @@ def callbacks_logger() -> Any:
     return Logger(None, [])
 
 
-# --- trials ----------------------------------------------------------------------------------------------------------
+# --- evaluation sets -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: Path) -> None:
-    trials = Trials(plan(SUITE, SUITE.suite, "validation"), tmp_path / "trials")
-    assert len(trials.known("afr")) == 60
-    verdict = trials.verdict(DropOldest(), 8)
-    assert verdict.score == 0
-    rows = trials.rows_of(DropOldest(), 10, "agent", training_seed=7)  # seats do not matter
-    theirs = {(r["scenario"], r["seed"], r["capacity"]): r for r in trials.rows if r["policy"] == "drop-oldest"}
-    assert len(rows) == len(theirs) == 60
+    evaluation = EvaluationSet(plan_for(SUITE, SUITE.suite, "validation"), tmp_path / "set")
+    assert len(evaluation.fixed("afr")) == 60
+    assert evaluation.verdict(evaluation.play(DropOldest(), 8)).score == 0
+    outcomes = evaluation.play(DropOldest(), 10)  # padding does not matter
+    rows = evaluation.benchmark_rows(outcomes, "agent", training_seed=7)
+    fixed = {(r["scenario"], r["seed"], r["capacity"]): r for r in evaluation.rows if r["policy"] == "drop-oldest"}
+    assert len(rows) == len(fixed) == 60
     for row in rows:
-        other = theirs[row["scenario"], row["seed"], row["capacity"]]
+        other = fixed[row["scenario"], row["seed"], row["capacity"]]
         assert {k: v for k, v in row.items() if k not in ("policy", "training_seed")} == pytest.approx(
             {k: v for k, v in other.items() if k != "policy"}, nan_ok=True
         )
     # A second reading makes nothing anew.
-    written = (tmp_path / "trials" / "manifest.json").stat().st_mtime_ns
-    again = Trials(plan(SUITE, SUITE.suite, "validation"), tmp_path / "trials")
-    assert (again.known("afr") == trials.known("afr")).all()
-    assert (tmp_path / "trials" / "manifest.json").stat().st_mtime_ns == written
+    written = (tmp_path / "set" / "manifest.json").stat().st_mtime_ns
+    again = EvaluationSet(plan_for(SUITE, SUITE.suite, "validation"), tmp_path / "set")
+    assert (again.fixed("afr") == evaluation.fixed("afr")).all()
+    assert (tmp_path / "set" / "manifest.json").stat().st_mtime_ns == written
 
 
 def test_as_many_episodes_as_asked_for_or_at_least_one_a_trace() -> None:
@@ -282,17 +280,28 @@ def test_as_many_episodes_as_asked_for_or_at_least_one_a_trace() -> None:
 
 
 def test_nothing_to_be_gained_is_an_error(tmp_path: Path) -> None:
-    trials = Trials(Plan("interruption-v1", ("afr",), "validation", (500,), 1), tmp_path / "trials")
+    evaluation = EvaluationSet(Plan("interruption-v1", ("afr",), "validation", (500,), 1), tmp_path / "set")
     with pytest.raises(BufgymError, match="cannot be bettered"):
-        trials.verdict(DropOldest(), 500)
+        evaluation.verdict(evaluation.run(policies.get("drop-oldest")))
 
 
 def test_a_record_goes_on_where_the_checkpoint_was(tmp_path: Path) -> None:
-    record = callbacks.Record(tmp_path / "curve.csv", ("steps", "seconds", "qoi"), 0)
+    columns = ("steps", "seconds", "qoi")
+    record = runs.Record(tmp_path / "curve.csv", columns, 0)
     for steps in (10, 20, 30):
         record.append(steps, steps / 10, 0.5)
-    assert callbacks.Record(tmp_path / "curve.csv", ("steps", "seconds", "qoi"), 20).rows == [
-        (10, 1, 0.5),
-        (20, 2, 0.5),
-    ]
+    assert runs.Record(tmp_path / "curve.csv", columns, 20).rows == [(10, 1, 0.5), (20, 2, 0.5)]
     assert (tmp_path / "curve.csv").read_text().split() == ["steps,seconds,qoi", "10,1.0,0.5", "20,2.0,0.5"]
+
+
+def test_the_best_validation_is_the_earliest_of_equals(tmp_path: Path) -> None:
+    settings = Settings(steps=40, validate_every=20)
+    validations = runs.Validations(tmp_path, ("regret",), min, settings, 0)
+    assert validations.due(0)
+    assert [validations.add(steps, 0.0, (regret,)) for steps, regret in ((0, 0.5), (20, 0.4), (30, 0.4))] == [
+        True,
+        True,
+        False,
+    ]
+    assert validations.best[0] == 20
+    assert [validations.due(steps) for steps in (30, 40, 49, 50)] == [False, True, True, True]

@@ -13,7 +13,11 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard", "cma"):
     pytest.importorskip(extra, reason="the extra [train] is not installed")
 
 import train  # noqa: E402  (these need the extra)
-from agents import evolution, fleet_grounds, fleets, training  # noqa: E402
+from agents import cma_es, training  # noqa: E402
+from agents.objectives import fleet  # noqa: E402
+from agents.objectives.objective import to_vector  # noqa: E402
+from agents.runs import prepare  # noqa: E402
+from agents.settings import Settings  # noqa: E402
 from bufgym import policies  # noqa: E402
 from bufgym.benchmark import fleets as benchmark  # noqa: E402
 from bufgym.benchmark.fleets_summary import summary  # noqa: E402
@@ -23,9 +27,7 @@ from bufgym.policies import learned, weights  # noqa: E402
 SUITE = dataclasses.replace(benchmark.get("fleet-v1"), robots=2, capacities=(3, 4))
 """fleet-v1 with two robots, and buffers so small that most arrivals ask for something to be dropped."""
 
-TINY = train.Arguments(
-    suite="fleet-v1", algo="evolution", name="tiny", steps=12_000, validate_every=6_000, test_seeds=1
-)
+TINY = Settings(suite="fleet-v1", algo="evolution", name="tiny", steps=12_000, validate_every=6_000, test_seeds=1)
 PPO = dataclasses.replace(
     TINY, algo="maskable-ppo", num_envs=4, n_steps=32, batch_size=64, width=8, epochs=1, steps=256, validate_every=128
 )
@@ -36,8 +38,8 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A folder of its own; a small suite, and only what takes no time of the rest."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(benchmark.SUITES, "fleet-v1", SUITE)
-    monkeypatch.setattr(fleet_grounds, "EPISODE_S", 1.0)
-    monkeypatch.setattr(fleet_grounds, "JUDGES", 1)
+    monkeypatch.setattr(fleet, "EPISODE_S", 1.0)
+    monkeypatch.setattr(fleet, "VALIDATION_EPISODES", 1)
     monkeypatch.setattr(benchmark, "default_policies", lambda: ["afr", "drop-oldest"])
     yield
 
@@ -49,32 +51,32 @@ def shipped(name: str = "learned-motion") -> weights.Weights:
 # --- where candidates are tried --------------------------------------------------------------------------------------
 
 
-def test_a_ground_is_what_the_benchmark_says_of_the_same_episodes() -> None:
+def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
     part = benchmark.suite_parts(SUITE, "validation", seeds=2)[0]
     part = part._replace(
         fleet=dataclasses.replace(part.fleet, uplink=dataclasses.replace(part.fleet.uplink, duration_s=2.0))
     )
     episodes = [benchmark.draw(part.fleet, seed) for seed in part.seeds]
-    ground = fleet_grounds.Ground(part.fleet, episodes, 4)
+    cell = fleet.FleetEpisodes(part.fleet, episodes, 4)
     rows = benchmark.run_parts([policies.get(name) for name in ("afr", "min-gap")], [part], [4])
     mean = {s.policy: s for s in summary(rows).overall}
-    assert ground.rival == pytest.approx(mean["afr"].team.value)
-    assert ground.team(policies.get("min-gap")) == pytest.approx(mean["min-gap"].team.value)
-    found = fleet_grounds.gain(policies.get("min-gap"), [ground])
-    assert found == pytest.approx(mean["min-gap"].gain.value) and found != 0
-    assert fleet_grounds.gain(policies.get("afr"), [ground]) == 0  # again and again the same
-    assert ground.decisions == 2 * 2 * 60
+    assert cell.rival == pytest.approx(mean["afr"].team.value)
+    assert cell.team_qoi(policies.get("min-gap")) == pytest.approx(mean["min-gap"].team.value)
+    gain = fleet.mean_gain(policies.get("min-gap"), [cell])
+    assert gain == pytest.approx(mean["min-gap"].gain.value) and gain != 0
+    assert fleet.mean_gain(policies.get("afr"), [cell]) == 0  # again and again the same
+    assert cell.decisions == 2 * 2 * 60
 
 
 @pytest.mark.slow
 def test_samples_go_once_round_the_training_links() -> None:
-    """A ground for each L of the same episodes; every seed has episodes of its own."""
-    found = fleet_grounds.samples(SUITE, seed=3)
-    assert [[ground.fleet.senders.capacity for ground in part] for part in found] == [[3, 4]] * fleet_grounds.PARTS
-    assert all(part[0].episodes is part[1].episodes for part in found)
-    links = [episode.link.trace.name for part in found for episode in part[0].episodes]
+    """The same episodes at each L; every seed has episodes of its own."""
+    parts = fleet.training_parts(SUITE, seed=3)
+    assert [[cell.fleet.senders.capacity for cell in part] for part in parts] == [[3, 4]] * fleet.PARTS
+    assert all(part[0].episodes is part[1].episodes for part in parts)
+    links = [episode.link.trace.name for part in parts for episode in part[0].episodes]
     assert len(links) == len(set(links)) == 24 and all("validation" not in name for name in links)
-    first, again, other = (fleet_grounds.samples(SUITE, seed)[0][0].episodes[0] for seed in (3, 3, 4))
+    first, again, other = (fleet.training_parts(SUITE, seed)[0][0].episodes[0] for seed in (3, 3, 4))
     assert first.link.offset_us == again.link.offset_us != other.link.offset_us
     assert first.robots == 2 and len(first.arrivals[0]) == 30
 
@@ -82,28 +84,33 @@ def test_samples_go_once_round_the_training_links() -> None:
 # --- where they begin ------------------------------------------------------------------------------------------------
 
 
+def start_of(**changes: str) -> weights.Weights:
+    """Where evolution begins with these settings."""
+    return fleet.FleetObjective(dataclasses.replace(TINY, **changes), Path(), 0).start()  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("sees", ["motion", "time"])
 def test_the_shipped_agent_reads_more_and_decides_the_same(sees: str) -> None:
     before = shipped(f"learned-{sees}")
-    made = fleets.widened(before, fleets.MORE[sees])
-    assert made.fields == (*before.fields, *fleets.MORE[sees])
-    part = fleet_grounds.samples(SUITE, seed=0)[0]
-    assert [ground.team(learned.policy("mine", made)) for ground in part] == [
-        ground.team(learned.policy("shipped", before)) for ground in part
+    made = fleet.widened(before, fleet.MORE[sees])
+    assert made.fields == (*before.fields, *fleet.MORE[sees])
+    part = fleet.training_parts(SUITE, seed=0)[0]
+    assert [cell.team_qoi(learned.policy("mine", made)) for cell in part] == [
+        cell.team_qoi(learned.policy("shipped", before)) for cell in part
     ]
     if sees == "time":
         assert not [name for name in made.fields if "motion" in name]
     # What it reads now can be searched.
-    assert len(evolution.to_vector(made)) > len(evolution.to_vector(before))
+    assert len(to_vector(made)) > len(to_vector(before))
     # Evolution begins there, but less ready to accept.
-    first = fleets.begin(dataclasses.replace(TINY, sees=sees), seed=0)
-    assert first.accept.bias[0] == made.accept.bias[0] - fleets.THRIFT
+    first = start_of(sees=sees)
+    assert first.accept.bias[0] == made.accept.bias[0] - fleet.THRIFT
     first.accept.bias[:] = made.accept.bias
     assert (first.memory() == made.memory()).all()
 
 
 def test_fields_of_ones_own_begin_with_greed() -> None:
-    made = fleets.begin(dataclasses.replace(TINY, fields="rank,motion_merged,left"), seed=0)
+    made = start_of(fields="rank,motion_merged,left")
     assert made.fields == ("rank", "motion_merged", "left") and made.still is None
     assert made.drop.skip.tolist() == pytest.approx([-0.4, -10, 0])
 
@@ -111,8 +118,8 @@ def test_fields_of_ones_own_begin_with_greed() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"suite": "fleet-v1,lte-v1"}, "suite fleet-v1: a fleet's agent learns from one suite alone"),
-        ({"algo": "dqn"}, "a fleet's agent learns from one suite alone, by evolution or maskable-ppo"),
+        ({"suite": "fleet-v1,lte-v1"}, "suite fleet-v1,lte-v1: a fleet's agent learns from one suite alone"),
+        ({"algo": "dqn"}, "a fleet's agent learns from one suite alone, by --algo evolution or maskable-ppo"),
         ({"algo": "maskable-ppo", "network": "plain"}, "network = 'plain': a fleet's agent scores slots"),
         ({"capacities": "5,x"}, "capacities = '5,x'"),
         ({"seeds": 0}, "seeds = 0: must be >= 1"),
@@ -124,28 +131,23 @@ def test_mistakes_are_told(change: dict[str, object], message: str) -> None:
         train.main(dataclasses.replace(TINY, **change))
 
 
-def test_other_suites_ask_for_no_fleet() -> None:
-    assert not fleets.wanted(dataclasses.replace(TINY, suite="lte-v1"))
-    assert not fleets.wanted(dataclasses.replace(TINY, suite=""))
-
-
 # --- training --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: pytest.CaptureFixture[str]) -> None:
     train.main(TINY)
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     folder = Path("runs/tiny")
     rows = read_rows(folder / "rows.csv", benchmark.ROWS)
     names = {"agent (seed 0)", "afr", "drop-oldest"}
     assert {row["policy"] for row in rows} == names and len(rows) == 12 * 2 * 2 * 3  # links, robots, L, policies
-    assert (folder / "results.txt").read_text() in told and "best on validation: seed 0" in told
-    found = np.loadtxt(folder / "seed-0" / "validation.csv", delimiter=",", skiprows=1)
-    assert found[0, 0] == 0 and found[-1, 0] >= TINY.steps and len(found) >= 3
+    assert (folder / "results.txt").read_text() in printed and "best on validation: seed 0" in printed
+    validations = np.loadtxt(folder / "seed-0" / "validation.csv", delimiter=",", skiprows=1)
+    assert validations[0, 0] == 0 and validations[-1, 0] >= TINY.steps and len(validations) >= 3
     # The file is what the best of these was: it does the same again.
     agent = weights.load(folder / "model.safetensors")
-    assert fleet_grounds.gain(agent, fleet_grounds.judges(SUITE)) == pytest.approx(found[:, 2].max(), abs=1e-12)
+    assert fleet.mean_gain(agent, fleet.validation_episodes(SUITE)) == pytest.approx(validations[:, 2].max(), abs=1e-12)
     mine = [row["qoi"] for row in rows if row["policy"] == "agent (seed 0)"]
     again = benchmark.run_parts([agent], benchmark.suite_parts(SUITE, "test", seeds=1), SUITE.capacities)
     assert [row["qoi"] for row in again] == mine
@@ -153,9 +155,9 @@ def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: py
 
 @pytest.mark.slow
 def test_a_run_that_goes_on_ends_like_one_that_never_stopped() -> None:
-    def validations(arguments: train.Arguments) -> list[list[str]]:
-        folder = training.prepare(arguments)
-        fleets.evolve(arguments, folder, 0)
+    def validations(arguments: Settings) -> list[list[str]]:
+        folder = prepare(arguments)
+        cma_es.train(arguments, folder, 0)
         lines = (folder / "seed-0" / "validation.csv").read_text().splitlines()[1:]
         return [[cell for k, cell in enumerate(line.split(",")) if k != 1] for line in lines]  # all but the seconds
 
@@ -169,7 +171,7 @@ def test_a_run_that_goes_on_ends_like_one_that_never_stopped() -> None:
 
 @pytest.mark.slow
 def test_ppo_shares_weights_over_robots_and_its_agent_needs_no_torch() -> None:
-    env = fleets.training_env(PPO)
+    env = training.training_env(PPO)
     assert env.num_envs == 4 and env.envs.rows.capacity == 4  # two cells of two robots, at the middle L
     train.main(PPO)
     folder = Path("runs/tiny")

@@ -41,6 +41,30 @@ ROOMS = [
 OUTSIDE = {"agents", "train", "tests"}
 """What imports bufgym, and is never imported by it."""
 
+TRAINING = [
+    "agents.settings",
+    "agents.runs",
+    "agents.mixed_env",
+    "agents.held_out",
+    "agents.evaluation",
+    "agents.objectives.objective",
+    "agents.objectives.queue",
+    "agents.objectives.topics",
+    "agents.objectives.fleet",
+    "agents.objectives",
+    "agents.cma_es",
+    "agents.callbacks",
+    "agents.dqn",
+    "agents.training",
+    "agents.report",
+    "agents.page",
+    "agents.goals",
+    "agents.scheduling",
+    "agents.ablation",
+    "train",
+]
+"""The modules that drive training, top to bottom. Each imports only bufgym and modules above it."""
+
 
 def imported_names(tree: ast.Module, module: str, is_package: bool) -> Iterator[tuple[int, str]]:
     """Each (line, full dotted name) that a module imports: at the top, in a function, or for types only."""
@@ -72,6 +96,59 @@ def faults(source: str, module: str, is_package: bool = False) -> list[str]:
             elif ROOMS.index(rest[0]) > ROOMS.index(room):
                 found.append(f"{module}:{line}: imports {rest[0]}, which is below {room}")
     return found
+
+
+def training_faults(source: str, module: str) -> list[str]:
+    """What in the imports of one module of TRAINING breaks their order, a sentence each."""
+    if module not in TRAINING:
+        return [f"{module}: has no place in TRAINING; give it one"]
+    found = []
+    for line, name in imported_names(ast.parse(source), module, is_package=False):
+        if name.split(".")[0] not in OUTSIDE:
+            if name.startswith("importlib.import_module"):
+                found.append(f"{module}:{line}: import_module hides what is imported")
+            continue
+        # The longest module that the name begins with: "agents.objectives.queue.start" is of that module.
+        owners = [other for other in TRAINING if f"{name}.".startswith(f"{other}.")]
+        if not owners:
+            found.append(f"{module}:{line}: imports {name}, which has no place in TRAINING")
+        elif TRAINING.index(max(owners, key=len)) >= TRAINING.index(module):
+            found.append(f"{module}:{line}: imports {max(owners, key=len)}, which is not above {module}")
+    return found
+
+
+def training_modules() -> dict[str, Path]:
+    """Dotted name -> file of train.py and every module in agents but ``agents/__init__.py``."""
+    paths = [*sorted((REPO / "agents").rglob("*.py")), REPO / "train.py"]
+    names = [".".join(path.relative_to(REPO).with_suffix("").parts).removesuffix(".__init__") for path in paths]
+    return {name: path for name, path in zip(names, paths, strict=True) if name != "agents"}
+
+
+@pytest.mark.parametrize("module", training_modules())
+def test_each_module_of_training_imports_only_what_is_above_it(module: str) -> None:
+    faults_found = training_faults(training_modules()[module].read_text(encoding="utf-8"), module)
+    assert not faults_found, "\n".join(faults_found)
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "fault"),
+    [
+        ("agents.training", "from agents.runs import Run", ""),
+        ("agents.training", "from agents import cma_es", ""),
+        ("train", "def main():\n    from agents import report, training", ""),
+        ("agents.runs", "from agents import training", "agents.training, which is not above"),
+        ("agents.runs", "def lazy():\n    from agents.report import report", "agents.report, which is not above"),
+        ("agents.settings", "from train import main", "train, which is not above"),
+        ("agents.objectives.queue", "from agents.objectives.fleet import widened", "which is not above"),
+        ("agents.runs", "from importlib import import_module", "hides"),
+        ("agents.runs", "from agents.attic import old", "has no place"),
+        ("agents.attic", "", "has no place"),
+    ],
+)
+def test_the_check_of_training_finds_what_it_should(module: str, source: str, fault: str) -> None:
+    sentences = training_faults(source, module)
+    assert len(sentences) == bool(fault)
+    assert all(fault in sentence for sentence in sentences)
 
 
 def modules() -> dict[str, Path]:
@@ -106,7 +183,7 @@ def test_each_room_imports_only_from_rooms_above(module: str) -> None:
         ("bufgym.policies.afr", "from ..sim import step", "below policies"),
         ("bufgym.model", "import bufgym", "not the whole package"),
         ("bufgym.model", "from bufgym import *", "not the whole package"),
-        ("bufgym.sb3", "from agents.evolution import Search", "never imports agents"),
+        ("bufgym.sb3", "from agents.cma_es import Evolution", "never imports agents"),
         ("bufgym.attic", "", "has no place"),
     ],
 )
@@ -197,3 +274,15 @@ def test_importing_bufgym_imports_nothing_heavy() -> None:
     core = heavy_modules_after("import numpy, gymnasium, numba")
     extra = heavy_modules_after("import bufgym") - core
     assert not extra, f"import bufgym also imports {sorted(extra)[:5]}"
+
+
+def test_sb3_without_its_extra_names_it() -> None:
+    """``stable_baselines3`` set to None cannot be imported, as if it were not installed."""
+    program = (
+        "import sys\nsys.modules['stable_baselines3'] = None\n"
+        "from bufgym.errors import BufgymError\n"
+        "try:\n    import bufgym.sb3\nexcept BufgymError as error:\n    print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=REPO, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("bufgym.sb3 needs ") and 'pip install "bufgym[train]"' in done.stdout

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,15 +13,25 @@ import pytest
 pytest.importorskip("stable_baselines3", reason="the extra [train] is not installed")
 pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
 
-from sb3_contrib import MaskablePPO
+import torch
+from sb3_contrib import MaskablePPO, RecurrentPPO
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common import env_util
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
 import bufgym
+from bufgym import policies
+from bufgym.benchmark.run import draw
+from bufgym.envs import SenderVectorEnv
 from bufgym.errors import BufgymError
-from bufgym.sb3 import GymVecEnv, make_vec_env
+from bufgym.sb3 import GymVecEnv, SlotExtractor, SlotPolicy, as_policy, make_vec_env
+from bufgym.scenario import Interruption
+from bufgym.scenario import get as scenario_of
+from bufgym.sim import run
+from bufgym.sim.metrics import outcome
 
 SMALL: dict[str, dict[str, Any]] = {
     "bufgym/Interruption-v0": {"capacity": 3, "t_max": 20},
@@ -191,3 +203,146 @@ def test_maskable_ppo_learns_from_it() -> None:
     mean, _ = evaluate_policy(model, envs, n_eval_episodes=8)
     assert isinstance(mean, float)
     assert 0 <= mean <= 20
+
+
+# --- trained models as policies --------------------------------------------------------------------------------------
+
+WORLD: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 1_000_000}
+FIELDS = ("rank", "motion_merged", "occupied", "occupancy")
+
+
+def untrained(algorithm: Any, policy: Any, env: Any = None, seed: int = 4, **options: Any) -> Any:
+    """A model with large random weights: its decisions vary."""
+    if algorithm is not DQN:
+        options = {"n_steps": 8, **({} if algorithm is A2C else {"batch_size": 16}), **options}
+    env = env or make_vec_env("bufgym/Uplink-v0", 2, seed=0, decide_at="arrival", **WORLD)
+    model = algorithm(policy, env, seed=1, device="cpu", **options)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    return model
+
+
+def flat_env() -> Any:
+    """Observations as one vector, for an MlpPolicy."""
+    return env_util.make_vec_env(lambda: gym.wrappers.FlattenObservation(gym.make("bufgym/Uplink-v0", **WORLD)), 2)
+
+
+def outcomes_in_env(model: Any, scenario: Any, masked: bool, flat: bool, fields: Any = None) -> list[Any]:
+    """What the model reaches in the environment, decision by decision."""
+    episodes = [draw(scenario, seed) for seed in range(4)]
+    envs = SenderVectorEnv(4, scenario, L, decide_at="arrival", fields=fields)
+    envs.reset(options={"episodes": episodes})
+    rows = envs.rows
+    while not rows.shown.ended.all():
+        observation: Any = rows.observation(rows.shown.slots, rows.shown.context)
+        if flat:
+            space = envs.single_observation_space
+            single = [{key: column[i] for key, column in observation.items()} for i in range(4)]
+            observation = np.array([gym.spaces.flatten(space, row) for row in single])
+        masks = {"action_masks": rows.shown.mask} if masked else {}
+        rows.step(np.asarray(model.predict(observation, deterministic=True, **masks)[0], np.int64))
+    return [outcome(rows.senders, i) for i in range(4)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("saved", [False, True])
+@pytest.mark.parametrize(
+    ("algorithm", "network"),
+    [
+        (PPO, "MultiInputPolicy"),
+        (PPO, "MlpPolicy"),
+        (MaskablePPO, "MultiInputPolicy"),
+        (MaskablePPO, "MlpPolicy"),
+        (DQN, "MultiInputPolicy"),
+        (DQN, "MlpPolicy"),
+        (A2C, "MultiInputPolicy"),
+        (A2C, "MlpPolicy"),
+    ],
+)
+def test_any_model_decides_as_a_policy_what_it_does_in_the_environment(
+    algorithm: Any, network: str, saved: bool, tmp_path: Path
+) -> None:
+    flat = network == "MlpPolicy"
+    model = untrained(algorithm, network, flat_env() if flat else None)
+    source: Any = model
+    if saved:
+        source = tmp_path / "mine.zip"
+        model.save(source)
+    policy = as_policy(source)
+    assert policy.name == ("mine" if saved else algorithm.__name__.lower())
+    scenario = replace(scenario_of("lte"), duration_s=2.0, size_bytes=1_000_000)
+    episodes = [draw(scenario, seed) for seed in range(4)]
+    senders = run(policy, episodes, L, scenario.value)
+    ours = [outcome(senders, i) for i in range(4)]
+    assert any(result.delivered and result.dropped for result in ours)
+    assert repr(ours) == repr(outcomes_in_env(model, scenario, algorithm is MaskablePPO, flat))  # NaN is NaN
+    if algorithm is MaskablePPO:
+        assert not senders.batch.senders["invalid"].any()
+
+
+@pytest.mark.slow
+def test_a_slot_network_serves_every_L_and_a_few_fields_are_enough(tmp_path: Path) -> None:
+    env = make_vec_env("bufgym/Uplink-v0", 2, seed=0, fields=FIELDS, **WORLD)
+    model = untrained(MaskablePPO, SlotPolicy, env, 6, policy_kwargs={"width": 8})
+    model.save(tmp_path / "slots.zip")
+    scenario = replace(scenario_of("lte"), duration_s=2.0, size_bytes=1_000_000)
+    episodes = [draw(scenario, seed) for seed in range(4)]
+    for policy in (as_policy(model, "slots"), as_policy(tmp_path / "slots.zip")):
+        assert policy.name == "slots" and policy.compile
+        senders = run(policy, episodes, L, scenario.value)
+        ours = [outcome(senders, i) for i in range(4)]
+        assert repr(ours) == repr(outcomes_in_env(model, scenario, True, False, FIELDS))
+        assert all(result.delivered and result.dropped for result in ours)
+        assert (run(policy, episodes, 20, scenario.value).batch.senders["invalid"] == 0).all()
+
+
+@pytest.mark.slow
+def test_an_agent_for_topics_is_a_scheduler() -> None:
+    """It drops and sends as in the environment, up to the last message: only there may a policy not hold."""
+    client = scenario_of("topics", duration_s=0.5)
+    env = make_vec_env("bufgym/Topics-v0", 2, seed=0, capacity=6, duration_s=0.5)
+    model = untrained(MaskablePPO, "MultiInputPolicy", env)
+    policy = as_policy(model, "scheduler")
+    assert policy.for_topics and policy.schedules
+    episode = draw(client, 0)
+    envs = SenderVectorEnv(1, client, 6)
+    envs.reset(options={"episodes": [episode]})
+    rows = envs.rows
+    while not rows.shown.ended.all():
+        observation = rows.observation(rows.shown.slots, rows.shown.context)
+        action, _ = model.predict(observation, deterministic=True, action_masks=rows.shown.mask)
+        rows.step(np.asarray(action, np.int64))
+    senders = run(policy, [episode], 6, client.value, topics=client.topics)
+    for name in ("rejected", "evicted", "transmitted"):
+        assert senders.batch.senders[name][0] == rows.senders.batch.senders[name][0]
+    assert np.array_equal(senders.batch.log["dropped_us"][0], rows.senders.batch.log["dropped_us"][0])
+
+
+def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
+    model = untrained(PPO, "MultiInputPolicy")
+    scenario = Interruption(t_max=20)
+    with pytest.raises(BufgymError, match="policy ppo: trained for L = 3, not for L = 5; only a network that scores"):
+        run(as_policy(model), [scenario.episode(20)], 5, scenario.value)
+    with pytest.raises(BufgymError, match=r"model cartpole: action space Discrete\(2\): must be Discrete\(L \+ 2\)"):
+        as_policy(untrained(PPO, "MlpPolicy", make_vec_env("CartPole-v1", 2)).policy, "cartpole", fields=["rank"])
+    flat = untrained(PPO, "MlpPolicy", flat_env())
+    with pytest.raises(BufgymError, match="which is no field"):
+        as_policy(flat, fields=["colour"])
+    with pytest.raises(BufgymError, match="must be the 4 of rank for L = 3"):
+        as_policy(flat, fields=["rank"])
+    recurrent = RecurrentPPO(
+        "MultiInputLstmPolicy", make_vec_env("bufgym/Uplink-v0", 2, **WORLD), batch_size=16, n_steps=8
+    )
+    with pytest.raises(BufgymError, match="recurrent"):
+        as_policy(recurrent)
+    with pytest.raises(BufgymError, match="no such file"):
+        as_policy(tmp_path / "none.zip")
+    assert policies.get("afr").name == "afr"  # nothing was registered
+
+
+def test_the_slot_extractor_serves_other_policies() -> None:
+    model = untrained(PPO, "MultiInputPolicy", policy_kwargs={"features_extractor_class": SlotExtractor})
+    assert isinstance(model.policy.features_extractor, SlotExtractor)
+    assert model.policy.features_extractor.features_dim == (L + 1) * 20

@@ -19,15 +19,18 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard", "matplotlib"):
     pytest.importorskip(extra, reason="the extras [train] and [plot] are not installed")
 
 import train  # noqa: E402  (these need the extras)
-from agents import evaluate, training  # noqa: E402
-from agents.trials import Trials, Verdict  # noqa: E402
+from agents import evaluation, held_out, runs, training  # noqa: E402
+from agents.callbacks import Curve, checkpoints  # noqa: E402
+from agents.evaluation import ValidationSets, Verdict  # noqa: E402
+from agents.mixed_env import Cell, MixedEnv  # noqa: E402
+from agents.settings import Settings  # noqa: E402
 from bufgym.benchmark.rows import read_rows  # noqa: E402
 from bufgym.errors import BufgymError  # noqa: E402
 from bufgym.policies import registry  # noqa: E402
 from bufgym.scenario import suites  # noqa: E402
 
 REPO = Path(__file__).resolve().parent.parent
-TINY = train.Arguments(
+TINY = Settings(
     name="tiny",
     steps=512,
     capacity=3,
@@ -79,6 +82,10 @@ def test_a_run_leaves_its_results(env: str, capsys: pytest.CaptureFixture[str]) 
     assert len({row["arrived"] for row in results["scores"]}) == 1  # all met the same episodes
     assert all(row["invalid"] == 0 for row in results["scores"] if row["policy"].startswith("agent"))
     assert results["settings"]["env"] == env
+    notes = json.loads((folder / "notes.json").read_text(encoding="utf-8"))
+    assert notes["training"].startswith("python train.py --") and notes["seeds"] == [0]
+    assert notes["scores"]["qoi"] == next(row["qoi"] for row in results["scores"] if row["policy"].startswith("agent"))
+    assert json.loads((folder / "seed-0" / "notes.json").read_text(encoding="utf-8"))["seeds"] == [0]
     assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "model.zip").exists()
     assert list((folder / "seed-0" / "tensorboard").glob("events*"))
@@ -88,28 +95,28 @@ def test_a_run_leaves_its_results(env: str, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = training.prepare(TINY)
+    folder = runs.prepare(TINY)
 
     class KilledError(Exception):
         """Stands for what ends a process in the middle of training."""
 
-    def dies_half_way(self: training.Curve) -> None:
+    def dies_half_way(self: Curve) -> None:
         row(self)
         if self.num_timesteps >= 384:
             raise KilledError
 
-    row = training.Curve._on_rollout_end
+    row = Curve._on_rollout_end
     with monkeypatch.context() as patch, pytest.raises(KilledError):
-        patch.setattr(training.Curve, "_on_rollout_end", dies_half_way)
+        patch.setattr(Curve, "_on_rollout_end", dies_half_way)
         training.train_seed(TINY, folder, 0)
     home = folder / "seed-0"
     # The third rollout was collected, but not learnt from: it does not count.
-    assert [path.stem for path in training.checkpoints(home)] == ["000000000128", "000000000256"]
+    assert [path.stem for path in checkpoints(home)] == ["000000000128", "000000000256"]
     assert curve_of(home) == [128, 256, 384]
-    before = training.MaskablePPO.load(training.checkpoints(home)[-1])
+    before = training.MaskablePPO.load(checkpoints(home)[-1])
 
     again = dataclasses.replace(TINY, resume=True)
-    assert training.prepare(again) == folder
+    assert runs.prepare(again) == folder
     run = training.train_seed(again, folder, 0)
     assert curve_of(home) == [128, 256, 384, 512]
     assert run.seconds > 0
@@ -125,22 +132,22 @@ def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: pytest.MonkeyPatc
 
 def test_a_run_is_not_overwritten_or_mixed_with_another() -> None:
     unnamed = dataclasses.replace(TINY, name="")
-    assert training.prepare(unnamed) == Path("runs/train-1")
-    assert training.prepare(unnamed) == Path("runs/train-2")
-    assert training.prepare(dataclasses.replace(unnamed, resume=True)) == Path("runs/train-2")
-    training.prepare(TINY)
-    with pytest.raises(SystemExit, match="exists"):
-        training.prepare(TINY)
-    with pytest.raises(SystemExit, match="capacity was 3, now 4"):
-        training.prepare(dataclasses.replace(TINY, resume=True, capacity=4))
-    with pytest.raises(SystemExit, match="no run"):
-        training.prepare(dataclasses.replace(TINY, resume=True, name="other"))
+    assert runs.prepare(unnamed) == Path("runs/train-1")
+    assert runs.prepare(unnamed) == Path("runs/train-2")
+    assert runs.prepare(dataclasses.replace(unnamed, resume=True)) == Path("runs/train-2")
+    runs.prepare(TINY)
+    with pytest.raises(BufgymError, match="exists"):
+        runs.prepare(TINY)
+    with pytest.raises(BufgymError, match="capacity was 3, now 4"):
+        runs.prepare(dataclasses.replace(TINY, resume=True, capacity=4))
+    with pytest.raises(BufgymError, match="no run"):
+        runs.prepare(dataclasses.replace(TINY, resume=True, name="other"))
 
 
 def test_held_out_traces_are_never_trained_on() -> None:
-    training_world, test_world = evaluate.worlds(TINY)
-    trained = {trace.name for trace in training_world.traces}  # type: ignore[attr-defined]
-    tested = {trace.name for trace in test_world.traces}  # type: ignore[attr-defined]
+    training_scenario, test_scenario = held_out.split_scenario(TINY)
+    trained = {trace.name for trace in training_scenario.traces}  # type: ignore[attr-defined]
+    tested = {trace.name for trace in test_scenario.traces}  # type: ignore[attr-defined]
     assert len(tested) == 2
     assert trained
     assert not trained & tested
@@ -149,8 +156,8 @@ def test_held_out_traces_are_never_trained_on() -> None:
 @pytest.mark.parametrize("decide_at", ["arrival", "overflow"])
 def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: str) -> None:
     """The agent's road (observations, actions, rows) and the policies' own are the same simulation."""
-    _, world = evaluate.worlds(TINY)
-    episodes = evaluate.held_out(world, 5)
+    _, scenario = held_out.split_scenario(TINY)
+    episodes = held_out.held_out_episodes(scenario, 5)
 
     class DropOldest:
         """Accepts where that is possible, else evicts slot 0."""
@@ -159,16 +166,17 @@ def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: str) -> None
             masks = np.asarray(action_masks)
             return np.where(masks[:, -1], TINY.capacity + 1, np.where(masks[:, 0], 0, TINY.capacity)), None
 
-    agent = evaluate.run_agent(DropOldest(), episodes, world, TINY.capacity, decide_at)  # type: ignore[arg-type]
-    assert agent == evaluate.run_fixed(episodes, world, TINY.capacity)["drop-oldest"]
-    assert any(outcome.dropped for outcome in agent)
+    env = MixedEnv([Cell("held-out", scenario, TINY.capacity)], [5], decide_at=decide_at)
+    outcomes = evaluation.play(DropOldest(), env, episodes)  # type: ignore[arg-type]
+    assert outcomes == held_out.run_fixed(episodes, scenario, TINY.capacity)["drop-oldest"]
+    assert any(outcome.dropped for outcome in outcomes)
 
 
 # --- on a suite ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algo", list(training.ALGORITHMS))
+@pytest.mark.parametrize("algo", training.ALGORITHMS)
 def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: pytest.CaptureFixture[str]) -> None:
     train.main(dataclasses.replace(SUITE, algo=algo))
     folder = Path("runs/tiny")
@@ -190,7 +198,7 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: pytest.Ca
     home = folder / "seed-0"
     with (home / "validation.csv").open(newline="", encoding="utf-8") as file:
         validation = {int(row["steps"]): float([*row.values()][-1]) for row in csv.DictReader(file)}
-    model = training.ALGORITHMS[algo].model
+    model = runs.MODEL if algo == "evolution" else "model.zip"
     assert (folder / model).read_bytes() == (home / model).read_bytes()
     if algo in training.LEARNERS:
         assert list(validation) == [0, 384, 768, 1152]
@@ -203,9 +211,9 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: pytest.Ca
     assert "cells (scenario, L) count" in printed
 
 
-def weights(arguments: train.Arguments, name: str) -> dict[str, np.ndarray]:
+def weights(arguments: Settings, name: str) -> dict[str, np.ndarray]:
     """All weights after training."""
-    folder = training.prepare(dataclasses.replace(arguments, name=name))
+    folder = runs.prepare(dataclasses.replace(arguments, name=name))
     run = training.train_seed(arguments, folder, arguments.seed)
     return {key: tensor.numpy() for key, tensor in training.load(arguments, run).policy.state_dict().items()}
 
@@ -222,7 +230,7 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(algo: str) -> None:
 @pytest.mark.slow
 def test_on_a_suite_too_the_same_seed_gives_the_same_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     verdicts = iter([0.9, 0.1, 0.7, 0.8] * 2)
-    monkeypatch.setattr(Trials, "verdict", lambda self, agent, seats: Verdict(0.5, 0.0, next(verdicts)))
+    monkeypatch.setattr(ValidationSets, "play", lambda self, agent, slots: Verdict(0.5, 0.0, next(verdicts)))
     first, again = weights(SUITE, "first"), weights(SUITE, "again")
     assert all((first[key] == again[key]).all() for key in first)
     # The second validation was the best: its agent is kept, not the last one.
@@ -232,8 +240,8 @@ def test_on_a_suite_too_the_same_seed_gives_the_same_weights(monkeypatch: pytest
 @pytest.mark.slow
 def test_a_suites_run_goes_on_with_its_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
     verdicts = iter([0.9, 0.1, 0.7, 0.5, 0.6])
-    monkeypatch.setattr(Trials, "verdict", lambda self, agent, seats: Verdict(0.5, 0.0, next(verdicts)))
-    folder = training.prepare(SUITE)
+    monkeypatch.setattr(ValidationSets, "play", lambda self, agent, slots: Verdict(0.5, 0.0, next(verdicts)))
+    folder = runs.prepare(SUITE)
     run = training.train_seed(dataclasses.replace(SUITE, steps=768), folder, 0)
     assert [(row[0], row[4]) for row in run.validation] == [(0, 0.9), (384, 0.1), (768, 0.7)]
     again = training.train_seed(dataclasses.replace(SUITE, resume=True), folder, 0)
@@ -244,9 +252,9 @@ def test_a_suites_run_goes_on_with_its_best_so_far(monkeypatch: pytest.MonkeyPat
 
 def test_dqn_goes_on_with_its_optimizer_and_a_fresh_replay() -> None:
     arguments = dataclasses.replace(TINY, algo="dqn")
-    folder = training.prepare(arguments)
+    folder = runs.prepare(arguments)
     training.train_seed(dataclasses.replace(arguments, steps=256), folder, 0)
-    before = training.MaskedDQN.load(training.checkpoints(folder / "seed-0")[-1])
+    before = training.MaskedDQN.load(checkpoints(folder / "seed-0")[-1])
     run = training.train_seed(arguments, folder, 0)
     after = training.load(arguments, run)
     assert (before.num_timesteps, after.num_timesteps) == (256, 512)
@@ -259,18 +267,51 @@ def test_dqn_goes_on_with_its_optimizer_and_a_fresh_replay() -> None:
 
 
 def test_batches_divide_the_experience() -> None:
-    assert training._even(32_768, 4_096) == 4_096
-    assert training._even(34_560, 4_096) == 3_840  # nine of them: eight would be too large
-    assert training._even(100, 4_096) == 100
+    assert training.even_batch(32_768, 4_096) == 4_096
+    assert training.even_batch(34_560, 4_096) == 3_840  # nine of them: eight would be too large
+    assert training.even_batch(100, 4_096) == 100
+    with pytest.raises(BufgymError, match="batch_size = 4: num_envs x n_steps = 7 decisions"):
+        training.even_batch(7, 4)
 
 
-def test_mistakes_are_told_before_a_folder_is_made() -> None:
-    for wrong in ({"suite": "no-such"}, {"suite": "lte-v1", "capacities": "0"}, {"suite": "lte-belgium-v1"}):
-        with pytest.raises(BufgymError):
-            training.prepare(dataclasses.replace(TINY, **wrong))
+NOT_POSITIVE = (
+    *("seeds", "steps", "capacity", "size_bytes", "duration_s", "width", "num_envs", "n_steps", "batch_size", "epochs"),
+    *("learning_rate", "checkpoint_every", "validate_every", "validation_episodes", "episodes"),
+)
+NEGATIVE = ("seed", "hidden", "still_hidden", "gamma", "gae_lambda", "entropy", "warm_up", "test_seeds")
+EVOLUTION = {"algo": "evolution", "suite": "interruption-v1"}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        *(({name: 0}, f"{name} = 0: must be") for name in NOT_POSITIVE),
+        *(({name: -1}, f"{name} = -1: must") for name in (*NOT_POSITIVE, *NEGATIVE)),
+        *(({name: float("nan")}, f"{name} = nan: must be a finite number") for name in ("gamma", "duration_s")),
+        *(({name: "no-such"}, f"{name} = 'no-such': must be one of") for name in ("env", "algo", "network", "reward")),
+        ({"gamma": 1.5}, "gamma = 1.5: must lie in 0..1"),
+        ({"batch_size": 1}, "batch_size = 1: must be >= 2"),
+        ({"hidden": 257}, "hidden = 257: must lie in 0..256"),
+        ({"suite": "no-such"}, "unknown suite 'no-such'"),
+        ({"suite": "lte-v1", "capacities": "0"}, "capacities = '0': must be whole numbers >= 1"),
+        ({"suite": "lte-v1", "capacities": "5,x"}, "capacities = '5,x': must be whole numbers such as"),
+        ({"suite": "lte-belgium-v1"}, "needs a folder of recordings"),
+        ({"suite": "lte-belgium-v1", "data": "no-such"}, "no-such"),
+        ({"suite": "lte-v1,topics-v1"}, "suite lte-v1,topics-v1: a scheduler learns from one suite alone"),
+        ({"suite": "fleet-v1", "algo": "dqn"}, "suite fleet-v1: a fleet's agent learns from one suite alone"),
+        ({"algo": "evolution"}, "learns from a suite's episodes: name one"),
+        ({**EVOLUTION, "fields": "rank"}, "fields = 'rank': must be rank, motion_merged or time_merged"),
+        ({**EVOLUTION, "fields": "rank,time_merged,colour"}, "fields = 'rank,time_merged,colour': must be"),
+        ({**EVOLUTION, "suite": "sustained-v1", "warm_up": 9}, "warm_up = 9: needs a suite of interruptions"),
+        ({"resume": True}, "there is no run in"),
+    ],
+)
+def test_mistakes_end_in_one_line_before_a_folder_is_made(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(SystemExit) as error:
+        train.main(dataclasses.replace(TINY, **wrong))  # type: ignore[arg-type]
+    assert str(error.value).startswith("error: ")
+    assert message in str(error.value) and "\n" not in str(error.value)
     assert not Path("runs").exists()
-    with pytest.raises(SystemExit, match="error: unknown suite 'no-such'"):
-        train.main(dataclasses.replace(TINY, suite="no-such"))
 
 
 @pytest.mark.slow
@@ -284,11 +325,11 @@ def test_a_process_killed_for_good_goes_on_and_a_second_seed_joins(tmp_path: Pat
     first = subprocess.Popen(command, env=environment, start_new_session=True, stdout=subprocess.DEVNULL)
     homes = [tmp_path / "runs" / "tiny" / f"seed-{seed}" for seed in (0, 1)]
     deadline = time.monotonic() + 60
-    while not training.checkpoints(homes[0]) and time.monotonic() < deadline:
+    while not checkpoints(homes[0]) and time.monotonic() < deadline:
         time.sleep(0.01)
     os.killpg(first.pid, signal.SIGKILL)
     first.wait()
-    assert training.checkpoints(homes[0])
+    assert checkpoints(homes[0])
     assert not (tmp_path / "runs" / "tiny" / "results.json").exists()
     again = [*command, "--resume", "--seeds", "2"]
     subprocess.run(again, env=environment, check=True, stdout=subprocess.DEVNULL, timeout=120)

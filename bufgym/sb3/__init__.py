@@ -1,5 +1,34 @@
-"""stable-baselines3 and bufgym: the vector environment it accepts, and the slot network as a policy of its own."""
+"""stable-baselines3 and sb3-contrib on bufgym: a vector environment, the slot network, trained models as policies.
 
-from bufgym.sb3.vec_env import GymVecEnv, make_vec_env
+    from sb3_contrib import MaskablePPO
+    from bufgym.sb3 import SlotPolicy, as_policy, make_vec_env
 
-__all__ = ["GymVecEnv", "make_vec_env"]
+    model = MaskablePPO(SlotPolicy, make_vec_env("bufgym/Uplink-v0", 256, capacity=8)).learn(1_000_000)
+    policy = as_policy(model, "mine")  # runs wherever the built-in policies do
+
+``export`` (or ``bufgym export``) writes a slot network to a file that bufgym runs without torch.
+"""
+
+from bufgym.errors import BufgymError
+
+try:
+    from bufgym.sb3.export import export, weights_of
+    from bufgym.sb3.networks import SlotExtractor, SlotPolicy, SlotScorer
+    from bufgym.sb3.policies import as_policy, takes_masks
+    from bufgym.sb3.vec_env import GymVecEnv, make_vec_env
+except ModuleNotFoundError as error:
+    if (error.name or "").split(".")[0] not in ("stable_baselines3", "sb3_contrib", "torch"):
+        raise
+    raise BufgymError(f'bufgym.sb3 needs {error.name}: pip install "bufgym[train]"') from None
+
+__all__ = [
+    "GymVecEnv",
+    "SlotExtractor",
+    "SlotPolicy",
+    "SlotScorer",
+    "as_policy",
+    "export",
+    "make_vec_env",
+    "takes_masks",
+    "weights_of",
+]

@@ -1,24 +1,29 @@
-"""The networks: a plain one over all numbers at once, and one that scores each slot with the same small network.
+"""The slot network, which scores each slot with the same small network, and a plain one over all numbers at once.
 
-Scoring slots one by one builds in what the problem has: what a message is worth depends on its neighbours (the slot's
-own features) and on the link (the context), not on the number of its slot. One set of weights serves every L.
+Scoring slots one by one builds in what is known of the problem: what a message is worth depends on its neighbours (the
+slot's own features) and on the link (the context), not on the number of its slot. One set of weights serves every L.
+
+    from sb3_contrib import MaskablePPO
+    from bufgym.sb3 import SlotExtractor, SlotPolicy, make_vec_env
+
+    env = make_vec_env("bufgym/Uplink-v0", 256, capacity=8)
+    MaskablePPO(SlotPolicy, env, policy_kwargs={"width": 32})
+    MaskablePPO("MultiInputPolicy", env, policy_kwargs={"features_extractor_class": SlotExtractor})
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
-# Most of what meets a queue with room should join it; exploration that drops messages at random learns little.
 ACCEPT_BIAS = 2.0
+"""Initial logit of accepting: exploration that drops messages where there is room learns little."""
 
 
 def field_names(space: spaces.Dict) -> tuple[list[str], list[str]]:
@@ -27,7 +32,7 @@ def field_names(space: spaces.Dict) -> tuple[list[str], list[str]]:
     return slots, [name for name in space if name not in slots]
 
 
-class SlotFeatures(BaseFeaturesExtractor):
+class SlotExtractor(BaseFeaturesExtractor):
     """[n, (L + 1) x (slot fields + context fields)]: each slot's features, with the context beside each."""
 
     def __init__(self, observation_space: spaces.Dict) -> None:
@@ -57,7 +62,7 @@ class SlotScorer(nn.Module):
     """
 
     def __init__(
-        self, features: SlotFeatures, width: int, masked: bool = True, accept_bias: float = ACCEPT_BIAS
+        self, features: SlotExtractor, width: int, masked: bool = True, accept_bias: float = ACCEPT_BIAS
     ) -> None:
         super().__init__()
         slots, inputs = features.slots, features.per_slot
@@ -73,8 +78,8 @@ class SlotScorer(nn.Module):
         self.critic = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU())
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        slots, here = self._slots(features)
-        return self._logits(slots, here), self._latent(slots, here)
+        slots, occupied = self._slots(features)
+        return self._logits(slots, occupied), self._latent(slots, occupied)
 
     def forward_actor(self, features: Tensor) -> Tensor:
         return self._logits(*self._slots(features))
@@ -89,20 +94,20 @@ class SlotScorer(nn.Module):
             return slots, torch.ones(slots.shape[:2], dtype=torch.bool)
         return slots, slots[..., self.occupied] > 0
 
-    def _logits(self, slots: Tensor, here: Tensor) -> Tensor:
+    def _logits(self, slots: Tensor, occupied: Tensor) -> Tensor:
         if self.masked:
-            drop = torch.zeros(here.shape).masked_scatter(here, self.score(slots[here]).squeeze(-1))
+            drop = torch.zeros(occupied.shape).masked_scatter(occupied, self.score(slots[occupied]).squeeze(-1))
         else:
             drop = self.score(slots).squeeze(-1)
         return torch.cat([drop, self.accept(slots[:, -1])], dim=1)
 
-    def _latent(self, slots: Tensor, here: Tensor) -> Tensor:
+    def _latent(self, slots: Tensor, occupied: Tensor) -> Tensor:
         """From the mean over messages and from the newcomer: its width is independent of L."""
         total = torch.zeros(len(slots), self.latent_dim_vf)
-        total = total.index_add(0, here.nonzero()[:, 0], self.worth(slots[here]))
-        mean = total / here.sum(dim=1, keepdim=True).clamp(min=1)
-        result: Tensor = self.critic(torch.cat([mean, self.worth(slots[:, -1])], dim=1))
-        return result
+        total = total.index_add(0, occupied.nonzero()[:, 0], self.worth(slots[occupied]))
+        mean = total / occupied.sum(dim=1, keepdim=True).clamp(min=1)
+        latent: Tensor = self.critic(torch.cat([mean, self.worth(slots[:, -1])], dim=1))
+        return latent
 
 
 def _perceptron(inputs: int, width: int, outputs: int, bias: float = 0.0) -> nn.Sequential:
@@ -119,14 +124,14 @@ class SlotPolicy(MaskableMultiInputActorCriticPolicy):
     def __init__(self, *args: Any, width: int = 32, masked: bool = True, **kwargs: Any) -> None:
         self.width, self.masked = width, masked
         kwargs.pop("use_sde", None)  # PPO says so to every policy, MaskablePPO to none; actions are discrete
-        kwargs.setdefault("features_extractor_class", SlotFeatures)
+        kwargs.setdefault("features_extractor_class", SlotExtractor)
         # Layers are initialised here as torch does; the library's orthogonal scheme would undo the accept bias.
         kwargs["ortho_init"] = False
         super().__init__(*args, **kwargs)
 
     def _build_mlp_extractor(self) -> None:
         features = self.features_extractor
-        assert isinstance(features, SlotFeatures)
+        assert isinstance(features, SlotExtractor)
         self.mlp_extractor = SlotScorer(features, self.width, self.masked)  # type: ignore[assignment]
 
     def _build(self, lr_schedule: Any) -> None:
@@ -146,21 +151,3 @@ def policy_of(network: str, width: int, masked: bool = True) -> tuple[Any, dict[
         return SlotPolicy, {"width": width, "masked": masked}
     plain = MaskableMultiInputActorCriticPolicy if masked else MultiInputActorCriticPolicy
     return plain, {"net_arch": [2 * width, 2 * width], "activation_fn": nn.ReLU}
-
-
-class IgnoresMasks:
-    """For a learner of stable-baselines3: takes masks as MaskablePPO does, and leaves the possible to its policy."""
-
-    policy: Any
-
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = False,
-        action_masks: NDArray[np.bool_] | None = None,
-    ) -> tuple[NDArray[Any], Any]:
-        """(actions, state) of the policy; it explores only as far as the policy itself does."""
-        found: tuple[NDArray[Any], Any] = self.policy.predict(observation, state, episode_start, deterministic)
-        return found

@@ -1,14 +1,12 @@
 """Native Gymnasium vector environments for stable-baselines3, which accepts nothing but its own ``VecEnv``.
 
-stable-baselines3 can only batch single environments, one Python call a step and environment. ``GymVecEnv`` hands it a
+stable-baselines3 itself batches single environments, one Python call a step and environment. ``GymVecEnv`` gives it a
 ``gymnasium.vector.VectorEnv`` instead, so that a compiled batch stays one call:
 
     from bufgym.sb3 import make_vec_env
     from sb3_contrib import MaskablePPO
 
     model = MaskablePPO("MultiInputPolicy", make_vec_env("bufgym/Uplink-v0", 256, seed=0), batch_size=4096)
-
-Only this module of bufgym imports stable-baselines3.
 """
 
 from __future__ import annotations
@@ -23,47 +21,42 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
+from stable_baselines3.common import env_util
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from bufgym.errors import BufgymError
 
-_SINGLE = {"observation_space": "single_observation_space", "action_space": "single_action_space"}
-"""What stable-baselines3 asks of one environment -> what a vector environment calls it."""
 
-
-def make_vec_env(id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> GymVecEnv:
+def make_vec_env(id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> VecEnv:
     """``num_envs`` environments of that Gymnasium id for stable-baselines3; ``kwargs`` go to the environment.
 
-    The native batch where the id has one that can reset in the same step (all of bufgym's can), else Gymnasium's own
-    batching of single environments.
-    With a ``seed``, environment i starts from seed + i at the first reset.
+    The native batch where the id has one that can reset in the same step (all of bufgym's can), else
+    stable-baselines3's own batch of single environments. With a ``seed``, environment i starts from seed + i at the
+    first reset.
     """
     entry = gym.spec(id).vector_entry_point
     native = load_env_creator(entry) if isinstance(entry, str) else entry
     # Gymnasium's own native batches know NEXT_STEP only.
-    if native is not None and "autoreset_mode" in inspect.signature(native).parameters:
-        kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
-        envs = gym.make_vec(id, num_envs, vectorization_mode="vector_entry_point", **kwargs)
-    else:
-        batching = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        envs = gym.make_vec(id, num_envs, vectorization_mode="sync", vector_kwargs=batching, **kwargs)
-    made = GymVecEnv(envs)
+    if native is None or "autoreset_mode" not in inspect.signature(native).parameters:
+        return env_util.make_vec_env(id, num_envs, seed, env_kwargs=kwargs)
+    kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
+    envs = GymVecEnv(gym.make_vec(id, num_envs, vectorization_mode="vector_entry_point", **kwargs))
     if seed is not None:
-        made.seed(seed)
-    return made
+        envs.seed(seed)
+    return envs
 
 
 class GymVecEnv(VecEnv):
-    """Any ``gymnasium.vector.VectorEnv`` with SAME_STEP autoreset as a stable-baselines3 ``VecEnv``.
+    """A native ``gymnasium.vector.VectorEnv`` with SAME_STEP autoreset as a stable-baselines3 ``VecEnv``.
 
     In the step that ends an episode its info has all that the environment reports at the end, ``terminal_observation``,
     ``TimeLimit.truncated``, and ``episode`` = {r: sum of rewards, l: steps, t: seconds since this object was made}, as
     stable-baselines3's ``Monitor`` writes it. Infos of the steps between are empty (n dicts a step cost more than a
     compiled step of n environments) unless ``step_infos``.
 
-    ``env_method(name)`` calls the batch's method once and deals its rows out, so ``action_masks`` costs one call.
+    ``env_method(name)`` calls the batch's method once and returns its rows, so ``action_masks`` costs one call.
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any], *, step_infos: bool = False) -> None:
@@ -130,66 +123,30 @@ class GymVecEnv(VecEnv):
         self._vector_options = options or None
 
     def has_attr(self, attr_name: str) -> bool:
-        try:
-            self._own(attr_name)
-        except AttributeError:
-            return super().has_attr(attr_name) if hasattr(self.envs.unwrapped, "get_attr") else False
-        return True
+        return hasattr(self.envs.unwrapped, _SINGLE.get(attr_name, attr_name))
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The batch's attribute, once for each index: what environments of a native batch share, they share."""
-        chosen = list(self._get_indices(indices))
-        try:
-            value = self._own(attr_name)
-        except AttributeError:
-            if not hasattr(self.envs.unwrapped, "get_attr"):
-                raise
-            each = self.envs.unwrapped.get_attr(attr_name)
-            return [each[i] for i in chosen]
-        return [value] * len(chosen)
+        """The batch's attribute, once for each index: environments of a native batch share it."""
+        value = getattr(self.envs.unwrapped, _SINGLE.get(attr_name, attr_name))
+        return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set it for the whole batch; for some of its environments only where each is an object of its own."""
-        batch = self.envs.unwrapped
-        chosen = list(self._get_indices(indices))
-        if hasattr(batch, "set_attr"):
-            values = self.get_attr(attr_name) if len(chosen) < self.num_envs else [value] * self.num_envs
-            for i in chosen:
-                values[i] = value
-            batch.set_attr(attr_name, values)
-        elif sorted(chosen) == list(range(self.num_envs)):
-            setattr(batch, attr_name, value)
-        else:
+        """Set it for the whole batch."""
+        if sorted(self._get_indices(indices)) != list(range(self.num_envs)):
             raise BufgymError(f"set_attr({attr_name!r}): environments of one batch share it; set it for all of them")
+        setattr(self.envs.unwrapped, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call the method on the whole batch, and give each index its row of what comes back."""
-        chosen = list(self._get_indices(indices))
-        batch = self.envs.unwrapped
-        try:
-            method = self._own(method_name)
-        except AttributeError:
-            if not hasattr(batch, "call"):
-                raise
-            returned = batch.call(method_name, *args, **kwargs)
-        else:
-            returned = method(*args, **kwargs)
-        if isinstance(returned, np.ndarray | Sequence) and not isinstance(returned, str):
-            if len(returned) == self.num_envs:
-                return [returned[i] for i in chosen]
-        return [returned] * len(chosen)
+        """Call the method on the whole batch; each index's row of what it returns."""
+        returned = getattr(self.envs.unwrapped, method_name)(*args, **kwargs)
+        by_row = isinstance(returned, np.ndarray | list | tuple) and len(returned) == self.num_envs
+        return [returned[i] if by_row else returned for i in self._get_indices(indices)]
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """True for ``Monitor``, whose work is done here (``evaluate_policy`` asks), else whether each is wrapped."""
-        chosen = list(self._get_indices(indices))
-        if issubclass(wrapper_class, Monitor):
-            return [True] * len(chosen)
-        singles = getattr(self.envs.unwrapped, "envs", None)
-        if singles is None:
-            return [False] * len(chosen)
-        return [_is_wrapped(singles[i], wrapper_class) for i in chosen]
+        """True for ``Monitor``, whose work is done here (``evaluate_policy`` asks); a native batch has no others."""
+        return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         images: Any = self.envs.render()
@@ -201,18 +158,14 @@ class GymVecEnv(VecEnv):
             return self.envs.render()
         return super().render(mode)
 
-    def _own(self, name: str) -> Any:
-        """An attribute of the vector environment itself; AttributeError where its single environments have it."""
-        batch = self.envs.unwrapped
-        # Batches of single environments (which can be asked one by one) would answer for all of them with their own.
-        if hasattr(batch, "get_attr") and name not in (*_SINGLE, "render_mode"):
-            raise AttributeError(name)
-        return getattr(batch, _SINGLE.get(name, name))
+
+_SINGLE = {"observation_space": "single_observation_space", "action_space": "single_action_space"}
+"""What stable-baselines3 calls an attribute of one environment -> what a vector environment calls it."""
 
 
 def _row(info: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """Environment ``i``'s info out of a vector environment's, where ``_key`` says who has ``key``."""
-    mine: dict[str, Any] = {}
+    """Environment ``i``'s info out of a vector environment's, where ``_key`` masks the rows that have ``key``."""
+    own: dict[str, Any] = {}
     for key, column in info.items():
         if key.startswith("_") and key[1:] in info:
             continue
@@ -220,21 +173,13 @@ def _row(info: Mapping[str, Any], i: int) -> dict[str, Any]:
         if mask is not None and not mask[i]:
             continue
         if isinstance(column, Mapping):
-            mine[key] = _row(column, i)
+            own[key] = _row(column, i)
         else:
             entry = column[i]
-            mine[key] = entry.item() if isinstance(entry, np.generic) else entry
-    return mine
+            own[key] = entry.item() if isinstance(entry, np.generic) else entry
+    return own
 
 
 def _final_observation(final: Any, i: int) -> Any:
     """Environment ``i``'s last observation from ``final_obs``: one array an environment, or a batched dict."""
     return _row(final, i) if isinstance(final, Mapping) else final[i]
-
-
-def _is_wrapped(env: gym.Env[Any, Any], wrapper_class: type[Any]) -> bool:
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, wrapper_class):
-            return True
-        env = env.env
-    return False

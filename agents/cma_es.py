@@ -1,0 +1,136 @@
+"""Evolution: a scorer's weights by CMA-ES over whole episodes, rolled out in compiled code.
+
+PPO learns from single decisions by costly updates; here a candidate is a vector of weights, and its fitness
+that of whole episodes (``objectives``). A rollout decides two million times a second, so a few minutes suffice. All
+candidates of a generation meet the same episodes, so that only what they decide tells them apart (common random
+numbers); the next generation meets others, and validation episodes say which mean to keep. The optimiser is pycma
+(Hansen, The CMA Evolution Strategy: A Tutorial, arXiv 1604.00772).
+
+With a warm-up, two scorers are learned one after the other: first that for a link that stands still, from interruptions
+alone (their mean over T is exact and cheap), then that for all other links, from the other suites.
+"""
+
+from __future__ import annotations
+
+import pickle
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cma
+import numpy as np
+
+from agents.objectives import OBJECTIVES
+from agents.objectives.objective import Objective, Vector, policy_of, to_vector, with_vector
+from agents.runs import MODEL, Record, Run, Validations, seed_bar
+from agents.settings import Settings
+from bufgym.files import replaced
+from bufgym.policies import weights
+from bufgym.policies.learned import Weights
+from bufgym.policies.learned_topics import TopicWeights
+
+POPULATION = 16
+"""Candidates a generation."""
+MEMORY = 10
+"""Generations over which the strategy's mean is averaged, exponentially."""
+DIAGONAL = 100
+"""From so many weights on, a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
+
+
+@dataclass
+class Evolution:
+    """The state of one seed's evolution: what a checkpoint holds."""
+
+    like: Weights | TopicWeights
+    """What is not searched has these numbers."""
+    still: bool
+    """Whether the scorer for links that stand still is searched, or the one for all others (or for all)."""
+    strategy: Any
+    """pycma's strategy."""
+    average: Vector
+    """Of the strategy's latest means (``MEMORY``), which the noise of single parts moves about: this is the agent."""
+    steps: int = 0
+    """Decisions rolled out so far."""
+    generations: int = 0
+    """Generations of this search."""
+    seconds: float = 0.0
+    """Time spent training, s."""
+
+    @staticmethod
+    def around(
+        like: Weights | TopicWeights, sigma: float, seed: int, *, still: bool = False, steps: int = 0
+    ) -> Evolution:
+        """A new search around these weights; ``still`` searches those of their second scorer."""
+        begin = to_vector(like.still if still and isinstance(like, Weights) and like.still else like)
+        options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
+        return Evolution(like, still, cma.CMAEvolutionStrategy(begin, sigma, options), begin, steps)
+
+    def weights(self, vector: Vector) -> Weights | TopicWeights:
+        """The agent that these numbers make."""
+        if self.still and isinstance(self.like, Weights) and self.like.still:
+            return replace(self.like, still=with_vector(self.like.still, vector))
+        weights: Weights | TopicWeights = with_vector(self.like, vector)
+        return weights
+
+    @property
+    def agent(self) -> Weights | TopicWeights:
+        """The agent so far."""
+        return self.weights(self.average)
+
+    def generation(self, objective: Objective) -> float:
+        """Ask for candidates, try them and tell their fitness, once; the best fitness."""
+        vectors = self.strategy.ask()
+        part = self.generations
+        fitness = [
+            objective.fitness(policy_of(objective.name, self.weights(vector)), part, self.still) for vector in vectors
+        ]
+        self.strategy.tell(vectors, fitness)
+        self.average = self.average + (self.strategy.mean - self.average) / MEMORY
+        self.steps += objective.decisions(part, self.still) * len(vectors)
+        self.generations += 1
+        return float(np.min(fitness))
+
+
+def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
+    """Evolve one seed until ``settings.steps`` decisions were rolled out, from its last checkpoint if there is one.
+
+    What did best on validation, by the same measure on other episodes, is kept as ``model.safetensors``.
+    """
+    home = folder / f"seed-{seed}"
+    home.mkdir(exist_ok=True)
+    objective = OBJECTIVES[settings.kind](settings, folder, seed)
+    checkpoint = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
+    if checkpoint.exists():
+        state: Evolution = pickle.loads(checkpoint.read_bytes())
+    else:
+        still = objective.warm_up
+        state = Evolution.around(objective.start(), objective.sigma[still], seed, still=still)
+    curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), state.steps)
+    validations = Validations(home, objective.columns, objective.best, settings, state.steps)
+    began = time.perf_counter() - state.seconds
+    bar = seed_bar(settings.steps, state.steps, seed, line)
+    while True:
+        if validations.due(state.steps):
+            measures = objective.validate(policy_of(objective.name, state.agent))
+            if validations.add(state.steps, state.seconds, measures):
+                notes = {"name": objective.name, "suite": settings.suite, "seeds": [seed], "algo": settings.algo}
+                weights.save(home / MODEL, state.agent, notes)
+            report = objective.message.format(measures[-1])
+            bar.set_postfix_str(report, refresh=False)
+            if not sys.stderr.isatty():
+                print(f"seed {seed}: {state.steps:,} of {settings.steps:,} steps, {report}", flush=True)
+        if state.steps >= settings.steps:
+            break
+        if state.still and state.steps >= settings.warm_up:
+            # From what did best on validation, as a scorer of interruptions alone may come to fail elsewhere.
+            state = Evolution.around(weights.read(home / MODEL)[0], objective.sigma[False], seed, steps=state.steps)
+        fitness = state.generation(objective)
+        state.seconds = round(time.perf_counter() - began, 3)
+        curve.append(state.steps, state.seconds, fitness)
+        with replaced(checkpoint) as unfinished:
+            unfinished.write_bytes(pickle.dumps(state))
+        bar.update(state.steps - bar.n)
+    bar.close()
+    return Run(seed, home, state.seconds, curve.rows, validations.rows, MODEL, objective.best)

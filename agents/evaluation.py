@@ -1,0 +1,169 @@
+"""A suite's episodes to validate and test agents on, beside what the fixed policies and the clairvoyant reach there.
+
+The episodes, and the rows of the fixed policies, are those of ``bufgym bench`` on the same split.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.mixed_env import MixedEnv, cells
+from agents.settings import Settings
+from bufgym.benchmark import run as bench
+from bufgym.benchmark.rows import Row
+from bufgym.benchmark.score import BASELINE, DISCRIMINATIVE, normalised_score, regret
+from bufgym.benchmark.sweep import Plan, cell, run_sweep, shards
+from bufgym.errors import BufgymError
+from bufgym.policies import Policy
+from bufgym.sb3 import takes_masks
+from bufgym.scenario import Episode, suites
+from bufgym.sim import run
+from bufgym.sim.metrics import Outcome, outcome
+
+Numbers = NDArray[np.float64]
+
+
+def play(agent: Any, env: MixedEnv, episodes: Sequence[Episode]) -> list[Outcome]:
+    """The outcome of each episode (one a row) under a learner's most likely action at every decision.
+
+    ``agent``: a model of stable-baselines3, or what has its ``predict``.
+    """
+    masked = takes_masks(agent)
+    env.load(episodes)
+    actions = np.zeros(env.num_envs, np.int64)
+    while (live := ~env.ended()).any():
+        observation = {name: column[live] for name, column in env.observation().items()}
+        masks = {"action_masks": env.action_masks()[live]} if masked else {}
+        actions[live], _ = agent.predict(observation, deterministic=True, **masks)
+        env.act(actions)
+    return [outcome(rows.senders, i) for rows in env.groups for i in range(len(rows))]
+
+
+class Verdict(NamedTuple):
+    """An agent's validation: means over the discriminative cells (see ``benchmark.score``).
+
+    Fields: ``score``, 0 is Drop Oldest and 1 the clairvoyant; ``regret``, 1 - H / the clairvoyant's; ``over_afr``,
+    regret over AFR's regret.
+    """
+
+    score: float
+    regret: float
+    over_afr: float
+
+
+class EvaluationSet:
+    """Every episode of the plan's split at every capacity; the rows of its fixed policies are kept in ``folder``."""
+
+    def __init__(self, plan: Plan, folder: Path, *, progress: bool = False) -> None:
+        self.plan = plan = plan.checked()
+        jobs = -1 if importlib.util.find_spec("joblib") else 1
+        self.rows = run_sweep(plan, folder, jobs=jobs, progress=progress)
+        settings = suites.get(plan.suite).settings(plan.split, plan.data)
+        drawn: dict[str, list[tuple[Row, Episode]]] = {label: [] for label in settings}
+        for shard in shards(plan):
+            scenario = cell(settings[shard.label].scenario, shard.trace)
+            trace = bench.cells(scenario)[0][0]
+            for seed in shard.seeds:
+                key = {"scenario": shard.label, "trace": trace, "seed": seed}
+                drawn[shard.label].append((key, bench.draw(scenario, seed)))
+        self.cells = cells(plan.suite, plan.split, plan.capacities, plan.data)
+        self._sizes = [len(drawn[c.label]) for c in self.cells]
+        self._keys = [key | {"capacity": c.capacity} for c in self.cells for key, _ in drawn[c.label]]
+        self._episodes = [episode for c in self.cells for _, episode in drawn[c.label]]
+        self._fixed = {(*_name(row), row["policy"]): row for row in self.rows}
+
+    def fixed(self, policy: str, column: str = "qoi") -> Numbers:
+        """[rows]: this column of a fixed policy's rows."""
+        return np.array([self._fixed[*_name(key), policy][column] for key in self._keys], np.float64)
+
+    def play(self, agent: Any, padded_slots: int) -> list[Outcome]:
+        """What an agent that observes so many slots reaches in every row."""
+        return play(agent, MixedEnv(self.cells, self._sizes, padded_slots), self._episodes)
+
+    def run(self, policy: Policy) -> list[Outcome]:
+        """What a policy reaches in every row."""
+        ends = np.cumsum(self._sizes).tolist()
+        outcomes = []
+        for c, size, end in zip(self.cells, self._sizes, ends, strict=True):
+            senders = run(policy, self._episodes[end - size : end], c.capacity, c.scenario.value)
+            outcomes += [outcome(senders, i) for i in range(size)]
+        return outcomes
+
+    def verdict(self, outcomes: Sequence[Outcome]) -> Verdict:
+        """An agent's outcomes against Drop Oldest, AFR and the clairvoyant; the plan must have both policies."""
+        qoi = np.array([result.qoi for result in outcomes])
+        first = np.cumsum([0, *self._sizes[:-1]])
+        agent, base, afr, best = (
+            np.add.reduceat(column, first)
+            for column in (qoi, self.fixed(BASELINE), self.fixed("afr"), self.fixed("afr", "clairvoyant"))
+        )
+        counted = regret(base, best) >= DISCRIMINATIVE
+        if not counted.any():
+            raise BufgymError(
+                f"suite {self.plan.suite}, L = {list(self.plan.capacities)}: Drop Oldest cannot be bettered"
+            )
+        agent, base, afr, best = agent[counted], base[counted], afr[counted], best[counted]
+        regrets, afr_regrets = float(regret(agent, best).mean()), float(regret(afr, best).mean())
+        score = float(normalised_score(agent, base, best).mean())
+        return Verdict(score, regrets, regrets / afr_regrets if afr_regrets else np.inf)
+
+    def benchmark_rows(self, outcomes: Sequence[Outcome], name: str, training_seed: int) -> list[Row]:
+        """An agent's outcomes as rows of the benchmark, which name the training seed too."""
+        rows = []
+        for key, result in zip(self._keys, outcomes, strict=True):
+            fixed = self._fixed[*_name(key), BASELINE]
+            bound = {"clairvoyant": fixed["clairvoyant"], "certified": fixed["certified"]}
+            bound["regret"] = bench.regret(result.qoi, bound["clairvoyant"])
+            rows.append({**key, "policy": name, **asdict(result), **bound, "training_seed": training_seed})
+        return rows
+
+
+def _name(row: Row) -> tuple[str, str, int, int]:
+    return row["scenario"], row["trace"], row["seed"], row["capacity"]
+
+
+def seeds_for(suite: str, split: str, capacities: Sequence[int], episodes: int, data: str | None) -> int:
+    """Seeds a trace, so that all scenarios, traces and capacities together have about so many episodes."""
+    one_seed = sum(len(shard.seeds) for shard in shards(Plan(suite, (), split, tuple(capacities), 1, data).checked()))
+    return max(1, round(episodes / (one_seed * len(capacities))))
+
+
+def plan_for(
+    settings: Settings, suite: str, split: str, specs: tuple[str, ...] = ("afr",), seeds: int | None = None
+) -> Plan:
+    """The fixed policies, episodes and capacities of a split of one of the run's suites."""
+    capacities, data = settings.capacities_of(suite), settings.data or None
+    if split == "validation":
+        share = math.ceil(settings.validation_episodes / len(settings.suites))
+        seeds = seeds_for(suite, split, capacities, share, data)
+    return Plan(suite, specs, split, capacities, seeds, data)
+
+
+class ValidationSets:
+    """The fixed validation episodes of all suites; made once, read from the run's folder afterwards."""
+
+    def __init__(self, settings: Settings, folder: Path, progress: bool = False) -> None:
+        self._sets = [
+            EvaluationSet(plan_for(settings, suite, "validation"), folder / "validation" / suite, progress=progress)
+            for suite in settings.suites
+        ]
+
+    def play(self, agent: Any, padded_slots: int) -> Verdict:
+        """An agent's verdict, averaged over the suites."""
+        return _mean([evaluation.verdict(evaluation.play(agent, padded_slots)) for evaluation in self._sets])
+
+    def run(self, policy: Policy) -> Verdict:
+        """A policy's verdict, averaged over the suites."""
+        return _mean([evaluation.verdict(evaluation.run(policy)) for evaluation in self._sets])
+
+
+def _mean(verdicts: Sequence[Verdict]) -> Verdict:
+    return Verdict(*np.mean(verdicts, axis=0).tolist())

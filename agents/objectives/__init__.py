@@ -1,0 +1,15 @@
+"""What evolution searches for, one module a kind of task: one queue, many topics, a fleet."""
+
+from __future__ import annotations
+
+from agents.objectives.fleet import FleetObjective
+from agents.objectives.objective import Objective
+from agents.objectives.queue import QueueObjective
+from agents.objectives.topics import TopicsObjective
+
+OBJECTIVES: dict[str, type[Objective]] = {
+    "queue": QueueObjective,
+    "topics": TopicsObjective,
+    "fleet": FleetObjective,
+}
+"""``Settings.kind`` -> its objective."""

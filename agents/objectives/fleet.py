@@ -1,0 +1,162 @@
+"""A fleet: one agent decides on every robot's buffer; its team QoI (the mean over robots of H) minus that of AFR.
+
+The robots of a cell share its capacity, so what one sends another cannot; each still sees its own buffer alone. The
+search begins with the agent that ships with bufgym, which learned on a link of its own; it may read more of the link
+(``MORE``) and learn to spare it (``THRIFT``).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from agents.objectives import queue
+from agents.objectives.objective import Objective
+from agents.settings import Settings
+from bufgym import policies
+from bufgym.benchmark import fleets as benchmark
+from bufgym.benchmark.rows import Row
+from bufgym.files import shipped
+from bufgym.policies import Policy, weights
+from bufgym.policies.learned import Network, Weights
+from bufgym.scenario import FleetEpisode, FleetScenario
+from bufgym.scenario.suites import FleetSuite
+from bufgym.sim import Senders
+from bufgym.sim.cell import Fleet
+
+PARTS, EPISODES, EPISODE_S = 12, 2, 30.0
+"""Training episodes come in so many parts, one a generation in turn: so many links, each at every capacity, so long.
+Of fleet-v1's training links each comes once."""
+VALIDATION_EPISODES = 4
+"""Validation episodes a link, of the suite's own length."""
+LINK = ("busy", "left", "departures")
+MORE = {"motion": ("time_before", "time_merged", *LINK, "arrival_motion_gap"), "time": LINK}
+"""What evolution reads besides what the shipped agents do: how the shared link goes on from one message to the next."""
+THRIFT = 7.0
+"""What evolution takes off the shipped agents' score of accepting where there is room. They accept by a margin so wide
+that changing it a little changes nothing, and a search from there stays where it is; with this off, the one with
+odometry drops while there is still room and its gain on training episodes is near its largest (docs/fleet.md)."""
+
+
+def suite_of(settings: Settings) -> FleetSuite:
+    """The suite, at the capacities that were asked for."""
+    suite = benchmark.get(settings.suite)
+    return replace(suite, capacities=settings.capacities_of(suite.of)) if settings.capacities else suite
+
+
+def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
+    """The same agent, which reads these fields as well but makes nothing of them yet."""
+    wide = Weights((*agent.fields, *more), _padded(agent.drop, len(more)), _padded(agent.accept, len(more)))
+    mix = np.zeros((len(wide.context), len(wide.slot)), np.float32)
+    if agent.mix is not None:
+        rows, columns = map(wide.context.index, agent.context), map(wide.slot.index, agent.slot)
+        mix[np.ix_(list(rows), list(columns))] = agent.mix
+    return replace(wide, mix=mix, still=widened(agent.still, more) if agent.still else None)
+
+
+def _padded(network: Network, more: int) -> Network:
+    """With so many inputs more, all of no weight."""
+    layers = list(network.layers)
+    if layers:
+        weight, bias = layers[0]
+        layers[0] = np.pad(weight, ((0, more), (0, 0))), bias
+    return replace(network, skip=np.pad(network.skip, (0, more)), bias=network.bias.copy(), layers=tuple(layers))
+
+
+# --- episodes --------------------------------------------------------------------------------------------------------
+
+
+class FleetEpisodes:
+    """Cells full of robots with one L, and what AFR on every robot reaches there."""
+
+    def __init__(self, fleet: FleetScenario, episodes: Sequence[FleetEpisode], capacity: int) -> None:
+        self.episodes = episodes
+        self.decisions = sum(len(arrivals) for episode in episodes for arrivals in episode.arrivals)
+        """How many a candidate takes: one an arrival."""
+        rows, messages = fleet.robots * len(episodes), fleet.max_messages
+        self.fleet = Fleet(Senders(rows, capacity, fleet.value, max_messages=messages), fleet.robots)
+        self.rival = self.team_qoi(policies.get(benchmark.BASELINE))
+
+    def team_qoi(self, policy: Policy) -> float:
+        """Mean over robots and episodes of H."""
+        for c, episode in enumerate(self.episodes):
+            self.fleet.load(c, episode)
+        self.fleet.run(policy)
+        sender = self.fleet.senders.batch.senders
+        return float((sender["delivered_gain"] + (sender["transmitted"] > 0)).mean())
+
+
+def mean_gain(policy: Policy, parts: Sequence[FleetEpisodes]) -> float:
+    """Team QoI above AFR's, mean over the parts."""
+    return float(np.mean([part.team_qoi(policy) - part.rival for part in parts]))
+
+
+def training_parts(suite: FleetSuite, seed: int) -> list[list[FleetEpisodes]]:
+    """``PARTS`` samples of the training episodes, each at every L; links in turn, ``EPISODES`` a sample."""
+    rng, fleet = np.random.default_rng(seed), FleetScenario(suite.robots, suite.uplink("train"))
+    links = [part.fleet for part in benchmark.fleet_parts("", fleet, [()] * len(fleet.uplink.traces))]
+    waiting: list[int] = []
+    parts = []
+    for _ in range(PARTS):
+        while len(waiting) < EPISODES:
+            waiting += rng.permutation(len(links)).tolist()
+        chosen, waiting = [links[k] for k in waiting[:EPISODES]], waiting[EPISODES:]
+        short = [replace(link, uplink=replace(link.uplink, duration_s=EPISODE_S)) for link in chosen]
+        episodes = [benchmark.draw(link, int(rng.integers(10**6))) for link in short]
+        parts.append([FleetEpisodes(short[0], episodes, L) for L in suite.capacities])
+    return parts
+
+
+def validation_episodes(suite: FleetSuite) -> list[FleetEpisodes]:
+    """The validation episodes at every L, the same for every seed."""
+    parts = benchmark.suite_parts(suite, "validation", VALIDATION_EPISODES)
+    episodes = [benchmark.draw(part.fleet, seed) for part in parts for seed in part.seeds]
+    return [FleetEpisodes(parts[0].fleet, episodes, L) for L in suite.capacities]
+
+
+# --- the objective ---------------------------------------------------------------------------------------------------
+
+
+class FleetObjective(Objective):
+    """The robots of one suite."""
+
+    name = "fleet"
+    columns = ("gain",)
+    best = max
+    message = "team QoI {:+.4f} over AFR's on validation"
+    sigma = queue.SIGMA
+
+    @functools.cached_property
+    def training(self) -> list[list[FleetEpisodes]]:
+        """See ``training_parts``."""
+        return training_parts(suite_of(self.settings), self.seed)
+
+    @functools.cached_property
+    def judges(self) -> list[FleetEpisodes]:
+        """See ``validation_episodes``."""
+        return validation_episodes(suite_of(self.settings))
+
+    def start(self) -> Weights:
+        """The shipped agent, less ready to accept; where fields or hidden units are asked for, greed."""
+        settings = self.settings
+        if settings.fields or settings.hidden:
+            return queue.start(settings.observed, settings.hidden, np.random.default_rng(self.seed))
+        agents = shipped("agents", "agents/pretrained", "*.safetensors")
+        agent = widened(weights.read(agents[f"learned-{settings.sees}"])[0], MORE[settings.sees])
+        agent.accept.bias[:] -= THRIFT
+        return agent
+
+    def measure(self, policy: Policy, episodes: Sequence[FleetEpisodes]) -> float:
+        """See ``mean_gain``."""
+        return mean_gain(policy, episodes)
+
+
+def test_rows(settings: Settings, agents: Sequence[Policy]) -> list[Row]:
+    """The agents and all fixed policies on the suite's test split."""
+    suite = suite_of(settings)
+    rivals = [policies.get(name) for name in benchmark.default_policies()]
+    parts = benchmark.suite_parts(suite, "test", settings.test_seeds or None)
+    return benchmark.run_parts([*agents, *rivals], parts, suite.capacities, progress=True)

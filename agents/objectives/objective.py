@@ -1,0 +1,141 @@
+"""What an objective is to the evolution loop, and weights as the vector that is searched."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.settings import Settings
+from bufgym.policies import Policy, learned, learned_topics
+from bufgym.policies.learned import Network, Weights
+from bufgym.policies.learned_topics import TopicWeights
+
+Vector = NDArray[np.float64]
+
+
+class Objective(ABC):
+    """One kind of task: where a search begins, how candidates are compared, how the agent to keep is chosen.
+
+    Training episodes come in parts, one a generation in turn, so that many episodes cost no more than a few.
+
+    Args:
+        settings: those of the run.
+        folder: the run's folder.
+        seed: the training seed, which training episodes are drawn from.
+    """
+
+    name: str
+    """What its policies are called."""
+    columns: tuple[str, ...]
+    """Names of what ``validate`` measures; the last one is what the agent to keep is chosen by."""
+    best: Callable[..., Any]
+    """``min`` or ``max``: which value of that last measure is the best."""
+    message: str
+    """That measure in words, as a format."""
+    sigma: Mapping[bool, float]
+    """First step size; True: for the scorer of links that stand still."""
+    training: Any
+    """The training episodes, part by part; each set of episodes has ``decisions``, about how many a candidate takes."""
+    judges: Any
+    """The validation episodes."""
+    warm_up = False
+    """Whether the scorer for links that stand still is searched first."""
+
+    def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
+        self.settings, self.folder, self.seed = settings, folder, seed
+
+    @abstractmethod
+    def start(self) -> Weights | TopicWeights:
+        """Where the search begins."""
+
+    @abstractmethod
+    def measure(self, policy: Policy, episodes: Any) -> float:
+        """The measure that candidates are compared by, on these episodes."""
+
+    def fitness(self, policy: Policy, part: int, still: bool) -> float:
+        """How a candidate does on a part of the training episodes: the less the better."""
+        measure = self.measure(policy, self.training[part % len(self.training)])
+        return -measure if self.best is max else measure
+
+    def decisions(self, part: int, still: bool) -> int:
+        """How many decisions one candidate takes there."""
+        return sum(episodes.decisions for episodes in self.training[part % len(self.training)])
+
+    def validate(self, policy: Policy) -> tuple[float, ...]:
+        """The measures of an agent on the validation episodes."""
+        return (self.measure(policy, self.judges),)
+
+
+def policy_of(name: str, weights: Weights | TopicWeights) -> Policy:
+    """The policy of these weights."""
+    if isinstance(weights, TopicWeights):
+        return learned_topics.policy(name, weights)
+    return learned.policy(name, weights)
+
+
+# --- weights as a vector ---------------------------------------------------------------------------------------------
+
+
+def to_vector(weights: Weights | TopicWeights) -> Vector:
+    """The numbers that are searched, float64[n]: networks one after the other, then the mixing.
+
+    What the context and the bias add to the score of every candidate alike decides in ``accept`` alone, which stays
+    linear.
+    """
+    numbers, searched = _numbers(weights)
+    return np.concatenate(numbers)[np.concatenate(searched)]
+
+
+def with_vector(weights: Weights | TopicWeights, vector: Vector) -> Any:
+    """These weights with the searched numbers replaced."""
+    parts, searched = _numbers(weights)
+    numbers = np.concatenate(parts)
+    numbers[np.concatenate(searched)] = vector
+    *networks, mix = np.split(numbers, np.cumsum([len(part) for part in parts[:-1]]))
+    changes: dict[str, Any] = {
+        name: _network(getattr(weights, name), flat) for name, flat in zip(_networks(weights), networks, strict=True)
+    }
+    if isinstance(weights, Weights) and weights.mix is not None:
+        changes["mix"] = mix.reshape(weights.mix.shape).astype(np.float32)
+    return replace(weights, **changes)
+
+
+def _networks(weights: Weights | TopicWeights) -> tuple[str, ...]:
+    return ("drop", "accept", "send") if isinstance(weights, TopicWeights) else ("drop", "accept")
+
+
+def _numbers(weights: Weights | TopicWeights) -> tuple[list[Vector], list[NDArray[np.bool_]]]:
+    """(numbers, whether each is searched) of every network and, last, of the mixing."""
+    table = learned_topics if isinstance(weights, TopicWeights) else learned
+    inputs = len(weights.fields)
+    numbers, searched = [], []
+    for name in _networks(weights):
+        flat = getattr(weights, name).flat()
+        if name == "accept":
+            mask = np.arange(len(flat)) <= inputs
+        else:
+            mask = np.ones(len(flat), np.bool_)
+            mask[:inputs] = [table.NAMES.index(field) < table.SLOTS for field in weights.fields]
+            mask[inputs] = False
+        numbers.append(flat)
+        searched.append(mask)
+    mix = getattr(weights, "mix", None)
+    numbers.append(np.zeros(0) if mix is None else mix.reshape(-1))
+    searched.append(np.ones(len(numbers[-1]), np.bool_))
+    return numbers, searched
+
+
+def _network(like: Network, flat: Vector) -> Network:
+    """The network of that shape with these numbers."""
+    shapes = [like.skip.shape, (1,), *(array.shape for layer in like.layers for array in layer), like.out.shape]
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+    skip, bias, *layers, out = (
+        part.reshape(shape).astype(np.float32) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)
+    )
+    return Network(skip, bias, tuple(zip(layers[::2], layers[1::2], strict=True)), out)

@@ -1,0 +1,248 @@
+"""One queue: the regret over that of AFR or Drop Oldest, whichever is better, averaged over suites.
+
+On interruptions the regret is *exact* over every length T (``oracle.EveryLength``); on other links it is that of
+*sampled* episodes, the same for all candidates (common random numbers).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.evaluation import ValidationSets, Verdict
+from agents.mixed_env import Cell, cells
+from agents.objectives.objective import Objective
+from agents.settings import Settings
+from bufgym import policies
+from bufgym.benchmark import sweep
+from bufgym.benchmark.run import best, draw, regret
+from bufgym.benchmark.score import BASELINE
+from bufgym.oracle import EveryLength
+from bufgym.policies import Policy, learned
+from bufgym.policies.learned import Weights
+from bufgym.scenario import Interruption, Uplink
+from bufgym.sim import Senders
+
+SIGMA = {True: 2.0, False: 0.3}
+"""First step size, for the scorer of a still link or of a moving one; the start's weights are of the order of 10."""
+SMALL = (1, 2, 3)
+"""L to learn from besides the suite's own, where the regret is exact and so costs next to nothing."""
+
+PARTS, PART_EPISODES = 8, 12
+"""A suite's training episodes come in so many parts of so many; interruptions, being exact, in one."""
+EPISODES = 40
+"""Sampled episodes a suite by default, spread evenly over its cells; at least one a cell."""
+VALIDATION_EPISODES, VALIDATION_SEED = 3 * EPISODES, 1
+
+AT_LEAST = 0.003
+"""A cell where AFR's regret is smaller counts as if it were this: there is next to nothing to be gained."""
+WORST = 3.0
+"""No ratio counts for more."""
+
+
+def start(fields: tuple[str, ...], width: int, rng: np.random.Generator) -> Weights:
+    """Drop what leaves the smallest merged gap (of motion, where it is seen), rather old than new; accept with room."""
+    weights = learned.random_weights(fields, (width,) if width else (), rng)
+    merged = "motion_merged" if "motion_merged" in fields else "time_merged"
+    weights.drop.skip[fields.index(merged)] = -10.0
+    weights.drop.skip[fields.index("rank")] = -0.4
+    weights.accept.bias[0] = 5.0
+    return replace(weights, mix=np.zeros((len(weights.context), len(weights.slot)), np.float32))
+
+
+# --- the regret in a suite's cells -----------------------------------------------------------------------------------
+
+
+class ExactRegrets:
+    """Interruptions, exactly over every T."""
+
+    def __init__(self, cells: Sequence[Cell]) -> None:
+        self.cells = list(cells)
+        indices: dict[Interruption, list[int]] = {}
+        for i, cell in enumerate(self.cells):
+            assert isinstance(cell.scenario, Interruption)
+            indices.setdefault(cell.scenario, []).append(i)
+        self._lengths = [
+            (own, EveryLength(scenario, [self.cells[i].capacity for i in own])) for scenario, own in indices.items()
+        ]
+        self.decisions = sum(lengths.decisions for _, lengths in self._lengths)
+
+    def regrets(self, policy: Policy) -> NDArray[np.float64]:
+        """By cell."""
+        by_cell = np.empty(len(self.cells))
+        for indices, lengths in self._lengths:
+            by_cell[indices] = lengths.regrets(policy)
+        return by_cell
+
+
+class SampledRegrets:
+    """Episodes of cells with links; ``drawn``: the (trace, seed) of each cell's episodes."""
+
+    def __init__(self, cells: Sequence[Cell], drawn: Sequence[Sequence[tuple[int, int]]]) -> None:
+        self.cells = list(cells)
+        self.episodes, self._senders, self._best = [], [], []
+        for (_, scenario, L), pairs in zip(cells, drawn, strict=True):
+            episodes = [draw(sweep.cell(scenario, trace), seed) for trace, seed in pairs]
+            self.episodes.append(episodes)
+            self._senders.append(Senders(len(pairs), L, scenario.value, max_messages=scenario.max_messages))
+            self._best.append(sum(best(episode, L, scenario).qoi for episode in episodes))
+        self.decisions = sum(len(episode.arrivals) for episodes in self.episodes for episode in episodes)
+
+    def regrets(self, policy: Policy) -> NDArray[np.float64]:
+        """By cell."""
+        by_cell = []
+        for episodes, senders, most in zip(self.episodes, self._senders, self._best, strict=True):
+            for i, episode in enumerate(episodes):
+                senders.load(i, episode)
+            senders.run(policy)
+            sender = senders.batch.senders
+            by_cell.append(regret(float((sender["delivered_gain"] + (sender["transmitted"] > 0)).sum()), most))
+        return np.array(by_cell)
+
+
+def sampled_regrets(cells: Sequence[Cell], seed: int, episodes: int = EPISODES) -> SampledRegrets:
+    """So many episodes in all, traces in turn from cell to cell; if they are fewer than cells, on that many cells."""
+    rng = np.random.default_rng(seed)
+    chosen = list(cells)
+    if episodes < len(chosen):
+        chosen = [chosen[k] for k in sorted(rng.permutation(len(chosen))[:episodes])]
+    per_cell = max(1, round(episodes / len(chosen)))
+    drawn = []
+    waiting: list[int] = []
+    for cell in chosen:
+        assert isinstance(cell.scenario, Uplink)
+        while len(waiting) < per_cell:
+            waiting += rng.permutation(len(cell.scenario.traces)).tolist()
+        traces, waiting = waiting[:per_cell], waiting[per_cell:]
+        drawn.append([(trace, int(rng.integers(10**6))) for trace in traces])
+    return SampledRegrets(chosen, drawn)
+
+
+CellRegrets = ExactRegrets | SampledRegrets
+
+
+class SuiteObjective:
+    """One suite: a policy's regrets over those of the rival, which in each cell is the better of AFR and Drop Oldest.
+
+    Args:
+        parts: samples of the suite's cells, one a generation in turn.
+    """
+
+    def __init__(self, *parts: CellRegrets) -> None:
+        self.parts = parts
+        self.decisions = sum(part.decisions for part in parts)
+        self.exact = all(isinstance(part, ExactRegrets) for part in parts)
+        rivals = [policies.get(name) for name in ("afr", BASELINE)]
+        regrets = [np.concatenate([part.regrets(rival) for part in parts]) for rival in rivals]
+        self.rivals = np.maximum(AT_LEAST, np.minimum(*regrets))
+        # Ratios of single sampled cells would be noise: those of one L and V are pooled. Exact ones each count.
+        keys = [(cell.capacity, cell.scenario.value.name) for part in parts for cell in part.cells]
+        kinds = list(dict.fromkeys(keys))
+        pool = np.array([kinds.index(key) for key in keys])
+        self._pools = np.split(pool, np.cumsum([len(part.cells) for part in parts])[:-1])
+        self._pooled_rivals = np.array([self.rivals[pool == k].mean() for k in range(len(kinds))])
+
+    def decisions_of(self, part: int | None = None) -> int:
+        """Arrivals that one policy decides about; ``part``: on this one alone."""
+        return sum(self.parts[k].decisions for k in self._chosen(part))
+
+    def over_rivals(self, policy: Policy, part: int | None = None) -> float:
+        """Regret over the rival's: root mean square over the cells, so that the worst ones count most.
+
+        ``part``: on this one alone (they are taken in turn), but over the rival's regret on all of them.
+        """
+        chosen = self._chosen(part)
+        regrets = np.concatenate([self.parts[k].regrets(policy) for k in chosen])
+        pool = np.concatenate([self._pools[k] for k in chosen])
+        ratios = [min(WORST, regrets[pool == k].mean() / self._pooled_rivals[k]) for k in np.unique(pool)]
+        return float(np.sqrt(np.mean(np.square(ratios))))
+
+    def _chosen(self, part: int | None) -> Sequence[int]:
+        return range(len(self.parts)) if part is None else [part % len(self.parts)]
+
+
+def suite_objectives(
+    settings: Settings, split: str, seed: int, episodes: int = EPISODES, parts: int = 1
+) -> list[SuiteObjective]:
+    """Those of every suite, drawn from ``seed``: ``parts`` times so many episodes, or the exact cells."""
+    small = () if settings.capacities else SMALL
+    rest = small, settings.data or None, split, seed, episodes, parts
+    return [_suite_objective(suite, settings.capacities_of(suite), *rest) for suite in settings.suites]
+
+
+@functools.lru_cache(
+    maxsize=32
+)  # bounds take a minute, and several agents may be trained in one process (the ablation)
+def _suite_objective(
+    suite: str,
+    capacities: tuple[int, ...],
+    small: tuple[int, ...],
+    data: str | None,
+    split: str,
+    seed: int,
+    episodes: int,
+    parts: int,
+) -> SuiteObjective:
+    suite_cells = cells(suite, split, capacities, data)
+    if any(isinstance(cell.scenario, Uplink) for cell in suite_cells):
+        return SuiteObjective(*(sampled_regrets(suite_cells, seed + 1000 * k, episodes) for k in range(parts)))
+    suite_cells += cells(suite, split, [L for L in small if L not in capacities], data)
+    return SuiteObjective(ExactRegrets(suite_cells))
+
+
+class QueueObjective(Objective):
+    """All suites of a run; with a warm-up first those of interruptions, then the others."""
+
+    name = "evolved"
+    columns = (*Verdict._fields, "over_rivals")
+    best = min
+    message = "regret {:.3f} x the rivals' on validation"
+    sigma = SIGMA
+
+    def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
+        super().__init__(settings, folder, seed)
+        self.warm_up = settings.warm_up > 0
+        self._validation = ValidationSets(settings, folder)
+
+    @functools.cached_property
+    def training(self) -> list[list[SuiteObjective]]:
+        """All suites; their parts are their own."""
+        return [suite_objectives(self.settings, "train", self.seed, PART_EPISODES, PARTS)]
+
+    @functools.cached_property
+    def judges(self) -> list[SuiteObjective]:
+        """All suites."""
+        return suite_objectives(self.settings, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
+
+    def start(self) -> Weights:
+        """The smallest merged gap goes; with a warm-up in both scorers."""
+        settings, fields = self.settings, self.settings.observed
+        weights = start(fields, settings.hidden, np.random.default_rng(self.seed))
+        if not self.warm_up:
+            return weights
+        return replace(weights, still=start(fields, settings.still_hidden, np.random.default_rng(self.seed)))
+
+    def measure(self, policy: Policy, episodes: Sequence[SuiteObjective], part: int | None = None) -> float:
+        """Regret over the rivals', mean over the suites."""
+        return float(np.mean([objective.over_rivals(policy, part) for objective in episodes]))
+
+    def fitness(self, policy: Policy, part: int, still: bool) -> float:
+        """Regret over the rivals' on the suites that are searched on now."""
+        return self.measure(policy, self._searched(still), part)
+
+    def decisions(self, part: int, still: bool) -> int:
+        """Over these suites."""
+        return sum(objective.decisions_of(part) for objective in self._searched(still))
+
+    def validate(self, policy: Policy) -> tuple[float, ...]:
+        """The verdict, and the fitness on other episodes."""
+        return *self._validation.run(policy), *super().validate(policy)
+
+    def _searched(self, still: bool) -> list[SuiteObjective]:
+        suites = self.training[0]
+        return [suite for suite in suites if suite.exact == still or not self.warm_up] or suites

@@ -1,0 +1,203 @@
+"""Many topics: what is dropped and what is sent, compared with Robofleet's published client on the same episodes.
+
+The weighted QoI is to be large, the age of information of the topics with the highest priority no larger
+(``AGE_SHARE``), that of the others not much larger (``OTHERS_SHARE``), and no ``no_drop`` message may be lost. Training
+episodes have other topics and faster or slower links (``varied``). The search begins with the greedy scheduler: drop
+what loses the least QoI now, send what gains the most a byte.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from agents.objectives.objective import Objective
+from agents.settings import Settings
+from bufgym import files, policies
+from bufgym.benchmark import topics as benchmark
+from bufgym.benchmark.rows import Row
+from bufgym.benchmark.run import draw
+from bufgym.errors import BufgymError
+from bufgym.model.link import FOREVER
+from bufgym.policies import Policy
+from bufgym.policies.learned import Network
+from bufgym.policies.learned_topics import TopicWeights
+from bufgym.scenario import Client, suites
+from bufgym.sim import Senders, age_until
+
+RIVAL = "robofleet"
+
+CONTEXT = ("occupancy", "stalled", "service_ratio", "left", "in_flight")
+SLOT = (
+    *("rank", "time_merged", "motion_merged", "loss", "relative_loss", "size", "priority", "weight", "no_drop"),
+    *("own", "waited", "silence", "lateness", "queued", "gain", "gain_per_byte"),
+)
+FIELDS = CONTEXT + SLOT
+"""What the agent reads."""
+
+PARTS, EPISODES, EPISODE_S = 24, 1, 30.0
+"""Training episodes come in so many parts, one a generation in turn: so many a setting of the suite, so long."""
+SIGMA = {False: 1.0}
+"""First step size."""
+AGE_SHARE, AGE_PENALTY = 0.9, 3.0
+"""The age of the first topics is to be this part of the rival's; what is more costs so much."""
+OTHERS_SHARE, OTHERS_PENALTY = 1.5, 0.25
+"""The same of all other topics: without it, what weighs little is never sent."""
+BELOW_PENALTY = 3.0
+"""What a QoI below the rival's costs, for each part of it that is missing."""
+VALIDATION_EPISODES, VALIDATION_SEED = 6, 1
+SCALES, KEPT = (0.7, 10.0), 0.75
+"""In training links are so many times as fast, and a topic is there with this probability: an agent that knows one
+client on scarce links alone falls behind its rival on others."""
+AMPLE = 6.0
+"""Validation episodes come once as they are, and once on links so many times as fast."""
+TINY = 1e-9
+"""So that an age of 0 can be compared with."""
+
+
+def start() -> TopicWeights:
+    """Greedy: drop what loses least, rather old than new; accept with room; send what gains most a byte."""
+
+    def network(**skip: float) -> Network:
+        weights = np.array([skip.get(field, 0.0) for field in FIELDS], np.float32)
+        return Network(weights, np.zeros(1, np.float32), (), np.zeros(0, np.float32))
+
+    accept = network()
+    accept.bias[0] = 5.0
+    return TopicWeights(FIELDS, network(loss=-10.0, rank=-0.4), accept, network(gain_per_byte=10.0, silence=2.0))
+
+
+# --- episodes --------------------------------------------------------------------------------------------------------
+
+
+class Reached(NamedTuple):
+    """What a policy reaches, summed over episodes.
+
+    Fields: ``qoi``, the weighted sum of the topics' H; ``first_age`` and ``others_age``, age of information at the
+    server of the topics with the highest priority and of the others, integrated over time, s^2; ``lost``, ``no_drop``
+    messages.
+    """
+
+    qoi: float
+    first_age: float
+    others_age: float
+    lost: int
+
+
+class ClientEpisodes:
+    """Episodes of one client over its traces, and what the rival reaches there."""
+
+    def __init__(self, client: Client, capacity: int, count: int, rng: np.random.Generator) -> None:
+        traces = [client.traces[int(k)] for k in rng.permutation(len(client.traces))]
+        chosen = [traces[k % len(traces)] for k in range(count)]
+        self.client = client
+        highest = max(topic.priority for topic in client.topics)
+        self._first = np.array([topic.priority == highest for topic in client.topics])
+        self._no_drop = np.array([topic.no_drop for topic in client.topics])
+        self.episodes = [draw(replace(client, traces=(trace,)), int(rng.integers(10**6))) for trace in chosen]
+        self.decisions = sum(len(episode.arrivals) for episode in self.episodes)
+        """About how many a candidate takes: one an arrival."""
+        self._senders = Senders(count, capacity, client.value, max_messages=client.max_messages, topics=client.topics)
+        self.rival = self.reached(policies.get(RIVAL))
+
+    def reached(self, policy: Policy) -> Reached:
+        """What the policy reaches."""
+        for i, episode in enumerate(self.episodes):
+            self._senders.load(i, episode)
+        self._senders.run(policy)
+        batch, count = self._senders.batch, len(self.client.topics)
+        for i in range(len(self.episodes)):
+            for k in range(count):
+                age_until(batch, i, k, FOREVER)
+        topics = np.asarray(batch.topics)[:, :count]
+        qoi = batch.senders["delivered_gain"].sum() + ((topics["received"] > 0) * topics["weight"]).sum()
+        dropped = np.asarray(batch.log["dropped_us"]) >= 0
+        lost = sum(
+            int((dropped[i, : len(episode.arrivals)] & self._no_drop[episode.arrivals["topic"]]).sum())
+            for i, episode in enumerate(self.episodes)
+        )
+        ages = topics["aged"].sum(0)
+        return Reached(float(qoi), float(ages[self._first].sum()), float(ages[~self._first].sum()), lost)
+
+
+def mean_fitness(policy: Policy, parts: Sequence[ClientEpisodes]) -> float:
+    """The less the better: minus the mean of QoI over the rival's, plus what the age is too large, plus losses."""
+    total = 0.0
+    for part in parts:
+        agent, rival = part.reached(policy), part.rival
+        share = agent.qoi / rival.qoi
+        older = max(0.0, agent.first_age / max(rival.first_age, TINY) - AGE_SHARE)
+        total += agent.lost - share + AGE_PENALTY * older
+        total += BELOW_PENALTY * max(0.0, 1 - share)
+        total += OTHERS_PENALTY * max(0.0, agent.others_age / max(rival.others_age, TINY) - OTHERS_SHARE)
+    return total / len(parts)
+
+
+def client_episodes(
+    suite: str, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
+) -> list[ClientEpisodes]:
+    """Episodes of each setting of a suite, its links ``scale`` times as fast; 0: each client varied by chance."""
+    rng, capacities = np.random.default_rng(seed), suites.get(suite).capacities
+    drawn = []
+    for setting in suites.get(suite).settings(split).values():
+        client = setting.scenario
+        if not isinstance(client, Client):
+            raise BufgymError(f"suite {suite}: has no topics")
+        client = client if episode_s is None else replace(client, duration_s=episode_s)
+        client = replace(client, scale=scale) if scale else varied(client, rng)
+        drawn += [ClientEpisodes(client, L, episodes, rng) for L in capacities]
+    return drawn
+
+
+def varied(client: Client, rng: np.random.Generator) -> Client:
+    """The same client with some of its topics, three at least, on links of another speed."""
+    kept = rng.random(len(client.streams)) < KEPT
+    kept[rng.permutation(len(kept))[:3]] = True
+    streams = tuple(stream for stream, is_kept in zip(client.streams, kept, strict=True) if is_kept)
+    return replace(client, streams=streams, scale=float(np.exp(rng.uniform(*np.log(SCALES)))))
+
+
+# --- the objective ---------------------------------------------------------------------------------------------------
+
+
+class TopicsObjective(Objective):
+    """The clients of one suite."""
+
+    name = "evolved"
+    columns = ("fitness",)
+    best = min
+    message = "{:.3f}"
+    sigma = SIGMA
+
+    @functools.cached_property
+    def training(self) -> list[list[ClientEpisodes]]:
+        """``PARTS`` of them, each of varied clients."""
+        suite, seeds = self.settings.suite, [1000 * self.seed + part for part in range(PARTS)]
+        return [client_episodes(suite, "train", seed, EPISODES, EPISODE_S, scale=0) for seed in seeds]
+
+    @functools.cached_property
+    def judges(self) -> list[ClientEpisodes]:
+        """The suite's clients as they are, and on ample links."""
+        rest = self.settings.suite, "validation", VALIDATION_SEED, VALIDATION_EPISODES
+        return [episodes for scale in (1.0, AMPLE) for episodes in client_episodes(*rest, scale=scale)]
+
+    def start(self) -> TopicWeights:
+        """The greedy scheduler."""
+        return start()
+
+    def measure(self, policy: Policy, episodes: Sequence[ClientEpisodes]) -> float:
+        """See ``mean_fitness``."""
+        return mean_fitness(policy, episodes)
+
+
+def test_rows(settings: Settings, agents: Sequence[Policy]) -> list[Row]:
+    """The agents and all schedulers but the shipped one on the suite's test split."""
+    shipped = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetensors")
+    rivals = [policies.get(name) for name in benchmark.default_policies() if name not in shipped]
+    suite = suites.get(settings.suite)
+    parts = benchmark.suite_parts(suite, "test", settings.test_seeds or None)
+    return benchmark.run_parts([*agents, *rivals], parts, suite.capacities, progress=True)

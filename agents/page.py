@@ -1,0 +1,41 @@
+"""What the pages about trained agents share: their commands, tables, and how numbers are written."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import tyro
+
+from bufgym.errors import BufgymError
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+    """A Markdown table, line by line."""
+    return [_line(head), "|---" * len(head) + "|", *map(_line, rows)]
+
+
+def _line(cells: Sequence[object]) -> str:
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def columns_of(file: Path, *names: str) -> list[tuple[float, ...]]:
+    """These columns of a curve that a run left, a tuple a row."""
+    with file.open(newline="", encoding="utf-8") as lines:
+        return [tuple(float(row[name]) for name in names) for row in csv.DictReader(lines)]
+
+
+def publish(text: str, out: Path | None) -> None:
+    """Write the page where that is asked for, and print it."""
+    if out:
+        out.write_text(text, encoding="utf-8")
+    print(text)
+
+
+def command(page: Callable[..., None]) -> None:
+    """Run a page's function as a command: its arguments are the options; a mistake ends in one line."""
+    try:
+        tyro.cli(page)
+    except BufgymError as error:
+        raise SystemExit(f"error: {error}") from None

@@ -1,0 +1,227 @@
+"""The settings of a training run, which are the options of ``train.py``, and the rules they must keep."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from dataclasses import asdict, dataclass
+from typing import Annotated, Literal, NamedTuple, NoReturn, get_args, get_origin, get_type_hints
+
+from bufgym import ENVIRONMENTS
+from bufgym.errors import BufgymError
+from bufgym.policies.learned import MAX_WIDTH, NAMES
+from bufgym.scenario import Interruption, suites
+from bufgym.scenario.suites import FLEET_SUITES, TOPIC_SUITES
+
+TIME = ("rank", "time_before", "time_merged", "occupancy", "stalled", "service_ratio")
+"""Fields that a queue and a clock can tell, as AFR's."""
+
+MOTION = (
+    *("rank", "motion_before", "motion_merged", "loss", "relative_loss"),
+    *("occupancy", "stalled", "service_ratio", "even_value", "bend"),
+)
+"""Fields with odometry and V."""
+
+SEES = {"time": TIME, "motion": MOTION}
+
+Kind = Literal["environment", "queue", "topics", "fleet"]
+"""What a run trains on: one environment, suites of one queue, a suite of many topics, or one of many robots."""
+
+_ALONE = {"topics": ("a scheduler", ("evolution",)), "fleet": ("a fleet's agent", ("evolution", "maskable-ppo"))}
+"""Kinds that are trained on one suite alone: what is trained, and by which algorithms."""
+
+
+class Range(NamedTuple):
+    """The numbers that a setting may be: from ``low`` to ``high``, and above 0 where ``positive``."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    positive: bool = False
+
+    def rule(self, value: float) -> str:
+        """The rule that a value breaks; empty if it breaks none."""
+        if not math.isfinite(value):
+            return "must be a finite number"
+        if self.positive and value <= 0:
+            return "must be > 0"
+        if self.low <= value <= self.high:
+            return ""
+        return f"must be >= {self.low}" if math.isinf(self.high) else f"must lie in {self.low}..{self.high}"
+
+
+Count = Annotated[int, Range(1)]
+Number = Annotated[int, Range(0)]
+Units = Annotated[int, Range(0, MAX_WIDTH)]
+Share = Annotated[float, Range(0, 1)]
+Positive = Annotated[float, Range(positive=True)]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Train an agent on a bufgym environment, or on a whole suite, and evaluate it on held-out episodes."""
+
+    env: str = "bufgym/Uplink-v0"
+    """Gymnasium id."""
+    suite: str = ""
+    """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
+    validation split, and report on its test split; the agent is asked at every arrival. Several, as in a,b: on all of
+    them at once. A suite of many topics (topics-v1) makes a scheduler, one of a fleet (fleet-v1) an agent
+    that all its robots share."""
+    data: str = ""
+    """Folder of recordings, for suites that need one."""
+    capacities: str = ""
+    """L of a suite's episodes, such as 5,10,25; by default the suite's own."""
+    algo: Literal["maskable-ppo", "ppo", "dqn", "evolution"] = "maskable-ppo"
+    """PPO with action masks, PPO without, double DQN with masks, or CMA-ES over whole episodes (suites only)."""
+    sees: Literal["motion", "time"] = "motion"
+    """What an evolved agent sees: odometry as well, or the clock alone."""
+    fields: str = ""
+    """Fields that an evolved agent reads, such as rank,motion_merged,stalled; by default those of --sees."""
+    hidden: Units = 0
+    """Hidden units of an evolved agent; with none, its scores are linear in what the context makes of the slots."""
+    still_hidden: Units = 6
+    """The same for its scorer of links that stand still (``warm_up``)."""
+    name: str = ""
+    """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
+    resume: bool = False
+    """Go on from the run's last checkpoint."""
+    seeds: Count = 1
+    """Train this many agents, each in a process of its own."""
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """The first seed."""
+    steps: Count = 1_500_000
+    """Decisions to learn from, for each seed."""
+    capacity: Count = 8
+    """L, messages (without a suite)."""
+    size_bytes: Count = 500_000
+    """Mean message size (uplink only); 500 kB at 30 Hz is 1.5 times what the shipped traces carry."""
+    duration_s: Positive = 30.0
+    """Length of an episode (uplink only)."""
+    decide_at: Literal["overflow", "arrival"] = "overflow"
+    """When the agent is asked: only when the buffer is full, or at every arrival."""
+    reward: Literal["retained", "delivered"] = "retained"
+    network: Literal["slots", "plain"] = "slots"
+    """One small network for every slot, or one over all numbers at once."""
+    width: Count = 32
+    """Hidden units a layer."""
+    num_envs: Count = 256
+    n_steps: Count = 128
+    """Steps in each environment between updates."""
+    batch_size: Annotated[int, Range(2)] = 4096
+    epochs: Count = 4
+    """Passes over each batch of experience."""
+    learning_rate: Positive = 2e-3
+    """At the start; falls linearly to 0."""
+    gamma: Share = 0.9
+    """``retained`` pays at once what a decision costs, so a short sight suffices and keeps the noise of motion out."""
+    gae_lambda: Share = 0.9
+    entropy: Annotated[float, Range(0)] = 0.0
+    """Weight of the entropy bonus."""
+    warm_up: Number = 0
+    """Decisions for which evolution first learns a scorer of its own for links that stand still, from interruptions
+    alone (their mean over T is exact and cheap); afterwards the one for all other links, from the other suites."""
+    checkpoint_every: Count = 250_000
+    """Steps."""
+    validate_every: Count = 250_000
+    """Steps (with a suite)."""
+    validation_episodes: Count = 300
+    """About so many in each validation, over all scenarios and capacities."""
+    test_seeds: Annotated[int, Range(0, 1000)] = 0
+    """Test episodes on each trace of a suite; 0: as many as the suite says."""
+    episodes: Count = 200
+    """Held-out episodes in the evaluation (without a suite)."""
+
+    @property
+    def suites(self) -> tuple[str, ...]:
+        """Those that ``suite`` names."""
+        return tuple(filter(None, self.suite.split(",")))
+
+    @property
+    def kind(self) -> Kind:
+        """What the run trains on."""
+        if not self.suites:
+            return "environment"
+        if any(suite in TOPIC_SUITES for suite in self.suites):
+            return "topics"
+        return "fleet" if any(suite in FLEET_SUITES for suite in self.suites) else "queue"
+
+    def capacities_of(self, suite: str) -> tuple[int, ...]:
+        """L to train for and to test at: those given, or the suite's."""
+        if not self.capacities:
+            return suites.get(suite).capacities
+        try:
+            capacities = tuple(int(part) for part in self.capacities.split(","))
+        except ValueError:
+            self._refuse("capacities", "must be whole numbers such as 5,10,25")
+        if min(capacities) < 1 or len(set(capacities)) < len(capacities):
+            self._refuse("capacities", "must be whole numbers >= 1, no two alike")
+        return capacities
+
+    @property
+    def observed(self) -> tuple[str, ...]:
+        """Fields that an evolved agent reads."""
+        return tuple(self.fields.split(",")) if self.fields else SEES[self.sees]
+
+    @property
+    def command(self) -> str:
+        """The command that trains it again: the settings that differ from the defaults."""
+        defaults = asdict(Settings())
+        words = [
+            f"--{name.replace('_', '-')} {shlex.quote(str(value))}"
+            for name, value in asdict(self).items()
+            if name not in ("name", "resume") and value != defaults[name]
+        ]
+        return " ".join(["python train.py", *words])
+
+    def checked(self) -> Settings:
+        """These settings, or a BufgymError that names the first one that breaks a rule, and the rule."""
+        for name, hint in get_type_hints(Settings, include_extras=True).items():
+            value = getattr(self, name)
+            for part in getattr(hint, "__metadata__", ()):
+                if broken := part.rule(value):
+                    self._refuse(name, broken)
+            if get_origin(hint) is Literal and value not in get_args(hint):
+                self._refuse(name, f"must be one of {', '.join(get_args(hint))}")
+        if self.kind == "environment" and self.env not in ENVIRONMENTS:
+            self._refuse("env", f"must be one of {', '.join(ENVIRONMENTS)}")
+        if self.kind == "environment" and self.algo == "evolution":
+            raise BufgymError("--algo evolution learns from a suite's episodes: name one (--suite)")
+        if self.kind in _ALONE:
+            agent, algorithms = _ALONE[self.kind]
+            if len(self.suites) > 1 or self.algo not in algorithms:
+                rule = f"{agent} learns from one suite alone, by --algo {' or '.join(algorithms)}"
+                raise BufgymError(f"suite {self.suite}: {rule}")
+        if self.kind == "fleet" and self.algo == "maskable-ppo":
+            if self.network != "slots":
+                self._refuse("network", "a fleet's agent scores slots")
+            if self.width > MAX_WIDTH:
+                self._refuse("width", f"a fleet's agent has at most {MAX_WIDTH} hidden units a layer")
+        if self.kind == "queue":
+            self._check_suites()
+        if self.capacities:
+            self.capacities_of("")
+        if self.algo == "evolution" or self.fields:
+            self._check_fields()
+        return self
+
+    def _check_fields(self) -> None:
+        """The rule of what an evolved agent reads."""
+        known = [name for name in self.observed if name in NAMES]
+        merged = {"motion_merged", "time_merged"} & set(known)
+        if len(set(known)) < len(self.observed) or not merged or "rank" not in known:
+            rule = "must be rank, motion_merged or time_merged, and others of the observation's, each once"
+            self._refuse("fields", f"{rule} (bufgym list observations)")
+
+    def _check_suites(self) -> None:
+        """The rules of suites of one queue."""
+        interruptions = False
+        for name in self.suites:
+            suite = suites.get(name)
+            suite.settings("validation", self.data or None)  # an error here where recordings are missing
+            settings = suite.settings("train", self.data or None).values()
+            interruptions |= any(isinstance(setting.scenario, Interruption) for setting in settings)
+        if self.warm_up and not interruptions:
+            self._refuse("warm_up", "needs a suite of interruptions")
+
+    def _refuse(self, name: str, rule: str) -> NoReturn:
+        raise BufgymError(f"{name} = {getattr(self, name)!r}: {rule}")

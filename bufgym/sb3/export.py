@@ -1,0 +1,139 @@
+"""A trained agent as a file of weights that bufgym runs without torch (``bufgym.policies.weights``)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
+from torch import nn
+
+from bufgym.errors import BufgymError
+from bufgym.oracle import EveryLength
+from bufgym.policies import Policy, learned, learned_topics
+from bufgym.policies import weights as files
+from bufgym.policies.learned import Network, Weights
+from bufgym.policies.learned_topics import TopicWeights
+from bufgym.policies.weights import StrPath
+from bufgym.sb3.networks import SlotExtractor, SlotScorer
+from bufgym.scenario import Streams, suites
+from bufgym.sim import run
+from bufgym.sim.metrics import received, weighted_qoi
+
+CHECKED = (4, 8, 16, 32)
+"""L of the regrets that are noted in the file."""
+
+
+def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
+    """Write the agent in ``model`` to ``out``, with what its run's folder says of its training.
+
+    Args:
+        model: an evolved agent's ``model.safetensors``, which gets its name and its scores; or the zip of a model of
+            stable-baselines3 with ``SlotPolicy``. A zip holds pickles, and reading it can run any code: export your
+            own alone.
+        out: the file to write, .safetensors.
+        name: the policy's name.
+        about: a sentence: what it was trained for.
+
+    Raises:
+        BufgymError: ``model`` is no agent that scores slots, or ``out`` cannot be written.
+    """
+    path = Path(model)
+    weights = files.read_any(path)[0] if path.suffix == ".safetensors" else weights_of(read_policy(path))
+    notes = {"name": name, "about": about, **run_notes(path)}
+    if isinstance(weights, TopicWeights):
+        return files.save(out, weights, {**notes, "weighted_qoi": topics_qoi(learned_topics.policy(name, weights))})
+    return files.save(out, weights, {**notes, "regret": regrets(learned.policy(name, weights))})
+
+
+# --- weights ---------------------------------------------------------------------------------------------------------
+
+
+def read_policy(path: StrPath) -> BasePolicy:
+    """The policy network in a saved model's zip, of whatever algorithm.
+
+    Raises:
+        BufgymError: no such file, or no model of stable-baselines3.
+    """
+    if not Path(path).is_file():
+        raise BufgymError(f"{path}: no such file")
+    try:
+        saved, parameters, _ = load_from_zip_file(Path(path), device="cpu")
+        assert saved is not None
+        arguments = dict(saved["policy_kwargs"])
+        policy: BasePolicy = saved["policy_class"](
+            saved["observation_space"], saved["action_space"], lambda _: 0.0, **arguments
+        )
+        policy.load_state_dict(dict(parameters["policy"]))
+    except Exception as error:  # of whatever kind a zip of pickles raises
+        raise BufgymError(f"{path}: no model of stable-baselines3: {type(error).__name__}: {error}") from None
+    policy.set_training_mode(False)
+    return policy
+
+
+def weights_of(model: Any) -> Weights:
+    """The actor of a model with ``SlotPolicy`` (or of that policy); the critic served training alone."""
+    policy = getattr(model, "policy", model)
+    features, scorer = (getattr(policy, part, None) for part in ("features_extractor", "mlp_extractor"))
+    if not isinstance(features, SlotExtractor) or not isinstance(scorer, SlotScorer):
+        raise BufgymError("only an agent that scores slots can be exported (train.py --network slots)")
+    fields = (*features.slot_fields, *features.context_fields)
+    return Weights(fields, _network(scorer.score), _network(scorer.accept))
+
+
+def _network(perceptron: nn.Sequential) -> Network:
+    """ReLU layers and one output; torch keeps weights as [outputs, inputs]."""
+    *hidden, last = [layer for layer in perceptron if isinstance(layer, nn.Linear)]
+    return Network(
+        np.zeros((hidden[0] if hidden else last).in_features, np.float32),
+        _array(last.bias),
+        tuple((np.ascontiguousarray(_array(layer.weight).T), _array(layer.bias)) for layer in hidden),
+        _array(last.weight)[0],
+    )
+
+
+def _array(parameter: Any) -> NDArray[np.float32]:
+    return np.array(parameter.detach().cpu().numpy(), np.float32)
+
+
+# --- what the file says of the agent ---------------------------------------------------------------------------------
+
+
+def regrets(policy: Policy) -> dict[str, float]:
+    """Its exact regret in interruption-v1's test split, for a test to find again: in each V, at each of ``CHECKED``."""
+    rounded = {}
+    for label, setting in suites.get("interruption-v1").settings("test").items():
+        for L, regret in zip(CHECKED, EveryLength(setting.scenario, CHECKED).regrets(policy), strict=True):
+            rounded[f"{label}, L = {L}"] = round(regret, 9)
+    return rounded
+
+
+def topics_qoi(policy: Policy) -> dict[str, float]:
+    """A scheduler's weighted QoI, for a test to find again: on the first test episode of each setting of topics-v1."""
+    suite = suites.get("topics-v1")
+    rounded = {}
+    for label, setting in suite.settings("test").items():
+        scenario: Any = setting.scenario
+        client = replace(scenario, traces=scenario.traces[:1])
+        streams = Streams.seeded(0)
+        episode = client.draw(streams).with_uniforms(streams.policy)
+        senders = run(policy, [episode], suite.capacities[0], client.value, topics=client.topics)
+        rounded[label] = round(weighted_qoi(senders, 0, received(senders, 0)), 6)
+    return rounded
+
+
+def run_notes(model: Path) -> dict[str, Any]:
+    """What train.py noted beside the model (``notes.json``): command, seeds and scores; {} elsewhere."""
+    path = model.with_name("notes.json")
+    if not path.is_file():
+        return {}
+    try:
+        notes: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise BufgymError(f"{path}: cannot be read: {error}") from None
+    return notes

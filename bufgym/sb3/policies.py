@@ -1,0 +1,149 @@
+"""``as_policy``: any trained model of stable-baselines3 or sb3-contrib as a policy for runs and benchmarks."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+
+from bufgym.errors import BufgymError
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
+from bufgym.observe import (
+    CONTEXT_FIELDS,
+    SLOT_FIELDS,
+    TOPIC_CONTEXT_FIELDS,
+    TOPIC_FIELDS,
+    TOPIC_SLOT_FIELDS,
+    observe_context,
+    observe_slots,
+    observe_topic_context,
+    observe_topic_slots,
+)
+from bufgym.policies import Policy
+from bufgym.policies.learned import policy as slot_policy
+from bufgym.policies.schedulers import fits, makes_room
+from bufgym.policies.weights import StrPath
+from bufgym.sb3.export import read_policy, weights_of
+from bufgym.sb3.networks import SlotScorer
+
+
+def as_policy(
+    model: BaseAlgorithm | BasePolicy | StrPath, name: str = "", *, fields: Sequence[str] | None = None
+) -> Policy:
+    """A trained model as a bufgym policy, which takes the model's most likely (or most valued) action.
+
+    A network that scores slots with masks (``SlotPolicy`` under MaskablePPO) runs compiled and serves every L. Any
+    other network runs in torch, one decision at a time, and serves the L it was trained for. Action masks are given to
+    algorithms that take them; an invalid action of the others does what it does in the environment.
+
+        policy = as_policy("model.zip", "mine")
+        bufgym.benchmark.run.run([policy, policies.get("afr")], scenario, capacities=[8], seeds=10)
+
+    Args:
+        model: the model, its ``policy``, or the path of a saved one. A zip holds pickles, and reading it can run any
+            code: read your own alone.
+        name: the policy's name; by default that of the file or class.
+        fields: what a flat observation (a ``Box``, from ``FlattenObservation``) is made of, in the environment's own
+            order; by default every field. A ``Dict`` observation names its fields.
+
+    Raises:
+        BufgymError: no such file, or a model that was trained on something else than a bufgym environment.
+    """
+    agent: Any = model if isinstance(model, BaseAlgorithm | BasePolicy) else read_policy(model)
+    if not name:
+        name = type(model).__name__.lower() if agent is model else Path(str(model)).stem
+    network = agent.policy if isinstance(agent, BaseAlgorithm) else agent
+    if getattr(network, "lstm_actor", None) is not None:
+        raise BufgymError(f"model {name}: has a recurrent network, whose state a policy cannot keep")
+    about = f"A trained {type(agent).__name__}."
+    masked = takes_masks(agent) and getattr(network, "masked", True)
+    decisions = _Decisions(name, agent, masked, fields)
+    if masked and isinstance(getattr(network, "mlp_extractor", None), SlotScorer) and not decisions.for_topics:
+        return slot_policy(name, weights_of(network), about)
+    if not decisions.for_topics:
+        return Policy(name, decisions.on_arrival, about=about)
+    return Policy(name, decisions.on_arrival, on_send=decisions.on_send, about=about, for_topics=True)
+
+
+def takes_masks(agent: Any) -> bool:
+    """Whether the agent's ``predict`` takes ``action_masks``, as MaskablePPO's does."""
+    return "action_masks" in inspect.signature(agent.predict).parameters
+
+
+class _Decisions:
+    """What a model decides from a robot's view, one decision at a time."""
+
+    def __init__(self, name: str, agent: Any, masked: bool, fields: Sequence[str] | None) -> None:
+        self.name, self.agent, self.masked = name, agent, masked
+        space, actions = agent.observation_space, agent.action_space
+        self.capacity = int(getattr(actions, "n", 0)) - 2
+        if self.capacity < 1:
+            raise BufgymError(f"model {name}: action space {actions}: must be Discrete(L + 2), as bufgym's are")
+        self.flat = not isinstance(space, spaces.Dict)
+        names = fields if self.flat else list(space)
+        self.for_topics = any(field.name in (names or ()) for field in TOPIC_FIELDS)
+        self.slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if self.for_topics else ())
+        self.context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if self.for_topics else ())
+        boxes = {
+            field.name: spaces.Box(field.low, field.high, (self.capacity + 1 if field.per == "slot" else 1,))
+            for field in self.slot_fields + self.context_fields
+        }
+        for field in names or ():
+            if field not in boxes:
+                raise BufgymError(f"model {name}: observes {field!r}, which is no field (bufgym list observations)")
+        self.fields = spaces.Dict({field: box for field, box in boxes.items() if names is None or field in names})
+        numbers, expected = (spaces.flatdim(part) for part in (space, self.fields))
+        if numbers != expected:
+            rule = f"must be the {expected} of {', '.join(self.fields)} for L = {self.capacity}"
+            raise BufgymError(f"model {name}: observes {numbers} numbers: {rule}")
+
+    def on_arrival(self, buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+        """A slot to evict, REJECT or ACCEPT."""
+        room = fits(buffer, arrival)
+        evictable = [makes_room(buffer, arrival, k) for k in range(len(buffer.slots))]
+        no_drop = self.for_topics and buffer.topics[arrival.topic].no_drop == 1
+        may_reject = not no_drop or not (room or any(evictable))
+        action = self._action(buffer, arrival, True, [*evictable, may_reject, room])
+        return action if action < self.capacity else REJECT if action == self.capacity else ACCEPT
+
+    def on_send(self, buffer: Buffer, memory: NDArray[np.float64]) -> int:
+        """The slot to send, or HOLD."""
+        sendable = [is_first(buffer, k) for k in range(len(buffer.slots))]
+        action = self._action(buffer, buffer.slots[0], False, [*sendable, True, False])
+        return action if action < self.capacity else HOLD
+
+    def _action(self, buffer: Buffer, arrival: Any, arriving: bool, valid: Sequence[bool]) -> int:
+        """The model's action; ``valid``: whether each queued slot's action is valid, then those of L and L + 1."""
+        L = buffer.capacity
+        if L != self.capacity:
+            raise BufgymError(
+                f"policy {self.name}: trained for L = {self.capacity}, not for L = {L}; only a network that scores "
+                "slots with masks (MaskablePPO with bufgym.sb3.SlotPolicy) serves every L"
+            )
+        slots = np.zeros((len(self.slot_fields), L + 1), np.float32)
+        context = np.zeros(len(self.context_fields), np.float32)
+        if self.for_topics:
+            observe_topic_slots(buffer, arrival, arriving, slots)
+            observe_topic_context(buffer, arrival, arriving, context)
+        else:
+            observe_slots(buffer, arrival, slots)
+            observe_context(buffer, arrival, context)
+        columns = {field.name: slots[i] for i, field in enumerate(self.slot_fields)}
+        columns |= {field.name: context[i : i + 1] for i, field in enumerate(self.context_fields)}
+        observation: Any = {field: columns[field] for field in self.fields}
+        if self.flat:
+            observation = spaces.flatten(self.fields, observation)
+        masks = {}
+        if self.masked:
+            mask = np.zeros(L + 2, np.bool_)
+            mask[: len(buffer.slots)], mask[L:] = valid[:-2], valid[-2:]
+            masks = {"action_masks": mask}
+        action, _ = self.agent.predict(observation, deterministic=True, **masks)
+        return int(action)
