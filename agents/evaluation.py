@@ -17,10 +17,13 @@ from numpy.typing import NDArray
 
 from agents.mixed_env import MixedEnv, cells
 from agents.settings import Settings
-from bufgym.benchmark import run as bench
+from bufgym.benchmark import bound
 from bufgym.benchmark.rows import Row
+from bufgym.benchmark.run import by_trace, draw
+from bufgym.benchmark.run import run as run_policies
 from bufgym.benchmark.score import BASELINE, DISCRIMINATIVE, normalised_score, regret
-from bufgym.benchmark.sweep import Plan, cell, run_sweep, shards
+from bufgym.benchmark.seeds import seeds_of, seeds_per_trace
+from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
 from bufgym.sb3 import takes_masks
@@ -60,21 +63,19 @@ class Verdict(NamedTuple):
 
 
 class EvaluationSet:
-    """Every episode of the plan's split at every capacity; the rows of its fixed policies are kept in ``folder``."""
+    """Every episode of the sweep's split at every capacity; the rows of its fixed policies are kept in ``folder``."""
 
-    def __init__(self, plan: Plan, folder: Path, *, progress: bool = False) -> None:
-        self.plan = plan = plan.checked()
+    def __init__(self, sweep: Sweep, folder: Path, *, progress: bool = False) -> None:
+        self.sweep = sweep = sweep.checked()
         jobs = -1 if importlib.util.find_spec("joblib") else 1
-        self.rows = run_sweep(plan, folder, jobs=jobs, progress=progress)
-        settings = suites.get(plan.suite).settings(plan.split, plan.data)
-        drawn: dict[str, list[tuple[Row, Episode]]] = {label: [] for label in settings}
-        for shard in shards(plan):
-            scenario = cell(settings[shard.label].scenario, shard.trace)
-            trace = bench.cells(scenario)[0][0]
+        self.rows = run_sweep(sweep, folder, jobs=jobs, progress=progress)
+        drawn: dict[str, list[tuple[Row, Episode]]] = {label: [] for label in sweep.settings()}
+        for shard in sweep.shards():
+            trace, scenario = by_trace(sweep.setting(shard.label, shard.trace).scenario)[0]
             for seed in shard.seeds:
                 key = {"scenario": shard.label, "trace": trace, "seed": seed}
-                drawn[shard.label].append((key, bench.draw(scenario, seed)))
-        self.cells = cells(plan.suite, plan.split, plan.capacities, plan.data)
+                drawn[shard.label].append((key, draw(scenario, seed)))
+        self.cells = cells(sweep.suite, sweep.split, sweep.capacities, sweep.data)
         self._sizes = [len(drawn[c.label]) for c in self.cells]
         self._keys = [key | {"capacity": c.capacity} for c in self.cells for key, _ in drawn[c.label]]
         self._episodes = [episode for c in self.cells for _, episode in drawn[c.label]]
@@ -98,7 +99,7 @@ class EvaluationSet:
         return outcomes
 
     def verdict(self, outcomes: Sequence[Outcome]) -> Verdict:
-        """An agent's outcomes against Drop Oldest, AFR and the clairvoyant; the plan must have both policies."""
+        """An agent's outcomes against Drop Oldest, AFR and the clairvoyant; the sweep must have both policies."""
         qoi = np.array([result.qoi for result in outcomes])
         first = np.cumsum([0, *self._sizes[:-1]])
         agent, base, afr, best = (
@@ -108,7 +109,7 @@ class EvaluationSet:
         counted = regret(base, best) >= DISCRIMINATIVE
         if not counted.any():
             raise BufgymError(
-                f"suite {self.plan.suite}, L = {list(self.plan.capacities)}: Drop Oldest cannot be bettered"
+                f"suite {self.sweep.suite}, L = {list(self.sweep.capacities)}: Drop Oldest cannot be bettered"
             )
         agent, base, afr, best = agent[counted], base[counted], afr[counted], best[counted]
         regrets, afr_regrets = float(regret(agent, best).mean()), float(regret(afr, best).mean())
@@ -120,9 +121,9 @@ class EvaluationSet:
         rows = []
         for key, result in zip(self._keys, outcomes, strict=True):
             fixed = self._fixed[*_name(key), BASELINE]
-            bound = {"clairvoyant": fixed["clairvoyant"], "certified": fixed["certified"]}
-            bound["regret"] = bench.regret(result.qoi, bound["clairvoyant"])
-            rows.append({**key, "policy": name, **asdict(result), **bound, "training_seed": training_seed})
+            known = {"clairvoyant": fixed["clairvoyant"], "certified": fixed["certified"]}
+            known["regret"] = bound.regret(result.qoi, known["clairvoyant"])
+            rows.append({**key, "policy": name, **asdict(result), **known, "training_seed": training_seed})
         return rows
 
 
@@ -132,19 +133,19 @@ def _name(row: Row) -> tuple[str, str, int, int]:
 
 def seeds_for(suite: str, split: str, capacities: Sequence[int], episodes: int, data: str | None) -> int:
     """Seeds a trace, so that all scenarios, traces and capacities together have about so many episodes."""
-    one_seed = sum(len(shard.seeds) for shard in shards(Plan(suite, (), split, tuple(capacities), 1, data).checked()))
+    one_seed = sum(len(shard.seeds) for shard in Sweep(suite, (), split, tuple(capacities), 1, data).checked().shards())
     return max(1, round(episodes / (one_seed * len(capacities))))
 
 
-def plan_for(
+def sweep_for(
     settings: Settings, suite: str, split: str, specs: tuple[str, ...] = ("afr",), seeds: int | None = None
-) -> Plan:
+) -> Sweep:
     """The fixed policies, episodes and capacities of a split of one of the run's suites."""
     capacities, data = settings.capacities_of(suite), settings.data or None
     if split == "validation":
         share = math.ceil(settings.validation_episodes / len(settings.suites))
         seeds = seeds_for(suite, split, capacities, share, data)
-    return Plan(suite, specs, split, capacities, seeds, data)
+    return Sweep(suite, specs, split, capacities, seeds, data)
 
 
 class ValidationSets:
@@ -152,7 +153,7 @@ class ValidationSets:
 
     def __init__(self, settings: Settings, folder: Path, progress: bool = False) -> None:
         self._sets = [
-            EvaluationSet(plan_for(settings, suite, "validation"), folder / "validation" / suite, progress=progress)
+            EvaluationSet(sweep_for(settings, suite, "validation"), folder / "validation" / suite, progress=progress)
             for suite in settings.suites
         ]
 
@@ -167,3 +168,14 @@ class ValidationSets:
 
 def _mean(verdicts: Sequence[Verdict]) -> Verdict:
     return Verdict(*np.mean(verdicts, axis=0).tolist())
+
+
+def test_rows(settings: Settings, policies: Sequence[Policy]) -> list[Row]:
+    """The rows of these policies on the test split of the run's one suite, of whatever kind."""
+    suite = suites.get(settings.suite)
+    seeds, capacities = seeds_per_trace(suite, settings.test_seeds or None), settings.capacities_of(suite.name)
+    rows = []
+    for label, setting in suite.settings("test").items():
+        for k, (_, scenario) in enumerate(by_trace(setting.scenario)):
+            rows += run_policies(policies, scenario, capacities, seeds_of(k, seeds), label=label, progress=True)
+    return rows

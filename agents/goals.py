@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from tyro.conf import Positional
 
 from agents.evaluation import EvaluationSet, Numbers
-from agents.page import columns_of, command, publish, table
+from agents.page import columns_of, command, publish, table, written
 from agents.runs import MODEL, read_settings
 from bufgym import files, policies
-from bufgym.benchmark.bootstrap import written
 from bufgym.benchmark.score import BASELINE, Interval, regret, scores
-from bufgym.benchmark.sweep import Plan
+from bufgym.benchmark.sweep import Sweep
 from bufgym.errors import BufgymError
 from bufgym.oracle import EveryLength, law, online_optimum
 from bufgym.policies import Policy, registry
@@ -99,8 +98,8 @@ def measure(
     shipped = files.shipped("agents", "agents/pretrained", "*.safetensors")
     fixed = [name for name in registry.names(for_topics=False) if name not in shipped]
     ranked = [name for name in fixed if registry.get(name).ranked]
-    plan = Plan(suite, tuple(ranked), "test", suite_of(suite).capacities, seeds, data)
-    evaluation = EvaluationSet(plan, folder / "goals" / suite)
+    sweep = Sweep(suite, tuple(ranked), "test", suite_of(suite).capacities, seeds, data)
+    evaluation = EvaluationSet(sweep, folder / "goals" / suite)
     cells = [(cell.label, cell.capacity) for cell in evaluation.cells]
     rows = [evaluation.benchmark_rows(evaluation.run(agent), AGENTS, seed) for seed, agent in enumerate(agents)]
     result = scores([{**row, "training_seed": None} for row in evaluation.rows] + [row for own in rows for row in own])

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import tyro
 
+from bufgym.benchmark import bootstrap
+from bufgym.benchmark.bootstrap import Interval
 from bufgym.errors import BufgymError
 
 
@@ -18,6 +20,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
 
 def _line(cells: Sequence[object]) -> str:
     return f"| {' | '.join(map(str, cells))} |"
+
+
+def written(interval: Interval, form: str) -> str:
+    """Such as 1.03 [1.01, 1.05], each number in this format."""
+    return " ".join(filter(None, bootstrap.written(interval, lambda number: format(number, form))))
 
 
 def columns_of(file: Path, *names: str) -> list[tuple[float, ...]]:

@@ -15,19 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents import training
-from agents.evaluation import EvaluationSet, plan_for, play
+from agents.evaluation import EvaluationSet, play, sweep_for
 from agents.held_out import held_out_episodes, run_fixed, split_scenario, summarise
 from agents.mixed_env import Cell, MixedEnv
 from agents.objectives import fleet, topics
 from agents.runs import Run, write_notes
 from agents.settings import Settings
-from bufgym.benchmark import fleets_summary, topics_summary
 from bufgym.benchmark.bootstrap import Interval, written
-from bufgym.benchmark.fleets import ROWS as FLEET_ROWS
-from bufgym.benchmark.rows import Row, write_rows
+from bufgym.benchmark.rows import write_rows
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.table import aligned
-from bufgym.benchmark.topics import ROWS as TOPICS_ROWS
+from bufgym.benchmark.tasks import TASKS
 from bufgym.policies import registry, weights
 
 COLUMNS = (
@@ -92,19 +90,17 @@ def _save(home: Path, settings: Settings, runs: Sequence[Run], best: Run, **resu
 # --- on many topics, or with many robots -----------------------------------------------------------------------------
 
 
-BENCHMARKS: dict[str, tuple[Any, Any, Callable[[Sequence[Row]], str]]] = {
-    "topics": (topics.test_rows, TOPICS_ROWS, lambda rows: topics_summary.plain(topics_summary.summary(rows))),
-    "fleet": (fleet.test_rows, FLEET_ROWS, lambda rows: fleets_summary.plain(fleets_summary.summary(rows))),
-}
-"""Kind -> (the rows of agents and fixed policies, their layout, rows -> table)."""
+RIVALS: dict[str, Callable[[], list[Policy]]] = {"topics": topics.rivals, "fleet": fleet.rivals}
+"""Kind -> the fixed policies that its agents are measured against."""
 
 
 def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
     """Every seed's agent beside the fixed policies on the test split: rows.csv, and the table in results.txt."""
-    test_rows, layout, table_of = BENCHMARKS[settings.kind]
-    rows = test_rows(settings, [dataclasses.replace(weights.load(run.model), name=agent_name(run)) for run in runs])
-    write_rows(rows, folder / "rows.csv", layout)
-    text = table_of(rows)
+    agents = [dataclasses.replace(weights.load(run.model), name=agent_name(run)) for run in runs]
+    rows = test_rows(settings, [*agents, *RIVALS[settings.kind]()])
+    task = TASKS[settings.kind]
+    write_rows(rows, folder / "rows.csv", task.layout)
+    text = task.summary(rows).plain()
     (folder / "results.txt").write_text(text + "\n", encoding="utf-8")
     print(text)
 
@@ -160,8 +156,8 @@ def report_suite(
         (the best agent's notes, the score of the agents together).
     """
     specs = tuple(registry.names(for_topics=False))
-    plan = plan_for(settings, suite, "test", specs, settings.test_seeds or None)
-    evaluation = EvaluationSet(plan, folder / "test" / suite, progress=True)
+    sweep = sweep_for(settings, suite, "test", specs, settings.test_seeds or None)
+    evaluation = EvaluationSet(sweep, folder / "test" / suite, progress=True)
     home.mkdir(exist_ok=True)
     agents = {agent_name(run): training.test_rows(settings, run, evaluation) for run in runs}
     rows: list[Row] = [{**row, "training_seed": None} for row in evaluation.rows]

@@ -9,9 +9,9 @@ from typing import Annotated, Literal, NamedTuple, NoReturn, get_args, get_origi
 
 from bufgym import ENVIRONMENTS
 from bufgym.errors import BufgymError
-from bufgym.policies.learned import MAX_WIDTH, NAMES
+from bufgym.policies.learned import NAMES
+from bufgym.policies.weights import MAX_WIDTH
 from bufgym.scenario import Interruption, suites
-from bufgym.scenario.suites import FLEET_SUITES, TOPIC_SUITES
 
 TIME = ("rank", "time_before", "time_merged", "occupancy", "stalled", "service_ratio")
 """Fields that a queue and a clock can tell, as AFR's."""
@@ -139,11 +139,10 @@ class Settings:
     @property
     def kind(self) -> Kind:
         """What the run trains on."""
-        if not self.suites:
+        kinds = {suites.get(suite).kind for suite in self.suites}
+        if not kinds:
             return "environment"
-        if any(suite in TOPIC_SUITES for suite in self.suites):
-            return "topics"
-        return "fleet" if any(suite in FLEET_SUITES for suite in self.suites) else "queue"
+        return "topics" if "topics" in kinds else "fleet" if "fleet" in kinds else "queue"
 
     def capacities_of(self, suite: str) -> tuple[int, ...]:
         """L to train for and to test at: those given, or the suite's."""

@@ -15,15 +15,14 @@ import numpy as np
 
 from agents.objectives import queue
 from agents.objectives.objective import Objective
-from agents.settings import Settings
 from bufgym import policies
-from bufgym.benchmark import fleets as benchmark
-from bufgym.benchmark.rows import Row
+from bufgym.benchmark import tasks
+from bufgym.benchmark.run import by_trace, draw
+from bufgym.benchmark.seeds import seeds_of
 from bufgym.files import shipped
 from bufgym.policies import Policy, weights
 from bufgym.policies.learned import Network, Weights
-from bufgym.scenario import FleetEpisode, FleetScenario
-from bufgym.scenario.suites import FleetSuite
+from bufgym.scenario import FleetEpisode, FleetScenario, suites
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
 
@@ -41,10 +40,11 @@ that changing it a little changes nothing, and a search from there stays where i
 odometry drops while there is still room and its gain on training episodes is near its largest (docs/fleet.md)."""
 
 
-def suite_of(settings: Settings) -> FleetSuite:
-    """The suite, at the capacities that were asked for."""
-    suite = benchmark.get(settings.suite)
-    return replace(suite, capacities=settings.capacities_of(suite.of)) if settings.capacities else suite
+def fleet_of(suite: str, split: str) -> FleetScenario:
+    """The robots of a suite on all links of one split."""
+    (setting,) = suites.get(suite).settings(split).values()
+    fleet: FleetScenario = setting.scenario
+    return fleet
 
 
 def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
@@ -78,7 +78,7 @@ class FleetEpisodes:
         """How many a candidate takes: one an arrival."""
         rows, messages = fleet.robots * len(episodes), fleet.max_messages
         self.fleet = Fleet(Senders(rows, capacity, fleet.value, max_messages=messages), fleet.robots)
-        self.rival = self.team_qoi(policies.get(benchmark.BASELINE))
+        self.rival = self.team_qoi(policies.get(tasks.TASKS["fleet"].baseline))
 
     def team_qoi(self, policy: Policy) -> float:
         """Mean over robots and episodes of H."""
@@ -94,10 +94,10 @@ def mean_gain(policy: Policy, parts: Sequence[FleetEpisodes]) -> float:
     return float(np.mean([part.team_qoi(policy) - part.rival for part in parts]))
 
 
-def training_parts(suite: FleetSuite, seed: int) -> list[list[FleetEpisodes]]:
+def training_parts(suite: str, capacities: Sequence[int], seed: int) -> list[list[FleetEpisodes]]:
     """``PARTS`` samples of the training episodes, each at every L; links in turn, ``EPISODES`` a sample."""
-    rng, fleet = np.random.default_rng(seed), FleetScenario(suite.robots, suite.uplink("train"))
-    links = [part.fleet for part in benchmark.fleet_parts("", fleet, [()] * len(fleet.uplink.traces))]
+    rng = np.random.default_rng(seed)
+    links = [link for _, link in by_trace(fleet_of(suite, "train"))]
     waiting: list[int] = []
     parts = []
     for _ in range(PARTS):
@@ -105,16 +105,16 @@ def training_parts(suite: FleetSuite, seed: int) -> list[list[FleetEpisodes]]:
             waiting += rng.permutation(len(links)).tolist()
         chosen, waiting = [links[k] for k in waiting[:EPISODES]], waiting[EPISODES:]
         short = [replace(link, uplink=replace(link.uplink, duration_s=EPISODE_S)) for link in chosen]
-        episodes = [benchmark.draw(link, int(rng.integers(10**6))) for link in short]
-        parts.append([FleetEpisodes(short[0], episodes, L) for L in suite.capacities])
+        episodes = [draw(link, int(rng.integers(10**6))) for link in short]
+        parts.append([FleetEpisodes(short[0], episodes, L) for L in capacities])
     return parts
 
 
-def validation_episodes(suite: FleetSuite) -> list[FleetEpisodes]:
+def validation_episodes(suite: str, capacities: Sequence[int]) -> list[FleetEpisodes]:
     """The validation episodes at every L, the same for every seed."""
-    parts = benchmark.suite_parts(suite, "validation", VALIDATION_EPISODES)
-    episodes = [benchmark.draw(part.fleet, seed) for part in parts for seed in part.seeds]
-    return [FleetEpisodes(parts[0].fleet, episodes, L) for L in suite.capacities]
+    links = [link for _, link in by_trace(fleet_of(suite, "validation"))]
+    episodes = [draw(link, seed) for k, link in enumerate(links) for seed in seeds_of(k, VALIDATION_EPISODES)]
+    return [FleetEpisodes(links[0], episodes, L) for L in capacities]
 
 
 # --- the objective ---------------------------------------------------------------------------------------------------
@@ -129,15 +129,19 @@ class FleetObjective(Objective):
     message = "team QoI {:+.4f} over AFR's on validation"
     sigma = queue.SIGMA
 
+    @property
+    def _capacities(self) -> tuple[int, ...]:
+        return self.settings.capacities_of(self.settings.suite)
+
     @functools.cached_property
     def training(self) -> list[list[FleetEpisodes]]:
         """See ``training_parts``."""
-        return training_parts(suite_of(self.settings), self.seed)
+        return training_parts(self.settings.suite, self._capacities, self.seed)
 
     @functools.cached_property
     def judges(self) -> list[FleetEpisodes]:
         """See ``validation_episodes``."""
-        return validation_episodes(suite_of(self.settings))
+        return validation_episodes(self.settings.suite, self._capacities)
 
     def start(self) -> Weights:
         """The shipped agent, less ready to accept; where fields or hidden units are asked for, greed."""
@@ -154,9 +158,6 @@ class FleetObjective(Objective):
         return mean_gain(policy, episodes)
 
 
-def test_rows(settings: Settings, agents: Sequence[Policy]) -> list[Row]:
-    """The agents and all fixed policies on the suite's test split."""
-    suite = suite_of(settings)
-    rivals = [policies.get(name) for name in benchmark.default_policies()]
-    parts = benchmark.suite_parts(suite, "test", settings.test_seeds or None)
-    return benchmark.run_parts([*agents, *rivals], parts, suite.capacities, progress=True)
+def rivals() -> list[Policy]:
+    """All fixed policies that may run on a fleet."""
+    return [policies.get(name) for name in tasks.TASKS["fleet"].default_policies("")]

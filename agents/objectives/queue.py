@@ -19,8 +19,8 @@ from agents.mixed_env import Cell, cells
 from agents.objectives.objective import Objective
 from agents.settings import Settings
 from bufgym import policies
-from bufgym.benchmark import sweep
-from bufgym.benchmark.run import best, draw, regret
+from bufgym.benchmark.bound import best, regret
+from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.score import BASELINE
 from bufgym.oracle import EveryLength
 from bufgym.policies import Policy, learned
@@ -87,7 +87,7 @@ class SampledRegrets:
         self.cells = list(cells)
         self.episodes, self._senders, self._best = [], [], []
         for (_, scenario, L), pairs in zip(cells, drawn, strict=True):
-            episodes = [draw(sweep.cell(scenario, trace), seed) for trace, seed in pairs]
+            episodes = [draw(by_trace(scenario)[trace][1], seed) for trace, seed in pairs]
             self.episodes.append(episodes)
             self._senders.append(Senders(len(pairs), L, scenario.value, max_messages=scenario.max_messages))
             self._best.append(sum(best(episode, L, scenario).qoi for episode in episodes))

@@ -16,10 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.objectives.objective import Objective
-from agents.settings import Settings
 from bufgym import files, policies
-from bufgym.benchmark import topics as benchmark
-from bufgym.benchmark.rows import Row
+from bufgym.benchmark import tasks
 from bufgym.benchmark.run import draw
 from bufgym.errors import BufgymError
 from bufgym.model.link import FOREVER
@@ -194,10 +192,8 @@ class TopicsObjective(Objective):
         return mean_fitness(policy, episodes)
 
 
-def test_rows(settings: Settings, agents: Sequence[Policy]) -> list[Row]:
-    """The agents and all schedulers but the shipped one on the suite's test split."""
+def rivals() -> list[Policy]:
+    """All schedulers but the shipped agent."""
     shipped = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetensors")
-    rivals = [policies.get(name) for name in benchmark.default_policies() if name not in shipped]
-    suite = suites.get(settings.suite)
-    parts = benchmark.suite_parts(suite, "test", settings.test_seeds or None)
-    return benchmark.run_parts([*agents, *rivals], parts, suite.capacities, progress=True)
+    names = tasks.TASKS["topics"].default_policies("")
+    return [policies.get(name) for name in names if name not in shipped]
