@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -16,7 +17,9 @@ from bufgym.benchmark import folder as inputs
 from bufgym.benchmark import report, table
 from bufgym.benchmark.report import style, timeline
 from bufgym.benchmark.rows import write_rows
+from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.errors import BufgymError
+from bufgym.scenario import FleetScenario, suites
 
 pytest.importorskip("jinja2", reason="the report needs Jinja")
 pytest.importorskip("plotly", reason="the report needs plotly")
@@ -212,6 +215,39 @@ def test_without_a_clairvoyant_there_are_dashes(tmp_path: Path) -> None:
     folder = make(tmp_path / "b", rows=rows)
     assert "| – | afr | – | – | – | – |" in report.markdown(folder)
     assert set(figures(report.write(folder).read_text(encoding="utf-8"))) == {"timeline", "memory"}
+
+
+@pytest.mark.parametrize(
+    ("suite", "changes", "heading"),
+    [
+        ("topics-v1", {"consumers": 2}, '<th scope="col">QoI / robofleet</th>'),
+        ("fleet-v1", {"robots": 2}, '<th scope="col">gain over afr</th>'),
+    ],
+)
+def test_topics_and_fleets_have_a_page_too(
+    suite: str, changes: dict[str, int], heading: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the quantities that their task shows, over all cells and in each."""
+    short = {
+        label: dataclasses.replace(setting, scenario=shortened(setting.scenario))
+        for label, setting in suites.get(suite).settings("validation").items()
+    }
+    monkeypatch.setitem(suites.SUITES, suite, dataclasses.replace(suites.get(suite), build=lambda *_: short))
+    sweep = Sweep(suite, ("drop-oldest", "rosbridge"), "validation", (3, 6), seeds=2, changes=changes)
+    run_sweep(sweep, tmp_path, jobs=1, command="the command", form="csv")
+    page = report.write(tmp_path).read_text(encoding="utf-8")
+    assert page.count(heading) == 1 + 2 * len(short)
+    assert f"{next(iter(changes))} = 2" in page and "not ranked: its queue is unbounded" in page
+    assert "ranking" in figures(page) and "discriminative" not in page
+    assert report.markdown(tmp_path).count("\n| # | policy |") == 1 + 2 * len(short)
+    assert f"Suite {suite}, validation: " in report.plain(tmp_path)
+
+
+def shortened(scenario: Any) -> Any:
+    """Two seconds on two of its traces."""
+    if isinstance(scenario, FleetScenario):
+        return dataclasses.replace(scenario, uplink=shortened(scenario.uplink))
+    return dataclasses.replace(scenario, traces=scenario.traces[:2], duration_s=2.0)
 
 
 def test_the_page_needs_an_extra_and_the_tables_do_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

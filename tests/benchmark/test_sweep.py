@@ -188,15 +188,20 @@ def test_the_baseline_is_always_there_and_the_suite_fills_what_is_open(small: Sw
 # -------------------- killed, failed, and taken up again
 
 
-LTE = ["bench", "--suite", "lte-v1", "--policies", "afr,mine", "--capacity", 5, "--seeds", 1, "--format", "csv"]
-"""24 shards."""
+KILLED = {
+    "lte-v1": ["bench", "--suite", "lte-v1", "--policies", "afr,mine", "--capacity", 5],
+    "topics-v1": ["topics", "--split", "validation", "--policies", "mine", "--window", 2],
+    "fleet-v1": ["fleet", "--policies", "mine", "--capacity", 5, "--robots", 2],
+}
+"""A command for each kind of suite."""
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("suite", KILLED)
 def test_a_run_that_was_killed_goes_on_where_it_was(
-    tmp_path: Path, mine: Path, monkeypatch: pytest.MonkeyPatch
+    suite: str, tmp_path: Path, mine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = [*LTE, "--policy-file", mine, "--jobs", 2]
+    words = [*KILLED[suite], "--seeds", 1, "--format", "csv", "--policy-file", mine, "--jobs", 2]
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     process = bufgym(*words, "--out", killed, TEST_SLEEP_S="0.4")
     deadline = time.monotonic() + 60
@@ -208,17 +213,20 @@ def test_a_run_that_was_killed_goes_on_where_it_was(
     os.killpg(process.pid, signal.SIGKILL)  # loky's workers, which would hold the pipes for minutes
     process.communicate()
     kept = contents(killed / "parts")
-    assert 3 <= len(kept) < 24 and not (killed / "rows.csv").exists()
+    shards = {"lte-v1": 24, "topics-v1": 18, "fleet-v1": 12}[suite]
+    assert 3 <= len(kept) < shards and not (killed / "rows.csv").exists()
 
     alone = [str(word) for word in (*words[:-2], "--backend", "sequential", "--out")]
     with monkeypatch.context() as patch:
         patch.setattr(sweep.shutil, "rmtree", lambda *_, **__: None)  # the parts stay, to be looked at
         assert main([*alone, str(killed)]) == 0
     after = contents(killed / "parts")
-    assert len([name for name in after if not name.startswith(".")]) == 24
+    assert len([name for name in after if not name.startswith(".")]) == shards
     assert all(after[name] == was for name, was in kept.items()), "a finished shard was touched"
     assert main([*alone, str(whole)]) == 0
-    for name in ("rows.csv", "timeline.json"):
+    names = {path.name for path in whole.iterdir()}
+    assert names == {"manifest.json", "rows.csv"} | ({"timeline.json"} if suite == "lte-v1" else set())
+    for name in names - {"manifest.json"}:
         assert (killed / name).read_bytes() == (whole / name).read_bytes()
     assert main([*alone, str(killed)]) == 0
     assert not (killed / "parts").exists()
