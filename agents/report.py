@@ -15,18 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents import training
-from agents.evaluation import EvaluationSet, play, sweep_for
+from agents.evaluation import EvaluationSet, play, sweep_for, test_rows
 from agents.held_out import held_out_episodes, run_fixed, split_scenario, summarise
 from agents.mixed_env import Cell, MixedEnv
 from agents.objectives import fleet, topics
+from agents.page import written
 from agents.runs import Run, write_notes
 from agents.settings import Settings
-from bufgym.benchmark.bootstrap import Interval, written
-from bufgym.benchmark.rows import write_rows
+from bufgym.benchmark import summary
+from bufgym.benchmark.bootstrap import Interval
+from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.table import aligned
 from bufgym.benchmark.tasks import TASKS
-from bufgym.policies import registry, weights
+from bufgym.policies import Policy, registry, weights
 
 COLUMNS = (
     ("QoI", "qoi", 1, ".3f"),
@@ -100,7 +102,7 @@ def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
     rows = test_rows(settings, [*agents, *RIVALS[settings.kind]()])
     task = TASKS[settings.kind]
     write_rows(rows, folder / "rows.csv", task.layout)
-    text = task.summary(rows).plain()
+    text = summary.plain(task.summary(rows))
     (folder / "results.txt").write_text(text + "\n", encoding="utf-8")
     print(text)
 
@@ -176,7 +178,7 @@ def report_suite(
         runs,
         best,
         validation={str(run.seed): run.reached for run in runs},
-        held_out={"suite": suite, "split": "test", "episodes": len(evaluation.rows) // len(evaluation.plan.specs)},
+        held_out={"suite": suite, "split": "test", "episodes": len(evaluation.rows) // len(evaluation.sweep.specs)},
         scores=[{"policy": name, "qoi": mean} for name, mean in means.items()],
         standings=[dataclasses.asdict(standing) for standing in result.standings],
         cells=[dataclasses.asdict(cell) for cell in result.cells],

@@ -6,13 +6,12 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from agents.page import command, publish
+from agents.page import command, publish, written
 from agents.runs import MODEL, read_settings
 from bufgym import policies
-from bufgym.benchmark.bootstrap import written
 from bufgym.benchmark.rows import read_rows
-from bufgym.benchmark.topics import ROWS
-from bufgym.benchmark.topics_summary import Standing, plain, summary
+from bufgym.benchmark.summary import Standing, plain
+from bufgym.benchmark.tasks import TASKS
 from bufgym.errors import BufgymError
 
 PAGE = """# Learned scheduling on topics-v1
@@ -54,18 +53,19 @@ def main(run: Positional[Path], out: Path | None = None) -> None:
     """
     if not (run / "rows.csv").is_file():
         raise BufgymError(f"{run / 'rows.csv'}: no such file; the run has not ended")
-    rows = read_rows(run / "rows.csv", ROWS)
-    results = summary(rows)
+    task = TASKS["topics"]
+    rows = read_rows(run / "rows.csv", task.layout)
+    results = task.summary(rows)
     kept = (run / MODEL).read_bytes()
     best = next(path.parent.name[5:] for path in sorted(run.glob(f"seed-*/{MODEL}")) if path.read_bytes() == kept)
     unbounded = {name for name in policies.names() if not policies.get(name).ranked}
     # Unbounded queues come last: their messages arrive long after.
     standings = sorted(results.overall, key=lambda standing: standing.policy in unbounded)
     agents = [standing for standing in results.overall if standing.policy.startswith("agent")]
-    low, high = (bound([standing.relative.value for standing in agents]) for bound in (min, max))
-    older = max(standing.age_relative.high for standing in agents)
+    low, high = (bound([standing["relative"].value for standing in agents]) for bound in (min, max))
+    older = max(standing["age_relative"].high for standing in agents)
     notes = (
-        f"Over all seeds: QoI {low:.2f} to {high:.2f} times Robofleet's, {sum(s.lost for s in agents):g} no_drop "
+        f"Over all seeds: QoI {low:.2f} to {high:.2f} times Robofleet's, {sum(s['lost'].value for s in agents):g} no_drop "
         f"messages lost, the topics of priority 20 at most {older:.3f} times as old (upper end of the interval). "
         "`rosbridge` has an unbounded queue: it loses nothing and delivers it long after."
     )
@@ -84,12 +84,12 @@ def main(run: Positional[Path], out: Path | None = None) -> None:
 def _line(standing: Standing) -> str:
     columns = [
         standing.policy,
-        written(standing.relative, ".3f"),
-        f"{standing.lost:g}",
-        written(standing.age_relative, ".3f"),
-        f"{standing.age_first_s.value:.2f}",
-        f"{standing.age_others_s.value:.2f}",
-        f"{standing.late.value:.1%}",
+        written(standing["relative"], ".3f"),
+        f"{standing['lost'].value:g}",
+        written(standing["age_relative"], ".3f"),
+        f"{standing['age_first_s'].value:.2f}",
+        f"{standing['age_others_s'].value:.2f}",
+        f"{standing['late'].value:.1%}",
     ]
     return f"| {' | '.join(columns)} |"
 

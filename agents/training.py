@@ -26,7 +26,7 @@ from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluation import EvaluationSet, ValidationSets, Verdict
 from agents.held_out import split_scenario
 from agents.mixed_env import MixedEnv, cells
-from agents.objectives.fleet import FleetObjective, suite_of
+from agents.objectives.fleet import FleetObjective, fleet_of
 from agents.objectives.objective import policy_of as slot_policy_of
 from agents.runs import MODEL, Numbers, Run, Validations, each_seed
 from agents.settings import Settings
@@ -118,12 +118,12 @@ def training_env(settings: Settings) -> VecEnv:
     """The batch of environments to train on: of one scenario, of whole train splits, or of robots as rows."""
     if settings.kind == "fleet":
         # Each robot is rewarded for its own information, at the middle capacity; a slot network serves the others too.
-        suite = suite_of(settings)
+        fleet, capacities = fleet_of(settings.suite, "train"), settings.capacities_of(settings.suite)
         batch = FleetVecEnv(
-            max(1, settings.num_envs // suite.robots),
-            suite.robots,
-            suite.uplink("train"),
-            suite.capacities[len(suite.capacities) // 2],
+            max(1, settings.num_envs // fleet.robots),
+            fleet.robots,
+            fleet.uplink,
+            capacities[len(capacities) // 2],
             reward="own",
             term=settings.reward,
             autoreset_mode="SameStep",
