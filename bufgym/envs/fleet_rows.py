@@ -18,9 +18,9 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import kernel
 from bufgym.model.link import FOREVER
 from bufgym.scenario import FleetScenario, Streams
-from bufgym.sim import DECISION, END, Batch, credit
+from bufgym.sim import DECISION, DEPARTURE, END, Batch, credit, decide, next_event, offer
 from bufgym.sim.cell import Fleet
-from bufgym.sim.shared_link import Shares, cell_event, decide_in_cell, offer
+from bufgym.sim.shared_link import Shares, next_in_cell
 
 REWARDS = ("team", "own")
 """Whose information a robot is paid for: the mean over its cell, or its own."""
@@ -30,11 +30,12 @@ REWARDS = ("team", "own")
 def advance_cell(batch: Batch, shares: Shares, c: int) -> None:
     """On to the next tick, where every robot of cell ``c`` has a decision due, or to the end."""
     robots = shares.cells[c].robots
-    waiting, event = 0, DECISION
-    while waiting < robots and event != END:
-        event = cell_event(batch, shares, c)
-        if event == DECISION:
-            waiting += 1
+    event = next_event(batch, shares, c)
+    while event == DEPARTURE:
+        event = next_event(batch, shares, c)
+    if event == DECISION:
+        for _ in range(1, robots):
+            next_in_cell(batch, shares, c)
     for i in range(c * robots, (c + 1) * robots):
         sender = batch.senders[i]
         if event == END:
@@ -68,8 +69,8 @@ def step_cells(
         first = c * robots
         if batch.senders[first].waiting == 1:
             for i in range(first, first + robots):
-                decide_in_cell(batch, shares, c, i, decision_of(actions[i], batch.senders[i].capacity))
-                offer(batch, shares, c)
+                decide(batch, i, decision_of(actions[i], batch.senders[i].capacity))
+                offer(batch, shares, i)
             advance_cell(batch, shares, c)
         for i in range(first, first + robots):
             write_rewards(batch, i, rewarded, shown)

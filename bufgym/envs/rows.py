@@ -96,9 +96,9 @@ def action_of(decision: int, capacity: int) -> int:
 def advance(batch: Batch, i: int) -> None:
     """On to the next decision, or to the end and all information counted."""
     sender = batch.senders[i]
-    event = next_event(batch, i)
+    event = next_event(batch, None, i)
     while event == DEPARTURE:
-        event = next_event(batch, i)
+        event = next_event(batch, None, i)
     if event == END:
         credit(batch, i, FOREVER)
         # What a dead link never carried was not retained after all.

@@ -1,20 +1,31 @@
-"""The socket and its link: what is taken, when it has crossed, when its pong comes, what has reached the server."""
+"""The socket: what it dequeues, what has been transmitted, when its ack comes, what has reached the server."""
 
 from __future__ import annotations
 
 from bufgym.kernel import kernel
 from bufgym.model.link import FOREVER, position_at, time_of
-from bufgym.sim.rules import (
-    arrives_on_topic,
-    dequeued_on_topic,
-    sendable,
-)
-from bufgym.sim.state import Batch
+from bufgym.sim.rules import dequeued_on_topic, received_on_topic, sendable
+from bufgym.sim.state import HELD, UNASKED, Batch
+
+
+@kernel
+def may_dequeue(batch: Batch, i: int) -> bool:
+    """Whether the socket may dequeue a message now: one is queued, and n_T leaves room in flight."""
+    sender = batch.senders[i]
+    if sender.occupancy == 0 or sender.socket == HELD:
+        return False
+    if sender.dequeued - sender.acked < sender.window:
+        return True
+    if sender.flush_no_drop == 1:
+        for k in range(sender.occupancy):
+            if sendable(batch, i, k):
+                return True
+    return False
 
 
 @kernel
 def dequeue(batch: Batch, i: int, k: int) -> None:
-    """Slot ``k`` goes from the buffer to the socket; when its bytes will have crossed is the link's affair."""
+    """Slot ``k`` goes from the buffer to the socket; the link begins with it later, or at once if the socket was empty."""
     sender = batch.senders[i]
     first = sender.first
     if k > 0:
@@ -33,6 +44,7 @@ def dequeue(batch: Batch, i: int, k: int) -> None:
     sender.dequeued += 1
     sender.last_dequeue_us = sender.now_us
     sender.departures += 1
+    sender.socket, sender.chosen = UNASKED, 0
     entry = batch.log[i, head.seq]
     entry.dequeued_us, entry.gain = sender.now_us, head.gain
     if sender.topics > 1:
@@ -56,13 +68,12 @@ def carried_by_now(batch: Batch, i: int) -> int:
 
 
 @kernel
-def begin_transmission(batch: Batch, i: int) -> None:
-    """The link carries what was taken last: behind the message before it, or from now on if the link was idle."""
+def begin_transmission(batch: Batch, i: int, size_bytes: int) -> None:
+    """The link of sender ``i`` alone begins with a message: behind the one before it, or from now on if it was idle."""
     sender = batch.senders[i]
-    head = batch.slots[i, sender.first - 1]
-    if sender.busy == 1 and sender.follows == 0:
+    if sender.follows == 0:
         sender.position = max(carried_by_now(batch, i), sender.position)
-    sender.position += head.size_bytes
+    sender.position += size_bytes
     at_us, sender.segment_finish = time_of(
         batch.knot_us,
         batch.knot_bytes,
@@ -72,36 +83,27 @@ def begin_transmission(batch: Batch, i: int) -> None:
         sender.segment_finish,
         sender.position,
     )
-    due_us = at_us if at_us == FOREVER else at_us - sender.offset_us
-    if sender.busy == 1:
-        sender.finish_us = due_us
-    else:
-        batch.log[i, head.seq].due_us = due_us
+    sender.finish_us = at_us if at_us == FOREVER else at_us - sender.offset_us
 
 
 @kernel
-def finish_transmission(batch: Batch, i: int) -> None:
-    """The last byte of the message in transmission has crossed; without pongs to wait for, its place is free."""
+def finish_transmission(batch: Batch, i: int, at_us: int) -> None:
+    """The last byte of the message in transmission has crossed the link; without acks to wait for, its place is free."""
     sender = batch.senders[i]
-    seq = batch.order[i, sender.transmitted]
-    batch.log[i, seq].transmitted_us = sender.finish_us
-    sender.now_us = sender.finish_us
+    batch.log[i, batch.order[i, sender.transmitted]].transmitted_us = at_us
+    sender.now_us, sender.finish_us, sender.follows = at_us, FOREVER, 1
     sender.transmitted += 1
     sender.busy -= 1
-    if sender.busy > 0:
-        sender.finish_us = batch.log[i, batch.order[i, sender.transmitted]].due_us
-    elif sender.occupancy > 0:
-        sender.follows = 1
     if sender.ack_delay_us == 0:
         sender.acked += 1
-        sender.held = 0
+        sender.socket = UNASKED
 
 
 @kernel
 def next_ack_us(batch: Batch, i: int) -> int:
-    """When the next pong comes for a message that has crossed; FOREVER if none is on its way."""
+    """When the next ack comes for a message that has been transmitted; FOREVER if none is on its way."""
     sender = batch.senders[i]
-    if sender.acked == sender.transmitted:
+    if sender.acked == sender.transmitted:  # always so without acks to wait for
         return FOREVER
     return int(batch.log[i, batch.order[i, sender.acked]].transmitted_us + sender.ack_delay_us)
 
@@ -119,19 +121,4 @@ def credit(batch: Batch, i: int, until_us: int) -> None:
         sender.delivered_gain += entry.gain
         sender.credited += 1
         if sender.topics > 1:
-            arrives_on_topic(batch, i, batch.arrivals[i, seq], received_us)
-
-
-@kernel
-def may_dequeue(batch: Batch, i: int) -> bool:
-    """Whether the socket may take a message now: one is queued, and n_T leaves room in flight."""
-    sender = batch.senders[i]
-    if sender.occupancy == 0 or sender.held == 1:
-        return False
-    if sender.dequeued - sender.acked < sender.window:
-        return True
-    if sender.flush_no_drop == 1:
-        for k in range(sender.occupancy):
-            if sendable(batch, i, k):
-                return True
-    return False
+            received_on_topic(batch, i, batch.arrivals[i, seq], received_us)

@@ -11,28 +11,31 @@ from bufgym.sim.state import ARRIVAL_WAITS, Batch
 
 
 @kernel
-def socket_bytes(batch: Batch, i: int) -> int:
-    """Bytes of the messages that the socket took and that have not crossed as a whole."""
+def left_of_all(batch: Batch, i: int) -> tuple[int, int]:
+    """(bytes not yet transmitted, all bytes) of the messages in a busy socket."""
     sender = batch.senders[i]
-    if sender.busy == 1:
-        return int(batch.slots[i, sender.first - 1].size_bytes)
-    total = 0
-    for k in range(sender.transmitted, sender.dequeued):
-        total += batch.arrivals[i, batch.order[i, k]].size_bytes
-    return total
+    size_bytes = total_bytes = batch.slots[i, sender.first - 1].size_bytes
+    if sender.busy > 1:
+        size_bytes = batch.arrivals[i, batch.order[i, sender.transmitted]].size_bytes
+        for k in range(sender.transmitted, sender.dequeued - 1):
+            total_bytes += batch.arrivals[i, batch.order[i, k]].size_bytes
+    elif sender.last_dequeue_us == sender.now_us:
+        return total_bytes, total_bytes
+    left_bytes = sender.position - carried_by_now(batch, i) + total_bytes - size_bytes
+    return min(total_bytes, max(0, left_bytes)), total_bytes
 
 
 @kernel
 def view(batch: Batch, i: int) -> Buffer:
     """What the policy of sender ``i`` may see now."""
     sender = batch.senders[i]
-    capacity, first, occupancy = sender.capacity, sender.first, sender.occupancy
-    sent = batch.slots[i, first - 1]
-    dequeued_arrival_us, dequeued_x = sent.arrival_us, sent.x
+    first, occupancy = sender.first, sender.occupancy
+    last = batch.slots[i, first - 1]
+    dequeued_arrival_us, dequeued_x = last.arrival_us, last.x
     previous_us, previous_x = sender.previous_us, sender.previous_x
     if sender.dequeued == 0:
         dequeued_arrival_us, dequeued_x = previous_us, previous_x
-        if sender.occupancy > 0:
+        if occupancy > 0:
             # a scheduler holds the first of all back
             dequeued_arrival_us, dequeued_x = batch.slots[i, first].arrival_us, batch.slots[i, first].x
     if sender.topics > 1 and sender.waiting == ARRIVAL_WAITS:
@@ -50,13 +53,13 @@ def view(batch: Batch, i: int) -> Buffer:
             while batch.slots[i, k].topic != arrival.topic:
                 k += 1
             dequeued_arrival_us, dequeued_x = batch.slots[i, k].arrival_us, batch.slots[i, k].x
-    socket_total = socket_bytes(batch, i) if sender.busy > 0 else 0
-    left_bytes = socket_total
-    if sender.busy > 0 and (sender.last_dequeue_us < sender.now_us or sender.busy > 1):
-        left_bytes = min(left_bytes, max(0, sender.position - carried_by_now(batch, i)))
+    left_bytes, left_fraction = 0, 0.0
+    if sender.busy > 0:
+        left_bytes, total_bytes = left_of_all(batch, i)
+        left_fraction = left_bytes / total_bytes
     return Buffer(
         batch.slots[i, first : first + occupancy],
-        capacity,
+        sender.capacity,
         sender.max_bytes,
         sender.backlog_bytes,
         sender.now_us,
@@ -67,7 +70,7 @@ def view(batch: Batch, i: int) -> Buffer:
         previous_x,
         1 if sender.busy > 0 else 0,
         left_bytes,
-        left_bytes / socket_total if sender.busy > 0 else 0.0,
+        left_fraction,
         sender.now_us - sender.last_dequeue_us,
         sender.period_us,
         sender.departures,
