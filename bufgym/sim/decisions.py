@@ -12,7 +12,6 @@ from bufgym.sim.rules import (
     kept_before,
     no_drop,
     refuge,
-    rules_of,
     sendable,
     too_soon,
 )
@@ -52,13 +51,14 @@ def arrive(batch: Batch, i: int) -> int:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
     if sender.limit_at_send == 0 and too_soon(batch, i, arrival.topic):
         batch.log[i, sender.next].limited = 1
-        decide(batch, i, REJECT)  # always possible: a no_drop topic has no rate limit
-        return NOTHING
-    asked = sender.first_decision <= sender.next <= sender.last_decision
-    if asked and not (sender.ask_when_full == 1 and has_room(batch, i)):
-        sender.waiting = ARRIVAL_WAITS
-        return DECISION
-    decide(batch, i, ACCEPT)
+        decision = REJECT  # always valid: a no_drop topic has no rate limit
+    else:
+        asked = sender.first_decision <= sender.next <= sender.last_decision
+        if asked and not (sender.ask_when_full == 1 and has_room(batch, i)):
+            sender.waiting = ARRIVAL_WAITS
+            return DECISION
+        decision = ACCEPT
+    decide(batch, i, decision)
     return NOTHING
 
 
@@ -76,11 +76,11 @@ def has_room(batch: Batch, i: int) -> bool:
 def can_evict(batch: Batch, i: int, k: int) -> bool:
     """Whether evicting slot ``k`` makes the arrival at hand fit."""
     sender = batch.senders[i]
-    if not 0 <= k < sender.occupancy or no_drop(batch, i, k):
+    if not 0 <= k < sender.occupancy:
         return False
     slot = batch.slots[i, sender.first + k]
     arrival = batch.arrivals[i, sender.next]
-    if slot.topic != arrival.topic and at_limit(batch, i, arrival.topic):
+    if no_drop(batch, i, slot.topic) or (slot.topic != arrival.topic and at_limit(batch, i, arrival.topic)):
         return False
     return bool(sender.backlog_bytes - slot.size_bytes + arrival.size_bytes <= sender.max_bytes)
 
@@ -89,7 +89,7 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
 def can_reject(batch: Batch, i: int) -> bool:
     """Whether the arrival at hand may be dropped: always, but for a no_drop message that could be kept somehow."""
     topic = batch.arrivals[i, batch.senders[i].next].topic
-    return rules_of(batch, i, topic).no_drop == 0 or (not has_room(batch, i) and refuge(batch, i) < 0)
+    return not no_drop(batch, i, topic) or (not has_room(batch, i) and refuge(batch, i) < 0)
 
 
 @kernel
@@ -101,18 +101,19 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     """
     sender = batch.senders[i]
     arrival = batch.arrivals[i, sender.next]
-    valid = True
-    enqueue = True
+    valid, enqueue, victim = True, True, -1
     if decision >= 0 and can_evict(batch, i, decision):
-        remove(batch, i, decision)
+        victim = decision
     elif decision == REJECT and can_reject(batch, i):
         enqueue = False
     else:
         enqueue = has_room(batch, i)
         valid = decision == ACCEPT and enqueue
-        if not enqueue and not can_reject(batch, i):
-            remove(batch, i, refuge(batch, i))
-            enqueue = True
+        if not enqueue and no_drop(batch, i, arrival.topic):
+            victim = refuge(batch, i)
+            enqueue = victim >= 0
+    if victim >= 0:
+        remove(batch, i, victim)
     if enqueue:
         # The first message of all, or of its topic, is the 1 in H = 1 + sum of V.
         gain = gain_behind(batch, i, sender.occupancy, arrival.topic, arrival.x)
@@ -160,10 +161,11 @@ def remove(batch: Batch, i: int, k: int) -> None:
 @kernel
 def answer_dequeue(batch: Batch, i: int, drop: bool) -> None:
     """The policy's answer to DEQUEUE: drop the head, or let it go. A no_drop message is never dropped."""
-    if drop and not no_drop(batch, i, 0):
+    sender = batch.senders[i]
+    if drop and not no_drop(batch, i, batch.slots[i, sender.first].topic):
         remove(batch, i, 0)
     else:
-        batch.senders[i].socket = CLEARED
+        sender.socket = CLEARED
 
 
 # --- choices of a scheduler ------------------------------------------------------------------------------------------

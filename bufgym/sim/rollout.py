@@ -19,7 +19,7 @@ from bufgym.policies.registry import Policy, runs_compiled, signatures
 from bufgym.sim.decisions import answer_dequeue, answer_send, decide
 from bufgym.sim.shared_link import Shares, shares_type
 from bufgym.sim.socket import credit
-from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, SEND, Batch, batch_type, named
+from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type, named
 from bufgym.sim.transition import next_event, sender_of
 from bufgym.sim.view import arrival_of, view
 
@@ -36,18 +36,22 @@ def rollout(
 ) -> None:
     """Run every sender of the batch to its end under one policy; ``memory`` is float64[n, entries]."""
     for c in range(len(batch.senders) if shares is None else len(shares.cells)):
-        event = next_event(batch, shares, c)
+        event = NOTHING
         while event != END:
-            i = sender_of(shares, c)
-            if event == DECISION:
-                decide(batch, i, on_arrival(view(batch, i), arrival_of(batch, i), memory[i]))
-            elif event == DEQUEUE:
-                answer_dequeue(batch, i, on_dequeue(view(batch, i), memory[i]))
-            elif event == SEND:
-                answer_send(batch, i, on_send(view(batch, i), memory[i]))
-            elif hears_departures:
-                on_departure(view(batch, i), memory[i])
             event = next_event(batch, shares, c)
+            # One view for all events: the kernels are inlined, and so the loop's code stays small.
+            if event == END or (event == DEPARTURE and not hears_departures):
+                continue
+            i = sender_of(shares, c)
+            buffer = view(batch, i)
+            if event == DECISION:
+                decide(batch, i, on_arrival(buffer, arrival_of(batch, i), memory[i]))
+            elif event == DEQUEUE:
+                answer_dequeue(batch, i, on_dequeue(buffer, memory[i]))
+            elif event == SEND:
+                answer_send(batch, i, on_send(buffer, memory[i]))
+            else:
+                on_departure(buffer, memory[i])
     for i in range(len(batch.senders)):
         credit(batch, i, FOREVER)
 

@@ -18,12 +18,6 @@ from bufgym.sim.state import Batch
 
 
 @kernel
-def rules_of(batch: Batch, i: int, topic: int) -> Any:
-    """The row of the topic table that holds for messages of ``topic``."""
-    return batch.topics[i, topic if batch.senders[i].topics > 1 else 0]
-
-
-@kernel
 def kept_before(batch: Batch, i: int, k: int, topic: int) -> int:
     """The slot before slot ``k`` on the same topic, -1 where there is none."""
     sender = batch.senders[i]
@@ -48,14 +42,16 @@ def kept_after(batch: Batch, i: int, k: int, topic: int) -> int:
 @kernel
 def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
     """Weight times V of the gap from what is kept before slot ``k`` on its topic to ``x``; 0 for its first message."""
-    sender, rules = batch.senders[i], rules_of(batch, i, topic)
+    sender = batch.senders[i]
+    if sender.topics == 1:  # in slot -1 lies the message dequeued last
+        if k == 0 and sender.dequeued == 0:
+            return 0.0
+        return value(batch.v, x - batch.slots[i, sender.first + k - 1].x)
+    rules = batch.topics[i, topic]
     j = kept_before(batch, i, k, topic)
-    if j >= 0 or (sender.topics == 1 and sender.dequeued > 0):
-        before_x = batch.slots[i, sender.first + j].x  # in slot -1 lies the message dequeued last
-    elif rules.dequeued > 0:
-        before_x = rules.dequeued_x
-    else:
+    if j < 0 and rules.dequeued == 0:
         return 0.0
+    before_x = batch.slots[i, sender.first + j].x if j >= 0 else rules.dequeued_x
     return float(rules.weight * value(batch.v[rules.v_start :], x - before_x))
 
 
@@ -126,21 +122,25 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
 @kernel
 def too_soon(batch: Batch, i: int, topic: int) -> bool:
     """Whether the arrival at hand comes sooner after the last one kept than its topic's rate limit allows."""
-    rules = rules_of(batch, i, topic)
+    if batch.senders[i].topics == 1:
+        return False
+    rules = batch.topics[i, topic]
     return bool(rules.kept_us >= 0 and batch.senders[i].now_us - rules.kept_us < rules.period_us)
 
 
 @kernel
 def at_limit(batch: Batch, i: int, topic: int) -> bool:
     """Whether as many messages of this topic are queued as may be."""
-    rules = rules_of(batch, i, topic)
+    if batch.senders[i].topics == 1:
+        return False
+    rules = batch.topics[i, topic]
     return bool(rules.queued >= rules.limit)
 
 
 @kernel
-def no_drop(batch: Batch, i: int, k: int) -> bool:
-    """Whether the message in slot ``k`` may not be dropped."""
-    return bool(rules_of(batch, i, batch.slots[i, batch.senders[i].first + k].topic).no_drop == 1)
+def no_drop(batch: Batch, i: int, topic: int) -> bool:
+    """Whether messages of this topic may not be dropped."""
+    return bool(batch.senders[i].topics > 1 and batch.topics[i, topic].no_drop == 1)
 
 
 @kernel
@@ -154,7 +154,7 @@ def refuge(batch: Batch, i: int) -> int:
         slot = batch.slots[i, sender.first + k]
         priority = batch.topics[i, slot.topic].priority
         fits = sender.backlog_bytes - slot.size_bytes + size_bytes <= sender.max_bytes
-        if fits and not no_drop(batch, i, k) and (best < 0 or priority < lowest):
+        if fits and not no_drop(batch, i, slot.topic) and (best < 0 or priority < lowest):
             best, lowest = k, priority
     return best
 
@@ -163,10 +163,11 @@ def refuge(batch: Batch, i: int) -> int:
 def sendable(batch: Batch, i: int, k: int) -> bool:
     """Whether slot ``k`` may be sent by the window and, where rate limits hold back at the socket, by its own."""
     sender = batch.senders[i]
+    topic = batch.slots[i, sender.first + k].topic
     full = sender.dequeued - sender.acked >= sender.window
-    if full and not (sender.flush_no_drop == 1 and no_drop(batch, i, k)):
+    if full and not (sender.flush_no_drop == 1 and no_drop(batch, i, topic)):
         return False
-    rules = rules_of(batch, i, batch.slots[i, sender.first + k].topic)
+    rules = batch.topics[i, topic if sender.topics > 1 else 0]  # a single queue's row has no period
     held_back = (
         sender.limit_at_send == 1 and rules.dequeued > 0 and sender.now_us - rules.last_dequeue_us < rules.period_us
     )

@@ -21,8 +21,8 @@ from bufgym.documented import documented
 from bufgym.kernel import kernel
 from bufgym.model.link import FOREVER, position_at, time_of
 from bufgym.sim.decisions import arrive
-from bufgym.sim.socket import finish_transmission
-from bufgym.sim.state import END, NOTHING, Batch
+from bufgym.sim.socket import finish_transmission, next_size_bytes
+from bufgym.sim.state import CARRIES, END, IDLE, NOTHING, Batch
 
 CELL = np.dtype(
     [
@@ -119,14 +119,15 @@ def settle(batch: Batch, shares: Shares, c: int) -> None:
 
 
 @kernel
-def join(batch: Batch, shares: Shares, i: int, size_bytes: int) -> None:
+def join(batch: Batch, shares: Shares, i: int) -> None:
     """Sender ``i`` begins with a message: at once behind the one before it, or from ``tick_us`` on."""
     c, robot = i // shares.goals.shape[1], i % shares.goals.shape[1]
-    cell = shares.cells[c]
-    if cell.busy == 0 and batch.senders[i].follows == 0:
+    cell, sender = shares.cells[c], batch.senders[i]
+    if cell.busy == 0 and sender.link == IDLE:
         cell.position = max(cell.reached, cell.position)  # what an idle cell could have carried is gone
+    sender.link = CARRIES
     cell.busy += 1
-    shares.goals[c, robot] = cell.served + size_bytes
+    shares.goals[c, robot] = cell.served + next_size_bytes(batch, i)
 
 
 @kernel

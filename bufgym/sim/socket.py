@@ -5,7 +5,7 @@ from __future__ import annotations
 from bufgym.kernel import kernel
 from bufgym.model.link import FOREVER, position_at, time_of
 from bufgym.sim.rules import dequeued_on_topic, received_on_topic, sendable
-from bufgym.sim.state import HELD, UNASKED, Batch
+from bufgym.sim.state import CARRIES, FREED, HELD, IDLE, UNASKED, Batch
 
 
 @kernel
@@ -52,6 +52,15 @@ def dequeue(batch: Batch, i: int, k: int) -> None:
 
 
 @kernel
+def next_size_bytes(batch: Batch, i: int) -> int:
+    """Size of the message in the socket that the link carries or is to carry next."""
+    sender = batch.senders[i]
+    if sender.busy == 1:
+        return int(batch.slots[i, sender.first - 1].size_bytes)
+    return int(batch.arrivals[i, batch.order[i, sender.transmitted]].size_bytes)
+
+
+@kernel
 def carried_by_now(batch: Batch, i: int) -> int:
     """The position that the link of sender ``i`` has come to."""
     sender = batch.senders[i]
@@ -68,12 +77,13 @@ def carried_by_now(batch: Batch, i: int) -> int:
 
 
 @kernel
-def begin_transmission(batch: Batch, i: int, size_bytes: int) -> None:
-    """The link of sender ``i`` alone begins with a message: behind the one before it, or from now on if it was idle."""
+def begin_transmission(batch: Batch, i: int) -> None:
+    """The link of sender ``i`` alone begins with the next message in the socket: at once if it was freed, else now."""
     sender = batch.senders[i]
-    if sender.follows == 0:
+    if sender.link == IDLE:
         sender.position = max(carried_by_now(batch, i), sender.position)
-    sender.position += size_bytes
+    sender.link = CARRIES
+    sender.position += next_size_bytes(batch, i)
     at_us, sender.segment_finish = time_of(
         batch.knot_us,
         batch.knot_bytes,
@@ -91,7 +101,7 @@ def finish_transmission(batch: Batch, i: int, at_us: int) -> None:
     """The last byte of the message in transmission has crossed the link; without acks to wait for, its place is free."""
     sender = batch.senders[i]
     batch.log[i, batch.order[i, sender.transmitted]].transmitted_us = at_us
-    sender.now_us, sender.finish_us, sender.follows = at_us, FOREVER, 1
+    sender.now_us, sender.finish_us, sender.link = at_us, FOREVER, FREED
     sender.transmitted += 1
     sender.busy -= 1
     if sender.ack_delay_us == 0:

@@ -24,6 +24,10 @@ UNASKED, CLEARED, CHOSEN, HELD = range(4)
 """States of a sender's ``socket``. UNASKED: nothing is decided about what it dequeues next. CLEARED: the policy does not
 drop the head. CHOSEN: it dequeues slot ``chosen``. HELD: it dequeues nothing before the next arrival or ack."""
 
+IDLE, FREED, CARRIES = range(3)
+"""States of a sender's ``link``. IDLE: nothing to carry. FREED: it has just finished a message, so that the next one
+follows without a pause. CARRIES: a message is in transmission."""
+
 SENDER = np.dtype(
     [
         # settings
@@ -60,7 +64,7 @@ SENDER = np.dtype(
         ("busy", np.int64),  # messages dequeued and not yet transmitted
         ("acked", np.int64),  # messages acked
         # link
-        ("follows", np.int64),  # 1: the link has just finished a message, so the next one follows without a pause
+        ("link", np.int64),  # IDLE, FREED or CARRIES
         ("position", np.int64),  # bytes of the trace used up when the message in transmission has been transmitted
         ("finish_us", np.int64),  # when that is; FOREVER while the link is idle
         ("segment_now", np.int64),  # where on the trace the clock and the socket were last looked up

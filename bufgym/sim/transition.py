@@ -17,11 +17,14 @@ from bufgym.sim.decisions import arrive, choose, oldest_sendable
 from bufgym.sim.shared_link import Shares, join, next_in_cell
 from bufgym.sim.socket import begin_transmission, dequeue, finish_transmission, may_dequeue, next_ack_us
 from bufgym.sim.state import (
+    CARRIES,
     CHOSEN,
     DEPARTURE,
     DEQUEUE,
     END,
+    FREED,
     HELD,
+    IDLE,
     NEVER,
     NOTHING,
     SEND,
@@ -83,10 +86,12 @@ def next_event(batch: Batch, shares: Shares | None, c: int) -> int:
     The event is about sender ``sender_of(shares, c)``.
     """
     while True:
-        event = offer(batch, shares, sender_of(shares, c))
-        if event != NOTHING:
-            return event
-        event = next_on_link(batch, c) if shares is None else next_in_cell(batch, shares, c)
+        i = sender_of(shares, c)
+        if shares is None and batch.senders[i].link != CARRIES and batch.senders[i].busy > 0:
+            begin_transmission(batch, i)
+        event = offer(batch, shares, i)
+        if event == NOTHING:
+            event = next_on_link(batch, c) if shares is None else next_in_cell(batch, shares, c)
         if event != NOTHING:
             return event
 
@@ -106,28 +111,23 @@ def offer(batch: Batch, shares: Shares | None, i: int) -> int:
     DEQUEUE or SEND where the policy is to be asked first.
     """
     sender = batch.senders[i]
-    if not may_dequeue(batch, i):
-        sender.follows = 0
-        return NOTHING
-    if sender.ask_at_dequeue == 1 and sender.socket == UNASKED:
-        return DEQUEUE
-    if sender.ask_at_send == 1 and sender.socket != CHOSEN:
-        sender.waiting = SOCKET_WAITS
-        return SEND
-    if sender.socket != CHOSEN and (sender.limit_at_send == 1 or sender.flush_no_drop == 1):
-        choose(batch, i, oldest_sendable(batch, i))
-        if sender.socket == HELD:
-            sender.follows = 0
-            return NOTHING
-    dequeue(batch, i, sender.chosen)
-    if sender.busy == 1:
-        size_bytes = batch.slots[i, sender.first - 1].size_bytes
-        if shares is None:
-            begin_transmission(batch, i, size_bytes)
-        else:
-            join(batch, shares, i, size_bytes)
-    sender.follows = 0
-    return DEPARTURE
+    if may_dequeue(batch, i):
+        if sender.ask_at_dequeue == 1 and sender.socket == UNASKED:
+            return DEQUEUE
+        if sender.socket != CHOSEN:
+            if sender.ask_at_send == 1:
+                sender.waiting = SOCKET_WAITS
+                return SEND
+            if sender.limit_at_send == 1 or sender.flush_no_drop == 1:
+                choose(batch, i, oldest_sendable(batch, i))
+        if sender.socket != HELD:
+            dequeue(batch, i, sender.chosen)
+            if shares is not None:
+                join(batch, shares, i)
+            return DEPARTURE
+    if sender.link == FREED:
+        sender.link = IDLE
+    return NOTHING
 
 
 @kernel
@@ -143,8 +143,6 @@ def next_on_link(batch: Batch, i: int) -> int:
     ack_us = next_ack_us(batch, i)
     if sender.finish_us <= arrives_us and sender.finish_us < ack_us:
         finish_transmission(batch, i, sender.finish_us)
-        if sender.busy > 0:
-            begin_transmission(batch, i, batch.arrivals[i, batch.order[i, sender.transmitted]].size_bytes)
     elif ack_us <= arrives_us:
         sender.now_us = ack_us
         sender.acked += 1

@@ -6,7 +6,7 @@ from typing import Any
 
 from bufgym.kernel import kernel
 from bufgym.model.buffer import Buffer
-from bufgym.sim.socket import carried_by_now
+from bufgym.sim.socket import carried_by_now, next_size_bytes
 from bufgym.sim.state import ARRIVAL_WAITS, Batch
 
 
@@ -14,14 +14,13 @@ from bufgym.sim.state import ARRIVAL_WAITS, Batch
 def left_of_all(batch: Batch, i: int) -> tuple[int, int]:
     """(bytes not yet transmitted, all bytes) of the messages in a busy socket."""
     sender = batch.senders[i]
-    size_bytes = total_bytes = batch.slots[i, sender.first - 1].size_bytes
-    if sender.busy > 1:
-        size_bytes = batch.arrivals[i, batch.order[i, sender.transmitted]].size_bytes
-        for k in range(sender.transmitted, sender.dequeued - 1):
-            total_bytes += batch.arrivals[i, batch.order[i, k]].size_bytes
-    elif sender.last_dequeue_us == sender.now_us:
+    total_bytes = batch.slots[i, sender.first - 1].size_bytes
+    if sender.busy == 1 and sender.last_dequeue_us == sender.now_us:
         return total_bytes, total_bytes
-    left_bytes = sender.position - carried_by_now(batch, i) + total_bytes - size_bytes
+    for k in range(sender.transmitted, sender.dequeued - 1):
+        total_bytes += batch.arrivals[i, batch.order[i, k]].size_bytes
+    waiting_bytes = total_bytes - next_size_bytes(batch, i)
+    left_bytes = sender.position - carried_by_now(batch, i) + waiting_bytes
     return min(total_bytes, max(0, left_bytes)), total_bytes
 
 
