@@ -91,20 +91,44 @@ def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     return zeros if JIT else zeros.view(np.recarray)
 
 
+def _place(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """LLVM's pointer to ``array[i, k]``, for i and k >= 0."""
+    from numba.core import cgutils
+
+    kind = signature.args[0]
+    view = context.make_array(kind)(context, builder, arguments[0])
+    return cast(Any, cgutils).get_item_pointer(context, builder, kind, view, list(arguments[1:]), wraparound=False)
+
+
+def _at(typing_context: Any, array: Any, i: Any, k: Any) -> Any:
+    """``array[i, k]`` without a look at the signs of i and k (a Numba intrinsic: a signature and its code)."""
+    from numba.np import arrayobj
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place = _place(context, builder, signature, arguments)
+        return cast(Any, arrayobj).load_item(context, builder, signature.args[0], place)
+
+    return array.dtype(array, i, k), generate
+
+
+def _python_at(array: NDArray[Any], i: int, k: int) -> Any:
+    return array[i, k]
+
+
+at: Any = cast(Any, numba.extending).intrinsic(_at) if JIT else _python_at
+"""``at(array, i, k)`` is ``array[i, k]`` for i, k >= 0: Numba spends five instructions on what a negative index means."""
+
+
 def _prefetch(typing_context: Any, array: Any, i: Any, k: Any) -> Any:
     """LLVM's prefetch of the place where ``array[i, k]`` lies (a Numba intrinsic: a signature and its code)."""
     from llvmlite import ir
     from numba.core import cgutils
 
-    code: Any = cgutils
-
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kind = signature.args[0]
-        view = context.make_array(kind)(context, builder, arguments[0])
-        place = code.get_item_pointer(context, builder, kind, view, list(arguments[1:]), wraparound=False)
+        place = _place(context, builder, signature, arguments)
         number, byte = ir.IntType(32), ir.IntType(8).as_pointer()
         hint = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
-        function = code.get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")
+        function = cast(Any, cgutils).get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")
         # 1: it will be written; 3: keep it near; 1: data, not code
         builder.call(function, [builder.bitcast(place, byte), number(1), number(3), number(1)])
         return context.get_dummy_value()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bufgym.kernel import kernel
+from bufgym.kernel import at, kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, push
 from bufgym.sim.rules import (
     arrived_on_topic,
@@ -37,7 +37,7 @@ _PERIOD_WEIGHT, _SERVICE_WEIGHT = 1 / 8, 1 / 16
 def arrive(batch: Batch, i: int) -> int:
     """The next message arrives: DECISION if it asks for one; if not, NOTHING, and it is enqueued where there is room."""
     sender = batch.senders[i]
-    arrival = batch.arrivals[i, sender.next]
+    arrival = at(batch.arrivals, i, sender.next)
     arrives_us = arrival.arrival_us
     sender.now_us = arrives_us
     sender.socket = UNASKED
@@ -50,7 +50,7 @@ def arrive(batch: Batch, i: int) -> int:
     else:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
     if sender.limit_at_send == 0 and too_soon(batch, i, arrival.topic):
-        batch.log[i, sender.next].limited = 1
+        at(batch.log, i, sender.next).limited = 1
         decision = REJECT  # always valid: a no_drop topic has no rate limit
     else:
         asked = sender.first_decision <= sender.next <= sender.last_decision
@@ -66,7 +66,7 @@ def arrive(batch: Batch, i: int) -> int:
 def has_room(batch: Batch, i: int) -> bool:
     """Whether the arrival at hand fits without a drop, by messages and by bytes."""
     sender = batch.senders[i]
-    arrival = batch.arrivals[i, sender.next]
+    arrival = at(batch.arrivals, i, sender.next)
     if sender.occupancy >= sender.capacity or at_limit(batch, i, arrival.topic):
         return False
     return bool(sender.backlog_bytes + arrival.size_bytes <= sender.max_bytes)
@@ -78,8 +78,8 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
     sender = batch.senders[i]
     if not 0 <= k < sender.occupancy:
         return False
-    slot = batch.slots[i, sender.first + k]
-    arrival = batch.arrivals[i, sender.next]
+    slot = at(batch.slots, i, sender.first + k)
+    arrival = at(batch.arrivals, i, sender.next)
     if no_drop(batch, i, slot.topic) or (slot.topic != arrival.topic and at_limit(batch, i, arrival.topic)):
         return False
     return bool(sender.backlog_bytes - slot.size_bytes + arrival.size_bytes <= sender.max_bytes)
@@ -88,7 +88,7 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
 @kernel
 def can_reject(batch: Batch, i: int) -> bool:
     """Whether the arrival at hand may be dropped: always, but for a no_drop message that could be kept somehow."""
-    topic = batch.arrivals[i, batch.senders[i].next].topic
+    topic = at(batch.arrivals, i, batch.senders[i].next).topic
     return not no_drop(batch, i, topic) or (not has_room(batch, i) and refuge(batch, i) < 0)
 
 
@@ -100,7 +100,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     the lowest priority.
     """
     sender = batch.senders[i]
-    arrival = batch.arrivals[i, sender.next]
+    arrival = at(batch.arrivals, i, sender.next)
     valid, enqueue, victim = True, True, -1
     if decision >= 0 and can_evict(batch, i, decision):
         victim = decision
@@ -119,12 +119,12 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         gain = gain_behind(batch, i, sender.occupancy, arrival.topic, arrival.x)
         sender.retained_gain += gain
         sender.first = push(batch.slots, i, sender.first, sender.occupancy, arrival)
-        batch.slots[i, sender.first + sender.occupancy].gain = gain
+        at(batch.slots, i, sender.first + sender.occupancy).gain = gain
         sender.occupancy += 1
         sender.backlog_bytes += arrival.size_bytes
         sender.peak_backlog_bytes = max(sender.peak_backlog_bytes, sender.backlog_bytes)
     else:
-        batch.log[i, sender.next].dropped_us = sender.now_us
+        at(batch.log, i, sender.next).dropped_us = sender.now_us
         sender.rejected += 1
     if not valid:
         sender.invalid += 1
@@ -141,15 +141,15 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
 def remove(batch: Batch, i: int, k: int) -> None:
     """Evict slot ``k``: its gap and the one behind it on its topic become one."""
     sender = batch.senders[i]
-    gone = batch.slots[i, sender.first + k]
+    gone = at(batch.slots, i, sender.first + k)
     sender.backlog_bytes -= gone.size_bytes
     sender.retained_gain -= gone.gain
-    batch.log[i, gone.seq].dropped_us = sender.now_us
+    at(batch.log, i, gone.seq).dropped_us = sender.now_us
     if sender.topics > 1:
-        batch.topics[i, gone.topic].queued -= 1
+        at(batch.topics, i, gone.topic).queued -= 1
     j = kept_after(batch, i, k, gone.topic)
     if j < sender.occupancy:
-        behind = batch.slots[i, sender.first + j]
+        behind = at(batch.slots, i, sender.first + j)
         merged = gain_behind(batch, i, k, gone.topic, behind.x)
         sender.retained_gain += merged - behind.gain
         behind.gain = merged
@@ -162,7 +162,7 @@ def remove(batch: Batch, i: int, k: int) -> None:
 def answer_dequeue(batch: Batch, i: int, drop: bool) -> None:
     """The policy's answer to DEQUEUE: drop the head, or let it go. A no_drop message is never dropped."""
     sender = batch.senders[i]
-    if drop and not no_drop(batch, i, batch.slots[i, sender.first].topic):
+    if drop and not no_drop(batch, i, at(batch.slots, i, sender.first).topic):
         remove(batch, i, 0)
     else:
         sender.socket = CLEARED
@@ -177,7 +177,7 @@ def can_send(batch: Batch, i: int, k: int) -> bool:
     sender = batch.senders[i]
     if not 0 <= k < sender.occupancy:
         return False
-    return kept_before(batch, i, k, batch.slots[i, sender.first + k].topic) < 0 and sendable(batch, i, k)
+    return kept_before(batch, i, k, at(batch.slots, i, sender.first + k).topic) < 0 and sendable(batch, i, k)
 
 
 @kernel

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bufgym.kernel import kernel
+from bufgym.kernel import at, kernel
 from bufgym.model.qoi import value
 from bufgym.sim.state import Batch
 
@@ -23,7 +23,7 @@ def kept_before(batch: Batch, i: int, k: int, topic: int) -> int:
     sender = batch.senders[i]
     j = k - 1
     if sender.topics > 1:
-        while j >= 0 and batch.slots[i, sender.first + j].topic != topic:
+        while j >= 0 and at(batch.slots, i, sender.first + j).topic != topic:
             j -= 1
     return j
 
@@ -34,7 +34,7 @@ def kept_after(batch: Batch, i: int, k: int, topic: int) -> int:
     sender = batch.senders[i]
     j = k + 1
     if sender.topics > 1:
-        while j < sender.occupancy and batch.slots[i, sender.first + j].topic != topic:
+        while j < sender.occupancy and at(batch.slots, i, sender.first + j).topic != topic:
             j += 1
     return j
 
@@ -46,12 +46,12 @@ def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
     if sender.topics == 1:  # in slot -1 lies the message dequeued last
         if k == 0 and sender.dequeued == 0:
             return 0.0
-        return value(batch.v, x - batch.slots[i, sender.first + k - 1].x)
-    rules = batch.topics[i, topic]
+        return value(batch.v, x - at(batch.slots, i, sender.first + k - 1).x)
+    rules = at(batch.topics, i, topic)
     j = kept_before(batch, i, k, topic)
     if j < 0 and rules.dequeued == 0:
         return 0.0
-    before_x = batch.slots[i, sender.first + j].x if j >= 0 else rules.dequeued_x
+    before_x = at(batch.slots, i, sender.first + j).x if j >= 0 else rules.dequeued_x
     return float(rules.weight * value(batch.v[rules.v_start :], x - before_x))
 
 
@@ -61,7 +61,7 @@ def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
 @kernel
 def arrived_on_topic(batch: Batch, i: int, message: Any, enqueued: bool) -> None:
     """``message`` has arrived, and was enqueued or not."""
-    topic = batch.topics[i, message.topic]
+    topic = at(batch.topics, i, message.topic)
     if topic.arrived > 0:
         topic.step_us, topic.step_x = message.arrival_us - topic.previous_us, message.x - topic.previous_x
     else:
@@ -80,7 +80,7 @@ def arrived_on_topic(batch: Batch, i: int, message: Any, enqueued: bool) -> None
 @kernel
 def dequeued_on_topic(batch: Batch, i: int, message: Any) -> None:
     """The socket has dequeued ``message``."""
-    topic = batch.topics[i, message.topic]
+    topic = at(batch.topics, i, message.topic)
     topic.queued -= 1
     topic.dequeued += 1
     topic.dequeued_arrival_us, topic.dequeued_x = message.arrival_us, message.x
@@ -91,7 +91,7 @@ def dequeued_on_topic(batch: Batch, i: int, message: Any) -> None:
 def received_on_topic(batch: Batch, i: int, message: Any, received_us: int) -> None:
     """``message`` has reached the server: its topic is younger again, and it may have come too late."""
     age_until(batch, i, message.topic, received_us)
-    topic = batch.topics[i, message.topic]
+    topic = at(batch.topics, i, message.topic)
     topic.received += 1
     topic.newest_us = max(topic.newest_us, message.arrival_us)
     if received_us - message.arrival_us > topic.deadline_us:
@@ -105,8 +105,8 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
     It begins with the topic's first arrival and ends with the episode's last, whatever a policy does.
     """
     sender = batch.senders[i]
-    rules = batch.topics[i, topic]
-    until_us = min(until_us, batch.arrivals[i, sender.arrivals - 1].arrival_us)
+    rules = at(batch.topics, i, topic)
+    until_us = min(until_us, at(batch.arrivals, i, sender.arrivals - 1).arrival_us)
     if rules.arrived == 0 or until_us <= rules.aged_us:
         return
     from_s, until_s = (rules.aged_us - rules.newest_us) / 1e6, (until_us - rules.newest_us) / 1e6
@@ -124,7 +124,7 @@ def too_soon(batch: Batch, i: int, topic: int) -> bool:
     """Whether the arrival at hand comes sooner after the last one kept than its topic's rate limit allows."""
     if batch.senders[i].topics == 1:
         return False
-    rules = batch.topics[i, topic]
+    rules = at(batch.topics, i, topic)
     return bool(rules.kept_us >= 0 and batch.senders[i].now_us - rules.kept_us < rules.period_us)
 
 
@@ -133,26 +133,26 @@ def at_limit(batch: Batch, i: int, topic: int) -> bool:
     """Whether as many messages of this topic are queued as may be."""
     if batch.senders[i].topics == 1:
         return False
-    rules = batch.topics[i, topic]
+    rules = at(batch.topics, i, topic)
     return bool(rules.queued >= rules.limit)
 
 
 @kernel
 def no_drop(batch: Batch, i: int, topic: int) -> bool:
     """Whether messages of this topic may not be dropped."""
-    return bool(batch.senders[i].topics > 1 and batch.topics[i, topic].no_drop == 1)
+    return bool(batch.senders[i].topics > 1 and at(batch.topics, i, topic).no_drop == 1)
 
 
 @kernel
 def refuge(batch: Batch, i: int) -> int:
     """The slot that goes for a no_drop message when nothing else helps: lowest priority, oldest; -1 if none may."""
     sender = batch.senders[i]
-    size_bytes = batch.arrivals[i, sender.next].size_bytes
+    size_bytes = at(batch.arrivals, i, sender.next).size_bytes
     best = -1
     lowest = 0.0
     for k in range(sender.occupancy):
-        slot = batch.slots[i, sender.first + k]
-        priority = batch.topics[i, slot.topic].priority
+        slot = at(batch.slots, i, sender.first + k)
+        priority = at(batch.topics, i, slot.topic).priority
         fits = sender.backlog_bytes - slot.size_bytes + size_bytes <= sender.max_bytes
         if fits and not no_drop(batch, i, slot.topic) and (best < 0 or priority < lowest):
             best, lowest = k, priority
@@ -163,11 +163,11 @@ def refuge(batch: Batch, i: int) -> int:
 def sendable(batch: Batch, i: int, k: int) -> bool:
     """Whether slot ``k`` may be sent by the window and, where rate limits hold back at the socket, by its own."""
     sender = batch.senders[i]
-    topic = batch.slots[i, sender.first + k].topic
+    topic = at(batch.slots, i, sender.first + k).topic
     full = sender.dequeued - sender.acked >= sender.window
     if full and not (sender.flush_no_drop == 1 and no_drop(batch, i, topic)):
         return False
-    rules = batch.topics[i, topic if sender.topics > 1 else 0]  # a single queue's row has no period
+    rules = at(batch.topics, i, topic if sender.topics > 1 else 0)  # a single queue's row has no period
     held_back = (
         sender.limit_at_send == 1 and rules.dequeued > 0 and sender.now_us - rules.last_dequeue_us < rules.period_us
     )

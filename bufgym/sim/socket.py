@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bufgym.kernel import kernel
+from bufgym.kernel import at, kernel
 from bufgym.model.link import FOREVER, position_at, time_of
 from bufgym.sim.rules import dequeued_on_topic, received_on_topic, sendable
 from bufgym.sim.state import CARRIES, FREED, HELD, IDLE, UNASKED, Batch
@@ -30,12 +30,12 @@ def dequeue(batch: Batch, i: int, k: int) -> None:
     first = sender.first
     if k > 0:
         # All but its gain stands in the list of arrivals as well.
-        seq, gain = batch.slots[i, first + k].seq, batch.slots[i, first + k].gain
+        seq, gain = at(batch.slots, i, first + k).seq, at(batch.slots, i, first + k).gain
         for j in range(first + k, first, -1):
-            batch.slots[i, j] = batch.slots[i, j - 1]
-        batch.slots[i, first] = batch.arrivals[i, seq]
-        batch.slots[i, first].gain = gain
-    head = batch.slots[i, first]
+            batch.slots[i, j] = at(batch.slots, i, j - 1)
+        batch.slots[i, first] = at(batch.arrivals, i, seq)
+        at(batch.slots, i, first).gain = gain
+    head = at(batch.slots, i, first)
     batch.order[i, sender.dequeued] = head.seq
     sender.busy += 1
     sender.first += 1
@@ -45,7 +45,7 @@ def dequeue(batch: Batch, i: int, k: int) -> None:
     sender.last_dequeue_us = sender.now_us
     sender.departures += 1
     sender.socket, sender.chosen = UNASKED, 0
-    entry = batch.log[i, head.seq]
+    entry = at(batch.log, i, head.seq)
     entry.dequeued_us, entry.gain = sender.now_us, head.gain
     if sender.topics > 1:
         dequeued_on_topic(batch, i, head)
@@ -56,8 +56,8 @@ def next_size_bytes(batch: Batch, i: int) -> int:
     """Size of the message in the socket that the link carries or is to carry next."""
     sender = batch.senders[i]
     if sender.busy == 1:
-        return int(batch.slots[i, sender.first - 1].size_bytes)
-    return int(batch.arrivals[i, batch.order[i, sender.transmitted]].size_bytes)
+        return int(at(batch.slots, i, sender.first - 1).size_bytes)
+    return int(at(batch.arrivals, i, batch.order[i, sender.transmitted]).size_bytes)
 
 
 @kernel
@@ -100,7 +100,7 @@ def begin_transmission(batch: Batch, i: int) -> None:
 def finish_transmission(batch: Batch, i: int, at_us: int) -> None:
     """The last byte of the message in transmission has crossed the link; without acks to wait for, its place is free."""
     sender = batch.senders[i]
-    batch.log[i, batch.order[i, sender.transmitted]].transmitted_us = at_us
+    at(batch.log, i, batch.order[i, sender.transmitted]).transmitted_us = at_us
     sender.now_us, sender.finish_us, sender.link = at_us, FOREVER, FREED
     sender.transmitted += 1
     sender.busy -= 1
@@ -115,7 +115,7 @@ def next_ack_us(batch: Batch, i: int) -> int:
     sender = batch.senders[i]
     if sender.acked == sender.transmitted:  # always so without acks to wait for
         return FOREVER
-    return int(batch.log[i, batch.order[i, sender.acked]].transmitted_us + sender.ack_delay_us)
+    return int(at(batch.log, i, batch.order[i, sender.acked]).transmitted_us + sender.ack_delay_us)
 
 
 @kernel
@@ -123,12 +123,12 @@ def credit(batch: Batch, i: int, until_us: int) -> None:
     """Count the information of what reached the server by ``until_us``, propagation included."""
     sender = batch.senders[i]
     while sender.credited < sender.transmitted:
-        seq = batch.order[i, sender.credited]
-        entry = batch.log[i, seq]
+        seq = at(batch.order, i, sender.credited)
+        entry = at(batch.log, i, seq)
         received_us = entry.transmitted_us + sender.propagation_us
         if until_us < received_us:
             break
         sender.delivered_gain += entry.gain
         sender.credited += 1
         if sender.topics > 1:
-            received_on_topic(batch, i, batch.arrivals[i, seq], received_us)
+            received_on_topic(batch, i, at(batch.arrivals, i, seq), received_us)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import kernel, records
+from bufgym.kernel import at, kernel, records
 from bufgym.model.link import FOREVER
 from bufgym.sim.decisions import arrive, choose, oldest_sendable
 from bufgym.sim.shared_link import Shares, join, next_in_cell
@@ -65,7 +65,7 @@ def load_row(
     """
     for k in range(len(arrivals)):
         batch.arrivals[i, k] = arrivals[k]
-        entry = batch.log[i, k]
+        entry = at(batch.log, i, k)
         entry.dequeued_us, entry.transmitted_us, entry.dropped_us, entry.limited = NEVER, NEVER, NEVER, 0
     for k in range(len(topics)):
         batch.topics[i, k] = topics[k]
@@ -139,7 +139,7 @@ def next_on_link(batch: Batch, i: int) -> int:
     """
     sender = batch.senders[i]
     more = sender.next < sender.arrivals
-    arrives_us = batch.arrivals[i, sender.next].arrival_us if more else FOREVER - 1
+    arrives_us = at(batch.arrivals, i, sender.next).arrival_us if more else FOREVER - 1
     ack_us = next_ack_us(batch, i)
     if sender.finish_us <= arrives_us and sender.finish_us < ack_us:
         finish_transmission(batch, i, sender.finish_us)
