@@ -116,7 +116,7 @@ def _python_at(array: NDArray[Any], i: int, k: int) -> Any:
 
 
 at: Any = cast(Any, numba.extending).intrinsic(_at) if JIT else _python_at
-"""``at(array, i, k)`` is ``array[i, k]`` for i, k >= 0: Numba spends five instructions on what a negative index means."""
+"""``at(array, i, k)`` is ``array[i, k]`` for i, k >= 0, without what Numba does about negative indices."""
 
 
 def _prefetch(typing_context: Any, array: Any, i: Any, k: Any) -> Any:

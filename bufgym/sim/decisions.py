@@ -35,7 +35,7 @@ _PERIOD_WEIGHT, _SERVICE_WEIGHT = 1 / 8, 1 / 16
 
 @kernel
 def arrive(batch: Batch, i: int) -> int:
-    """The next message arrives: DECISION if it asks for one; if not, NOTHING, and it is enqueued where there is room."""
+    """The next message arrives: DECISION if it asks for one; else NOTHING, and it is enqueued where there is room."""
     sender = batch.senders[i]
     arrival = at(batch.arrivals, i, sender.next)
     arrives_us = arrival.arrival_us

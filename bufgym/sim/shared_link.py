@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bufgym.documented import documented
 from bufgym.kernel import kernel
-from bufgym.model.link import FOREVER, position_at, time_of
+from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.decisions import arrive
 from bufgym.sim.socket import finish_transmission, next_size_bytes
 from bufgym.sim.state import CARRIES, END, IDLE, NOTHING, Batch
@@ -103,15 +103,7 @@ def least(numbers: NDArray[np.int64]) -> int:
 def settle(batch: Batch, shares: Shares, c: int) -> None:
     """Give every busy sender the whole bytes that its share has come to by ``tick_us``."""
     cell = shares.cells[c]
-    cell.reached, cell.segment_now = position_at(
-        batch.knot_us,
-        batch.knot_bytes,
-        cell.first_knot,
-        cell.last_knot,
-        cell.after,
-        cell.segment_now,
-        cell.tick_us + cell.offset_us,
-    )
+    cell.reached = carried_by(batch.knot_us, batch.knot_bytes, cell, cell.tick_us)
     if cell.busy > 0:
         share = (cell.reached - cell.position) // cell.busy
         cell.served += share
@@ -138,16 +130,7 @@ def next_finish(batch: Batch, shares: Shares, c: int) -> tuple[int, int, int]:
         return FOREVER, cell.position, FOREVER
     goal = least(shares.goals[c])
     position = cell.position + cell.busy * (goal - cell.served)
-    at_us, cell.segment_finish = time_of(
-        batch.knot_us,
-        batch.knot_bytes,
-        cell.first_knot,
-        cell.last_knot,
-        cell.after,
-        cell.segment_finish,
-        position,
-    )
-    return goal, position, FOREVER if at_us == FOREVER else at_us - cell.offset_us
+    return goal, position, finish_of(batch.knot_us, batch.knot_bytes, cell, position)
 
 
 @kernel

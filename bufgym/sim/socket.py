@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bufgym.kernel import at, kernel
-from bufgym.model.link import FOREVER, position_at, time_of
+from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.rules import dequeued_on_topic, received_on_topic, sendable
 from bufgym.sim.state import CARRIES, FREED, HELD, IDLE, UNASKED, Batch
 
@@ -25,7 +25,7 @@ def may_dequeue(batch: Batch, i: int) -> bool:
 
 @kernel
 def dequeue(batch: Batch, i: int, k: int) -> None:
-    """Slot ``k`` goes from the buffer to the socket; the link begins with it later, or at once if the socket was empty."""
+    """Slot ``k`` goes from the buffer to the socket; the link has yet to begin with it."""
     sender = batch.senders[i]
     first = sender.first
     if k > 0:
@@ -61,44 +61,19 @@ def next_size_bytes(batch: Batch, i: int) -> int:
 
 
 @kernel
-def carried_by_now(batch: Batch, i: int) -> int:
-    """The position that the link of sender ``i`` has come to."""
-    sender = batch.senders[i]
-    reached, sender.segment_now = position_at(
-        batch.knot_us,
-        batch.knot_bytes,
-        sender.first_knot,
-        sender.last_knot,
-        sender.after,
-        sender.segment_now,
-        sender.now_us + sender.offset_us,
-    )
-    return reached
-
-
-@kernel
 def begin_transmission(batch: Batch, i: int) -> None:
     """The link of sender ``i`` alone begins with the next message in the socket: at once if it was freed, else now."""
     sender = batch.senders[i]
     if sender.link == IDLE:
-        sender.position = max(carried_by_now(batch, i), sender.position)
+        sender.position = max(carried_by(batch.knot_us, batch.knot_bytes, sender, sender.now_us), sender.position)
     sender.link = CARRIES
     sender.position += next_size_bytes(batch, i)
-    at_us, sender.segment_finish = time_of(
-        batch.knot_us,
-        batch.knot_bytes,
-        sender.first_knot,
-        sender.last_knot,
-        sender.after,
-        sender.segment_finish,
-        sender.position,
-    )
-    sender.finish_us = at_us if at_us == FOREVER else at_us - sender.offset_us
+    sender.finish_us = finish_of(batch.knot_us, batch.knot_bytes, sender, sender.position)
 
 
 @kernel
 def finish_transmission(batch: Batch, i: int, at_us: int) -> None:
-    """The last byte of the message in transmission has crossed the link; without acks to wait for, its place is free."""
+    """The last byte of the message in transmission crosses the link; without acks to wait for, its place is free."""
     sender = batch.senders[i]
     at(batch.log, i, batch.order[i, sender.transmitted]).transmitted_us = at_us
     sender.now_us, sender.finish_us, sender.link = at_us, FOREVER, FREED

@@ -21,8 +21,8 @@ NOTHING_WAITS, ARRIVAL_WAITS, SOCKET_WAITS = range(3)
 """What a sender may be ``waiting`` for: nothing, a decision on its arrival, or the choice of what to send."""
 
 UNASKED, CLEARED, CHOSEN, HELD = range(4)
-"""States of a sender's ``socket``. UNASKED: nothing is decided about what it dequeues next. CLEARED: the policy does not
-drop the head. CHOSEN: it dequeues slot ``chosen``. HELD: it dequeues nothing before the next arrival or ack."""
+"""States of a sender's ``socket``. UNASKED: nothing is decided about what it dequeues next. CLEARED: the policy does
+not drop the head. CHOSEN: it dequeues slot ``chosen``. HELD: it dequeues nothing before the next arrival or ack."""
 
 IDLE, FREED, CARRIES = range(3)
 """States of a sender's ``link``. IDLE: nothing to carry. FREED: it has just finished a message, so that the next one

@@ -6,7 +6,8 @@ from typing import Any
 
 from bufgym.kernel import at, kernel
 from bufgym.model.buffer import Buffer
-from bufgym.sim.socket import carried_by_now, next_size_bytes
+from bufgym.model.link import carried_by
+from bufgym.sim.socket import next_size_bytes
 from bufgym.sim.state import ARRIVAL_WAITS, Batch
 
 
@@ -20,7 +21,8 @@ def left_of_all(batch: Batch, i: int) -> tuple[int, int]:
     for k in range(sender.transmitted, sender.dequeued - 1):
         total_bytes += at(batch.arrivals, i, batch.order[i, k]).size_bytes
     waiting_bytes = total_bytes - next_size_bytes(batch, i)
-    left_bytes = sender.position - carried_by_now(batch, i) + waiting_bytes
+    carried_bytes = carried_by(batch.knot_us, batch.knot_bytes, sender, sender.now_us)
+    left_bytes = sender.position - carried_bytes + waiting_bytes
     return min(total_bytes, max(0, left_bytes)), total_bytes
 
 
