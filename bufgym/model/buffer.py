@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bufgym.documented import documented
 from bufgym.errors import BufgymError
-from bufgym.kernel import kernel
+from bufgym.kernel import item, kernel
 from bufgym.model.qoi import merging_loss, value
 
 MESSAGE = np.dtype(
@@ -166,7 +166,7 @@ def before(buffer: Buffer, k: int, topic: int) -> int:
     """The slot kept before slot ``k`` on the same topic, -1 where there is none."""
     j = k - 1
     if len(buffer.topics) > 1:
-        while j >= 0 and buffer.slots[j].topic != topic:
+        while j >= 0 and item(buffer.slots, j).topic != topic:
             j -= 1
     return j
 
@@ -176,7 +176,7 @@ def after(buffer: Buffer, k: int, topic: int) -> int:
     """The slot kept after slot ``k`` on the same topic, ``len(buffer.slots)`` where there is none."""
     j = k + 1
     if len(buffer.topics) > 1:
-        while j < len(buffer.slots) and buffer.slots[j].topic != topic:
+        while j < len(buffer.slots) and item(buffer.slots, j).topic != topic:
             j += 1
     return j
 
@@ -184,32 +184,33 @@ def after(buffer: Buffer, k: int, topic: int) -> int:
 @kernel
 def is_first(buffer: Buffer, k: int) -> bool:
     """Whether slot ``k`` is the oldest of its topic: a topic's messages are sent in order."""
-    return before(buffer, k, buffer.slots[k].topic) < 0
+    return before(buffer, k, item(buffer.slots, k).topic) < 0
 
 
 @kernel
 def _gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int, float, float]:
     """(time gaps, us, then gaps in x) of slot ``k`` to the messages kept before it and after it on its topic."""
     s = len(buffer.slots)
-    message = arrival if k == s else buffer.slots[k]
+    message = arrival if k == s else item(buffer.slots, k)
     at_us, x, topic = message.arrival_us, message.x, message.topic
     from_us, from_x = at_us, x
     arrives = len(buffer.topics) == 1 or arrival.topic == topic  # the arrival is what follows the topic's last message
     j = before(buffer, k, topic)
     if j >= 0:
-        from_us, from_x = buffer.slots[j].arrival_us, buffer.slots[j].x
+        from_us, from_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x
     elif arrives:
         from_us, from_x = buffer.dequeued_arrival_us, buffer.dequeued_x
-    elif buffer.topics[topic].dequeued > 0:
-        from_us, from_x = buffer.topics[topic].dequeued_arrival_us, buffer.topics[topic].dequeued_x
+    elif item(buffer.topics, topic).dequeued > 0:
+        past = item(buffer.topics, topic)
+        from_us, from_x = past.dequeued_arrival_us, past.dequeued_x
     if k == s:
         return at_us - from_us, at_us - buffer.previous_us, x - from_x, x - buffer.previous_x
     to_us, to_x = arrival.arrival_us, arrival.x
     j = after(buffer, k, topic)
     if j < s:
-        to_us, to_x = buffer.slots[j].arrival_us, buffer.slots[j].x
+        to_us, to_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x
     elif not arrives:
-        past = buffer.topics[topic]
+        past = item(buffer.topics, topic)
         to_us, to_x = max(at_us, past.previous_us) + past.step_us, max(x, past.previous_x) + past.step_x
     return at_us - from_us, to_us - at_us, x - from_x, to_x - x
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import kernel
+from bufgym.kernel import item, kernel
 from bufgym.traces.trace import Trace
 
 FOREVER = 2**62
@@ -82,16 +82,22 @@ class Knots:
 def segment(knots: NDArray[np.int64], first: int, last: int, hint: int, point: int) -> int:
     """k with knots[k] <= point < knots[k + 1], first <= k < last. ``hint``: where it was last time, often still so."""
     for k in range(hint, min(hint + 4, last)):
-        if knots[k] <= point < knots[k + 1]:
+        if item(knots, k) <= point < item(knots, k + 1):
             return k
     low, high = first, last
     while high - low > 1:
         middle = (low + high) // 2
-        if knots[middle] <= point:
+        if item(knots, middle) <= point:
             low = middle
         else:
             high = middle
     return low
+
+
+@kernel
+def share(part: int, whole: int, amount: int) -> Any:
+    """part / whole of ``amount``, rounded down; none is negative, which spares Numba a look at the signs."""
+    return np.int64(np.uint64(part * amount) // np.uint64(whole))
 
 
 @kernel
@@ -108,10 +114,11 @@ def position_at(
             # Whole segment lengths first, so that the product below stays within 64 bits.
             span, carried = duration - us[last - 1], total - size[last - 1]
             whole, rest = (t_us - duration) // span, (t_us - duration) % span
-            return total + whole * carried + carried * rest // span, last - 1
+            return total + whole * carried + share(rest, span, carried), last - 1
         laps, t = t_us // duration, t_us % duration
     k = segment(us, first, last, hint, t)
-    return laps * total + size[k] + (size[k + 1] - size[k]) * (t - us[k]) // (us[k + 1] - us[k]), k
+    from_us, from_bytes = item(us, k), item(size, k)
+    return laps * total + from_bytes + share(t - from_us, item(us, k + 1) - from_us, item(size, k + 1) - from_bytes), k
 
 
 @kernel
@@ -133,8 +140,10 @@ def time_of(
         laps = (position - 1) // total
         within = position - laps * total
     k = segment(size, first, last, hint, within - 1)  # size[k] < within <= size[k + 1]
-    need, carried = within - size[k], size[k + 1] - size[k]
-    return laps * duration + us[k] + -(-need * (us[k + 1] - us[k]) // carried), k
+    from_us, from_bytes = item(us, k), item(size, k)
+    span, carried = item(us, k + 1) - from_us, item(size, k + 1) - from_bytes
+    # rounded up: the whole span less what is left of it, rounded down
+    return laps * duration + from_us + span - share(from_bytes + carried - within, carried, span), k
 
 
 @kernel

@@ -57,7 +57,7 @@ def next_size_bytes(batch: Batch, i: int) -> int:
     sender = batch.senders[i]
     if sender.busy == 1:
         return int(at(batch.slots, i, sender.first - 1).size_bytes)
-    return int(at(batch.arrivals, i, batch.order[i, sender.transmitted]).size_bytes)
+    return int(at(batch.arrivals, i, at(batch.order, i, sender.transmitted)).size_bytes)
 
 
 @kernel
@@ -75,7 +75,7 @@ def begin_transmission(batch: Batch, i: int) -> None:
 def finish_transmission(batch: Batch, i: int, at_us: int) -> None:
     """The last byte of the message in transmission crosses the link; without acks to wait for, its place is free."""
     sender = batch.senders[i]
-    at(batch.log, i, batch.order[i, sender.transmitted]).transmitted_us = at_us
+    at(batch.log, i, at(batch.order, i, sender.transmitted)).transmitted_us = at_us
     sender.now_us, sender.finish_us, sender.link = at_us, FOREVER, FREED
     sender.transmitted += 1
     sender.busy -= 1
@@ -90,7 +90,7 @@ def next_ack_us(batch: Batch, i: int) -> int:
     sender = batch.senders[i]
     if sender.acked == sender.transmitted:  # always so without acks to wait for
         return FOREVER
-    return int(at(batch.log, i, batch.order[i, sender.acked]).transmitted_us + sender.ack_delay_us)
+    return int(at(batch.log, i, at(batch.order, i, sender.acked)).transmitted_us + sender.ack_delay_us)
 
 
 @kernel

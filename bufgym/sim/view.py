@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bufgym.kernel import at, kernel
+from bufgym.kernel import at, kernel, stretch
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import carried_by
 from bufgym.sim.socket import next_size_bytes
@@ -19,7 +19,7 @@ def left_of_all(batch: Batch, i: int) -> tuple[int, int]:
     if sender.busy == 1 and sender.last_dequeue_us == sender.now_us:
         return total_bytes, total_bytes
     for k in range(sender.transmitted, sender.dequeued - 1):
-        total_bytes += at(batch.arrivals, i, batch.order[i, k]).size_bytes
+        total_bytes += at(batch.arrivals, i, at(batch.order, i, k)).size_bytes
     waiting_bytes = total_bytes - next_size_bytes(batch, i)
     carried_bytes = carried_by(batch.knot_us, batch.knot_bytes, sender, sender.now_us)
     left_bytes = sender.position - carried_bytes + waiting_bytes
@@ -59,7 +59,7 @@ def view(batch: Batch, i: int) -> Buffer:
         left_bytes, total_bytes = left_of_all(batch, i)
         left_fraction = left_bytes / total_bytes
     return Buffer(
-        batch.slots[i, first : first + occupancy],
+        stretch(batch.slots, i, first, occupancy),
         sender.capacity,
         sender.max_bytes,
         sender.backlog_bytes,
@@ -77,7 +77,7 @@ def view(batch: Batch, i: int) -> Buffer:
         sender.departures,
         sender.service_ratio,
         batch.v,
-        batch.topics[i],
+        stretch(batch.topics, i, 0, sender.topics),
         sender.window,
         sender.dequeued - sender.acked,
     )
