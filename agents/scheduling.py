@@ -64,8 +64,9 @@ def main(run: Positional[Path], out: Path | None = None) -> None:
     agents = [standing for standing in results.overall if standing.policy.startswith("agent")]
     low, high = (bound([standing["relative"].value for standing in agents]) for bound in (min, max))
     older = max(standing["age_relative"].high for standing in agents)
+    lost = sum(standing["lost"].value for standing in agents)
     notes = (
-        f"Over all seeds: QoI {low:.2f} to {high:.2f} times Robofleet's, {sum(s['lost'].value for s in agents):g} no_drop "
+        f"Over all seeds: QoI {low:.2f} to {high:.2f} times Robofleet's, {lost:g} no_drop "
         f"messages lost, the topics of priority 20 at most {older:.3f} times as old (upper end of the interval). "
         "`rosbridge` has an unbounded queue: it loses nothing and delivers it long after."
     )

@@ -91,20 +91,73 @@ def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     return zeros if JIT else zeros.view(np.recarray)
 
 
+# What follows works on places of arrays that exist, as kernels do: indices are >= 0 and slices lie inside. Numba's own
+# indexing looks at the sign of every index and at the ends of every slice, a fifth of the instructions of a rollout.
+
+
+def _place(context: Any, builder: Any, kind: Any, array: Any, indices: Any) -> Any:
+    """LLVM's pointer to the element of ``array``, of Numba type ``kind``, at ``indices``."""
+    from numba.core import cgutils
+
+    view = context.make_array(kind)(context, builder, array)
+    return cast(Any, cgutils).get_item_pointer(context, builder, kind, view, list(indices), wraparound=False)
+
+
+def _read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    from numba.np import arrayobj
+
+    kind, array = signature.args[0], arguments[0]
+    place = _place(context, builder, kind, array, arguments[1:])
+    return cast(Any, arrayobj).load_item(context, builder, kind, place)
+
+
+def _item(typing_context: Any, array: Any, k: Any) -> Any:
+    return array.dtype(array, k), _read
+
+
+def _at(typing_context: Any, array: Any, i: Any, k: Any) -> Any:
+    return array.dtype(array, i, k), _read
+
+
+def _stretch(typing_context: Any, array: Any, i: Any, first: Any, length: Any) -> Any:
+    from numba.np import arrayobj
+
+    row = array.copy(ndim=1)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        whole = context.make_array(array)(context, builder, arguments[0])
+        place = _place(context, builder, array, arguments[0], arguments[1:3])
+        view = context.make_array(row)(context, builder)
+        size, shape = whole.itemsize, [arguments[3]]
+        cast(Any, arrayobj).populate_array(view, place, shape, [size], size, whole.meminfo, whole.parent)
+        return view._getvalue()
+
+    return row(array, i, first, length), generate
+
+
+def _unchecked(intrinsic: Callable[..., Any], python: Callable[..., Any]) -> Any:
+    """``intrinsic`` (a Numba intrinsic: a signature and its code), or the same in Python where nothing is compiled."""
+    return cast(Any, numba.extending).intrinsic(intrinsic) if JIT else python
+
+
+item: Any = _unchecked(_item, lambda array, k: array[k])
+"""``item(array, k)`` is ``array[k]``."""
+at: Any = _unchecked(_at, lambda array, i, k: array[i, k])
+"""``at(array, i, k)`` is ``array[i, k]``."""
+stretch: Any = _unchecked(_stretch, lambda array, i, first, length: array[i, first : first + length])
+"""``stretch(array, i, first, length)`` is ``array[i, first : first + length]``, for an array in C order."""
+
+
 def _prefetch(typing_context: Any, array: Any, i: Any, k: Any) -> Any:
     """LLVM's prefetch of the place where ``array[i, k]`` lies (a Numba intrinsic: a signature and its code)."""
     from llvmlite import ir
     from numba.core import cgutils
 
-    code: Any = cgutils
-
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kind = signature.args[0]
-        view = context.make_array(kind)(context, builder, arguments[0])
-        place = code.get_item_pointer(context, builder, kind, view, list(arguments[1:]), wraparound=False)
+        place = _place(context, builder, signature.args[0], arguments[0], arguments[1:])
         number, byte = ir.IntType(32), ir.IntType(8).as_pointer()
         hint = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
-        function = code.get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")
+        function = cast(Any, cgutils).get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")
         # 1: it will be written; 3: keep it near; 1: data, not code
         builder.call(function, [builder.bitcast(place, byte), number(1), number(3), number(1)])
         return context.get_dummy_value()
@@ -112,9 +165,5 @@ def _prefetch(typing_context: Any, array: Any, i: Any, k: Any) -> Any:
     return numba.types.void(array, i, k), generate
 
 
-def _no_prefetch(array: NDArray[Any], i: int, k: int) -> None:
-    """Nothing to do where nothing is compiled."""
-
-
-prefetch: Any = cast(Any, numba.extending).intrinsic(_prefetch) if JIT else _no_prefetch
+prefetch: Any = _unchecked(_prefetch, lambda array, i, k: None)
 """``prefetch(array, i, k)`` asks the processor to fetch ``array[i, k]`` into its cache, without waiting for it."""

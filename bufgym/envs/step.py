@@ -42,9 +42,10 @@ from bufgym.sim import (
     decide,
     has_room,
     next_event,
+    offer,
     view,
 )
-from bufgym.sim.shared_link import Shares, cell_event, decide_in_cell, offer
+from bufgym.sim.shared_link import Shares, next_in_cell
 
 DELIVERED, RETAINED, AGE, LATE = range(len(REWARD_TERMS) + len(TOPIC_REWARD_TERMS))
 """Columns of ``StepOutput.reward_terms``."""
@@ -176,9 +177,9 @@ def write_mask(batch: Batch, i: int, action_mask: NDArray[np.bool_]) -> None:
 @kernel
 def advance(batch: Batch, i: int) -> None:
     """Run row ``i`` to its next decision, or to the end of its episode."""
-    event = next_event(batch, i)
+    event = next_event(batch, None, i)
     while event == DEPARTURE:
-        event = next_event(batch, i)
+        event = next_event(batch, None, i)
     settle_gains(batch, i, event == END)
 
 
@@ -221,11 +222,12 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], rewarded: NDArray[np.flo
 def advance_cell(batch: Batch, shares: Shares, c: int) -> None:
     """Run cell ``c`` to its next tick, where every robot has a decision due, or to the end of its episode."""
     robots = shares.cells[c].robots
-    asking, event = 0, DECISION
-    while asking < robots and event != END:
-        event = cell_event(batch, shares, c)
-        if event == DECISION:
-            asking += 1
+    event = next_event(batch, shares, c)
+    while event == DEPARTURE:
+        event = next_event(batch, shares, c)
+    if event == DECISION:
+        for _ in range(1, robots):
+            next_in_cell(batch, shares, c)
     for i in range(c * robots, (c + 1) * robots):
         settle_gains(batch, i, event == END)
 
@@ -253,8 +255,8 @@ def step_cells(
         first = c * robots
         if batch.senders[first].waiting == ARRIVAL_WAITS:
             for i in range(first, first + robots):
-                decide_in_cell(batch, shares, c, i, decision_of(actions[i], batch.senders[i].capacity))
-                offer(batch, shares, c)
+                decide(batch, i, decision_of(actions[i], batch.senders[i].capacity))
+                offer(batch, shares, i)
             advance_cell(batch, shares, c)
         for i in range(first, first + robots):
             write_rewards(batch, i, rewarded, output)

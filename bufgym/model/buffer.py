@@ -1,8 +1,8 @@
 """The bounded buffer of one sender, as a row of an array: push, pop the head, evict a slot.
 
-A row of ``slots`` holds, in order, the message that the socket took last (in transmission or already delivered) and
-then the queued ones. The head sits at ``first``; so ``slots[first - 1]`` is what the head's information is measured
-against, and popping the head moves nothing. Slot 0 is the oldest queued message (DESIGN: slot, head, tail).
+A row of ``slots`` holds, in order, the message dequeued last (in transmission or already delivered) and then the queued
+ones. The head is at column ``first``; so ``slots[first - 1]`` is what the head's information is measured against, and
+popping the head moves nothing. Slot 0 is the oldest queued message.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.documented import documented
 from bufgym.errors import BufgymError
-from bufgym.kernel import kernel
+from bufgym.kernel import item, kernel
 from bufgym.model.qoi import merging_loss, value
 
 MESSAGE = np.dtype(
@@ -23,7 +24,7 @@ MESSAGE = np.dtype(
         ("size_bytes", np.int64),
         ("topic", np.int64),
         ("x", np.float64),  # coordinate: how far the scene has moved on (frame index or motion)
-        ("uniform", np.float64),  # uniform in [0, 1): a randomised policy's own draw for this arrival
+        ("uniform", np.float64),  # uniform draw in [0, 1), for randomised policies
         ("gain", np.float64),  # V(x - x of the message kept before it): what its delivery adds
     ],
     align=True,
@@ -31,7 +32,7 @@ MESSAGE = np.dtype(
 
 TOPIC = np.dtype(
     [
-        # what the topic is (see ``bufgym.model.topics.Topic``)
+        # settings (see ``bufgym.model.topics.Topic``)
         ("priority", np.float64),
         ("weight", np.float64),  # of its H in the weighted sum
         ("period_us", np.int64),  # rate limit: at most one message a period; 0 for none
@@ -39,7 +40,7 @@ TOPIC = np.dtype(
         ("no_drop", np.int64),  # 1: may not be dropped
         ("deadline_us", np.int64),  # a message is late when it is older than this at the server
         ("v_start", np.int64),  # where its V begins in the array of all V
-        # what the sender knows of its past
+        # what the sender knows of the past
         ("queued", np.int64),  # messages in the buffer
         ("arrived", np.int64),
         ("kept_us", np.int64),  # arrival time of the message enqueued last
@@ -47,16 +48,16 @@ TOPIC = np.dtype(
         ("previous_x", np.float64),
         ("step_us", np.int64),  # time between its last two arrivals
         ("step_x", np.float64),
-        ("dequeued", np.int64),  # messages the socket took
-        ("dequeued_arrival_us", np.int64),  # arrival time of the one taken last
+        ("dequeued", np.int64),  # messages the socket dequeued
+        ("dequeued_arrival_us", np.int64),  # arrival time of the last of them
         ("dequeued_x", np.float64),
-        ("last_dequeue_us", np.int64),  # when the socket took it
-        # what the server has of it: for who counts, not known on board
+        ("last_dequeue_us", np.int64),  # when it was dequeued
+        # what the server has of it: statistics that the robot does not know
         ("received", np.int64),
         ("newest_us", np.int64),  # arrival time of the newest received
         ("aged_us", np.int64),  # until when its age has been counted
         ("aged", np.float64),  # its age, integrated over that time, s^2
-        # room for whoever walks along the queue
+        # scratch of kernels that walk along the queue
         ("mark", np.int64),
     ],
     align=True,
@@ -64,7 +65,7 @@ TOPIC = np.dtype(
 
 # A policy's decision is the slot to evict for the newcomer (0 = oldest), or one of these.
 REJECT, ACCEPT = -1, -2
-# A scheduler's choice is the slot to send, or to send nothing until the next arrival or pong.
+# A scheduler's choice is the slot to send, or to send nothing until the next arrival or ack.
 HOLD = -1
 
 UNLIMITED_BYTES = 2**62
@@ -81,14 +82,15 @@ def check_limits(capacity: int, max_bytes: int | None) -> None:
         raise BufgymError(f"max_bytes = {max_bytes!r}: B must be a whole number >= 1, or None for no limit")
 
 
+@documented
 class Buffer(NamedTuple):
-    """All that a policy may see: what the robot has on board when a message arrives. No field of it is to be written.
+    """All that a policy may see: what the robot knows on board when a message arrives. Do not write to it.
 
-    Whatever is written here is known without feedback from the server and without measuring the link's bandwidth.
+    Nothing here needs feedback from the server or a measurement of the link's bandwidth.
     """
 
     slots: NDArray[Any]
-    """MESSAGE[occupancy]: the queued messages, 0 = oldest. Not the one in transmission: it can't be dropped."""
+    """MESSAGE[occupancy]: the queued messages, 0 = oldest; without the one in transmission, which can't be dropped."""
     capacity: int
     """L, messages."""
     max_bytes: int
@@ -98,40 +100,39 @@ class Buffer(NamedTuple):
     now_us: int
     """The robot's clock, us."""
     dequeued: int
-    """How many messages the socket has taken so far (delivered, or in transmission)."""
+    """Messages dequeued so far (delivered, or in transmission)."""
     dequeued_arrival_us: int
-    """Arrival time of the message that the socket took last, us; while there was none, that of the oldest queued, else
-    that of the previous arrival. Of several topics the newcomer's counts, here and in the next three.
-    """
+    """Arrival time of the message dequeued last, us; before the first, that of the oldest queued message, else of the
+    previous arrival. With several topics this and the next three are those of the newcomer's topic."""
     dequeued_x: float
-    """Coordinate of the message that the socket took last."""
+    """Coordinate x of the message dequeued last."""
     previous_us: int
-    """Arrival time of the arrival before this one, kept or not, us."""
+    """Time of the previous arrival, kept or not, us."""
     previous_x: float
-    """Coordinate of the arrival before this one, kept or not."""
+    """Coordinate x of the previous arrival, kept or not."""
     busy: int
     """1 while a message is in transmission, else 0."""
     left_bytes: int
-    """Bytes of the message in transmission that have not crossed yet."""
+    """Bytes of the message in transmission that are not yet transmitted."""
     left_fraction: float
     """The same as a fraction of that message, in [0, 1]."""
     stalled_us: int
-    """Time since the socket last took a message, us."""
+    """Time since a message was last dequeued, us."""
     period_us: float
     """Running mean of the time between arrivals, us."""
     departures: int
-    """Messages the socket has taken since the arrival before this one."""
+    """Messages dequeued since the previous arrival."""
     service_ratio: float
     """Running mean of departures per arrival: 1 = the link keeps up, 0 = it stands still."""
     v: NDArray[np.float64]
-    """The value function, for ``qoi.value(buffer.v, distance)``; with several topics that of each from its
+    """float64[entries]: the value function, for ``qoi.value(buffer.v, distance)``; with several topics each from its
     ``v_start`` on."""
     topics: NDArray[Any]
-    """TOPIC[topics]; a sender that knows one topic only keeps its settings there and nothing else."""
+    """TOPIC[topics]: settings and past of each topic; a single queue keeps settings there and nothing else."""
     window: int
-    """n_T: messages that may be sent and not yet answered by a pong."""
+    """n_T: messages that may be sent and not yet acked."""
     in_flight: int
-    """Messages sent and not yet answered by a pong (without pongs: not yet across)."""
+    """Messages sent and not yet acked (without acks: not yet transmitted)."""
     parameters: NDArray[np.float64] = NO_PARAMETERS
     """float64[parameters], read-only: the policy's own settings, in the order of its registration, or its weights."""
 
@@ -160,7 +161,7 @@ def evict(slots: NDArray[Any], i: int, first: int, occupancy: int, k: int) -> in
 
 
 def row_width(capacity: int) -> int:
-    """Columns of ``slots`` for L = ``capacity``: the message taken last, L queued, L more to pop without moving."""
+    """Columns of ``slots`` for L = ``capacity``: the message dequeued last, L queued, L more to pop without moving."""
     return 1 + 2 * capacity
 
 
@@ -169,7 +170,7 @@ def before(buffer: Buffer, k: int, topic: int) -> int:
     """The slot kept before slot ``k`` on the same topic, -1 where there is none."""
     j = k - 1
     if len(buffer.topics) > 1:
-        while j >= 0 and buffer.slots[j].topic != topic:
+        while j >= 0 and item(buffer.slots, j).topic != topic:
             j -= 1
     return j
 
@@ -179,7 +180,7 @@ def after(buffer: Buffer, k: int, topic: int) -> int:
     """The slot kept after slot ``k`` on the same topic, ``len(buffer.slots)`` where there is none."""
     j = k + 1
     if len(buffer.topics) > 1:
-        while j < len(buffer.slots) and buffer.slots[j].topic != topic:
+        while j < len(buffer.slots) and item(buffer.slots, j).topic != topic:
             j += 1
     return j
 
@@ -187,67 +188,53 @@ def after(buffer: Buffer, k: int, topic: int) -> int:
 @kernel
 def is_first(buffer: Buffer, k: int) -> bool:
     """Whether slot ``k`` is the oldest of its topic: a topic's messages are sent in order."""
-    return before(buffer, k, buffer.slots[k].topic) < 0
+    return before(buffer, k, item(buffer.slots, k).topic) < 0
 
 
 @kernel
-def topic_arrives(buffer: Buffer, arrival: Any, topic: int) -> bool:
-    """Whether the arrival at hand is what follows a topic's queued messages."""
-    return len(buffer.topics) == 1 or arrival.topic == topic
+def _gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int, float, float]:
+    """(time gaps, us, then gaps in x) of slot ``k`` to the messages kept before it and after it on its topic."""
+    s = len(buffer.slots)
+    message = arrival if k == s else item(buffer.slots, k)
+    at_us, x, topic = message.arrival_us, message.x, message.topic
+    from_us, from_x = at_us, x
+    arrives = len(buffer.topics) == 1 or arrival.topic == topic  # the arrival is what follows the topic's last message
+    j = before(buffer, k, topic)
+    if j >= 0:
+        from_us, from_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x
+    elif arrives:
+        from_us, from_x = buffer.dequeued_arrival_us, buffer.dequeued_x
+    elif item(buffer.topics, topic).dequeued > 0:
+        past = item(buffer.topics, topic)
+        from_us, from_x = past.dequeued_arrival_us, past.dequeued_x
+    if k == s:
+        return at_us - from_us, at_us - buffer.previous_us, x - from_x, x - buffer.previous_x
+    to_us, to_x = arrival.arrival_us, arrival.x
+    j = after(buffer, k, topic)
+    if j < s:
+        to_us, to_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x
+    elif not arrives:
+        past = item(buffer.topics, topic)
+        to_us, to_x = max(at_us, past.previous_us) + past.step_us, max(x, past.previous_x) + past.step_x
+    return at_us - from_us, to_us - at_us, x - from_x, to_x - x
 
 
 @kernel
 def time_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int]:
     """Time from slot ``k`` back to the message kept before it on its topic and on to the one kept after it, us.
 
-    The newcomer is slot ``len(buffer.slots)``. What follows it has not come yet: one more step like the last is
-    expected, so its second gap is the time since the previous arrival. So it is for the last of another topic.
+    The newcomer is slot ``len(buffer.slots)``. What follows it is still to come: one more step like the last is
+    expected, so its second gap is the time since the previous arrival. The same goes for the last of another topic.
     """
-    s = len(buffer.slots)
-    here = arrival.arrival_us if k == s else buffer.slots[k].arrival_us
-    topic = arrival.topic if k == s else buffer.slots[k].topic
-    j = before(buffer, k, topic)
-    if j >= 0:
-        since = buffer.slots[j].arrival_us
-    elif topic_arrives(buffer, arrival, topic):
-        since = buffer.dequeued_arrival_us
-    else:
-        since = buffer.topics[topic].dequeued_arrival_us if buffer.topics[topic].dequeued > 0 else here
-    if k == s:
-        return here - since, here - buffer.previous_us
-    j = after(buffer, k, topic)
-    if j < s:
-        until = buffer.slots[j].arrival_us
-    elif topic_arrives(buffer, arrival, topic):
-        until = arrival.arrival_us
-    else:
-        until = max(here, buffer.topics[topic].previous_us) + buffer.topics[topic].step_us
-    return here - since, until - here
+    back_us, on_us, _, _ = _gaps(buffer, arrival, k)
+    return back_us, on_us
 
 
 @kernel
 def motion_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
     """The same as ``time_gaps`` in the coordinate x: what the scene moved before slot ``k`` and after it."""
-    s = len(buffer.slots)
-    here = arrival.x if k == s else buffer.slots[k].x
-    topic = arrival.topic if k == s else buffer.slots[k].topic
-    j = before(buffer, k, topic)
-    if j >= 0:
-        since = buffer.slots[j].x
-    elif topic_arrives(buffer, arrival, topic):
-        since = buffer.dequeued_x
-    else:
-        since = buffer.topics[topic].dequeued_x if buffer.topics[topic].dequeued > 0 else here
-    if k == s:
-        return here - since, here - buffer.previous_x
-    j = after(buffer, k, topic)
-    if j < s:
-        until = buffer.slots[j].x
-    elif topic_arrives(buffer, arrival, topic):
-        until = arrival.x
-    else:
-        until = max(here, buffer.topics[topic].previous_x) + buffer.topics[topic].step_x
-    return here - since, until - here
+    _, _, back_x, on_x = _gaps(buffer, arrival, k)
+    return back_x, on_x
 
 
 @kernel
@@ -268,7 +255,7 @@ def arrival_gain(buffer: Buffer, arrival: Any) -> float:
 def loss(buffer: Buffer, arrival: Any, k: int) -> float:
     """QoI lost if slot ``k`` went and nothing else: V(a) + V(b) - V(a + b) for its gaps a, b; >= 0 as V is concave.
 
-    With several topics times the weight of its own.
+    With several topics, times the weight of its topic.
     """
     a, b = motion_gaps(buffer, arrival, k)
     if len(buffer.topics) == 1:

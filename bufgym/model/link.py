@@ -1,23 +1,24 @@
 """The link: a capacity trace turned into delivery times, exactly, in whole microseconds and bytes.
 
-A trace gives the bytes C(t) that the link could have carried up to time t, linear between its knots. The socket is
-serial and work-conserving: a message that starts at byte position u (u = C(t) for an idle link, else where the one
-before it ended) has crossed at the first microsecond t with C(t) >= u + bytes. Positions, not times, are carried
-from message to message, so nothing is lost to rounding however many follow each other.
+A trace gives the bytes C(t) that the link could have carried by time t, linear between its knots. The socket is serial
+and work-conserving: a message that starts at byte position u (u = C(t) for an idle link, else where the one before it
+ended) has been transmitted at the first microsecond t with C(t) >= u + bytes. Positions, not times, are passed on from
+message to message, so nothing is lost to rounding however many follow each other.
 
-After the trace's end the link may *loop* (the trace begins again), *hold* (the last segment's rate goes on) or
-*stop* (nothing crosses any more).
+After the trace's end the link may *loop* (the trace begins again), *hold* (the last segment's rate goes on) or *stop*
+(it carries nothing more).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import kernel
+from bufgym.kernel import item, kernel
 from bufgym.traces.trace import Trace
 
 FOREVER = 2**62
@@ -29,11 +30,14 @@ _AFTER = {"loop": LOOP, "hold": HOLD, "stop": STOP}
 
 @dataclass(frozen=True)
 class Link:
-    """One sender's link: ``trace`` from ``offset_us`` on; each message reaches the server ``propagation_us`` later."""
+    """One sender's link: a trace from an offset on, and a propagation delay."""
 
     trace: Trace
+    """Capacity over time, and what follows its end."""
     offset_us: int = 0
+    """Where on the trace the episode begins, us."""
     propagation_us: int = 0
+    """From the end of a message's transmission to its receipt at the server, us."""
 
     def __post_init__(self) -> None:
         for name in ("offset_us", "propagation_us"):
@@ -41,14 +45,15 @@ class Link:
                 raise BufgymError(f"link on {self.trace.name}: {name} = {getattr(self, name)}: must be >= 0")
 
     def carried_by(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]:
-        """C at each of these times, which must not decrease: bytes, rounded down, as ``position_at`` has it."""
-        by = np.empty(len(t_us), np.int64)
-        _positions(self.trace.time_us, self.trace.cumulative_bytes, _AFTER[self.trace.after], t_us + self.offset_us, by)
-        return by
+        """C at these times (int64[n], us, not decreasing): int64[n], bytes, rounded down as in ``position_at``."""
+        carried = np.empty(len(t_us), np.int64)
+        trace = self.trace
+        _positions(trace.time_us, trace.cumulative_bytes, _AFTER[trace.after], t_us + self.offset_us, carried)
+        return carried
 
     @property
     def carries_bytes(self) -> int:
-        """The position that no message can pass: the link's last byte, or FOREVER where it never stops."""
+        """All bytes that the link will ever carry; FOREVER where it never stops."""
         carried = self.trace.cumulative_bytes
         ends = self.trace.after == "stop" or (self.trace.after == "hold" and carried[-1] == carried[-2])
         return int(carried[-1]) if ends else FOREVER
@@ -77,16 +82,22 @@ class Knots:
 def segment(knots: NDArray[np.int64], first: int, last: int, hint: int, point: int) -> int:
     """k with knots[k] <= point < knots[k + 1], first <= k < last. ``hint``: where it was last time, often still so."""
     for k in range(hint, min(hint + 4, last)):
-        if knots[k] <= point < knots[k + 1]:
+        if item(knots, k) <= point < item(knots, k + 1):
             return k
     low, high = first, last
     while high - low > 1:
         middle = (low + high) // 2
-        if knots[middle] <= point:
+        if item(knots, middle) <= point:
             low = middle
         else:
             high = middle
     return low
+
+
+@kernel
+def share(part: int, whole: int, amount: int) -> Any:
+    """part / whole of ``amount``, rounded down; none is negative, which spares Numba a look at the signs."""
+    return np.int64(np.uint64(part * amount) // np.uint64(whole))
 
 
 @kernel
@@ -103,10 +114,11 @@ def position_at(
             # Whole segment lengths first, so that the product below stays within 64 bits.
             span, carried = duration - us[last - 1], total - size[last - 1]
             whole, rest = (t_us - duration) // span, (t_us - duration) % span
-            return total + whole * carried + carried * rest // span, last - 1
+            return total + whole * carried + share(rest, span, carried), last - 1
         laps, t = t_us // duration, t_us % duration
     k = segment(us, first, last, hint, t)
-    return laps * total + size[k] + (size[k + 1] - size[k]) * (t - us[k]) // (us[k + 1] - us[k]), k
+    from_us, from_bytes = item(us, k), item(size, k)
+    return laps * total + from_bytes + share(t - from_us, item(us, k + 1) - from_us, item(size, k + 1) - from_bytes), k
 
 
 @kernel
@@ -115,7 +127,7 @@ def time_of(
 ) -> tuple[int, int]:
     """(first t with C(t) >= position, us; segment it lies in); FOREVER where that never comes. position > 0."""
     duration, total = us[last], size[last]
-    laps, wanted = 0, position
+    laps, within = 0, position
     if position > total:
         if after == STOP:
             return FOREVER, last - 1
@@ -126,17 +138,40 @@ def time_of(
             whole, rest = (position - total) // carried, (position - total) % carried
             return duration + whole * span + -(-rest * span // carried), last - 1
         laps = (position - 1) // total
-        wanted = position - laps * total
-    k = segment(size, first, last, hint, wanted - 1)  # size[k] < wanted <= size[k + 1]
-    need, carried = wanted - size[k], size[k + 1] - size[k]
-    return laps * duration + us[k] + -(-need * (us[k + 1] - us[k]) // carried), k
+        within = position - laps * total
+    k = segment(size, first, last, hint, within - 1)  # size[k] < within <= size[k + 1]
+    from_us, from_bytes = item(us, k), item(size, k)
+    span, carried = item(us, k + 1) - from_us, item(size, k + 1) - from_bytes
+    # rounded up: the whole span less what is left of it, rounded down
+    return laps * duration + from_us + span - share(from_bytes + carried - within, carried, span), k
+
+
+@kernel
+def carried_by(knot_us: NDArray[np.int64], knot_bytes: NDArray[np.int64], link: Any, t_us: int) -> int:
+    """Bytes that a link has carried by the sender's time ``t_us``.
+
+    ``link``: a record with the fields first_knot, last_knot, after, offset_us, segment_now and segment_finish.
+    """
+    position, link.segment_now = position_at(
+        knot_us, knot_bytes, link.first_knot, link.last_knot, link.after, link.segment_now, t_us + link.offset_us
+    )
+    return position
+
+
+@kernel
+def finish_of(knot_us: NDArray[np.int64], knot_bytes: NDArray[np.int64], link: Any, position: int) -> int:
+    """The sender's time at which a link (a record as above) has carried so many bytes, us; FOREVER if it never will."""
+    t_us, link.segment_finish = time_of(
+        knot_us, knot_bytes, link.first_knot, link.last_knot, link.after, link.segment_finish, position
+    )
+    return t_us if t_us == FOREVER else t_us - link.offset_us
 
 
 @kernel
 def _positions(
-    us: NDArray[np.int64], size: NDArray[np.int64], after: int, t_us: NDArray[np.int64], by: NDArray[np.int64]
+    us: NDArray[np.int64], size: NDArray[np.int64], after: int, t_us: NDArray[np.int64], carried: NDArray[np.int64]
 ) -> None:
-    """``by[k]`` = C(t_us[k])."""
+    """``carried[k]`` = C(t_us[k])."""
     hint = 0
     for k in range(len(t_us)):
-        by[k], hint = position_at(us, size, 0, len(us) - 1, after, hint, t_us[k])
+        carried[k], hint = position_at(us, size, 0, len(us) - 1, after, hint, t_us[k])

@@ -1,16 +1,19 @@
 """The sender: one transition function for a batch of senders, and the main loop for a fixed policy.
 
-Order of things at an arrival at time t: (1) everything the link finishes up to and including t leaves, and successors
-start; (2) the policy decides; (3) if the socket is idle it takes the head at once. After the last arrival the buffer
-drains. Nothing sent is lost (TCP); the message in transmission is outside the buffer.
+At an arrival at time t: (1) every message that the link has finished by t leaves, and the next ones begin; (2) the
+policy decides; (3) if the socket is idle it dequeues the head at once. After the last arrival the buffer empties. TCP:
+nothing sent is lost. The message in transmission is outside the buffer.
 
-``next_event`` moves one sender to the next thing that somebody must hear of: the socket took a message (DEPARTURE), an
-arrival asks for a decision (DECISION), or it is over (END). ``decide`` carries a decision out. Environments, rollouts
-and benchmarks are loops around these two. Queue disciplines that drop at the head, such as CoDel, are asked there too
-(DEQUEUE, ``answer_dequeue``), and a scheduler chooses what the free socket takes (SEND, ``answer_send``).
+``next_event`` moves one sender on to its next event: the socket dequeued a message (DEPARTURE), an arrival asks for a
+decision (DECISION), or the episode is over (END). ``decide`` carries a decision out. Environments, rollouts and
+benchmarks are loops around these two. Queue disciplines that drop at the head, such as CoDel, are asked before the
+socket dequeues it (DEQUEUE, ``answer_dequeue``), and a scheduler chooses what the socket dequeues (SEND,
+``answer_send``).
 
-The socket takes a message while fewer than n_T are in flight: sent and not yet answered by a pong, which comes a round
-trip after the last byte has crossed. With n_T = 1 and no delay that is a socket that is free as soon as the link is.
+The socket dequeues while fewer than n_T messages are in flight: sent and not yet acked. The ack comes a round trip
+after a message's last byte has crossed the link. With n_T = 1 and no ack delay the socket is free whenever the link is.
+
+Robots that share the link of a cell are senders like all others: only the link differs (``bufgym.sim.shared_link``).
 """
 
 from bufgym.sim.decisions import (
@@ -23,35 +26,23 @@ from bufgym.sim.decisions import (
     decide,
     has_room,
 )
+from bufgym.sim.rollout import answer_of, python_view
 from bufgym.sim.rules import age_until
-from bufgym.sim.senders import (
-    Senders,
-    answer_of,
-    ask,
-    compiled_rollout,
-    padded,
-    python_rollout,
-    python_view,
-    rollout,
-    run,
-)
-from bufgym.sim.socket import begin_transmission, credit, dequeue, finish_transmission, may_dequeue
+from bufgym.sim.senders import Senders, padded, run
+from bufgym.sim.socket import credit
 from bufgym.sim.state import (
     ARRIVAL_WAITS,
     DECISION,
     DEPARTURE,
     DEQUEUE,
     END,
-    LOG_ENTRY,
     NEVER,
     SEND,
-    SENDER,
     SOCKET_WAITS,
     Batch,
-    batch_type,
     named,
 )
-from bufgym.sim.transition import arrive, next_event
+from bufgym.sim.transition import next_event, offer
 from bufgym.sim.view import arrival_of, view
 
 __all__ = [
@@ -60,10 +51,8 @@ __all__ = [
     "DEPARTURE",
     "DEQUEUE",
     "END",
-    "LOG_ENTRY",
     "NEVER",
     "SEND",
-    "SENDER",
     "SOCKET_WAITS",
     "Batch",
     "Senders",
@@ -72,27 +61,18 @@ __all__ = [
     "answer_of",
     "answer_send",
     "arrival_of",
-    "arrive",
-    "ask",
-    "batch_type",
-    "begin_transmission",
     "can_evict",
     "can_hold",
     "can_reject",
     "can_send",
-    "compiled_rollout",
     "credit",
     "decide",
-    "dequeue",
-    "finish_transmission",
     "has_room",
-    "may_dequeue",
     "named",
     "next_event",
+    "offer",
     "padded",
-    "python_rollout",
     "python_view",
-    "rollout",
     "run",
     "view",
 ]

@@ -1,6 +1,7 @@
-"""What a run was worth: one definition of each statistic, computed from what became of every message.
+"""Statistics of a finished run: one definition of each, computed from the log of every message.
 
-Times are those at which a message's last byte crossed the link; it reaches the server a propagation delay later.
+Times of transmission are those at which a message's last byte crossed the link; it reaches the server a propagation
+delay later.
 """
 
 from __future__ import annotations
@@ -13,36 +14,42 @@ from numpy.typing import NDArray
 
 from bufgym.sim import NEVER, Senders
 
+NAN = float("nan")
+
 
 @dataclass(frozen=True)
 class Outcome:
-    """One finished run of one sender."""
+    """The statistics of one finished run of one sender."""
 
     qoi: float
     """H = 1 + sum of V over the messages received; 0 if none was. With several topics the weighted sum of theirs."""
     arrived: int
+    """Messages that arrived at the sender."""
     delivered: int
+    """Messages transmitted."""
     dropped: int
+    """Messages evicted or rejected."""
     in_transmission: int
     """1 where the link stopped for good with a message on it; with n_T > 1 perhaps more."""
     buffered: int
-    """Still queued at the end, likewise."""
+    """Messages still queued at the end, for the same reason."""
     longest_gap: float
     """Largest step in the coordinate x between messages received one after the other."""
     longest_gap_s: float
     """Largest time between the arrivals of messages received one after the other, s."""
     mean_sojourn_s: float
-    """From arrival at the sender until the last byte has crossed, mean over the messages delivered, s."""
+    """Time from arrival at the sender to the end of transmission, mean over the messages delivered, s."""
     p95_sojourn_s: float
+    """95th percentile of the same, s."""
     mean_age_s: float
     """Age of information at the server (now - arrival time of the newest received), mean over time from the first
     receipt to the last, s."""
     peak_age_s: float
-    """The same just before each receipt that lowers it, mean over these, s."""
+    """Age just before each receipt that lowers it, mean over these, s."""
     max_age_s: float
-    """The largest age just before any receipt, s."""
+    """Largest age just before any receipt, s."""
     peak_backlog_bytes: int
-    """Bytes queued at most; one that goes straight to an idle socket passes through the queue as well."""
+    """Largest number of bytes queued; a message that goes straight to an idle socket counts as queued as well."""
     invalid: int
     """Decisions that could not be carried out as given."""
 
@@ -51,7 +58,7 @@ METRICS = tuple(f.name for f in fields(Outcome))
 
 
 def received(senders: Senders, i: int) -> NDArray[Any]:
-    """MESSAGE[delivered]: what the link carried, in the order in which it did."""
+    """MESSAGE[delivered]: what sender ``i`` transmitted, in that order."""
     batch = senders.batch
     order: NDArray[np.int64] = batch.order[i, : batch.senders[i]["transmitted"]]
     messages: NDArray[Any] = np.asarray(batch.arrivals[i])[order]
@@ -62,23 +69,22 @@ def outcome(senders: Senders, i: int) -> Outcome:
     """The statistics of sender ``i``'s run."""
     batch = senders.batch
     sender = np.asarray(batch.senders)[i]
-    got = received(senders, i)
+    messages = received(senders, i)
     log = np.asarray(batch.log[i])[: sender["arrivals"]]
-    transmitted_us = log["transmitted_us"][got["seq"]]
-    sojourn_s = (transmitted_us - got["arrival_us"]) / 1e6
-    mean_age, peak_age, max_age = ages_s(transmitted_us + sender["propagation_us"], got["arrival_us"])
-    none = float("nan")
+    transmitted_us = log["transmitted_us"][messages["seq"]]
+    mean_sojourn, p95_sojourn = sojourns_s(transmitted_us - messages["arrival_us"])
+    mean_age, peak_age, max_age = ages_s(transmitted_us + sender["propagation_us"], messages["arrival_us"])
     return Outcome(
-        qoi=weighted_qoi(senders, i, got) if senders.topics else senders.value.information(got["x"]),
+        qoi=weighted_qoi(senders, i, messages) if senders.topics else senders.value.information(messages["x"]),
         arrived=int(sender["next"]),
-        delivered=len(got),
+        delivered=len(messages),
         dropped=int((log["dropped_us"] != NEVER).sum()),
         in_transmission=int(sender["busy"]),
         buffered=int(sender["occupancy"]),
-        longest_gap=float(np.diff(got["x"]).max(initial=0)),
-        longest_gap_s=float(np.diff(got["arrival_us"]).max(initial=0)) / 1e6,
-        mean_sojourn_s=float(sojourn_s.mean()) if len(got) else none,
-        p95_sojourn_s=float(np.percentile(sojourn_s, 95)) if len(got) else none,
+        longest_gap=float(np.diff(messages["x"]).max(initial=0)),
+        longest_gap_s=float(np.diff(messages["arrival_us"]).max(initial=0)) / 1e6,
+        mean_sojourn_s=mean_sojourn,
+        p95_sojourn_s=p95_sojourn,
         mean_age_s=mean_age,
         peak_age_s=peak_age,
         max_age_s=max_age,
@@ -89,29 +95,34 @@ def outcome(senders: Senders, i: int) -> Outcome:
 
 @dataclass(frozen=True)
 class TopicOutcome:
-    """What became of one topic in one finished run."""
+    """The statistics of one topic in one finished run."""
 
     topic: str
+    """Its name."""
     qoi: float
     """Its own H, without its weight."""
     arrived: int
+    """Messages that arrived at the sender."""
     delivered: int
+    """Messages transmitted."""
     limited: int
-    """Dropped because they came sooner than the rate limit allows."""
+    """Messages dropped because they came sooner than the rate limit allows."""
     lost: int
-    """Dropped otherwise."""
+    """Messages dropped for other reasons."""
     buffered: int
-    """Still queued or on the way at the end."""
+    """Messages still queued or in the socket at the end."""
     bytes_delivered: int
+    """Bytes of the messages transmitted."""
     mean_sojourn_s: float
-    """From arrival at the sender until it reached the server, propagation included; NaN if none did."""
+    """Time from arrival at the sender to receipt at the server, propagation included, s; NaN if none was received."""
     p95_sojourn_s: float
+    """95th percentile of the same, s."""
     mean_age_s: float
-    """Age of information at the server, mean over time from the topic's first arrival to the episode's last."""
+    """Age of information at the server, mean over time from the topic's first arrival to the episode's last, s."""
     peak_age_s: float
-    """The largest age in that time."""
+    """Largest age in that time, s."""
     late: int
-    """Delivered after their deadline."""
+    """Messages received after their deadline."""
 
 
 def topic_outcomes(senders: Senders, i: int) -> list[TopicOutcome]:
@@ -119,45 +130,53 @@ def topic_outcomes(senders: Senders, i: int) -> list[TopicOutcome]:
     sender = np.asarray(senders.batch.senders)[i]
     arrivals = np.asarray(senders.batch.arrivals[i])[: sender["arrivals"]]
     log = np.asarray(senders.batch.log[i])[: sender["arrivals"]]
-    got = received(senders, i)
+    all_messages = received(senders, i)
     until_us = int(arrivals["arrival_us"][-1])
-    made = []
+    outcomes = []
     for k, topic in enumerate(senders.topics):
-        of_it = arrivals["topic"] == k
-        mine = got[got["topic"] == k]
-        dropped = of_it & (log["dropped_us"] != NEVER)
+        arrived = arrivals["topic"] == k
+        messages = all_messages[all_messages["topic"] == k]
+        dropped = arrived & (log["dropped_us"] != NEVER)
         limited = int((dropped & (log["limited"] == 1)).sum())
-        at_us = log["transmitted_us"][mine["seq"]] + sender["propagation_us"]
-        sojourn_s = (at_us - mine["arrival_us"]) / 1e6
-        first_us = int(arrivals["arrival_us"][of_it][0]) if of_it.any() else until_us
-        mean_age, peak_age = ages_between_s(at_us, mine["arrival_us"], first_us, until_us)
-        none = float("nan")
-        made.append(
+        received_us = log["transmitted_us"][messages["seq"]] + sender["propagation_us"]
+        sojourn_us = received_us - messages["arrival_us"]
+        mean_sojourn, p95_sojourn = sojourns_s(sojourn_us)
+        first_us = int(arrivals["arrival_us"][arrived][0]) if arrived.any() else until_us
+        mean_age, peak_age = ages_between_s(received_us, messages["arrival_us"], first_us, until_us)
+        outcomes.append(
             TopicOutcome(
                 topic=topic.name,
-                qoi=(topic.value or senders.value).information(mine["x"]),
-                arrived=int(of_it.sum()),
-                delivered=len(mine),
+                qoi=(topic.value or senders.value).information(messages["x"]),
+                arrived=int(arrived.sum()),
+                delivered=len(messages),
                 limited=limited,
                 lost=int(dropped.sum()) - limited,
-                buffered=int(of_it.sum() - dropped.sum()) - len(mine),
-                bytes_delivered=int(mine["size_bytes"].sum()),
-                mean_sojourn_s=float(sojourn_s.mean()) if len(mine) else none,
-                p95_sojourn_s=float(np.percentile(sojourn_s, 95)) if len(mine) else none,
+                buffered=int(arrived.sum() - dropped.sum()) - len(messages),
+                bytes_delivered=int(messages["size_bytes"].sum()),
+                mean_sojourn_s=mean_sojourn,
+                p95_sojourn_s=p95_sojourn,
                 mean_age_s=mean_age,
                 peak_age_s=peak_age,
-                late=int((sojourn_s > topic.deadline_s).sum()) if topic.deadline_s is not None else 0,
+                late=int((sojourn_us / 1e6 > topic.deadline_s).sum()) if topic.deadline_s is not None else 0,
             )
         )
-    return made
+    return outcomes
 
 
-def weighted_qoi(senders: Senders, i: int, got: NDArray[Any]) -> float:
-    """H of several topics: the sum of weight x H of each over the messages ``got``."""
+def weighted_qoi(senders: Senders, i: int, messages: NDArray[Any]) -> float:
+    """H of several topics: the sum of weight x H of each over ``messages``, MESSAGE[received]."""
     total = 0.0
     for k, topic in enumerate(senders.topics):
-        total += topic.share * (topic.value or senders.value).information(got["x"][got["topic"] == k])
+        total += topic.share * (topic.value or senders.value).information(messages["x"][messages["topic"] == k])
     return total
+
+
+def sojourns_s(sojourn_us: NDArray[np.int64]) -> tuple[float, float]:
+    """(mean, 95th percentile) of these sojourn times, s; NaN if there are none."""
+    if len(sojourn_us) == 0:
+        return NAN, NAN
+    sojourn_s = sojourn_us / 1e6
+    return float(sojourn_s.mean()), float(np.percentile(sojourn_s, 95))
 
 
 def ages_between_s(
@@ -168,7 +187,7 @@ def ages_between_s(
     ``received_us`` must not decrease. NaN where that time has no length.
     """
     if until_us <= from_us:
-        return (float("nan"),) * 2
+        return NAN, NAN
     known = received_us < until_us
     begins_us = np.concatenate([[from_us], received_us[known]])
     ends_us = np.concatenate([received_us[known], [until_us]])
@@ -184,7 +203,7 @@ def ages_s(received_us: NDArray[np.int64], arrival_us: NDArray[np.int64]) -> tup
     Between two receipts the age grows from (first receipt - newest arrival time so far) at slope 1: a trapezium.
     """
     if len(received_us) < 2:
-        return (float("nan"),) * 3
+        return NAN, NAN, NAN
     newest_us = np.maximum.accumulate(arrival_us)
     from_us, until_us = received_us[:-1] - newest_us[:-1], received_us[1:] - newest_us[:-1]
     lengths = np.diff(received_us)

@@ -1,15 +1,18 @@
-"""What several topics side by side add to the sender: each has its own gaps, limits and rights.
+"""Rules of topics: each has gaps, limits and rights of its own. A single queue is the case of one topic without limits.
 
 A topic's messages are sent in the order of their arrival. ``no_drop`` messages are neither evicted nor rejected while
 anything else could make room for them. Rate limits, ``no_drop`` and the in-flight window are Robofleet's
-(github ut-amrl/robofleet_client_lib); FACTS of the published and the released client differ, both are settings here.
+(github ut-amrl/robofleet_client_lib); the published and the released client differ, and both are settings here.
+
+A single queue ignores the messages' topic numbers and reads row 0 of the topic table. It keeps no score in that row:
+so its limits never bind, and what the row would say is in the sender's record. That saves a tenth of a rollout's time.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from bufgym.kernel import kernel
+from bufgym.kernel import at, kernel
 from bufgym.model.qoi import value
 from bufgym.sim.state import Batch
 
@@ -17,48 +20,82 @@ from bufgym.sim.state import Batch
 @kernel
 def kept_before(batch: Batch, i: int, k: int, topic: int) -> int:
     """The slot before slot ``k`` on the same topic, -1 where there is none."""
-    first = batch.senders[i].first
+    sender = batch.senders[i]
     j = k - 1
-    while j >= 0 and batch.slots[i, first + j].topic != topic:
-        j -= 1
+    if sender.topics > 1:
+        while j >= 0 and at(batch.slots, i, sender.first + j).topic != topic:
+            j -= 1
     return j
 
 
 @kernel
-def topic_gain(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
-    """Weight times V of the gap from what is kept before slot ``k`` on its topic to ``x``; 0 for its first message."""
-    rules = batch.topics[i, topic]
-    j = kept_before(batch, i, k, topic)
-    if j >= 0:
-        return float(rules.weight * value(batch.v[rules.v_start :], x - batch.slots[i, batch.senders[i].first + j].x))
-    if rules.dequeued > 0:
-        return float(rules.weight * value(batch.v[rules.v_start :], x - rules.dequeued_x))
-    return 0.0
+def kept_after(batch: Batch, i: int, k: int, topic: int) -> int:
+    """The slot after slot ``k`` on the same topic, the occupancy where there is none."""
+    sender = batch.senders[i]
+    j = k + 1
+    if sender.topics > 1:
+        while j < sender.occupancy and at(batch.slots, i, sender.first + j).topic != topic:
+            j += 1
+    return j
 
 
 @kernel
-def merge_on_topic(batch: Batch, i: int, k: int) -> None:
-    """Slot ``k`` is about to be evicted: the gap of the next message on its topic reaches back over it."""
+def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
+    """Weight times V of the gap from what is kept before slot ``k`` on its topic to ``x``; 0 for its first message."""
     sender = batch.senders[i]
-    topic = batch.slots[i, sender.first + k].topic
-    batch.topics[i, topic].queued -= 1
-    for j in range(k + 1, sender.occupancy):
-        after = batch.slots[i, sender.first + j]
-        if after.topic == topic:
-            merged = topic_gain(batch, i, k, topic, after.x)
-            sender.retained_gain += merged - after.gain
-            after.gain = merged
-            return
+    if sender.topics == 1:  # in slot -1 lies the message dequeued last
+        if k == 0 and sender.dequeued == 0:
+            return 0.0
+        return value(batch.v, x - at(batch.slots, i, sender.first + k - 1).x)
+    rules = at(batch.topics, i, topic)
+    j = kept_before(batch, i, k, topic)
+    if j < 0 and rules.dequeued == 0:
+        return 0.0
+    before_x = at(batch.slots, i, sender.first + j).x if j >= 0 else rules.dequeued_x
+    return float(rules.weight * value(batch.v[rules.v_start :], x - before_x))
+
+
+# --- a topic's past ---------------------------------------------------------------------------------------------------
+
+
+@kernel
+def arrived_on_topic(batch: Batch, i: int, message: Any, enqueued: bool) -> None:
+    """``message`` has arrived, and was enqueued or not."""
+    topic = at(batch.topics, i, message.topic)
+    if topic.arrived > 0:
+        topic.step_us, topic.step_x = message.arrival_us - topic.previous_us, message.x - topic.previous_x
+    else:
+        topic.step_us, topic.step_x = 0, 0.0
+        topic.aged_us, topic.newest_us = message.arrival_us, message.arrival_us
+    if enqueued:
+        if topic.dequeued + topic.queued == 0:
+            # until one is sent, spacing counts from here
+            topic.dequeued_arrival_us, topic.dequeued_x = message.arrival_us, message.x
+        topic.queued += 1
+        topic.kept_us = message.arrival_us
+    topic.previous_us, topic.previous_x = message.arrival_us, message.x
+    topic.arrived += 1
 
 
 @kernel
 def dequeued_on_topic(batch: Batch, i: int, message: Any) -> None:
-    """The socket has taken ``message``."""
-    topic = batch.topics[i, message.topic]
+    """The socket has dequeued ``message``."""
+    topic = at(batch.topics, i, message.topic)
     topic.queued -= 1
     topic.dequeued += 1
     topic.dequeued_arrival_us, topic.dequeued_x = message.arrival_us, message.x
     topic.last_dequeue_us = batch.senders[i].now_us
+
+
+@kernel
+def received_on_topic(batch: Batch, i: int, message: Any, received_us: int) -> None:
+    """``message`` has reached the server: its topic is younger again, and it may have come too late."""
+    age_until(batch, i, message.topic, received_us)
+    topic = at(batch.topics, i, message.topic)
+    topic.received += 1
+    topic.newest_us = max(topic.newest_us, message.arrival_us)
+    if received_us - message.arrival_us > topic.deadline_us:
+        batch.senders[i].late += topic.weight
 
 
 @kernel
@@ -68,8 +105,8 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
     It begins with the topic's first arrival and ends with the episode's last, whatever a policy does.
     """
     sender = batch.senders[i]
-    rules = batch.topics[i, topic]
-    until_us = min(until_us, batch.arrivals[i, sender.arrivals - 1].arrival_us)
+    rules = at(batch.topics, i, topic)
+    until_us = min(until_us, at(batch.arrivals, i, sender.arrivals - 1).arrival_us)
     if rules.arrived == 0 or until_us <= rules.aged_us:
         return
     from_s, until_s = (rules.aged_us - rules.newest_us) / 1e6, (until_us - rules.newest_us) / 1e6
@@ -79,44 +116,46 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
     rules.aged_us = until_us
 
 
-@kernel
-def arrives_on_topic(batch: Batch, i: int, message: Any, received_us: int) -> None:
-    """``message`` has reached the server: its topic is younger again, and it may have come too late."""
-    age_until(batch, i, message.topic, received_us)
-    topic = batch.topics[i, message.topic]
-    topic.received += 1
-    topic.newest_us = max(topic.newest_us, message.arrival_us)
-    if received_us - message.arrival_us > topic.deadline_us:
-        batch.senders[i].late += topic.weight
+# --- limits and rights ------------------------------------------------------------------------------------------------
 
 
 @kernel
 def too_soon(batch: Batch, i: int, topic: int) -> bool:
     """Whether the arrival at hand comes sooner after the last one kept than its topic's rate limit allows."""
-    rules = batch.topics[i, topic]
+    if batch.senders[i].topics == 1:
+        return False
+    rules = at(batch.topics, i, topic)
     return bool(rules.kept_us >= 0 and batch.senders[i].now_us - rules.kept_us < rules.period_us)
 
 
 @kernel
 def at_limit(batch: Batch, i: int, topic: int) -> bool:
     """Whether as many messages of this topic are queued as may be."""
-    rules = batch.topics[i, topic]
+    if batch.senders[i].topics == 1:
+        return False
+    rules = at(batch.topics, i, topic)
     return bool(rules.queued >= rules.limit)
+
+
+@kernel
+def no_drop(batch: Batch, i: int, topic: int) -> bool:
+    """Whether messages of this topic may not be dropped."""
+    return bool(batch.senders[i].topics > 1 and at(batch.topics, i, topic).no_drop == 1)
 
 
 @kernel
 def refuge(batch: Batch, i: int) -> int:
     """The slot that goes for a no_drop message when nothing else helps: lowest priority, oldest; -1 if none may."""
     sender = batch.senders[i]
-    size_bytes = batch.arrivals[i, sender.next].size_bytes
+    size_bytes = at(batch.arrivals, i, sender.next).size_bytes
     best = -1
     lowest = 0.0
     for k in range(sender.occupancy):
-        slot = batch.slots[i, sender.first + k]
-        rules = batch.topics[i, slot.topic]
+        slot = at(batch.slots, i, sender.first + k)
+        priority = at(batch.topics, i, slot.topic).priority
         fits = sender.backlog_bytes - slot.size_bytes + size_bytes <= sender.max_bytes
-        if rules.no_drop == 0 and fits and (best < 0 or rules.priority < lowest):
-            best, lowest = k, rules.priority
+        if fits and not no_drop(batch, i, slot.topic) and (best < 0 or priority < lowest):
+            best, lowest = k, priority
     return best
 
 
@@ -124,12 +163,11 @@ def refuge(batch: Batch, i: int) -> int:
 def sendable(batch: Batch, i: int, k: int) -> bool:
     """Whether slot ``k`` may be sent by the window and, where rate limits hold back at the socket, by its own."""
     sender = batch.senders[i]
+    topic = at(batch.slots, i, sender.first + k).topic
     full = sender.dequeued - sender.acked >= sender.window
-    if sender.topics == 1:
-        return not full
-    rules = batch.topics[i, batch.slots[i, sender.first + k].topic]
-    if full and not (sender.flush_no_drop == 1 and rules.no_drop == 1):
+    if full and not (sender.flush_no_drop == 1 and no_drop(batch, i, topic)):
         return False
+    rules = at(batch.topics, i, topic if sender.topics > 1 else 0)  # a single queue's row has no period
     held_back = (
         sender.limit_at_send == 1 and rules.dequeued > 0 and sender.now_us - rules.last_dequeue_us < rules.period_us
     )

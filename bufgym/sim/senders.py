@@ -1,62 +1,26 @@
-"""Senders that hold episodes, and the main loop for a fixed policy."""
+"""Senders that hold episodes, and the run of a policy on episodes of one queue or of several topics."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for, records
+from bufgym.kernel import records
 from bufgym.model.buffer import MESSAGE, TOPIC, UNLIMITED_BYTES, check_limits, row_width
-from bufgym.model.link import FOREVER, Knots
+from bufgym.model.link import Knots
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, copies_of, topic_table
-from bufgym.policies.registry import Policy, runs_compiled, signatures
+from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode
-from bufgym.sim.decisions import answer_dequeue, answer_send, decide
-from bufgym.sim.socket import credit
-from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, LOG_ENTRY, SEND, SENDER, Batch, batch_type, named
-from bufgym.sim.transition import load_row, next_event
-from bufgym.sim.view import arrival_of, view
-
-
-def rollout(
-    batch: Batch,
-    memory: NDArray[np.float64],
-    on_arrival: Any,
-    on_departure: Any,
-    on_dequeue: Any,
-    on_send: Any,
-    hears_departures: bool,
-) -> None:
-    """Run every sender of the batch to its end under one policy; ``memory`` is float64[n, entries]."""
-    for i in range(len(batch.senders)):
-        event = next_event(batch, i)
-        while event != END:
-            if event == DECISION:
-                decide(batch, i, on_arrival(view(batch, i), arrival_of(batch, i), memory[i]))
-            elif event == DEQUEUE:
-                answer_dequeue(batch, i, on_dequeue(view(batch, i), memory[i]))
-            elif event == SEND:
-                answer_send(batch, i, on_send(view(batch, i), memory[i]))
-            elif hears_departures:
-                on_departure(view(batch, i), memory[i])
-            event = next_event(batch, i)
-        credit(batch, i, FOREVER)
-
-
-@functools.cache
-def compiled_rollout() -> Any:
-    """``rollout`` compiled once for every policy (policies arrive as values of one function type)."""
-    functions = tuple(numba.types.FunctionType(signature) for signature in signatures())
-    memory = numba.types.Array(numba.types.float64, 2, "C")
-    return compile_for(numba.types.void(batch_type(), memory, *functions, numba.types.boolean), rollout)
+from bufgym.sim.rollout import roll_out
+from bufgym.sim.shared_link import Shares
+from bufgym.sim.state import LOG_ENTRY, SENDER, Batch
+from bufgym.sim.transition import load_row
 
 
 class Senders:
@@ -135,86 +99,29 @@ class Senders:
             memory = policy.privileged(self.episodes[i], self.capacity, self.max_bytes, self.value)
         return memory
 
-    def run(self, policy: Policy, memory: NDArray[np.float64] | None = None) -> None:
-        """Run every loaded sender to its end under ``policy``; ``memory``: float64[n, entries], fresh by default."""
-        if memory is None:
-            rows = range(len(self)) if policy.privileged is not None else ()
-            memory = (
-                padded([self.new_memory(policy, i) for i in rows])
-                if rows
-                else policy.new_memory(len(self), self.capacity)
-            )
-        senders = self.batch.senders
+    def run(self, policy: Policy, memory: NDArray[np.float64] | None = None, shares: Shares | None = None) -> None:
+        """Run every loaded sender to its end under ``policy``; ``memory``: float64[n, entries], fresh by default.
+
+        ``shares``: the cells whose links the senders share (see ``bufgym.sim.cell.Fleet``); None if each has its own.
+        """
+        if memory is None and policy.privileged is not None:
+            memory = padded([self.new_memory(policy, i) for i in range(len(self))])
+        elif memory is None:
+            memory = policy.new_memory(len(self), self.capacity)
+        senders, client = self.batch.senders, policy.client
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
-        senders["limit_at_send"], senders["flush_no_drop"] = policy.client.limit_at_send, policy.client.flush_no_drop
-        if not policy.client.awaits_acks:
+        senders["limit_at_send"], senders["flush_no_drop"] = client.limit_at_send, client.flush_no_drop
+        if not client.awaits_acks:
             senders["window"], senders["ack_delay_us"] = 1, 0
-        batch = self.batch._replace(parameters=policy.parameter_array)
-        if runs_compiled(policy):
-            compiled_rollout()(batch, memory, *policy.compiled, policy.hears_departures)
-        else:
-            python_rollout(batch, memory, policy)
+        roll_out(self.batch._replace(parameters=policy.parameter_array), shares, memory, policy)
 
 
 def padded(rows: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
-    """Rows of different lengths as one array, filled up with zeros."""
-    made = np.zeros((len(rows), max(map(len, rows))))
+    """float64[rows, longest]: rows of different lengths as one array, filled up with zeros."""
+    table = np.zeros((len(rows), max(map(len, rows))))
     for i, row in enumerate(rows):
-        made[i, : len(row)] = row
-    return made
-
-
-python_view = getattr(view, "py_func", view)
-"""``view`` for Python callers, over a ``named`` batch: the compiled kernel must not hand its arrays to Python."""
-
-
-def answer_of(policy: Policy, hook: str, given: Any) -> int:
-    """What a policy that is ordinary Python gave, a whole number (or a yes or no); a BufgymError for anything else."""
-    try:
-        number = int(given)
-    except (TypeError, ValueError, OverflowError):
-        number = None
-    if number is None or number != given:
-        raise BufgymError(f"policy {policy.name}: {hook} returned {given!r}: must be a whole number")
-    return number
-
-
-def ask(
-    policy: Policy,
-    batch: Batch,
-    seen: Batch,
-    i: int,
-    event: int,
-    memory: NDArray[np.float64],
-    decide: Callable[[Batch, int, int], object],
-) -> None:
-    """Tell a policy that is ordinary Python of an event of sender ``i`` and carry its answer out.
-
-    ``seen``: the same batch, ``named``; ``memory``: float64[entries]; ``decide``: what carries a DECISION out.
-    """
-    if event == DEPARTURE and not policy.hears_departures:
-        return
-    shown = python_view(seen, i)
-    if event == DECISION:
-        answer = policy.on_arrival(shown, seen.arrivals[i, seen.senders[i].next], memory)
-        decide(batch, i, answer_of(policy, "on_arrival", answer))
-    elif event == DEQUEUE:
-        answer_dequeue(batch, i, bool(answer_of(policy, "on_dequeue", policy.on_dequeue(shown, memory))))
-    elif event == SEND:
-        answer_send(batch, i, answer_of(policy, "on_send", policy.on_send(shown, memory)))
-    else:
-        policy.on_departure(shown, memory)
-
-
-def python_rollout(batch: Batch, memory: NDArray[np.float64], policy: Policy) -> None:
-    """``rollout`` for a policy that is ordinary Python: the transition stays compiled, views are made in Python."""
-    seen = named(batch)
-    for i in range(len(batch.senders)):
-        event = next_event(batch, i)
-        while event != END:
-            ask(policy, batch, seen, i, event, memory[i], decide)
-            event = next_event(batch, i)
-        credit(batch, i, FOREVER)
+        table[i, : len(row)] = row
+    return table
 
 
 def run(

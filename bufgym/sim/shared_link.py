@@ -1,11 +1,11 @@
-"""Processor sharing in whole bytes and microseconds: the transition of a cell.
+"""Processor sharing in whole bytes and microseconds: the link that the robots of a cell share.
 
 With n senders busy, one byte for each moves the cell n bytes along its trace. So the cell counts ``served``, the bytes
-that a sender would have been given had it been busy from the beginning: a message of b bytes that starts at S has
-crossed at ``served`` = S + b, whoever else comes and goes, and the next to finish is the one with the least such goal.
-When somebody joins, each is given the whole bytes that its share has come to; the rest, less than one byte for each,
-stays with the cell (``position`` keeps it) and is shared among all who are busy from then on. So no byte of capacity
-is lost or given twice.
+that a sender would have been given had it been busy from the beginning: a message of b bytes that starts at S has been
+transmitted at ``served`` = S + b, whoever else comes and goes, and the next to finish is the one with the least such
+goal. When a sender joins, each is given the whole bytes that its share has come to; the rest, less than one byte for
+each, stays with the cell (``position`` keeps it) and is shared among all who are busy from then on. So no byte of
+capacity is lost or given twice.
 """
 
 from __future__ import annotations
@@ -17,43 +17,27 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.documented import documented
 from bufgym.kernel import kernel
-from bufgym.model.link import FOREVER, position_at, time_of
-from bufgym.sim import (
-    ARRIVAL_WAITS,
-    DECISION,
-    DEPARTURE,
-    DEQUEUE,
-    END,
-    NEVER,
-    SEND,
-    SOCKET_WAITS,
-    Batch,
-    arrive,
-    decide,
-    dequeue,
-    finish_transmission,
-    may_dequeue,
-)
-
-NOTHING = -1
-NOBODY = -1
+from bufgym.model.link import FOREVER, carried_by, finish_of
+from bufgym.sim.decisions import arrive
+from bufgym.sim.socket import finish_transmission, next_size_bytes
+from bufgym.sim.state import CARRIES, END, IDLE, NOTHING, Batch
 
 CELL = np.dtype(
     [
-        # what the cell is
+        # settings
         ("robots", np.int64),  # N: rows c N .. c N + N - 1 of the batch are in cell c
-        ("first_knot", np.int64),
+        ("first_knot", np.int64),  # of its trace, in the batch's knots
         ("last_knot", np.int64),
-        ("after", np.int64),
+        ("after", np.int64),  # what follows the trace's end: LOOP, HOLD or STOP
         ("offset_us", np.int64),
-        # its clock
+        # clock
         ("tick_us", np.int64),  # the time of the arrivals under way
         ("next_us", np.int64),  # the time of those after them
-        ("robot", np.int64),  # who may be next to have one of those under way; N: all have come
-        ("row", np.int64),  # the sender that the last event is about
-        ("free", np.int64),  # the sender whose free socket looks for its next message; NOBODY
-        # its capacity
+        ("robot", np.int64),  # the first robot that may still have one of those under way; N: all have come
+        ("row", np.int64),  # the sender that the last event is about, and whose socket may be free
+        # capacity
         ("busy", np.int64),  # n: senders with a message in transmission
         ("served", np.int64),  # bytes given to each sender that has been busy all the time
         ("position", np.int64),  # bytes of the trace used up by that
@@ -65,15 +49,17 @@ CELL = np.dtype(
 )
 
 
+@documented
 class Shares(NamedTuple):
     """The arrays of several cells with N robots each, beside the ``Batch`` of their senders."""
 
     cells: NDArray[Any]
-    """CELL[cells]"""
+    """CELL[cells]: settings and state of each cell."""
     goals: NDArray[np.int64]
-    """[cells, N]: ``served`` at which the message in transmission will have crossed; FOREVER for a free socket."""
+    """int64[cells, N]: ``served`` at which the message in transmission will have been transmitted; FOREVER for a free
+    socket."""
     due_us: NDArray[np.int64]
-    """[cells, N]: when the next message arrives; FOREVER after the last."""
+    """int64[cells, N]: when the next message arrives, us; FOREVER after the last."""
 
 
 @functools.cache
@@ -88,30 +74,26 @@ def load_cell(batch: Batch, shares: Shares, c: int) -> None:
     """Put cell ``c`` at the beginning of the episodes that its senders have been given: same link, nothing arrived."""
     cell = shares.cells[c]
     robots = shares.goals.shape[1]
-    link = batch.senders[c * robots]
-    cell.robots, cell.robot = robots, robots
-    cell.first_knot, cell.last_knot, cell.after, cell.offset_us = (
-        link.first_knot,
-        link.last_knot,
-        link.after,
-        link.offset_us,
-    )
+    first = c * robots
+    link = batch.senders[first]
+    cell.robots, cell.robot, cell.row = robots, robots, first
+    cell.first_knot, cell.last_knot, cell.after = link.first_knot, link.last_knot, link.after
+    cell.offset_us = link.offset_us
     cell.segment_now, cell.segment_finish = cell.first_knot, cell.first_knot
-    cell.tick_us, cell.row, cell.free = 0, 0, NOBODY
-    cell.busy, cell.served, cell.position, cell.reached = 0, 0, 0, 0
+    cell.tick_us, cell.busy, cell.served, cell.position, cell.reached = 0, 0, 0, 0, 0
     for robot in range(robots):
         shares.goals[c, robot] = FOREVER
-        shares.due_us[c, robot] = batch.arrivals[c * robots + robot, 0].arrival_us
+        shares.due_us[c, robot] = batch.arrivals[first + robot, 0].arrival_us
     cell.next_us = least(shares.due_us[c])
 
 
 @kernel
-def least(times: NDArray[np.int64]) -> int:
-    """The least of them."""
-    found = FOREVER
-    for k in range(len(times)):
-        found = min(found, times[k])
-    return found
+def least(numbers: NDArray[np.int64]) -> int:
+    """The least of the numbers, FOREVER if there are none."""
+    smallest = FOREVER
+    for number in numbers:
+        smallest = min(smallest, number)
+    return smallest
 
 
 # --- capacity --------------------------------------------------------------------------------------------------------
@@ -121,96 +103,79 @@ def least(times: NDArray[np.int64]) -> int:
 def settle(batch: Batch, shares: Shares, c: int) -> None:
     """Give every busy sender the whole bytes that its share has come to by ``tick_us``."""
     cell = shares.cells[c]
-    cell.reached, cell.segment_now = position_at(
-        batch.knot_us,
-        batch.knot_bytes,
-        cell.first_knot,
-        cell.last_knot,
-        cell.after,
-        cell.segment_now,
-        cell.tick_us + cell.offset_us,
-    )
+    cell.reached = carried_by(batch.knot_us, batch.knot_bytes, cell, cell.tick_us)
     if cell.busy > 0:
-        each = (cell.reached - cell.position) // cell.busy
-        cell.served += each
-        cell.position += each * cell.busy
+        share = (cell.reached - cell.position) // cell.busy
+        cell.served += share
+        cell.position += share * cell.busy
 
 
 @kernel
-def join(batch: Batch, shares: Shares, c: int, i: int) -> None:
-    """Sender ``i`` shares the cell: at once behind the message before it, or from ``tick_us`` on."""
+def join(batch: Batch, shares: Shares, i: int) -> None:
+    """Sender ``i`` begins with a message: at once behind the one before it, or from ``tick_us`` on."""
+    c, robot = i // shares.goals.shape[1], i % shares.goals.shape[1]
     cell, sender = shares.cells[c], batch.senders[i]
-    if cell.busy == 0 and sender.follows == 0:
+    if cell.busy == 0 and sender.link == IDLE:
         cell.position = max(cell.reached, cell.position)  # what an idle cell could have carried is gone
+    sender.link = CARRIES
     cell.busy += 1
-    shares.goals[c, i - c * cell.robots] = cell.served + batch.slots[i, sender.first - 1].size_bytes
+    shares.goals[c, robot] = cell.served + next_size_bytes(batch, i)
 
 
 @kernel
 def next_finish(batch: Batch, shares: Shares, c: int) -> tuple[int, int, int]:
-    """(goal, position and time, us) of the message that will have crossed first; time FOREVER if none ever will."""
+    """(goal, position and time, us) of the message that will be transmitted first; time FOREVER if none ever will."""
     cell = shares.cells[c]
     if cell.busy == 0:
         return FOREVER, cell.position, FOREVER
     goal = least(shares.goals[c])
     position = cell.position + cell.busy * (goal - cell.served)
-    at_us, cell.segment_finish = time_of(
-        batch.knot_us,
-        batch.knot_bytes,
-        cell.first_knot,
-        cell.last_knot,
-        cell.after,
-        cell.segment_finish,
-        position,
-    )
-    return goal, position, FOREVER if at_us == FOREVER else at_us - cell.offset_us
+    return goal, position, finish_of(batch.knot_us, batch.knot_bytes, cell, position)
 
 
 @kernel
-def finish_in_cell(batch: Batch, shares: Shares, c: int, goal: int, position: int, finish_us: int) -> None:
-    """The message with the least goal has crossed, and its sender's socket is free; equals go one after the other."""
+def finish_in_cell(batch: Batch, shares: Shares, c: int, goal: int, position: int, at_us: int) -> None:
+    """The message with the least goal has been transmitted, and its sender's socket is free; of equals, one of them."""
     cell = shares.cells[c]
     robot = 0
     while shares.goals[c, robot] != goal:
         robot += 1
-    i = c * cell.robots + robot
     cell.served, cell.position = goal, position
     cell.busy -= 1
+    cell.row = c * cell.robots + robot
     shares.goals[c, robot] = FOREVER
-    batch.senders[i].finish_us = finish_us
-    finish_transmission(batch, i)
-    cell.free = i
+    finish_transmission(batch, cell.row, at_us)
 
 
-# --- the next event --------------------------------------------------------------------------------------------------
+# --- what comes next -------------------------------------------------------------------------------------------------
 
 
 @kernel
-def offer(batch: Batch, shares: Shares, c: int) -> int:
-    """The free socket takes its head and shares the cell: DEPARTURE; or who must be asked first; or NOTHING."""
+def next_in_cell(batch: Batch, shares: Shares, c: int) -> int:
+    """What comes next in cell ``c``: a message transmitted, a tick, an arrival at one of its robots, or the END.
+
+    The order of things is that of a sender: what the link finishes up to and including a time leaves, and successors
+    start; then the arrivals of that time come, in the order of the robots. No decision and no start among them changes
+    what is in transmission at that time, so all of them may also be gathered before the first is answered. NOTHING
+    unless an arrival asks for a DECISION.
+    """
     cell = shares.cells[c]
-    i = cell.free
-    sender = batch.senders[i]
-    cell.row = i
-    if not may_dequeue(batch, i):
-        sender.follows = 0
-        cell.free = NOBODY
-        return NOTHING
-    if sender.ask_at_dequeue > sender.cleared:
-        return DEQUEUE
-    if sender.ask_at_send == 1 and sender.chosen == NEVER:
-        sender.waiting = SOCKET_WAITS
-        return SEND
-    dequeue(batch, i, max(sender.chosen, 0))
-    join(batch, shares, c, i)
-    sender.cleared, sender.follows, sender.chosen = 0, 0, NEVER
-    cell.free = NOBODY
-    return DEPARTURE
+    if cell.robot < cell.robots:
+        return arrive_in_cell(batch, shares, c)
+    goal, position, finish_us = next_finish(batch, shares, c)
+    if finish_us <= min(cell.next_us, FOREVER - 1):
+        finish_in_cell(batch, shares, c, goal, position, finish_us)
+    elif cell.next_us == FOREVER:
+        return END
+    else:
+        cell.tick_us, cell.robot = cell.next_us, 0
+        settle(batch, shares, c)
+    return NOTHING
 
 
 @kernel
 def arrive_in_cell(batch: Batch, shares: Shares, c: int) -> int:
-    """The next of the arrivals under way: DECISION if it asks for one, else NOTHING. Its sender is ``cell.row``."""
+    """The next of the arrivals under way, if one is left: DECISION if it asks for one, else NOTHING."""
     cell = shares.cells[c]
     robot = cell.robot
     while robot < cell.robots and shares.due_us[c, robot] != cell.tick_us:
@@ -226,48 +191,7 @@ def arrive_in_cell(batch: Batch, shares: Shares, c: int) -> int:
         # Where its link, were it alone, would have to be so that the bytes left are the ones left of its share.
         sender.position = shares.goals[c, robot] - cell.served + cell.reached if sender.busy > 0 else 0
         cell.row = i
-        if arrive(batch, i):
-            sender.waiting = ARRIVAL_WAITS
-            event = DECISION
-        else:
-            cell.free = i
+        event = arrive(batch, i)
     if cell.robot == cell.robots:
         cell.next_us = least(shares.due_us[c])
     return event
-
-
-@kernel
-def cell_event(batch: Batch, shares: Shares, c: int) -> int:
-    """Move cell ``c`` on to the next DEPARTURE, DECISION, DEQUEUE, SEND of its sender ``cell.row``, or to its END.
-
-    The order of things is that of a sender: what the link finishes up to and including a time leaves, and successors
-    start; then the arrivals of that time come, in the order of the robots. No decision and no start among them changes
-    what is in transmission at that time, so all of them may also be gathered before the first is answered.
-    """
-    cell = shares.cells[c]
-    while True:
-        if cell.free != NOBODY:
-            event = offer(batch, shares, c)
-            if event != NOTHING:
-                return event
-        if cell.robot < cell.robots:
-            event = arrive_in_cell(batch, shares, c)
-            if event != NOTHING:
-                return event
-            continue
-        goal, position, finish_us = next_finish(batch, shares, c)
-        if finish_us <= min(cell.next_us, FOREVER - 1):
-            finish_in_cell(batch, shares, c, goal, position, finish_us)
-        elif cell.next_us == FOREVER:
-            return END
-        else:
-            cell.tick_us, cell.robot = cell.next_us, 0
-            settle(batch, shares, c)
-
-
-@kernel
-def decide_in_cell(batch: Batch, shares: Shares, c: int, i: int, decision: int) -> bool:
-    """Carry out a decision on the arrival at sender ``i``, as ``decide`` does; then its socket may be free to take."""
-    possible = decide(batch, i, decision)
-    shares.cells[c].free = i
-    return possible

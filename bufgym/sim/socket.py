@@ -1,132 +1,18 @@
-"""The socket and its link: what is taken, when it has crossed, when its pong comes, what has reached the server."""
+"""The socket: what it dequeues, what has been transmitted, when its ack comes, what has reached the server."""
 
 from __future__ import annotations
 
-from bufgym.kernel import kernel
-from bufgym.model.link import FOREVER, position_at, time_of
-from bufgym.sim.rules import (
-    arrives_on_topic,
-    dequeued_on_topic,
-    sendable,
-)
-from bufgym.sim.state import Batch
-
-
-@kernel
-def dequeue(batch: Batch, i: int, k: int) -> None:
-    """Slot ``k`` goes from the buffer to the socket; when its bytes will have crossed is the link's affair."""
-    sender = batch.senders[i]
-    first = sender.first
-    if k > 0:
-        # All but its gain stands in the list of arrivals as well.
-        seq, gain = batch.slots[i, first + k].seq, batch.slots[i, first + k].gain
-        for j in range(first + k, first, -1):
-            batch.slots[i, j] = batch.slots[i, j - 1]
-        batch.slots[i, first] = batch.arrivals[i, seq]
-        batch.slots[i, first].gain = gain
-    head = batch.slots[i, first]
-    batch.order[i, sender.dequeued] = head.seq
-    sender.busy += 1
-    sender.first += 1
-    sender.occupancy -= 1
-    sender.backlog_bytes -= head.size_bytes
-    sender.dequeued += 1
-    sender.last_dequeue_us = sender.now_us
-    sender.departures += 1
-    entry = batch.log[i, head.seq]
-    entry.dequeued_us, entry.gain = sender.now_us, head.gain
-    if sender.topics > 1:
-        dequeued_on_topic(batch, i, head)
-
-
-@kernel
-def carried_by_now(batch: Batch, i: int) -> int:
-    """The position that the link of sender ``i`` has come to."""
-    sender = batch.senders[i]
-    reached, sender.segment_now = position_at(
-        batch.knot_us,
-        batch.knot_bytes,
-        sender.first_knot,
-        sender.last_knot,
-        sender.after,
-        sender.segment_now,
-        sender.now_us + sender.offset_us,
-    )
-    return reached
-
-
-@kernel
-def begin_transmission(batch: Batch, i: int) -> None:
-    """The link carries what was taken last: behind the message before it, or from now on if the link was idle."""
-    sender = batch.senders[i]
-    head = batch.slots[i, sender.first - 1]
-    if sender.busy == 1 and sender.follows == 0:
-        sender.position = max(carried_by_now(batch, i), sender.position)
-    sender.position += head.size_bytes
-    at_us, sender.segment_finish = time_of(
-        batch.knot_us,
-        batch.knot_bytes,
-        sender.first_knot,
-        sender.last_knot,
-        sender.after,
-        sender.segment_finish,
-        sender.position,
-    )
-    due_us = at_us if at_us == FOREVER else at_us - sender.offset_us
-    if sender.busy == 1:
-        sender.finish_us = due_us
-    else:
-        batch.log[i, head.seq].due_us = due_us
-
-
-@kernel
-def finish_transmission(batch: Batch, i: int) -> None:
-    """The last byte of the message in transmission has crossed; without pongs to wait for, its place is free."""
-    sender = batch.senders[i]
-    seq = batch.order[i, sender.transmitted]
-    batch.log[i, seq].transmitted_us = sender.finish_us
-    sender.now_us = sender.finish_us
-    sender.transmitted += 1
-    sender.busy -= 1
-    if sender.busy > 0:
-        sender.finish_us = batch.log[i, batch.order[i, sender.transmitted]].due_us
-    elif sender.occupancy > 0:
-        sender.follows = 1
-    if sender.ack_delay_us == 0:
-        sender.acked += 1
-        sender.held = 0
-
-
-@kernel
-def next_ack_us(batch: Batch, i: int) -> int:
-    """When the next pong comes for a message that has crossed; FOREVER if none is on its way."""
-    sender = batch.senders[i]
-    if sender.acked == sender.transmitted:
-        return FOREVER
-    return int(batch.log[i, batch.order[i, sender.acked]].transmitted_us + sender.ack_delay_us)
-
-
-@kernel
-def credit(batch: Batch, i: int, until_us: int) -> None:
-    """Count the information of what reached the server by ``until_us``, propagation included."""
-    sender = batch.senders[i]
-    while sender.credited < sender.transmitted:
-        seq = batch.order[i, sender.credited]
-        entry = batch.log[i, seq]
-        received_us = entry.transmitted_us + sender.propagation_us
-        if until_us < received_us:
-            break
-        sender.delivered_gain += entry.gain
-        sender.credited += 1
-        if sender.topics > 1:
-            arrives_on_topic(batch, i, batch.arrivals[i, seq], received_us)
+from bufgym.kernel import at, kernel
+from bufgym.model.link import FOREVER, carried_by, finish_of
+from bufgym.sim.rules import dequeued_on_topic, received_on_topic, sendable
+from bufgym.sim.state import CARRIES, FREED, HELD, IDLE, UNASKED, Batch
 
 
 @kernel
 def may_dequeue(batch: Batch, i: int) -> bool:
-    """Whether the socket may take a message now: one is queued, and n_T leaves room in flight."""
+    """Whether the socket may dequeue a message now: one is queued, and n_T leaves room in flight."""
     sender = batch.senders[i]
-    if sender.occupancy == 0 or sender.held == 1:
+    if sender.occupancy == 0 or sender.socket == HELD:
         return False
     if sender.dequeued - sender.acked < sender.window:
         return True
@@ -135,3 +21,89 @@ def may_dequeue(batch: Batch, i: int) -> bool:
             if sendable(batch, i, k):
                 return True
     return False
+
+
+@kernel
+def dequeue(batch: Batch, i: int, k: int) -> None:
+    """Slot ``k`` goes from the buffer to the socket; the link has yet to begin with it."""
+    sender = batch.senders[i]
+    first = sender.first
+    if k > 0:
+        # All but its gain stands in the list of arrivals as well.
+        seq, gain = at(batch.slots, i, first + k).seq, at(batch.slots, i, first + k).gain
+        for j in range(first + k, first, -1):
+            batch.slots[i, j] = at(batch.slots, i, j - 1)
+        batch.slots[i, first] = at(batch.arrivals, i, seq)
+        at(batch.slots, i, first).gain = gain
+    head = at(batch.slots, i, first)
+    batch.order[i, sender.dequeued] = head.seq
+    sender.busy += 1
+    sender.first += 1
+    sender.occupancy -= 1
+    sender.backlog_bytes -= head.size_bytes
+    sender.dequeued += 1
+    sender.last_dequeue_us = sender.now_us
+    sender.departures += 1
+    sender.socket, sender.chosen = UNASKED, 0
+    entry = at(batch.log, i, head.seq)
+    entry.dequeued_us, entry.gain = sender.now_us, head.gain
+    if sender.topics > 1:
+        dequeued_on_topic(batch, i, head)
+
+
+@kernel
+def next_size_bytes(batch: Batch, i: int) -> int:
+    """Size of the message in the socket that the link carries or is to carry next."""
+    sender = batch.senders[i]
+    if sender.busy == 1:
+        return int(at(batch.slots, i, sender.first - 1).size_bytes)
+    return int(at(batch.arrivals, i, at(batch.order, i, sender.transmitted)).size_bytes)
+
+
+@kernel
+def begin_transmission(batch: Batch, i: int) -> None:
+    """The link of sender ``i`` alone begins with the next message in the socket: at once if it was freed, else now."""
+    sender = batch.senders[i]
+    if sender.link == IDLE:
+        sender.position = max(carried_by(batch.knot_us, batch.knot_bytes, sender, sender.now_us), sender.position)
+    sender.link = CARRIES
+    sender.position += next_size_bytes(batch, i)
+    sender.finish_us = finish_of(batch.knot_us, batch.knot_bytes, sender, sender.position)
+
+
+@kernel
+def finish_transmission(batch: Batch, i: int, at_us: int) -> None:
+    """The last byte of the message in transmission crosses the link; without acks to wait for, its place is free."""
+    sender = batch.senders[i]
+    at(batch.log, i, at(batch.order, i, sender.transmitted)).transmitted_us = at_us
+    sender.now_us, sender.finish_us, sender.link = at_us, FOREVER, FREED
+    sender.transmitted += 1
+    sender.busy -= 1
+    if sender.ack_delay_us == 0:
+        sender.acked += 1
+        sender.socket = UNASKED
+
+
+@kernel
+def next_ack_us(batch: Batch, i: int) -> int:
+    """When the next ack comes for a message that has been transmitted; FOREVER if none is on its way."""
+    sender = batch.senders[i]
+    if sender.acked == sender.transmitted:  # always so without acks to wait for
+        return FOREVER
+    return int(at(batch.log, i, at(batch.order, i, sender.acked)).transmitted_us + sender.ack_delay_us)
+
+
+@kernel
+def credit(batch: Batch, i: int, until_us: int) -> None:
+    """Count the information of what reached the server by ``until_us``, propagation included."""
+    sender = batch.senders[i]
+    while sender.credited < sender.transmitted:
+        seq = at(batch.order, i, sender.credited)
+        entry = at(batch.log, i, seq)
+        received_us = entry.transmitted_us + sender.propagation_us
+        if until_us < received_us:
+            break
+        sender.delivered_gain += entry.gain
+        sender.credited += 1
+        if sender.topics > 1:
+            received_on_topic(batch, i, at(batch.arrivals, i, seq), received_us)

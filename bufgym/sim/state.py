@@ -9,68 +9,81 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.documented import documented
 from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC
 
 END, DEPARTURE, DECISION, DEQUEUE, SEND = range(5)
-ARRIVAL_WAITS, SOCKET_WAITS = 1, 2
-"""What a sender may be ``waiting`` for: a decision on its arrival, or the choice of what to send."""
+"""Events of a sender (see the package's text)."""
+NOTHING = -1
+"""No event: time moves on without a question or a departure."""
+
+NOTHING_WAITS, ARRIVAL_WAITS, SOCKET_WAITS = range(3)
+"""What a sender may be ``waiting`` for: nothing, a decision on its arrival, or the choice of what to send."""
+
+UNASKED, CLEARED, CHOSEN, HELD = range(4)
+"""States of a sender's ``socket``. UNASKED: nothing is decided about what it dequeues next. CLEARED: the policy does
+not drop the head. CHOSEN: it dequeues slot ``chosen``. HELD: it dequeues nothing before the next arrival or ack."""
+
+IDLE, FREED, CARRIES = range(3)
+"""States of a sender's ``link``. IDLE: nothing to carry. FREED: it has just finished a message, so that the next one
+follows without a pause. CARRIES: a message is in transmission."""
 
 SENDER = np.dtype(
     [
-        # what the sender is
+        # settings
         ("capacity", np.int64),  # L, messages
         ("max_bytes", np.int64),  # B, bytes
         ("ask_when_full", np.int64),  # 1: only an arrival that finds no room asks for a decision
-        ("ask_at_dequeue", np.int64),  # 1: the policy may drop the head before the socket takes it
-        ("ask_at_send", np.int64),  # 1: a scheduler chooses which message the free socket takes
+        ("ask_at_dequeue", np.int64),  # 1: the policy may drop the head before the socket dequeues it
+        ("ask_at_send", np.int64),  # 1: a scheduler chooses which message the socket dequeues
         ("topics", np.int64),  # 1: one queue, whatever the messages' topics; else each topic has rules of its own
-        ("window", np.int64),  # n_T: messages sent and not yet answered by a pong, at most
-        ("ack_delay_us", np.int64),  # from a message's crossing to its pong
+        ("window", np.int64),  # n_T: messages sent and not yet acked, at most
+        ("ack_delay_us", np.int64),  # from the end of a message's transmission to its ack
         ("limit_at_send", np.int64),  # 1: rate limits hold back at the socket, 0: they drop at arrival
         ("flush_no_drop", np.int64),  # 1: no_drop messages are sent even when the window is full
-        # its episode
+        # episode
         ("arrivals", np.int64),  # messages in all
-        ("first_decision", np.int64),
-        ("last_decision", np.int64),
-        ("first_knot", np.int64),
+        ("first_decision", np.int64),  # arrivals from this one to
+        ("last_decision", np.int64),  # this one ask for a decision
+        ("first_knot", np.int64),  # of its trace, in the batch's knots
         ("last_knot", np.int64),
-        ("after", np.int64),
+        ("after", np.int64),  # what follows the trace's end: LOOP, HOLD or STOP
         ("offset_us", np.int64),
         ("propagation_us", np.int64),
-        # its clock
+        # clock
         ("now_us", np.int64),
         ("next", np.int64),  # the next arrival, or the one that waits for a decision
-        ("waiting", np.int64),  # 1 while a decision is due
-        # its buffer
+        ("waiting", np.int64),  # NOTHING_WAITS, ARRIVAL_WAITS or SOCKET_WAITS
+        # buffer
         ("first", np.int64),  # column of the head
         ("occupancy", np.int64),
         ("backlog_bytes", np.int64),
-        # its socket
-        ("busy", np.int64),  # messages that it took and that have not crossed yet
-        ("cleared", np.int64),  # 1: the head may go; nobody need be asked again
-        ("follows", np.int64),  # 1: the head follows the message before it without a pause
-        ("chosen", np.int64),  # the slot that the scheduler sends next, NEVER before it is asked
-        ("held", np.int64),  # 1: the scheduler sends nothing before the next arrival or pong
-        ("acked", np.int64),  # messages answered by a pong
-        ("position", np.int64),  # bytes of the trace used up when all that the socket took has crossed
-        ("finish_us", np.int64),  # when the message in transmission will have crossed
+        # socket
+        ("socket", np.int64),  # UNASKED, CLEARED, CHOSEN or HELD
+        ("chosen", np.int64),  # the slot that it dequeues next; 0 unless CHOSEN
+        ("busy", np.int64),  # messages dequeued and not yet transmitted
+        ("acked", np.int64),  # messages acked
+        # link
+        ("link", np.int64),  # IDLE, FREED or CARRIES
+        ("position", np.int64),  # bytes of the trace used up when the message in transmission has been transmitted
+        ("finish_us", np.int64),  # when that is; FOREVER while the link is idle
         ("segment_now", np.int64),  # where on the trace the clock and the socket were last looked up
         ("segment_finish", np.int64),
         # counts
-        ("dequeued", np.int64),  # messages the socket took
-        ("transmitted", np.int64),  # messages that left the socket
+        ("dequeued", np.int64),  # messages the socket dequeued
+        ("transmitted", np.int64),  # messages whose last byte has crossed the link
         ("credited", np.int64),  # messages that reached the server
         ("rejected", np.int64),
         ("evicted", np.int64),
         ("invalid", np.int64),  # decisions that could not be carried out as given
-        ("peak_backlog_bytes", np.int64),  # queued at most
-        # what the policy may know of its own past
-        ("previous_us", np.int64),
+        ("peak_backlog_bytes", np.int64),  # largest backlog so far
+        # what the policy may know of the past
+        ("previous_us", np.int64),  # time of the previous arrival
         ("previous_x", np.float64),
-        ("last_dequeue_us", np.int64),  # when the socket last took a message
-        ("departures", np.int64),
-        ("period_us", np.float64),
-        ("service_ratio", np.float64),
+        ("last_dequeue_us", np.int64),  # when the socket last dequeued a message
+        ("departures", np.int64),  # messages dequeued since the previous arrival
+        ("period_us", np.float64),  # running mean of the time between arrivals
+        ("service_ratio", np.float64),  # running mean of departures per arrival
         # information
         ("delivered_gain", np.float64),  # sum of V over what reached the server
         ("retained_gain", np.float64),  # sum of V over what is kept or sent
@@ -83,36 +96,39 @@ SENDER = np.dtype(
 LOG_ENTRY = np.dtype(
     [
         ("dequeued_us", np.int64),  # the socket took it out of the buffer
-        ("due_us", np.int64),  # its last byte will cross the link; known once the socket has it
         ("transmitted_us", np.int64),  # its last byte crossed the link
         ("dropped_us", np.int64),  # it was evicted or rejected
         ("limited", np.int64),  # 1: a rate limit dropped it
-        ("gain", np.float64),  # V that its delivery adds; it is settled once the socket has taken it
+        ("gain", np.float64),  # V that its delivery adds; settled once the socket has dequeued it
     ],
     align=True,
 )
 NEVER = -1
-"""In FATE: it did not happen."""
+"""A time in LOG_ENTRY: it has not happened."""
 
 
+@documented
 class Batch(NamedTuple):
     """The arrays of n senders, changed in place by the kernels. A snapshot is a copy of them."""
 
     senders: NDArray[Any]
-    """SENDER[n]"""
+    """SENDER[n]: settings, state and counts of each sender."""
     slots: NDArray[Any]
-    """MESSAGE[n, 1 + 2 L] (see ``bufgym.model.buffer``)"""
+    """MESSAGE[n, 1 + 2 L]: the message dequeued last and those queued (see ``bufgym.model.buffer``)."""
     arrivals: NDArray[Any]
-    """MESSAGE[n, messages]"""
+    """MESSAGE[n, messages]: the episode, in order of arrival."""
     log: NDArray[Any]
-    """FATE[n, messages]"""
+    """LOG_ENTRY[n, messages]: what became of each message."""
     order: NDArray[np.int64]
-    """[n, messages]: sequence numbers in the order in which the socket took them."""
+    """int64[n, messages]: sequence numbers in the order in which the socket dequeued them."""
     knot_us: NDArray[np.int64]
+    """int64[knots]: times of the knots of every trace, us (see ``bufgym.model.link.Knots``)."""
     knot_bytes: NDArray[np.int64]
+    """int64[knots]: bytes that the trace has carried by then."""
     v: NDArray[np.float64]
+    """float64[entries]: the value functions, one after the other (``Value.array``)."""
     topics: NDArray[Any]
-    """TOPIC[n, topics]"""
+    """TOPIC[n, topics]: the rules and the past of each topic; one row for a single queue."""
     parameters: NDArray[np.float64] = NO_PARAMETERS
     """float64[parameters], read-only: those of the policy at hand, which ``view`` shows it."""
 

@@ -1,4 +1,8 @@
-"""The transition: one function moves a sender on to its next event."""
+"""The transition: one function moves a sender, or the robots of a cell that share a link, on to the next event.
+
+``shares`` is what differs: None where every sender has a link of its own, and *cell* c is then sender c; else the cells
+of ``bufgym.sim.shared_link``. Numba compiles each case for itself.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +10,39 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from bufgym.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT
+from bufgym.kernel import at, kernel, records
 from bufgym.model.link import FOREVER
-from bufgym.sim.decisions import choose, decide, has_room, oldest_sendable
-from bufgym.sim.rules import (
-    too_soon,
-)
+from bufgym.sim.decisions import arrive, choose, oldest_sendable
+from bufgym.sim.shared_link import Shares, join, next_in_cell
 from bufgym.sim.socket import begin_transmission, dequeue, finish_transmission, may_dequeue, next_ack_us
-from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NEVER, SEND, SOCKET_WAITS, Batch
+from bufgym.sim.state import (
+    CARRIES,
+    CHOSEN,
+    DEPARTURE,
+    DEQUEUE,
+    END,
+    FREED,
+    HELD,
+    IDLE,
+    NEVER,
+    NOTHING,
+    SEND,
+    SENDER,
+    SOCKET_WAITS,
+    UNASKED,
+    Batch,
+)
 
-# Weights of the running means: about the last 8 arrivals for the period, 16 for the drain.
-_PERIOD_WEIGHT, _DRAIN_WEIGHT = 1 / 8, 1 / 16
+
+def _beginning() -> NDArray[Any]:
+    """SENDER[1]: what every episode begins with; all fields that are not named here are 0."""
+    sender = records(1, SENDER)
+    sender["first"] = 1
+    sender["finish_us"] = FOREVER
+    return sender
+
+
+_BEGINNING = _beginning()
 
 
 @kernel
@@ -33,101 +58,96 @@ def load_row(
 ) -> None:
     """Put sender ``i`` at the beginning of an episode: empty buffer, idle socket, nothing arrived.
 
-    ``topics``: TOPIC[topics], their settings; ``buffer``: capacity, max_bytes, ask_when_full; ``decisions``: first and
-    last arrival that asks for one; ``link``: first and last knot, what follows the end, offset_us, propagation_us;
-    ``window``: n_T and the time from a message's crossing to its pong, us.
+    ``topics``: TOPIC[topics], their settings; ``buffer``: capacity, max_bytes, ask_when_full;
+    ``decisions``: first and last arrival that asks for one; ``link``: first and last knot, what follows the end,
+    offset_us, propagation_us; ``window``: n_T and the time from the end of a message's transmission to its ack, us.
     """
     for k in range(len(arrivals)):
         batch.arrivals[i, k] = arrivals[k]
-        entry = batch.log[i, k]
-        entry.dequeued_us, entry.due_us, entry.transmitted_us, entry.dropped_us, entry.limited = (
-            NEVER,
-            NEVER,
-            NEVER,
-            NEVER,
-            0,
-        )
+        entry = at(batch.log, i, k)
+        entry.dequeued_us, entry.transmitted_us, entry.dropped_us, entry.limited = NEVER, NEVER, NEVER, 0
     for k in range(len(topics)):
         batch.topics[i, k] = topics[k]
+    batch.senders[i] = _BEGINNING[0]
     sender = batch.senders[i]
     sender.capacity, sender.max_bytes, sender.ask_when_full = buffer
     sender.first_decision, sender.last_decision = decisions
     sender.first_knot, sender.last_knot, sender.after, sender.offset_us, sender.propagation_us = link
-    sender.topics, sender.window, sender.ack_delay_us = len(topics), window[0], window[1]
     sender.segment_now, sender.segment_finish = sender.first_knot, sender.first_knot
-    sender.arrivals = len(arrivals)
-    sender.first = 1
-    sender.now_us, sender.next, sender.waiting, sender.occupancy, sender.backlog_bytes = 0, 0, 0, 0, 0
-    sender.busy, sender.position, sender.finish_us = 0, 0, 0
-    sender.ask_at_dequeue, sender.cleared, sender.follows = 0, 0, 0
-    sender.ask_at_send, sender.chosen, sender.held, sender.acked = 0, NEVER, 0, 0
-    sender.limit_at_send, sender.flush_no_drop = 0, 0
-    sender.dequeued, sender.transmitted, sender.credited = 0, 0, 0
-    sender.rejected, sender.evicted, sender.invalid, sender.peak_backlog_bytes = 0, 0, 0, 0
-    sender.previous_us, sender.last_dequeue_us, sender.departures = 0, 0, 0
-    sender.previous_x, sender.period_us, sender.service_ratio = 0.0, 0.0, 0.0
-    sender.delivered_gain, sender.retained_gain, sender.aged, sender.late = 0.0, 0.0, 0.0, 0.0
+    sender.window, sender.ack_delay_us = window
+    sender.arrivals, sender.topics = len(arrivals), len(topics)
 
 
 @kernel
-def next_event(batch: Batch, i: int) -> int:
-    """Move sender ``i`` on to its next DEPARTURE, DECISION, DEQUEUE, SEND or END (see the package's text)."""
-    sender = batch.senders[i]
+def next_event(batch: Batch, shares: Shares | None, c: int) -> int:
+    """Move cell ``c`` on to its next DEPARTURE, DECISION, DEQUEUE, SEND or END (see the package's text).
+
+    The event is about sender ``sender_of(shares, c)``.
+    """
     while True:
-        if may_dequeue(batch, i):
-            if sender.ask_at_dequeue > sender.cleared:
-                return DEQUEUE
-            if sender.ask_at_send == 1 and sender.chosen == NEVER:
+        i = sender_of(shares, c)
+        if shares is None and batch.senders[i].link != CARRIES and batch.senders[i].busy > 0:
+            begin_transmission(batch, i)
+        event = offer(batch, shares, i)
+        if event == NOTHING:
+            event = next_on_link(batch, c) if shares is None else next_in_cell(batch, shares, c)
+        if event != NOTHING:
+            return event
+
+
+@kernel
+def sender_of(shares: Shares | None, c: int) -> int:
+    """The sender that the last event of cell ``c`` is about, and whose socket may be free."""
+    if shares is None:
+        return c
+    return int(shares.cells[c].row)
+
+
+@kernel
+def offer(batch: Batch, shares: Shares | None, i: int) -> int:
+    """Let the socket of sender ``i`` dequeue: DEPARTURE where it does, NOTHING where it may not.
+
+    DEQUEUE or SEND where the policy is to be asked first.
+    """
+    sender = batch.senders[i]
+    if may_dequeue(batch, i):
+        if sender.ask_at_dequeue == 1 and sender.socket == UNASKED:
+            return DEQUEUE
+        if sender.socket != CHOSEN:
+            if sender.ask_at_send == 1:
                 sender.waiting = SOCKET_WAITS
                 return SEND
-            if sender.chosen == NEVER and (sender.limit_at_send == 1 or sender.flush_no_drop == 1):
+            if sender.limit_at_send == 1 or sender.flush_no_drop == 1:
                 choose(batch, i, oldest_sendable(batch, i))
-                continue
-            dequeue(batch, i, max(sender.chosen, 0))
-            begin_transmission(batch, i)
-            sender.cleared, sender.follows, sender.chosen = 0, 0, NEVER
+        if sender.socket != HELD:
+            dequeue(batch, i, sender.chosen)
+            if shares is not None:
+                join(batch, shares, i)
             return DEPARTURE
-        sender.follows = 0
-        more = sender.next < sender.arrivals
-        arrives_us = batch.arrivals[i, sender.next].arrival_us if more else FOREVER - 1
-        ack_delay_us = next_ack_us(batch, i) if sender.ack_delay_us > 0 else FOREVER
-        if sender.busy > 0 and sender.finish_us <= arrives_us and sender.finish_us < ack_delay_us:
-            finish_transmission(batch, i)
-            continue
-        if sender.ack_delay_us > 0 and ack_delay_us <= arrives_us:
-            sender.now_us = ack_delay_us
-            sender.acked += 1
-            sender.held = 0
-            continue
-        if not more:
-            return END
-        if arrive(batch, i):
-            sender.waiting = ARRIVAL_WAITS
-            return DECISION
+    if sender.link == FREED:
+        sender.link = IDLE
+    return NOTHING
 
 
 @kernel
-def arrive(batch: Batch, i: int) -> bool:
-    """The next message arrives. Whether it asks for a decision; if not it is enqueued where there is room."""
+def next_on_link(batch: Batch, i: int) -> int:
+    """What comes next for a sender with a link of its own: a message transmitted, an ack, an arrival, or the END.
+
+    At one time acks come first, then the end of a transmission, then arrivals. NOTHING unless an arrival asks for a
+    DECISION.
+    """
     sender = batch.senders[i]
-    arrival = batch.arrivals[i, sender.next]
-    arrives_us = arrival.arrival_us
-    sender.now_us = arrives_us
-    sender.held = 0
-    if sender.next > 0:
-        gap_us = arrives_us - sender.previous_us
-        if sender.next == 1:
-            sender.period_us = float(gap_us)
-        sender.period_us += _PERIOD_WEIGHT * (gap_us - sender.period_us)
-        sender.service_ratio += _DRAIN_WEIGHT * (sender.departures - sender.service_ratio)
+    more = sender.next < sender.arrivals
+    arrives_us = at(batch.arrivals, i, sender.next).arrival_us if more else FOREVER - 1
+    ack_us = next_ack_us(batch, i)
+    if sender.finish_us <= arrives_us and sender.finish_us < ack_us:
+        finish_transmission(batch, i, sender.finish_us)
+    elif ack_us <= arrives_us:
+        sender.now_us = ack_us
+        sender.acked += 1
+        sender.socket = UNASKED
+    elif more:
+        return arrive(batch, i)
     else:
-        sender.previous_us, sender.previous_x = arrives_us, arrival.x
-    if sender.topics > 1 and sender.limit_at_send == 0 and too_soon(batch, i, arrival.topic):
-        batch.log[i, sender.next].limited = 1
-        decide(batch, i, REJECT)  # which is possible: a no_drop topic has no rate limit
-        return False
-    asked = sender.first_decision <= sender.next <= sender.last_decision
-    if asked and not (sender.ask_when_full == 1 and has_room(batch, i)):
-        return True
-    decide(batch, i, ACCEPT)
-    return False
+        return END
+    return NOTHING

@@ -199,7 +199,7 @@ def test_every_field_is_its_twins(case):
     origin, events = with_origins(twin), case.twin_events(twin)
     event_name = next(events)
     while True:
-        event = next_event(batch, 0)
+        event = next_event(batch, None, 0)
         assert NAMES[event] == event_name
         if event == END:
             break

@@ -120,7 +120,7 @@ def test_bytes_limit():
     # L = 5: the oldest goes. 4 (3000) cannot fit whatever goes: drop-oldest's answer is impossible, it is rejected.
     senders = line([0, 0, 0, 0, 0], capacity=5, sizes=[1_000, 1_000, 1_000, 1_000, 3_000], max_bytes=2_500)
     asked = []
-    while (event := next_event(senders.batch, 0)) != END:
+    while (event := next_event(senders.batch, None, 0)) != END:
         if event == DECISION:
             seq, room = int(senders.batch.senders[0]["next"]), has_room(senders.batch, 0)
             asked.append((seq, room, [k for k in range(5) if can_evict(senders.batch, 0, k)]))
@@ -331,7 +331,7 @@ def test_conservation_after_every_event(case, chance, drops_at_dequeue):
     sender = batch.senders[0]
     before_us = 0
     while True:
-        event = next_event(batch, 0)
+        event = next_event(batch, None, 0)
         conserve(case, senders)
         assert sender["now_us"] >= before_us
         before_us = sender["now_us"]
@@ -350,7 +350,7 @@ def test_conservation_after_every_event(case, chance, drops_at_dequeue):
             assert decide(batch, 0, chance.choice(possible))
             conserve(case, senders)
     assert sender["next"] == len(case.twin_messages)
-    assert next_event(batch, 0) == END  # and stays there
+    assert next_event(batch, None, 0) == END  # and stays there
 
 
 def conserve(case: Case, senders: Senders) -> None:

@@ -204,7 +204,7 @@ def test_a_limit_of_one_topic():
     topics = (Topic("camera", limit=1), Topic("status"))
     senders = Senders(1, 5, V, max_messages=4, topics=topics)
     senders.load(0, episode([0, 0, 0, 0], [1, 1, 0, 0]))
-    while next_event(senders.batch, 0) != DECISION or senders.batch.senders[0]["next"] < 3:
+    while next_event(senders.batch, None, 0) != DECISION or senders.batch.senders[0]["next"] < 3:
         if senders.batch.senders[0]["waiting"]:
             decide(senders.batch, 0, ACCEPT)
     assert [can_evict(senders.batch, 0, k) for k in range(3)] == [False, True, False]
@@ -415,7 +415,7 @@ def test_agrees_with_twin_event_by_event(case):
     senders, twin = case.senders(), case.twin()
     batch, events, answer, expected = senders.batch, case.twin_events(twin), None, ""
     while expected != "end":
-        expected, event = events.send(answer), next_event(batch, 0)
+        expected, event = events.send(answer), next_event(batch, None, 0)
         assert NAMES[event] == expected
         credit(batch, 0, int(batch.senders[0]["now_us"]))
         agree(senders, twin)
@@ -569,7 +569,7 @@ def test_invariants_after_every_event(case, chance):
     # Arrivals that ask nobody may find no room; where all ask, and are given what is possible, nothing is impossible.
     everyone = case.case.episode.first_decision == 0 and case.case.episode.last_decision > len(case.case.twin_messages)
     while event != END:
-        event = next_event(batch, 0)
+        event = next_event(batch, None, 0)
         assert sender["now_us"] >= now_us
         now_us = int(sender["now_us"])
         hold(case, senders)
@@ -585,7 +585,7 @@ def test_invariants_after_every_event(case, chance):
         hold(case, senders)
     assert sender["invalid"] == 0 or not everyone
     assert sender["next"] == len(case.case.twin_messages)
-    assert next_event(batch, 0) == END  # and stays there
+    assert next_event(batch, None, 0) == END  # and stays there
 
 
 @given(topic_cases(min_topics=1))
@@ -593,7 +593,7 @@ def test_invariants_under_impossible_decisions(case):
     senders = case.senders()
     batch, event = senders.batch, None
     while event != END:
-        event = next_event(batch, 0)
+        event = next_event(batch, None, 0)
         if event == DECISION:
             uniform = float(batch.arrivals[0, batch.senders[0]["next"]]["uniform"])
             kept_if_possible(case, senders, decision(uniform, case.case.capacity))

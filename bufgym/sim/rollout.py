@@ -1,0 +1,113 @@
+"""The main loop for a fixed policy: compiled once for all compiled policies, or with a policy in ordinary Python.
+
+Both run senders with links of their own (``shares`` is None) and robots that share the link of a cell.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.errors import BufgymError
+from bufgym.kernel import compile_for
+from bufgym.model.link import FOREVER
+from bufgym.policies.registry import Policy, runs_compiled, signatures
+from bufgym.sim.decisions import answer_dequeue, answer_send, decide
+from bufgym.sim.shared_link import Shares, shares_type
+from bufgym.sim.socket import credit
+from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type, named
+from bufgym.sim.transition import next_event, sender_of
+from bufgym.sim.view import arrival_of, view
+
+
+def rollout(
+    batch: Batch,
+    shares: Shares | None,
+    memory: NDArray[np.float64],
+    on_arrival: Any,
+    on_departure: Any,
+    on_dequeue: Any,
+    on_send: Any,
+    hears_departures: bool,
+) -> None:
+    """Run every sender of the batch to its end under one policy; ``memory`` is float64[n, entries]."""
+    for c in range(len(batch.senders) if shares is None else len(shares.cells)):
+        event = NOTHING
+        while event != END:
+            event = next_event(batch, shares, c)
+            # One view for all events: the kernels are inlined, and so the loop's code stays small.
+            if event == END or (event == DEPARTURE and not hears_departures):
+                continue
+            i = sender_of(shares, c)
+            buffer = view(batch, i)
+            if event == DECISION:
+                decide(batch, i, on_arrival(buffer, arrival_of(batch, i), memory[i]))
+            elif event == DEQUEUE:
+                answer_dequeue(batch, i, on_dequeue(buffer, memory[i]))
+            elif event == SEND:
+                answer_send(batch, i, on_send(buffer, memory[i]))
+            else:
+                on_departure(buffer, memory[i])
+    for i in range(len(batch.senders)):
+        credit(batch, i, FOREVER)
+
+
+@functools.cache
+def compiled_rollout(shared: bool) -> Any:
+    """``rollout`` compiled once for every policy (policies arrive as values of one function type).
+
+    ``shared``: for the cells of a shared link; else for senders with links of their own.
+    """
+    functions = tuple(numba.types.FunctionType(signature) for signature in signatures())
+    memory = numba.types.Array(numba.types.float64, 2, "C")
+    shares = shares_type() if shared else numba.types.none
+    return compile_for(numba.types.void(batch_type(), shares, memory, *functions, numba.types.boolean), rollout)
+
+
+python_view = getattr(view, "py_func", view)
+"""``view`` for Python callers, over a ``named`` batch: the compiled kernel must not hand its arrays to Python."""
+
+
+def answer_of(policy: Policy, hook: str, answer: Any) -> int:
+    """The answer of a policy in ordinary Python as a whole number (or a yes or no); a BufgymError for anything else."""
+    try:
+        number = int(answer)
+    except (TypeError, ValueError, OverflowError):
+        number = None
+    if number is None or number != answer:
+        raise BufgymError(f"policy {policy.name}: {hook} returned {answer!r}: must be a whole number")
+    return number
+
+
+def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
+    """``rollout`` for a policy in ordinary Python: the transition stays compiled, views are made in Python."""
+    records = named(batch)
+    for c in range(len(batch.senders) if shares is None else len(shares.cells)):
+        while (event := next_event(batch, shares, c)) != END:
+            i = sender_of(shares, c)
+            if event == DEPARTURE and not policy.hears_departures:
+                continue
+            buffer = python_view(records, i)
+            if event == DECISION:
+                answer = policy.on_arrival(buffer, records.arrivals[i, records.senders[i].next], memory[i])
+                decide(batch, i, answer_of(policy, "on_arrival", answer))
+            elif event == DEQUEUE:
+                answer_dequeue(batch, i, bool(answer_of(policy, "on_dequeue", policy.on_dequeue(buffer, memory[i]))))
+            elif event == SEND:
+                answer_send(batch, i, answer_of(policy, "on_send", policy.on_send(buffer, memory[i])))
+            else:
+                policy.on_departure(buffer, memory[i])
+    for i in range(len(batch.senders)):
+        credit(batch, i, FOREVER)
+
+
+def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
+    """Run every sender to its end under ``policy``, compiled where the policy is."""
+    if runs_compiled(policy):
+        compiled_rollout(shares is not None)(batch, shares, memory, *policy.compiled, policy.hears_departures)
+    else:
+        python_rollout(batch, shares, memory, policy)
