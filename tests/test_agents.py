@@ -17,11 +17,11 @@ import torch  # noqa: E402  (these need the extra)
 
 from agents import mixed_env, runs, training  # noqa: E402
 from agents.dqn import INVALID, valid_actions  # noqa: E402
-from agents.evaluation import EvaluationSet, plan_for, seeds_for  # noqa: E402
+from agents.evaluation import EvaluationSet, seeds_for, sweep_for  # noqa: E402
 from agents.settings import Settings  # noqa: E402
 from bufgym import policies  # noqa: E402
 from bufgym.benchmark.run import draw  # noqa: E402
-from bufgym.benchmark.sweep import Plan  # noqa: E402
+from bufgym.benchmark.sweep import Sweep  # noqa: E402
 from bufgym.errors import BufgymError  # noqa: E402
 from bufgym.model.qoi import exponential  # noqa: E402
 from bufgym.sb3 import GymVecEnv  # noqa: E402
@@ -254,7 +254,7 @@ def callbacks_logger() -> Any:
 
 @pytest.mark.slow
 def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: Path) -> None:
-    evaluation = EvaluationSet(plan_for(SUITE, SUITE.suite, "validation"), tmp_path / "set")
+    evaluation = EvaluationSet(sweep_for(SUITE, SUITE.suite, "validation"), tmp_path / "set")
     assert len(evaluation.fixed("afr")) == 60
     assert evaluation.verdict(evaluation.play(DropOldest(), 8)).score == 0
     outcomes = evaluation.play(DropOldest(), 10)  # padding does not matter
@@ -268,7 +268,7 @@ def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: P
         )
     # A second reading makes nothing anew.
     written = (tmp_path / "set" / "manifest.json").stat().st_mtime_ns
-    again = EvaluationSet(plan_for(SUITE, SUITE.suite, "validation"), tmp_path / "set")
+    again = EvaluationSet(sweep_for(SUITE, SUITE.suite, "validation"), tmp_path / "set")
     assert (again.fixed("afr") == evaluation.fixed("afr")).all()
     assert (tmp_path / "set" / "manifest.json").stat().st_mtime_ns == written
 
@@ -280,7 +280,7 @@ def test_as_many_episodes_as_asked_for_or_at_least_one_a_trace() -> None:
 
 
 def test_nothing_to_be_gained_is_an_error(tmp_path: Path) -> None:
-    evaluation = EvaluationSet(Plan("interruption-v1", ("afr",), "validation", (500,), 1), tmp_path / "set")
+    evaluation = EvaluationSet(Sweep("interruption-v1", ("afr",), "validation", (500,), 1), tmp_path / "set")
     with pytest.raises(BufgymError, match="cannot be bettered"):
         evaluation.verdict(evaluation.run(policies.get("drop-oldest")))
 

@@ -19,13 +19,27 @@ from agents.objectives.objective import to_vector  # noqa: E402
 from agents.runs import prepare  # noqa: E402
 from agents.settings import Settings  # noqa: E402
 from bufgym import policies  # noqa: E402
-from bufgym.benchmark import fleets as benchmark  # noqa: E402
-from bufgym.benchmark.fleets_summary import summary  # noqa: E402
 from bufgym.benchmark.rows import read_rows  # noqa: E402
+from bufgym.benchmark.run import by_trace, draw, run  # noqa: E402
+from bufgym.benchmark.seeds import seeds_of  # noqa: E402
+from bufgym.benchmark.tasks import TASKS, FleetTask  # noqa: E402
 from bufgym.policies import learned, weights  # noqa: E402
+from bufgym.scenario import suites  # noqa: E402
+from bufgym.scenario.suites import Setting  # noqa: E402
 
-SUITE = dataclasses.replace(benchmark.get("fleet-v1"), robots=2, capacities=(3, 4))
+FLEET_V1 = suites.get("fleet-v1")
+
+
+def two_robots(split: str, data: Path | None) -> dict[str, Setting]:
+    """fleet-v1's scenario with two robots."""
+    ((label, setting),) = FLEET_V1.build(split, data).items()
+    return {label: dataclasses.replace(setting, scenario=dataclasses.replace(setting.scenario, robots=2))}
+
+
+SUITE = dataclasses.replace(FLEET_V1, build=two_robots, capacities=(3, 4))
 """fleet-v1 with two robots, and buffers so small that most arrivals ask for something to be dropped."""
+
+TASK = TASKS["fleet"]
 
 TINY = Settings(suite="fleet-v1", algo="evolution", name="tiny", steps=12_000, validate_every=6_000, test_seeds=1)
 PPO = dataclasses.replace(
@@ -37,10 +51,10 @@ PPO = dataclasses.replace(
 def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A folder of its own; a small suite, and only what takes no time of the rest."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(benchmark.SUITES, "fleet-v1", SUITE)
+    monkeypatch.setitem(suites.SUITES, "fleet-v1", SUITE)
     monkeypatch.setattr(fleet, "EPISODE_S", 1.0)
     monkeypatch.setattr(fleet, "VALIDATION_EPISODES", 1)
-    monkeypatch.setattr(benchmark, "default_policies", lambda: ["afr", "drop-oldest"])
+    monkeypatch.setattr(FleetTask, "default_policies", lambda self, suite: ["afr", "drop-oldest"])
     yield
 
 
@@ -52,18 +66,15 @@ def shipped(name: str = "learned-motion") -> weights.Weights:
 
 
 def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
-    part = benchmark.suite_parts(SUITE, "validation", seeds=2)[0]
-    part = part._replace(
-        fleet=dataclasses.replace(part.fleet, uplink=dataclasses.replace(part.fleet.uplink, duration_s=2.0))
-    )
-    episodes = [benchmark.draw(part.fleet, seed) for seed in part.seeds]
-    cell = fleet.FleetEpisodes(part.fleet, episodes, 4)
-    rows = benchmark.run_parts([policies.get(name) for name in ("afr", "min-gap")], [part], [4])
-    mean = {s.policy: s for s in summary(rows).overall}
-    assert cell.rival == pytest.approx(mean["afr"].team.value)
-    assert cell.team_qoi(policies.get("min-gap")) == pytest.approx(mean["min-gap"].team.value)
+    robots = by_trace(fleet.fleet_of("fleet-v1", "validation"))[0][1]
+    robots = dataclasses.replace(robots, uplink=dataclasses.replace(robots.uplink, duration_s=2.0))
+    cell = fleet.FleetEpisodes(robots, [draw(robots, seed) for seed in (0, 1)], 4)
+    rows = run([policies.get(name) for name in ("afr", "min-gap")], robots, [4], 2)
+    mean = TASK.summary(rows).standings
+    assert cell.rival == pytest.approx(mean["afr"]["team"].value)
+    assert cell.team_qoi(policies.get("min-gap")) == pytest.approx(mean["min-gap"]["team"].value)
     gain = fleet.mean_gain(policies.get("min-gap"), [cell])
-    assert gain == pytest.approx(mean["min-gap"].gain.value) and gain != 0
+    assert gain == pytest.approx(mean["min-gap"]["gain"].value) and gain != 0
     assert fleet.mean_gain(policies.get("afr"), [cell]) == 0  # again and again the same
     assert cell.decisions == 2 * 2 * 60
 
@@ -71,12 +82,14 @@ def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
 @pytest.mark.slow
 def test_samples_go_once_round_the_training_links() -> None:
     """The same episodes at each L; every seed has episodes of its own."""
-    parts = fleet.training_parts(SUITE, seed=3)
+    parts = fleet.training_parts("fleet-v1", SUITE.capacities, seed=3)
     assert [[cell.fleet.senders.capacity for cell in part] for part in parts] == [[3, 4]] * fleet.PARTS
     assert all(part[0].episodes is part[1].episodes for part in parts)
     links = [episode.link.trace.name for part in parts for episode in part[0].episodes]
     assert len(links) == len(set(links)) == 24 and all("validation" not in name for name in links)
-    first, again, other = (fleet.training_parts(SUITE, seed)[0][0].episodes[0] for seed in (3, 3, 4))
+    first, again, other = (
+        fleet.training_parts("fleet-v1", SUITE.capacities, seed)[0][0].episodes[0] for seed in (3, 3, 4)
+    )
     assert first.link.offset_us == again.link.offset_us != other.link.offset_us
     assert first.robots == 2 and len(first.arrivals[0]) == 30
 
@@ -94,7 +107,7 @@ def test_the_shipped_agent_reads_more_and_decides_the_same(sees: str) -> None:
     before = shipped(f"learned-{sees}")
     made = fleet.widened(before, fleet.MORE[sees])
     assert made.fields == (*before.fields, *fleet.MORE[sees])
-    part = fleet.training_parts(SUITE, seed=0)[0]
+    part = fleet.training_parts("fleet-v1", SUITE.capacities, seed=0)[0]
     assert [cell.team_qoi(learned.policy("mine", made)) for cell in part] == [
         cell.team_qoi(learned.policy("shipped", before)) for cell in part
     ]
@@ -106,7 +119,7 @@ def test_the_shipped_agent_reads_more_and_decides_the_same(sees: str) -> None:
     first = start_of(sees=sees)
     assert first.accept.bias[0] == made.accept.bias[0] - fleet.THRIFT
     first.accept.bias[:] = made.accept.bias
-    assert (first.memory() == made.memory()).all()
+    assert (first.parameters() == made.parameters()).all()
 
 
 def test_fields_of_ones_own_begin_with_greed() -> None:
@@ -139,7 +152,7 @@ def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: py
     train.main(TINY)
     printed = capsys.readouterr().out
     folder = Path("runs/tiny")
-    rows = read_rows(folder / "rows.csv", benchmark.ROWS)
+    rows = read_rows(folder / "rows.csv", TASK.layout)
     names = {"agent (seed 0)", "afr", "drop-oldest"}
     assert {row["policy"] for row in rows} == names and len(rows) == 12 * 2 * 2 * 3  # links, robots, L, policies
     assert (folder / "results.txt").read_text() in printed and "best on validation: seed 0" in printed
@@ -147,9 +160,11 @@ def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: py
     assert validations[0, 0] == 0 and validations[-1, 0] >= TINY.steps and len(validations) >= 3
     # The file is what the best of these was: it does the same again.
     agent = weights.load(folder / "model.safetensors")
-    assert fleet.mean_gain(agent, fleet.validation_episodes(SUITE)) == pytest.approx(validations[:, 2].max(), abs=1e-12)
+    validation = fleet.validation_episodes("fleet-v1", SUITE.capacities)
+    assert fleet.mean_gain(agent, validation) == pytest.approx(validations[:, 2].max(), abs=1e-12)
     mine = [row["qoi"] for row in rows if row["policy"] == "agent (seed 0)"]
-    again = benchmark.run_parts([agent], benchmark.suite_parts(SUITE, "test", seeds=1), SUITE.capacities)
+    links = enumerate(by_trace(fleet.fleet_of("fleet-v1", "test")))
+    again = [row for k, (_, link) in links for row in run([agent], link, SUITE.capacities, seeds_of(k, 1))]
     assert [row["qoi"] for row in again] == mine
 
 
@@ -165,7 +180,7 @@ def test_a_run_that_goes_on_ends_like_one_that_never_stopped() -> None:
     validations(dataclasses.replace(TINY, name="cut", steps=6_000))
     assert validations(dataclasses.replace(TINY, name="cut", resume=True)) == whole
     agents = [Path(f"runs/{name}/seed-0/model.safetensors") for name in ("whole", "cut")]
-    memories = [weights.read(agent)[0].memory() for agent in agents]
+    memories = [weights.read(agent)[0].parameters() for agent in agents]
     assert (memories[0] == memories[1]).all()
 
 
@@ -175,7 +190,7 @@ def test_ppo_shares_weights_over_robots_and_its_agent_needs_no_torch() -> None:
     assert env.num_envs == 4 and env.envs.rows.capacity == 4  # two cells of two robots, at the middle L
     train.main(PPO)
     folder = Path("runs/tiny")
-    rows = read_rows(folder / "rows.csv", benchmark.ROWS)
+    rows = read_rows(folder / "rows.csv", TASK.layout)
     assert {row["capacity"] for row in rows if row["policy"] == "agent (seed 0)"} == {3, 4}
     agent, noted = weights.read(folder / "model.safetensors")
     assert agent.widths == (8, 8) and noted["algo"] == "maskable-ppo"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from bufgym import files, policies
-from bufgym.benchmark.run import best, draw
-from bufgym.benchmark.sweep import cell
+from bufgym.benchmark.bound import best
+from bufgym.benchmark.run import by_trace, draw
 from bufgym.model import qoi
 from bufgym.oracle import integer, law
 from bufgym.policies import weights
@@ -59,7 +59,7 @@ def test_its_regret_in_interruptions_is_what_its_file_says(name: str) -> None:
 def test_motion_is_worth_something_on_fading_links() -> None:
     """Four test links of lte-v1 with camera motion, L = 15: with odometry < on time alone < AFR's regret."""
     scenario = suites.get("lte-v1").settings("test")["motion"].scenario
-    episodes = [draw(cell(scenario, trace), seed=1) for trace in range(4)]
+    episodes = [draw(link, seed=1) for _, link in by_trace(scenario)[:4]]
     most = sum(best(episode, 15, scenario).qoi for episode in episodes)
 
     def regret(name: str) -> float:

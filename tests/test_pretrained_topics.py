@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from bufgym import files, policies
-from bufgym.benchmark.topics import run_parts, suite_parts
+from bufgym.benchmark.run import by_trace, run
 from bufgym.policies import weights
 from bufgym.scenario import suites
 
@@ -27,11 +27,9 @@ def test_its_file_is_small_and_tells_how_it_was_made() -> None:
 @pytest.mark.slow
 def test_on_the_first_test_episode_of_each_setting_it_is_what_its_file_says_and_above_robofleet() -> None:
     """Weighted QoI as noted and larger; the first topics no older; no message lost that may not be."""
-    parts = [part._replace(seeds=part.seeds[:1]) for part in suite_parts(SUITE, "test")]
-    first = {}
-    for part in parts:
-        first.setdefault(part.scenario, part)
-    rows = run_parts([policies.get("learned-scheduler"), policies.get("robofleet")], list(first.values()), (32,))
+    rivals = [policies.get("learned-scheduler"), policies.get("robofleet")]
+    first = {label: by_trace(setting.scenario)[0][1] for label, setting in SUITE.settings("test").items()}
+    rows = [row for label, client in first.items() for row in run(rivals, client, (32,), [0], label=label)]
     noted = weights.read_any(SHIPPED["learned-scheduler"])[1]["weighted_qoi"]
     ages = dict.fromkeys(("learned-scheduler", "robofleet"), 0.0)
     for scenario in first:

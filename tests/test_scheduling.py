@@ -27,6 +27,7 @@ from bufgym.model import qoi  # noqa: E402
 from bufgym.model.topics import Topic  # noqa: E402
 from bufgym.policies import learned_topics, weights  # noqa: E402
 from bufgym.scenario import Client, Stream, suites  # noqa: E402
+from bufgym.scenario.suites import Setting  # noqa: E402
 from bufgym.sim import run  # noqa: E402
 from bufgym.sim.metrics import topic_outcomes  # noqa: E402
 from bufgym.traces import Trace  # noqa: E402
@@ -230,14 +231,15 @@ def test_seeds_repeat_themselves_and_differ(short_episodes: None) -> None:
 def test_a_run_leaves_an_agent_and_a_table(
     short_episodes: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Through ``train.main``; the test split as few seconds of one setting."""
+    """Through ``train.main``; the test split as few seconds of one setting on one link."""
     suite = suites.get("topics-v1")
-    true_parts = topics.benchmark.suite_parts
 
-    def short(suite: Any, split: str, seeds: int | None) -> Any:
-        return true_parts(suite, split, seeds, duration_s=3.0)[:1]
+    def short(split: str, data: Path | None) -> dict[str, Setting]:
+        label, setting = next(iter(suite.settings(split, data).items()))
+        client = dataclasses.replace(setting.scenario, duration_s=3.0, traces=setting.scenario.traces[:1])
+        return {label: dataclasses.replace(setting, scenario=client)} if split == "test" else suite.build(split, data)
 
-    monkeypatch.setattr(topics.benchmark, "suite_parts", short)
+    monkeypatch.setitem(suites.SUITES, suite.name, dataclasses.replace(suite, build=short))
     train.main(dataclasses.replace(TINY, steps=1_000))
     home = Path("runs/tiny")
     printed = capsys.readouterr().out
