@@ -139,19 +139,19 @@ def begin(scorer: Scorer, which: int, scratch: Scratch) -> float:
 def score(scorer: Scorer, which: int, common: float, k: int, scratch: Scratch) -> float:
     """The score of candidate ``k`` (L: the newcomer) by network ``which``, whose ``begin`` gave ``common``."""
     net = scorer.networks[which * scorer.size : (which + 1) * scorer.size]
-    f, h = scratch.f, scratch.h
-    n, c, first, second = len(f), scorer.context, scorer.first, scorer.second
-    for i in range(c, n):
-        f[i] = scratch.rows[int(scorer.fields[i]), k]
+    n, c, first, second = len(scorer.fields), scorer.context, scorer.first, scorer.second
+    h, slot, own_fields = scratch.h, scratch.f[c:], scorer.fields[c:]
+    for i in range(n - c):
+        slot[i] = scratch.rows[int(own_fields[i]), k]
     own = 0.0
     for i in range(n - c):
-        own += scratch.skip[i] * f[c + i]
+        own += scratch.skip[i] * slot[i]
     weights, sums, width = n + 1, first, first
     for o in range(first):
-        h[sums + o] = h[o]
-    for i in range(c, n):
+        h[first + o] = h[o]
+    for i in range(n - c):
         for o in range(first):
-            h[sums + o] += f[i] * net[weights + i * first + o]
+            h[first + o] += slot[i] * net[weights + (c + i) * first + o]
     if first > 0:
         weights += (n + 1) * first
     if second > 0:
