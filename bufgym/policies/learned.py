@@ -27,7 +27,18 @@ from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.observe import CONTEXT_FIELDS, FIELDS, SLOT_FIELDS, observe_context, observe_slots
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.scoring import DROP, KEEP, Network, ScorerWeights, begin, divide, read_context, score, unpack
+from bufgym.policies.scoring import (
+    DROP,
+    KEEP,
+    Network,
+    ScorerWeights,
+    begin,
+    divide,
+    end_of,
+    read_context,
+    score,
+    unpack,
+)
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 
@@ -43,9 +54,8 @@ arrival of an interruption on (1/16), or 41 arrivals after a link that kept up h
 def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The decision that scores highest."""
     s, L = len(buffer.slots), buffer.capacity
-    scorer = unpack(buffer.parameters, 0, 2)
-    if scorer.end < len(buffer.parameters) and buffer.service_ratio < STILL:
-        scorer = unpack(buffer.parameters, scorer.end, 2)
+    at = end_of(buffer.parameters, 0, 2) if buffer.service_ratio < STILL else 0
+    scorer = unpack(buffer.parameters, at if at < len(buffer.parameters) else 0, 2)
     scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
     observe_context(buffer, arrival, scratch.context)
     observe_slots(buffer, arrival, scratch.rows)

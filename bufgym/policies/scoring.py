@@ -40,11 +40,11 @@ class Scorer(NamedTuple):
     fields: NDArray[np.float64]
     """[inputs]: where each field stands in the observation of its kind, the context's fields first."""
     networks: NDArray[np.float64]
-    """[networks, numbers]: skip and b; W1 (a row for each input) and b1; W2 and b2; w."""
+    """One after another, ``size`` numbers each: skip and b; W1 (a row for each input) and b1; W2 and b2; w."""
+    size: int
+    """Numbers of one network."""
     mix: NDArray[np.float64]
     """[context fields, slot fields], or nothing."""
-    end: int
-    """Where these parameters end."""
 
 
 class Scratch(NamedTuple):
@@ -73,16 +73,23 @@ def network_size(inputs: int, first: int, second: int) -> int:
 
 
 @kernel
+def end_of(parameters: NDArray[np.float64], begin: int, networks: int) -> int:
+    """Where the parameters of a scorer of so many networks end that begin at ``begin``."""
+    inputs, context = int(parameters[begin]), int(parameters[begin + 1])
+    size = network_size(inputs, int(parameters[begin + 2]), int(parameters[begin + 3]))
+    return begin + HEADER + inputs + networks * size + int(parameters[begin + 4]) * context * (inputs - context)
+
+
+@kernel
 def unpack(parameters: NDArray[np.float64], begin: int, networks: int) -> Scorer:
     """The scorer of so many networks whose parameters begin at ``begin``."""
     inputs, context = int(parameters[begin]), int(parameters[begin + 1])
     first, second = int(parameters[begin + 2]), int(parameters[begin + 3])
     size = network_size(inputs, first, second)
     nets = begin + HEADER + inputs
-    mix = nets + networks * size
-    end = mix + int(parameters[begin + 4]) * context * (inputs - context)
-    table = parameters[nets:mix].reshape((networks, size))
-    return Scorer(context, first, second, parameters[begin + HEADER : nets], table, parameters[mix:end], end)
+    mix, end = nets + networks * size, end_of(parameters, begin, networks)
+    fields = parameters[begin + HEADER : nets]
+    return Scorer(context, first, second, fields, parameters[nets:mix], size, parameters[mix:end])
 
 
 @kernel
@@ -106,7 +113,8 @@ def read_context(scorer: Scorer, scratch: Scratch) -> None:
 @kernel
 def begin(scorer: Scorer, which: int, scratch: Scratch) -> float:
     """What the context adds to every score by network ``which``; its part of the first layer goes to ``scratch.h``."""
-    net, f, h, skip = scorer.networks[which], scratch.f, scratch.h, scratch.skip
+    net = scorer.networks[which * scorer.size : (which + 1) * scorer.size]
+    f, h, skip = scratch.f, scratch.h, scratch.skip
     n, c, first = len(f), scorer.context, scorer.first
     for i in range(n - c):
         skip[i] = net[c + i]
@@ -130,19 +138,20 @@ def begin(scorer: Scorer, which: int, scratch: Scratch) -> float:
 @kernel
 def score(scorer: Scorer, which: int, common: float, k: int, scratch: Scratch) -> float:
     """The score of candidate ``k`` (L: the newcomer) by network ``which``, whose ``begin`` gave ``common``."""
-    net, f, h = scorer.networks[which], scratch.f, scratch.h
-    n, c, first, second = len(f), scorer.context, scorer.first, scorer.second
-    for i in range(c, n):
-        f[i] = scratch.rows[int(scorer.fields[i]), k]
+    net = scorer.networks[which * scorer.size : (which + 1) * scorer.size]
+    n, c, first, second = len(scorer.fields), scorer.context, scorer.first, scorer.second
+    h, slot, own_fields = scratch.h, scratch.f[c:], scorer.fields[c:]
+    for i in range(n - c):
+        slot[i] = scratch.rows[int(own_fields[i]), k]
     own = 0.0
     for i in range(n - c):
-        own += scratch.skip[i] * f[c + i]
+        own += scratch.skip[i] * slot[i]
     weights, sums, width = n + 1, first, first
     for o in range(first):
-        h[sums + o] = h[o]
-    for i in range(c, n):
+        h[first + o] = h[o]
+    for i in range(n - c):
         for o in range(first):
-            h[sums + o] += f[i] * net[weights + i * first + o]
+            h[first + o] += slot[i] * net[weights + (c + i) * first + o]
     if first > 0:
         weights += (n + 1) * first
     if second > 0:
