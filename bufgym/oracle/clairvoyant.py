@@ -8,9 +8,8 @@ a message waits. Rejecting all other messages at their arrival keeps the queue s
 
     s_i - c_i <= L b.
 
-``labels.py`` finds the best set under that condition. With unequal sizes the room left depends on which messages wait;
-the condition is relaxed to one that every set within L messages and B bytes satisfies, and the result is an upper
-bound.
+``labels.py`` finds the best set under that condition. With unequal sizes the room left depends on which messages wait:
+``unequal.py`` finds a good set and an upper bound that is close to it.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ from numpy.typing import NDArray
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
 from bufgym.model.qoi import Value
-from bufgym.oracle import labels
+from bufgym.oracle import labels, unequal
+from bufgym.oracle.priced import Problem
 from bufgym.policies.registry import register
 from bufgym.scenario import Episode
 
@@ -34,7 +34,7 @@ class Plan:
     """The clairvoyant's decisions for one episode."""
 
     qoi: float
-    """The best H: no policy with this L and B reaches more."""
+    """The best H, or an upper bound of it: no policy with this L and B reaches more."""
     kept: NDArray[np.bool_]
     """bool[messages]: which to accept; the others are rejected at their arrival."""
     certified: bool
@@ -53,13 +53,13 @@ def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | N
     c = episode.link.carried_by(arrivals["arrival_us"])
     size, x = np.ascontiguousarray(arrivals["size_bytes"]), np.ascontiguousarray(arrivals["x"])
     most_bytes = UNLIMITED_BYTES if max_bytes is None else max_bytes
-    limit = np.empty(n, np.int64)
+    ends = episode.link.carries_bytes
     if (size == size[0]).all():
         room = min(capacity, most_bytes // int(size[0]))
-        limit[:] = room * size[0] if room else labels.NEVER
+        limit = np.full(n, room * size[0] if room else labels.NEVER)
+        sent, gain = labels.best(c, size, limit, x, v.array, ends)
     else:
-        _relaxed_limits(c, size, capacity, most_bytes, np.empty(n, np.int64), np.empty(capacity, np.int64), limit)
-    sent, gain = labels.best(c, size, limit, x, v.array, episode.link.carries_bytes)
+        sent, gain = unequal.best(_unequal(c, size, x, v.array, ends, capacity, most_bytes))
     kept = np.zeros(n, np.bool_)
     kept[sent] = True
     qoi = 1.0 + gain if len(sent) else 0.0
@@ -69,6 +69,25 @@ def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | N
     undecided = ~kept
     undecided[episode.first_decision : episode.last_decision + 1] = False
     return Plan(qoi, kept, reached and fits and not undecided.any())
+
+
+def _unequal(
+    c: NDArray[np.int64],
+    size: NDArray[np.int64],
+    x: NDArray[np.float64],
+    v: NDArray[np.float64],
+    ends: int,
+    capacity: int,
+    max_bytes: int,
+) -> Problem:
+    """The episode for ``unequal``."""
+    n = len(c)
+    limit, between, idle = (np.empty(n, np.int64) for _ in range(3))
+    _relaxed_limits(c, size, capacity, max_bytes, np.empty(n, np.int64), np.empty(capacity, np.int64), limit)
+    # Where no more bytes wait than the L smallest messages have, fewer than L wait.
+    certain = np.minimum(np.minimum(limit, np.sort(size)[:capacity].sum()), max_bytes - size)
+    labels.find_idle(c, size, limit, certain, between, idle)
+    return Problem(c, size, limit, x, v, ends, between, idle, capacity, max_bytes)
 
 
 @kernel

@@ -16,8 +16,7 @@ nothing else could have been sent in time.
 known to be reachable can be dropped. The search first assumes that the optimum lies close to the upper bound; if it
 finds nothing there, it looks further down, at last from the gain of a plan that ``future`` itself has led to.
 
-Messages of unequal sizes end at arbitrary bytes, so that labels rarely dominate each other: there ``future`` on a fine
-grid is the answer itself, an upper bound.
+Sizes are equal here. For others see ``unequal``.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ from bufgym.model.qoi import value
 NEVER = -1
 """As a limit: there is never room for the message."""
 
-GRID, FINE_GRID = 16, 256
-"""Grid steps to a mean message: where labels find the optimum, and where the grid itself gives the bound."""
+GRID = 16
+"""Grid steps to a message."""
 
 MAX_CELLS = 1 << 23
 """Entries of ``future`` at most (8 bytes each); a coarser grid then does."""
@@ -104,19 +103,16 @@ def best(
     v: NDArray[np.float64],
     ends: int,
 ) -> tuple[NDArray[np.int64], float]:
-    """(messages of the best plan in order, its gain: H - 1); with unequal sizes a good plan and an upper bound."""
+    """(messages of the best plan in order, its gain: H - 1)."""
     n = len(c)
-    equal = bool((size == size[0]).all())
     furthest = max(0, int((limit + size).max()))
-    grid = max(1, int(size.mean()) // (GRID if equal else FINE_GRID), furthest * n // MAX_CELLS)
+    grid = max(1, int(size[0]) // GRID, furthest * n // MAX_CELLS)
     between, idle, guide = np.empty((3, n), np.int64)
     problem = Problem(c, size, limit, x, v, ends, between, idle, grid, np.zeros((n, furthest // grid + 2)))
-    find_idle(problem)
+    find_idle(c, size, limit, limit, between, idle)
     find_future(problem)
     length, low = guided(problem, guide)
     high = most(problem)
-    if not equal:
-        return guide[:length], high
     labels = no_labels(n)
     for share in SHARES:
         enough = high - share * (high - low)
@@ -162,14 +158,21 @@ def plan_of(labels: Labels) -> tuple[NDArray[np.int64], float]:
 
 
 @kernel
-def find_idle(p: Problem) -> None:
-    """Fill ``between`` and ``idle``."""
-    for i in range(len(p.c)):
+def find_idle(
+    c: NDArray[np.int64],
+    size: NDArray[np.int64],
+    limit: NDArray[np.int64],
+    certain: NDArray[np.int64],
+    between: NDArray[np.int64],
+    idle: NDArray[np.int64],
+) -> None:
+    """Fill ``between`` and ``idle`` (see ``Problem``); a message that waits for ``certain`` bytes surely finds room."""
+    for i in range(len(c)):
         m = i - 1
-        while m >= 0 and (p.limit[m] < 0 or p.c[m] + p.size[m] > p.c[i]):
+        while m >= 0 and (limit[m] < 0 or c[m] + size[m] > c[i]):
             m -= 1
-        p.between[i] = m
-        p.idle[i] = min(p.c[i] - p.size[m], p.c[m] + p.limit[m]) if m >= 0 else -1
+        between[i] = m
+        idle[i] = min(c[i] - size[m], c[m] + certain[m]) if m >= 0 else -1
 
 
 @kernel

@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import records
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy
 from bufgym.scenario.fleet import FleetEpisode, check_robots
 from bufgym.sim.senders import Senders
-from bufgym.sim.shared_link import CELL, Shares, load_cell
+from bufgym.sim.shared_link import load_cell, new_shares
 
 
 class Fleet:
@@ -27,10 +26,7 @@ class Fleet:
                 f"a fleet of {self.robots} robots needs a multiple of that many senders, of one queue each"
             )
         self.senders = senders
-        cells = len(senders) // self.robots
-        self.shares = Shares(
-            records(cells, CELL), np.zeros((cells, self.robots), np.int64), np.zeros((cells, self.robots), np.int64)
-        )
+        self.shares = new_shares(len(senders) // self.robots, self.robots)
 
     def __len__(self) -> int:
         return len(self.shares.cells)

@@ -80,7 +80,10 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
         return False
     slot = at(batch.slots, i, sender.first + k)
     arrival = at(batch.arrivals, i, sender.next)
-    if no_drop(batch, i, slot.topic) or (slot.topic != arrival.topic and at_limit(batch, i, arrival.topic)):
+    if sender.topics > 1 and (
+        at(batch.topics, i, slot.topic).no_drop == 1
+        or (slot.topic != arrival.topic and at_limit(batch, i, arrival.topic))
+    ):
         return False
     return bool(sender.backlog_bytes - slot.size_bytes + arrival.size_bytes <= sender.max_bytes)
 

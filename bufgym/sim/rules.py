@@ -163,11 +163,12 @@ def refuge(batch: Batch, i: int) -> int:
 def sendable(batch: Batch, i: int, k: int) -> bool:
     """Whether slot ``k`` may be sent by the window and, where rate limits hold back at the socket, by its own."""
     sender = batch.senders[i]
-    topic = at(batch.slots, i, sender.first + k).topic
     full = sender.dequeued - sender.acked >= sender.window
-    if full and not (sender.flush_no_drop == 1 and no_drop(batch, i, topic)):
+    if sender.topics == 1:
+        return not full
+    rules = at(batch.topics, i, at(batch.slots, i, sender.first + k).topic)
+    if full and not (sender.flush_no_drop == 1 and rules.no_drop == 1):
         return False
-    rules = at(batch.topics, i, topic if sender.topics > 1 else 0)  # a single queue's row has no period
     held_back = (
         sender.limit_at_send == 1 and rules.dequeued > 0 and sender.now_us - rules.last_dequeue_us < rules.period_us
     )

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import records
-from bufgym.model.buffer import MESSAGE, TOPIC, UNLIMITED_BYTES, check_limits, row_width
+from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.link import Knots
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, copies_of, topic_table
@@ -19,12 +18,16 @@ from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode
 from bufgym.sim.rollout import roll_out
 from bufgym.sim.shared_link import Shares
-from bufgym.sim.state import LOG_ENTRY, SENDER, Batch
+from bufgym.sim.state import new_batch
 from bufgym.sim.transition import load_row
 
 
 class Senders:
-    """A batch of n senders that share L, B and V, each with an episode of its own."""
+    """A batch of n senders that share L, B and V, each with an episode of its own.
+
+    ``capacity`` (L, messages), ``max_bytes`` (B), ``decide_at``, ``value`` (V) and ``topics`` are its settings, ``batch``
+    its arrays (see ``Batch``), ``episodes`` what each sender has loaded: None before it is.
+    """
 
     def __init__(
         self,
@@ -37,7 +40,7 @@ class Senders:
         decide_at: str = "arrival",
         topics: Sequence[Topic] = (),
     ) -> None:
-        """n senders with room for L = ``capacity`` messages (and B = ``max_bytes`` bytes), without episodes yet.
+        """n senders with room for L = ``capacity`` messages (and B = ``max_bytes`` bytes), without episodes so far.
 
         ``topics``: the rules of each topic, by the topic numbers of the messages; none for one queue without rules.
         """
@@ -52,17 +55,7 @@ class Senders:
         self._topic_table, values = topic_table(self.topics, self.capacity, v)
         self.episodes: list[Episode | None] = [None] * n
         self._knots = Knots()
-        self.batch = Batch(
-            records(n, SENDER),
-            records((n, row_width(self.capacity)), MESSAGE),
-            records((n, max_messages), MESSAGE),
-            records((n, max_messages), LOG_ENTRY),
-            np.zeros((n, max_messages), np.int64),
-            self._knots.us,
-            self._knots.bytes,
-            values,
-            records((n, len(self._topic_table)), TOPIC),
-        )
+        self.batch = new_batch(n, self.capacity, max_messages, len(self._topic_table), values)
 
     def __len__(self) -> int:
         return len(self.episodes)
@@ -135,7 +128,10 @@ def run(
     memory: NDArray[np.float64] | None = None,
     topics: Sequence[Topic] = (),
 ) -> Senders:
-    """The senders after ``policy`` met each of ``episodes``, one sender each; an unbounded policy has L = all."""
+    """The senders after ``policy`` ran through each of ``episodes``, one sender each.
+
+    The queue of an unbounded policy has room for all messages, whatever ``capacity`` says.
+    """
     if not episodes:
         raise BufgymError("no episode to run")
     if policy.client.encoding:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.documented import documented
-from bufgym.kernel import kernel
+from bufgym.kernel import kernel, records
 from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.decisions import arrive
 from bufgym.sim.socket import finish_transmission, next_size_bytes
@@ -62,11 +62,16 @@ class Shares(NamedTuple):
     """int64[cells, N]: when the next message arrives, us; FOREVER after the last."""
 
 
+def new_shares(cells: int, robots: int) -> Shares:
+    """The arrays of so many cells with N = ``robots`` each."""
+    numbers = np.zeros((cells, robots), np.int64)
+    return Shares(records(cells, CELL), numbers, numbers.copy())
+
+
 @functools.cache
 def shares_type() -> Any:
     """Numba's type of ``Shares``."""
-    array, table = numba.types.Array, numba.types.Array(numba.types.int64, 2, "C")
-    return cast(Any, numba.types).NamedTuple((array(numba.from_dtype(CELL), 1, "C"), table, table), Shares)
+    return cast(Any, numba).typeof(new_shares(1, 1))
 
 
 @kernel

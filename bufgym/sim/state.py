@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.documented import documented
-from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC
+from bufgym.kernel import records
+from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC, row_width
+from bufgym.model.qoi import exponential
 
 END, DEPARTURE, DECISION, DEQUEUE, SEND = range(5)
 """Events of a sender (see the package's text)."""
@@ -133,29 +135,25 @@ class Batch(NamedTuple):
     """float64[parameters], read-only: those of the policy at hand, which ``view`` shows it."""
 
 
+def new_batch(n: int, capacity: int, messages: int, topics: int, v: NDArray[np.float64]) -> Batch:
+    """The arrays of n senders of at most L = ``capacity`` queued and ``messages`` arriving messages; no traces yet."""
+    return Batch(
+        records(n, SENDER),
+        records((n, row_width(capacity)), MESSAGE),
+        records((n, messages), MESSAGE),
+        records((n, messages), LOG_ENTRY),
+        np.zeros((n, messages), np.int64),
+        np.zeros(0, np.int64),
+        np.zeros(0, np.int64),
+        v,
+        records((n, topics), TOPIC),
+    )
+
+
 @functools.cache
 def batch_type() -> Any:
     """Numba's type of a ``Batch``."""
-    array, int_ = numba.types.Array, numba.types.int64
-    record = {
-        name: numba.from_dtype(dtype) for name, dtype in (("s", SENDER), ("m", MESSAGE), ("f", LOG_ENTRY), ("t", TOPIC))
-    }
-    ints, constants = array(int_, 1, "C"), array(numba.types.float64, 1, "C", readonly=True)
-    return cast(Any, numba.types).NamedTuple(
-        (
-            array(record["s"], 1, "C"),
-            array(record["m"], 2, "C"),
-            array(record["m"], 2, "C"),
-            array(record["f"], 2, "C"),
-            array(int_, 2, "C"),
-            ints,
-            ints,
-            constants,
-            array(record["t"], 2, "C"),
-            constants,
-        ),
-        Batch,
-    )
+    return cast(Any, numba).typeof(new_batch(1, 1, 1, 1, exponential().array))
 
 
 def named(batch: Batch) -> Batch:

@@ -1,0 +1,126 @@
+"""A good plan for messages of unequal sizes: beam search along the episode, guided by the priced programme.
+
+For each message a few *states* are kept: ways to send it last, each with the byte at which it ends, its gain, and the
+message and state before it. So the queue that a later arrival meets is known exactly: those messages of the state that
+have not begun by then. States are ranked by what they have gained, less what they paid, plus what the programme
+(``priced``) promises.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.kernel import kernel
+from bufgym.model.qoi import value
+from bufgym.oracle.priced import Problem, Programme, ends_too_early, waiting_cost
+
+
+class States(NamedTuple):
+    """The states at each message, best first; arrays over [messages, width]."""
+
+    count: NDArray[np.int64]
+    """[messages]: states in use."""
+    end: NDArray[np.int64]
+    """The byte at which the message ends."""
+    gain: NDArray[np.float64]
+    net: NDArray[np.float64]
+    """The gain, less the prices paid."""
+    promise: NDArray[np.float64]
+    """``net``, and what may still be gained: the rank of the state."""
+    parent: NDArray[np.int64]
+    """[messages, width, 2]: the message sent before, and its state; -1: none."""
+    latest: NDArray[np.int64]
+    """[messages]: the latest end of any state at this message or one before it."""
+
+
+def new_states(messages: int, width: int) -> States:
+    """Room for so many states."""
+    shape = (messages, width)
+    return States(
+        np.zeros(messages, np.int64),
+        np.zeros(shape, np.int64),
+        np.zeros(shape),
+        np.zeros(shape),
+        np.zeros(shape),
+        np.zeros((*shape, 2), np.int64),
+        np.zeros(messages, np.int64),
+    )
+
+
+@kernel
+def search(p: Problem, d: Programme, states: States, plan: NDArray[np.int64]) -> tuple[int, float]:
+    """(length, gain) of the best plan found; its messages go to ``plan``, the last one first."""
+    best_gain, best_message, best_state = 0.0, -1, -1
+    for j in range(len(p.c)):
+        states.count[j] = 0
+        states.latest[j] = states.latest[j - 1] if j > 0 else 0
+        if p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
+            continue
+        if p.between[j] < 0:
+            offer(p, d, states, j, -1, 0)
+        for i in range(j - 1, -1, -1):
+            if ends_too_early(p, i, states.latest[i], j):
+                break
+            for w in range(states.count[i]):
+                offer(p, d, states, j, i, w)
+        for w in range(states.count[j]):
+            states.latest[j] = max(states.latest[j], states.end[j, w])
+            if best_message < 0 or states.gain[j, w] > best_gain:
+                best_gain, best_message, best_state = states.gain[j, w], j, w
+    length = 0
+    i, w = best_message, best_state
+    while i >= 0:
+        plan[length] = i
+        length += 1
+        i, w = states.parent[i, w, 0], states.parent[i, w, 1]
+    return length, best_gain
+
+
+@kernel
+def offer(p: Problem, d: Programme, states: States, j: int, i: int, w: int) -> None:
+    """Send message j after state ``w`` of message i (-1: first of all), if it finds room and is among the best."""
+    e = states.end[i, w] if i >= 0 else 0
+    s = max(e, p.c[j])
+    if s - p.c[j] > p.limit[j] or s + p.size[j] > p.ends:
+        return
+    if i >= 0 and (ends_too_early(p, i, e, j) or not has_room(p, states, i, w, j)):
+        return
+    added = value(p.v, p.x[j] - p.x[i]) if i >= 0 else 0.0
+    net = added + (states.net[i, w] if i >= 0 else 0.0)
+    if s > p.c[j]:
+        net -= waiting_cost(p, d, j, s // d.grid)
+    end = s + p.size[j]
+    promise = net + d.future[j, end // d.grid - p.c[j] // d.grid]
+    k, width = states.count[j], states.end.shape[1]
+    if k == width and promise <= states.promise[j, k - 1]:
+        return
+    for other in range(k):
+        if states.end[j, other] == end and states.net[j, other] == net:
+            return  # the same by all that ranks it
+    k = min(k, width - 1)
+    states.count[j] = k + 1
+    while k > 0 and states.promise[j, k - 1] < promise:
+        states.end[j, k], states.gain[j, k] = states.end[j, k - 1], states.gain[j, k - 1]
+        states.net[j, k], states.promise[j, k] = states.net[j, k - 1], states.promise[j, k - 1]
+        states.parent[j, k, 0], states.parent[j, k, 1] = states.parent[j, k - 1, 0], states.parent[j, k - 1, 1]
+        k -= 1
+    states.end[j, k], states.net[j, k], states.promise[j, k] = end, net, promise
+    states.gain[j, k] = added + (states.gain[i, w] if i >= 0 else 0.0)
+    states.parent[j, k, 0], states.parent[j, k, 1] = i, w
+
+
+@kernel
+def has_room(p: Problem, states: States, i: int, w: int, j: int) -> bool:
+    """Whether message j fits into the queue that state ``w`` of message i has left, by messages and by bytes."""
+    queued, backlog = 1, p.size[j]
+    # Messages began in the order in which they were sent: those that wait still are the last ones.
+    while i >= 0 and states.end[i, w] - p.size[i] > p.c[j]:
+        queued += 1
+        backlog += p.size[i]
+        if queued > p.capacity or backlog > p.max_bytes:
+            return False
+        i, w = states.parent[i, w, 0], states.parent[i, w, 1]
+    return queued <= p.capacity and backlog <= p.max_bytes
