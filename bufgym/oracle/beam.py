@@ -21,7 +21,7 @@ from bufgym.oracle.priced import Problem, Programme, ends_too_early, waiting_cos
 class States(NamedTuple):
     """The states at each message, best first; arrays over [messages, width]."""
 
-    count: NDArray[np.int64]
+    used: NDArray[np.int64]
     """[messages]: states in use."""
     end: NDArray[np.int64]
     """The byte at which the message ends."""
@@ -55,7 +55,7 @@ def search(p: Problem, d: Programme, states: States, plan: NDArray[np.int64]) ->
     """(length, gain) of the best plan found; its messages go to ``plan``, the last one first."""
     best_gain, best_message, best_state = 0.0, -1, -1
     for j in range(len(p.c)):
-        states.count[j] = 0
+        states.used[j] = 0
         states.latest[j] = states.latest[j - 1] if j > 0 else 0
         if p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
             continue
@@ -64,9 +64,9 @@ def search(p: Problem, d: Programme, states: States, plan: NDArray[np.int64]) ->
         for i in range(j - 1, -1, -1):
             if ends_too_early(p, i, states.latest[i], j):
                 break
-            for w in range(states.count[i]):
+            for w in range(states.used[i]):
                 offer(p, d, states, j, i, w)
-        for w in range(states.count[j]):
+        for w in range(states.used[j]):
             states.latest[j] = max(states.latest[j], states.end[j, w])
             if best_message < 0 or states.gain[j, w] > best_gain:
                 best_gain, best_message, best_state = states.gain[j, w], j, w
@@ -94,14 +94,14 @@ def offer(p: Problem, d: Programme, states: States, j: int, i: int, w: int) -> N
         net -= waiting_cost(p, d, j, s // d.grid)
     end = s + p.size[j]
     promise = net + d.future[j, end // d.grid - p.c[j] // d.grid]
-    k, width = states.count[j], states.end.shape[1]
+    k, width = states.used[j], states.end.shape[1]
     if k == width and promise <= states.promise[j, k - 1]:
         return
     for other in range(k):
         if states.end[j, other] == end and states.net[j, other] == net:
             return  # the same by all that ranks it
     k = min(k, width - 1)
-    states.count[j] = k + 1
+    states.used[j] = k + 1
     while k > 0 and states.promise[j, k - 1] < promise:
         states.end[j, k], states.gain[j, k] = states.end[j, k - 1], states.gain[j, k - 1]
         states.net[j, k], states.promise[j, k] = states.net[j, k - 1], states.promise[j, k - 1]

@@ -111,7 +111,7 @@ def best(
     problem = Problem(c, size, limit, x, v, ends, between, idle, grid, np.zeros((n, furthest // grid + 2)))
     find_idle(c, size, limit, limit, between, idle)
     find_future(problem)
-    length, low = guided(problem, guide)
+    _, low = guided(problem, guide)
     high = most(problem)
     labels = no_labels(n)
     for share in SHARES:

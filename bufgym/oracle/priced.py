@@ -63,13 +63,14 @@ class Programme(NamedTuple):
 @kernel
 def waiting_cost(p: Problem, d: Programme, j: int, step: int) -> float:
     """What message j pays for waiting until it begins at this grid step."""
-    return max(0.0, d.price[0, step] - d.before[0, j]) + p.size[j] * max(0.0, d.price[1, step] - d.before[1, j])
+    message, byte = d.price[0, step] - d.before[0, j], d.price[1, step] - d.before[1, j]
+    return float(max(0.0, message) + p.size[j] * max(0.0, byte))
 
 
 @kernel
 def ends_too_early(p: Problem, i: int, e: int, j: int) -> bool:
     """Whether another message is worth sending between message i, which ends at byte e, and message j."""
-    return p.between[j] > i and e <= p.idle[j]
+    return bool(p.between[j] > i and e <= p.idle[j])
 
 
 @kernel
