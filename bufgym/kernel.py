@@ -91,79 +91,80 @@ def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     return zeros if JIT else zeros.view(np.recarray)
 
 
-# What follows works on places of arrays that exist, as kernels do: indices are >= 0 and slices lie inside. Numba's own
-# indexing looks at the sign of every index and at the ends of every slice, a fifth of the instructions of a rollout.
+# What follows works on elements that exist: indices are >= 0 and slices lie inside the array. Numba's own
+# indexing checks the sign of every index and the ends of every slice, which is a fifth of a rollout's instructions.
 
 
-def _place(context: Any, builder: Any, kind: Any, array: Any, indices: Any) -> Any:
-    """LLVM's pointer to the element of ``array``, of Numba type ``kind``, at ``indices``."""
+def item(array: NDArray[Any], k: int) -> Any:
+    """``array[k]``."""
+    return array[k]
+
+
+def at(array: NDArray[Any], i: int, k: int) -> Any:
+    """``array[i, k]``."""
+    return array[i, k]
+
+
+def stretch(array: NDArray[Any], i: int, first: int, length: int) -> Any:
+    """``array[i, first : first + length]`` of an array in C order."""
+    return array[i, first : first + length]
+
+
+def prefetch(array: NDArray[Any], i: int, k: int) -> None:
+    """Ask the processor to fetch ``array[i, k]`` into its cache, without waiting for it; nothing in plain Python."""
+
+
+def _place(context: Any, builder: Any, signature: Any, arguments: Any, indices: Any) -> Any:
+    """LLVM's pointer to the element of the first argument, an array, at ``indices``."""
     from numba.core import cgutils
 
-    view = context.make_array(kind)(context, builder, array)
+    kind = signature.args[0]
+    view = context.make_array(kind)(context, builder, arguments[0])
     return cast(Any, cgutils).get_item_pointer(context, builder, kind, view, list(indices), wraparound=False)
 
 
 def _read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """LLVM's code of ``item`` and ``at``."""
     from numba.np import arrayobj
 
-    kind, array = signature.args[0], arguments[0]
-    place = _place(context, builder, kind, array, arguments[1:])
-    return cast(Any, arrayobj).load_item(context, builder, kind, place)
+    place = _place(context, builder, signature, arguments, arguments[1:])
+    return cast(Any, arrayobj).load_item(context, builder, signature.args[0], place)
 
 
-def _item(typing_context: Any, array: Any, k: Any) -> Any:
-    return array.dtype(array, k), _read
-
-
-def _at(typing_context: Any, array: Any, i: Any, k: Any) -> Any:
-    return array.dtype(array, i, k), _read
-
-
-def _stretch(typing_context: Any, array: Any, i: Any, first: Any, length: Any) -> Any:
+def _view(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """LLVM's code of ``stretch``."""
     from numba.np import arrayobj
 
-    row = array.copy(ndim=1)
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        whole = context.make_array(array)(context, builder, arguments[0])
-        place = _place(context, builder, array, arguments[0], arguments[1:3])
-        view = context.make_array(row)(context, builder)
-        size, shape = whole.itemsize, [arguments[3]]
-        cast(Any, arrayobj).populate_array(view, place, shape, [size], size, whole.meminfo, whole.parent)
-        return view._getvalue()
-
-    return row(array, i, first, length), generate
+    whole = context.make_array(signature.args[0])(context, builder, arguments[0])
+    place = _place(context, builder, signature, arguments, arguments[1:3])
+    view = context.make_array(signature.return_type)(context, builder)
+    size, shape = whole.itemsize, [arguments[3]]
+    cast(Any, arrayobj).populate_array(view, place, shape, [size], size, whole.meminfo, whole.parent)
+    return view._getvalue()
 
 
-def _unchecked(intrinsic: Callable[..., Any], python: Callable[..., Any]) -> Any:
-    """``intrinsic`` (a Numba intrinsic: a signature and its code), or the same in Python where nothing is compiled."""
-    return cast(Any, numba.extending).intrinsic(intrinsic) if JIT else python
-
-
-item: Any = _unchecked(_item, lambda array, k: array[k])
-"""``item(array, k)`` is ``array[k]``."""
-at: Any = _unchecked(_at, lambda array, i, k: array[i, k])
-"""``at(array, i, k)`` is ``array[i, k]``."""
-stretch: Any = _unchecked(_stretch, lambda array, i, first, length: array[i, first : first + length])
-"""``stretch(array, i, first, length)`` is ``array[i, first : first + length]``, for an array in C order."""
-
-
-def _prefetch(typing_context: Any, array: Any, i: Any, k: Any) -> Any:
-    """LLVM's prefetch of the place where ``array[i, k]`` lies (a Numba intrinsic: a signature and its code)."""
+def _hint(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """LLVM's code of ``prefetch``."""
     from llvmlite import ir
     from numba.core import cgutils
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        place = _place(context, builder, signature.args[0], arguments[0], arguments[1:])
-        number, byte = ir.IntType(32), ir.IntType(8).as_pointer()
-        hint = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
-        function = cast(Any, cgutils).get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")
-        # 1: it will be written; 3: keep it near; 1: data, not code
-        builder.call(function, [builder.bitcast(place, byte), number(1), number(3), number(1)])
-        return context.get_dummy_value()
-
-    return numba.types.void(array, i, k), generate
+    place = _place(context, builder, signature, arguments, arguments[1:])
+    number, byte = ir.IntType(32), ir.IntType(8).as_pointer()
+    hint = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+    function = cast(Any, cgutils).get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")
+    # 1: it will be written; 3: keep it near; 1: data, not code
+    builder.call(function, [builder.bitcast(place, byte), number(1), number(3), number(1)])
+    return context.get_dummy_value()
 
 
-prefetch: Any = _unchecked(_prefetch, lambda array, i, k: None)
-"""``prefetch(array, i, k)`` asks the processor to fetch ``array[i, k]`` into its cache, without waiting for it."""
+def _compile_as(function: Callable[..., Any], typer: Callable[..., Any], code: Callable[..., Any]) -> None:
+    """Numba compiles calls of ``function`` to ``code``; ``typer`` gives the type of the result."""
+    numba_ = cast(Any, numba)
+    numba_.extending.type_callable(function)(lambda context: typer)
+    numba_.extending.lower_builtin(function, numba_.types.Array, numba_.types.VarArg(numba_.types.Any))(code)
+
+
+_compile_as(item, lambda array, k: array.dtype, _read)
+_compile_as(at, lambda array, i, k: array.dtype, _read)
+_compile_as(stretch, lambda array, i, first, length: array.copy(ndim=1), _view)
+_compile_as(prefetch, lambda array, i, k: numba.types.void, _hint)

@@ -8,13 +8,25 @@ from typing import Any
 import naive
 import numpy as np
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from bufgym.model import qoi
+from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, messages
 from bufgym.sim import NEVER, Senders
 from bufgym.traces import Trace
+
+
+def decide_anything(buffer: Any, arrival: Any, memory: Any) -> int:
+    """Decides at random, invalid decisions included."""
+    return int(arrival.uniform * (buffer.capacity + 4)) - 2
+
+
+# The twin draws from [accept, reject, 0, 1, ..., L + 1]: floor(uniform x (L + 4)) - 2, as ACCEPT is -2 and REJECT -1.
+assert (ACCEPT, REJECT) == (-2, -1)
+ANYTHING = Policy("test-anything", decide_anything, compile=True)
 
 
 @dataclass
@@ -64,18 +76,40 @@ def trace(knots: list[tuple[int, int]], after: str) -> Trace:
     return Trace("random", np.array(us, np.int64), np.array(size, np.int64), after=after)
 
 
+def drawn_messages(
+    rng: np.random.Generator, n: int, largest: int, arrival_us: NDArray[np.int64] | None = None
+) -> NDArray[Any]:
+    """n messages of less than ``largest`` bytes, several at the same time among them; x in eighths: exact sums."""
+    step_us = rng.choice([0, 1, 700, 5_000], n) + rng.integers(0, 3_000, n) * rng.integers(0, 2, n)
+    arrivals = messages(
+        np.cumsum(step_us) if arrival_us is None else arrival_us,
+        rng.integers(1, largest, n),
+        np.cumsum(rng.integers(0, 5, n)) / 8,
+    )
+    arrivals["uniform"] = rng.random(n)
+    return arrivals
+
+
+def twin_messages(arrivals: NDArray[Any]) -> list[dict[str, Any]]:
+    """MESSAGE[n] as the twins have it."""
+    return [
+        {
+            "seq": k,
+            "us": int(a["arrival_us"]),
+            "bytes": int(a["size_bytes"]),
+            "x": float(a["x"]),
+            "uniform": a["uniform"],
+        }
+        for k, a in enumerate(np.asarray(arrivals))
+    ]
+
+
 @st.composite
 def cases(draw: st.DrawFn, max_bytes: bool = True, max_messages: int = 40) -> Case:
     """Arrivals with equal times among them, sizes around 2 kB, coordinates in eighths, so that their sums are exact."""
     n = draw(st.integers(1, max_messages))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    step_us = rng.choice([0, 1, 700, 5_000], n) + rng.integers(0, 3_000, n) * rng.integers(0, 2, n)
-    arrivals = messages(
-        np.cumsum(step_us),
-        rng.integers(1, draw(st.sampled_from([2, 4_000])), n),
-        np.cumsum(rng.integers(0, 5, n)) / 8,
-    )
-    arrivals["uniform"] = rng.random(n)
+    arrivals = drawn_messages(rng, n, draw(st.sampled_from([2, 4_000])))
     arrivals["topic"] = rng.integers(0, 3, n)
     knots, after = draw(traces())
     link = Link(trace(knots, after), draw(st.integers(0, 3 * knots[-1][0])), draw(st.integers(0, 30_000)))
@@ -83,16 +117,7 @@ def cases(draw: st.DrawFn, max_bytes: bool = True, max_messages: int = 40) -> Ca
     last = draw(st.sampled_from([2**31, n // 2]))
     return Case(
         Episode(arrivals, link, first, last),
-        [
-            {
-                "seq": k,
-                "us": int(a["arrival_us"]),
-                "bytes": int(a["size_bytes"]),
-                "x": float(a["x"]),
-                "uniform": a["uniform"],
-            }
-            for k, a in enumerate(np.asarray(arrivals))
-        ],
+        twin_messages(arrivals),
         knots,
         draw(st.integers(1, 6)),
         draw(st.one_of(st.none(), st.integers(1_000, 15_000))) if max_bytes else None,
@@ -113,12 +138,17 @@ VALUES = st.one_of(
 
 
 def log(senders: Senders, i: int = 0) -> dict[str, dict[int, int]]:
-    """{"taken_us": {sequence number: time}, ...}, of what happened at all."""
+    """{"dequeued_us": {sequence number: time}, ...}, of what happened at all."""
     rows = np.asarray(senders.batch.log[i])[: int(senders.batch.senders[i]["arrivals"])]
     return {
         name: {k: int(us) for k, us in enumerate(rows[name]) if us != NEVER}
         for name in ("dequeued_us", "transmitted_us", "dropped_us")
     }
+
+
+def twin_log(twin: Any) -> dict[str, dict[int, int]]:
+    """The same of a twin."""
+    return {"dequeued_us": twin.dequeued, "transmitted_us": twin.transmitted, "dropped_us": twin.dropped}
 
 
 def order(senders: Senders, i: int = 0) -> list[int]:
@@ -127,7 +157,7 @@ def order(senders: Senders, i: int = 0) -> list[int]:
 
 
 def same(a: Senders, b: Senders) -> bool:
-    """Whether both batches ended with the same fates and the same information, bit for bit."""
+    """Whether both batches ended with the same logs and the same information, bit for bit."""
     rows, others = np.asarray(a.batch.senders), np.asarray(b.batch.senders)
     return bool(
         (np.asarray(a.batch.log) == np.asarray(b.batch.log)).all()

@@ -8,30 +8,37 @@ import math
 import naive
 import numpy as np
 import pytest
-from cases import VALUES, cases, log, order, same, trace, traces
+from cases import (
+    ANYTHING,
+    VALUES,
+    cases,
+    decide_anything,
+    drawn_messages,
+    log,
+    order,
+    same,
+    trace,
+    traces,
+    twin_log,
+    twin_messages,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from naive_cell import Cell
 
-from bufgym import policies, scenario
+from bufgym import policies
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.buffer import ACCEPT, HOLD, MESSAGE
+from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.model.link import Link
-from bufgym.scenario import FleetEpisode, FleetScenario, Streams, Uplink, messages
-from bufgym.sim import Senders, run
-from bufgym.sim.cell import Fleet, run_fleet
+from bufgym.scenario import FleetEpisode, FleetScenario, Streams, messages
+from bufgym.sim import run
+from bufgym.sim.cell import run_fleet
 from bufgym.sim.metrics import outcome
-from bufgym.traces import shipped
 
 V = qoi.exponential(0.5)
 US = trace([(0, 0), (1_000_000, 1_000_000)], "loop")
 """1 byte a microsecond."""
-
-
-def anything(buffer, arrival, memory):
-    """Decides at random, invalid decisions included."""
-    return int(arrival.uniform * (buffer.capacity + 4)) - 2
 
 
 def accept(buffer, arrival, memory):
@@ -44,9 +51,8 @@ def hesitant(buffer, memory):
     return HOLD if memory[0] % 3 == 0 else 0
 
 
-ANYTHING = policies.Policy("test-anything", anything, compile=True)
 ACCEPTS = policies.Policy("test-accept", accept, compile=True)
-HESITANT = policies.Policy("test-hesitant", anything, on_send=hesitant, memory={"asked": 0.0}, compile=True)
+HESITANT = policies.Policy("test-hesitant", decide_anything, on_send=hesitant, memory={"asked": 0.0}, compile=True)
 POLICIES = [
     p for p in (*map(policies.get, policies.names()), ANYTHING, HESITANT) if p.privileged is None and not any(p.work)
 ]
@@ -180,10 +186,7 @@ def cells(draw, idle=True):
     robots, n = [], draw(st.integers(1, 15))
     largest = draw(st.sampled_from([2, 40, 4_000]))
     for _ in range(draw(st.integers(1, 4))):
-        step_us = rng.choice([0, 1, 700, 5_000], n) + rng.integers(0, 3_000, n) * rng.integers(0, 2, n)
-        arrival_us = robots[0]["arrival_us"] if together and robots else np.cumsum(step_us)
-        arrivals = messages(arrival_us, rng.integers(1, largest, n), np.cumsum(rng.integers(0, 5, n)) / 8)
-        arrivals["uniform"] = rng.random(n)
+        arrivals = drawn_messages(rng, n, largest, robots[0]["arrival_us"] if together and robots else None)
         robots.append(arrivals)
         n = n if together else int(rng.integers(1, 16))
     max_bytes = draw(st.one_of(st.none(), st.integers(1_000, 15_000)))
@@ -192,21 +195,8 @@ def cells(draw, idle=True):
 
 def twin(episode, knots, policy, capacity, max_bytes=None, decide_at="arrival", whole=True):
     link = naive.Link(knots, episode.link.trace.after, episode.link.offset_us)
-    heard = [
-        [
-            {
-                "seq": k,
-                "us": int(a["arrival_us"]),
-                "bytes": int(a["size_bytes"]),
-                "x": float(a["x"]),
-                "uniform": a["uniform"],
-            }
-            for k, a in enumerate(np.asarray(arrivals))
-        ]
-        for arrivals in episode.arrivals
-    ]
-    made = Cell(link, [policy() for _ in heard], capacity, max_bytes, decide_at, whole)
-    return made.run(heard)
+    cell = Cell(link, [policy() for _ in episode.arrivals], capacity, max_bytes, decide_at, whole)
+    return cell.run([twin_messages(arrivals) for arrivals in episode.arrivals])
 
 
 class TwinAnything(naive.Policy):
@@ -234,11 +224,7 @@ def test_the_whole_byte_twin_agrees_exactly(drawn, decide_at):
     fleet = run_fleet(ANYTHING, [episode], capacity, V, max_bytes=max_bytes, decide_at=decide_at)
     slow = twin(episode, knots, TwinAnything, capacity, max_bytes, decide_at)
     for i, robot in enumerate(slow.robots):
-        assert log(fleet.senders, i) == {
-            "dequeued_us": robot.dequeued,
-            "transmitted_us": robot.transmitted,
-            "dropped_us": robot.dropped,
-        }
+        assert log(fleet.senders, i) == twin_log(robot)
         assert order(fleet.senders, i) == robot.order
         told = outcome(fleet.senders, i)
         assert told.arrived == told.delivered + told.in_transmission + told.buffered + told.dropped
@@ -313,10 +299,6 @@ def test_a_python_policy_does_what_the_compiled_one_does(name):
     )
 
 
-def accept(buffer, arrival, memory):
-    return policies.ACCEPT if len(buffer.slots) < buffer.capacity else policies.REJECT
-
-
 @pytest.mark.parametrize("hook", ["on_arrival", "on_dequeue", "on_send"])
 @pytest.mark.parametrize("given", [None, "1", 0.5])
 def test_what_is_no_whole_number_is_no_answer(hook, given):
@@ -349,88 +331,3 @@ def test_policies_remember_each_robot_for_itself():
     twins = FleetEpisode((episode.arrivals[0], episode.arrivals[0], episode.arrivals[1]), episode.link)
     fleet = run_fleet(policies.get("afr"), [twins], 4, made.value)
     assert log(fleet.senders, 0) == log(fleet.senders, 1) != log(fleet.senders, 2)
-
-
-# --- scenarios -------------------------------------------------------------------------------------------------------
-
-
-def test_a_fleet_of_one_meets_the_episodes_of_its_uplink():
-    uplink = scenario.get("lte", duration_s=5.0, size_cv=0.4)
-    one = FleetScenario(1, uplink).draw(Streams.seeded(5))
-    single = uplink.draw(Streams.seeded(5))
-    assert (np.asarray(one.arrivals[0]) == np.asarray(single.arrivals)).all()
-    assert one.link.trace.cumulative_bytes.tolist() == single.link.trace.cumulative_bytes.tolist()
-    assert one.link.offset_us == single.link.offset_us
-
-
-def test_cameras_tick_together_and_each_robot_moves_for_itself():
-    made, (episode, other) = drawn_episodes(4)
-    assert episode.robots == 4
-    assert episode.ticks_together
-    first = episode.arrivals[0]
-    for name in ("x", "size_bytes"):
-        assert len({tuple(arrivals[name].tolist()) for arrivals in episode.arrivals}) == 4
-    assert len(first) == made.max_messages == 90
-    assert all((np.diff(arrivals["x"]) >= 0).all() and arrivals["x"][0] == 0 for arrivals in episode.arrivals)
-    assert first.dtype == MESSAGE
-    assert other.arrivals[0]["arrival_us"].tolist() != first["arrival_us"].tolist()
-    again = made.draw(Streams.seeded(0))
-    assert all((np.asarray(a) == np.asarray(b)).all() for a, b in zip(again.arrivals, episode.arrivals, strict=True))
-    late = FleetEpisode((first, messages(first["arrival_us"] + 1, 10)), episode.link)
-    assert not late.ticks_together
-    episode_with_uniforms = episode.with_uniforms(np.random.default_rng(0))
-    assert (
-        episode_with_uniforms.arrivals[0]["uniform"].tolist() != episode_with_uniforms.arrivals[1]["uniform"].tolist()
-    )
-    assert not first["uniform"].any()
-
-
-def test_the_cell_grows_with_the_robots():
-    uplink = scenario.get("lte", scale=(0.5, 2.0))
-    mean = {t.name: t.total_bytes for t in uplink.traces}
-    for robots in (1, 3, 256):
-        drawn = [
-            FleetScenario(robots, uplink).draw(Streams.seeded(k)).link.trace for k in range(8 if robots < 9 else 1)
-        ]
-        for found in drawn:
-            assert round(found.total_bytes / mean[found.name] / robots, 3) in (0.5, 2.0)
-
-
-@pytest.mark.parametrize(
-    ("build", "complaint"),
-    [
-        (lambda: FleetScenario(0), "robots = 0: must be a whole number from 1 to 256"),
-        (lambda: FleetScenario(257), "robots = 257"),
-        (lambda: FleetScenario(True), "robots = True"),
-        (lambda: FleetScenario(2, "lte"), "'lte' is not a bufgym.scenario Uplink"),
-        (lambda: FleetScenario.of(2, "interruption"), "needs an Uplink"),
-        (lambda: FleetScenario.of(2, "lte", wheels=4), "no parameter 'wheels'"),
-        (lambda: FleetScenario.of(2, "nowhere"), "unknown scenario 'nowhere'"),
-        (lambda: FleetEpisode((), Link(US)), "robots = 0"),
-        (lambda: FleetEpisode((messages(np.array([0]), 1)[:0],), Link(US)), "robot 0: an episode needs at least one"),
-        (lambda: run_fleet(ACCEPTS, [], 2, V), "no episode"),
-        (lambda: Fleet(Senders(3, 2, V, max_messages=1), 2), "multiple of that many senders"),
-        (lambda: Fleet(Senders(2, 2, V, max_messages=9), 2).load(0, FleetScenario(3).draw(Streams.seeded(0))), "has 2"),
-        (lambda: run_fleet(policies.Policy("p", accept, privileged=lambda *_: 0), [_short()], 2, V), "link of its own"),
-    ],
-)
-def test_bad_input_is_told_apart(build, complaint):
-    with pytest.raises(BufgymError) as error:
-        build()
-    assert complaint in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def _short():
-    return FleetEpisode((messages(np.array([0]), 1),), Link(US))
-
-
-def test_a_workload_is_no_stream(tmp_path):
-    from bufgym.traces import Workload
-
-    assert isinstance(FleetScenario().uplink, Uplink)
-    assert FleetScenario().uplink.traces
-    assert shipped()
-    played = Workload("played", np.array([0, 10]), np.array([1, 1]))
-    with pytest.raises(BufgymError, match="one robot's workload"):
-        FleetScenario.of(2, "lte", workload=played, motion=())
