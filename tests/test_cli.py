@@ -210,7 +210,7 @@ def fails(command: list[str], naming: str, capsys: pytest.CaptureFixture[str]) -
         (["--capacity", "5,5"], "5 is given more than once"),
         (["--capacity", "99999999"], "99999999"),
         (["--fps", "0"], "0: must be"),
-        (["--fps", "nan"], "'nan'"),
+        (["--fps", "nan"], "nan: must be"),
         (["--seeds", "0"], "0: must be"),
         (["--bytes", "1.5"], "1.5"),
         (["--seconds", "1e9"], "30000000000"),

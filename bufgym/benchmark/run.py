@@ -14,7 +14,7 @@ from typing import Any
 
 from bufgym.benchmark import tasks
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.seeds import draw
+from bufgym.benchmark.tasks.task import draw
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
 
@@ -73,7 +73,7 @@ def run(
                             key |= {"policy": policy.name, "capacity": capacity}
                             for entries in result:
                                 row = key | entries
-                                rows.append({name: row[name] for name in task.layout.columns})
+                                rows.append({name: row[name] for name in task.layout})
                         advance(len(batch))
     return rows
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bufgym.cli.options import Commands, command, load_policies, policy_specs, positive
-from bufgym.cli.suite import SUITE_OPTIONS, given, out_options, refuse, run_suite, suite_options, target, who_options
+from bufgym.cli.options import Commands, command, given, load_policies, policy_specs, positive, refuse
+from bufgym.cli.suite import SUITE_OPTIONS, out_options, run_suite, suite_options, target, who_options
 from bufgym.errors import BufgymError
 
 SUITE = "topics-v1"

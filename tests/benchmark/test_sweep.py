@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from bufgym import policies
-from bufgym.benchmark import manifest, run, sweep
+from bufgym.benchmark import run, sweep
 from bufgym.benchmark.rows import read_rows, write_rows
 from bufgym.benchmark.sweep import Sweep
 from bufgym.cli import main
@@ -329,7 +329,7 @@ def test_so_does_another_version_or_another_policy_file(
     with pytest.raises(BufgymError, match="policy_file is"):
         sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
     mine.write_text(text)
-    monkeypatch.setattr(manifest, "__version__", "0.0.0")
+    monkeypatch.setattr(sweep, "__version__", "0.0.0")
     with pytest.raises(BufgymError, match=r'bufgym is ".*", but this run has "0\.0\.0"'):
         sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
     assert contents(tmp_path / "out") == before

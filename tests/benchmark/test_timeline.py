@@ -11,7 +11,7 @@ import pytest
 
 from bufgym import policies
 from bufgym.benchmark import run
-from bufgym.benchmark.timeline import choose, timeline
+from bufgym.benchmark.tasks.timeline import choose, timeline
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Uplink
 from bufgym.traces import Trace

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark import bound
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import BASELINE
-from bufgym.benchmark.seeds import draw
+from bufgym.benchmark.tasks import bound
+from bufgym.benchmark.tasks.task import draw
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
 from bufgym.sim import NEVER
