@@ -47,6 +47,8 @@ class Quantity(NamedTuple):
     """The policy it compares with, which has none of its own."""
     total: bool = False
     """Whether it adds up over cells; else it is the mean over them."""
+    drawn: bool = False
+    """Whether a report draws it beside the ranking."""
 
 
 @dataclass(frozen=True)

@@ -84,16 +84,17 @@ class TopicsTask(Task):
 
         paired = "sum over sum, on the episodes that both met"
         first_age = "mean age of information at the server of the topics with the highest priority, s"
+        relative_age = f"that age over the one under {BASELINE}: {paired}"
         others_age = "mean age of information of all other topics, s"
         lost = "messages of no_drop topics that were dropped, in all episodes together"
         late = "of the messages delivered on topics with a deadline, the share after it"
         rate = "messages delivered a second, until the last arrival or receipt"
         return (
             Quantity("qoi", "QoI", _one_digit, "sum over topics of weight x H, mean over episodes", interval=False),
-            Quantity("relative", f"QoI / {BASELINE}", score, f"QoI over that of {BASELINE}: {paired}"),
+            Quantity("relative", f"QoI / {BASELINE}", score, f"QoI over that of {BASELINE}: {paired}", drawn=True),
             Quantity("lost", "no_drop lost", _messages, lost, interval=False, total=True),
             Quantity("age_first_s", f"age, {first} (s)", _seconds, first_age, interval=False),
-            Quantity("age_relative", f"age / {BASELINE}", score, f"that age over the one under {BASELINE}: {paired}"),
+            Quantity("age_relative", f"age / {BASELINE}", score, relative_age, drawn=True),
             Quantity("age_others_s", "age, others (s)", _seconds, others_age),
             Quantity("late", "late", percent, late, interval=False),
             Quantity("rate_hz", "msg/s", _one_digit, rate, interval=False),
