@@ -136,14 +136,16 @@ def paired_difference(
     h: ArrayLike, h_ref: ArrayLike, *, resamples: int = 2000, confidence: float = 0.95, seed: int = 0
 ) -> Interval:
     """Mean of H - H_ref over the episodes that both met, in the same order; NaN for none."""
-    ours, theirs = (np.asarray(numbers, np.float64) for numbers in (h, h_ref))
-    if ours.ndim != 1 or ours.shape != theirs.shape:
-        raise BufgymError(f"shapes {ours.shape} and {theirs.shape}: must be one H an episode, of the same episodes")
+    values, reference = (np.asarray(numbers, np.float64) for numbers in (h, h_ref))
+    if values.ndim != 1 or values.shape != reference.shape:
+        raise BufgymError(
+            f"shapes {values.shape} and {reference.shape}: must be one H an episode, of the same episodes"
+        )
     check_resampling(resamples, confidence)
-    if not len(ours):
+    if not len(values):
         return UNKNOWN
-    weights = times_drawn(len(ours), resamples, np.random.default_rng(seed))
-    return percentile_interval(weights @ (ours - theirs) / len(ours), confidence)
+    weights = times_drawn(len(values), resamples, np.random.default_rng(seed))
+    return percentile_interval(weights @ (values - reference) / len(values), confidence)
 
 
 def scores(

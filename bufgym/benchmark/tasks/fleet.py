@@ -117,14 +117,14 @@ def _runs(rows: Sequence[Row]) -> dict[Run, list[float]]:
     return {key: [run[robot]["qoi"] for robot in sorted(run)] for key, run in runs.items()}
 
 
-def _statistics(ours: Numbers, theirs: Numbers, weights: Numbers) -> dict[str, Numbers]:
+def _statistics(ours: Numbers, base: Numbers, weights: Numbers) -> dict[str, Numbers]:
     """See ``summary.Statistics``; H[episodes, robots]."""
     square = ours.shape[1] * np.square(ours).sum(1)
     by_episode = {
         "team": ours.mean(1),
-        "gain": (ours - theirs).mean(1),
-        "above": (ours - theirs > TIE * theirs).mean(1),
-        "below": (theirs - ours > TIE * theirs).mean(1),
+        "gain": (ours - base).mean(1),
+        "above": (ours - base > TIE * base).mean(1),
+        "below": (base - ours > TIE * base).mean(1),
         "worst": ours.min(1),
         # Where nobody got anything all are equal.
         "fairness": np.where(square > 0, ratio(np.square(ours.sum(1)), square, square > 0), 1.0),

@@ -78,8 +78,8 @@ class QueueTask(Task):
     def example(
         self, policies: Sequence[Policy], rows: Sequence[Row], setting_of: Callable[[Row], Setting]
     ) -> dict[str, Any] | None:
-        shown = timeline.choose(rows)
-        if shown is None:
+        row = timeline.choose(rows)
+        if row is None:
             return None
-        setting = setting_of(shown)
-        return {**timeline.timeline(policies, setting.scenario, shown), "about": setting.about}
+        setting = setting_of(row)
+        return {**timeline.timeline(policies, setting.scenario, row), "about": setting.about}

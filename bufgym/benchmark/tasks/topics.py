@@ -191,7 +191,7 @@ def _numbers(topics: Rows) -> list[float]:
     ]
 
 
-def _statistics(ours: Numbers, theirs: Numbers, weights: Numbers) -> dict[str, Numbers]:
+def _statistics(ours: Numbers, base: Numbers, weights: Numbers) -> dict[str, Numbers]:
     """See ``summary.Statistics``."""
 
     def share(above: Numbers, below: Numbers) -> Numbers:
@@ -205,10 +205,10 @@ def _statistics(ours: Numbers, theirs: Numbers, weights: Numbers) -> dict[str, N
     qoi, lost, age_first, age_others, late, due, delivered, seconds = ours.T
     return {
         "qoi": average(qoi),
-        "relative": share(qoi, theirs.T[0]),
+        "relative": share(qoi, base.T[0]),
         "lost": weights @ lost,
         "age_first_s": average(age_first),
-        "age_relative": share(age_first, theirs.T[2]),
+        "age_relative": share(age_first, base.T[2]),
         "age_others_s": average(age_others),
         "late": share(late, due),
         "rate_hz": share(delivered, seconds),
