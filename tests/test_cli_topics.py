@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from cli_cases import fails
 
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
@@ -174,11 +175,3 @@ def test_without_pyarrow_parquet_is_refused_before_the_work(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     fails(["topics", "--out", "rows.parquet"], "Parquet files need pyarrow", capsys)
-
-
-def fails(command: list[str], naming: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """The command ends with code 2 and one line that names the culprit."""
-    assert main(command) == 2
-    shown = capsys.readouterr()
-    assert shown.out == "" and shown.err.count("\n") == 1
-    assert shown.err.startswith("bufgym: error: ") and naming in shown.err

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bufgym.benchmark.bound import meet
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.table import aligned
+from bufgym.benchmark.tasks.bound import meet
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
 from bufgym.policies import Policy

@@ -1,21 +1,15 @@
-"""``manifest.json``: what was run into a folder, so that no other run's rows get mixed in, and a report can say it."""
+"""The JSON files of a run's folder: what was run (``manifest.json``), so that no other run's rows get mixed in."""
 
 from __future__ import annotations
 
-import datetime
-import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bufgym import __version__
-from bufgym.benchmark.checked_json import check, read_object
 from bufgym.benchmark.tasks import TASKS
 from bufgym.errors import BufgymError, where
 from bufgym.files import replaced
-from bufgym.policies import Policy
-from bufgym.scenario.suites import Setting, Suite
 
 FORMAT = 2
 """The version of the folder's layout: raised when manifest, rows or timeline change their meaning."""
@@ -25,54 +19,8 @@ _KINDS = {
     **dict.fromkeys(("unranked", "scenarios", "changes"), dict),
 }
 
-_SAME = (
-    *("format", "bufgym", "suite", "split", "policies", "policy_file", "capacities", "seeds", "changes"),
-    "scenarios",
-)
+_SAME = ["format", "bufgym", "suite", "split", "policies", "policy_file", "capacities", "seeds", "changes", "scenarios"]
 """What two runs that share a folder must have in common."""
-
-
-def describe(
-    suite: Suite,
-    settings: Mapping[str, Setting],
-    policies: Sequence[Policy],
-    *,
-    policy_file: str | None,
-    **entries: Any,
-) -> dict[str, Any]:
-    """The manifest of a run; ``entries`` go into it as they are."""
-    return {
-        "format": FORMAT,
-        "bufgym": __version__,
-        "made": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "task": suite.kind,
-        "suite": suite.name,
-        "about": suite.about,
-        "policies": [policy.name for policy in policies],
-        "unranked": {policy.name: policy.unranked_because for policy in policies if not policy.ranked},
-        "policy_file": policy_file and hashlib.sha256(Path(policy_file).read_bytes()).hexdigest()[:16],
-        "scenarios": {
-            label: {
-                "about": setting.about,
-                "value": setting.scenario.value.name,
-                **({} if setting.outage_s is None else {"outage_s": setting.outage_s}),
-                **({"recordings": _fingerprint(setting.scenario)} if suite.needs else {}),
-            }
-            for label, setting in settings.items()
-        },
-        **entries,
-    }
-
-
-def _fingerprint(scenario: Any) -> str:
-    """Tells recordings apart that go by the same names."""
-    stream = getattr(scenario, "uplink", scenario)
-    digest = hashlib.sha256()
-    for trace in getattr(stream, "traces", ()):
-        digest.update(trace.time_us.tobytes() + trace.cumulative_bytes.tobytes())
-    for motion in getattr(stream, "motion", ()):
-        digest.update(motion.time_us.tobytes())
-    return digest.hexdigest()[:16]
 
 
 def claim(out: Path, manifest: dict[str, Any]) -> None:
@@ -121,3 +69,38 @@ def write_json(file: Path, content: dict[str, Any]) -> None:
 def _short(entry: object) -> str:
     text = json.dumps(entry)
     return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+# --- JSON files ------------------------------------------------------------------------------------------------------
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The object that the file holds; numbers must be finite."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+    except UnicodeDecodeError:
+        raise BufgymError(f"{path}: must be UTF-8 text") from None
+    except json.JSONDecodeError as error:
+        raise BufgymError(where(path, error.lineno, None, f"must be JSON: {error.msg}")) from None
+    except ValueError as error:
+        raise BufgymError(f"{path}: {error}") from None
+    if not isinstance(content, dict):
+        raise BufgymError(f"{path}: must be a JSON object")
+    return content
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant}: numbers must be finite")
+
+
+def check(path: Path, place: str, content: Any, kinds: Mapping[str, Any]) -> None:
+    """Every entry of ``kinds`` is in the object ``content``, and of its kind; ``place`` says where the object is."""
+    if not isinstance(content, dict):
+        raise BufgymError(f"{path}: {place} must be an object")
+    for name, kind in kinds.items():
+        field = f"{place}.{name}" if place else name
+        if name not in content:
+            raise BufgymError(f"{path}: no {field}")
+        if not isinstance(content[name], kind):
+            words = {str: "text", list: "a list", dict: "an object", int: "a whole number"}.get(kind, "a number")
+            raise BufgymError(where(path, None, content[name], f"must be {words}", field=field))

@@ -5,50 +5,38 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
-from bufgym.sim.metrics import METRICS
+from bufgym.sim.metrics import Outcome
 
 Row = dict[str, Any]
+Layout = Mapping[str, type]
+"""The columns of one kind of rows, in their order, with the kind of their cells: str, int, float or bool."""
 
-COLUMNS = ("scenario", "trace", "seed", "policy", "capacity", *METRICS, "clairvoyant", "certified", "regret")
-"""What a row has, in this order.
+
+def columns_of(outcome: type) -> dict[str, type]:
+    """The fields of a dataclass of statistics as columns."""
+    return {field.name: {"int": int, "float": float, "str": str}[str(field.type)] for field in fields(outcome)}
+
+
+RUNS: Layout = {
+    **{"scenario": str, "trace": str, "seed": int, "policy": str, "capacity": int},
+    **columns_of(Outcome),
+    **{"clairvoyant": float, "certified": bool, "regret": float},
+}
+"""One row for each run of one queue.
 
 ``clairvoyant`` is the best possible H of this episode at this capacity, ``certified`` whether that is exact (else an
 upper bound), ``regret`` = 1 - H / clairvoyant. They are None where the bound was not asked for; ``regret`` also for a
 policy that is not bound by L.
 """
 
-TEXT = ("scenario", "policy", "trace")
-WHOLE = (
-    "capacity",
-    "seed",
-    "training_seed",
-    "arrived",
-    "delivered",
-    "dropped",
-    "in_transmission",
-    "buffered",
-    "peak_backlog_bytes",
-    "invalid",
-)
-YES_NO = ("certified",)
-
-
-class Layout(NamedTuple):
-    """The columns of one kind of rows, and which of them are no numbers with a fraction."""
-
-    columns: tuple[str, ...] = COLUMNS
-    text: tuple[str, ...] = TEXT
-    whole: tuple[str, ...] = WHOLE
-    yes_no: tuple[str, ...] = YES_NO
-
-
-RUNS = Layout()
-"""One row a run: those of ``bufgym bench``."""
+_MORE: Layout = {"training_seed": int}
+"""Columns that rows of any layout may have besides; those of other names hold numbers with a fraction."""
 
 
 def checked_target(path: str | os.PathLike[str]) -> Path:
@@ -64,13 +52,14 @@ def checked_target(path: str | os.PathLike[str]) -> Path:
 def write_rows(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str], layout: Layout = RUNS) -> Path:
     """Write rows to a ``.csv`` or ``.parquet`` file, whole or not at all; None is an empty cell (CSV) or null."""
     target = checked_target(path)
-    columns = list(rows[0]) if rows else list(layout.columns)
+    columns = list(rows[0]) if rows else list(layout)
     if target.suffix == ".parquet":
         pyarrow, parquet = _pyarrow()
-        schema = pyarrow.schema([(name, _arrow_type(pyarrow, name, layout)) for name in columns])
-        made = pyarrow.Table.from_pylist([dict(row) for row in rows], schema=schema)
+        kinds = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64(), bool: pyarrow.bool_()}
+        schema = pyarrow.schema([(name, kinds[_kind(name, layout)]) for name in columns])
+        table = pyarrow.Table.from_pylist([dict(row) for row in rows], schema=schema)
         with replaced(target) as temporary:
-            parquet.write_table(made, temporary, write_page_checksum=True)
+            parquet.write_table(table, temporary, write_page_checksum=True)
         return target
     with replaced(target) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
         # Floats are written so that they read back to the last bit.
@@ -111,19 +100,19 @@ def _read_parquet(source: Path) -> list[Row]:
     return rows
 
 
+def _kind(name: str, layout: Layout) -> type:
+    return layout.get(name) or _MORE.get(name, float)
+
+
 def _parsed(path: Path, line: int, name: str, text: str, layout: Layout) -> Any:
-    if name in layout.text:
-        return text
-    if text == "":
-        return None
-    if name in layout.yes_no:
-        if text not in ("True", "False"):
-            raise BufgymError(f"{path}, line {line}: {name} = {text!r}: must be True or False")
-        return text == "True"
+    kind = _kind(name, layout)
+    if kind is str or text == "":
+        return text if kind is str else None
     try:
-        return int(text) if name in layout.whole else float(text)
-    except ValueError:
-        raise BufgymError(f"{path}, line {line}: {name} = {text!r}: must be a number") from None
+        return {"True": True, "False": False}[text] if kind is bool else kind(text)
+    except (KeyError, ValueError):
+        rule = "True or False" if kind is bool else "a number"
+        raise BufgymError(f"{path}, line {line}: {name} = {text!r}: must be {rule}") from None
 
 
 def has_pyarrow() -> bool:
@@ -142,11 +131,3 @@ def _pyarrow() -> tuple[Any, Any]:
     except ImportError:
         raise BufgymError('Parquet files need pyarrow: pip install "bufgym[bench]" (or write .csv)') from None
     return pyarrow, pyarrow.parquet
-
-
-def _arrow_type(pyarrow: Any, name: str, layout: Layout) -> Any:
-    if name in layout.text:
-        return pyarrow.string()
-    if name in layout.yes_no:
-        return pyarrow.bool_()
-    return pyarrow.int64() if name in layout.whole else pyarrow.float64()

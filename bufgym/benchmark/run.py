@@ -14,7 +14,7 @@ from typing import Any
 
 from bufgym.benchmark import tasks
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.seeds import draw
+from bufgym.benchmark.tasks.task import draw
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
 
@@ -52,9 +52,9 @@ def run(
     """
     task = tasks.of(scenario, **settings)
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
-    for name, given in (("policies", policies), ("capacities", capacities), ("seeds", numbers)):
-        if not given:
-            raise BufgymError(f"{name} = {seeds if name == 'seeds' else list(given)}: need at least one")
+    for name, entries in (("policies", policies), ("capacities", capacities), ("seeds", numbers)):
+        if not entries:
+            raise BufgymError(f"{name} = {seeds if name == 'seeds' else list(entries)}: need at least one")
     check_distinct(policies)
     for policy in policies:
         task.check(policy)
@@ -71,9 +71,9 @@ def run(
                         for seed, result in zip(batch, results, strict=True):
                             key = {"scenario": label, "trace": trace, "seed": seed}
                             key |= {"policy": policy.name, "capacity": capacity}
-                            for entries in result:
-                                row = key | entries
-                                rows.append({name: row[name] for name in task.layout.columns})
+                            for cells in result:
+                                row = key | cells
+                                rows.append({name: row[name] for name in task.layout})
                         advance(len(batch))
     return rows
 
@@ -87,9 +87,9 @@ def check_distinct(policies: Sequence[Policy]) -> None:
 
 
 @contextmanager
-def bar(total: int, wanted: bool, unit: str = "run", done: int = 0) -> Iterator[Any]:
+def bar(total: int, show: bool, unit: str = "run", done: int = 0) -> Iterator[Any]:
     """A function to call with the number of runs (or other units) just finished; ``done`` were finished before."""
-    if wanted and sys.stderr.isatty():
+    if show and sys.stderr.isatty():
         try:
             from tqdm import tqdm
         except ImportError:

@@ -36,20 +36,6 @@ from bufgym.benchmark.bootstrap import (
 from bufgym.benchmark.episodes import TIE, Cell, Numbers, Table
 from bufgym.errors import BufgymError
 
-__all__ = [
-    "BASELINE",
-    "DISCRIMINATIVE",
-    "CellScore",
-    "Interval",
-    "Scores",
-    "Standing",
-    "interquartile_mean",
-    "normalised_score",
-    "paired_difference",
-    "regret",
-    "scores",
-]
-
 BASELINE = "drop-oldest"
 """What ROS does: its score is 0."""
 
@@ -150,14 +136,16 @@ def paired_difference(
     h: ArrayLike, h_ref: ArrayLike, *, resamples: int = 2000, confidence: float = 0.95, seed: int = 0
 ) -> Interval:
     """Mean of H - H_ref over the episodes that both met, in the same order; NaN for none."""
-    ours, theirs = (np.asarray(numbers, np.float64) for numbers in (h, h_ref))
-    if ours.ndim != 1 or ours.shape != theirs.shape:
-        raise BufgymError(f"shapes {ours.shape} and {theirs.shape}: must be one H an episode, of the same episodes")
+    values, reference = (np.asarray(numbers, np.float64) for numbers in (h, h_ref))
+    if values.ndim != 1 or values.shape != reference.shape:
+        raise BufgymError(
+            f"shapes {values.shape} and {reference.shape}: must be one H an episode, of the same episodes"
+        )
     check_resampling(resamples, confidence)
-    if not len(ours):
+    if not len(values):
         return UNKNOWN
-    weights = times_drawn(len(ours), resamples, np.random.default_rng(seed))
-    return percentile_interval(weights @ (ours - theirs) / len(ours), confidence)
+    weights = times_drawn(len(values), resamples, np.random.default_rng(seed))
+    return percentile_interval(weights @ (values - reference) / len(values), confidence)
 
 
 def scores(
@@ -207,16 +195,9 @@ def scores(
         for cell, s in by_cell.items():
             cell_scores.append(
                 CellScore(
-                    scenario=cell[0],
-                    capacity=cell[1],
-                    policy=policy,
-                    episodes=len(table.episodes[cell[0]]),
-                    qoi=interval(s.qoi),
-                    score=interval(s.score),
-                    regret=interval(s.regret),
-                    difference=interval(s.difference),
-                    discriminative=samples[cell].discriminative,
-                    exact=table.exact[cell],
+                    *(*cell, policy, len(table.episodes[cell[0]])),
+                    *(interval(s.qoi), interval(s.score), interval(s.regret), interval(s.difference)),
+                    *(samples[cell].discriminative, table.exact[cell]),
                 )
             )
         overall = _overall([by_cell[cell] for cell in discriminative], [samples[cell] for cell in discriminative])
@@ -288,14 +269,8 @@ def _statistics(h: Numbers, h_ref: Numbers | None, sample: _Sample) -> _Statisti
         tied = np.abs(minus) <= TIE * np.abs(h_ref)
         better = np.where(tied, 0.5, minus > 0)
         difference, improvement = (sample.sums(numbers).sum(axis=1) / episodes for numbers in (minus, better))
-    return _Statistics(
-        qoi=total / episodes,
-        score=normalised_score(total, base, best),
-        regret=regret(total, best),
-        difference=difference,
-        improvement=improvement,
-        by_trace=normalised_score(sums, sample.base, sample.best),
-    )
+    score, by_trace = normalised_score(total, base, best), normalised_score(sums, sample.base, sample.best)
+    return _Statistics(total / episodes, score, regret(total, best), difference, improvement, by_trace)
 
 
 def _overall(cells: Sequence[_Statistics], samples: Sequence[_Sample]) -> tuple[Numbers, Numbers, Numbers, Numbers]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,8 @@ from bufgym.benchmark.bootstrap import (
 )
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores
-from bufgym.benchmark.table import in_blocks
+from bufgym.benchmark.table import Rows, in_blocks
+from bufgym.errors import BufgymError
 
 
 class Quantity(NamedTuple):
@@ -46,6 +47,8 @@ class Quantity(NamedTuple):
     """The policy it compares with, which has none of its own."""
     total: bool = False
     """Whether it adds up over cells; else it is the mean over them."""
+    drawn: bool = False
+    """Whether a report draws it beside the ranking."""
 
 
 @dataclass(frozen=True)
@@ -97,14 +100,29 @@ class Summary:
         return {standing.policy: standing for standing in self.overall}
 
 
+KEY = ("scenario", "capacity", "policy", "trace", "seed")
 Run = tuple[str, int, str, str, int]
-"""(scenario, capacity, policy, trace, seed)."""
+"""What ``KEY`` names."""
 Statistics = Callable[[Numbers, Numbers, Numbers], dict[str, Numbers]]
 """(a policy's numbers, the baseline's, weights) -> each statistic of the sample and its resamples, [1 + resamples].
 
 The numbers are [episodes, entries], the same episodes of both; weights[1 + resamples, episodes] say how often each
 episode was drawn.
 """
+
+
+def by_run(rows: Rows, part: str, value: str) -> dict[Run, dict[Any, Mapping[str, Any]]]:
+    """The rows of each run by their column ``part``; an error where one has no ``value``, or a part has two rows."""
+    runs: dict[Run, dict[Any, Mapping[str, Any]]] = {}
+    for number, row in enumerate(rows):
+        for name in (*KEY, part, value):
+            if row.get(name) is None:
+                raise BufgymError(f"rows[{number}]: no {name}")
+        run = runs.setdefault((row["scenario"], row["capacity"], row["policy"], row["trace"], row["seed"]), {})
+        if row[part] in run:
+            raise BufgymError(f"rows[{number}]: {part} {row[part]!r} of one run has more than one row")
+        run[row[part]] = row
+    return runs
 
 
 def summarise(
@@ -137,8 +155,7 @@ def summarise(
     """
     check_resampling(resamples, confidence)
     # ``read`` makes sure that all met the same episodes, and orders them.
-    keys = ("scenario", "capacity", "policy", "trace", "seed")
-    rows = [{**dict(zip(keys, run, strict=True)), "qoi": numbers[0]} for run, numbers in runs.items()]
+    rows = [{**dict(zip(KEY, run, strict=True)), "qoi": numbers[0]} for run, numbers in runs.items()]
     table = episodes.read(rows, baseline)
     drawn = {name: times_drawn(len(e), resamples, stream(seed, name)) for name, e in table.episodes.items()}
     cells = list(dict.fromkeys((scenario, capacity) for scenario, capacity, *_ in runs))

@@ -8,6 +8,8 @@ become ``rows.parquet`` (or ``rows.csv``) beside ``manifest.json``, which says w
 
 from __future__ import annotations
 
+import datetime
+import hashlib
 import importlib.util
 import itertools
 import shutil
@@ -16,17 +18,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from bufgym import policies
+from bufgym import __version__, policies
 from bufgym.benchmark import cluster, manifest, tasks
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
 from bufgym.benchmark.run import bar, by_trace, check_distinct, run
-from bufgym.benchmark.seeds import SEEDS_PER_TRACE, seeds_of, seeds_per_trace
 from bufgym.benchmark.tasks import Task
 from bufgym.errors import BufgymError, line_in
 from bufgym.scenario import suites
 from bufgym.scenario.suites import Setting
 
+SEEDS_PER_TRACE = 1000
+"""Episode s of trace k has the seed 1000 k + s: no two traces of a scenario share a draw."""
 _SEEDS_PER_SHARD = 25
 
 Load = Callable[[str | None], None]
@@ -83,7 +86,9 @@ class Sweep:
         """The same with nothing left open; a mistake in it ends in an error here, before any work."""
         suite, task = suites.get(self.suite), self.task
         self.settings()
-        seeds = seeds_per_trace(suite, self.seeds)
+        seeds = suite.seeds if self.seeds is None else self.seeds
+        if not 1 <= seeds <= SEEDS_PER_TRACE:
+            raise BufgymError(f"seeds = {seeds}: must lie between 1 and {SEEDS_PER_TRACE}")
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
         specs = self.specs if task.baseline in self.specs else (*self.specs, task.baseline)
@@ -98,7 +103,7 @@ class Sweep:
         shards = []
         for label, setting in self.settings().items():
             for trace in range(len(by_trace(setting.scenario))):
-                numbers = seeds_of(trace, int(self.seeds or 0))
+                numbers = [SEEDS_PER_TRACE * trace + s for s in range(self.seeds or 0)]
                 for k in range(0, len(numbers), _SEEDS_PER_SHARD):
                     shards.append(Shard(self, label, trace, tuple(numbers[k : k + _SEEDS_PER_SHARD])))
         return shards
@@ -212,21 +217,47 @@ def run_sweep(
 
 
 def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, Any]:
-    settings = sweep.settings()
+    """What ``manifest.json`` says about a checked sweep."""
+    suite, settings = suites.get(sweep.suite), sweep.settings()
     episodes = sum(len(shard.seeds) for shard in shards)
-    described = sweep.task.describe([setting.scenario for setting in settings.values()], episodes)
-    return manifest.describe(
-        suites.get(sweep.suite),
-        settings,
-        sweep.policies,
-        split=sweep.split,
-        command=command,
-        episodes=described,
-        capacities=list(sweep.capacities),
-        seeds=sweep.seeds,
-        changes=dict(sweep.changes),
-        policy_file=sweep.policy_file,
-    )
+    code = sweep.policy_file and Path(sweep.policy_file).read_bytes()
+    return {
+        "format": manifest.FORMAT,
+        "bufgym": __version__,
+        "made": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "task": suite.kind,
+        "suite": suite.name,
+        "split": sweep.split,
+        "about": suite.about,
+        "episodes": sweep.task.describe([setting.scenario for setting in settings.values()], episodes),
+        "command": command,
+        "policies": [policy.name for policy in sweep.policies],
+        "unranked": {policy.name: policy.unranked_because for policy in sweep.policies if not policy.ranked},
+        "capacities": list(sweep.capacities),
+        "seeds": sweep.seeds,
+        "changes": dict(sweep.changes),
+        "policy_file": code and hashlib.sha256(code).hexdigest()[:16],
+        "scenarios": {
+            label: {
+                "about": setting.about,
+                "value": setting.scenario.value.name,
+                **({} if setting.outage_s is None else {"outage_s": setting.outage_s}),
+                **({"recordings": _fingerprint(setting.scenario)} if suite.needs else {}),
+            }
+            for label, setting in settings.items()
+        },
+    }
+
+
+def _fingerprint(scenario: Any) -> str:
+    """Tells recordings apart that go by the same names."""
+    stream = getattr(scenario, "uplink", scenario)
+    digest = hashlib.sha256()
+    for trace in getattr(stream, "traces", ()):
+        digest.update(trace.time_us.tobytes() + trace.cumulative_bytes.tobytes())
+    for motion in getattr(stream, "motion", ()):
+        digest.update(motion.time_us.tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _form(out: Path) -> str:
@@ -245,7 +276,7 @@ def _read(file: Path, shard: Shard) -> list[Row]:
         raise BufgymError(f"{error}; {again}") from None
     scenario = sweep.settings()[shard.label].scenario
     runs = len(sweep.specs) * len(sweep.capacities) * len(shard.seeds)
-    expected, columns = runs * sweep.task.rows_per_run(scenario), layout.columns
+    expected, columns = runs * sweep.task.rows_per_run(scenario), tuple(layout)
     if len(rows) != expected or any(tuple(row) != columns for row in rows):
         raise BufgymError(f"{file}: {len(rows)} rows where {expected} of {len(columns)} columns were written; {again}")
     return rows

@@ -144,8 +144,8 @@ def markdown(rows: Rows) -> str:
 def _cells(rows: Rows) -> list[list[str]]:
     """Titles, then a line for each entry of ``means``; no regret where no row has one."""
     entries = means(rows)
-    shown = [c for c in COLUMNS if c.key != "regret" or any(not math.isnan(entry["regret"]) for entry in entries)]
-    return [[column.title for column in shown], *([written(entry[c.key], c) for c in shown] for entry in entries)]
+    columns = [c for c in COLUMNS if c.key != "regret" or any(not math.isnan(entry["regret"]) for entry in entries)]
+    return [[column.title for column in columns], *([written(entry[c.key], c) for c in columns] for entry in entries)]
 
 
 def written(number: Any, column: Column) -> str:

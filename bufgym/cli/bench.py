@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bufgym.cli.options import Commands, command, count, load_policies, policy_specs
+from bufgym.cli.options import Commands, command, count, load_policies, policy_specs, refuse
 from bufgym.cli.scenarios import scenario, scenario_options
-from bufgym.cli.suite import SUITE_OPTIONS, out_options, refuse, run_suite, suite_options, target, who_options
+from bufgym.cli.suite import SUITE_OPTIONS, out_options, run_suite, suite_options, target, who_options
 from bufgym.cli.trace_bags import WORKLOAD_OPTIONS
 from bufgym.errors import BufgymError
 from bufgym.files import replaced

@@ -7,9 +7,11 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn, TypeAlias
+from typing import Any, NoReturn, TypeAlias, TypeVar
 
 from bufgym.errors import BufgymError
+
+T = TypeVar("T")
 
 
 class Parser(argparse.ArgumentParser):
@@ -33,50 +35,26 @@ def command(commands: Commands, name: str, function: Callable[[argparse.Namespac
 # --- types of options ------------------------------------------------------------------------------------------------
 
 
-def number(text: str) -> float:
-    """A finite number."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r}: must be a finite number")
-    return value
+def _checked(convert: Callable[[str], T], holds: Callable[[T], bool], rule: str) -> Callable[[str], T]:
+    """The type of an option: what ``convert`` makes of its text, if that ``holds``; ``rule`` says what it must be."""
+
+    def parse(text: str) -> T:
+        try:
+            value = convert(text)
+        except ValueError:
+            value = None
+        if value is None or not holds(value):
+            raise argparse.ArgumentTypeError(f"{text}: must be {rule}")
+        return value
+
+    return parse
 
 
-def positive(text: str) -> float:
-    """A number > 0."""
-    value = number(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"{text}: must be a number > 0")
-    return value
-
-
-def least_0(text: str) -> float:
-    """A number >= 0."""
-    value = number(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text}: must be a number >= 0")
-    return value
-
-
-def count(text: str) -> int:
-    """A whole number >= 1."""
-    value = natural(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text}: must be a whole number >= 1")
-    return value
-
-
-def natural(text: str) -> int:
-    """A whole number >= 0."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text}: must be a whole number >= 0")
-    return value
+number = _checked(float, math.isfinite, "a finite number")
+positive = _checked(float, lambda number: 0 < number < math.inf, "a number > 0")
+least_0 = _checked(float, lambda number: 0 <= number < math.inf, "a number >= 0")
+count = _checked(int, lambda number: number >= 1, "a whole number >= 1")
+natural = _checked(int, lambda number: number >= 0, "a whole number >= 0")
 
 
 def capacities(text: str) -> list[int]:
@@ -112,6 +90,18 @@ def policies_option(parser: argparse._ActionsContainer, default: str) -> None:
 def policy_specs(texts: Sequence[str] | None) -> list[str]:
     """The policies that ``--policies`` names, with commas or as several words; none if it was not given."""
     return [spec for text in texts or () for spec in split_policies(text)]
+
+
+def given(options: argparse.Namespace, names: tuple[str, ...]) -> dict[str, Any]:
+    """Those of the options that the user gave."""
+    values = {name: getattr(options, name) for name in names}
+    return {name: value for name, value in values.items() if value is not None and value is not False}
+
+
+def refuse(options: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
+    """An error for the first of these options that the user gave: ``--name why``."""
+    for name in given(options, names):
+        raise BufgymError(f"--{name.replace('_', '-')} {why}")
 
 
 # --- a user's own policies -------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from bufgym.cli.options import count, least_0, positive
+from bufgym.cli.options import count, given, least_0, positive, refuse
 from bufgym.cli.trace_bags import (
     WORKLOAD_OPTIONS,
     motion_settings,
@@ -16,10 +16,10 @@ from bufgym.cli.trace_bags import (
     workload_lines,
     workload_options,
 )
-from bufgym.errors import BufgymError
 
 if TYPE_CHECKING:
-    from bufgym.scenario import Scenario
+    from bufgym.model.qoi import Value
+    from bufgym.scenario import Scenario, Uplink
     from bufgym.traces import Motion, Trace
 
 DEFAULTS = {
@@ -73,118 +73,114 @@ def scenario_options(parser: argparse.ArgumentParser) -> None:
 def scenario(options: argparse.Namespace) -> tuple[Scenario, str]:
     """The scenario that the options describe, and a few lines about it."""
     unused = _UPLINK_ONLY if options.interruption else _INTERRUPTION_ONLY
-    for name in unused:
-        if getattr(options, name) is not None:
-            only = "cannot go with" if options.interruption else "needs"
-            raise BufgymError(f"--{name.replace('_', '-')} {only} --interruption")
-    take = {
-        name: default if getattr(options, name) is None else getattr(options, name)
-        for name, default in DEFAULTS.items()
-    }
+    refuse(options, unused, "cannot go with --interruption" if options.interruption else "needs --interruption")
+    settings = {**DEFAULTS, **given(options, tuple(DEFAULTS))}
     if options.interruption:
-        return _interruption(options, take)
+        return _interruption(options, settings)
     if options.workload is not None:
-        return _recording(options, take)
-    for name in ("topics", "odom", "bridge_gaps"):
-        if getattr(options, name) is not None:
-            raise BufgymError(f"--{name.replace('_', '-')} needs --workload")
+        return _recording(options, settings)
+    refuse(options, ("topics", "odom", "bridge_gaps"), "needs --workload")
     if options.motion is None:
         refuse_motion(options, "needs --motion, or --workload with --odom")
-    return _uplink(options, take)
+    return _uplink(options, settings)
 
 
-def _interruption(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario, str]:
-    from bufgym.model import qoi
+def _interruption(options: argparse.Namespace, settings: dict[str, Any]) -> tuple[Scenario, str]:
     from bufgym.scenario import Interruption
 
-    made = Interruption(
-        law=take["law"],
-        t_min=take["t_min"],
-        t_max=take["t_max"],
-        t_mean=take["t_mean"],
-        rate_hz=take["fps"],
-        size_bytes=take["bytes"],
-        value=qoi.parse(options.value) if options.value is not None else qoi.exponential(),
+    interruption = Interruption(
+        **{name: settings[name] for name in _INTERRUPTION_ONLY},
+        rate_hz=settings["fps"],
+        size_bytes=settings["bytes"],
+        value=_value(options, by_motion=False),
     )
-    length = f"T = {made.t_max}" if made.law == "fixed" else f"T {made.law} on {made.t_min}..{made.t_max}"
-    about = f"One interruption of T messages, {length}; V = {made.value.name} over frame indices."
-    return made, f"{about}\nMeans over {options.seeds} seeds. Regret = 1 - (QoI - 1) / oracle."
+    law, t_min, t_max = interruption.law, interruption.t_min, interruption.t_max
+    length = f"T = {t_max}" if law == "fixed" else f"T {law} on {t_min}..{t_max}"
+    about = f"One interruption of T messages, {length}; V = {interruption.value.name} over frame indices."
+    return interruption, f"{about}\nMeans over {options.seeds} seeds. Regret = 1 - (QoI - 1) / oracle."
 
 
-def _uplink(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario, str]:
+def _uplink(options: argparse.Namespace, settings: dict[str, Any]) -> tuple[Scenario, str]:
     from bufgym import traces
-    from bufgym.model import qoi
     from bufgym.scenario import Uplink
 
-    names = traces.shipped()
-    motions = options.motion if options.motion is not None else [name for name in names if name.startswith("drive-")]
-    if motions == ["none"]:
-        motions = []
-    default = qoi.exponential(math.exp(-1)) if motions else qoi.exponential()
-    made = Uplink(
+    motions = options.motion
+    if motions is None:
+        motions = [name for name in traces.shipped() if name.startswith("drive-")]
+    uplink = Uplink(
         traces=_links(options),
-        motion=tuple(_motion(name, options) for name in motions),
-        rate_hz=take["fps"],
-        jitter=take["jitter"],
-        size_bytes=take["bytes"],
-        size_cv=take["size_cv"],
-        duration_s=take["seconds"],
-        scale=(take["scale"],),
-        value=qoi.parse(options.value) if options.value is not None else default,
+        motion=_motions(motions, options),
+        rate_hz=settings["fps"],
+        jitter=settings["jitter"],
+        size_bytes=settings["bytes"],
+        size_cv=settings["size_cv"],
+        duration_s=settings["seconds"],
+        scale=(settings["scale"],),
+        value=_value(options, by_motion=motions != ["none"]),
     )
-    recorded = _some([_with_gaps(motion) for motion in made.motion])
-    over = f"the camera's motion, in fields of view, from {recorded}" if motions else "the frame index"
-    scaled = f" x {take['scale']:g}" if take["scale"] != 1 else ""
+    recorded = _some([_with_gaps(motion) for motion in uplink.motion])
+    x = f"the camera's motion, in fields of view, from {recorded}" if uplink.motion else "the frame index"
+    traces_met = f"{len(uplink.traces)} {'trace' if len(uplink.traces) == 1 else 'traces'}"
     about = [
-        f"{take['fps']:g} messages/s of {take['bytes']} bytes for {take['seconds']:g} s"
-        f" over {_some([trace.name for trace in made.traces])}{scaled}, from random offsets.",
-        f"QoI = 1 + sum of V(step in x) over the messages received; V = {made.value.name}.",
-        f"x is {over}.",
-        f"Means over {len(made.traces)} {'trace' if len(made.traces) == 1 else 'traces'} x {options.seeds} seeds;"
-        " every policy meets the same episodes.",
+        f"{settings['fps']:g} messages/s of {settings['bytes']} bytes for {settings['seconds']:g} s"
+        f" over {_over(uplink, settings)}, from random offsets.",
+        *_measured(uplink, x),
+        f"Means over {traces_met} x {options.seeds} seeds; every policy meets the same episodes.",
     ]
-    return made, "\n".join(about)
+    return uplink, "\n".join(about)
 
 
-def _recording(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scenario, str]:
+def _recording(options: argparse.Namespace, settings: dict[str, Any]) -> tuple[Scenario, str]:
     """A workload as it was recorded; with --seeds, from random places on each trace."""
-    from bufgym.model import qoi
     from bufgym.scenario import Uplink
     from bufgym.traces import read_workload
 
-    for name in _STREAM_ONLY:
-        if getattr(options, name) is not None:
-            raise BufgymError(f"--{name.replace('_', '-')} cannot go with --workload: a recording has its own")
+    refuse(options, _STREAM_ONLY, "cannot go with --workload: a recording has its own")
     workload = read_workload(options.workload, **workload_arguments(options))
-    motions = [] if options.motion in (None, ["none"]) else [_motion(name, options) for name in options.motion]
+    motions = _motions(options.motion or [], options)
     if options.odom is None and not motions:
         refuse_motion(options, "needs --odom or --motion")
     by_motion = bool(motions) or workload.x is not None
-    default = qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential()
     random_offset = options.seeds is not None
     options.seeds = options.seeds or 1
-    made = Uplink(
+    uplink = Uplink(
         traces=_links(options),
-        motion=tuple(motions),
-        scale=(take["scale"],),
+        motion=motions,
+        scale=(settings["scale"],),
         random_offset=random_offset,
-        value=qoi.parse(options.value) if options.value is not None else default,
+        value=_value(options, by_motion),
         workload=workload,
     )
-    x = f"motion, from {_some([_with_gaps(motion) for motion in motions])}" if motions else "motion, as recorded"
-    where = f"{options.seeds} random places each" if random_offset else "from the trace's start"
-    scaled = f" x {take['scale']:g}" if take["scale"] != 1 else ""
+    source = f"from {_some([_with_gaps(motion) for motion in motions])}" if motions else "as recorded"
+    places = f"{options.seeds} random places each" if random_offset else "from the trace's start"
     shared = "; all topics share one queue" if len(workload.topics) > 1 else ""
     about = [
-        workload.source,
-        "",
-        *workload_lines(workload),
-        "",
-        f"Played over {_some([trace.name for trace in made.traces])}{scaled}, {where}{shared}.",
-        f"QoI = 1 + sum of V(step in x) over the messages received; V = {made.value.name}.",
-        f"x is {f'the {x}, in fields of view' if by_motion else 'the number of the message'}.",
+        *(workload.source, "", *workload_lines(workload), ""),
+        f"Played over {_over(uplink, settings)}, {places}{shared}.",
+        *_measured(uplink, f"the motion, {source}, in fields of view" if by_motion else "the number of the message"),
     ]
-    return made, "\n".join(about)
+    return uplink, "\n".join(about)
+
+
+def _value(options: argparse.Namespace, by_motion: bool) -> Value:
+    """V as the options say, or the default over motion or over frame indices."""
+    from bufgym.model import qoi
+
+    if options.value is not None:
+        return qoi.parse(options.value)
+    return qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential()
+
+
+def _over(uplink: Uplink, settings: dict[str, Any]) -> str:
+    scaled = f" x {settings['scale']:g}" if settings["scale"] != 1 else ""
+    return _some([trace.name for trace in uplink.traces]) + scaled
+
+
+def _measured(uplink: Uplink, x: str) -> list[str]:
+    return [
+        f"QoI = 1 + sum of V(step in x) over the messages received; V = {uplink.value.name}.",
+        f"x is {x}.",
+    ]
 
 
 def _links(options: argparse.Namespace) -> tuple[Trace, ...]:
@@ -194,6 +190,11 @@ def _links(options: argparse.Namespace) -> tuple[Trace, ...]:
     if names is None:
         names = [name for name in traces.shipped() if name.startswith("lte-")]
     return tuple(traces.load(name) for name in names)
+
+
+def _motions(names: Sequence[str], options: argparse.Namespace) -> tuple[Motion, ...]:
+    """Motions by their shipped names or from files; none for ``["none"]``."""
+    return () if list(names) == ["none"] else tuple(_motion(name, options) for name in names)
 
 
 def _motion(name: str, options: argparse.Namespace) -> Motion:

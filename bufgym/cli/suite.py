@@ -6,9 +6,9 @@ import argparse
 import shlex
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from bufgym.cli.options import capacities, count, load_policies, policies_option, policy_file, policy_specs
+from bufgym.cli.options import capacities, count, given, load_policies, policies_option, policy_file, policy_specs
 from bufgym.errors import BufgymError
 
 if TYPE_CHECKING:
@@ -46,18 +46,6 @@ def out_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     group.add_argument("--out", metavar="DIR", help=target)
     group.add_argument("--format", choices=("csv", "parquet"), help="format of the rows (default: parquet if it can)")
     return group
-
-
-def given(options: argparse.Namespace, names: tuple[str, ...]) -> dict[str, Any]:
-    """Those of the options that the user gave."""
-    values = {name: getattr(options, name) for name in names}
-    return {name: value for name, value in values.items() if value is not None and value is not False}
-
-
-def refuse(options: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
-    """An error for the first of these options that the user gave: ``--name why``."""
-    for name in given(options, names):
-        raise BufgymError(f"--{name.replace('_', '-')} {why}")
 
 
 def target(options: argparse.Namespace) -> Path | None:

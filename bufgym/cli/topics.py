@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bufgym.cli.options import Commands, command, load_policies, policy_specs, positive
-from bufgym.cli.suite import SUITE_OPTIONS, given, out_options, refuse, run_suite, suite_options, target, who_options
+from bufgym.cli.options import Commands, command, given, load_policies, policy_specs, positive, refuse
+from bufgym.cli.suite import SUITE_OPTIONS, out_options, run_suite, suite_options, target, who_options
 from bufgym.errors import BufgymError
 
 SUITE = "topics-v1"
@@ -51,8 +51,8 @@ def _topics(options: argparse.Namespace) -> None:
     task = TASKS["topics"]
     specs = policy_specs(options.policies) or task.default_policies(SUITE)
     names = [policies.get(spec).name for spec in dict.fromkeys([*specs, task.baseline])]
-    shown = None if options.by_topic is None else policies.get(options.by_topic).name
-    if shown is not None and shown not in names:
+    by_name = None if options.by_topic is None else policies.get(options.by_topic).name
+    if by_name is not None and by_name not in names:
         raise BufgymError(f"--by-topic {options.by_topic}: not among the policies that run")
     if options.config is None:
         refuse(options, ("trace", "motion", "scale"), "needs --config: a suite's episodes are frozen")
@@ -61,8 +61,8 @@ def _topics(options: argparse.Namespace) -> None:
     else:
         refuse(options, ("suite", *SUITE_OPTIONS, "format"), "cannot go with --config")
         rows = _own_client(options, specs)
-    if shown is not None:
-        print(f"\n{shown}, topic by topic: means over episodes\n{by_topic(rows, shown)}")
+    if by_name is not None:
+        print(f"\n{by_name}, topic by topic: means over episodes\n{by_topic(rows, by_name)}")
 
 
 def _own_client(options: argparse.Namespace, specs: list[str]) -> list[dict[str, Any]]:

@@ -38,10 +38,10 @@ def test_rows_of_a_cell_worked_by_hand() -> None:
     """Two robots over 1 kB/s together (half of what a fleet of two has): each frame takes 2 s, so that frame 1, waiting
     from 1 s on, begins at 2 s as frame 2 arrives, which then waits until 4 s. All three arrive, at 2, 4 and 6 s."""
     rows = met(2, replace(ONE, scale=0.5))
-    assert [tuple(row) for row in rows] == [ROWS.columns] * 2
+    assert [list(row) for row in rows] == [list(ROWS)] * 2
     key = {"scenario": "hand", "trace": "1 kB/s", "seed": 0, "robots": 2, "policy": "drop-newest", "capacity": 1}
     assert [key | {"robot": robot} for robot in (0, 1)] == [
-        {name: row[name] for name in ROWS.columns[:7]} for row in rows
+        {name: row[name] for name in list(ROWS)[:7]} for row in rows
     ]
     for row in rows:
         assert (row["arrived"], row["delivered"], row["dropped"], row["buffered"]) == (3, 3, 0, 0)
@@ -57,7 +57,7 @@ def test_a_fleet_of_one_has_the_rows_of_the_benchmark_for_one() -> None:
     chosen = [policies.get(name) for name in ("afr", "random")]
     mine = run(chosen, FleetScenario(1, uplink), [2, 4], [3, 8], label="s")
     alone = run(chosen, uplink, [2, 4], [3, 8], label="s", bound=False)
-    names = [name for name in ROWS.columns if name not in ("robots", "robot")]
+    names = [name for name in ROWS if name not in ("robots", "robot")]
     place = ("capacity", "policy", "seed")
     for rows in (mine, alone):
         rows.sort(key=lambda row: [row[name] for name in place])

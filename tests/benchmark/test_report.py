@@ -1,4 +1,4 @@
-"""The report: what stands on the page and in the tables, bad folders, and the page in a real browser."""
+"""The report: what stands on the page and in the tables."""
 
 from __future__ import annotations
 
@@ -6,86 +6,20 @@ import dataclasses
 import json
 import math
 import re
-import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from report_cases import MANIFEST, QOI, TIMELINE, make
 
 from bufgym.benchmark import folder as inputs
 from bufgym.benchmark import report, table
 from bufgym.benchmark.report import style, timeline
-from bufgym.benchmark.rows import write_rows
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.errors import BufgymError
 from bufgym.scenario import FleetScenario, suites
 
 pytest.importorskip("jinja2", reason="the report needs Jinja")
 pytest.importorskip("plotly", reason="the report needs plotly")
-
-BEST = 100.0
-QOI = {"clairvoyant": 100.0, "<b>": 95.0, "afr": 90.0, "drop-oldest": 80.0, "random": 60.0}
-"""H of each policy in every episode. Scores: 1, 3/4, 1/2, 0, -1; regrets 0, 5, 10, 20, 40 %."""
-
-MANIFEST = {
-    "format": 2,
-    "task": "queue",
-    "bufgym": "0.1.0",
-    "suite": "tiny-v1",
-    "split": "test",
-    "about": "Two outages and a good link.",
-    "made": "2026-05-01",
-    "command": "bufgym bench --suite tiny-v1 --out <here>",
-    "policies": list(QOI),
-    "unranked": {"clairvoyant": "it knows the future"},
-    "capacities": [2, 4],
-    "seeds": 3,
-    "changes": {},
-    "episodes": "",
-    "scenarios": {
-        "short": {"about": "Out for 5 s.", "value": "exponential:0.618", "outage_s": 5.0},
-        "long": {"about": "Out for 20 s.", "value": "exponential:0.618", "outage_s": 20.0},
-        "good": {"about": "Never out.", "value": "exponential:0.618"},
-    },
-}
-
-TIMELINE = {
-    "scenario": "long",
-    "capacity": 2,
-    "trace": "t",
-    "seed": 0,
-    "about": "The first.",
-    "arrival_s": [0.0, 1.0, 2.0, 3.0, 4.0, 5.0],
-    "x": [0.0, 0.5, 1.0, 4.0, 4.5, 5.0],
-    "rate": {"t_s": [0.0, 2.0, 4.0], "bytes_per_s": [1e5, 0.0, 1e5]},
-    "demand_bytes_per_s": 8e4,
-    "policies": {
-        "afr": {"qoi": 3.5, "regret": 0.1, "received": [[0, 0.0, 0.5], [2, 2.0, 4.1]], "dropped": [[1, 2.0], [3, 3.0]]},
-        "<b>": {"qoi": 1.0, "regret": 0.5, "received": [], "dropped": [[k, 5.0] for k in range(6)]},
-    },
-}
-
-
-def make(folder: Path, **changes: Any) -> Path:
-    """A run: every policy on 2 traces x 3 seeds of 3 scenarios; on the good link nobody loses more than 0.1 %."""
-    rows = []
-    for scenario in MANIFEST["scenarios"]:
-        for trace in ("t", "u"):
-            for seed in range(3):
-                for capacity in (2, 4):
-                    for policy, qoi in QOI.items():
-                        regret = (1 - qoi / BEST) / (400 if scenario == "good" else 1)
-                        row = {"scenario": scenario, "trace": trace, "seed": seed, "capacity": capacity}
-                        row |= {"policy": policy, "qoi": BEST * (1 - regret), "clairvoyant": BEST, "regret": regret}
-                        row |= {"certified": scenario != "long", "mean_sojourn_s": capacity / 10, "mean_age_s": 0.5}
-                        rows.append({**row, "peak_backlog_bytes": 100_000 * capacity})
-    rows = changes.pop("rows", rows)
-    folder.mkdir(exist_ok=True)
-    (folder / "manifest.json").write_text(json.dumps({**MANIFEST, **changes}), encoding="utf-8")
-    (folder / "timeline.json").write_text(json.dumps(TIMELINE), encoding="utf-8")
-    write_rows(rows, folder / "rows.csv")
-    return folder
 
 
 @pytest.fixture
@@ -250,12 +184,6 @@ def shortened(scenario: Any) -> Any:
     return dataclasses.replace(scenario, traces=scenario.traces[:2], duration_s=2.0)
 
 
-def test_the_page_needs_an_extra_and_the_tables_do_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
-    assert "bufgym[report]" in refusal(folder)
-    assert "afr" in report.markdown(folder)
-
-
 # --- the timeline -----------------------------------------------------------------------------------------------------
 
 
@@ -278,124 +206,3 @@ def test_labels_are_moved_apart_no_further_than_needed() -> None:
     assert style.apart({"a": 50.0, "b": 50.0}, 10) == {"a": 45.0, "b": 55.0}
     # b and c touch; moved apart they touch a: all three settle around their mean, 54.
     assert style.apart({"a": 50.0, "c": 56.0, "b": 56.0}, 10) == {"a": 44.0, "c": 54.0, "b": 64.0}
-
-
-# --- bad folders ------------------------------------------------------------------------------------------------------
-
-
-def refusal(folder: Path) -> str:
-    with pytest.raises(BufgymError) as caught:
-        report.write(folder)
-    assert not (folder / "report.html").exists()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
-def test_a_folder_must_hold_a_run(tmp_path: Path) -> None:
-    assert "must be a folder" in refusal(tmp_path / "absent")
-    assert "no manifest.json" in refusal(tmp_path)
-    folder = make(tmp_path / "run")
-    (folder / "rows.csv").unlink()
-    assert "no rows.parquet and no rows.csv" in refusal(folder)
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ('{"format": 2,\n', "manifest.json, line 2: must be JSON"),
-        ("[]", "manifest.json: must be a JSON object"),
-        ('{"format": 1}', "manifest.json: format = 1: must be 2"),
-        (json.dumps({**MANIFEST, "suite": 3}), "manifest.json: suite = 3: must be text"),
-        (json.dumps({**MANIFEST, "scenarios": {"a": 1}}), "manifest.json: scenarios.a must be an object"),
-        (json.dumps({**MANIFEST, "scenarios": {"a": {"outage_s": "x"}}}), "scenarios.a.outage_s = x: must be a number"),
-        (json.dumps({**MANIFEST, "task": "chess"}), "manifest.json: task = chess: must be one of queue, topics, fleet"),
-        (json.dumps({k: v for k, v in MANIFEST.items() if k != "command"}), "manifest.json: no command"),
-    ],
-)
-def test_a_broken_manifest_is_refused(folder: Path, text: str, complaint: str) -> None:
-    (folder / "manifest.json").write_text(text, encoding="utf-8")
-    assert complaint in refusal(folder)
-
-
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        ({"x": [0.0]}, "arrival_s and x must have one entry a message"),
-        ({"x": [0.0, 1.0, 2.0, 3.0, 4.0, "5"]}, "x must hold numbers alone"),
-        ({"x": [0.0, 1.0, 2.0, 3.0, 4.0, math.nan]}, "NaN: numbers must be finite"),
-        ({"rate": {"t_s": [0.0], "bytes_per_s": []}}, "must be of one length"),
-        ({"policies": {"afr": {"qoi": 1.0, "received": [[6, 0.0, 0.0]], "dropped": []}}}, "a message 0..5"),
-        ({"policies": {"afr": {"qoi": 1.0, "received": [], "dropped": [[0]]}}}, "policies.afr.dropped = [0]"),
-        ({"policies": {"afr": {"received": [], "dropped": []}}}, "timeline.json: no policies.afr.qoi"),
-    ],
-)
-def test_a_broken_timeline_is_refused(folder: Path, changes: dict[str, Any], complaint: str) -> None:
-    (folder / "timeline.json").write_text(json.dumps({**TIMELINE, **changes}), encoding="utf-8")
-    found = refusal(folder)
-    assert complaint in found and "timeline.json" in found
-
-
-def test_broken_rows_are_refused(tmp_path: Path) -> None:
-    rows = inputs.read(make(tmp_path / "a")).rows
-    without = [{name: cell for name, cell in row.items() if name != "qoi"} for row in rows]
-    assert "rows.csv: no column 'qoi'" in refusal(make(tmp_path / "b", rows=without))
-    unmet = [row for row in rows if (row["policy"], row["seed"]) != ("afr", 1)]
-    assert "rows.csv: afr at " in refusal(make(tmp_path / "c", rows=unmet))
-    no_baseline = [row for row in rows if row["policy"] != "drop-oldest"]
-    assert "rows.csv: " in (found := refusal(make(tmp_path / "d", rows=no_baseline))) and "baseline" in found
-
-
-# --- in a browser -----------------------------------------------------------------------------------------------------
-
-QUIET = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
-
-SIZES = """() => [...document.querySelectorAll("[data-panel]:not([hidden])")].map((place) => {
-    const box = place.querySelector("svg.main-svg").getBoundingClientRect();
-    return [place.closest("figure").dataset.chart, box.width, box.height, place.querySelectorAll("path, image").length];
-})"""
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_browser_draws_every_chart_without_network_or_complaint(folder: Path, scheme: str) -> None:
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("no chromium on this machine")
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = report.write(folder)
-    said: list[str] = []
-    asked: list[str] = []
-    with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=QUIET)
-        page = browser.new_page(color_scheme=scheme, viewport={"width": 1000, "height": 800})
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
-        page.goto(path.as_uri())
-        page.wait_for_function("document.querySelectorAll('svg.main-svg').length >= 7")
-        sizes = page.evaluate(SIZES)
-        ink = page.evaluate("getComputedStyle(document.querySelector('#ranking .xtick text')).fill")
-        # Another scheme while the page is open: the charts follow.
-        page.emulate_media(color_scheme="light" if scheme == "dark" else "dark")
-        page.wait_for_function(
-            "(was) => getComputedStyle(document.querySelector('#ranking .xtick text')).fill !== was", arg=ink
-        )
-        page.select_option("#capacities select", "long")
-        names = page.locator("#delays .ytick text").all_text_contents()
-        width = page.evaluate("document.documentElement.scrollWidth")
-        browser.close()
-    assert said == []
-    assert [url for url in asked if not url.startswith("data:")] == [path.as_uri()]
-    assert {chart for chart, *_ in sizes} == {"ranking", "capacities", "outages", "delays", "timeline", "memory"}
-    for chart, wide, high, shapes in sizes:
-        assert wide > 200 and high > 100 and shapes > 0, chart
-    assert ink == ("rgb(27, 31, 36)" if scheme == "light" else "rgb(230, 233, 237)")
-    assert "<b>" in names  # as it is written, not as bold type
-    assert width == 1000  # nothing sticks out

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from bufgym.benchmark.rows import COLUMNS, TEXT, WHOLE, YES_NO, Row, read_rows, write_rows
+from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
 from bufgym.errors import BufgymError
 from bufgym.files import replaced
 
@@ -19,10 +19,8 @@ ENDINGS = ["csv", "parquet"]
 
 def row(**changed: Any) -> Row:
     """A row with a different cell in every column."""
-    made: Row = {}
-    for k, name in enumerate(COLUMNS):
-        made[name] = f"{name} text" if name in TEXT else True if name in YES_NO else k if name in WHOLE else k / 7
-    return {**made, **changed}
+    cells = {str: "{0} text".format, bool: lambda _, __: True, int: lambda _, k: k, float: lambda _, k: k / 7}
+    return {name: cells[kind](name, k) for k, (name, kind) in enumerate(RUNS.items())} | changed
 
 
 HARD = [
@@ -111,7 +109,7 @@ def test_a_line_of_another_length_is_named(tmp_path: Path, change: Any) -> None:
     path = write_rows([row(), row()], tmp_path / "rows.csv")
     *rest, last = path.read_text().splitlines()
     path.write_text("\n".join([*rest, change(last)]) + "\n")
-    with pytest.raises(BufgymError, match=rf"rows\.csv, line 3: must have {len(COLUMNS)} cells, as line 1 has"):
+    with pytest.raises(BufgymError, match=rf"rows\.csv, line 3: must have {len(RUNS)} cells, as line 1 has"):
         read_rows(path)
 
 

@@ -35,7 +35,7 @@ def test_means_leave_out_what_is_missing_and_come_best_first() -> None:
     assert math.isnan(entries[3]["regret"])
 
 
-def test_plain_text_is_aligned_and_says_what_was_impossible() -> None:
+def test_plain_text_is_aligned_and_says_what_was_invalid() -> None:
     lines = table.plain(ROWS).split("\n")
     assert lines[0].split()[:4] == ["policy", "L", "QoI", "delivered"]
     assert lines[3] == ""  # between capacities

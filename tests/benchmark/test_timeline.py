@@ -11,7 +11,7 @@ import pytest
 
 from bufgym import policies
 from bufgym.benchmark import run
-from bufgym.benchmark.timeline import choose, timeline
+from bufgym.benchmark.tasks.timeline import choose, timeline
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Uplink
 from bufgym.traces import Trace
@@ -64,7 +64,7 @@ def test_something_is_left_where_the_link_stops() -> None:
 
 
 def test_the_drawn_capacity_carries_the_messages() -> None:
-    """The curve's area until a time is at least what has crossed by then, and it reaches past the last receipt."""
+    """The curve's area until a time is at least what was transmitted by then, and it reaches past the last receipt."""
     rows = run.run(CHOSEN, GAPPY, [3], [0])
     made = timeline(CHOSEN, GAPPY, rows[0])
     step_s = made["rate"]["t_s"][1]

@@ -14,7 +14,7 @@ from bufgym.benchmark.folder import Run
 from bufgym.benchmark.report import style
 from bufgym.benchmark.report.style import Figure
 from bufgym.benchmark.score import CellScore
-from bufgym.benchmark.summary import Quantity, Standing, Summary
+from bufgym.benchmark.summary import Quantity, Summary
 from bufgym.benchmark.table import percent
 
 
@@ -70,87 +70,67 @@ def with_interval(value: Interval, write: Callable[[float], str]) -> str:
 
 
 def ranking(context: Context) -> Chart | None:
-    """A dot and an interval for each policy, by the quantities that matter; None where no policy has a value."""
-    summary = context.summary
-    quantities = {quantity.key: quantity for quantity in summary.quantities}
-    if summary.scores is None:
-        panels = _summary_panels(context)
-    else:
-        shown = quantities["score"], quantities["improvement"]
-        panels = [
-            _dots(context, shown[0], (0, 1), (-1.0, 1.05, 2.1), quantities["iqm"]),
-            _dots(context, shown[1], (0.5,), (-1.0, 1.0, 2.0)),
-        ]
-        panels = [panel for panel, quantity in zip(panels, shown, strict=True) if _known(summary, quantity)]
-    if not _known(summary, quantities[summary.rank_by]):
+    """A dot and an interval for each policy; None where no policy has a value of what ranks them."""
+    quantities = {quantity.key: quantity for quantity in context.summary.quantities}
+    if not _known(context, quantities[context.summary.rank_by]):
         return None
+    panels = [
+        _dots(context, quantity, quantities.get("iqm") if quantity.key == "score" else None)
+        for quantity in quantities.values()
+        if quantity.drawn and _known(context, quantity)
+    ]
     alt = "Each policy's place in the ranking with intervals; the numbers are in the table above"
     return Chart("ranking", alt, [], {(): panels})
 
 
-def _summary_panels(context: Context) -> list[Figure]:
-    """The two quantities with intervals that come first; a line marks the baseline."""
-    figures = []
-    for quantity in [q for q in context.summary.quantities if q.interval][:2]:
-        values = [s[quantity.key].value for s in _known(context.summary, quantity)]
-        # What lies far out is written at the edge, or the others could not be told apart.
-        low, high = np.percentile(values, [25, 75]) if values else (0.0, 1.0)
-        spread = 4 * max(high - low, 1e-3)
-        near = [value for value in values if low - spread <= value <= high + spread] or [0.0]
-        base = context.summary.standings[context.summary.baseline][quantity.key].value
-        limits = float(low - spread), max(near), float(high + spread)
-        figures.append(_dots(context, quantity, (base,), limits, start=min(near)))
-    return figures
+def _known(context: Context, quantity: Quantity) -> dict[str, Interval]:
+    """The policies that have a value; where no interval is known it is that point."""
+    values = {standing.policy: standing[quantity.key] for standing in context.summary.overall}
+    return {
+        policy: Interval(value, *((value, value) if math.isnan(low) else (low, high)))
+        for policy, (value, low, high) in values.items()
+        if not math.isnan(value)
+    }
 
 
-def _known(summary: Summary, quantity: Quantity) -> list[Standing]:
-    """Those that have a value."""
-    return [standing for standing in summary.overall if not math.isnan(standing[quantity.key].value)]
+def _dots(context: Context, quantity: Quantity, second: Quantity | None) -> Figure:
+    """One lane for each policy, with a tick for a second quantity. A line marks the policy that is compared with.
 
-
-def _dots(
-    context: Context,
-    quantity: Quantity,
-    lines: Sequence[float],
-    limits: tuple[float, float, float],
-    second: Quantity | None = None,
-    start: float = 0.0,
-) -> Figure:
-    """One lane for each policy. ``limits``: what is below the first or above the last is written at the edge; the axis
-    reaches from ``start`` at least to the second."""
-    floor, high, ceiling = limits
-    shown = _known(context.summary, quantity)
-    inside = [s[quantity.key] for s in shown if s[quantity.key].high >= floor and s[quantity.key].low <= ceiling]
-    inside += [value._replace(low=value.value, high=value.value) for value in inside if math.isnan(value.low)]
-    margin = 0.04 * max(high - start, 1e-3)
-    low = min([value.low for value in inside if not math.isnan(value.low)] + [start]) - margin
-    high = max([value.high + margin for value in inside if not math.isnan(value.high)] + [high + margin / 4])
+    What lies more than two interquartile ranges beyond the quartiles is written at the edge.
+    """
+    known, standings = _known(context, quantity), context.summary.standings
+    first, third = np.percentile([value for value, *_ in known.values()], [25, 75]).tolist()
+    floor, ceiling = first - 2 * (third - first) - 1e-3, third + 2 * (third - first) + 1e-3
+    inside = [interval for interval in known.values() if floor <= interval.value <= ceiling]
+    low, high = min(interval.low for interval in inside), max(interval.high for interval in inside)
+    low, high = low - 0.04 * (high - low) - 1e-6, high + 0.04 * (high - low) + 1e-6
     data, notes = [], []
-    for s in shown:
-        value, colour, name = s[quantity.key], context.colour(s.policy), style.text(s.policy)
-        if value.high < floor or value.value < floor:
-            notes.append(style.note(f"◂ {quantity.write(value.value)}", x=low, y=name, xanchor="left", xshift=2))
+    for policy, interval in known.items():
+        value, colour, name = interval.value, context.colour(policy), style.text(policy)
+        if interval not in inside:
+            edge: dict[str, Any] = {"x": low, "xanchor": "left", "xshift": 2}
+            if value > ceiling:
+                edge = {"x": high, "xanchor": "right", "xshift": -2}
+            words = f"{quantity.write(value)} ▸" if value > ceiling else f"◂ {quantity.write(value)}"
+            notes.append(style.note(words, y=name, **edge))
             continue
-        if value.low > ceiling or value.value > ceiling:
-            notes.append(style.note(f"{quantity.write(value.value)} ▸", x=high, y=name, xanchor="right", xshift=-2))
-            continue
-        arms = [0.0 if math.isnan(arm) else arm for arm in (value.high - value.value, value.value - value.low)]
-        bars = {"type": "data", "symmetric": False, "array": arms[:1], "arrayminus": arms[1:], "color": colour}
-        hover = f"<b>%{{y}}</b><br>{quantity.title} {with_interval(value, quantity.write)}"
-        symbol = "circle" if s.ranked else "circle-open"
+        symbol = "circle" if standings[policy].ranked else "circle-open"
+        bars = {"type": "data", "symmetric": False, "color": colour, "thickness": 2, "width": 0}
+        bars |= {"array": [interval.high - value], "arrayminus": [value - interval.low]}
+        hover = f"<b>%{{y}}</b><br>{quantity.title} {with_interval(interval, quantity.write)}"
         marker: dict[str, Any] = {"color": colour, "size": 9, "symbol": symbol}
-        data.append(
-            style.scatter([value.value], [name], hover, marker=marker, error_x={**bars, "thickness": 2, "width": 0})
-        )
-        if second is not None and not math.isnan(s[second.key].value):
-            hover = f"<b>%{{y}}</b><br>{second.title} {with_interval(s[second.key], second.write)}"
+        data.append(style.scatter([value], [name], hover, marker=marker, error_x=bars))
+        if second is not None and not math.isnan(standings[policy][second.key].value):
+            beside = standings[policy][second.key]
+            hover = f"<b>%{{y}}</b><br>{second.title} {with_interval(beside, second.write)}"
             marker = {"color": colour, "size": 8, "symbol": "line-ns-open", "line": {"width": 1.5}}
-            data.append(style.scatter([s[second.key].value], [name], hover, marker=marker))
+            data.append(style.scatter([beside.value], [name], hover, marker=marker))
     axis = style.axis(quantity.title, range=[low, high], nticks=7)
     if quantity.write is percent:
         axis["tickformat"] = ".0%"
-    layout = style.lanes([s.policy for s in reversed(shown)], xaxis=axis, annotations=notes)
-    layout["shapes"] = [style.line("x", at) for at in lines]
+    layout = style.lanes(list(reversed(known)), xaxis=axis, annotations=notes)
+    compared = known.get(quantity.versus or context.summary.baseline)
+    layout["shapes"] = [] if compared is None else [style.line("x", compared.value)]
     return {"data": data, "layout": layout}
 
 

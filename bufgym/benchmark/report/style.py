@@ -124,12 +124,12 @@ def line(axis: str, at: float) -> dict[str, Any]:
     return {"type": "line", "layer": "below", **ends, **whole, "line": {"color": "var(--axis)", "width": 1.5}}
 
 
-def apart(wanted: Mapping[str, float], gap: float) -> dict[str, float]:
-    """Positions at least ``gap`` apart, in the order of the wanted ones and as a whole no higher nor lower."""
-    names = sorted(wanted, key=lambda name: wanted[name])
+def apart(targets: Mapping[str, float], gap: float) -> dict[str, float]:
+    """Positions at least ``gap`` apart, in the order of the targets and as a whole no higher nor lower."""
+    names = sorted(targets, key=lambda name: targets[name])
     groups: list[tuple[float, list[str]]] = []  # (centre, names), bottom up; groups that touch become one
     for name in names:
-        groups.append((wanted[name], [name]))
+        groups.append((targets[name], [name]))
         while len(groups) > 1:
             (below, first), (above, second) = groups[-2:]
             if above - below >= gap * (len(first) + len(second)) / 2:

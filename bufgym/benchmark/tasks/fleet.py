@@ -10,21 +10,20 @@ import numpy as np
 
 from bufgym.benchmark.bootstrap import ratio
 from bufgym.benchmark.episodes import TIE, Numbers
-from bufgym.benchmark.rows import TEXT, WHOLE, Layout, Row
-from bufgym.benchmark.summary import Quantity, Run, Summary, summarise
+from bufgym.benchmark.rows import Layout, Row, columns_of
+from bufgym.benchmark.summary import Quantity, Run, Summary, by_run, summarise
 from bufgym.benchmark.table import decimal, percent, score
 from bufgym.benchmark.tasks.task import Result, Task, counted
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy, get, names
 from bufgym.scenario import FleetEpisode, FleetScenario
 from bufgym.sim.cell import run_fleet
-from bufgym.sim.metrics import METRICS, outcome
+from bufgym.sim.metrics import Outcome, outcome
 
-ROWS = Layout(
-    columns=("scenario", "trace", "seed", "robots", "policy", "capacity", "robot", *METRICS),
-    text=TEXT,
-    whole=(*WHOLE, "robots", "robot"),
-)
+ROWS: Layout = {
+    **{"scenario": str, "trace": str, "seed": int, "robots": int, "policy": str, "capacity": int, "robot": int},
+    **columns_of(Outcome),
+}
 """One row for each robot and episode: which robot, of how many, and its ``Outcome``."""
 
 
@@ -38,10 +37,11 @@ class FleetTask(Task):
     kind = "fleet"
     scenarios = (FleetScenario,)
     layout = ROWS
-    needed = ROWS.columns
+    needed = tuple(ROWS)
     baseline = "afr"
     reference = "afr"
     listed = ("gain", "above", "worst")
+    no_plan = "a link of its own, which no robot in a cell has"
     legend = (
         "Team QoI: mean of H over the robots. Intervals: 95 %, over episodes, as the robots of one share a link.",
         "Robots above, below: with a larger or smaller H than the same robot under AFR. Fairness: Jain's index of H.",
@@ -50,10 +50,6 @@ class FleetTask(Task):
     def default_policies(self, suite: str) -> list[str]:
         """The ranked policies for one queue."""
         return [name for name in names(for_topics=False) if get(name).ranked]
-
-    def check(self, policy: Policy) -> None:
-        if policy.privileged is not None:
-            raise BufgymError(f"policy {policy.name}: it plans with a link of its own, which no robot in a cell has")
 
     def by_trace(self, scenario: FleetScenario) -> list[tuple[str, Any]]:
         return [(label, replace(scenario, uplink=uplink)) for label, uplink in super().by_trace(scenario.uplink)]
@@ -77,31 +73,31 @@ class FleetTask(Task):
                 for c in range(len(episodes))
             ]
 
-    def quantities(self, baseline: str = "afr") -> tuple[Quantity, ...]:
+    def quantities(self) -> tuple[Quantity, ...]:
+        afr = self.baseline
+
         def gained(number: float) -> str:
             return f"{'+' if number >= 0 else ''}{score(number)}"
 
         def four_digits(number: float) -> str:
             return decimal(number, 4)
 
-        same = f"that of the same robot under {baseline}"
+        same = f"that of the same robot under {afr}"
+        above = f"robots whose H is above {same}"
         below = f"robots whose H is below {same}; the rest are equal"
         jain = "Jain's index of the robots' H, (sum H)^2 / (N sum H^2): 1 if all are equal, 1/N if one has everything"
         return (
             Quantity("team", "team QoI", score, "mean over the robots of H, mean over episodes", interval=False),
-            Quantity("gain", f"gain over {baseline}", gained, f"team QoI minus that of {baseline}", versus=baseline),
-            Quantity(
-                "above", f"robots above {baseline}'s", percent, f"robots whose H is above {same}", versus=baseline
-            ),
-            Quantity("below", "below", percent, below, interval=False, versus=baseline),
+            Quantity("gain", f"gain over {afr}", gained, f"team QoI minus that of {afr}", versus=afr, drawn=True),
+            Quantity("above", f"robots above {afr}'s", percent, above, versus=afr, drawn=True),
+            Quantity("below", "below", percent, below, interval=False, versus=afr),
             Quantity("worst", "worst robot", score, "the least H of a robot, mean over episodes", interval=False),
             Quantity("fairness", "fairness", four_digits, f"{jain} (Jain, Chiu and Hawe 1984)", interval=False),
         )
 
     def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
-        options = {"baseline": self.baseline, **options}
-        quantities = self.quantities(options["baseline"])
-        return summarise(_runs(rows), _statistics, quantities, rank_by="gain", unranked=unranked, **options)
+        options |= {"rank_by": "gain", "baseline": self.baseline, "unranked": unranked}
+        return summarise(_runs(rows), _statistics, self.quantities(), **options)
 
     def describe(self, scenarios: Sequence[FleetScenario], episodes: int) -> str:
         fleet = scenarios[0]
@@ -112,33 +108,23 @@ class FleetTask(Task):
 
 def _runs(rows: Sequence[Row]) -> dict[Run, list[float]]:
     """H of each robot by run."""
-    if not rows:
-        raise BufgymError("no rows to score")
-    by_robot: dict[Run, dict[int, float]] = {}
-    for number, row in enumerate(rows):
-        for key in ("scenario", "capacity", "policy", "trace", "seed", "robot", "qoi"):
-            if row.get(key) is None:
-                raise BufgymError(f"rows[{number}]: no {key}")
-        run = by_robot.setdefault((row["scenario"], row["capacity"], row["policy"], row["trace"], row["seed"]), {})
-        if row["robot"] in run:
-            raise BufgymError(f"rows[{number}]: robot {row['robot']} of one run has more than one row")
-        run[row["robot"]] = row["qoi"]
     robots: dict[str, set[int]] = {}
-    for (scenario, capacity, policy, trace, seed), run in by_robot.items():
+    runs = by_run(rows, "robot", "qoi")
+    for (scenario, capacity, policy, trace, seed), run in runs.items():
         if odd := sorted(robots.setdefault(scenario, set(run)) ^ run.keys()):
             place = f"{policy} at {scenario}, L = {capacity}, trace {trace}, seed {seed}"
             raise BufgymError(f"{place}: robot {odd[0]} is not in every episode; all must have the same robots")
-    return {key: [run[robot] for robot in sorted(run)] for key, run in by_robot.items()}
+    return {key: [run[robot]["qoi"] for robot in sorted(run)] for key, run in runs.items()}
 
 
-def _statistics(ours: Numbers, theirs: Numbers, weights: Numbers) -> dict[str, Numbers]:
+def _statistics(ours: Numbers, base: Numbers, weights: Numbers) -> dict[str, Numbers]:
     """See ``summary.Statistics``; H[episodes, robots]."""
     square = ours.shape[1] * np.square(ours).sum(1)
     by_episode = {
         "team": ours.mean(1),
-        "gain": (ours - theirs).mean(1),
-        "above": (ours - theirs > TIE * theirs).mean(1),
-        "below": (theirs - ours > TIE * theirs).mean(1),
+        "gain": (ours - base).mean(1),
+        "above": (ours - base > TIE * base).mean(1),
+        "below": (base - ours > TIE * base).mean(1),
         "worst": ours.min(1),
         # Where nobody got anything all are equal.
         "fairness": np.where(square > 0, ratio(np.square(ours.sum(1)), square, square > 0), 1.0),

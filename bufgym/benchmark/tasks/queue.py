@@ -6,11 +6,11 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from bufgym.benchmark import bound, timeline
 from bufgym.benchmark.rows import RUNS, Row
 from bufgym.benchmark.score import BASELINE, scores
 from bufgym.benchmark.summary import Quantity, Standing, Summary
 from bufgym.benchmark.table import percent, score
+from bufgym.benchmark.tasks import bound, timeline
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.benchmark.tuned import tuned
 from bufgym.policies import Policy, names
@@ -57,14 +57,13 @@ class QueueTask(Task):
 
     def quantities(self, reference: str = "afr") -> tuple[Quantity, ...]:
         means = "mean over the discriminative cells"
+        scale = f"0 is Drop Oldest, 1 the clairvoyant, which no policy can pass; {means}"
         above = f"share of episodes on which H is above that of {reference}; equal ones count one half"
         return (
-            Quantity(
-                "score", "score", score, f"0 is Drop Oldest, 1 the clairvoyant, which no policy can pass; {means}"
-            ),
+            Quantity("score", "score", score, scale, drawn=True),
             Quantity("iqm", "IQM", score, "interquartile mean of the scores on each discriminative cell and trace"),
             Quantity("regret", "regret", percent, f"share of the clairvoyant's H that was lost; {means}"),
-            Quantity("improvement", f"better than {reference}", score, above, versus=reference),
+            Quantity("improvement", f"better than {reference}", score, above, versus=reference, drawn=True),
         )
 
     def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
@@ -79,8 +78,8 @@ class QueueTask(Task):
     def example(
         self, policies: Sequence[Policy], rows: Sequence[Row], setting_of: Callable[[Row], Setting]
     ) -> dict[str, Any] | None:
-        shown = timeline.choose(rows)
-        if shown is None:
+        row = timeline.choose(rows)
+        if row is None:
             return None
-        setting = setting_of(shown)
-        return {**timeline.timeline(policies, setting.scenario, shown), "about": setting.about}
+        setting = setting_of(row)
+        return {**timeline.timeline(policies, setting.scenario, row), "about": setting.about}

@@ -1,4 +1,4 @@
-"""The protocol of a task."""
+"""The protocol of a task, and how an episode is drawn for any of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any, ClassVar
 
 from bufgym.benchmark.rows import Layout, Row
 from bufgym.benchmark.summary import Quantity, Summary
+from bufgym.errors import BufgymError
 from bufgym.policies import Policy
+from bufgym.scenario import Streams
 from bufgym.scenario.suites import Setting
 
 Result = list[Row]
@@ -34,6 +36,8 @@ class Task(ABC):
     """The policy that a row of the leaderboard is compared with besides."""
     listed: ClassVar[tuple[str, ...]]
     """Quantities that the leaderboard lists, by key."""
+    no_plan: ClassVar[str] = ""
+    """Why a privileged policy can't take part: what it plans with; empty if it can."""
     legend: ClassVar[tuple[str, ...]] = ()
     """Lines under a printed summary."""
 
@@ -41,8 +45,10 @@ class Task(ABC):
     def default_policies(self, suite: str) -> list[str]:
         """The policies that run on a suite unless the caller says otherwise."""
 
-    def check(self, policy: Policy) -> None:  # noqa: B027  (most tasks take every policy)
+    def check(self, policy: Policy) -> None:
         """An error for a policy that can't take part."""
+        if policy.privileged is not None and self.no_plan:
+            raise BufgymError(f"policy {policy.name}: it plans with {self.no_plan}")
 
     def by_trace(self, scenario: Any) -> list[tuple[str, Any]]:
         """The scenario split into one for each of its traces: (label, scenario). Equal names get a number."""
@@ -80,7 +86,7 @@ class Task(ABC):
         Args:
             rows: of ``run``.
             unranked: policies that are shown but not ranked.
-            options: ``baseline``, ``resamples``, ``confidence`` and ``seed``, as in ``summarise``.
+            options: ``resamples``, ``confidence`` and ``seed``, as in ``summarise``.
         """
 
     def senders(self, rows: Sequence[Row]) -> Sequence[Row]:
@@ -99,6 +105,12 @@ class Task(ABC):
         ``setting_of`` gives the setting of a row, its scenario on that row's trace alone.
         """
         return None
+
+
+def draw(scenario: Any, seed: int) -> Any:
+    """The episode of this seed, with the uniform draws of randomised policies."""
+    streams = Streams.seeded(seed)
+    return scenario.draw(streams).with_uniforms(streams.policy)
 
 
 def counted(n: int, thing: str) -> str:

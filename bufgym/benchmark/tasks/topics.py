@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from bufgym.benchmark.bootstrap import ratio
 from bufgym.benchmark.episodes import Numbers
-from bufgym.benchmark.rows import Layout, Row
-from bufgym.benchmark.summary import Quantity, Run, Summary, summarise, title
+from bufgym.benchmark.rows import Layout, Row, columns_of
+from bufgym.benchmark.summary import KEY, Quantity, Summary, by_run, summarise, title
 from bufgym.benchmark.table import Column, Rows, decimal, in_blocks, mean, percent, score, written
 from bufgym.benchmark.tasks.task import Result, Task, counted
 from bufgym.errors import BufgymError
@@ -26,19 +26,14 @@ BASELINE = "robofleet"
 _RIVALS = ("drop-oldest", "rosbridge")
 """Made for one queue, but what a robot's topics meet today."""
 
-_OUTCOME = tuple(field.name for field in fields(TopicOutcome))[1:]
+_OUTCOME = {name: float for name in columns_of(TopicOutcome) if name != "topic"} | {"arrived": int}
 
-ROWS = Layout(
-    columns=(
-        *("scenario", "trace", "seed", "window", "consumers", "policy", "capacity"),
-        *("topic", "priority", "weight", "no_drop", "deadline_s"),
-        *_OUTCOME,
-        *("weighted_qoi", "seconds", "invalid"),
-    ),
-    text=("scenario", "trace", "policy", "topic"),
-    whole=("seed", "window", "consumers", "capacity", "arrived", "invalid"),
-    yes_no=("no_drop",),
-)
+ROWS: Layout = {
+    **{"scenario": str, "trace": str, "seed": int, "window": int, "consumers": int, "policy": str, "capacity": int},
+    **{"topic": str, "priority": float, "weight": float, "no_drop": bool, "deadline_s": float},
+    **_OUTCOME,
+    **{"weighted_qoi": float, "seconds": float, "invalid": int},
+}
 """One row for each topic of a run.
 
 It has the rules of the topic (``deadline_s`` is None where it has none) and its ``TopicOutcome`` (means over the
@@ -55,10 +50,11 @@ class TopicsTask(Task):
     kind = "topics"
     scenarios = (Client,)
     layout = ROWS
-    needed = ROWS.columns
+    needed = tuple(ROWS)
     baseline = BASELINE
     reference = BASELINE
     listed = ("relative", "lost", "age_relative")
+    no_plan = "a queue of its own, which no topic of a client has"
     legend = (
         "QoI: sum over topics of weight x H, mean over episodes; [low, high]: 95 % intervals, resampling episodes.",
         "no_drop lost: messages, all episodes together. Age: of information, at the server, mean over topics and time.",
@@ -69,10 +65,6 @@ class TopicsTask(Task):
     def default_policies(self, suite: str) -> list[str]:
         """All that are made for topics, and what is in use without them."""
         return [*_RIVALS, *names(for_topics=True)]
-
-    def check(self, policy: Policy) -> None:
-        if policy.privileged is not None:
-            raise BufgymError(f"policy {policy.name}: it plans with a queue of its own, which no topic of a client has")
 
     def messages(self, scenario: Client) -> int:
         return scenario.max_messages * scenario.consumers
@@ -87,44 +79,37 @@ class TopicsTask(Task):
             senders = run(policy, episodes, capacity, scenario.value, topics=scenario.topics)
             yield [_rows(scenario, senders, i) for i in range(len(episodes))]
 
-    def quantities(self, baseline: str = BASELINE, first: str = "first") -> tuple[Quantity, ...]:
+    def quantities(self, first: str = "first") -> tuple[Quantity, ...]:
         """``first``: what the topics of the highest priority are called."""
-
-        def seconds(number: float) -> str:
-            return decimal(number, 2)
-
-        def one_digit(number: float) -> str:
-            return decimal(number, 1)
-
-        def messages(number: float) -> str:
-            return f"{round(number, 1):g}"
 
         paired = "sum over sum, on the episodes that both met"
         first_age = "mean age of information at the server of the topics with the highest priority, s"
+        relative_age = f"that age over the one under {BASELINE}: {paired}"
         others_age = "mean age of information of all other topics, s"
         lost = "messages of no_drop topics that were dropped, in all episodes together"
         late = "of the messages delivered on topics with a deadline, the share after it"
         rate = "messages delivered a second, until the last arrival or receipt"
         return (
-            Quantity("qoi", "QoI", one_digit, "sum over topics of weight x H, mean over episodes", interval=False),
-            Quantity("relative", f"QoI / {baseline}", score, f"QoI over that of {baseline}: {paired}"),
-            Quantity("lost", "no_drop lost", messages, lost, interval=False, total=True),
-            Quantity("age_first_s", f"age, {first} (s)", seconds, first_age, interval=False),
-            Quantity("age_relative", f"age / {baseline}", score, f"that age over the one under {baseline}: {paired}"),
-            Quantity("age_others_s", "age, others (s)", seconds, others_age),
+            Quantity("qoi", "QoI", _one_digit, "sum over topics of weight x H, mean over episodes", interval=False),
+            Quantity("relative", f"QoI / {BASELINE}", score, f"QoI over that of {BASELINE}: {paired}", drawn=True),
+            Quantity("lost", "no_drop lost", _messages, lost, interval=False, total=True),
+            Quantity("age_first_s", f"age, {first} (s)", _seconds, first_age, interval=False),
+            Quantity("age_relative", f"age / {BASELINE}", score, relative_age, drawn=True),
+            Quantity("age_others_s", "age, others (s)", _seconds, others_age),
             Quantity("late", "late", percent, late, interval=False),
-            Quantity("rate_hz", "msg/s", one_digit, rate, interval=False),
+            Quantity("rate_hz", "msg/s", _one_digit, rate, interval=False),
         )
 
     def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
-        runs, priorities = _runs(rows)
-        options = {"baseline": self.baseline, **options}
-        first = f"priority {priorities[0]:g}" if len(priorities) == 1 else "first"
-        quantities = self.quantities(options["baseline"], first)
-        return summarise(runs, _statistics, quantities, rank_by="relative", unranked=unranked, **options)
+        runs = by_run(rows, "topic", "weighted_qoi")
+        priorities = {max(row["priority"] for row in run.values()) for run in runs.values()}
+        first = f"priority {priorities.pop():g}" if len(priorities) == 1 else "first"
+        numbers = {key: _numbers(list(run.values())) for key, run in runs.items()}
+        options |= {"rank_by": "relative", "baseline": self.baseline, "unranked": unranked}
+        return summarise(numbers, _statistics, self.quantities(first), **options)
 
     def senders(self, rows: Sequence[Row]) -> Sequence[Row]:
-        return list({_run_of(row): row for row in rows}.values())
+        return list({tuple(row[name] for name in KEY): row for row in rows}.values())
 
     def describe(self, scenarios: Sequence[Client], episodes: int) -> str:
         client, many = scenarios[0], counted(episodes, "episode")
@@ -177,23 +162,16 @@ def _folded(copies: Sequence[TopicOutcome]) -> Row:
 # --- the summary -----------------------------------------------------------------------------------------------------
 
 
-def _run_of(row: Mapping[str, Any]) -> Run:
-    return row["scenario"], row["capacity"], row["policy"], row["trace"], row["seed"]
+def _seconds(number: float) -> str:
+    return decimal(number, 2)
 
 
-def _runs(rows: Rows) -> tuple[dict[Run, list[float]], list[float]]:
-    """The numbers of each run, and the highest priority of each scenario without repetition."""
-    groups: dict[Run, list[Mapping[str, Any]]] = {}
-    for number, row in enumerate(rows):
-        for name in ("scenario", "capacity", "policy", "trace", "seed", "topic", "weighted_qoi"):
-            if row.get(name) is None:
-                raise BufgymError(f"rows[{number}]: no {name}")
-        group = groups.setdefault(_run_of(row), [])
-        if any(other["topic"] == row["topic"] for other in group):
-            raise BufgymError(f"rows[{number}]: topic {row['topic']!r} of one run has more than one row")
-        group.append(row)
-    priorities = dict.fromkeys(max(row["priority"] for row in group) for group in groups.values())
-    return {run: _numbers(group) for run, group in groups.items()}, list(priorities)
+def _one_digit(number: float) -> str:
+    return decimal(number, 1)
+
+
+def _messages(number: float) -> str:
+    return f"{round(number, 1):g}"
 
 
 def _numbers(topics: Rows) -> list[float]:
@@ -213,7 +191,7 @@ def _numbers(topics: Rows) -> list[float]:
     ]
 
 
-def _statistics(ours: Numbers, theirs: Numbers, weights: Numbers) -> dict[str, Numbers]:
+def _statistics(ours: Numbers, base: Numbers, weights: Numbers) -> dict[str, Numbers]:
     """See ``summary.Statistics``."""
 
     def share(above: Numbers, below: Numbers) -> Numbers:
@@ -227,10 +205,10 @@ def _statistics(ours: Numbers, theirs: Numbers, weights: Numbers) -> dict[str, N
     qoi, lost, age_first, age_others, late, due, delivered, seconds = ours.T
     return {
         "qoi": average(qoi),
-        "relative": share(qoi, theirs.T[0]),
+        "relative": share(qoi, base.T[0]),
         "lost": weights @ lost,
         "age_first_s": average(age_first),
-        "age_relative": share(age_first, theirs.T[2]),
+        "age_relative": share(age_first, base.T[2]),
         "age_others_s": average(age_others),
         "late": share(late, due),
         "rate_hz": share(delivered, seconds),

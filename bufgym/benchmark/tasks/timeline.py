@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark import bound
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import BASELINE
-from bufgym.benchmark.seeds import draw
+from bufgym.benchmark.tasks import bound
+from bufgym.benchmark.tasks.task import draw
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
 from bufgym.sim import NEVER
@@ -30,10 +30,10 @@ def choose(rows: Sequence[Row]) -> Row | None:
     return max(candidates, key=lambda row: (row["regret"], row["scenario"], row["trace"], row["seed"]), default=None)
 
 
-def timeline(policies: Sequence[Policy], scenario: Scenario, shown: Row) -> dict[str, Any]:
-    """The episode of the row ``shown`` under every policy; times in s, rates in bytes/s."""
-    episode = draw(scenario, shown["seed"])
-    capacity = shown["capacity"]
+def timeline(policies: Sequence[Policy], scenario: Scenario, chosen: Row) -> dict[str, Any]:
+    """The episode of the row ``chosen`` under every policy; times in s, rates in bytes/s."""
+    episode = draw(scenario, chosen["seed"])
+    capacity = chosen["capacity"]
     plan = bound.best(episode, capacity, scenario)
     arrivals = np.asarray(episode.arrivals)
     lanes: dict[str, Any] = {}
@@ -58,7 +58,7 @@ def timeline(policies: Sequence[Policy], scenario: Scenario, shown: Row) -> dict
     carried = np.diff(episode.link.carried_by(edges_us))
     offered_s = max(1, int(arrivals["arrival_us"][-1])) / 1e6
     return {
-        **{key: shown[key] for key in ("scenario", "capacity", "trace", "seed")},
+        **{key: chosen[key] for key in ("scenario", "capacity", "trace", "seed")},
         "arrival_s": (arrivals["arrival_us"] / 1e6).tolist(),
         "x": arrivals["x"].tolist(),
         "rate": {"t_s": (edges_us[:-1] / 1e6).tolist(), "bytes_per_s": (carried / _STEP_S).tolist()},
