@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 
-HEADER = 5
-"""Numbers before the fields: fields read, those of the context among them, widths of both layers, 1 if it mixes."""
+HEADER = 6
+"""Numbers before the fields: fields read, those of the context among them, widths of both layers, numbers of one
+network, mixing weights."""
 DROP, KEEP, SEND = range(3)
 """The networks of a scorer, in the order of its parameters: of dropping a candidate, accepting it, sending it."""
 
@@ -63,29 +64,17 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def network_size(inputs: int, first: int, second: int) -> int:
-    """Numbers of one network."""
-    if first == 0:
-        return inputs + 1
-    if second == 0:
-        return inputs + 1 + (inputs + 1) * first + first
-    return inputs + 1 + (inputs + 1) * first + (first + 1) * second + second
-
-
-@kernel
 def end_of(parameters: NDArray[np.float64], begin: int, networks: int) -> int:
     """Where the parameters of a scorer of so many networks end that begin at ``begin``."""
-    inputs, context = int(parameters[begin]), int(parameters[begin + 1])
-    size = network_size(inputs, int(parameters[begin + 2]), int(parameters[begin + 3]))
-    return begin + HEADER + inputs + networks * size + int(parameters[begin + 4]) * context * (inputs - context)
+    inputs, size, mixing = int(parameters[begin]), int(parameters[begin + 4]), int(parameters[begin + 5])
+    return begin + HEADER + inputs + networks * size + mixing
 
 
 @kernel
 def unpack(parameters: NDArray[np.float64], begin: int, networks: int) -> Scorer:
     """The scorer of so many networks whose parameters begin at ``begin``."""
     inputs, context = int(parameters[begin]), int(parameters[begin + 1])
-    first, second = int(parameters[begin + 2]), int(parameters[begin + 3])
-    size = network_size(inputs, first, second)
+    first, second, size = int(parameters[begin + 2]), int(parameters[begin + 3]), int(parameters[begin + 4])
     nets = begin + HEADER + inputs
     mix, end = nets + networks * size, end_of(parameters, begin, networks)
     fields = parameters[begin + HEADER : nets]
@@ -266,5 +255,6 @@ class ScorerWeights:
         order = [self.fields.index(name) for name in (*self.context, *self.slot)]
         places = [*map(self.CONTEXT_NAMES.index, self.context), *map(self.SLOT_NAMES.index, self.slot)]
         networks = [getattr(self, name).flat(order) for name in self.NETWORKS]
-        header = [len(self.fields), len(self.context), *self.widths, 0 if mix is None else 1]
-        return np.concatenate([header, places, *networks, *([] if mix is None else [mix.reshape(-1)])])
+        mixing = np.zeros(0) if mix is None else mix.reshape(-1)
+        header = [len(self.fields), len(self.context), *self.widths, len(networks[0]), len(mixing)]
+        return np.concatenate([header, places, *networks, mixing])
