@@ -1,7 +1,8 @@
 """What Robofleet's Fig. 3 to 7 share: the messages, the programs that send them, and what became of each.
 
-The paper sends with n_T = 1 in its experiments; so do we. What it leaves open is an option of each figure. Arrivals
-are jittered by up to a tenth of their period, which is what differs from run to run; every sender meets the same ones.
+The paper [sikand2021robofleet] sends with n_T = 1 in its experiments; so do we. What it leaves open is an option of
+each figure. Arrivals are jittered by up to a tenth of their period, which is what differs from run to run; every sender
+meets the same ones.
 
 Left out on purpose: TCP (a link that stands still is found again at once, unless a figure takes a silence as option),
 the bytes of pings and pongs, encoding time, and whatever lies behind the server.
@@ -224,5 +225,5 @@ def curves(axes: Any, rows: Rows, x: str, y: str, names: Sequence[str], **styles
     for k, name in enumerate(names):
         means = {at: rows.mean(y, **{x: at}, sender=name) for at in rows.where(sender=name).distinct(x)}
         program = PROGRAMS[name]
-        style = {**program.style, "markersize": 4 + 2 * k, "zorder": 3 - 0.1 * k, **styles}  # equal lines stay visible
+        style = {**program.style, "markersize": 4 + k, "zorder": 3 - 0.1 * k, **styles}  # equal lines stay visible
         axes.plot(list(means), list(means.values()), label=program.label, **style)
