@@ -17,17 +17,16 @@ from numpy.typing import NDArray
 
 from agents.mixed_env import MixedEnv, cells
 from agents.settings import Settings
-from bufgym.benchmark import bound
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.run import run as run_policies
 from bufgym.benchmark.score import BASELINE, DISCRIMINATIVE, normalised_score, regret
-from bufgym.benchmark.seeds import seeds_of, seeds_per_trace
 from bufgym.benchmark.sweep import Sweep, run_sweep
+from bufgym.benchmark.tasks import bound
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
 from bufgym.sb3 import takes_masks
-from bufgym.scenario import Episode, suites
+from bufgym.scenario import Episode
 from bufgym.sim import run
 from bufgym.sim.metrics import Outcome, outcome
 
@@ -172,10 +171,9 @@ def _mean(verdicts: Sequence[Verdict]) -> Verdict:
 
 def test_rows(settings: Settings, policies: Sequence[Policy]) -> list[Row]:
     """The rows of these policies on the test split of the run's one suite, of whatever kind."""
-    suite = suites.get(settings.suite)
-    seeds, capacities = seeds_per_trace(suite, settings.test_seeds or None), settings.capacities_of(suite.name)
+    sweep = Sweep(settings.suite, (), "test", settings.capacities_of(settings.suite), settings.test_seeds or None)
     rows = []
-    for label, setting in suite.settings("test").items():
-        for k, (_, scenario) in enumerate(by_trace(setting.scenario)):
-            rows += run_policies(policies, scenario, capacities, seeds_of(k, seeds), label=label, progress=True)
+    for shard in sweep.checked().shards():
+        scenario = sweep.setting(shard.label, shard.trace).scenario
+        rows += run_policies(policies, scenario, sweep.capacities, shard.seeds, label=shard.label, progress=True)
     return rows

@@ -21,7 +21,8 @@ from agents.evaluation import EvaluationSet, Numbers
 from agents.page import columns_of, command, publish, table, written
 from agents.runs import MODEL, read_settings
 from bufgym import files, policies
-from bufgym.benchmark.score import BASELINE, Interval, regret, scores
+from bufgym.benchmark.bootstrap import Interval
+from bufgym.benchmark.score import BASELINE, regret, scores
 from bufgym.benchmark.sweep import Sweep
 from bufgym.errors import BufgymError
 from bufgym.oracle import EveryLength, law, online_optimum

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from bufgym import files, policies
-from bufgym.benchmark.bound import best
 from bufgym.benchmark.run import by_trace, draw
+from bufgym.benchmark.tasks.bound import best
 from bufgym.model import qoi
 from bufgym.oracle import integer, law
 from bufgym.policies import weights

@@ -18,7 +18,7 @@ from agents.objectives.objective import Objective
 from bufgym import policies
 from bufgym.benchmark import tasks
 from bufgym.benchmark.run import by_trace, draw
-from bufgym.benchmark.seeds import seeds_of
+from bufgym.benchmark.sweep import Sweep
 from bufgym.files import shipped
 from bufgym.policies import Policy, weights
 from bufgym.policies.learned import Network, Weights
@@ -112,9 +112,10 @@ def training_parts(suite: str, capacities: Sequence[int], seed: int) -> list[lis
 
 def validation_episodes(suite: str, capacities: Sequence[int]) -> list[FleetEpisodes]:
     """The validation episodes at every L, the same for every seed."""
-    links = [link for _, link in by_trace(fleet_of(suite, "validation"))]
-    episodes = [draw(link, seed) for k, link in enumerate(links) for seed in seeds_of(k, VALIDATION_EPISODES)]
-    return [FleetEpisodes(links[0], episodes, L) for L in capacities]
+    sweep = Sweep(suite, (), "validation", seeds=VALIDATION_EPISODES).checked()
+    drawn = [(sweep.setting(shard.label, shard.trace).scenario, shard.seeds) for shard in sweep.shards()]
+    episodes = [draw(robots, seed) for robots, seeds in drawn for seed in seeds]
+    return [FleetEpisodes(drawn[0][0], episodes, L) for L in capacities]
 
 
 # --- the objective ---------------------------------------------------------------------------------------------------

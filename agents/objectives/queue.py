@@ -19,9 +19,9 @@ from agents.mixed_env import Cell, cells
 from agents.objectives.objective import Objective
 from agents.settings import Settings
 from bufgym import policies
-from bufgym.benchmark.bound import best, regret
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.score import BASELINE
+from bufgym.benchmark.tasks.bound import best, regret
 from bufgym.oracle import EveryLength
 from bufgym.policies import Policy, learned
 from bufgym.policies.learned import Weights
