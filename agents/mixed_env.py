@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from bufgym.envs.rows import Rows
 from bufgym.errors import BufgymError
-from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
 from bufgym.scenario import Episode, Scenario, suites
 
 Observation = dict[str, NDArray[np.float32]]
@@ -154,8 +153,8 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def observation(self) -> Observation:
         """Every row's, padded; fresh arrays."""
-        slots = np.zeros((self.num_envs, len(SLOT_FIELDS), self.padded_slots + 1), np.float32)
-        context = np.empty((self.num_envs, len(CONTEXT_FIELDS)), np.float32)
+        slots = np.zeros((self.num_envs, len(self._widest.slot_fields), self.padded_slots + 1), np.float32)
+        context = np.empty((self.num_envs, len(self._widest.context_fields)), np.float32)
         for rows, span in zip(self.groups, self.spans, strict=True):
             slots[span, :, : rows.capacity] = rows.output.slots[:, :, :-1]
             slots[span, :, -1] = rows.output.slots[:, :, -1]

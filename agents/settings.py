@@ -183,6 +183,8 @@ class Settings:
                 self._refuse(name, f"must be one of {', '.join(get_args(hint))}")
         if self.kind == "environment" and self.env not in ENVIRONMENTS:
             self._refuse("env", f"must be one of {', '.join(ENVIRONMENTS)}")
+        if self.kind == "environment" and self.env == "bufgym/Topics-v0":
+            self._refuse("env", "a scheduler learns from a suite of topics (--suite topics-v1 --algo evolution)")
         if self.kind == "environment" and self.algo == "evolution":
             raise BufgymError("--algo evolution learns from a suite's episodes: name one (--suite)")
         if self.kind in _ALONE:

@@ -289,6 +289,7 @@ EVOLUTION = {"algo": "evolution", "suite": "interruption-v1"}
         *(({name: -1}, f"{name} = -1: must") for name in (*NOT_POSITIVE, *NEGATIVE)),
         *(({name: float("nan")}, f"{name} = nan: must be a finite number") for name in ("gamma", "duration_s")),
         *(({name: "no-such"}, f"{name} = 'no-such': must be one of") for name in ("env", "algo", "network", "reward")),
+        ({"env": "bufgym/Topics-v0"}, "env = 'bufgym/Topics-v0': a scheduler learns from a suite of topics"),
         ({"gamma": 1.5}, "gamma = 1.5: must lie in 0..1"),
         ({"batch_size": 1}, "batch_size = 1: must be >= 2"),
         ({"hidden": 257}, "hidden = 257: must lie in 0..256"),
