@@ -4,17 +4,7 @@ from __future__ import annotations
 
 from bufgym.kernel import at, kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, push
-from bufgym.sim.rules import (
-    arrived_on_topic,
-    at_limit,
-    gain_behind,
-    kept_after,
-    kept_before,
-    no_drop,
-    refuge,
-    sendable,
-    too_soon,
-)
+from bufgym.sim import rules
 from bufgym.sim.state import (
     ARRIVAL_WAITS,
     CHOSEN,
@@ -49,7 +39,7 @@ def arrive(batch: Batch, i: int) -> int:
         sender.service_ratio += _SERVICE_WEIGHT * (sender.departures - sender.service_ratio)
     else:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
-    if sender.limit_at_send == 0 and too_soon(batch, i, arrival.topic):
+    if sender.limit_at_send == 0 and rules.too_soon(batch, i, arrival.topic):
         at(batch.log, i, sender.next).limited = 1
         decision = REJECT  # always valid: a no_drop topic has no rate limit
     else:
@@ -67,7 +57,7 @@ def has_room(batch: Batch, i: int) -> bool:
     """Whether the arrival at hand fits without a drop, by messages and by bytes."""
     sender = batch.senders[i]
     arrival = at(batch.arrivals, i, sender.next)
-    if sender.occupancy >= sender.capacity or at_limit(batch, i, arrival.topic):
+    if sender.occupancy >= sender.capacity or rules.at_limit(batch, i, arrival.topic):
         return False
     return bool(sender.backlog_bytes + arrival.size_bytes <= sender.max_bytes)
 
@@ -82,7 +72,7 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
     arrival = at(batch.arrivals, i, sender.next)
     if sender.topics > 1 and (
         at(batch.topics, i, slot.topic).no_drop == 1
-        or (slot.topic != arrival.topic and at_limit(batch, i, arrival.topic))
+        or (slot.topic != arrival.topic and rules.at_limit(batch, i, arrival.topic))
     ):
         return False
     return bool(sender.backlog_bytes - slot.size_bytes + arrival.size_bytes <= sender.max_bytes)
@@ -92,7 +82,7 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
 def can_reject(batch: Batch, i: int) -> bool:
     """Whether the arrival at hand may be dropped: always, but for a no_drop message that could be kept somehow."""
     topic = at(batch.arrivals, i, batch.senders[i].next).topic
-    return not no_drop(batch, i, topic) or (not has_room(batch, i) and refuge(batch, i) < 0)
+    return not rules.no_drop(batch, i, topic) or (not has_room(batch, i) and rules.refuge(batch, i) < 0)
 
 
 @kernel
@@ -112,14 +102,14 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     else:
         enqueue = has_room(batch, i)
         valid = decision == ACCEPT and enqueue
-        if not enqueue and no_drop(batch, i, arrival.topic):
-            victim = refuge(batch, i)
+        if not enqueue and rules.no_drop(batch, i, arrival.topic):
+            victim = rules.refuge(batch, i)
             enqueue = victim >= 0
     if victim >= 0:
         remove(batch, i, victim)
     if enqueue:
         # The first message of all, or of its topic, is the 1 in H = 1 + sum of V.
-        gain = gain_behind(batch, i, sender.occupancy, arrival.topic, arrival.x)
+        gain = rules.gain_behind(batch, i, sender.occupancy, arrival.topic, arrival.x)
         sender.retained_gain += gain
         sender.first = push(batch.slots, i, sender.first, sender.occupancy, arrival)
         at(batch.slots, i, sender.first + sender.occupancy).gain = gain
@@ -132,7 +122,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     if not valid:
         sender.invalid += 1
     if sender.topics > 1:
-        arrived_on_topic(batch, i, arrival, enqueue)
+        rules.arrived_on_topic(batch, i, arrival, enqueue)
     sender.previous_us, sender.previous_x = arrival.arrival_us, arrival.x
     sender.departures = 0
     sender.waiting = NOTHING_WAITS
@@ -150,10 +140,10 @@ def remove(batch: Batch, i: int, k: int) -> None:
     at(batch.log, i, gone.seq).dropped_us = sender.now_us
     if sender.topics > 1:
         at(batch.topics, i, gone.topic).queued -= 1
-    j = kept_after(batch, i, k, gone.topic)
+    j = rules.kept_after(batch, i, k, gone.topic)
     if j < sender.occupancy:
         behind = at(batch.slots, i, sender.first + j)
-        merged = gain_behind(batch, i, k, gone.topic, behind.x)
+        merged = rules.gain_behind(batch, i, k, gone.topic, behind.x)
         sender.retained_gain += merged - behind.gain
         behind.gain = merged
     sender.first = evict(batch.slots, i, sender.first, sender.occupancy, k)
@@ -165,7 +155,7 @@ def remove(batch: Batch, i: int, k: int) -> None:
 def answer_dequeue(batch: Batch, i: int, drop: bool) -> None:
     """The policy's answer to DEQUEUE: drop the head, or let it go. A no_drop message is never dropped."""
     sender = batch.senders[i]
-    if drop and not no_drop(batch, i, at(batch.slots, i, sender.first).topic):
+    if drop and not rules.no_drop(batch, i, at(batch.slots, i, sender.first).topic):
         remove(batch, i, 0)
     else:
         sender.socket = CLEARED
@@ -180,7 +170,8 @@ def can_send(batch: Batch, i: int, k: int) -> bool:
     sender = batch.senders[i]
     if not 0 <= k < sender.occupancy:
         return False
-    return kept_before(batch, i, k, at(batch.slots, i, sender.first + k).topic) < 0 and sendable(batch, i, k)
+    topic = at(batch.slots, i, sender.first + k).topic
+    return rules.kept_before(batch, i, k, topic) < 0 and rules.sendable(batch, i, k)
 
 
 @kernel

@@ -25,8 +25,8 @@ from bufgym.sim.transition import load_row
 class Senders:
     """A batch of n senders that share L, B and V, each with an episode of its own.
 
-    ``capacity`` (L, messages), ``max_bytes`` (B), ``decide_at``, ``value`` (V) and ``topics`` are the settings that
-    they share, ``batch`` their arrays (see ``Batch``), ``episodes`` what each has loaded, None for nothing.
+    ``capacity`` (L, messages), ``max_bytes`` (B), ``decide_at``, ``value`` (V) and ``topics`` are the shared settings,
+    ``batch`` the arrays (see ``Batch``), ``episodes`` what each sender has loaded, None for nothing.
     """
 
     def __init__(

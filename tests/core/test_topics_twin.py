@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from topic_cases import choice, decision, topic_cases, unwanted
 
-from bufgym import policies
+from bufgym import policies, sim
 from bufgym.model.buffer import (
     ACCEPT,
     HOLD,
@@ -28,30 +28,8 @@ from bufgym.model.buffer import (
 from bufgym.model.link import FOREVER
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
-from bufgym.sim import (
-    DECISION,
-    DEPARTURE,
-    DEQUEUE,
-    END,
-    NEVER,
-    SEND,
-    age_until,
-    answer_dequeue,
-    answer_send,
-    can_evict,
-    can_hold,
-    can_reject,
-    can_send,
-    credit,
-    decide,
-    has_room,
-    named,
-    next_event,
-    python_view,
-    run,
-)
 
-NAMES = {DECISION: "decision", DEPARTURE: "departure", DEQUEUE: "dequeue", SEND: "send", END: "end"}
+NAMES = {sim.DECISION: "decision", sim.DEPARTURE: "departure", sim.DEQUEUE: "dequeue", sim.SEND: "send", sim.END: "end"}
 
 
 # --- against the twin ------------------------------------------------------------------------------------------------
@@ -62,34 +40,34 @@ def test_agrees_with_twin_event_by_event(case):
     senders, twin = case.senders(), case.twin()
     batch, events, answer, expected = senders.batch, case.twin_events(twin), None, ""
     while expected != "end":
-        expected, event = events.send(answer), next_event(batch, None, 0)
+        expected, event = events.send(answer), sim.next_event(batch, None, 0)
         assert NAMES[event] == expected
-        credit(batch, 0, int(batch.senders[0]["now_us"]))
+        sim.credit(batch, 0, int(batch.senders[0]["now_us"]))
         agree(senders, twin)
-        view = python_view(named(batch), 0)
+        view = sim.python_view(sim.named(batch), 0)
         assert (view.window, view.in_flight) == (case.case.episode.window, len(twin.in_flight))
         assert (view.busy, view.left_bytes) == (int(bool(twin.socket)), twin.left_bytes())
         answer = None
         if expected == "decision":
             agree_on_gaps(senders, twin)
             answer = decision(twin.newcomer["uniform"], case.case.capacity)
-            decide(batch, 0, answer)
+            sim.decide(batch, 0, answer)
         elif expected == "send":
-            masks = [can_send(batch, 0, k) for k in range(-1, case.case.capacity + 1)]
+            masks = [sim.can_send(batch, 0, k) for k in range(-1, case.case.capacity + 1)]
             assert masks == [False, *(twin.sendable(m) for m in twin.slots())] + [False] * (
                 len(masks) - 1 - view.slots.size
             )
-            assert can_hold(batch, 0) == twin.may_hold()
+            assert sim.can_hold(batch, 0) == twin.may_hold()
             answer = choice(twin.now, len(twin.slots()), len(twin.dequeued), case.case.capacity)
-            answer_send(batch, 0, answer)
+            sim.answer_send(batch, 0, answer)
         elif expected == "dequeue":
             answer = unwanted(twin.now, len(twin.slots()))
-            answer_dequeue(batch, 0, answer)
+            sim.answer_dequeue(batch, 0, answer)
     agree_on_log(senders, twin)
     until = int(batch.senders[0]["now_us"]) + 5_000
-    credit(batch, 0, until)
+    sim.credit(batch, 0, until)
     for k in range(len(case.topics)):
-        age_until(batch, 0, k, until)
+        sim.age_until(batch, 0, k, until)
     agree(senders, twin, until, to_the_end=True)
 
 
@@ -137,15 +115,15 @@ def agree(senders, twin, until=None, to_the_end=False):
 
 def agree_on_gaps(senders, twin):
     """What a policy reads about the newcomer and every slot."""
-    seen = named(senders.batch)
-    buffer, arrival = python_view(seen, 0), seen.arrivals[0, seen.senders[0].next]
+    seen = sim.named(senders.batch)
+    buffer, arrival = sim.python_view(seen, 0), seen.arrivals[0, seen.senders[0].next]
     newcomer, slots = twin.newcomer, twin.slots()
     reference, last = twin.reference(), twin.kept_before(newcomer)
     assert (buffer.dequeued_arrival_us, buffer.dequeued_x) == (reference["us"], reference["x"])
     gain = twin.gain(twin.lane(newcomer), [last, newcomer]) if last else 0.0
     assert arrival_gain(buffer, arrival) == pytest.approx(gain, abs=1e-12)
-    assert has_room(senders.batch, 0) == twin.fits(newcomer)
-    assert can_reject(senders.batch, 0) == (not twin.must_keep(newcomer))
+    assert sim.has_room(senders.batch, 0) == twin.fits(newcomer)
+    assert sim.can_reject(senders.batch, 0) == (not twin.must_keep(newcomer))
     evictable = twin.evictable(newcomer)
     for k, message in enumerate([*slots, newcomer]):
         lane = twin.lane(message)
@@ -159,7 +137,7 @@ def agree_on_gaps(senders, twin):
         if k < len(slots):
             assert after(buffer, k, lane) == min([j for j in own if j > k], default=len(slots))
             assert is_first(buffer, k) == (k == own[0])
-            assert can_evict(senders.batch, 0, k) == (message in evictable)
+            assert sim.can_evict(senders.batch, 0, k) == (message in evictable)
 
 
 def agree_on_log(senders, twin):
@@ -211,41 +189,41 @@ def test_invariants_after_every_event(case, chance):
     capacity, event, now_us = case.case.capacity, None, 0
     # Arrivals that ask nobody may find no room; where all ask, and are given what is possible, nothing is impossible.
     everyone = case.case.episode.first_decision == 0 and case.case.episode.last_decision > len(case.case.twin_messages)
-    while event != END:
-        event = next_event(batch, None, 0)
+    while event != sim.END:
+        event = sim.next_event(batch, None, 0)
         assert sender["now_us"] >= now_us
         now_us = int(sender["now_us"])
         hold(case, senders)
-        if event == DECISION:
-            possible = [k for k in range(capacity) if can_evict(batch, 0, k)]
-            possible += [REJECT] * can_reject(batch, 0) + [ACCEPT] * has_room(batch, 0)
+        if event == sim.DECISION:
+            possible = [k for k in range(capacity) if sim.can_evict(batch, 0, k)]
+            possible += [REJECT] * sim.can_reject(batch, 0) + [ACCEPT] * sim.has_room(batch, 0)
             kept_if_possible(case, senders, chance.choice(possible), possible=True)
-        elif event == SEND:
-            possible = [k for k in range(capacity) if can_send(batch, 0, k)] + [HOLD] * can_hold(batch, 0)
-            assert answer_send(batch, 0, chance.choice(possible))
-        elif event == DEQUEUE:
-            answer_dequeue(batch, 0, chance.random() < 0.5)
+        elif event == sim.SEND:
+            possible = [k for k in range(capacity) if sim.can_send(batch, 0, k)] + [HOLD] * sim.can_hold(batch, 0)
+            assert sim.answer_send(batch, 0, chance.choice(possible))
+        elif event == sim.DEQUEUE:
+            sim.answer_dequeue(batch, 0, chance.random() < 0.5)
         hold(case, senders)
     assert sender["invalid"] == 0 or not everyone
     assert sender["next"] == len(case.case.twin_messages)
-    assert next_event(batch, None, 0) == END  # and stays there
+    assert sim.next_event(batch, None, 0) == sim.END  # and stays there
 
 
 @given(topic_cases())
 def test_invariants_under_impossible_decisions(case):
     senders = case.senders()
     batch, event = senders.batch, None
-    while event != END:
-        event = next_event(batch, None, 0)
-        if event == DECISION:
+    while event != sim.END:
+        event = sim.next_event(batch, None, 0)
+        if event == sim.DECISION:
             uniform = float(batch.arrivals[0, batch.senders[0]["next"]]["uniform"])
             kept_if_possible(case, senders, decision(uniform, case.case.capacity))
-        elif event == SEND:
+        elif event == sim.SEND:
             sender = batch.senders[0]
             k = choice(int(sender["now_us"]), int(sender["occupancy"]), int(sender["dequeued"]), case.case.capacity)
-            answer_send(batch, 0, k)
-        elif event == DEQUEUE:
-            answer_dequeue(batch, 0, True)
+            sim.answer_send(batch, 0, k)
+        elif event == sim.DEQUEUE:
+            sim.answer_dequeue(batch, 0, True)
         hold(case, senders)
 
 
@@ -256,8 +234,8 @@ def kept_if_possible(case, senders, answer, possible=False):
     slots = np.asarray(batch.slots[0])[sender["first"] : sender["first"] + sender["occupancy"]].copy()
     seq = int(sender["next"])
     newcomer = np.asarray(batch.arrivals[0])[seq].copy()
-    assert decide(batch, 0, answer) or not possible
-    gone = np.asarray(batch.log[0])["dropped_us"] != NEVER
+    assert sim.decide(batch, 0, answer) or not possible
+    gone = np.asarray(batch.log[0])["dropped_us"] != sim.NEVER
     no_drop = [rules.no_drop for rules in case.topics] or [False] * 3  # one queue ignores the messages' topics
     assert not any(gone[m["seq"]] and no_drop[m["topic"]] for m in slots)
     if not (gone[seq] and no_drop[newcomer["topic"]]):
@@ -277,7 +255,8 @@ def hold(case, senders):
     topic = np.asarray(case.case.episode.arrivals)["topic"] * bool(case.topics)
     x = np.asarray(case.case.episode.arrivals)["x"]
     slots = np.asarray(batch.slots[0])[first : first + queued]
-    dropped, transmitted, dequeued = (rows[name] != NEVER for name in ("dropped_us", "transmitted_us", "dequeued_us"))
+    times = ("dropped_us", "transmitted_us", "dequeued_us")
+    dropped, transmitted, dequeued = (rows[name] != sim.NEVER for name in times)
     assert (transmitted <= dequeued).all() and not (dropped & dequeued).any()
     assert not (dropped | dequeued)[slots["seq"]].any()
     assert (dequeued & ~transmitted).sum() == sender["busy"]
@@ -339,8 +318,8 @@ def test_one_topic_without_rules_is_a_plain_sender(case, v, on_send, data):
     limits = {"max_bytes": case.max_bytes, "decide_at": case.decide_at}
     for policy in data.draw(st.lists(st.sampled_from(PLAIN), min_size=4, max_size=4)):
         scheduled = policy if on_send is None else replace(policy, on_send=on_send)
-        plain = run(policy if on_send is head else scheduled, [case.episode], case.capacity, v, **limits)
-        topics = run(scheduled, [one_topic(case)], case.capacity, v, topics=[Topic("only")], **limits)
+        plain = sim.run(policy if on_send is head else scheduled, [case.episode], case.capacity, v, **limits)
+        topics = sim.run(scheduled, [one_topic(case)], case.capacity, v, topics=[Topic("only")], **limits)
         assert same(plain, topics), policy.name
 
 
@@ -349,6 +328,6 @@ def test_one_topic_without_rules_has_the_same_window(case, v, window, ack_delay_
     for on_send in (head, holds_sometimes):
         policy = replace(PLAIN[-1], on_send=on_send)
         windowed = {"window": window, "ack_delay_us": ack_delay_us}
-        plain = run(policy, [replace(case.episode, **windowed)], case.capacity, v)
-        topics = run(policy, [replace(one_topic(case), **windowed)], case.capacity, v, topics=[Topic("only")])
+        plain = sim.run(policy, [replace(case.episode, **windowed)], case.capacity, v)
+        topics = sim.run(policy, [replace(one_topic(case), **windowed)], case.capacity, v, topics=[Topic("only")])
         assert same(plain, topics)
