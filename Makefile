@@ -12,12 +12,13 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 .DEFAULT_GOAL := help
-.PHONY: help train test fuzz format clean
+.PHONY: help train test fuzz claims format clean
 
 help:
 	@echo "make train    set up if needed, then train an agent        (ARGS=... go to train.py)"
 	@echo "make test     set up if needed, then check everything      (PYTEST_ARGS=... go to pytest)"
 	@echo "make fuzz     set up if needed, then read 100,000 broken link files (nightly)"
+	@echo "make claims   set up if needed, then test every claim of the papers (nightly; DATA=folder of recordings)"
 	@echo "make format   set up if needed, then format and fix what can be fixed"
 	@echo "make clean    remove caches and build products; keeps .venv and results"
 	@echo ""
@@ -37,6 +38,12 @@ test: $(READY)
 # For the night: 100,000 broken link files, others every day.
 fuzz: $(READY)
 	BUFGYM_FUZZ=100000 BUFGYM_FUZZ_SEED=$$(date +%Y%m%d) HYPOTHESIS_PROFILE=thorough $(PYTEST) tests/traces/test_fuzz_links.py $(PYTEST_ARGS)
+
+# For the night: every figure, and what came out beside the page as it stands.
+claims: $(READY)
+	mkdir -p build
+	$(BIN)/python -m bufgym reproduce --claims build/claims.md $(if $(DATA),--data $(DATA))
+	diff docs/claims.md build/claims.md
 
 format: $(READY)
 	$(BIN)/ruff format .

@@ -13,12 +13,23 @@ def add(commands: Commands) -> None:
     reproduce = command(commands, "reproduce", _reproduce, "figures and tables of the papers, our number beside theirs")
     reproduce.add_argument("names", nargs="*", metavar="NAME", help="which; 'all' for all; none lists them")
     reproduce.add_argument("--data", metavar="DIR", help="folder of recordings, for the figures that need one")
+    reproduce.add_argument("--claims", metavar="FILE", help="run every figure and write the page of claims (Markdown)")
     reproduce.add_argument("--out", default="reproduced", metavar="DIR", help="where pictures go (%(default)s)")
 
 
 def _reproduce(options: argparse.Namespace) -> None:
     from bufgym import reproduce
 
+    data = None if options.data is None else Path(options.data)
+    if data is not None and not data.is_dir():
+        raise BufgymError(f"{data}: no such folder (--data)")
+    if options.claims is not None:
+        from bufgym.reproduce.page import claims_page
+
+        Path(options.claims).write_text(claims_page(data), encoding="utf-8")
+        print(f"claims: {options.claims}")
+        if not options.names:
+            return
     if not options.names:
         print("figures (bufgym reproduce NAME..., or all)\n" + columns(list(reproduce.FIGURES.items())))
         return
@@ -26,9 +37,6 @@ def _reproduce(options: argparse.Namespace) -> None:
         if name != "all" and name not in reproduce.FIGURES:
             raise BufgymError(f"unknown figure {name!r}; known: all, {', '.join(reproduce.FIGURES)}")
     names = list(reproduce.FIGURES) if "all" in options.names else list(dict.fromkeys(options.names))
-    data = None if options.data is None else Path(options.data)
-    if data is not None and not data.is_dir():
-        raise BufgymError(f"{data}: no such folder (--data)")
     out = Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
     for k, name in enumerate(names):

@@ -16,7 +16,7 @@ from typing import Any
 from bufgym.errors import BufgymError
 from bufgym.reproduce.figure import Figure, report, save_picture, statements
 
-FIGURES: dict[str, str] = {name: texts["title"] for name, texts in statements().items()}
+FIGURES: dict[str, str] = {name: texts["title"] for name, texts in statements().items() if "title" in texts}
 """Name -> what it shows, in one line."""
 
 NEEDS_DATA: dict[str, str] = {name: texts["needs"] for name, texts in statements().items() if "needs" in texts}

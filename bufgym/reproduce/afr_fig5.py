@@ -114,7 +114,13 @@ class Reproduction(Figure):
         afr_mean, oldest_mean = (mean_score(policy, PAPER_L, *MEAN_OVER) for policy in ("afr", "drop-oldest"))
         printed = [row for row in rows if row["T"] in PAPER_PEAKS]
         peaks = equal_lengths(rows)
+        beyond = [row for row in rows if row["T"] > PAPER_L]
+        ordered = [row["afr"] > row["random"] > row["drop-oldest"] for row in beyond]
         return {
+            "equal": peaks == list(PAPER_PEAKS),
+            "order": all(ordered) if ordered else None,
+            "ordered": sum(ordered),
+            "lengths": len(ordered),
             "peaks": listed(peaks),
             "paper_peaks": listed(PAPER_PEAKS),
             "below": listed([f"{row['T']}: {row['afr'] / row['oracle-ideal']:.5f}" for row in printed]),

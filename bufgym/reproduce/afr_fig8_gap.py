@@ -31,7 +31,7 @@ IDLE = 10.0
 
 @dataclass(frozen=True)
 class Reproduction(StreamFigure):
-    """Failure rates of each policy at each L, over each link and camera; the picture shows the first camera."""
+    """Failure rates of each policy at each L, over each camera; the picture shows the first."""
 
     threshold: float = 0.5
     """Motion gap above which a run fails, fields of view."""
@@ -59,18 +59,23 @@ class Reproduction(StreamFigure):
         return Rows(row for row in rows if row["run"] < self.runs)
 
     def tables(self, rows: Rows) -> list[str]:
-        """Failures in % in each setting: of the first runs at each L, and of all runs at each threshold."""
+        """Failures in % with each camera: of the first runs at each L, of all runs at each threshold and size."""
         lines: list[str] = []
-        for setting in rows.distinct("setting"):
-            played = rows.where(setting=setting)
+        for camera in rows.distinct("camera"):
+            played = rows.where(camera=camera, size_kb=self.size_kb)
             few, half = self.first(played), float(np.median(played.column("longest_gap_views", policy="drop-oldest")))
-            cells = [["L", *map(str, self.capacities), "|", *(f"> {limit:g}" for limit in self.thresholds)]]
+            sizes = rows.where(camera=camera).distinct("size_kb")
+            heads = [*self.capacities, "|", *(f"> {limit:g}" for limit in self.thresholds), "|"]
+            cells: list[list[object]] = [["L", *heads, *(f"{kb:g} kB" for kb in sizes)]]
             for policy in STYLES:
                 rates = [f"{failures(few, self.threshold, policy=policy, L=L):.0f}" for L in self.capacities]
                 many = [f"{failures(played, limit, policy=policy):.1f}" for limit in self.thresholds]
-                cells.append([policy, *rates, "|", *many])
+                swept = [rows.where(camera=camera, size_kb=kb, policy=policy) for kb in sizes]
+                cells.append(
+                    [policy, *rates, "|", *many, "|", *(f"{failures(runs, self.threshold):.1f}" for runs in swept)]
+                )
             others = ", ".join(f"{p} {failures(played, half, policy=p):.1f} %" for p in STYLES if p != "drop-oldest")
-            lines += [setting, *table(cells), f"At {half:.2f} Drop Oldest fails in half of the runs, and {others}", ""]
+            lines += [camera, *table(cells), f"At {half:.2f} Drop Oldest fails in half of the runs, and {others}", ""]
         return lines[:-1]
 
     def worst(self, rows: Rows, above: int) -> float:
@@ -79,78 +84,72 @@ class Reproduction(StreamFigure):
         return max(rates, default=0.0)
 
     def claims(self, rows: Rows) -> dict[str, Any]:
-        """The paper's three statements in each setting; the larger number of runs decides."""
-        verdicts: dict[str, list[bool | None]] = {"others": [], "afr": [], "large": []}
-        texts: dict[str, list[str]] = {"others": [], "afr": [], "large": []}
-        for setting in rows.distinct("setting"):
-            many = rows.where(setting=setting)
-            few = self.first(many)
-            rates, few_rates = (
-                [failures(played, self.threshold, policy=policy) for policy in ("drop-oldest", "random")]
-                for played in (many, few)
-            )
-            # Where nobody loses track, AFR earns no credit for keeping it.
-            tested = max(rates) >= IDLE
-            verdicts["others"].append(all(40 <= rate <= 60 for rate in rates))
-            texts["others"].append(f"{setting} {rates[0]:.0f}, {rates[1]:.0f} ({few_rates[0]:.0f}, {few_rates[1]:.0f})")
-            for key, above in (("afr", 0), ("large", 10)):
-                worst = self.worst(many, above)
-                verdicts[key].append((worst < IDLE if above == 0 else worst == 0) if tested else None)
-                texts[key].append(f"{setting} {worst:.0f} ({self.worst(few, above):.0f}){'' if tested else ' no test'}")
+        """The paper's three statements, with the first camera; the larger number of runs decides."""
+        camera = self.cameras[0].name
+        many = rows.where(camera=camera, size_kb=self.size_kb)
+        few = self.first(many)
+        oldest, random = (failures(many, self.threshold, policy=p) for p in ("drop-oldest", "random"))
+        few_oldest, few_random = (failures(few, self.threshold, policy=p) for p in ("drop-oldest", "random"))
+        # Where nobody loses track, AFR earns no credit for keeping it.
+        tested = max(oldest, random) >= IDLE
+        sizes = {kb: rows.where(camera=camera, size_kb=kb) for kb in rows.distinct("size_kb")}
         compared = [
-            failures(rows, limit, setting=setting, policy="afr")
-            <= min(failures(rows, limit, setting=setting, policy=p) for p in ("drop-oldest", "random"))
-            for setting in rows.distinct("setting")
+            failures(rows, limit, camera=c, size_kb=kb, policy="afr")
+            <= min(failures(rows, limit, camera=c, size_kb=kb, policy=p) for p in ("drop-oldest", "random"))
+            for kb, c in rows.distinct("size_kb", "camera")
             for limit in self.thresholds
         ]
-        slowest = float(self.streamed[1].min()) / (RATE_HZ * self.size_bytes)
-        links = rows.where(camera=self.cameras[0].name).distinct("setting", "link_scale")
         return {
-            **{key: None if set(tests) == {None} else False not in tests for key, tests in verdicts.items()},
+            "oldest": 40 <= oldest <= 60,
+            "randoms": 40 <= random <= 60,
+            "afr": self.worst(many, 0) < IDLE if tested else None,
+            "large": self.worst(many, 10) == 0 if tested else None,
             "about": self.about(),
+            "camera": camera,
             "idle": IDLE,
-            "others_text": "; ".join(texts["others"]),
-            "worst": "; ".join(texts["afr"]),
-            "worst_large": "; ".join(texts["large"]),
+            "oldest_rates": f"{oldest:.0f} % ({few_oldest:.0f} %)",
+            "random_rates": f"{random:.0f} % ({few_random:.0f} %)",
+            "worst": f"{self.worst(many, 0):.0f} % ({self.worst(few, 0):.0f} %)",
+            "worst_large": f"{self.worst(many, 10):.0f} % ({self.worst(few, 10):.0f} %)",
+            "swept_oldest": _swept({kb: failures(r, self.threshold, policy="drop-oldest") for kb, r in sizes.items()}),
+            "swept_random": _swept({kb: failures(r, self.threshold, policy="random") for kb, r in sizes.items()}),
+            "swept_afr": _swept({kb: self.worst(r, 0) for kb, r in sizes.items()}),
+            "swept_large": _swept({kb: self.worst(r, 10) for kb, r in sizes.items()}),
             "few": 1 - 0.05 ** (1 / self.runs),
             "many": 1 - 0.05 ** (1 / self.more_runs),
             "ahead": sum(compared),
             "pairs": len(compared),
-            "carried": "; ".join(
-                f"{setting.partition(', link ')[2]}: {self.share_carried(scale):.0%}, in the slowest second "
-                f"{slowest * scale:.0%}"
-                for setting, scale in links
-            ),
+            "carried": self.share_carried(),
+            "slowest": float(self.streamed[1].min()) / (RATE_HZ * self.size_bytes),
         }
 
     def size_inches(self, rows: Rows) -> tuple[float, float]:
-        links = len(rows.distinct("link_scale"))
-        return 3.6 * len(self.thresholds) + 0.6, 2.6 * links + 1.0
+        return 3.6 * len(self.thresholds) + 0.6, 3.6
 
     def draw(self, rows: Rows, figure: Any) -> None:
-        camera = self.cameras[0].name
-        settings = rows.where(camera=camera).distinct("setting")
-        grid = figure.subplots(len(settings), len(self.thresholds), squeeze=False, sharex=True, sharey=True)
+        played = rows.where(camera=self.cameras[0].name, size_kb=self.size_kb)
         ticks = np.arange(len(self.capacities))
-        for line, setting in zip(grid, settings, strict=True):
-            played = rows.where(setting=setting)
-            for axes, limit in zip(line, self.thresholds, strict=True):
-                for k, (policy, (label, colour, marker)) in enumerate(STYLES.items()):
-                    few, many = (
-                        [failures(some, limit, policy=policy, L=L) for L in self.capacities]
-                        for some in (self.first(played), played)
-                    )
-                    # Marks stand side by side, so that equal rates stay visible.
-                    aside = ticks + 0.09 * (k - (len(STYLES) - 1) / 2)
-                    axes.plot(aside, few, marker, color=colour, markersize=5, label=label)
-                    axes.plot(ticks, many, color=colour, linewidth=1)
-                axes.set_xticks(ticks, [str(L) for L in self.capacities])
-                finish(axes, f"link {setting.partition(', link ')[2]}, threshold {limit:g}", ylim=(-4, 104))
-            line[0].set_ylabel("runs that fail, %")
-        for axes in grid[-1]:
-            axes.set_xlabel("queue size L")
-        figure.suptitle(f"{camera}: marks {self.runs} runs, lines {self.more_runs} runs", fontsize=10)
-        legend_below(figure, 5, grid[0, 0])
+        panels = figure.subplots(1, len(self.thresholds), squeeze=False, sharey=True)[0]
+        for axes, limit in zip(panels, self.thresholds, strict=True):
+            for k, (policy, (label, colour, marker)) in enumerate(STYLES.items()):
+                few, many = (
+                    [failures(some, limit, policy=policy, L=L) for L in self.capacities]
+                    for some in (self.first(played), played)
+                )
+                # Marks stand side by side, so that equal rates stay visible.
+                aside = ticks + 0.09 * (k - (len(STYLES) - 1) / 2)
+                axes.plot(aside, few, marker, color=colour, markersize=5, label=label)
+                axes.plot(ticks, many, color=colour, linewidth=1)
+            axes.set_xticks(ticks, [str(L) for L in self.capacities])
+            finish(axes, f"gap above {limit:g} views", ylim=(-4, 104), xlabel="queue size L")
+        panels[0].set_ylabel("runs that fail, %")
+        title = f"{self.cameras[0].name}, {self.size_kb:g} kB: marks {self.runs} runs, lines {self.more_runs} runs"
+        figure.suptitle(title, fontsize=10)
+        legend_below(figure, 5, panels[0])
+
+
+def _swept(rates: dict[float, float]) -> str:
+    return ", ".join(f"{rate:.0f} % at {kb:g} kB" for kb, rate in sorted(rates.items()))
 
 
 def failures(rows: Rows, threshold: float, **where: object) -> float:

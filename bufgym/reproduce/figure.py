@@ -73,16 +73,6 @@ def several(rule: Rule) -> Rule:
     return check
 
 
-def optional(rule: Rule) -> Rule:
-    """None, or what keeps ``rule``."""
-
-    def check(name: str, value: Any) -> None:
-        if value is not None:
-            rule(name, value)
-
-    return check
-
-
 # --- the protocol ----------------------------------------------------------------------------------------------------
 
 
@@ -133,17 +123,28 @@ def statements() -> dict[str, dict[str, Any]]:
     return texts
 
 
+def facts_of(figure: Figure, rows: Rows) -> dict[str, Any]:
+    """What the texts may quote: the figure's options and what its claims return."""
+    return {option.name: getattr(figure, option.name) for option in fields(figure)} | dict(figure.claims(rows))
+
+
 def report(name: str, figure: Figure, rows: Rows) -> list[str]:
     """Lines of text: our numbers beside the paper's, and which of its claims hold."""
-    facts = {option.name: getattr(figure, option.name) for option in fields(figure)} | dict(figure.claims(rows))
-    texts = statements()[name]
+    facts, texts = facts_of(figure, rows), statements()[name]
     lines = [*_filled(f"{texts['title']}. {texts.get('setup', '')}", facts), "", *figure.tables(rows), ""]
     for claim, text in texts.get("claims", {}).items():
-        finding = f"{VERDICTS[facts[claim]]}. " if claim in facts else ""
-        lines += [*_filled(text["says"], facts), *_filled(f"  {finding}{text['ours']}", facts)]
+        finding = f"{VERDICTS[facts.get(claim)]}. " if claim in facts else ""
+        lines += [*_filled(f"{source(text)}: {text['says']}", facts), *_filled(f"  {finding}{text['ours']}", facts)]
     if "notes" in texts:
         lines += ["", *_filled(texts["notes"], facts)]
     return lines
+
+
+def source(text: Mapping[str, Any]) -> str:
+    """Where the paper says so; or that we do."""
+    if text.get("own"):
+        return "Our addition"
+    return str(text["place"]) if text.get("abstract") else f"{text['place']} (wording not checked)"
 
 
 def _filled(text: str, facts: Mapping[str, Any]) -> list[str]:

@@ -1,7 +1,8 @@
 """Fig. 3 of the Robofleet paper: latency and throughput against the publish rate of one PointCloud2 topic, 100 Mbit/s.
 
-With n_T = 1 one message is being sent and one waits, the newest; with every topic no_drop all wait. The size of a
-cloud, the round trip and how long it is published are not in the paper.
+Robofleet with n_T = 1 (one message is being sent and one waits, the newest) and with every topic no_drop (all wait),
+as published and as released; beside it rosbridge, which sends JSON from an unbounded queue, and native ROS with a
+queue of its own. The size of a cloud, the round trip and how long it is published are not known to us.
 """
 
 from __future__ import annotations
@@ -12,30 +13,30 @@ from itertools import product
 from typing import Any
 
 from bufgym.reproduce.figure import COLOURS, finish, legend_below
-from bufgym.reproduce.robofleet_evaluation import MBIT, POINTS, SHORT, ClientFigure, cloud_bytes, curves, p95, stream
-from bufgym.reproduce.rows import Rows
+from bufgym.reproduce.robofleet_evaluation import MBIT, SHORT, CloudFigure, cloud_bytes, curves, p95, stream
+from bufgym.reproduce.rows import Rows, listed
 from bufgym.traces.generate import steady
 
-SENDERS = ("robofleet", "no-drop", "no-drop-released")
+SENDERS = ("robofleet", "no-drop", "no-drop-released", "rosbridge", "ros-native")
 LOW = 2.0
 """Latency up to so many times that of the lowest rate is called low."""
+EQUAL = 0.02
+"""Relative: latencies nearer than this count as alike."""
 GROWN = 10.0
 """Latency beyond so many times that of the lowest rate is called grown."""
 
 
 @dataclass(frozen=True)
-class Reproduction(ClientFigure):
+class Reproduction(CloudFigure):
     """Fig. 3 for these publish rates."""
 
     rates_hz: Sequence[float] = (5, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100, 120)
     mbit_per_s: float = 100.0
     """Of the link, which is steady."""
-    points: int = POINTS
-    """Of a cloud, 16 bytes each."""
     duration_s: float = 20.0
     """How long is published; without drops the latency depends on it."""
 
-    SIZE_INCHES = (9.0, 4.2)
+    SIZE_INCHES = (10.0, 4.4)
 
     @property
     def link_hz(self) -> float:
@@ -79,7 +80,22 @@ class Reproduction(ClientFigure):
         growth = {name: high_ms[name] / rows.mean("latency_ms", sender=name, publish_hz=low) for name in SENDERS}
         received_hz = at_high.mean("received_hz", sender="robofleet")
         tested = high > self.link_hz
+        # Rosbridge is behind at the lowest rate already, for its messages are longer.
+        rates = sorted(self.rates_hz)
+        ms = {name: [rows.mean("latency_ms", sender=name, publish_hz=rate) for rate in rates] for name in SENDERS}
+        trio = list(zip(rates, ms["robofleet"], ms["rosbridge"], ms["ros-native"], strict=True))
+        ahead = [rate for rate, own, _, native in trio if own < native * (1 - EQUAL)]
+        behind = [rate for rate, own, _, native in trio if own > native * (1 + EQUAL)]
         return {
+            "rosbridge": all(own < bridge for _, own, bridge, _ in trio),
+            "native": not behind,
+            "ahead_of_native": listed([f"{rate:g}" for rate in ahead]),
+            "behind_native": listed([f"{rate:g}" for rate in behind]),
+            "some": "; ".join(
+                f"{rate:g} Hz {own:.1f} / {bridge:.0f} / {native:.1f} ms"
+                for rate, own, bridge, native in trio
+                if rate in (low, 40, 60, high)
+            ),
             "low": growth["robofleet"] <= LOW and received_hz < high if tested else None,
             "grows": growth["no-drop"] >= GROWN if tested else None,
             "cloud_bytes": cloud_bytes(self.points)[1],
@@ -110,4 +126,4 @@ class Reproduction(ClientFigure):
         received.set(ylabel="messages received per second", ylim=(0, 1.15 * min(high, self.link_hz)))
         place = {"textcoords": "offset points", "ha": "right", "fontsize": 8}
         received.annotate("the link's rate", (self.link_hz, 0), (-4, 6), **place)
-        legend_below(figure, 4, received)
+        legend_below(figure, 3, received)

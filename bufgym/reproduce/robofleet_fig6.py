@@ -31,7 +31,7 @@ STRAIGHT = 0.98
 class Reproduction(ClientFigure):
     """Fig. 6 for clouds of so many points and 1 to ``max_consumers`` consumers."""
 
-    points: Sequence[int] = (1_500, 10_000)
+    points: Sequence[int] = (1_500, 4_000, 10_000)
     """Of a cloud, 16 bytes each; one panel each."""
     max_consumers: int = 8
     rate_hz: float = 5.0
@@ -45,7 +45,7 @@ class Reproduction(ClientFigure):
 
     def simulate(self) -> Rows:
         link = steady(self.mbit_per_s * MBIT)
-        senders = [("robofleet", 1), *(("ros-native", queue) for queue in self.queue_sizes)]
+        senders = [("robofleet", 1), ("rosbridge", 1), *(("ros-native", queue) for queue in self.queue_sizes)]
         rows = Rows()
         for points, n, (name, queue), seed in product(
             self.points, range(1, self.max_consumers + 1), senders, range(self.runs)
@@ -54,7 +54,7 @@ class Reproduction(ClientFigure):
             sent = self.send(name, (topic,), link, self.duration_s, seed, queue_size=queue, consumers=n)
             in_time = sent.received_s <= self.duration_s
             latency_s = sent.latency_s[in_time]
-            label = "Robofleet" if name == "robofleet" else f"native ROS, queue of {queue}"
+            label = f"native ROS, queue of {queue}" if name == "ros-native" else PROGRAMS[name].label.split(",")[0]
             key = {"points": points, "consumers": n, "sender": name, "queue_size": queue, "run": seed, "line": label}
             rows.append(
                 {
@@ -81,8 +81,8 @@ class Reproduction(ClientFigure):
                 f"{carried} of {self.max_consumers} copies.",
                 "Mean latency, s, by consumers; then the share received, on average and by the worst off:",
                 *shown.pivot("line", "consumers", "mean_latency_s", ".3f"),
-                *shown.where(sender="ros-native").pivot("line", "consumers", "received_share", ".0%"),
-                *shown.where(sender="ros-native").pivot("line", "consumers", "least_received_share", ".0%"),
+                *shown.pivot("line", "consumers", "received_share", ".0%"),
+                *shown.pivot("line", "consumers", "least_received_share", ".0%"),
                 "",
             ]
         return lines[:-1]
@@ -106,7 +106,15 @@ class Reproduction(ClientFigure):
                     f"{points:,} points, {line} {'yes' if linear[-1] else 'NO'} ({slope:.3f} s a consumer, "
                     f"r = {straight:.3f})"
                 )
+        one = rows.where(consumers=1)
+        names = ("rosbridge", "ros-native", "robofleet")
+        trios = {p: [one.mean("mean_latency_s", points=p, sender=n) for n in names] for p in self.points}
         return {
+            "rosbridge": all(bridge > native for bridge, native, _ in trios.values()),
+            "bridge": "; ".join(
+                f"{points:,} points " + " / ".join(f"{seconds:.3f}" for seconds in trio) + " s"
+                for points, trio in trios.items()
+            ),
             "constant": max(growth.values()) <= CONSTANT,
             "growth": listed([f"{ratio:.2f} times at {points:,} points" for points, ratio in growth.items()]),
             "linear": all(linear),
@@ -122,7 +130,7 @@ class Reproduction(ClientFigure):
         for axes, points in zip(panels, self.points, strict=True):
             for k, (name, label) in enumerate(rows.distinct("sender", "line")):
                 style = PROGRAMS[name].style | {"zorder": 3 - 0.1 * k}
-                if k > 1:  # further queues: open and larger, so that equal lines stay visible
+                if k > 2:  # further queues: open and larger, so that equal lines stay visible
                     style |= {"linestyle": "--", "markersize": 5.5 + 2 * k, "markerfacecolor": "none"}
                 axes.plot(consumers, self.latencies_s(rows, points, label), label=label, **style)
             if (fits := self.fits(points)) < self.max_consumers:

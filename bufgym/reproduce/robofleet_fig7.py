@@ -37,6 +37,8 @@ LOOKS = {
 }
 """Kind -> colour, marker and its size."""
 COUNTED_HZ = 10.0
+SPIKE = 2.0
+"""A topic is affected by the zone until the last receipt with a latency beyond so many times its highest before it."""
 KEPT = 2.0
 """A latency is kept whose median in the zone is within so many times that before it, own bytes slower as they are."""
 
@@ -46,15 +48,15 @@ class Reproduction(ClientFigure):
     """Fig. 7 for these rates in the bad zone."""
 
     bad_mbit_per_s: Sequence[float] = (4.0, 2.0, 1.0, 0.5)
-    good_mbit_per_s: float = 100.0
-    """Of the link elsewhere."""
+    good_mbit_per_s: float = 10.0
+    """Of the link elsewhere; at 100 rosbridge's backlog is gone in a moment, and its long recovery cannot be seen."""
     image_priorities: Sequence[float] = (1.0, 0.1, 0.01)
     """Of Robofleet's images; the first in every zone, all of them in the one that is shown."""
     bad_from: int = 430
     """The message, of a topic of 10 Hz, with which the zone begins."""
     bad_s: float = 30.0
     """How long it lasts."""
-    after_s: float = 15.0
+    after_s: float = 60.0
     """How long the link is good again."""
     queue_size: int = QUEUE_SIZE
     """Of native ROS, messages a topic."""
@@ -141,6 +143,14 @@ class Reproduction(ClientFigure):
             lines.append(cells)
         return table(lines)
 
+    def affected(self, rows: Rows, name: str) -> list[float]:
+        """For each zone, how long after its end the topic that recovers last is still affected, s; mean over runs."""
+        first = rows.where(sender=name, image_priority=self.image_priorities[0])
+        return [
+            max(first.mean("affected_after_s", bad_mbit_per_s=bad, topic=kind) for kind in TOPICS)
+            for bad in self.bad_mbit_per_s
+        ]
+
     def claims(self, rows: Rows) -> dict[str, Any]:
         first = rows.where(image_priority=self.image_priorities[0], bad_mbit_per_s=self.shown)
         native = first.where(sender="ros-native", topic="PoseStamped")
@@ -150,7 +160,24 @@ class Reproduction(ClientFigure):
             f"{first.mean('median_in_zone_ms', sender=name, topic='PoseStamped') / 1e3:.2f} s"
             for name in SENDERS
         )
+        affected = {name: self.affected(rows, name) for name in SENDERS}
+        spikes = [
+            row["highest_in_zone_ms"] > row["highest_before_ms"]
+            for row in rows.where(image_priority=self.image_priorities[0])
+        ]
         return {
+            "spike": all(spikes),
+            "longer": all(
+                bridge > own for bridge, own in zip(affected["rosbridge"], affected["robofleet"], strict=True)
+            ),
+            "spikes": sum(spikes),
+            "played": len(spikes),
+            "spike_times": SPIKE,
+            "zones": ", ".join(f"{bad:g}" for bad in self.bad_mbit_per_s),
+            "affected": "; ".join(
+                f"{PROGRAMS[name].label.split(',')[0]} {', '.join(f'{s:.1f}' for s in seconds)} s"
+                for name, seconds in affected.items()
+            ),
             "no-drop": lost == 0,
             "lost": lost,
             "from_s": self.zone_s[0],
@@ -195,13 +222,18 @@ class Reproduction(ClientFigure):
 def _entry(sent: Sent, zone_s: tuple[float, float]) -> Row:
     """What became of one topic before the zone and in it."""
     zone = sent.between(*zone_s)
-    latency_s = zone.received.latency_s
+    latency_s, received = zone.received.latency_s, sent.received
+    before_s = sent.between(0, zone_s[0]).received.latency_s
+    late = received.latency_s > SPIKE * before_s.max()
     return {
-        "median_before_ms": 1e3 * float(np.median(sent.between(0, zone_s[0]).received.latency_s)),
+        "median_before_ms": 1e3 * float(np.median(before_s)),
+        "highest_before_ms": 1e3 * float(before_s.max()),
         "median_in_zone_ms": 1e3 * float(np.median(latency_s)) if len(latency_s) else math.nan,
         "p95_in_zone_ms": 1e3 * p95(latency_s),
         "arrived_in_zone": len(zone),
         "lost_in_zone": len(zone) - len(latency_s),
+        "highest_in_zone_ms": 1e3 * float(latency_s.max()) if len(latency_s) else math.nan,
+        "affected_after_s": max(0.0, float(received.received_s[late].max(initial=0)) - zone_s[1]),
         "lost": len(sent) - len(sent.received),
     }
 

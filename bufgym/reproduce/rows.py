@@ -41,12 +41,16 @@ class Rows(list[Row]):
             spec: how a mean is written, such as ".1f" or ".0%".
             labels: what a line or column is called, where that is not its value.
         """
-        labels = labels or {}
+        known = labels or {}
+
+        def label(value: Any) -> str:
+            return known.get(value, f"{value:g}" if isinstance(value, float) else str(value))
+
         heads = self.distinct(by)
-        lines: list[list[object]] = [[index, *(labels.get(head, head) for head in heads)]]
+        lines = [[index, *map(label, heads)]]
         for key in self.distinct(index):
             means = (self.mean(value, **{index: key, by: head}) for head in heads)
-            lines.append([labels.get(key, key), *(format(number, spec) for number in means)])
+            lines.append([label(key), *(format(number, spec) for number in means)])
         return table(lines)
 
     def save(self, path: Path) -> Path:

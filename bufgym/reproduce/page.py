@@ -1,0 +1,82 @@
+"""The page docs/claims.md: every sentence of the papers that we know of, the command that tests it, what comes out.
+
+``bufgym reproduce --claims docs/claims.md --data DIR`` writes it. Without recordings the figures that need them are
+left as not checked.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from bufgym.errors import BufgymError
+from bufgym.reproduce import FIGURES, NEEDS_DATA, figure
+from bufgym.reproduce.figure import facts_of, source, statements
+
+PAPERS = {
+    "afr": "AFR [wang2022afr]",
+    "robofleet": "Robofleet [sikand2021robofleet]",
+}
+"""Start of a section's name -> the paper, with its key in references.bib."""
+
+VERDICTS = {True: "holds", False: "**differs**", None: "not checked"}
+
+HEAD = """\
+# The papers' claims
+
+Every sentence of the two papers that we know of and that can be checked, the command that tests it, our number, and
+whether it holds. Keys in brackets are those of [references.bib](references.bib).
+
+Sentences are in our words. Those whose place names the abstract were checked against it; the wording of all others was
+not checked against the papers' text. "Our addition" marks what the papers do not say. Where a paper leaves a parameter
+open, ours is a stated default of the command's figure.
+
+This page is made by
+
+    bufgym reproduce --claims docs/claims.md --data DIR
+
+with the folder of recordings; `make test` compares the rows marked † with what the code prints, `make claims` all.
+"""
+
+
+def claim_rows(name: str, **options: Any) -> list[str]:
+    """The rows of one section of ``afr.toml`` or ``robofleet.toml``, in Markdown.
+
+    Raises:
+        BufgymError: the figure cannot be made, such as without recordings.
+    """
+    texts = statements()[name]
+    facts: dict[str, Any] = {}
+    if name in FIGURES:
+        reproduction = figure(name, **options)
+        facts = facts_of(reproduction, reproduction.simulate())
+    command = f"`{name}`{' †' if texts.get('fast') else ''}" if name in FIGURES else ""
+    lines = []
+    for claim, text in texts.get("claims", {}).items():
+        ours = " ".join(text["ours"].format(**facts).split())
+        cells = [
+            source(text),
+            text["says"].format(**facts),
+            command,
+            ours,
+            VERDICTS[facts.get(claim)],
+            text.get("why", ""),
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def claims_page(data: Path | None = None) -> str:
+    """The whole page; it runs every figure."""
+    lines = [HEAD]
+    for paper, title in PAPERS.items():
+        lines += [f"## {title}", ""]
+        lines += ["| place | claim | `bufgym reproduce` | ours | verdict | why |", "|---|---|---|---|---|---|"]
+        for name in statements():
+            if name.startswith(f"{paper}-"):
+                try:
+                    lines += claim_rows(name, **({"data": data} if name in NEEDS_DATA else {}))
+                except BufgymError as error:
+                    lines.append(f"| | {FIGURES[name]} | `{name}` | | not checked | {error} |")
+        lines.append("")
+    return "\n".join(lines)
