@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from bufgym.reproduce.afr_fig2 import GeometryFigure
+from bufgym.reproduce.afr_fig2 import MESSAGES, GeometryFigure
 from bufgym.reproduce.figure import COLOURS, finish
 from bufgym.reproduce.rows import Rows
 
@@ -28,4 +28,5 @@ class Reproduction(GeometryFigure):
             axes.plot(d, rows.column("V", motion=name), "o", color=COLOURS[colour], markersize=4, label=label)
         finish(axes, "V from the overlap of views (marks) and by the formula (lines)", ylim=(0, 1.05))
         axes.set(xlabel="d, messages between two that are received", ylabel="V(d), part of the view that is new")
+        axes.set_xticks(range(0, MESSAGES + 1, 2))
         axes.legend(frameon=False)

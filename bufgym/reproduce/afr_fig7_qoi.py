@@ -39,7 +39,7 @@ class Reproduction(StreamFigure):
         facts: dict[str, Any] = {"about": self.about()}
         for other in ("drop-oldest", "random", "orbbuf"):
             changes = {
-                (size_kb, camera): played.mean("regret", policy="afr") / played.mean("regret", policy=other) - 1
+                (size_kb, camera): _change(played.mean("regret", policy="afr"), played.mean("regret", policy=other))
                 for size_kb, camera in rows.distinct("size_kb", "camera")
                 for played in [rows.where(size_kb=size_kb, camera=camera)]
             }
@@ -82,3 +82,8 @@ class Reproduction(StreamFigure):
             )
             axes.plot([], [], marker, color=colour, label=label)
         axes.set_xticks(ticks, [str(L) for L in self.capacities])
+
+
+def _change(regret: float, other: float) -> float:
+    """Relative to the other's; 0 where that is 0."""
+    return regret / other - 1 if other > 0 else 0.0

@@ -159,21 +159,25 @@ class Reproduction(Figure):
         return 7.0, 0.34 * len(rows) + 2.2
 
     def draw(self, rows: Rows, figure: Any) -> None:
-        axes = figure.add_subplot()
-        at = np.arange(len(rows))
-        inside, median, p99 = (rows.column(f"{name}_us") for name in ("inside", "called_median", "called_p99"))
-        axes.plot(inside, at, "o", color=COLOURS["afr"], label=f"inside a {HOW}")
-        axes.hlines(at, median, p99, color=COLOURS["random"], linewidth=1.5)
-        axes.plot(median, at, "s", color=COLOURS["random"], label="called from Python, median to p99")
+        """The paper's four above, ours below."""
+        papers = Rows(row for row in rows if row["policy"] in PAPER)
+        others = Rows(row for row in rows if row["policy"] not in PAPER)
+        panels = figure.subplots(2, 1, sharex=True, height_ratios=[len(papers), max(1, len(others))])
+        for axes, shown, title in zip(panels, (papers, others), ("the paper's four", "not in the paper"), strict=True):
+            at = np.arange(len(shown))
+            inside, median, p99 = (shown.column(f"{name}_us") for name in ("inside", "called_median", "called_p99"))
+            axes.plot(inside, at, "o", color=COLOURS["afr"], label=f"inside a {HOW}")
+            axes.hlines(at, median, p99, color=COLOURS["random"], linewidth=1.5)
+            axes.plot(median, at, "s", color=COLOURS["random"], label="called from Python, median to p99")
+            finish(axes, f"One decision on a full queue, L = {self.capacity}: {title}", xscale="log")
+            axes.set_yticks(at, shown.distinct("policy"))
+            axes.set_ylim(len(shown) - 0.4, -0.6)
         of_paper = (("<", "<", 10.0, "paper: under 10 us"), ("~", "D", 10e3, "paper: ORBBuf, features recomputed"))
         for sign, marker, us, label in of_paper:
-            lines = [i for i, row in enumerate(rows) if row["paper"].startswith(sign)]
-            axes.plot([us] * len(lines), lines, marker, color=COLOURS["drop-oldest"], label=label)
-        title = f"One decision on a full queue, L = {self.capacity}, this machine"
-        finish(axes, title, xscale="log", xlabel="time of one decision, us")
-        axes.set_yticks(at, [row["policy"] for row in rows])
-        axes.invert_yaxis()
-        legend_below(figure, 2)
+            lines = [i for i, row in enumerate(papers) if row["paper"].startswith(sign)]
+            panels[0].plot([us] * len(lines), lines, marker, color=COLOURS["drop-oldest"], label=label)
+        panels[1].set_xlabel("time of one decision, us")
+        legend_below(figure, 2, panels[0])
 
 
 def _yes(claim: bool) -> str:

@@ -224,5 +224,5 @@ def curves(axes: Any, rows: Rows, x: str, y: str, names: Sequence[str], **styles
     for k, name in enumerate(names):
         means = {at: rows.mean(y, **{x: at}, sender=name) for at in rows.where(sender=name).distinct(x)}
         program = PROGRAMS[name]
-        style = {**program.style, "markersize": 4 + 2 * k, "zorder": 3 - 0.1 * k, **styles}  # equal lines stay visible
+        style = {**program.style, "markersize": 4 + k, "zorder": 3 - 0.1 * k, **styles}  # equal lines stay visible
         axes.plot(list(means), list(means.values()), label=program.label, **style)

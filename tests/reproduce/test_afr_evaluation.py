@@ -6,7 +6,6 @@ import csv
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from bufgym.benchmark.run import draw
@@ -17,46 +16,66 @@ from bufgym.reproduce import afr_evaluation as common
 from bufgym.scenario.suites import motion_value
 from bufgym.traces import Trace, write_csv
 
-SHIPPED: dict[str, Any] = {"trace": "lte-synthetic-0", "motion": ["drive-0"], "frames": 60, "capacities": (3,)}
+SHIPPED: dict[str, Any] = {
+    "trace": "lte-synthetic-0",
+    "motion": ["drive-0"],
+    "frames": 60,
+    "capacities": (3,),
+    "sweep_kb": (300,),
+}
 """A small run that needs no folder of recordings."""
 
 
 # -------------------- the setup
 
 
-def test_the_second_link_has_the_papers_ceiling_within_the_stream(tmp_path: Path) -> None:
-    """60 frames last 2 s: the best of the first two seconds, 3 MB/s, becomes 15; the 6 MB/s later do not count."""
+def test_a_setting_for_each_size_and_camera(tmp_path: Path) -> None:
+    """60 frames last 2 s: 2 MB/s on average of 30 x 200 kB; the 6 MB/s later do not count."""
     path = tmp_path / "link.csv"
     write_csv(Trace.steps([(1, 3e6), (1, 1e6), (1, 6e6)], name="link"), path)
-    stream = figure("afr-fig7-qoi", trace=str(path), motion="drive-0", frames=60, size_bytes=200_000)
+    options: dict[str, Any] = {"trace": str(path), "motion": "drive-0", "frames": 60, "size_bytes": 200_000}
+    stream = figure("afr-fig7-qoi", **options, sweep_kb=(300, 100))
     assert isinstance(stream, common.StreamFigure)
     settings = stream.settings(timed=True)
-    assert [(s.link, s.camera, s.scale) for s in settings] == [
-        ("as recorded", "drive-0", 1.0),
-        ("as recorded", "time", 1.0),
-        ("x 5.00", "drive-0", 5.0),
-        ("x 5.00", "time", 5.0),
+    assert [(s.size_kb, s.camera) for s in settings] == [
+        (kb, camera) for kb in (100, 200, 300) for camera in ("drive-0", "time")
     ]
     assert settings[0].uplink.value == motion_value() and settings[0].uplink.max_messages == 60
-    # 2 MB/s on average of 30 x 200 kB
     assert stream.share_carried() == pytest.approx(1 / 3)
-    assert stream.share_carried(5.0) == pytest.approx(5 / 3)
 
 
 def test_runs_begin_at_the_start_of_the_link_and_anywhere_on_the_camera() -> None:
-    stream = figure("afr-fig7-qoi", **SHIPPED, size_bytes=200_000, ceiling_bytes_per_s=None)
+    stream = figure("afr-fig7-qoi", **SHIPPED, size_bytes=200_000)
     assert isinstance(stream, common.StreamFigure)
-    (setting,) = stream.settings(timed=False)
+    (setting,) = (s for s in stream.settings(timed=False) if s.size_kb == 200)
     episodes = [draw(setting.uplink, seed) for seed in range(3)]
     assert all(e.link.offset_us == 0 for e in episodes)
     assert len({float(e.arrivals["x"][-1]) for e in episodes}) == 3
     rows = stream.play([setting], 3, bound=True)
     assert len(rows) == 3 * len(common.STYLES)
-    for row in rows:
-        x = episodes[row["run"]].arrivals["x"]
-        every = 1 + sum(1 - np.exp(-gap) for gap in np.diff(x))
-        assert row["H_all_frames"] == pytest.approx(every, rel=1e-12)
-        assert row["loss"] == pytest.approx(1 - row["H"] / every, abs=1e-12)
+    assert len({row["H_clairvoyant"] for row in rows}) == 3
+
+
+# -------------------- the size of a frame
+
+
+def test_frames_kept_are_counted_by_the_second_of_their_arrival(tmp_path: Path) -> None:
+    path = tmp_path / "wide.csv"
+    write_csv(Trace.constant(1e8, 30.0, name="wide"), path)
+    size = figure("afr-frame-size", trace=str(path), frames=750, capacities=(5,), runs=1, sweep_kb=(300,))
+    rows = size.simulate()
+    assert set(rows.column("dropped")) == {0}
+    assert all(abs(row[f"kept_in_second_{s}"] - 30) <= 1 for row in rows for s in (21, 23))
+    assert not size.claims(rows)["recalculations"]
+
+
+@pytest.mark.slow
+def test_160_kB_reproduce_both_of_the_papers_numbers(shared_data: Path) -> None:
+    size = figure("afr-frame-size", data=shared_data, sweep_kb=(140, 230), capacities=(5, 15, 25))
+    facts = size.claims(size.simulate())
+    assert facts["recalculations"] and facts["rate"]
+    assert (facts["fewest"], facts["most"]) == (386, 406)
+    assert facts["both_kb"] == "160"
 
 
 # -------------------- Fig. 6
@@ -88,23 +107,19 @@ def test_fig6_of_the_recorded_link(shared_data: Path) -> None:
     assert max(float(r["bytes_per_s"]) for r in streamed) == pytest.approx(4.03e6, rel=1e-3)
     facts = fig6.claims(rows)
     assert facts["low-seconds"] and facts["low_seconds"] == "21, 23"
-    assert not facts["ceiling"]
-    assert (facts["under"], facts["seconds"], facts["overload"]) == (27, 27, True)
+    assert (facts["under"], facts["seconds"], facts["overload"]) == (27, 27, True)  # of 30 x 160 kB
 
 
 # -------------------- Fig. 7
 
 
-def test_fig7_counts_regret_against_the_best_and_loss_against_all_frames() -> None:
+def test_fig7_counts_regret_against_the_best() -> None:
     fig7 = figure("afr-fig7-qoi", **SHIPPED, size_bytes=500_000, runs=2)
     rows = fig7.simulate()
-    assert len(rows) == 2 * 2 * len(common.STYLES) * 2  # links, cameras and time, policies, runs
+    assert len(rows) == 2 * 2 * len(common.STYLES) * 2  # sizes, cameras and time, policies, runs
     for row in rows:
-        ours, best, every = (float(row[name]) for name in ("H", "H_clairvoyant", "H_all_frames"))
-        assert ours <= best * (1 + 1e-12) and best <= every * (1 + 1e-12)
-        assert float(row["regret"]) == pytest.approx(1 - ours / best)
-        assert float(row["loss"]) == pytest.approx(1 - ours / every)
-    assert max(float(row["loss"]) for row in rows) > 0.01
+        assert row["H"] <= row["H_clairvoyant"] * (1 + 1e-12)
+        assert row["regret"] == pytest.approx(1 - row["H"] / row["H_clairvoyant"])
     assert rows == fig7.simulate()
 
 
@@ -114,23 +129,23 @@ def test_fig7_on_a_slow_but_steady_link_random_is_behind_drop_oldest(tmp_path: P
     path = tmp_path / "steady.csv"
     write_csv(Trace.constant(2e6, 30.0, name="steady"), path)
     options = SHIPPED | {"trace": str(path), "frames": 300, "capacities": (5, 20)}
-    rows = figure("afr-fig7-qoi", **options, size_bytes=200_000, runs=3, ceiling_bytes_per_s=None).simulate()
-    oldest, random = (rows.mean("loss", camera="time", policy=p) for p in ("drop-oldest", "random"))
+    rows = figure("afr-fig7-qoi", **options, size_bytes=200_000, runs=3).simulate().where(size_kb=200)
+    oldest, random = (rows.mean("regret", camera="time", policy=p) for p in ("drop-oldest", "random"))
     assert oldest < 0.9 * random
 
 
 @pytest.mark.slow
 def test_fig7_over_the_recorded_link(shared_data: Path) -> None:
-    fig7 = figure("afr-fig7-qoi", data=shared_data)
+    fig7 = figure("afr-fig7-qoi", data=shared_data, sweep_kb=(230,))
     rows = fig7.simulate()
-    for scale in {r["link_scale"] for r in rows}:
+    for size_kb in (160, 230):
         for camera in (*common.CAMERAS, "time"):
             afr, oldest, random = (
-                rows.mean("regret", link_scale=scale, camera=camera, policy=p) for p in ("afr", "drop-oldest", "random")
+                rows.mean("regret", size_kb=size_kb, camera=camera, policy=p) for p in ("afr", "drop-oldest", "random")
             )
             # The paper's order; by far more than the runs differ.
-            assert afr < 0.7 * oldest and afr < 0.6 * random, (scale, camera)
-    recorded = {"link_scale": 1.0, "camera": "freiburg1_desk"}
+            assert afr < 0.7 * oldest and afr < 0.6 * random, (size_kb, camera)
+    recorded = {"size_kb": 230, "camera": "freiburg1_desk"}
     # Where ours differ from the paper: ORBBuf knows the true motion, Random trails Drop Oldest under overload.
     assert rows.mean("regret", **recorded, policy="orbbuf") < rows.mean("regret", **recorded, policy="afr")
     assert rows.mean("regret", **recorded, policy="random") > 1.3 * rows.mean(
@@ -143,8 +158,8 @@ def test_fig7_over_the_recorded_link(shared_data: Path) -> None:
 
 
 def test_fig8_counts_runs_whose_longest_gap_exceeds_the_threshold() -> None:
-    options: dict[str, Any] = SHIPPED | {"frames": 150, "size_bytes": 900_000, "ceiling_bytes_per_s": None}
-    rows = figure("afr-fig8-gap", **options, runs=2, more_runs=4).simulate()
+    options: dict[str, Any] = SHIPPED | {"frames": 150, "size_bytes": 900_000}
+    rows = figure("afr-fig8-gap", **options, runs=2, more_runs=4).simulate().where(size_kb=900)
     assert len(rows) == len(common.STYLES) * 4
     gaps = sorted(float(r["longest_gap_views"]) for r in rows if r["policy"] == "drop-oldest")
     assert len(set(gaps)) == 4
@@ -156,14 +171,13 @@ def test_fig8_counts_runs_whose_longest_gap_exceeds_the_threshold() -> None:
 
 @pytest.mark.slow
 def test_fig8_over_the_recorded_link(shared_data: Path) -> None:
-    rows = figure("afr-fig8-gap", data=shared_data, more_runs=40).simulate()
-    runs = rows.where(link_scale=1.0, camera="freiburg1_desk")
-    rate = {p: afr_fig8_gap.failures(runs, 0.5, policy=p) for p in common.STYLES}
-    assert rate["afr"] < 10 and rate["min-motion-gap"] < 10
-    assert rate["drop-oldest"] > 40 and rate["random"] > 40
-    assert all(afr_fig8_gap.failures(runs, 0.5, policy="afr", L=L) <= 5 for L in (15, 20, 25))
-    # At L = 5 it does fail, which the paper's "under 10 %" does not say.
-    assert afr_fig8_gap.failures(runs, 0.5, policy="afr", L=5) > 0
+    fig8 = figure("afr-fig8-gap", data=shared_data, sweep_kb=(230,))
+    rows = fig8.simulate()
+    facts = fig8.claims(rows)
+    assert facts["oldest"] and facts["afr"] and not facts["large"]
+    assert (facts["oldest_rates"], facts["worst"], facts["worst_large"]) == ("50 % (48 %)", "5 % (20 %)", "1 % (0 %)")
+    runs = rows.where(size_kb=160, camera="freiburg1_desk")
+    assert afr_fig8_gap.failures(runs, 0.5, policy="min-motion-gap") == 0
 
 
 # -------------------- without recordings, and mistakes

@@ -14,7 +14,7 @@ from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
-from bufgym.reproduce import afr_fig4, afr_fig5, afr_fig9, afr_theorems, run
+from bufgym.reproduce import afr_fig2, afr_fig4, afr_fig5, afr_fig9, afr_theorems, afr_vs_random, figure
 from bufgym.scenario import Interruption
 from bufgym.sim import NEVER
 
@@ -182,8 +182,95 @@ def test_a_worst_ratio_worked_by_hand() -> None:
 
 
 def test_the_grid_has_no_violation() -> None:
-    text = run("afr-theorems", max_capacity=5, last_T=80)
-    assert text.count(" 0 violations") == text.count("violations") == text.count("holds") == 5
+    theorems = figure("afr-theorems", max_capacity=5, last_T=80)
+    rows = theorems.simulate()
+    facts = theorems.claims(rows)
+    assert all(facts[claim] for claim in ("theorem-1", "theorem-2", "theorem-3", "sharper", "even", "equal"))
+    assert facts["comparisons"] == 5 * sum(range(1, 81))
+
+
+@given(L=st.integers(1, 12), T=st.integers(1, 120), v=VALUES)
+def test_every_V_is_a_sum_of_extremes(L: int, T: int, v: Value) -> None:
+    """V at whole numbers is sum of w_D min(d, D), w_D = the fall of V's slope at D, and H is linear in V."""
+    (gaps,) = afr_theorems.gaps_of("afr", L, [T])
+    slopes = np.diff([v(float(d)) for d in range(T + 3)])
+    weights = slopes[:-1] - slopes[1:]
+    weights[-1] = slopes[-2]  # beyond the longest gap V need not go on
+    assert weights @ afr_theorems.extremes(gaps) == pytest.approx(sum(v(float(g)) for g in gaps), rel=1e-9)
+
+
+def test_theorem_3_can_fail() -> None:
+    """Turned around, Drop Oldest is below AFR for some V at every T beyond L."""
+    for L, T in ((3, 9), (8, 30)):
+        (afr,), (oldest,) = (afr_theorems.gaps_of(policy, L, [T]) for policy in ("afr", "drop-oldest"))
+        assert (afr_theorems.extremes(oldest) < afr_theorems.extremes(afr)).any()
+
+
+# -------------------- AFR against Random
+
+
+def all_outcomes(L: int, T: int) -> dict[tuple[int, ...], float]:
+    """Messages kept by Random -> probability, by trying every drop."""
+    outcomes = {tuple(range(1, min(L, T) + 1)): 1.0}
+    for t in range(L + 1, T + 1):
+        grown: dict[tuple[int, ...], float] = {}
+        for kept, probability in outcomes.items():
+            candidates = (*kept, t)
+            for k in range(L + 1):
+                left = candidates[:k] + candidates[k + 1 :]
+                grown[left] = grown.get(left, 0.0) + probability / (L + 1)
+        outcomes = grown
+    return outcomes
+
+
+@pytest.mark.parametrize(("L", "T"), [(1, 1), (1, 4), (2, 5), (3, 8), (4, 3)])
+def test_expected_gaps_are_those_of_every_outcome(L: int, T: int) -> None:
+    counts = np.zeros(14)
+    for kept, probability in all_outcomes(L, T).items():
+        for gap in np.diff((0, *kept, T + 1)):
+            counts[gap] += probability
+    assert afr_vs_random.expected_gaps(L, 12)[T] == pytest.approx(counts, abs=1e-12)
+
+
+def test_expected_gaps_add_up() -> None:
+    counts = afr_vs_random.expected_gaps(8, 60)
+    lengths = np.arange(1, 61)
+    assert counts.sum(axis=1)[1:] == pytest.approx(np.minimum(lengths, 8) + 1)
+    assert (counts @ np.arange(62))[1:] == pytest.approx(lengths + 1)
+
+
+def test_random_is_ahead_of_afr_at_L_1_alone() -> None:
+    """T = 4, V ~ min(d, 2): AFR keeps message 4, gaps 4 and 1, so 3; Random's mean is 3.375."""
+    comparison = figure("afr-vs-random", max_capacity=8, last_T=40)
+    rows = comparison.simulate()
+    facts = comparison.claims(rows)
+    assert facts["grid"] and facts["one"]
+    assert (facts["counter_afr"], facts["counter_random"]) == (3, pytest.approx(3.375))
+    assert rows[0]["violations"] > 0
+
+
+# -------------------- Fig. 1 to 3
+
+
+def test_fig1_shows_what_is_received() -> None:
+    fig1 = figure("afr-fig1")
+    rows = fig1.simulate()
+    assert fig1.tables(rows)[0].split()[2:] == ["0", *map(str, range(19, 28))]  # Drop Oldest: the last 8
+    (gaps,) = afr_theorems.gaps_of("afr", 8, [26])
+    assert fig1.tables(rows)[2].split()[1:] == ["0", *map(str, np.cumsum(gaps))]
+
+
+def test_fig2_views_overlap_by_hand() -> None:
+    """Turning 7.5 of 60 degrees an eighth of the view is new; a square seen at 1 / 0.618 the area has 0.382 new."""
+    motions = afr_fig2.Reproduction().motions()
+    assert motions["turn"].new(1) == pytest.approx(1 / 8)
+    assert motions["turn"].new(8) == motions["turn"].new(20) == 1
+    assert motions["wall"].new(1) == pytest.approx(1 - 0.618)
+    # 2 x 1.5 m x tan 30 degrees = 1.732 m of wall, of which 0.15 m are new.
+    assert motions["corridor"].new(1) == pytest.approx(0.15 / 1.7320508)
+
+
+# -------------------- the theorems' ratio
 
 
 def test_properties_can_fail() -> None:

@@ -12,16 +12,27 @@ import pytest
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.reproduce import FIGURES, run
+from bufgym.reproduce.figure import statements
+from bufgym.reproduce.page import claim_rows
 
+SHORT: dict[str, Any] = {
+    "trace": "lte-synthetic-0",
+    "frames": 40,
+    "capacities": (2, 4),
+    "runs": 2,
+    "sweep_kb": (500,),
+}
 SMALL: dict[str, dict[str, Any]] = {
+    "afr-fig1": {},
+    "afr-fig2": {},
+    "afr-fig3": {},
     "afr-fig4": {},
     "afr-fig5": {"runs": 50 if JIT else 3, "last_T": 40 if JIT else 18},
     "afr-fig6": {"trace": "lte-synthetic-0"},
-    "afr-fig7-qoi": {"trace": "lte-synthetic-0", "motion": ["drive-0"], "frames": 40, "capacities": (2, 4), "runs": 2},
-    "afr-fig8-gap": {
-        **{"trace": "lte-synthetic-0", "motion": ["drive-0"], "frames": 40, "capacities": (2, 4)},
-        **{"runs": 2, "more_runs": 3},
-    },
+    "afr-frame-size": SHORT,
+    "afr-fig7-qoi": {**SHORT, "motion": ["drive-0"]},
+    "afr-fig8-gap": {**SHORT, "motion": ["drive-0"], "more_runs": 3},
+    "afr-vs-random": {"max_capacity": 8, "last_T": 20},
     "afr-theorems": {"max_capacity": 4, "last_T": 40},
     "afr-fig9": {"decisions": 1000, "calls": 100},
     "robofleet-table1": {"points": 50},
@@ -34,6 +45,8 @@ SMALL: dict[str, dict[str, Any]] = {
 """Options that keep each figure short; a new figure must add its own."""
 
 NEEDS_LIBRARIES = {"robofleet-table1": ("rosbags", "flatbuffers")}
+
+CLAIMS = Path(__file__).parent.parent.parent / "docs" / "claims.md"
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -73,8 +86,31 @@ def test_without_matplotlib_the_numbers_still_come(tmp_path: Path, monkeypatch: 
     assert [path.name for path in tmp_path.iterdir()] == ["afr-fig4.csv"]
 
 
+def test_every_claim_has_its_place_or_is_ours() -> None:
+    for name, texts in statements().items():
+        assert {"title"} <= set(texts) or name.endswith("-other"), name
+        for claim, text in texts["claims"].items():
+            assert {"says", "ours"} <= set(text), (name, claim)
+            assert bool(text.get("own")) != ("place" in text), (name, claim)
+
+
+def test_the_page_has_a_row_for_every_claim() -> None:
+    page = CLAIMS.read_text(encoding="utf-8")
+    for name in FIGURES:
+        assert page.count(f"`{name}` |") + page.count(f"`{name}` † |") == len(statements()[name]["claims"]), name
+
+
+@pytest.mark.parametrize("name", [name for name, texts in statements().items() if texts.get("fast")])
+def test_fast_rows_of_the_page_are_what_comes_out(name: str) -> None:
+    for library in NEEDS_LIBRARIES.get(name, ()):
+        pytest.importorskip(library)
+    page = CLAIMS.read_text(encoding="utf-8").splitlines()
+    for row in claim_rows(name):
+        assert row in page
+
+
 def test_unknown_names_and_options_list_the_known() -> None:
-    with pytest.raises(BufgymError, match="unknown figure 'afr-fig99'; known: afr-fig4, afr-fig5"):
+    with pytest.raises(BufgymError, match="unknown figure 'afr-fig99'; known: afr-fig1, afr-fig2"):
         run("afr-fig99")
     with pytest.raises(BufgymError, match="afr-fig5: no option 'rums'; it has: runs, last_T, seed"):
         run("afr-fig5", rums=3)
@@ -87,6 +123,8 @@ def test_unknown_names_and_options_list_the_known() -> None:
         ("afr-fig5", {"runs": 1}),
         ("afr-fig5", {"last_T": 0}),
         ("afr-theorems", {"max_capacity": 0}),
+        ("afr-fig2", {"turn_degrees": 0}),
+        ("afr-vs-random", {"last_T": 3}),
         ("afr-fig9", {"calls": 0}),
     ],
 )

@@ -159,6 +159,9 @@ def test_fig3_backpressure_keeps_latency_low_and_no_drop_does_not() -> None:
     assert rows.mean("dropped", sender="no-drop", publish_hz=100) == 0
     facts = fig3.claims(rows)
     assert facts["low"] and facts["grows"]
+    # 562 kB of JSON take 45 ms: rosbridge is behind at 10 Hz already. Native ROS drops its oldest above the link's 78.
+    assert latency_ms("rosbridge", 10) == pytest.approx(50, abs=0.5)
+    assert facts["rosbridge"] and facts["ahead_of_native"] == "100"
     slow = figure("robofleet-fig3", rates_hz=(5, 10), duration_s=1, runs=1)
     assert slow.claims(slow.simulate())["grows"] is None  # no rate exceeds the link
 
@@ -197,7 +200,7 @@ def test_fig4_a_silence_delays_both() -> None:
 
 @pytest.mark.slow
 def test_fig5_low_latency_is_bought_with_fewer_messages() -> None:
-    fig5 = figure("robofleet-fig5", runs=1)
+    fig5 = figure("robofleet-fig5", rate_hz=30.0, runs=1)
     rows = fig5.simulate()
     highest = {s: np.nanmax(rows.column("max_latency_s", sender=s)) for s in ("robofleet", "no-drop")}
     # 160,344 bytes at 4 Mbit/s are 0.32 s; the message that goes is at most a period of 33 ms old.
@@ -209,6 +212,13 @@ def test_fig5_low_latency_is_bought_with_fewer_messages() -> None:
     link = [float(r["link_mbit_per_s"]) for r in rows if r["sender"] == "robofleet"]
     assert (link[0], link[-1]) == (pytest.approx(96.8), 4.0)
     assert fig5.claims(rows)["low"]
+
+
+def test_fig5_rosbridge_breaks_first_native_ros_later() -> None:
+    fig5 = figure("robofleet-fig5", runs=1)
+    facts = fig5.claims(fig5.simulate())
+    assert facts["order"]
+    assert facts["breaks"].startswith("n_T = 1 never; ")
 
 
 def test_fig6_native_ros_grows_with_the_consumers_and_robofleet_does_not() -> None:
@@ -242,9 +252,7 @@ def test_fig6_says_when_copies_exceed_the_link() -> None:
 
 @pytest.mark.slow
 def test_fig7_no_drop_is_kept_and_images_go() -> None:
-    fig7 = figure(
-        "robofleet-fig7", bad_mbit_per_s=(1.0,), image_priorities=(1.0, 0.01), bad_from=100, after_s=10, runs=1
-    )
+    fig7 = figure("robofleet-fig7", bad_mbit_per_s=(1.0,), image_priorities=(1.0, 0.01), bad_from=100, runs=1)
     rows = fig7.simulate()
 
     def in_zone(sender: str, topic: str, column: str, priority: float = 1.0) -> float:
@@ -266,6 +274,9 @@ def test_fig7_no_drop_is_kept_and_images_go() -> None:
         )
     facts = fig7.claims(rows)
     assert facts["no-drop"] and facts["lost"] == 0
+    assert facts["spike"] and facts["longer"]
+    assert 40 < in_zone("rosbridge", "PoseStamped", "affected_after_s") < 55
+    assert in_zone("robofleet", "PoseStamped", "affected_after_s") < 0.2
     # Native ROS's turns by message: 75,188 + 7,260 + 75 bytes a round are 0.66 s, so 45 poses of 300 in the zone; a
     # full queue of 10 makes them nearly a second old. What waits at its end, 10 of each, goes once the link is good.
     gone, came = (in_zone("ros-native", "PoseStamped", f"{entry}_in_zone") for entry in ("lost", "arrived"))
