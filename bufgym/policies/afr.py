@@ -62,7 +62,7 @@ def afr(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     return thin(r, c, p, r, s, L, memory)
 
 
-@register("afr-paper", memory=MEMORY, source="AFR paper, Sec. III (literal text)", compile=True)
+@register("afr-paper", memory=MEMORY, source="AFR paper, Sec. IV-A, Algorithm 1 (literal text)", compile=True)
 def afr_paper(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """Adaptive Frame Rate by the letter of the paper: s/L < 2/3, p not moved at departures."""
     r, c, p = memory[R], memory[C], memory[P]

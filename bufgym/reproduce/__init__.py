@@ -3,7 +3,7 @@
 ``run("afr-fig5", Path("out"))`` returns a text to print and saves the numbers (CSV) and the picture (PNG) under
 ``out``. Each figure is one module with a class ``Reproduction``, imported only when it is asked for. The numbers need
 nothing beyond bufgym (those of robofleet-table1 its extra ``robofleet``); the picture needs matplotlib, which comes
-with ``bufgym[plot]``.
+with ``bufgym[plot]``. Keys in brackets, such as [wang2022afr], are those of docs/references.bib.
 """
 
 from __future__ import annotations

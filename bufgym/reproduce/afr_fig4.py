@@ -1,4 +1,4 @@
-"""Fig. 4 of the AFR paper: which messages AFR keeps as an interruption grows, step by step.
+"""Fig. 4 of the AFR paper [wang2022afr]: which messages AFR keeps as an interruption grows, step by step.
 
 Message 0 is in transmission when the link stops; message T is the T-th to arrive since. With L = 8 messages 9 to 16
 push out 1, 3, ..., 15: one pass of the dropping position p over the queue. Then the dropping rate r doubles: every

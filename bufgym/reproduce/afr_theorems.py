@@ -1,4 +1,4 @@
-"""The theorems of the AFR paper, checked on the simulator for every L, T and V of a grid.
+"""The theorems of the AFR paper [wang2022afr], checked on the simulator for every L, T and V of a grid.
 
 "Every V" is checked exactly, not by sample. H depends on V at whole-numbered gaps alone, and there a concave V with
 V(0) = 0 that does not fall is a sum of V(d) = min(d, D), D = 1, 2, ..., with weights >= 0. H is linear in V: what holds

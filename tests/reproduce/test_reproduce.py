@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import re
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from bufgym.cli import main
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.reproduce import FIGURES, run
@@ -107,6 +109,25 @@ def test_fast_rows_of_the_page_are_what_comes_out(name: str) -> None:
     page = CLAIMS.read_text(encoding="utf-8").splitlines()
     for row in claim_rows(name):
         assert row in page
+
+
+def test_the_command_writes_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from bufgym.reproduce import page
+
+    # The two that need neither recordings nor time, and one that is left unchecked without recordings.
+    names = ("afr-fig4", "afr-fig6", "robofleet-other")
+    monkeypatch.setattr(page, "statements", lambda: {name: statements()[name] for name in names})
+    assert main(["reproduce", "--claims", str(tmp_path / "claims.md")]) == 0
+    text = (tmp_path / "claims.md").read_text(encoding="utf-8")
+    assert "| 10 of 10 drops as in the paper. | holds |" in text
+    assert "(--data DIR)" in text and "| not checked |" in text
+
+
+def test_what_is_cited_is_in_the_references() -> None:
+    keys = set(re.findall(r"^@\w+\{(\w+),", (CLAIMS.parent / "references.bib").read_text(encoding="utf-8"), re.M))
+    texts = [CLAIMS, *(CLAIMS.parent.parent / "bufgym" / "reproduce").glob("*.py")]
+    cited = {key for path in texts for key in re.findall(r"\[([a-z]+20\d\d\w+)\]", path.read_text(encoding="utf-8"))}
+    assert {"wang2022afr", "sikand2021robofleet", "vanderhooft2016http2"} <= cited <= keys
 
 
 def test_unknown_names_and_options_list_the_known() -> None:
