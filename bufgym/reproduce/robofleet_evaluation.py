@@ -1,7 +1,7 @@
 """What Robofleet's Fig. 3 to 7 share: the messages, the programs that send them, and what became of each.
 
-The paper [sikand2021robofleet] sends with n_T = 1 in its experiments; so do we. What it leaves open is an option of each
-figure. Arrivals are jittered by up to a tenth of their period, which is what differs from run to run; every sender
+The paper [sikand2021robofleet] sends with n_T = 1 in its experiments; so do we. What it leaves open is an option of
+each figure. Arrivals are jittered by up to a tenth of their period, which is what differs from run to run; every sender
 meets the same ones.
 
 Left out on purpose: TCP (a link that stands still is found again at once, unless a figure takes a silence as option),

@@ -1,9 +1,9 @@
 """Table I of the Robofleet paper: bytes of a message as ROS binary, as Robofleet's flatbuffer, as rosbridge's JSON.
 
-The paper [sikand2021robofleet] names types and bytes, not contents. We build a message of each type that has the paper's
-bytes as ROS binary, then encode the same message in the other ways. What is ours alone to choose (beams, topics,
-content) is stated in the text; PointCloud2, PoseStamped and Odometry are in the paper's experiments but not in its
-table.
+The paper [sikand2021robofleet] names types and bytes, not contents. We build a message of each type that has the
+paper's bytes as ROS binary, then encode the same message in the other ways. What is ours alone to choose (beams,
+topics, content) is stated in the text; PointCloud2, PoseStamped and Odometry are in the paper's experiments but not in
+its table.
 """
 
 from __future__ import annotations
