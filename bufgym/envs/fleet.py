@@ -126,7 +126,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
             dict(zip(agents, rows.rewards().tolist(), strict=True)),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, False),
-            {agent: rows.info(i, masks[i]) for i, agent in enumerate(agents)},
+            {agent: rows.info(i, masks[i], terminated) for i, agent in enumerate(agents)},
         )
 
     def state(self) -> NDArray[np.float32]:

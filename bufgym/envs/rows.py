@@ -98,6 +98,7 @@ class Rows:
         )
         self.capacity = self.senders.capacity
         self.terms = REWARD_TERMS + (TOPIC_REWARD_TERMS if topics else ())
+        self._term_names = [term.name for term in self.terms]
         self.weights = reward_weights(reward, self.terms)
         self.slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
         self.context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
@@ -174,15 +175,14 @@ class Rows:
             "invalid": sender["invalid"],
         }
 
-    def info(self, i: int, action_mask: NDArray[np.bool_]) -> dict[str, Any]:
+    def info(self, i: int, action_mask: NDArray[np.bool_], terminated: bool) -> dict[str, Any]:
         """Gymnasium's info of row ``i`` after a step: mask, invalid actions, reward terms; at the end its summary."""
-        terms = self.output.reward_terms[i].tolist()
         info = {
             "action_mask": action_mask,
-            "invalid": self.senders.batch.senders["invalid"][i].item(),
-            "reward_terms": {term.name: terms[k] for k, term in enumerate(self.terms)},
+            "invalid": self.senders.batch.senders["invalid"].item(i),
+            "reward_terms": dict(zip(self._term_names, self.output.reward_terms[i].tolist(), strict=True)),
         }
-        if self.output.terminated[i]:
+        if terminated:
             info |= {name: number.item() for name, number in self.summary(i).items()}
         return info
 

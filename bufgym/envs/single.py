@@ -111,11 +111,12 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             raise rows.bad_action("action", action)
         self._action[0] = action
         rows.step(self._action)
-        info = rows.info(0, self.action_masks())
+        terminated = rows.output.terminated.item()
+        info = rows.info(0, self.action_masks(), terminated)
         reward = 0.0
         for weight, term in zip(self._weights, info["reward_terms"].values(), strict=True):
             reward += weight * term
-        return self._observation(), reward, rows.output.terminated.item(), False, info
+        return self._observation(), reward, terminated, False, info
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[L + 2]: the actions that are valid now (the name that sb3-contrib looks for)."""
