@@ -58,11 +58,8 @@ def afr(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 
 @register("afr-paper", memory=MEMORY, source="AFR paper, Sec. IV-A, Algorithm 1 (literal text)", compile=True)
-<<<<<<< HEAD
+@register("afr-paper", memory=MEMORY, source="AFR paper, Sec. IV-A, Algorithm 1 (literal text)", compile=True)
 def afr_paper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-=======
-def afr_paper(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
->>>>>>> reproduce
     """Adaptive Frame Rate by the letter of the paper: s/L < 2/3, p not moved at departures."""
     r, c, p = memory[R], memory[C], memory[P]
     L, s = buffer.capacity, len(buffer.slots)

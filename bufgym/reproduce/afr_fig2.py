@@ -110,11 +110,7 @@ class GeometryFigure(Figure):
         values = [qoi.tabulated(range(MESSAGES + 1), rows.column("V", motion=name).tolist()) for name in self.motions()]
         difference = float(abs(rows.column("V") - rows.column("formula")).max())
         names = ", ".join(motion.formula.name for motion in self.motions().values())
-<<<<<<< HEAD
-        return {"concave": len(values) == 3, "formulas": difference < 1e-12, "difference": difference, "names": names}
-=======
         return {"concave": len(values) == len(self.motions()), "formulas": difference < 1e-12, "names": names}
->>>>>>> reproduce
 
 
 @dataclass(frozen=True)
