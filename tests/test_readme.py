@@ -1,4 +1,4 @@
-"""What README tells users to type is there, and its policies run as printed."""
+"""What README and the guide tell users to type is there; policies run and tables come out as printed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import pytest
 from bufgym import cli, policies, reproduce
 from bufgym.cli import main
 
-README = (Path(__file__).resolve().parent.parent / "README.md").read_text(encoding="utf-8")
+REPO = Path(__file__).resolve().parent.parent
+README = "\n".join((REPO / name).read_text(encoding="utf-8") for name in ("README.md", "docs/guide.md"))
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 SPANS = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", README, flags=re.MULTILINE | re.DOTALL))
 
@@ -63,3 +64,24 @@ def test_policies_run_as_printed(
         assert f"\n{name} " in shown and "invalid" not in shown
     finally:
         policies.registry._REGISTRY.pop(name, None)
+
+
+@pytest.mark.slow
+def test_the_table_is_what_its_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (REPO / "README.md").read_text(encoding="utf-8")
+    command, table = re.findall(r"```\n(bufgym bench --policies [^\n]*)\n```\n\n```\n(.*?)```", text, re.DOTALL)[0]
+    assert main(command.split()[1:]) == 0
+    assert capsys.readouterr().out.strip() == table.strip()
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{path.name}" for path in sorted((REPO / "docs").glob("*.md")))])
+def test_links_lead_somewhere(page: str) -> None:
+    text = (REPO / page).read_text(encoding="utf-8")
+    anchors = {
+        re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in re.findall(r"^#+ (.*)$", README, re.M)
+    }
+    for target in re.findall(r"\]\(([^)]+)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL)):
+        path, _, anchor = target.partition("#")
+        if not target.startswith("http"):
+            assert not path or ((REPO / page).parent / path).exists(), target
+            assert not anchor or anchor in anchors, target
