@@ -19,7 +19,6 @@ REPO = Path(__file__).resolve().parent.parent
 
 ROOMS = [
     "errors",
-    "checks",
     "files",
     "kernel",
     "traces",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bufgym.checks import whole
 from bufgym.envs.rows import FleetRows, Rows
 from bufgym.envs.vector import SenderVectorEnv
+from bufgym.model.checks import whole
 from bufgym.scenario import FleetScenario, Uplink
 
 

@@ -13,10 +13,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym.checks import whole
 from bufgym.envs.rows import Observation, Rows, check_render_mode
 from bufgym.envs.step import StepOutput
 from bufgym.errors import BufgymError
+from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
 
 _SUMMARY = ("qoi", "arrived", "delivered", "dropped")

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.documented import documented
 from bufgym.errors import BufgymError
 from bufgym.kernel import item, kernel
+from bufgym.model.documented import documented
 from bufgym.model.qoi import merging_loss, value
 
 MESSAGE = np.dtype(

@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bufgym.checks import whole
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
+from bufgym.model.checks import whole
 from bufgym.model.qoi import Value
 from bufgym.oracle.interruption import integer
 from bufgym.policies.gaps import min_gap

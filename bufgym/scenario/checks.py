@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from bufgym.checks import above_0, between
 from bufgym.errors import BufgymError
+from bufgym.model.checks import above_0, between
 from bufgym.model.qoi import Value
 from bufgym.traces import Motion, Trace
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.checks import above_0, whole
 from bufgym.errors import BufgymError
 from bufgym.kernel import records
 from bufgym.model import qoi
 from bufgym.model.buffer import MESSAGE
+from bufgym.model.checks import above_0, whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, check_window

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.checks import whole
 from bufgym.errors import BufgymError
 from bufgym.kernel import records
 from bufgym.model.buffer import MESSAGE
+from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_ack_delay, check_window

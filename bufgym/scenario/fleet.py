@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.checks import whole
 from bufgym.errors import BufgymError
+from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.scenario import registry

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.checks import whole
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
+from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic

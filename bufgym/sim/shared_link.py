@@ -17,8 +17,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.documented import documented
 from bufgym.kernel import kernel, records
+from bufgym.model.documented import documented
 from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.decisions import arrive
 from bufgym.sim.socket import finish_transmission, next_size_bytes

@@ -9,9 +9,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.documented import documented
 from bufgym.kernel import records
 from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC, row_width
+from bufgym.model.documented import documented
 from bufgym.model.qoi import exponential
 
 END, DEPARTURE, DECISION, DEQUEUE, SEND = range(5)
