@@ -25,7 +25,8 @@ from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.score import BASELINE, regret, scores
 from bufgym.benchmark.sweep import Sweep
 from bufgym.errors import BufgymError
-from bufgym.oracle import EveryLength, law, online_optimum
+from bufgym.oracle import law, online_optimum
+from bufgym.oracle.lengths import EveryLength
 from bufgym.policies import Policy, registry
 from bufgym.scenario import Interruption
 from bufgym.scenario.suites import get as suite_of

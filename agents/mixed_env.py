@@ -73,16 +73,7 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise BufgymError(f"{self.padded_slots} padded slots: a cell has L = {largest}")
 
         def rows(cell: Cell, size: int) -> Rows:
-            return Rows(
-                size,
-                scenario=cell.scenario,
-                capacity=cell.capacity,
-                max_bytes=None,
-                decide_at=decide_at,
-                reward=reward,
-                fields=None,
-                parameters={},
-            )
+            return Rows(size, cell.scenario, cell.capacity, decide_at=decide_at, reward=reward)
 
         self.groups = [rows(cell, size) for cell, size in zip(cells, sizes, strict=True)]
         self.num_envs = sum(sizes)

@@ -73,10 +73,10 @@ def test_bench_runs_a_users_policy_file(trace: str, tmp_path: Path, capsys: pyte
     mine = tmp_path / "mine.py"
     mine.write_text(
         "from bufgym.policies import ACCEPT, register\n"
-        "@register('my-own', memory={'seen': 0, 'step': 1}, parameters=('step',))\n"
+        "@register('my-own', memory={'seen': 0}, parameters={'step': 1})\n"
         "def my_own(buffer, arrival, memory):\n"
         "    'Mine.'\n"
-        "    memory[0] += memory[1]\n"
+        "    memory[0] += buffer.parameters[0]\n"
         "    return ACCEPT if len(buffer.slots) < buffer.capacity else int(memory[0]) % buffer.capacity\n"
     )
     try:

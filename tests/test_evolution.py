@@ -22,7 +22,8 @@ from agents.objectives.objective import to_vector, with_vector  # noqa: E402
 from agents.runs import MODEL, prepare  # noqa: E402
 from agents.settings import MOTION, SEES, TIME, Settings  # noqa: E402
 from bufgym import policies  # noqa: E402
-from bufgym.oracle import EveryLength, integer, law  # noqa: E402
+from bufgym.oracle import integer, law  # noqa: E402
+from bufgym.oracle.lengths import EveryLength  # noqa: E402
 from bufgym.policies import learned, weights  # noqa: E402
 from bufgym.scenario import Interruption  # noqa: E402
 from bufgym.sim import run  # noqa: E402
@@ -62,7 +63,7 @@ def test_weights_are_a_vector_and_back() -> None:
     assert len(vector) == 5 + (10 * 3 + 3 + 3) + (10 + 1) + 5 * 5
     again = with_vector(weights, vector)
     assert (to_vector(again) == vector).all()
-    assert (again.memory() == weights.memory()).all()
+    assert (again.parameters() == weights.parameters()).all()
     changed = with_vector(weights, np.arange(len(vector), dtype=float))
     assert changed.drop.skip.tolist() == [0, 1, 2, 3, 4, *[0] * 5]  # 0: what the context adds to every drop
     assert changed.mix is not None and changed.mix[-1, -1] == len(vector) - 1
@@ -177,7 +178,7 @@ def test_a_run_leaves_an_agent_goes_on_after_a_kill_and_repeats(capsys: pytest.C
     rest = dataclasses.replace(half, steps=TINY.steps, resume=True)
     training.train_all(rest, prepare(rest))
     again, _ = weights.read(folder / "seed-0" / MODEL)
-    assert (again.memory() == whole.memory()).all()
+    assert (again.parameters() == whole.parameters()).all()
 
 
 @pytest.mark.slow

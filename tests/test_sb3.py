@@ -235,13 +235,13 @@ def outcomes_in_env(model: Any, scenario: Any, masked: bool, flat: bool, fields:
     envs = SenderVectorEnv(4, scenario, L, decide_at="arrival", fields=fields)
     envs.reset(options={"episodes": episodes})
     rows = envs.rows
-    while not rows.shown.ended.all():
-        observation: Any = rows.observation(rows.shown.slots, rows.shown.context)
+    while not rows.output.terminated.all():
+        observation: Any = rows.observation(rows.output.slots, rows.output.context)
         if flat:
             space = envs.single_observation_space
             single = [{key: column[i] for key, column in observation.items()} for i in range(4)]
             observation = np.array([gym.spaces.flatten(space, row) for row in single])
-        masks = {"action_masks": rows.shown.mask} if masked else {}
+        masks = {"action_masks": rows.output.action_mask} if masked else {}
         rows.step(np.asarray(model.predict(observation, deterministic=True, **masks)[0], np.int64))
     return [outcome(rows.senders, i) for i in range(4)]
 
@@ -310,9 +310,9 @@ def test_an_agent_for_topics_is_a_scheduler() -> None:
     envs = SenderVectorEnv(1, client, 6)
     envs.reset(options={"episodes": [episode]})
     rows = envs.rows
-    while not rows.shown.ended.all():
-        observation = rows.observation(rows.shown.slots, rows.shown.context)
-        action, _ = model.predict(observation, deterministic=True, action_masks=rows.shown.mask)
+    while not rows.output.terminated.all():
+        observation = rows.observation(rows.output.slots, rows.output.context)
+        action, _ = model.predict(observation, deterministic=True, action_masks=rows.output.action_mask)
         rows.step(np.asarray(action, np.int64))
     senders = run(policy, [episode], 6, client.value, topics=client.topics)
     for name in ("rejected", "evicted", "transmitted"):

@@ -2,11 +2,9 @@
 
 from bufgym.oracle.clairvoyant import Plan, clairvoyant
 from bufgym.oracle.interruption import by_length, ideal, integer
-from bufgym.oracle.lengths import EveryLength
 from bufgym.oracle.online import OnlineOptimum, law, online_optimum
 
 __all__ = [
-    "EveryLength",
     "OnlineOptimum",
     "Plan",
     "by_length",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import naive
 import numpy as np
@@ -285,15 +286,7 @@ def drawn_episodes(robots, count=2, **parameters):
 def test_a_python_policy_does_what_the_compiled_one_does(name):
     made, episodes = drawn_episodes(3)
     compiled = policies.get(name)
-    python = policies.Policy(
-        "test-python",
-        compiled.on_arrival,
-        compiled.on_departure,
-        compiled.on_dequeue,
-        compiled.on_send,
-        compiled.memory,
-        client=compiled.client,
-    )
+    python = replace(compiled, name="test-python", compile=False)
     assert same(
         run_fleet(compiled, episodes, 4, made.value).senders, run_fleet(python, episodes, 4, made.value).senders
     )

@@ -318,7 +318,7 @@ def without_bounds(c, size, limit, x, v, ends) -> float:
     """The gain of the best of all labels, none left out for leading nowhere."""
     work, steps = np.empty((2, len(c)), np.int64), (limit + size).max() // 1_000 + 2
     p = labels.Problem(c, size, limit, x, v, ends, work[0], work[1], 1_000, np.zeros((len(c), steps)))
-    labels.find_idle(p)
+    labels.find_idle(p.c, p.size, p.limit, p.limit, p.between, p.idle)
     return labels.plan_of(labels.fill(p, -np.inf, labels.no_labels(len(c))))[1]
 
 

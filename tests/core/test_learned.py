@@ -20,7 +20,7 @@ from bufgym.benchmark.run import draw
 from bufgym.cli import export as command
 from bufgym.cli.options import Parser
 from bufgym.envs import SenderVectorEnv
-from bufgym.envs.rows import decision_of
+from bufgym.envs.step import decision_of
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.model import qoi
@@ -226,11 +226,11 @@ def test_an_exported_agent_decides_as_it_did(tmp_path):
     envs.reset(options={"episodes": episodes})
     rows, memory = envs.rows, policy.new_memory(1, L)[0]
     met, differ, dequeued = 0, 0, set()
-    while not rows.shown.ended.all():
-        observation = rows.observation(rows.shown.slots, rows.shown.context)
-        actions, _ = model.predict(observation, deterministic=True, action_masks=rows.shown.mask)
+    while not rows.output.terminated.all():
+        observation = rows.observation(rows.output.slots, rows.output.context)
+        actions, _ = model.predict(observation, deterministic=True, action_masks=rows.output.action_mask)
         batch = named(rows.senders.batch._replace(parameters=policy.parameter_array))
-        for i in np.flatnonzero(~rows.shown.ended):
+        for i in np.flatnonzero(~rows.output.terminated):
             arrival = batch.arrivals[i, batch.senders[i].next]
             decision = policy.on_arrival(python_view(batch, i), arrival, memory)
             met, differ = met + 1, differ + (decision != decision_of(actions[i], L))
