@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn, TypeAlias
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, printable
 
 
 class Parser(argparse.ArgumentParser):
@@ -18,6 +18,9 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise BufgymError(f"{message} (see {self.prog} --help)")
 
+
+MAX_EPISODES = 100_000
+"""On each trace. Each is a row of every policy and capacity, all of them held in memory."""
 
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 """What ``add_subparsers`` returns: where commands are added."""
@@ -66,6 +69,14 @@ def count(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text}: must be a whole number >= 1")
     return value
+
+
+def episodes(text: str) -> int:
+    """How many seeds: a whole number from 1 to ``MAX_EPISODES``."""
+    number = count(text)
+    if number > MAX_EPISODES:
+        raise argparse.ArgumentTypeError(f"{text}: must be at most {MAX_EPISODES}")
+    return number
 
 
 def natural(text: str) -> int:
@@ -151,6 +162,7 @@ def load_policies(path: str | None) -> None:
 
 def columns(lines: Sequence[Sequence[str]]) -> str:
     """Left-aligned columns, indented; the last is not padded."""
+    lines = [list(map(printable, line)) for line in lines]
     widths = [max((len(line[c]) for line in lines), default=0) for c in range(max(map(len, lines), default=0))]
     return "\n".join(
         "  " + "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines

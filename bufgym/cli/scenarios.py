@@ -16,7 +16,7 @@ from bufgym.cli.trace_bags import (
     workload_lines,
     workload_options,
 )
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, printable
 
 if TYPE_CHECKING:
     from bufgym.scenario import Scenario
@@ -176,7 +176,7 @@ def _recording(options: argparse.Namespace, take: dict[str, Any]) -> tuple[Scena
     scaled = f" x {take['scale']:g}" if take["scale"] != 1 else ""
     shared = "; all topics share one queue" if len(workload.topics) > 1 else ""
     about = [
-        workload.source,
+        printable(workload.source),
         "",
         *workload_lines(workload),
         "",
@@ -218,4 +218,4 @@ def _with_gaps(motion: Motion) -> str:
 
 
 def _some(names: Sequence[str]) -> str:
-    return ", ".join(names) if len(names) <= 3 else f"{names[0]} .. {names[-1]}"
+    return printable(", ".join(names) if len(names) <= 3 else f"{names[0]} .. {names[-1]}")
