@@ -1,4 +1,4 @@
-"""Files of strangers: what is too large, endless, forged or no regular file ends in one line, soon, in little memory."""
+"""Files of strangers: what is too large, endless, forged or no regular file ends in one line, and soon."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def test_traces_that_nobody_follows_make_room(monkeypatch):
 
 def test_a_new_trace_for_every_episode_takes_no_more_memory(monkeypatch):
     monkeypatch.setattr(link, "KEPT_KNOTS", 100)
-    scenario = Uplink(traces=(trace(KNOTS, "loop"),), duration_s=0.01)
+    scenario = Uplink(traces=(trace(KNOTS, "loop"),), duration_s=0.2)
     senders = Senders(1, 2, scenario.value, max_messages=scenario.max_messages)
     for k in range(1, 500):
         one = replace(scenario, traces=(trace([(0, 0), (10_000, k), (30_000, 2 * k)], "loop"),))
