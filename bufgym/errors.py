@@ -12,6 +12,8 @@ from os import PathLike
 
 _MOST_CHARACTERS = 60
 """Longer values are cut in messages: a broken file can hold a line of any length."""
+_MOST_MESSAGE = 2000
+"""Characters."""
 
 
 def printable(text: object) -> str:
@@ -26,7 +28,9 @@ class BufgymError(ValueError):
     """A value that bufgym cannot work with; the message names the value and the rule that it breaks, on one line."""
 
     def __init__(self, message: object = "") -> None:
-        super().__init__(printable(message))
+        text = printable(message)
+        # The place stands at the beginning and the rule at the end; what is between may be as long as a file.
+        super().__init__(text if len(text) <= _MOST_MESSAGE else f"{text[:1000]}...{text[-500:]}")
 
 
 class TraceError(BufgymError):

@@ -155,6 +155,8 @@ def read(path: Path) -> dict[str, Entry]:
                 except ValueError:
                     rule = "must be a number"
                     raise BufgymError(where(path, reader.line_num, line[name], rule, field=name)) from None
+            if row["suite"] not in suites.SUITES:
+                raise BufgymError(where(path, reader.line_num, row["suite"], "must be a suite", field="suite"))
             if row["quantity"] not in task_of(row["suite"]).listed:
                 rule = f"must be one of {', '.join(task_of(row['suite']).listed)}"
                 raise BufgymError(where(path, reader.line_num, row["quantity"], rule, field="quantity"))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from bufgym.traces import Trace
 
 _PICTURES = (".png", ".svg", ".pdf")
-_MOST_DRAWN = 20_000
+_MOST_DRAWN = 5_000
 """Rates in a picture, which is some 1300 pixels wide; more are drawn as means over as many windows."""
 
 

@@ -55,8 +55,6 @@ MAX_TOML_BYTES = 2**18
 """A client of a thousand topics has less."""
 MAX_DOTS = 100
 """In a line."""
-MAX_MESSAGE = 1000
-"""Characters of an error."""
 
 _TOPIC_KEYS = {f.name for f in fields(Topic)} - {"value"}
 _STREAM_KEYS = {"rate_hz", "size_bytes", "jitter", "size_cv", "moves"}
@@ -81,9 +79,7 @@ def read_client(path: str | Path, **parameters: Any) -> Client:
         recordings = {} if "traces" in parameters else shipped()
         return Client(tuple(map(_stream, tables)), **{**settings, **recordings, **parameters})
     except BufgymError as error:
-        # A value of the file's may be as long as the file.
-        text = str(error) if len(str(error)) <= MAX_MESSAGE else f"{str(error)[:MAX_MESSAGE]}..."
-        raise BufgymError(text if text.startswith(f"{path}") else f"{path}: {text}") from None
+        raise error if str(error).startswith(f"{path}") else BufgymError(f"{path}: {error}") from None
 
 
 def _settings(path: str | Path) -> dict[str, Any]:

@@ -80,7 +80,7 @@ def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any) -> None:
         leaderboard.read(path)
     leaderboard.write([], path)
     with path.open("a") as file:
-        file.write("s,p,1,1,score,many,1,1,0.1.0,c\n")
+        file.write("lte-v1,p,1,1,score,many,1,1,0.1.0,c\n")
     with pytest.raises(BufgymError, match=r"board\.csv.*many.*must be a number"):
         leaderboard.read(path)
     assert main(["validate", "lte-v1/nobody", "--file", str(REPO / "docs" / "leaderboard.csv")]) == 2

@@ -75,11 +75,11 @@ def bags(folder: Path) -> tuple[list[tuple[str, bytes]], Callable[[Path], object
 
 def toml(folder: Path) -> tuple[list[tuple[str, bytes]], Callable[[Path], object]]:
     from bufgym.scenario import read_client
-    from bufgym.traces import Trace
+    from bufgym.traces import Trace, load_motion
 
-    links = (Trace.constant(1e6, 1),)
+    links, motion = (Trace.constant(1e6, 1),), (load_motion("drive-0"),)
     file = "client.toml", (REPO / "examples" / "client.toml").read_bytes()
-    return [file], lambda path: read_client(path, traces=links, motion=())
+    return [file], lambda path: read_client(path, traces=links, motion=motion)
 
 
 def results(folder: Path) -> tuple[list[tuple[str, bytes]], Callable[[Path], object]]:
@@ -149,6 +149,7 @@ def read_all(kind: str, first: int, last: int) -> int:
             finally:
                 signal.alarm(0)
                 path.write_bytes(data)
+    assert sound > (last - first) // 20 or last - first < 50, f"{kind}: {sound} sound: mutations are meant to be mild"
     return sound
 
 
