@@ -20,7 +20,7 @@ import zstandard
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from bufgym import policies, traces
-from bufgym.benchmark import folder, leaderboard, manifest
+from bufgym.benchmark import folder, leaderboard, manifest, tuned
 from bufgym.cli import main
 from bufgym.errors import BufgymError, TraceError, printable
 from bufgym.files import FREELY_UNPACKED_BYTES
@@ -244,6 +244,29 @@ def test_a_report_of_files_that_are_none(
         folder.read(tmp_path)  # not every run has one
         return
     assert str(tmp_path) in said(["report", str(tmp_path)], capsys)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "rows.csv", "timeline.json"])
+def test_a_fifo_in_a_run_s_folder_is_refused(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(tmp_path)
+    (tmp_path / name).unlink()
+    os.mkfifo(tmp_path / name)
+    assert f"{name}: must be a regular file" in said(["report", str(tmp_path)], capsys)
+
+
+def test_settings_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tuned, "FILE", tmp_path / "tuned.json")
+    tuned.write("lte-v1", {"decimate": {"setting": "decimate:every=2"}})
+    before = tuned.FILE.read_bytes()
+
+    def half(path: Path, text: str, **_: object) -> None:
+        path.write_bytes(text.encode()[:20])
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_text", half)
+    with pytest.raises(OSError, match="No space"):
+        tuned.write("lte-v1", {"decimate": {"setting": "decimate:every=3"}})
+    assert tuned.FILE.read_bytes() == before and list(tmp_path.iterdir()) == [tuned.FILE]
 
 
 def write_run(out: Path) -> None:
