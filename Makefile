@@ -17,7 +17,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 help:
 	@echo "make train    set up if needed, then train an agent        (ARGS=... go to train.py)"
 	@echo "make test     set up if needed, then check everything      (PYTEST_ARGS=... go to pytest)"
-	@echo "make fuzz     set up if needed, then read 100,000 broken link files (nightly)"
+	@echo "make fuzz     set up if needed, then feed it broken files, command lines and random episodes (nightly)"
 	@echo "make claims   set up if needed, then test every claim of the papers (nightly; DATA=folder of recordings)"
 	@echo "make format   set up if needed, then format and fix what can be fixed"
 	@echo "make clean    remove caches and build products; keeps .venv and results"
@@ -35,9 +35,9 @@ test: $(READY)
 	NUMBA_DISABLE_JIT=0 $(PYTEST) $(PYTEST_ARGS)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -m "not slow" $(PYTEST_ARGS)
 
-# For the night: 100,000 broken link files, others every day.
+# For the night: 100,000 broken files of each kind, 10,000 command lines, 1,000,000 episodes, others every day.
 fuzz: $(READY)
-	BUFGYM_FUZZ=100000 BUFGYM_FUZZ_SEED=$$(date +%Y%m%d) HYPOTHESIS_PROFILE=thorough $(PYTEST) tests/traces/test_fuzz_links.py $(PYTEST_ARGS)
+	BUFGYM_FUZZ=100000 BUFGYM_FUZZ_SEED=$$(date +%Y%m%d) HYPOTHESIS_PROFILE=thorough $(PYTEST) tests/fuzz $(PYTEST_ARGS)
 
 # For the night: every figure, and what came out beside the page as it stands.
 claims: $(READY)

@@ -12,10 +12,25 @@ from os import PathLike
 
 _MOST_CHARACTERS = 60
 """Longer values are cut in messages: a broken file can hold a line of any length."""
+_MOST_MESSAGE = 2000
+"""Characters."""
+
+
+def printable(text: object) -> str:
+    """The text on one line, without a character that a terminal obeys: each is written as in Python (``\\x1b``).
+
+    Names come from files of strangers: a newline in one could forge a line of output, an escape code hide another.
+    """
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 
 
 class BufgymError(ValueError):
-    """A value that bufgym cannot work with; the message names the value and the rule that it breaks."""
+    """A value that bufgym cannot work with; the message names the value and the rule that it breaks, on one line."""
+
+    def __init__(self, message: object = "") -> None:
+        text = printable(message)
+        # The place stands at the beginning and the rule at the end; what is between may be as long as a file.
+        super().__init__(text if len(text) <= _MOST_MESSAGE else f"{text[:1000]}...{text[-500:]}")
 
 
 class TraceError(BufgymError):

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, and the folders of those that come with bufgym."""
+"""Files: written whole or not at all, read with bounds, and the folders of those that come with bufgym."""
 
 from __future__ import annotations
 
@@ -8,7 +8,51 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from bufgym.errors import BufgymError
+
 PACKAGE = Path(__file__).resolve().parent
+
+FREELY_UNPACKED_BYTES = 64 * 2**20
+MOST_UNPACKED = 100
+"""No recording or data set of text is packed so well; a bomb is packed a thousand times smaller or more."""
+
+
+def read_whole(path: str | os.PathLike[str], most_bytes: int) -> bytes:
+    """All bytes of a regular file of at most so many.
+
+    Raises BufgymError: missing, a folder, a device, a FIFO, larger.
+    """
+    source = Path(path)
+    try:
+        if source.exists() and not source.is_file():
+            raise BufgymError(f"{path}: must be a regular file")
+        with source.open("rb") as file:
+            data = file.read(most_bytes + 1)
+    except (OSError, ValueError) as error:
+        if isinstance(error, BufgymError):
+            raise
+        why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {_why(error)}"
+        raise BufgymError(f"{path}: {why}") from None
+    if len(data) > most_bytes:
+        raise BufgymError(f"{path}: larger than {most_bytes} bytes: must be at most that")
+    return data
+
+
+def read_utf8(path: str | os.PathLike[str], most_bytes: int) -> str:
+    """The text of such a file; an error for one that is not UTF-8."""
+    try:
+        return read_whole(path, most_bytes).decode("utf-8")
+    except UnicodeDecodeError:
+        raise BufgymError(f"{path}: must be UTF-8 text") from None
+
+
+def unpacked_limit(packed_bytes: int) -> int:
+    """How many bytes may come out of so many packed ones."""
+    return FREELY_UNPACKED_BYTES + MOST_UNPACKED * packed_bytes
+
+
+def _why(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error)
 
 
 @contextmanager

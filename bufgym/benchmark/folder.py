@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym.benchmark import manifest
-from bufgym.benchmark.manifest import check, read_object
+from bufgym.benchmark.checked_json import check, read_object
 from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.errors import BufgymError, where

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -17,11 +18,16 @@ from bufgym.benchmark.rows import Row
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.errors import BufgymError, where
-from bufgym.files import replaced
+from bufgym.files import read_utf8, replaced
 from bufgym.scenario import suites
 
 COLUMNS = ("suite", "policy", "rank", "cells", "quantity", "value", "low", "high", "bufgym", "command")
 """Of the file, which has one line for each quantity of an entry."""
+
+MAX_BYTES = 16 * 2**20
+"""Of the file; each line has some 200."""
+
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -85,17 +91,32 @@ def _run(suite: str, specs: Sequence[str], data: str | None = None, jobs: int | 
 
 
 def validate(entry: Entry, **options: Any) -> Entry:
-    """The entry made anew; an error if one of its values has left the interval that the file states."""
+    """The entry made anew; an error if a value or an interval of the file is not what comes out.
+
+    The file's interval is no measure of the file's value: a row could state any width.
+    """
     specs = dict.fromkeys([entry.policy, task_of(entry.suite).reference])
     (again,) = (e for e in _run(entry.suite, list(specs), **options) if e.policy == entry.policy)
-    for key, (stated, low, high) in entry.values.items():
-        value = again.values[key].value
-        inside = math.isnan(stated) if math.isnan(value) else low - 1e-9 <= value <= high + 1e-9
-        if not inside:
-            raise BufgymError(
-                f"{entry.name}: {key} is {value:.6f}, outside [{low:.6f}, {high:.6f}] (stated: {stated:.6f})"
-            )
+    for key, stated in entry.values.items():
+        now = again.values[key]
+        if not _agree(stated, now):
+            raise BufgymError(f"{entry.name}: {key} is {_in_full(now)}, but the file states {_in_full(stated)}")
     return again
+
+
+def _agree(stated: Interval, now: Interval) -> bool:
+    """Whether the value lies in the interval computed now, and the interval is that one within a tenth of its width."""
+    if math.isnan(now.value):
+        return math.isnan(stated.value)
+    if math.isnan(now.low):
+        return math.isnan(stated.low) and abs(stated.value - now.value) <= _ROUNDING
+    ends = abs(stated.low - now.low), abs(stated.high - now.high)
+    inside = now.low - _ROUNDING <= stated.value <= now.high + _ROUNDING
+    return inside and all(end <= (now.high - now.low) / 10 + _ROUNDING for end in ends)
+
+
+def _in_full(interval: Interval) -> str:
+    return f"{interval.value:.6f} [{interval.low:.6f}, {interval.high:.6f}]"
 
 
 # --- the file --------------------------------------------------------------------------------------------------------
@@ -120,22 +141,31 @@ def read(path: Path) -> dict[str, Entry]:
     """The entries by name; an error that names the file, the line and the value if one can't be read."""
     kinds = {**dict.fromkeys(COLUMNS, str), "rank": int, "cells": int, "value": float, "low": float, "high": float}
     board: dict[str, Entry] = {}
-    with open(path, encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
+    reader = csv.DictReader(io.StringIO(read_utf8(path, MAX_BYTES), newline=""), strict=True)
+    try:
         if reader.fieldnames != list(COLUMNS):
             raise BufgymError(where(path, 1, None, f"must have the columns {', '.join(COLUMNS)}"))
         for line in reader:
+            if None in line or None in line.values():
+                raise BufgymError(where(path, reader.line_num, None, f"must have {len(COLUMNS)} cells"))
             row: dict[str, Any] = {}
             for name, kind in kinds.items():
                 try:
                     row[name] = kind(line[name])
-                except (TypeError, ValueError):
+                except ValueError:
                     rule = "must be a number"
                     raise BufgymError(where(path, reader.line_num, line[name], rule, field=name)) from None
+            if row["suite"] not in suites.SUITES:
+                raise BufgymError(where(path, reader.line_num, row["suite"], "must be a suite", field="suite"))
+            if row["quantity"] not in task_of(row["suite"]).listed:
+                rule = f"must be one of {', '.join(task_of(row['suite']).listed)}"
+                raise BufgymError(where(path, reader.line_num, row["quantity"], rule, field="quantity"))
             entry = Entry(row["suite"], row["policy"], row["rank"], row["cells"], {}, row["bufgym"])
             values = board.get(entry.name, entry).values
             interval = Interval(row["value"], row["low"], row["high"])
             board[entry.name] = replace(entry, values={**values, row["quantity"]: interval})
+    except csv.Error as error:
+        raise BufgymError(where(path, reader.line_num, None, f"must be CSV: {error}")) from None
     return board
 
 

@@ -72,6 +72,8 @@ def write_rows(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str], 
 def read_rows(path: str | os.PathLike[str], layout: Layout = RUNS) -> list[Row]:
     """The rows that ``write_rows`` wrote."""
     source = Path(path)
+    if source.exists() and not source.is_file():
+        raise BufgymError(f"{source}: must be a regular file")
     if source.suffix == ".parquet":
         return _read_parquet(source)
     with open(source, encoding="utf-8", newline="") as file:

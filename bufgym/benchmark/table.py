@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from bufgym.errors import printable
+
 Rows = Sequence[Mapping[str, Any]]
 
 # --- numbers ---------------------------------------------------------------------------------------------------------
@@ -41,6 +43,7 @@ def mean(numbers: Sequence[float | None]) -> float:
 
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
     """Rows of cells as lines of text: the first column to the left, the others to the right."""
+    lines = [list(map(printable, line)) for line in lines]
     widths = [max(len(line[c]) for line in lines) for c in range(len(lines[0]))]
     out = []
     for line in lines:
@@ -54,13 +57,14 @@ def in_blocks(head: list[str], blocks: Sequence[tuple[str, list[list[str]]]]) ->
     lines = aligned([head, *(line for _, block in blocks for line in block)])
     out, at = [lines[0]], 1
     for title, block in blocks:
-        out += ["", title, *lines[at : at + len(block)]]
+        out += ["", printable(title), *lines[at : at + len(block)]]
         at += len(block)
     return "\n".join(out)
 
 
 def markdown_table(head: Sequence[str], lines: Sequence[Sequence[str]], *, left: int = 1) -> list[str]:
     """Lines of a Markdown table: ``left`` columns to the left, the others to the right."""
+    lines = [[printable(cell).replace("|", "\\|") for cell in line] for line in lines]
     rule = "|" + "---|" * left + "---:|" * (len(head) - left)
     return ["| " + " | ".join(head) + " |", rule, *("| " + " | ".join(line) + " |" for line in lines)]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import policies
+from bufgym.benchmark.checked_json import read_object
 from bufgym.errors import BufgymError, where
 from bufgym.files import replaced
 
@@ -17,13 +18,8 @@ FILE = Path(__file__).with_name("tuned.json")
 
 def read() -> dict[str, dict[str, dict[str, Any]]]:
     """What ``tuned.json`` holds; an error that names the file and the rule that it breaks."""
-    try:
-        suites = json.loads(FILE.read_text(encoding="utf-8"))
-    except UnicodeDecodeError:
-        raise BufgymError(f"{FILE}: must be UTF-8 text") from None
-    except json.JSONDecodeError as error:
-        raise BufgymError(where(FILE, error.lineno, None, f"must be JSON: {error.msg}")) from None
-    if not isinstance(suites, dict) or not all(isinstance(entries, dict) for entries in suites.values()):
+    suites = read_object(FILE)
+    if not all(isinstance(entries, dict) for entries in suites.values()):
         raise BufgymError(f"{FILE}: must be a JSON object of suites, each an object of policies")
     for suite, entries in suites.items():
         for policy, entry in entries.items():

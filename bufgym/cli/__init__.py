@@ -8,6 +8,8 @@ one line on stderr and exit code 2; Ctrl-C in 130.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import os
 import re
 import sys
@@ -17,7 +19,7 @@ from bufgym import __version__
 from bufgym.cli import bench, export, figures, fleet, leaderboard, listing, perf, play, report, topics, traces, tune
 from bufgym.cli.listing import _LISTS, KINDS, environments
 from bufgym.cli.options import Parser, split_policies
-from bufgym.errors import BufgymError, line_in
+from bufgym.errors import BufgymError, line_in, printable
 
 __all__ = ["KINDS", "_LISTS", "environments", "main", "split_policies"]
 
@@ -25,15 +27,14 @@ __all__ = ["KINDS", "_LISTS", "environments", "main", "split_policies"]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit code."""
     policy_file: str | None = None
+    _open_output()
     try:
         options = _parser().parse_args(arguments)
         policy_file = getattr(options, "policy_file", None)
         options.command(options)
         sys.stdout.flush()
-    except BrokenPipeError:
-        # The reader (head, less) has gone; what the interpreter flushes at its exit has nowhere to go either.
-        with open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader (head, less) has gone
+        _drop_output()
         return 141
     except KeyboardInterrupt:
         return 130
@@ -41,6 +42,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed(str(error))
     except OSError as error:
         file = f"{error.filename}: " if error.filename is not None else ""
+        try:
+            sys.stdout.flush()
+        except OSError:  # a full disk behind the output
+            _drop_output()
         return _failed(f"{file}{error.strerror or error}")
     except Exception as error:
         place = line_in(error, policy_file) if policy_file else None
@@ -50,6 +55,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _failed(f"{policy_file}: a policy with compile=True that Numba cannot compile: {_gist(error)}")
         raise
     return 0
+
+
+def _open_output() -> None:
+    """Output that is closed is dropped; what its encoding lacks (a dash in ASCII) is written as ``\\u2013``."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None or stream.closed:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115  (open as long as the process)
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _drop_output() -> None:
+    """What the interpreter flushes at its exit has nowhere to go."""
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -66,7 +87,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _failed(message: str) -> int:
-    print(f"bufgym: error: {' '.join(message.split())}", file=sys.stderr)
+    with contextlib.suppress(OSError):
+        print(f"bufgym: error: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
     return 2
 
 

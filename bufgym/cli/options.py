@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias, TypeVar
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, printable
 
 T = TypeVar("T")
 
@@ -20,6 +20,9 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise BufgymError(f"{message} (see {self.prog} --help)")
 
+
+MAX_EPISODES = 100_000
+"""On each trace. Each is a row of every policy and capacity, all of them held in memory."""
 
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 """What ``add_subparsers`` returns: where commands are added."""
@@ -55,6 +58,14 @@ positive = _checked(float, lambda number: 0 < number < math.inf, "a number > 0")
 least_0 = _checked(float, lambda number: 0 <= number < math.inf, "a number >= 0")
 count = _checked(int, lambda number: number >= 1, "a whole number >= 1")
 natural = _checked(int, lambda number: number >= 0, "a whole number >= 0")
+
+
+def episodes(text: str) -> int:
+    """How many seeds: a whole number from 1 to ``MAX_EPISODES``."""
+    seeds = count(text)
+    if seeds > MAX_EPISODES:
+        raise argparse.ArgumentTypeError(f"{text}: must be at most {MAX_EPISODES}")
+    return seeds
 
 
 def capacities(text: str) -> list[int]:
@@ -141,6 +152,7 @@ def load_policies(path: str | None) -> None:
 
 def columns(lines: Sequence[Sequence[str]]) -> str:
     """Left-aligned columns, indented; the last is not padded."""
+    lines = [list(map(printable, line)) for line in lines]
     widths = [max((len(line[c]) for line in lines), default=0) for c in range(max(map(len, lines), default=0))]
     return "\n".join(
         "  " + "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines

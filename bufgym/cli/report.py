@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from bufgym.cli.options import Commands, command
+from bufgym.errors import printable
 
 
 def add(commands: Commands) -> None:
@@ -16,4 +17,5 @@ def add(commands: Commands) -> None:
 def _report(options: argparse.Namespace) -> None:
     from bufgym.benchmark import report
 
-    print(report.markdown(options.folder) if options.markdown else f"wrote {report.write(options.folder)}")
+    text = report.markdown(options.folder) if options.markdown else f"wrote {report.write(options.folder)}"
+    print("\n".join(map(printable, text.split("\n"))))

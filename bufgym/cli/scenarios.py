@@ -16,6 +16,7 @@ from bufgym.cli.trace_bags import (
     workload_lines,
     workload_options,
 )
+from bufgym.errors import printable
 
 if TYPE_CHECKING:
     from bufgym.model.qoi import Value
@@ -155,7 +156,7 @@ def _recording(options: argparse.Namespace, settings: dict[str, Any]) -> tuple[S
     places = f"{options.seeds} random places each" if random_offset else "from the trace's start"
     shared = "; all topics share one queue" if len(workload.topics) > 1 else ""
     about = [
-        *(workload.source, "", *workload_lines(workload), ""),
+        *(printable(workload.source), "", *workload_lines(workload), ""),
         f"Played over {_over(uplink, settings)}, {places}{shared}.",
         *_measured(uplink, f"the motion, {source}, in fields of view" if by_motion else "the number of the message"),
     ]
@@ -219,4 +220,4 @@ def _with_gaps(motion: Motion) -> str:
 
 
 def _some(names: Sequence[str]) -> str:
-    return ", ".join(names) if len(names) <= 3 else f"{names[0]} .. {names[-1]}"
+    return printable(", ".join(names) if len(names) <= 3 else f"{names[0]} .. {names[-1]}")

@@ -8,7 +8,15 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bufgym.cli.options import capacities, count, given, load_policies, policies_option, policy_file, policy_specs
+from bufgym.cli.options import (
+    capacities,
+    episodes,
+    given,
+    load_policies,
+    policies_option,
+    policy_file,
+    policy_specs,
+)
 from bufgym.errors import BufgymError
 
 if TYPE_CHECKING:
@@ -35,7 +43,7 @@ def who_options(parser: argparse.ArgumentParser, policies: str, capacity: str, s
     group = parser.add_argument_group("who runs")
     policies_option(group, policies)
     group.add_argument("--capacity", type=capacities, metavar="L,...", help=f"capacities L, messages ({capacity})")
-    group.add_argument("--seeds", type=count, metavar="N", help=f"episodes on each trace ({seeds})")
+    group.add_argument("--seeds", type=episodes, metavar="N", help=f"episodes on each trace ({seeds})")
     policy_file(group)
 
 

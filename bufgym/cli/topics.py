@@ -9,7 +9,7 @@ from typing import Any
 
 from bufgym.cli.options import Commands, command, given, load_policies, policy_specs, positive, refuse
 from bufgym.cli.suite import SUITE_OPTIONS, out_options, run_suite, suite_options, target, who_options
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, printable
 
 SUITE = "topics-v1"
 CAPACITY = 32
@@ -96,7 +96,7 @@ def _own_client(options: argparse.Namespace, specs: list[str]) -> list[dict[str,
     scaled = f" x {client.scale:g}" if client.scale != 1 else ""
     link = client.traces[0].name if len(client.traces) == 1 else f"{len(client.traces)} links"
     about = f"{len(client.topics)} topic{'' if len(client.topics) == 1 else 's'} over {link}{scaled}"
-    print(f"The client of {options.config}.\n{task.describe([client], seeds * len(client.traces))}\n")
+    print(f"The client of {printable(options.config)}.\n{task.describe([client], seeds * len(client.traces))}\n")
     print(plain(task.summary(rows, unranked), {label: about}) + "\n")
     notes = [f"{name} has no rank: {reason}." for name, reason in unranked.items()]
     print("\n".join([*task.legend, *notes, *invalid(task.senders(rows))]))

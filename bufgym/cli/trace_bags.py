@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bufgym.cli.options import Commands, command, positive
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, printable
 
 if TYPE_CHECKING:
     from bufgym.traces import MotionSettings, Workload
@@ -116,12 +116,12 @@ def _from_bag(options: argparse.Namespace) -> None:
         refuse_motion(options, "needs --odom")
     bag = read_bag(options.file, arguments.pop("odom", None))
     if options.topics is None and options.out is None and options.odom is None:
-        print(f"{bag.path} ({bag.kind})\n")
+        print(printable(f"{bag.path} ({bag.kind})") + "\n")
         print("\n".join(_listed(bag, workload_from_bag(bag).summary() if len(bag.time_ns) else [])))
         print("\nchoose with --topics, take motion with --odom, write with -o")
         return
     workload = workload_from_bag(bag, **arguments)
-    print(workload.source + "\n")
+    print(printable(workload.source) + "\n")
     print("\n".join(workload_lines(workload)))
     if options.out is not None:
         write_workload_csv(workload, Path(options.out))
@@ -133,7 +133,8 @@ def _from_poses(options: argparse.Namespace) -> None:
 
     motion = read_motion(options.file, motion_settings(options), format=options.format, times=options.times)
     seconds = motion.duration_us / 1e6
-    print(f"{motion.name}\n  source  {motion.source}\n  motion  {motion.total:.3f} fields of view in {seconds:.3f} s")
+    print(f"{printable(motion.name)}\n  source  {printable(motion.source)}")
+    print(f"  motion  {motion.total:.3f} fields of view in {seconds:.3f} s")
     count = len(motion.gaps)
     print(f"  gaps    {count}" + (f", the longest {motion.longest_gap_s:.1f} s" if count else ""))
     if options.out is None:

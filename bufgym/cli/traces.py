@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from bufgym.cli import trace_bags, trace_fetch, trace_fit, trace_generate
 from bufgym.cli.options import Commands, columns, command
-from bufgym.errors import BufgymError, TraceError
+from bufgym.errors import BufgymError, TraceError, printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from bufgym.traces import Trace
 
 _PICTURES = (".png", ".svg", ".pdf")
+_MOST_DRAWN = 5_000
+"""Rates in a picture, which is some 1300 pixels wide; more are drawn as means over as many windows."""
 
 
 def add(commands: Commands) -> None:
@@ -64,7 +66,7 @@ def _info(options: argparse.Namespace) -> None:
             for key, number in traces.describe(trace).items()
         ]
         knots = ("knots", f"{len(trace.time_us)}")
-        blocks.append(f"{trace.name}\n" + columns([("source", trace.source), knots, *lines]))
+        blocks.append(f"{printable(trace.name)}\n" + columns([("source", trace.source), knots, *lines]))
     print("\n\n".join(blocks))
 
 
@@ -80,10 +82,12 @@ def _validate(options: argparse.Namespace) -> None:
             trace = _load(name, options)
         except TraceError as error:
             failed += 1
-            print(f"error  {' '.join(str(error).split())}")
+            print(f"error  {error}")
         else:
             summary = traces.describe(trace)
-            print(f"OK     {trace.source}: {summary['duration_s']:.1f} s, mean {summary['mean_KBps']:.1f} KB/s")
+            print(
+                f"OK     {printable(trace.source)}: {summary['duration_s']:.1f} s, mean {summary['mean_KBps']:.1f} KB/s"
+            )
     if len(names) > 1:
         print(f"{len(names) - failed} of {len(names)} files are sound")
     if failed:
@@ -119,7 +123,7 @@ def _convert(options: argparse.Namespace) -> None:
         trace = _load(name, options)
         traces.WRITERS[to](trace, target)
         lost = traces.difference(trace, traces.read_trace(target, to))
-        print(f"wrote {target} (format {to}) from {trace.source}: {lost}")
+        print(printable(f"wrote {target} (format {to}) from {trace.source}: {lost}"))
 
 
 def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
@@ -158,7 +162,7 @@ def _plot(options: argparse.Namespace) -> None:
     axes[-1].set_xlabel("time (s)")
     figure.align_ylabels()
     figure.savefig(out, dpi=150)
-    print(f"wrote {out}")
+    print(printable(f"wrote {out}"))
 
 
 def _draw(axis: Axes, trace: Trace) -> None:
@@ -168,6 +172,8 @@ def _draw(axis: Axes, trace: Trace) -> None:
     from bufgym import traces
 
     lengths_us, rates = trace.samples()
+    if len(rates) > _MOST_DRAWN:
+        lengths_us, rates = trace.samples(-(-trace.duration_us // _MOST_DRAWN))
     edges_s = np.concatenate([[0], np.cumsum(lengths_us)]) / 1e6
     axis.stairs(rates / 1e6, edges_s, fill=True, color="tab:blue", alpha=0.35)
     axis.stairs(rates / 1e6, edges_s, color="tab:blue", linewidth=0.6)
@@ -176,7 +182,7 @@ def _draw(axis: Axes, trace: Trace) -> None:
     axis.stairs(-0.05 * top * low, edges_s, baseline=-0.02 * top * low, fill=True, color="tab:red", linewidth=0)
     summary = traces.describe(trace)
     title = f"mean {summary['mean_KBps'] / 1e3:.3g} MB/s, {summary['seconds_below_500KBps']:.4g} s under 500 KB/s (red)"
-    axis.set_title(trace.name, fontsize="medium", loc="left")
+    axis.set_title(printable(trace.name), fontsize="medium", loc="left")
     axis.set_title(title, fontsize="small", loc="right")
     axis.set_ylabel("MB/s")
     axis.set_xlim(0, edges_s[-1])

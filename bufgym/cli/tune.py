@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 
-from bufgym.cli.options import Commands, command, count, policies_option, policy_specs
+from bufgym.cli.options import Commands, command, episodes, policies_option, policy_specs
 
 
 def add(commands: Commands) -> None:
@@ -15,7 +15,7 @@ def add(commands: Commands) -> None:
     policies_option(parser, "all that have a grid of settings, by their plain names")
     option("--split", default="validation", metavar="S", help="validation (default) or train; test is refused")
     option("--data", metavar="DIR", help="folder of recordings, for suites over real links")
-    option("--seeds", type=count, metavar="N", help="episodes on each trace (default: the suite's)")
+    option("--seeds", type=episodes, metavar="N", help="episodes on each trace (default: the suite's)")
     option("--jobs", type=int, metavar="N", help="processes side by side (default: one a core)")
     option("--write", action="store_true", help="keep what was chosen, for bufgym bench --suite")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ def is_number(value: Any) -> bool:
 
 def above_0(name: str, number: Any) -> None:
     """``number`` is finite and > 0."""
-    if not (is_number(number) and math.isfinite(number) and number > 0):
+    if not (is_number(number) and 0 < number <= sys.float_info.max):
         raise BufgymError(f"{name} = {number!r}: must be a number > 0")
 
 

@@ -59,23 +59,75 @@ class Link:
         return int(carried[-1]) if ends else FOREVER
 
 
+KEPT_KNOTS = 2**20
+"""As many knots are stored (16 MB) before those of a trace that no sender follows any more make room for others."""
+
+
+@dataclass(eq=False)
+class _Place:
+    """Where the knots of a trace lie, and how many senders follow it."""
+
+    trace: Trace  # kept, as an id is only unique while its object lives
+    first: int
+    room: int
+    senders: int = 0
+
+
 class Knots:
-    """The knots of several traces in two flat arrays, as kernels read them; each trace is stored once."""
+    """The knots of several traces in two flat arrays, as kernels read them; each trace is stored once.
+
+    Traces that come again stay stored, and so do all that a sender follows; of the others it forgets those that were
+    left first, when it needs their room: a new trace for every episode takes no more and more memory.
+    """
 
     def __init__(self) -> None:
         self.us = np.zeros(0, np.int64)
         self.bytes = np.zeros(0, np.int64)
-        self._places: dict[int, tuple[Trace, int, int]] = {}
+        self._end = 0
+        self._places: dict[int, _Place] = {}
+        self._followed: dict[int, _Place] = {}
+        self._idle: dict[int, _Place] = {}
 
-    def place(self, trace: Trace) -> tuple[int, int, int]:
-        """(first knot, last knot, what follows the end) of ``trace``, storing it at its first use."""
-        # The trace itself is kept as well: an id is only unique while its object lives.
-        if id(trace) not in self._places:
-            self._places[id(trace)] = (trace, len(self.us), len(self.us) + len(trace.time_us) - 1)
-            self.us = np.concatenate([self.us, trace.time_us])
-            self.bytes = np.concatenate([self.bytes, trace.cumulative_bytes])
-        _, first, last = self._places[id(trace)]
-        return first, last, _AFTER[trace.after]
+    def place(self, trace: Trace, sender: int) -> tuple[int, int, int]:
+        """(first knot, last knot, what follows the end) of ``trace``, which ``sender`` follows from now on."""
+        left = self._followed.pop(sender, None)
+        if left is not None:
+            left.senders -= 1
+            if not left.senders:
+                self._idle[id(left.trace)] = left
+        place = self._places.get(id(trace)) or self._stored(trace)
+        place.senders += 1
+        self._idle.pop(id(trace), None)
+        self._followed[sender] = place
+        return place.first, place.first + len(trace.time_us) - 1, _AFTER[trace.after]
+
+    def _stored(self, trace: Trace) -> _Place:
+        knots = len(trace.time_us)
+        place = _Place(trace, *self._room(knots))
+        self._places[id(trace)] = place
+        here = slice(place.first, place.first + knots)
+        self.us[here], self.bytes[here] = trace.time_us, trace.cumulative_bytes
+        return place
+
+    def _room(self, knots: int) -> tuple[int, int]:
+        """(first, how many) knots that may be written."""
+        if self._end + knots > max(KEPT_KNOTS, len(self.us)):
+            for place in self._idle.values():
+                if place.room >= knots:
+                    self._forget(place)
+                    return place.first, place.room
+            # None of them alone has it; those at the end together may.
+            for place in list(self._idle.values()):
+                self._forget(place)
+            self._end = max((place.first + place.room for place in self._places.values()), default=0)
+        first, self._end = self._end, self._end + knots
+        if self._end > len(self.us):
+            more = np.zeros(max(self._end, 2 * len(self.us)) - len(self.us), np.int64)
+            self.us, self.bytes = np.concatenate([self.us, more]), np.concatenate([self.bytes, more])
+        return first, knots
+
+    def _forget(self, place: _Place) -> None:
+        del self._places[id(place.trace)], self._idle[id(place.trace)]
 
 
 @kernel

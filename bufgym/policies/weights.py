@@ -33,7 +33,7 @@ from safetensors.numpy import save as serialized
 
 from bufgym import __version__
 from bufgym.errors import BufgymError, where
-from bufgym.files import replaced
+from bufgym.files import read_whole, replaced
 from bufgym.observe import FIELDS, TOPIC_FIELDS
 from bufgym.policies import learned, learned_topics
 from bufgym.policies.learned import Weights
@@ -172,12 +172,7 @@ def read(path: StrPath) -> tuple[Weights, dict[str, Any]]:
 
 def read_any(path: StrPath) -> tuple[Weights | TopicWeights, dict[str, Any]]:
     """As ``read``, of either kind."""
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise BufgymError(f"{path}: cannot be read: {error.strerror}") from None
-    return _parsed(path, data)
+    return _parsed(path, read_whole(path, MAX_BYTES))
 
 
 def _parsed(path: StrPath, data: bytes) -> tuple[Weights | TopicWeights, dict[str, Any]]:
@@ -213,7 +208,7 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
     """The JSON object in the header, its rules checked."""
     # 8 bytes: the header's length; then the header, which the library has read without complaint.
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-    text = header.get("__metadata__", {}).get(KEY)
+    text = (header.get("__metadata__") or {}).get(KEY)
     if text is None:
         raise BufgymError(f"{path}: has no metadata of bufgym's; no file of a learned policy")
     try:

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.files import replaced
+
 Row = dict[str, Any]
 """Column -> text, number or None."""
 
@@ -56,7 +58,7 @@ class Rows(list[Row]):
     def save(self, path: Path) -> Path:
         """Write the rows as CSV; return the path."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="", encoding="utf-8") as file:
+        with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(self[0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(self)

@@ -9,7 +9,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, where
+from bufgym.files import read_utf8
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.scenario.client import Client, Stream
@@ -50,6 +51,11 @@ def client_over_lte() -> Client:
     return Client(robofleet_example(), **shipped(), scale=0.25)
 
 
+MAX_TOML_BYTES = 2**18
+"""A client of a thousand topics has less."""
+MAX_DOTS = 100
+"""In a line."""
+
 _TOPIC_KEYS = {f.name for f in fields(Topic)} - {"value"}
 _STREAM_KEYS = {"rate_hz", "size_bytes", "jitter", "size_cv", "moves"}
 _CLIENT_KEYS = {"window", "propagation_us", "round_trip_us", "consumers", "duration_s"}
@@ -65,22 +71,30 @@ def read_client(path: str | Path, **parameters: Any) -> Client:
     Raises BufgymError, one line that names the file, for a file that can't be read or breaks a rule.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise BufgymError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise BufgymError(f"{path}: no configuration that can be read: {why}") from None
-    try:
-        settings = tomllib.loads(text)
+        settings = _settings(path)
         tables = settings.pop("topic", [])
         check_keys(settings, _CLIENT_KEYS, "topic, ")
         if not isinstance(tables, list) or not tables:
             raise BufgymError("needs at least one [[topic]]")
         recordings = {} if "traces" in parameters else shipped()
         return Client(tuple(map(_stream, tables)), **{**settings, **recordings, **parameters})
-    except (BufgymError, tomllib.TOMLDecodeError) as error:
-        raise BufgymError(f"{path}: {error}") from None
+    except BufgymError as error:
+        raise error if str(error).startswith(f"{path}") else BufgymError(f"{path}: {error}") from None
+
+
+def _settings(path: str | Path) -> dict[str, Any]:
+    """What the TOML file holds."""
+    text = read_utf8(path, MAX_TOML_BYTES)
+    for number, line in enumerate(text.split("\n"), 1):
+        # The parser's memory grows with the square of a dotted key's parts.
+        if line.count(".") > MAX_DOTS:
+            raise BufgymError(where(path, number, None, f"must have at most {MAX_DOTS} dots"))
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise BufgymError(f"{path}: nested too deep") from None
+    except ValueError as error:  # tomllib's own, and int()'s for thousands of digits
+        raise BufgymError(f"{path}: {str(error).partition(';')[0]}") from None
 
 
 def check_keys(table: Mapping[str, Any], known: set[str], first: str = "") -> None:

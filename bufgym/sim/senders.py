@@ -70,7 +70,7 @@ class Senders:
         if self.topics and not (numbers.min() >= 0 and numbers.max() < len(self.topics)):
             unknown = numbers.min() if numbers.min() < 0 else numbers.max()
             raise BufgymError(f"episode: unknown topic {unknown}; the senders know {len(self.topics)}, from 0 on")
-        first_knot, last_knot, after = self._knots.place(link.trace)
+        first_knot, last_knot, after = self._knots.place(link.trace, i)
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
         self.episodes[i] = episode

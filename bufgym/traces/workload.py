@@ -104,11 +104,13 @@ class Workload:
 
     def summary(self) -> list[TopicSummary]:
         """One entry for each topic that has messages, most bytes first."""
+        assert self.topic is not None
         total = int(self.size_bytes.sum())
+        by_topic = np.argsort(self.topic, kind="stable")
+        ends = np.cumsum(np.bincount(self.topic, minlength=len(self.topics)))
         topics = []
-        for k, name in enumerate(self.topics):
-            is_of_topic = self.topic == k
-            times, topic_bytes = self.arrival_us[is_of_topic], int(self.size_bytes[is_of_topic].sum())
+        for name, chosen in zip(self.topics, np.split(by_topic, ends[:-1]), strict=True):
+            times, topic_bytes = self.arrival_us[chosen], int(self.size_bytes[chosen].sum())
             if len(times):
                 lasts = times[-1] > times[0]
                 rate_hz = (len(times) - 1) / ((times[-1] - times[0]) / US_PER_S) if lasts else math.nan

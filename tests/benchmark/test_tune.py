@@ -201,8 +201,8 @@ def test_nothing_is_written_unasked() -> None:
     [
         (b"{", "line 1: must be JSON"),
         (b"\xff", "must be UTF-8"),
-        (b"[]", "must be a JSON object of suites"),
-        (b'{"lte-v1": []}', "must be a JSON object of suites"),
+        (b"[]", "must be a JSON object"),
+        (b'{"lte-v1": []}', "must be a JSON object"),
         (b'{"lte-v1": {"decimate": 3}}', r"lte-v1.decimate.setting = '': must be a setting of that policy"),
         (b'{"lte-v1": {"decimate": {"setting": "afr"}}}', r"lte-v1.decimate.setting = afr: must be a setting of that"),
         (b'{"lte-v1": {"decimate": {"setting": "decimate:pace=2"}}}', "lte-v1.decimate: .* no parameter 'pace'"),

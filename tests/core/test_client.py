@@ -216,7 +216,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(BufgymError, match=r"^[^:]*missing.toml: no such file$"):
         read_client(tmp_path / "missing.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(BufgymError, match=r"binary.toml: no configuration that can be read"):
+    with pytest.raises(BufgymError, match=r"binary.toml: must be UTF-8 text"):
         read_client(tmp_path / "binary.toml")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import naive
 import numpy as np
 import pytest
@@ -10,7 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym.errors import BufgymError
+from bufgym.model import link
 from bufgym.model.link import FOREVER, Knots, Link, position_at, segment, time_of
+from bufgym.scenario import Streams, Uplink
+from bufgym.sim.senders import Senders
 
 # 1000 bytes in the first 10 ms, nothing for 10 ms, then 3000 bytes in 10 ms: 0.1, 0 and 0.3 bytes a microsecond.
 KNOTS = [(0, 0), (10_000, 1_000), (20_000, 1_000), (30_000, 4_000)]
@@ -18,8 +23,8 @@ KNOTS = [(0, 0), (10_000, 1_000), (20_000, 1_000), (30_000, 4_000)]
 
 def kernels(knots, after):
     store = Knots()
-    store.place(trace([(0, 0), (7, 9)], "stop"))  # so that this trace does not begin at knot 0
-    first, last, code = store.place(trace(knots, after))
+    store.place(trace([(0, 0), (7, 9)], "stop"), 0)  # so that this trace does not begin at knot 0
+    first, last, code = store.place(trace(knots, after), 1)
     where = (store.us, store.bytes, first, last, code, first)
     return lambda t: position_at(*where, t)[0], lambda position: time_of(*where, position)[0]
 
@@ -83,10 +88,38 @@ def test_nothing_is_lost_to_rounding():
 
 def test_traces_are_stored_once():
     store, a, b = Knots(), trace(KNOTS, "loop"), trace([(0, 0), (5, 5)], "hold")
-    assert store.place(a) == (0, 3, 0)
-    assert store.place(b) == (4, 5, 1)
-    assert store.place(a) == (0, 3, 0)
-    assert len(store.us) == len(store.bytes) == 6
+    assert store.place(a, 0) == (0, 3, 0)
+    assert store.place(b, 1) == (4, 5, 1)
+    assert store.place(a, 1) == (0, 3, 0)
+    assert store.place(b, 0) == (4, 5, 1)
+    assert store.us[:6].tolist() == [0, 10_000, 20_000, 30_000, 0, 5]
+
+
+def test_traces_that_nobody_follows_make_room(monkeypatch):
+    """Room for 8 knots: a new trace for each episode takes the place of one that was left, never of one followed."""
+    monkeypatch.setattr(link, "KEPT_KNOTS", 8)
+    store, a = Knots(), trace(KNOTS, "loop")
+    store.place(a, 0)
+    for k in range(1, 100):
+        new = trace([(0, 0), (5, k)], "hold")
+        first, last, _ = store.place(new, 1)
+        assert store.us[first : last + 1].tolist() == [0, 5] and store.bytes[last] == k
+    assert store.us[:4].tolist() == [0, 10_000, 20_000, 30_000] and store.place(a, 1) == (0, 3, 0)
+    assert len(store.us) == 8
+    # Longer ones, each a knot more than the last: the one before is no room for it, but all that were left are.
+    for count in range(5, 200):
+        store.place(trace([(k, k) for k in range(count)], "hold"), 1)
+    assert len(store.us) <= 2 * (4 + 200)
+
+
+def test_a_new_trace_for_every_episode_takes_no_more_memory(monkeypatch):
+    monkeypatch.setattr(link, "KEPT_KNOTS", 100)
+    scenario = Uplink(traces=(trace(KNOTS, "loop"),), duration_s=0.2)
+    senders = Senders(1, 2, scenario.value, max_messages=scenario.max_messages)
+    for k in range(1, 500):
+        one = replace(scenario, traces=(trace([(0, 0), (10_000, k), (30_000, 2 * k)], "loop"),))
+        senders.load(0, one.draw(Streams.seeded(k)))
+    assert len(senders.batch.knot_us) <= 200
 
 
 @pytest.mark.parametrize("name", ["offset_us", "propagation_us"])

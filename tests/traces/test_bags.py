@@ -217,9 +217,9 @@ def test_lengths_out_of_all_proportion(tmp_path: Path, monkeypatch: pytest.Monke
         path.write_bytes(raw)
         with pytest.raises(TraceError, match="cut off or damaged"):
             read_bag(path)
-    from bufgym.traces.formats import bags
+    from bufgym.traces.formats import bag_files, bags
 
-    monkeypatch.setattr(bags, "MAX_CHUNK_BYTES", 300)
+    monkeypatch.setattr(bag_files, "MAX_CHUNK_BYTES", 300)
     monkeypatch.setattr(bags, "MAX_BAG_MESSAGES", 8)
     for compression in (CompressionType.ZSTD, CompressionType.LZ4):
         bomb = cases.write_mcap(tmp_path / "b.mcap", [(0, "/t", "x", bytes(10_000))], compression)
@@ -230,6 +230,7 @@ def test_lengths_out_of_all_proportion(tmp_path: Path, monkeypatch: pytest.Monke
         bomb = cases.write_ros1(tmp_path / f"{form.name}.bag", entries, form)
         with pytest.raises(TraceError, match="a chunk of more than 300 bytes"):
             read_bag(bomb)
+    monkeypatch.setattr(bag_files, "MAX_CHUNK_BYTES", 2**20)
     many = cases.write_rosbag2(tmp_path / "many", cases.drive(), StoragePlugin.SQLITE3)
     with pytest.raises(TraceError, match="more than 8 messages: must be fewer"):
         read_bag(many)

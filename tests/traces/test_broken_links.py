@@ -72,7 +72,7 @@ BROKEN = [
     (UCC_HEADER + "2019.12.16_13.40.04,0,1\n", "line 2: .*: must have 5 columns, has 3"),
     (
         UCC_HEADER + "2019.12.16_13.40.04,0,1,1,D\n2019.12.16_13.40.10,0,1,1,D\n",
-        "line 3: Timestamp = 2019.12.16_13.40.10: must be from -2 to 5 s after the line above",
+        "line 3: Timestamp = 2019.12.16_13.40.10: must be at most 5 s after the line above",
     ),
     # NYU-METS
     ("1,Mbits/sec\n1,MBytes/sec\n", "line 2: unit = MBytes/sec: must be one of bits/sec, Kbits/sec"),

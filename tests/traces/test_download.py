@@ -278,3 +278,41 @@ def test_garbled_answers_end_in_a_file_or_our_error(tmp_path: Path, monkeypatch:
         server.shutdown(socket.SHUT_RDWR)
         thread.join()
     assert 30 < refused < 300
+
+
+ENDLESS = {
+    "100 Continue": (b"", b"HTTP/1.1 100 Continue\r\n\r\n" * 40),
+    "trailers": (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n", b"More: and more\r\n" * 60),
+}
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 0.05])
+@pytest.mark.parametrize("kind", ENDLESS)
+def test_headers_and_trailers_without_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, wait_s: float
+) -> None:
+    """As fast as they can, or never silent for long: the attempt ends by bytes, or by time."""
+    from bufgym.traces.datasets import connection
+
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    monkeypatch.setattr(connection, "MAX_HEAD_BYTES", 10**5)
+    first, again = ENDLESS[kind]
+    stop = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            with suppress(OSError):
+                while True:
+                    client, _ = server.accept()
+                    with client, suppress(OSError):
+                        client.recv(4096)
+                        client.sendall(first)
+                        while not stop.wait(wait_s):
+                            client.sendall(again)
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        address = f"http://127.0.0.1:{server.getsockname()[1]}/"
+        with pytest.raises(BufgymError, match="gave up after 1 attempts"):
+            download(address, tmp_path / "part", None, Patience(attempts=1, silence_s=0.5))
+        stop.set()

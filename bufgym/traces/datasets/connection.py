@@ -7,16 +7,22 @@ from __future__ import annotations
 
 import errno
 import http.client
+import io
+import math
 import socket
 import ssl
+import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import IO
+from typing import IO, Any
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
 
 from bufgym.errors import BufgymError
+
+MAX_HEAD_BYTES = 2**20
+"""Of headers, or of trailers."""
 
 _SHOWN_CHARACTERS = 200
 # Request timeout, too early, too many requests, and errors inside the server: they may pass.
@@ -63,6 +69,73 @@ class SafeRedirects(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
+class _Metered(io.RawIOBase):
+    """The bytes of a connection; while `most_s` is set, only so many and for so long."""
+
+    def __init__(self, raw: io.RawIOBase) -> None:
+        self._raw = raw
+        self._until_s = math.inf
+        self._left: float = math.inf
+
+    def allow(self, most_s: float, most_bytes: float) -> None:
+        """From now on."""
+        self._until_s, self._left = time.monotonic() + most_s, most_bytes
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        if time.monotonic() > self._until_s:
+            raise TimeoutError("the server talks without saying anything")
+        count = self._raw.readinto(buffer)
+        self._left -= count or 0
+        if self._left < 0:
+            raise http.client.HTTPException(f"more than {MAX_HEAD_BYTES} bytes of headers or trailers")
+        return count
+
+    def close(self) -> None:
+        self._raw.close()
+        super().close()
+
+
+class _Response(http.client.HTTPResponse):
+    """A response whose headers and trailers end: `100 Continue` may come again and again, trailers without end."""
+
+    def __init__(self, sock: socket.socket, *args: Any, **options: Any) -> None:
+        super().__init__(sock, *args, **options)
+        self.fp.close()
+        self._metered = _Metered(sock.makefile("rb", buffering=0))
+        self._most_s = sock.gettimeout() or math.inf
+        self.fp = io.BufferedReader(self._metered)
+        self._metered.allow(2 * self._most_s, MAX_HEAD_BYTES)
+
+    def begin(self) -> None:
+        super().begin()
+        self._metered.allow(math.inf, math.inf)
+
+    def _read_and_discard_trailer(self) -> None:
+        self._metered.allow(2 * self._most_s, MAX_HEAD_BYTES)
+        super()._read_and_discard_trailer()  # type: ignore[misc]
+
+
+class _Http(http.client.HTTPConnection):
+    response_class = _Response
+
+
+class _Https(http.client.HTTPSConnection):
+    response_class = _Response
+
+
+class _HttpHandler(urllib.request.HTTPHandler):
+    def http_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
+        return self.do_open(_Http, req)
+
+
+class _HttpsHandler(urllib.request.HTTPSHandler):
+    def https_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
+        return self.do_open(_Https, req)
+
+
 @contextmanager
 def opened(request: urllib.request.Request, silence_s: float) -> Iterator[http.client.HTTPResponse]:
     """The server's response with code 2xx, after redirections.
@@ -76,7 +149,9 @@ def opened(request: urllib.request.Request, silence_s: float) -> Iterator[http.c
         BufgymError: not worth one.
     """
     try:
-        response = urllib.request.build_opener(SafeRedirects).open(request, timeout=silence_s)
+        response = urllib.request.build_opener(SafeRedirects, _HttpHandler, _HttpsHandler).open(
+            request, timeout=silence_s
+        )
     except HTTPError as error:
         error.close()
         raise _refused(request.full_url, error) from None

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from bufgym.errors import BufgymError, where
+from bufgym.files import unpacked_limit
 from bufgym.traces.datasets.connection import in_words
 from bufgym.traces.datasets.download import disk
 
@@ -59,7 +60,8 @@ def unpack(archive: Path, folder: Path, most_bytes: int | None = None) -> list[P
     Args:
         archive: named .zip, .tar, .tgz, .tar.gz, .tar.bz2 or .tar.xz.
         folder: created by this call, complete.
-        most_bytes: limit of the bytes after decompression, MAX_UNPACKED_BYTES by default.
+        most_bytes: limit of the bytes after decompression, MAX_UNPACKED_BYTES by default; never more than
+            `unpacked_limit` of the archive's size.
 
     Returns:
         The files, in the archive's order.
@@ -68,6 +70,8 @@ def unpack(archive: Path, folder: Path, most_bytes: int | None = None) -> list[P
         BufgymError: a damaged archive, one that is too big, or a member that must not be in the folder.
     """
     most_bytes = MAX_UNPACKED_BYTES if most_bytes is None else most_bytes
+    with disk(archive):
+        most_bytes = min(most_bytes, unpacked_limit(archive.stat().st_size))
     kind = ending(archive.name)
     members = _zip if kind == ".zip" else _tar
     unfinished = folder.with_name(f".{folder.name}.unfinished")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -110,7 +111,7 @@ class PoseCollector:
         if not all(abs(value) <= MAX_POSITION_M for value in values[:3]):
             rule = f"must be finite and within {MAX_POSITION_M:g} m"
             raise fault(self.path, rule, value=values[:3], field=f"{field}, position")
-        norm = float(np.linalg.norm(values[3:]))
+        norm = math.hypot(*values[3:])
         if not abs(norm - 1) <= NORM_TOLERANCE:
             raise fault(self.path, "must be 1 within 1 %", value=f"{norm:.6g}", field=f"{field}, norm")
         poses.append((time_ns, values))

@@ -44,8 +44,8 @@ def read_ucc(path: StrPath, column: str = "DL_bitrate") -> Knots:
     """Each line counts for 1 s at its rate in kbit/s, as in the data set's own figures.
 
     The stamps have whole seconds only, and two lines often share one. By the stamps a recording lasts up to a tenth
-    longer than by its number of lines; the note says how long. A stamp more than 2 s before or 5 s after the one above
-    counts as a gap and is refused.
+    longer than by its number of lines; the note says how long. A stamp more than 2 s before the latest above, or 5 s
+    after the line above, counts as a gap and is refused; so is a file that ends before it begins.
     """
     intervals = Intervals()
     with open_text(path) as file:
@@ -56,18 +56,23 @@ def read_ucc(path: StrPath, column: str = "DL_bitrate") -> Knots:
             raise fault(path, f"must begin with a header that names {columns}", line=header and header.number)
         names = split_cells(header.text)
         time_at, rate_at = names.index(_UCC_TIME), names.index(column)
-        first = previous = None
+        first = previous = latest = None
         for line in lines:
             cells = line.columns(len(names), ",")
             time = _stamp(line, cells[time_at])
-            if previous is not None:
-                step_s = (time - previous).total_seconds()
-                if not MIN_UCC_STEP_S <= step_s <= MAX_UCC_STEP_S:
-                    rule = f"must be from {MIN_UCC_STEP_S} to {MAX_UCC_STEP_S} s after the line above"
+            if previous is not None and latest is not None:
+                # Measured from the latest, so that a file in reverse is not taken for one step back after the other.
+                if (time - latest).total_seconds() < MIN_UCC_STEP_S:
+                    rule = f"must be at most {-MIN_UCC_STEP_S} s before the latest above"
                     raise line.error(cells[time_at], rule, _UCC_TIME)
-            first, previous = first or time, time
+                if (time - previous).total_seconds() > MAX_UCC_STEP_S:
+                    rule = f"must be at most {MAX_UCC_STEP_S} s after the line above"
+                    raise line.error(cells[time_at], rule, _UCC_TIME)
+            first, previous, latest = first or time, time, max(latest or time, time)
             kbit_per_s = line.decimal(column, cells[rate_at], 0, _MAX_KBIT_PER_S)
             intervals.add(line, US_PER_S, round(kbit_per_s * 125))
+    if first is not None and previous is not None and previous < first:
+        raise fault(path, "ends before it begins: must be in order of time", field=_UCC_TIME)
     clock_s = 0 if first is None or previous is None else (previous - first).total_seconds()
     return intervals.knots(path, f"column {column}, 1 s a line, {clock_s:g} s by its clock")
 

@@ -133,7 +133,8 @@ def _chosen(
 ) -> tuple[tuple[str, ...], npt.NDArray[np.bool_], Int64Array]:
     """The topics that fit, which messages they have (bool[n]), and these messages' topics by their new numbers."""
     names = bags.matching(source, topics, patterns)
-    numbers = [topics.index(name) for name in names]
+    places = {name: k for k, name in enumerate(topics)}
+    numbers = [places[name] for name in names]
     chosen = np.isin(topic, numbers)
     renumbered = np.zeros(len(topics), np.int64)
     renumbered[numbers] = np.arange(len(numbers))

@@ -1,7 +1,6 @@
 """Whatever is in a link file, reading it ends in a sound trace or in an error of bufgym's own that names the file.
 
-A few hundred inputs by default, the same in every run; $BUFGYM_FUZZ says how many and $BUFGYM_FUZZ_SEED which (`make
-fuzz`: 100,000, others every day). A failure shows the seed and the number of its input in the file's name.
+A failure shows the seed and the number of its input in the file's name.
 
 Inputs are files of each format, recorded ones where they are present, mutated: bytes flipped, parts cut out, doubled or
 swapped with another file's, numbers and lines of absurd size put in; some packed as gzip or zip before or after that.
@@ -24,38 +23,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_files import HEADER, SAMPLES, written
+from mutations import COUNT, SEED, mutated
 
 from bufgym.errors import BufgymError, TraceError
 from bufgym.traces import FORMATS, members, read_trace
 
-COUNT = int(os.environ.get("BUFGYM_FUZZ", "400"))
-SEED = os.environ.get("BUFGYM_FUZZ_SEED", "0")
 BATCHES = 8
 HANG_S = 60
 MOST_BYTES = 2 * 10**9
-
-ABSURD = [
-    b"1e999",
-    b"-1",
-    b"nan",
-    b"Infinity",
-    b"9" * 25,
-    b"7" * 5000,
-    b"1" * 4096 + b"x",
-    b"1000000000000000 1",  # a gap of 10**15
-    b"\n" * 2000,
-    b" " * 5000,
-    b"\x00" * 50,
-    b"\xff\xfe",
-    "٣".encode(),
-    b"[" * 3000,
-    b'{"duration_ms": 1e308, "bandwidth_kbps": 1e308},',
-    b"2019.12.16_13.40.04",
-    b",",
-    b"\r",
-    b"PK\x03\x04",
-    b"\x1f\x8b\x08",
-]
 
 
 @contextmanager
@@ -87,30 +62,6 @@ def ends_well(path: Path, format: str | None, column: str | None = None) -> bool
             return False
     assert trace.total_bytes > 0 and 0 < trace.duration_us <= 10**13
     return True
-
-
-def mutated(uniform: random.Random, data: bytes, others: list[bytes]) -> bytes:
-    mutant = bytearray(data)
-    for _ in range(uniform.choice([0, 0, 1, 1, 1, 2, 4, 16])):
-        at, length = uniform.randrange(len(mutant) + 1), uniform.choice([1, 1, 3, 20, 200])
-        match uniform.randrange(7):
-            case 0 if mutant:
-                mutant[at % len(mutant)] ^= 1 << uniform.randrange(8)
-            case 1:
-                del mutant[at : at + length]
-            case 2:
-                mutant[at:at] = uniform.choice(ABSURD)
-            case 3:
-                mutant[at:at] = mutant[at : at + length] * uniform.choice([1, 2, 50])
-            case 4:
-                other = uniform.choice(others)
-                place = uniform.randrange(len(other))
-                mutant[at : at + length] = other[place : place + length]
-            case 5:
-                del mutant[at:]
-            case _:
-                mutant[at : at + 1] = uniform.choice([b"0", b"9", b"-", b".", b" ", b"\n", b",", b"e", b'"', b"}"])
-    return bytes(mutant)
 
 
 def packed(uniform: random.Random, data: bytes) -> bytes:

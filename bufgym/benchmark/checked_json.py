@@ -1,0 +1,56 @@
+"""JSON files from outside: read and checked, with errors that name the file, the field and the rule."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+from bufgym.errors import BufgymError, where
+from bufgym.files import read_utf8
+
+MAX_JSON_BYTES = 64 * 2**20
+"""A timeline of 100,000 messages has some 20 MB."""
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The object that the file holds; numbers must be finite."""
+    text = read_utf8(path, MAX_JSON_BYTES)
+    try:
+        content = json.loads(text, parse_constant=_refuse, parse_float=_finite)
+    except RecursionError:
+        raise BufgymError(f"{path}: nested too deep") from None
+    except json.JSONDecodeError as error:
+        raise BufgymError(where(path, error.lineno, None, f"must be JSON: {error.msg}")) from None
+    except ValueError as error:
+        raise BufgymError(f"{path}: {str(error).partition(';')[0]}") from None
+    if not isinstance(content, dict):
+        raise BufgymError(f"{path}: must be a JSON object")
+    return content
+
+
+def _finite(digits: str) -> float:
+    number = float(digits)
+    return number if math.isfinite(number) else _refuse(digits)
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"{constant}: numbers must be finite")
+
+
+def check(path: Path, place: str, content: Any, kinds: Mapping[str, Any]) -> None:
+    """Every entry of ``kinds`` is in the object ``content``, and of its kind; ``place`` says where the object is."""
+    if not isinstance(content, dict):
+        raise BufgymError(f"{path}: {place} must be an object")
+    for name, kind in kinds.items():
+        field = f"{place}.{name}" if place else name
+        if name not in content:
+            raise BufgymError(f"{path}: no {field}")
+        # True is an int of Python's, but no number.
+        if not isinstance(content[name], kind) or isinstance(content[name], bool):
+            words = {str: "text", list: "a list", dict: "an object", int: "a whole number"}.get(kind, "a number")
+            raise BufgymError(where(path, None, content[name], f"must be {words}", field=field))
+        if kind is str and not content[name].isprintable():
+            raise BufgymError(where(path, None, content[name], "must be one line of text", field=field))

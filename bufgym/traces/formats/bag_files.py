@@ -1,0 +1,299 @@
+"""The files of recordings: every message that an MCAP file, a ROS 1 bag or a rosbag2 holds, in the order of the file.
+
+A recording may be a stranger's. Nothing that it says of itself is trusted: a record is no longer than the file, a chunk
+unpacks to no more than MAX_CHUNK_BYTES, and all of it to no more than `files.unpacked_limit` of its size. rosbag2's
+SQLite files are read by two plain queries, and of its `metadata.yaml` four entries, line by line: SQLite views and YAML
+can make a small file endless.
+"""
+
+from __future__ import annotations
+
+import bz2
+import io
+import os
+import re
+import sqlite3
+import struct
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import IO, Any, Final
+
+from bufgym.files import read_utf8, unpacked_limit
+from bufgym.traces.formats.bag_poses import Channel
+
+# A chunk of a recording has some MB, a robot some hundred topics; more is a mistake, or a bomb.
+MAX_CHUNK_BYTES: Final = 2**28
+MAX_TOPICS: Final = 10_000
+MAX_METADATA_BYTES: Final = 2**23
+
+_RECORD: Final = struct.Struct("<BQ")
+"""An MCAP record's kind and length."""
+_MESSAGE: Final = struct.Struct("<HIQQ")
+"""Channel, sequence number, when it was logged and when it was published, ns."""
+_STORAGE: Final = re.compile(r"\s*(storage_identifier|compression_format|compression_mode):(.*)")
+_PIECE_BYTES: Final = 2**20
+
+Message = tuple[Channel, int, bytes]
+"""Its channel, when it was logged in ns, and its serialised form."""
+
+
+class _Unpacked:
+    """Counts what comes out of a recording."""
+
+    def __init__(self, packed_bytes: int) -> None:
+        self.most_bytes = unpacked_limit(packed_bytes)
+        self._left = self.most_bytes
+
+    def add(self, count: int) -> None:
+        self._left -= count
+        if self._left < 0:
+            raise ValueError(f"unpacks to more than {self.most_bytes} bytes: must be less, or be unpacked before")
+
+
+class _Bounded(io.BufferedReader):
+    """A file that reads no more than it holds, so that a damaged length does not become an allocation."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(_regular(path)))
+        self._left = self.size = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1) -> bytes:
+        data = super().read(self._left if size is None or size < 0 else min(size, self._left))
+        self._left -= len(data)
+        return data
+
+
+def _regular(path: Path) -> Path:
+    if not path.is_file():
+        raise ValueError(f"{path.name}: must be a regular file")
+    return path
+
+
+# --- MCAP ------------------------------------------------------------------------------------------------------------
+
+
+def mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
+    """Every message of an MCAP file, or of all in a folder; adds every topic to ``types``, even without messages."""
+    for file_path in sorted(path.glob("*.mcap")) if path.is_dir() else [path]:
+        yield from _mcap(file_path, types)
+
+
+def _mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
+    from mcap import records
+    from mcap.data_stream import ReadDataStream
+    from mcap.opcode import Opcode
+    from mcap.stream_reader import StreamReader
+
+    schemas: dict[int, str] = {}
+    channels: dict[int, Channel] = {}
+
+    def declared(record: Any) -> None:
+        if isinstance(record, records.Schema):
+            schemas[record.id] = record.name
+        elif isinstance(record, records.Channel):
+            types[record.topic] = _type(schemas.get(record.schema_id, ""))
+            channels[record.id] = Channel(record.topic, types[record.topic], record.message_encoding)
+
+    with _Bounded(path) as file:
+        unpacked = _Unpacked(file.size)
+        reader = StreamReader(file, emit_chunks=True, record_size_limit=MAX_CHUNK_BYTES)
+        for record in reader.records:
+            declared(record)
+            if isinstance(record, records.Message):
+                yield channels[record.channel_id], record.log_time, record.data
+            elif isinstance(record, records.Chunk):
+                for kind, content in _records(_chunk(record, unpacked)):
+                    if kind == Opcode.MESSAGE:
+                        number, _, logged_ns, _ = _MESSAGE.unpack_from(content)
+                        yield channels[number], logged_ns, bytes(content[_MESSAGE.size :])
+                    elif kind == Opcode.SCHEMA:
+                        declared(records.Schema.read(ReadDataStream(io.BytesIO(content))))
+                    elif kind == Opcode.CHANNEL:
+                        declared(records.Channel.read(ReadDataStream(io.BytesIO(content))))
+
+
+def _records(chunk: bytes) -> Iterator[tuple[int, memoryview]]:
+    """(kind, content) of the records in a chunk, one at a time: millions of small ones do not become objects."""
+    view, at = memoryview(chunk), 0
+    while at < len(view):
+        kind, length = _RECORD.unpack_from(view, at)
+        at += _RECORD.size
+        if length > len(view) - at:
+            raise ValueError("a record longer than its chunk")
+        yield kind, view[at : at + length]
+        at += length
+
+
+def _chunk(chunk: Any, unpacked: _Unpacked) -> bytes:
+    """The chunk's records; it must hold as much as it says."""
+    size = chunk.uncompressed_size
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk of {size} bytes: must be at most {MAX_CHUNK_BYTES}")
+    unpacked.add(size)
+    if chunk.compression == "zstd":
+        data = _unzstd(chunk.data, size)
+    elif chunk.compression == "lz4":
+        import lz4.frame
+
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise ValueError(f"compression {chunk.compression!r}: must be zstd, lz4 or none")
+    if len(data) != size:
+        raise ValueError(f"a chunk of {len(data)} bytes that says {size}")
+    return data
+
+
+def _unzstd(packed: bytes, most_bytes: int) -> bytes:
+    """At most one byte more than that."""
+    with _zstd(io.BytesIO(packed)) as reader:
+        data = bytearray()
+        while len(data) <= most_bytes and (piece := reader.read(min(_PIECE_BYTES, most_bytes + 1 - len(data)))):
+            data += piece
+    return bytes(data)
+
+
+def _zstd(packed: IO[bytes]) -> Any:
+    import zstandard
+
+    return zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(packed, read_across_frames=True)
+
+
+def _type(schema: str) -> str:
+    """A ROS 1 type name ("nav_msgs/Odometry") as in ROS 2; any other name unchanged."""
+    package, _, name = schema.partition("/")
+    return f"{package}/msg/{name}" if name and "/" not in name else schema
+
+
+# --- rosbag2 ---------------------------------------------------------------------------------------------------------
+
+
+def rosbag2(path: Path, types: dict[str, str]) -> Iterator[Message]:
+    """Every message of a rosbag2's folder, or of one of its SQLite files, which may have any name."""
+    if not path.is_dir():
+        yield from _sqlite(path, types)
+        return
+    storage, names = _metadata(path / "metadata.yaml")
+    compression = storage.get("compression_mode", "").lower()
+    form = storage.get("compression_format", "")
+    if compression not in ("", "none") and form != "zstd":
+        raise ValueError(f"compression {form!r}: must be zstd")
+    read = {"sqlite3": _sqlite, "mcap": _mcap}.get(storage.get("storage_identifier", ""))
+    if read is None:
+        raise ValueError(f"storage {storage.get('storage_identifier')!r}: must be sqlite3 or mcap")
+    files = [_regular(path / name) for name in names]
+    unpacked = _Unpacked(sum(file.stat().st_size for file in files))
+    with tempfile.TemporaryDirectory() as scratch:
+        for file in files:
+            if compression != "file":
+                messages = read(file, types)
+            else:
+                # One at a time, as each may be large.
+                plain = Path(scratch) / "plain"
+                _unpack(file, plain, unpacked)
+                messages = read(plain, types)
+            for channel, logged_ns, data in messages:
+                if compression == "message":
+                    data = _unzstd(data, MAX_CHUNK_BYTES)
+                    if len(data) > MAX_CHUNK_BYTES:
+                        raise ValueError(f"a message of more than {MAX_CHUNK_BYTES} bytes: must be at most that")
+                    unpacked.add(len(data))
+                yield channel, logged_ns, data
+
+
+def _metadata(path: Path) -> tuple[dict[str, str], list[str]]:
+    """How its files are stored, and their names, as ROS 2 writes them: a line each."""
+    storage: dict[str, str] = {}
+    names: list[str] = []
+    listing = False
+    for line in read_utf8(path, MAX_METADATA_BYTES).splitlines():
+        text = line.strip()
+        if listing and text.startswith("- "):
+            names.append(Path(_scalar(text[2:])).name)
+            continue
+        listing = text == "relative_file_paths:"
+        if (match := _STORAGE.fullmatch(line)) is not None:
+            storage.setdefault(match[1], _scalar(match[2]))
+    return storage, names
+
+
+def _scalar(text: str) -> str:
+    """A YAML scalar of one line, without its quotes."""
+    text = text.strip()
+    quoted = len(text) >= 2 and text[0] == text[-1] and text[0] in "'\""
+    return text[1:-1] if quoted else text
+
+
+def _unpack(packed: Path, plain: Path, unpacked: _Unpacked) -> None:
+    with packed.open("rb") as file, _zstd(file) as reader, plain.open("wb") as out:
+        while piece := reader.read(_PIECE_BYTES):
+            unpacked.add(len(piece))
+            out.write(piece)
+
+
+def _sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
+        base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
+        base.execute("PRAGMA trusted_schema = OFF")
+        kinds = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
+        if base.execute(kinds).fetchone() != (2,):
+            raise ValueError("no table of messages and topics")
+        channels: dict[int, Channel] = {}
+        for number, topic, type, encoding in base.execute("SELECT id, name, type, serialization_format FROM topics"):
+            if encoding != "cdr" or not isinstance(topic, str) or not isinstance(type, str):
+                raise ValueError(f"topic {topic!r} of type {type!r} in {encoding!r}: must be text, in cdr")
+            if len(channels) > MAX_TOPICS:
+                break  # who reads on says so
+            types[topic] = type
+            channels[number] = Channel(topic, type, "cdr")
+        for number, logged_ns, data in base.execute("SELECT topic_id, timestamp, data FROM messages"):
+            if not isinstance(logged_ns, int) or not isinstance(data, bytes):
+                raise ValueError("a message's time must be a whole number, and its data bytes")
+            yield channels[number], logged_ns, data
+
+
+# --- ROS 1 -----------------------------------------------------------------------------------------------------------
+
+
+def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
+    """Every message of a ROS 1 bag."""
+    from rosbags.rosbag1 import Reader
+
+    with Reader(path) as reader:
+        unpacked = _Unpacked(path.stat().st_size)
+        for place, chunk in reader.chunks.items():
+            reader.chunks[place] = chunk._replace(decompressor=_limited(chunk.decompressor, unpacked))
+        channels: dict[int, Channel] = {}
+        for connection in reader.connections:
+            types[connection.topic] = connection.msgtype
+            channels[connection.id] = Channel(connection.topic, connection.msgtype, "ros1")
+        for connection, logged_ns, data in reader.messages(list(reader.connections)):
+            yield channels[connection.id], logged_ns, data
+
+
+def _limited(decompress: Callable[[bytes], bytes], unpacked: _Unpacked) -> Callable[[bytes], bytes]:
+    """The decompression of a ROS 1 chunk, limited to MAX_CHUNK_BYTES of output."""
+    import lz4.frame
+
+    decompressors: dict[Any, Callable[[], Any]] = {
+        bz2.decompress: bz2.BZ2Decompressor,
+        lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
+    }
+    if decompress not in decompressors:
+        return decompress
+
+    def limited(data: bytes) -> bytes:
+        content: bytes = decompressors[decompress]().decompress(data, max_length=MAX_CHUNK_BYTES + 1)
+        if len(content) > MAX_CHUNK_BYTES:
+            raise ValueError(f"a chunk of more than {MAX_CHUNK_BYTES} bytes: must be at most that")
+        unpacked.add(len(content))
+        return content
+
+    return limited
+
+
+SOURCES: Final = {"mcap": mcap, "ros1": ros1, "rosbag2": rosbag2}
+"""What reads each kind of recording."""

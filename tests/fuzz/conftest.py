@@ -1,0 +1,9 @@
+"""What fuzzing reads lies beside the other tests' helpers."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+for name in ("traces", "core"):
+    sys.path.append(str(Path(__file__).resolve().parents[1] / name))

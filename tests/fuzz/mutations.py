@@ -1,0 +1,63 @@
+"""Sound files made unsound: how many, which, and how.
+
+A few hundred inputs by default, the same in every run; $BUFGYM_FUZZ says how many and $BUFGYM_FUZZ_SEED which (`make
+fuzz`: 100,000 of each kind, others every day).
+"""
+
+from __future__ import annotations
+
+import os
+import random
+
+COUNT = int(os.environ.get("BUFGYM_FUZZ", "400"))
+SEED = os.environ.get("BUFGYM_FUZZ_SEED", "0")
+
+ABSURD = [
+    b"1e999",
+    b"-1",
+    b"nan",
+    b"Infinity",
+    b"9" * 25,
+    b"7" * 5000,
+    b"1" * 4096 + b"x",
+    b"1000000000000000 1",  # a gap of 10**15
+    b"\n" * 2000,
+    b" " * 5000,
+    b"\x00" * 50,
+    b"\xff\xfe",
+    "٣".encode(),
+    b"[" * 3000,
+    b'{"duration_ms": 1e308, "bandwidth_kbps": 1e308},',
+    b"2019.12.16_13.40.04",
+    b",",
+    b"\r",
+    b"PK\x03\x04",
+    b"\x1f\x8b\x08",
+    b"null",
+    b"\x1b[31m",
+    b"a" + b".a" * 2000,
+]
+
+
+def mutated(uniform: random.Random, data: bytes, others: list[bytes]) -> bytes:
+    mutant = bytearray(data)
+    for _ in range(uniform.choice([0, 0, 1, 1, 1, 2, 4, 16])):
+        at, length = uniform.randrange(len(mutant) + 1), uniform.choice([1, 1, 3, 20, 200])
+        match uniform.randrange(7):
+            case 0 if mutant:
+                mutant[at % len(mutant)] ^= 1 << uniform.randrange(8)
+            case 1:
+                del mutant[at : at + length]
+            case 2:
+                mutant[at:at] = uniform.choice(ABSURD)
+            case 3:
+                mutant[at:at] = mutant[at : at + length] * uniform.choice([1, 2, 50])
+            case 4:
+                other = uniform.choice(others)
+                place = uniform.randrange(len(other))
+                mutant[at : at + length] = other[place : place + length]
+            case 5:
+                del mutant[at:]
+            case _:
+                mutant[at : at + 1] = uniform.choice([b"0", b"9", b"-", b".", b" ", b"\n", b",", b"e", b'"', b"}"])
+    return bytes(mutant)

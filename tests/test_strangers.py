@@ -1,0 +1,274 @@
+"""Files of strangers: what is too large, endless, forged or no regular file ends in one line, and soon."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "traces"))
+import bag_cases as cases
+
+from bufgym import policies, traces
+from bufgym.benchmark import folder, leaderboard, manifest, tuned
+from bufgym.cli import main
+from bufgym.errors import BufgymError, TraceError, printable
+from bufgym.scenario import read_client
+
+REPO = Path(__file__).resolve().parents[1]
+EXAMPLE = REPO / "examples" / "client.toml"
+
+
+def said(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line on stderr; exit code 2."""
+    assert main(arguments) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("bufgym: error: ") and message.count("\n") == 1 and message[:-1].isprintable()
+    return message
+
+
+# -------------------- configurations
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        ("a" + ".a" * 40_000 + " = 1", "line 1: must have at most 100 dots"),
+        ("a = " + "[" * 100_000, "nested too deep"),
+        ("window = " + "9" * 5000, "Exceeds the limit"),
+        ("x" * 2**19, "larger than 262144 bytes"),
+        (b"\xff\xfe", "must be UTF-8 text"),
+    ],
+)
+def test_toml_without_bounds_is_refused(tmp_path: Path, text: str | bytes, rule: str) -> None:
+    path = tmp_path / "client.toml"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    with pytest.raises(BufgymError, match=rule) as error:
+        read_client(path)
+    assert str(error.value).count(str(path)) == 1
+
+
+@pytest.mark.parametrize("key", ["window", "duration_s", "rate_hz", "size_bytes", "priority", "weight"])
+@pytest.mark.parametrize("number", ["1" + "0" * 400, "-1e300", "nan", "inf", "true", "1979-05-27"])
+def test_numbers_of_any_size_are_read_or_refused(tmp_path: Path, key: str, number: str) -> None:
+    path = tmp_path / "client.toml"
+    own = f"{key} = {number}\n" if key in ("window", "duration_s") else ""
+    topic = {"name": '"t"', "rate_hz": "1", "size_bytes": "1", **({} if own else {key: number})}
+    path.write_text(own + "[[topic]]\n" + "".join(f"{k} = {v}\n" for k, v in topic.items()))
+    with pytest.raises(BufgymError, match=r"client\.toml"):
+        read_client(path)
+
+
+@pytest.mark.parametrize("command", ["topics --config", "trace info", "trace from-bag", "report", "bench --workload"])
+def test_devices_and_fifos_are_refused(tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    for path in ("/dev/zero", str(fifo)):
+        assert path in said([*command.split(), path], capsys)
+
+
+# -------------------- results
+
+
+def test_a_row_is_not_believed_its_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A forged value needs a wide interval; what counts is the interval that is computed now."""
+    now = leaderboard.Interval(0.5, 0.4, 0.6)
+    entry = leaderboard.Entry("lte-v1", "afr", 1, 3, {"score": now}, "0.1.0")
+    monkeypatch.setattr(leaderboard, "_run", lambda *a, **k: [entry])
+    assert leaderboard.validate(entry) is entry
+    for value, low, high in ((0.9, -9, 9), (0.5, -9, 9), (0.9, 0.85, 0.95), (0.61, 0.4, 0.6), (float("nan"), 0.4, 0.6)):
+        forged = leaderboard.replace(entry, values={"score": leaderboard.Interval(value, low, high)})
+        with pytest.raises(BufgymError, match=r"score is 0.500000 \[0.400000, 0.600000\], but the file states"):
+            leaderboard.validate(forged)
+
+
+def a_board(**changes: str) -> list[dict[str, str]]:
+    row = dict(
+        zip(leaderboard.COLUMNS, ["lte-v1", "afr", "1", "3", "score", "0.5", "0.4", "0.6", "0.1", "x"], strict=True)
+    )
+    return [{**row, **changes}]
+
+
+@pytest.mark.parametrize(
+    ("changes", "rule"),
+    [
+        ({"rank": "first"}, "line 2: rank = first: must be a number"),
+        ({"suite": "no-such"}, "line 2: suite = no-such: must be a suite"),
+        ({"quantity": "luck"}, "line 2: quantity = luck: must be one of"),
+        ({"value": "0.5,0.6"}, "line 2: value = 0.5,0.6: must be a number"),
+        ({"command": "x" * 200_000}, "must be CSV: field larger"),
+    ],
+)
+def test_a_leaderboard_that_was_tampered_with(
+    tmp_path: Path, changes: dict[str, str], rule: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "board.csv"
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, leaderboard.COLUMNS)
+        writer.writeheader()
+        writer.writerows(a_board(**changes))
+    assert rule in said(["validate", "lte-v1/afr", "--file", str(path)], capsys)
+
+
+@pytest.mark.parametrize("data", [None, b"\xff\xfe\x00", b"a,b\n1,2\n", b"", b"\x00" * 50])
+def test_a_leaderboard_that_is_none(tmp_path: Path, data: bytes | None, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "board.csv"
+    if data is not None:
+        path.write_bytes(data)
+    assert "board.csv" in said(["validate", "lte-v1/afr", "--file", str(path)], capsys)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "rows.csv", "timeline.json"])
+@pytest.mark.parametrize("data", [None, b"\xff", b"[" * 100_000, b"{}", b'{"format": 2}', b"1e999", b"9" * 5000])
+def test_a_report_of_files_that_are_none(
+    tmp_path: Path, name: str, data: bytes | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_run(tmp_path)
+    (tmp_path / name).unlink() if data is None else (tmp_path / name).write_bytes(data)
+    if (name, data) == ("timeline.json", None):
+        folder.read(tmp_path)  # not every run has one
+        return
+    assert str(tmp_path) in said(["report", str(tmp_path)], capsys)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "rows.csv", "timeline.json"])
+def test_a_fifo_in_a_run_s_folder_is_refused(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(tmp_path)
+    (tmp_path / name).unlink()
+    os.mkfifo(tmp_path / name)
+    assert f"{name}: must be a regular file" in said(["report", str(tmp_path)], capsys)
+
+
+def test_settings_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tuned, "FILE", tmp_path / "tuned.json")
+    tuned.write("lte-v1", {"decimate": {"setting": "decimate:every=2"}})
+    before = tuned.FILE.read_bytes()
+
+    def half(path: Path, text: str, **_: object) -> None:
+        path.write_bytes(text.encode()[:20])
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_text", half)
+    with pytest.raises(OSError, match="No space"):
+        tuned.write("lte-v1", {"decimate": {"setting": "decimate:every=3"}})
+    assert tuned.FILE.read_bytes() == before and list(tmp_path.iterdir()) == [tuned.FILE]
+
+
+def write_run(out: Path) -> None:
+    """A folder as ``bufgym bench --suite`` writes it, as far as it is read before a page is made."""
+    from bufgym.benchmark.tasks import TASKS
+
+    entries = {name: "x" for name in ("suite", "split", "about", "episodes", "bufgym", "command")}
+    entries |= {"format": manifest.FORMAT, "task": "queue", "unranked": {}, "scenarios": {"a": {}}, "changes": {}}
+    (out / "manifest.json").write_text(json.dumps(entries))
+    needed = TASKS["queue"].needed
+    (out / "rows.csv").write_text(",".join(needed) + "\n" + ",".join("1" for _ in needed) + "\n")
+    (out / "timeline.json").write_text(
+        '{"scenario": "a", "capacity": 1, "arrival_s": [0], "x": [0], "rate": {"t_s": [], "bytes_per_s": []},'
+        ' "policies": {}}'
+    )
+
+
+def test_weights_whose_metadata_are_null(tmp_path: Path) -> None:
+    header = json.dumps({"__metadata__": None}).encode()
+    path = tmp_path / "null.safetensors"
+    path.write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(BufgymError, match=r"has no metadata of bufgym's|no safetensors file"):
+        policies.load(path)
+
+
+# -------------------- what reaches the terminal
+
+
+def test_what_is_printable_stays_and_all_else_is_written_out() -> None:
+    assert printable("lte 4 \N{MULTIPLICATION SIGN} caf\N{LATIN SMALL LETTER E WITH ACUTE}") == "lte 4 × café"
+    assert printable("a\nb\x1b[31m\x07\x9b\u202e\ud800\x00") == r"a\nb\x1b[31m\x07\x9b\u202e\ud800\x00"
+    assert printable(printable("\x1b")) == r"\x1b"
+    assert str(BufgymError("a\nb")) == r"a\nb"
+
+
+FORGED = "x\nOK     all.csv: 9 s, mean 9 KB\x1b[2K\x1b[31m/s"
+
+
+def test_a_member_s_name_forges_no_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import zipfile
+
+    path = tmp_path / "two.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(FORGED, "1\n2\n")
+        archive.writestr(FORGED + "y", "broken")
+    with pytest.raises(SystemExit):
+        main(["trace", "validate", str(path)])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3 and all(line.isprintable() for line in lines)
+    assert [line.split()[0] for line in lines] == ["OK", "error", "1"]
+    assert main(["trace", "info", f"{path}:{FORGED}"]) == 0
+    assert all(line.isprintable() for line in capsys.readouterr().out.splitlines())
+
+
+def test_a_topic_s_name_forges_no_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = cases.write_mcap(tmp_path / "t.mcap", [(0, FORGED, "type\x1b[0m", b"1"), (1, "/t", "x", b"1")])
+    assert main(["trace", "from-bag", str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert all(line.isprintable() for line in lines)
+    assert not any(line.startswith("OK") for line in lines)
+    assert "no topic" in said(["trace", "from-bag", str(path), "--topics", "\x1b[31m"], capsys)
+
+
+def ran(arguments: list[str], **options: object) -> subprocess.CompletedProcess[bytes]:
+    environment = {**os.environ, "PYTHONPATH": str(REPO), **options.pop("env", {})}
+    return subprocess.run([sys.executable, "-m", "bufgym", *arguments], cwd=REPO, env=environment, **options)
+
+
+def test_output_of_another_encoding_closed_or_full() -> None:
+    for encoding in ("ascii", "latin-1"):
+        done = ran(["list", "rewards"], env={"PYTHONIOENCODING": encoding}, capture_output=True)
+        assert done.returncode == 0 and done.stderr == b""
+        done.stdout.decode(encoding)
+    done = ran(["trace", "info", "\u2013.csv"], env={"PYTHONIOENCODING": "ascii"}, capture_output=True)
+    assert done.returncode == 2 and rb"\u2013.csv" in done.stderr and done.stderr.count(b"\n") == 1
+    shell = f"{sys.executable} -m bufgym"
+    for command, code in ((f"{shell} list rewards >&-", 0), (f"{shell} trace info nowhere >&- 2>&-", 2)):
+        done = subprocess.run(["sh", "-c", command], cwd=REPO, capture_output=True)
+        assert (done.returncode, done.stdout, done.stderr) == (code, b"", b"")
+    if Path("/dev/full").exists():
+        with open("/dev/full", "wb") as full:
+            done = ran(["list", "rewards"], stdout=full, stderr=subprocess.PIPE)
+        assert done.returncode == 2 and done.stderr.count(b"\n") == 1 and b"Traceback" not in done.stderr
+
+
+# -------------------- numbers without bounds
+
+
+def test_a_hundred_million_episodes_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("bench", "topics", "fleet", "tune lte-v1"):
+        message = said([*command.split(), "--seeds", "100000000"], capsys)
+        assert "argument --seeds: 100000000: must be at most 100000" in message
+
+
+def test_four_months_of_two_packets_are_drawn_in_windows(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "long"
+    path.write_text("1\n9999999999\n")
+    assert main(["trace", "plot", str(path), "--out", str(tmp_path / "long.svg")]) == 0
+    assert (tmp_path / "long.svg").stat().st_size < 5_000_000
+
+
+def test_a_ucc_file_in_reverse_is_refused(tmp_path: Path) -> None:
+    stamps = [f"2019.12.16_13.40.{s:02d}" for s in range(20)]
+    path = tmp_path / "ucc.csv"
+
+    def written(order: list[str]) -> Path:
+        path.write_text("Timestamp,DL_bitrate,UL_bitrate\n" + "".join(f"{stamp},8,8\n" for stamp in order))
+        return path
+
+    assert traces.read_trace(written(stamps)).duration_us == 20_000_000
+    with pytest.raises(TraceError, match=r"line 5: .*40.16: must be at most 2 s before the latest above"):
+        traces.read_trace(written(stamps[::-1]))
+    with pytest.raises(TraceError, match="ends before it begins"):
+        traces.read_trace(written(stamps[1::-1]))
