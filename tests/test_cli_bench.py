@@ -197,3 +197,25 @@ def test_an_output_folder_that_cannot_be_made(trace: str, tmp_path: Path, capsys
     (tmp_path / "taken").touch()
     fails(["bench", "--trace", trace, *QUICK, "--out", str(tmp_path / "taken")], "taken: File exists", capsys)
     fails(["bench", "--trace", trace, *QUICK, "--out", "rows.csv"], "rows.csv: without --suite it must be", capsys)
+
+
+@pytest.mark.slow
+def test_regret_that_rests_on_an_upper_bound_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--trace", "lte-synthetic-0", "--size-cv", "1", "--bytes", "900000", "--seconds", "5", "--capacity", "3"]
+    assert main(["bench", *words, "--seeds", "1", "--policies", "clairvoyant,afr,rosbridge"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    table = [line.split()[0] for line in lines if line.startswith(("clairvoyant", "afr", "rosbridge"))]
+    assert table[0] == "afr" and set(table[1:]) == {"clairvoyant", "rosbridge"}  # those that do not compete come last
+    assert any("regret, at most" in line for line in lines)
+    assert "note: clairvoyant does not compete: it knows the future" in lines
+    assert any(line.startswith("note: regret rests on an upper bound") for line in lines)
+
+
+def test_the_clairvoyant_plans_for_a_sender_that_is_always_asked(
+    trace: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    overflow = ["bench", "--trace", trace, *QUICK, "--decide-at", "overflow"]
+    assert main([*overflow, "--policies", "clairvoyant,afr"]) == 2
+    assert "policy clairvoyant: it plans for a sender that asks at every arrival" in capsys.readouterr().err
+    assert main(overflow) == 0
+    assert "\nclairvoyant " not in capsys.readouterr().out

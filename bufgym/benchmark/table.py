@@ -6,7 +6,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from bufgym.errors import printable
+from bufgym import policies
+from bufgym.errors import BufgymError, printable
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -111,7 +112,8 @@ COLUMNS = (
 def means(rows: Rows) -> list[dict[str, Any]]:
     """One entry for each (policy, capacity): means over its rows; capacity ascending, then QoI descending.
 
-    None and NaN count as missing; a mean over nothing but missing numbers is NaN.
+    Policies that do not compete (see ``unranked``) come after the others of a capacity. None and NaN count as missing;
+    a mean over nothing but missing numbers is NaN.
     """
     groups: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
     for row in rows:
@@ -124,7 +126,21 @@ def means(rows: Rows) -> list[dict[str, Any]]:
         }
         for (capacity, policy), group in groups.items()
     ]
-    return sorted(entries, key=lambda entry: (entry["capacity"], -entry["qoi"], entry["policy"]))
+    apart = unranked(rows)
+    return sorted(entries, key=lambda e: (e["capacity"], e["policy"] in apart, -e["qoi"], e["policy"]))
+
+
+def unranked(rows: Rows) -> dict[str, str]:
+    """Policies among the rows that do not compete, and why."""
+    reasons = {}
+    for name in dict.fromkeys(row["policy"] for row in rows):
+        try:
+            reason = policies.get(name).unranked_because
+        except BufgymError:
+            continue  # an agent of a run, which no registry knows
+        if reason:
+            reasons[name] = reason
+    return reasons
 
 
 def plain(rows: Rows) -> str:
@@ -135,21 +151,34 @@ def plain(rows: Rows) -> str:
         if k > 1 and cells[k][1] != cells[k - 1][1]:
             out.append("")
         out.append(line)
-    return "\n".join([*out, *invalid(rows)])
+    return "\n".join([*out, *notes(rows)])
 
 
 def markdown(rows: Rows) -> str:
     """A Markdown table; numbers to the right."""
     head, *body = _cells(rows)
-    notes = invalid(rows)
-    return "\n".join([*markdown_table(head, body), *(["", *notes] if notes else [])])
+    lines = notes(rows)
+    return "\n".join([*markdown_table(head, body), *(["", *lines] if lines else [])])
+
+
+def notes(rows: Rows) -> list[str]:
+    """What the reader of the means must know besides."""
+    apart = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked(rows).items()]
+    bound = "note: regret rests on an upper bound of the best QoI, which is not exact here: it is at most this"
+    return [*apart, *([bound] if _inexact(rows) else []), *invalid(rows)]
+
+
+def _inexact(rows: Rows) -> bool:
+    """Whether a regret rests on a bound that is not certified to be exact."""
+    return any(row.get("certified") is False and row.get("regret") is not None for row in rows)
 
 
 def _cells(rows: Rows) -> list[list[str]]:
     """Titles, then a line for each entry of ``means``; no regret where no row has one."""
     entries = means(rows)
     columns = [c for c in COLUMNS if c.key != "regret" or any(not math.isnan(entry["regret"]) for entry in entries)]
-    return [[column.title for column in columns], *([written(entry[c.key], c) for c in columns] for entry in entries)]
+    titles = ["regret, at most" if c.key == "regret" and _inexact(rows) else c.title for c in columns]
+    return [titles, *([written(entry[c.key], c) for c in columns] for entry in entries)]
 
 
 def written(number: Any, column: Column) -> str:

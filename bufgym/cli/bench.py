@@ -65,6 +65,8 @@ def _scenario(options: argparse.Namespace) -> None:
     options.decide_at = options.decide_at or "arrival"
     specs = policy_specs(options.policies) or policies.names(for_topics=False)
     chosen = [policies.get(spec) for spec in specs]
+    if options.decide_at == "overflow" and not options.policies:
+        chosen = [policy for policy in chosen if policy.privileged is None]  # see QueueTask.check
     form = options.format or ("parquet" if files.has_pyarrow() else "csv")
     stream, about = scenario(options)
     if options.out is not None:

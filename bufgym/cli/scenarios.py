@@ -98,7 +98,7 @@ def _interruption(options: argparse.Namespace, settings: dict[str, Any]) -> tupl
     law, t_min, t_max = interruption.law, interruption.t_min, interruption.t_max
     length = f"T = {t_max}" if law == "fixed" else f"T {law} on {t_min}..{t_max}"
     about = f"One interruption of T messages, {length}; V = {interruption.value.name} over frame indices."
-    return interruption, f"{about}\nMeans over {options.seeds} seeds. Regret = 1 - (QoI - 1) / oracle."
+    return interruption, f"{about}\nMeans over {options.seeds} seeds. Regret = 1 - QoI / the clairvoyant's."
 
 
 def _uplink(options: argparse.Namespace, settings: dict[str, Any]) -> tuple[Scenario, str]:

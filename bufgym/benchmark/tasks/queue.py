@@ -13,6 +13,7 @@ from bufgym.benchmark.table import percent, score
 from bufgym.benchmark.tasks import bound, timeline
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.benchmark.tuned import tuned
+from bufgym.errors import BufgymError
 from bufgym.policies import Policy, names
 from bufgym.scenario import Episode
 from bufgym.scenario.suites import Setting
@@ -41,6 +42,13 @@ class QueueTask(Task):
     def default_policies(self, suite: str) -> list[str]:
         """All that are not made for topics, as their sources have them, and the variants tuned on the suite."""
         return [*names(for_topics=False), *tuned(suite)]
+
+    def check(self, policy: Policy) -> None:
+        if policy.privileged is not None and self.decide_at != "arrival":
+            raise BufgymError(
+                f"policy {policy.name}: it plans for a sender that asks at every arrival, not with decide_at = "
+                f"{self.decide_at!r}; its H is an upper bound there"
+            )
 
     def play(
         self, policies: Sequence[Policy], scenario: Any, episodes: Sequence[Episode], capacity: int
