@@ -34,6 +34,7 @@ from bufgym.sim import (
     Batch,
     age_until,
     answer_send,
+    arrival_of,
     can_evict,
     can_hold,
     can_reject,
@@ -137,13 +138,14 @@ def write_observation(batch: Batch, i: int, output: StepOutput) -> None:
         output.action_mask[i, sender.capacity] = True
         return
     buffer = view(batch, i)
-    # When the socket asks there is no newcomer: the last arrival fills the argument and is not read.
-    arrival = batch.arrivals[i, min(sender.next, sender.arrivals - 1)]
     if sender.topics > 1:
         arriving = sender.waiting == ARRIVAL_WAITS
+        # When the socket asks there is no newcomer: the last arrival fills the argument and is not read.
+        arrival = batch.arrivals[i, min(sender.next, sender.arrivals - 1)]
         observe_topic_slots(buffer, arrival, arriving, output.slots[i])
         observe_topic_context(buffer, arrival, arriving, output.context[i])
     else:
+        arrival = arrival_of(batch, i)
         observe_slots(buffer, arrival, output.slots[i])
         observe_context(buffer, arrival, output.context[i])
     write_mask(batch, i, output.action_mask)
@@ -164,10 +166,11 @@ def write_mask(batch: Batch, i: int, action_mask: NDArray[np.bool_]) -> None:
         # The same as below, only faster.
         action_mask[i, : sender.occupancy] = True
         action_mask[i, sender.occupancy : capacity] = False
+        action_mask[i, capacity] = True
     else:
         for k in range(capacity):
             action_mask[i, k] = can_evict(batch, i, k)
-    action_mask[i, capacity] = can_reject(batch, i)
+        action_mask[i, capacity] = can_reject(batch, i)
     action_mask[i, capacity + 1] = has_room(batch, i)
 
 
