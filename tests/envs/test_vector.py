@@ -35,7 +35,7 @@ CASES: dict[str, tuple[Scenario, dict[str, Any]]] = {
     "topics in a window": (client(duration_s=0.6, window=3, round_trip_us=30_000), {"reward": "late"}),
 }
 L, N = 4, 3
-STEPS = 150 if JIT else 70
+STEPS = 150 if JIT else 90
 
 
 def vector(case: str, **more: Any) -> SenderVectorEnv:
