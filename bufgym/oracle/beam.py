@@ -3,7 +3,7 @@
 For each message a few *states* are kept: ways to send it last, each with the byte at which it ends, its gain, and the
 message and state before it. So the queue that a later arrival meets is known exactly: those messages of the state that
 have not begun by then. States are ranked by what they have gained, less what they paid, plus what the programme
-(``priced``) promises.
+(``programme``) promises.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 from bufgym.model.qoi import value
-from bufgym.oracle.priced import Problem, Programme, ends_too_early, waiting_cost
+from bufgym.oracle.programme import Problem, Room, waiting_cost
 
 
 class States(NamedTuple):
@@ -51,7 +51,13 @@ def new_states(messages: int, width: int) -> States:
 
 
 @kernel
-def search(p: Problem, d: Programme, states: States, plan: NDArray[np.int64]) -> tuple[int, float]:
+def ends_too_early(p: Problem, i: int, e: int, j: int) -> bool:
+    """Whether another message is worth sending between message i, which ends at byte e, and message j."""
+    return bool(p.between[j] > i and e <= p.idle[j])
+
+
+@kernel
+def search(p: Problem, room: Room, states: States, plan: NDArray[np.int64]) -> tuple[int, float]:
     """(length, gain) of the best plan found; its messages go to ``plan``, the last one first."""
     best_gain, best_message, best_state = 0.0, -1, -1
     for j in range(len(p.c)):
@@ -60,12 +66,12 @@ def search(p: Problem, d: Programme, states: States, plan: NDArray[np.int64]) ->
         if p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
             continue
         if p.between[j] < 0:
-            offer(p, d, states, j, -1, 0)
+            offer(p, room, states, j, -1, 0)
         for i in range(j - 1, -1, -1):
             if ends_too_early(p, i, states.latest[i], j):
                 break
             for w in range(states.used[i]):
-                offer(p, d, states, j, i, w)
+                offer(p, room, states, j, i, w)
         for w in range(states.used[j]):
             states.latest[j] = max(states.latest[j], states.end[j, w])
             if best_message < 0 or states.gain[j, w] > best_gain:
@@ -80,20 +86,20 @@ def search(p: Problem, d: Programme, states: States, plan: NDArray[np.int64]) ->
 
 
 @kernel
-def offer(p: Problem, d: Programme, states: States, j: int, i: int, w: int) -> None:
+def offer(p: Problem, room: Room, states: States, j: int, i: int, w: int) -> None:
     """Send message j after state ``w`` of message i (-1: first of all), if it finds room and is among the best."""
     e = states.end[i, w] if i >= 0 else 0
     s = max(e, p.c[j])
     if s - p.c[j] > p.limit[j] or s + p.size[j] > p.ends:
         return
-    if i >= 0 and (ends_too_early(p, i, e, j) or not has_room(p, states, i, w, j)):
+    if i >= 0 and (ends_too_early(p, i, e, j) or not has_room(p, room, states, i, w, j)):
         return
     added = value(p.v, p.x[j] - p.x[i]) if i >= 0 else 0.0
     net = added + (states.net[i, w] if i >= 0 else 0.0)
     if s > p.c[j]:
-        net -= waiting_cost(p, d, j, s // d.grid)
+        net -= waiting_cost(p, room, j, s // p.grid)
     end = s + p.size[j]
-    promise = net + d.future[j, end // d.grid - p.c[j] // d.grid]
+    promise = net + p.future[j, end // p.grid - p.c[j] // p.grid]
     k, width = states.used[j], states.end.shape[1]
     if k == width and promise <= states.promise[j, k - 1]:
         return
@@ -113,14 +119,14 @@ def offer(p: Problem, d: Programme, states: States, j: int, i: int, w: int) -> N
 
 
 @kernel
-def has_room(p: Problem, states: States, i: int, w: int, j: int) -> bool:
+def has_room(p: Problem, room: Room, states: States, i: int, w: int, j: int) -> bool:
     """Whether message j fits into the queue that state ``w`` of message i has left, by messages and by bytes."""
     queued, backlog = 1, p.size[j]
     # Messages began in the order in which they were sent: those that wait still are the last ones.
     while i >= 0 and states.end[i, w] - p.size[i] > p.c[j]:
         queued += 1
         backlog += p.size[i]
-        if queued > p.capacity or backlog > p.max_bytes:
+        if queued > room.capacity or backlog > room.max_bytes:
             return False
         i, w = states.parent[i, w, 0], states.parent[i, w, 1]
-    return queued <= p.capacity and backlog <= p.max_bytes
+    return queued <= room.capacity and backlog <= room.max_bytes

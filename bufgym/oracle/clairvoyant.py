@@ -24,7 +24,7 @@ from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
 from bufgym.model.qoi import Value
 from bufgym.oracle import labels, unequal
-from bufgym.oracle.priced import Problem
+from bufgym.oracle.programme import NEVER
 from bufgym.policies.registry import register
 from bufgym.scenario import Episode
 
@@ -56,10 +56,14 @@ def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | N
     ends = episode.link.carries_bytes
     if (size == size[0]).all():
         room = min(capacity, most_bytes // int(size[0]))
-        limit = np.full(n, room * size[0] if room else labels.NEVER)
+        limit = np.full(n, room * size[0] if room else NEVER)
         sent, gain = labels.best(c, size, limit, x, v.array, ends)
     else:
-        sent, gain = unequal.best(_unequal(c, size, x, v.array, ends, capacity, most_bytes))
+        limit = np.empty(n, np.int64)
+        _relaxed_limits(c, size, capacity, most_bytes, np.empty(n, np.int64), np.empty(capacity, np.int64), limit)
+        # Where no more bytes wait than the L smallest messages have, fewer than L wait.
+        certain = np.minimum(np.minimum(limit, np.sort(size)[:capacity].sum()), most_bytes - size)
+        sent, gain = unequal.best(c, size, limit, certain, x, v.array, ends, capacity, most_bytes)
     kept = np.zeros(n, np.bool_)
     kept[sent] = True
     qoi = 1.0 + gain if len(sent) else 0.0
@@ -69,25 +73,6 @@ def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | N
     undecided = ~kept
     undecided[episode.first_decision : episode.last_decision + 1] = False
     return Plan(qoi, kept, reached and fits and not undecided.any())
-
-
-def _unequal(
-    c: NDArray[np.int64],
-    size: NDArray[np.int64],
-    x: NDArray[np.float64],
-    v: NDArray[np.float64],
-    ends: int,
-    capacity: int,
-    max_bytes: int,
-) -> Problem:
-    """The episode for ``unequal``."""
-    n = len(c)
-    limit, between, idle = (np.empty(n, np.int64) for _ in range(3))
-    _relaxed_limits(c, size, capacity, max_bytes, np.empty(n, np.int64), np.empty(capacity, np.int64), limit)
-    # Where no more bytes wait than the L smallest messages have, fewer than L wait.
-    certain = np.minimum(np.minimum(limit, np.sort(size)[:capacity].sum()), max_bytes - size)
-    labels.find_idle(c, size, limit, certain, between, idle)
-    return Problem(c, size, limit, x, v, ends, between, idle, capacity, max_bytes)
 
 
 @kernel
@@ -127,7 +112,7 @@ def _relaxed_limits(
         if held > 0:
             limit[i] = min(limit[i], largest[0] + max_bytes - size[i])
         if size[i] > max_bytes:
-            limit[i] = labels.NEVER
+            limit[i] = NEVER
         reach[i] = max(reach[i - 1] if i > 0 else 0, c[i] + limit[i] + size[i])
 
 

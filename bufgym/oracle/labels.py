@@ -28,15 +28,10 @@ from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 from bufgym.model.qoi import value
-
-NEVER = -1
-"""As a limit: there is never room for the message."""
+from bufgym.oracle.programme import Problem, find_future, new_problem
 
 GRID = 16
 """Grid steps to a message."""
-
-MAX_CELLS = 1 << 23
-"""Entries of ``future`` at most (8 bytes each); a coarser grid then does."""
 
 SHARES = (1 / 16, 1 / 4, 1.0)
 """How far below the upper bound to look for the optimum: shares of the way down to a plan that is known."""
@@ -46,35 +41,6 @@ LABELS = 1 << 14
 
 _ROUNDING = 1e-9
 """Tolerance: the bounds add the same numbers in another order."""
-
-
-class Problem(NamedTuple):
-    """One episode as the kernels read it; arrays over messages.
-
-    Fields:
-        c: int64, bytes that the link can have carried when the message arrives.
-        size: int64, bytes of the message.
-        limit: int64, bytes that may still have to pass before it when it arrives, at most; or NEVER.
-        x: float64, coordinate of the message.
-        v: ``Value.array``.
-        ends: the link's last byte.
-        between: int64, the last message before it that could have been sent before it arrives; -1: none.
-        idle: int64, after a message before ``between`` that ends by this byte, ``between`` could be sent in time.
-        grid: bytes to a grid step.
-        future: float64[messages, steps], no plan gains more after message i, if that ends at byte
-            (c_i // grid + k) * grid or later.
-    """
-
-    c: NDArray[np.int64]
-    size: NDArray[np.int64]
-    limit: NDArray[np.int64]
-    x: NDArray[np.float64]
-    v: NDArray[np.float64]
-    ends: int
-    between: NDArray[np.int64]
-    idle: NDArray[np.int64]
-    grid: int
-    future: NDArray[np.float64]
 
 
 class Labels(NamedTuple):
@@ -105,12 +71,8 @@ def best(
 ) -> tuple[NDArray[np.int64], float]:
     """(messages of the best plan in order, its gain: H - 1)."""
     n = len(c)
-    furthest = max(0, int((limit + size).max()))
-    grid = max(1, int(size[0]) // GRID, furthest * n // MAX_CELLS)
-    between, idle, guide = np.empty((3, n), np.int64)
-    problem = Problem(c, size, limit, x, v, ends, between, idle, grid, np.zeros((n, furthest // grid + 2)))
-    find_idle(c, size, limit, limit, between, idle)
-    find_future(problem)
+    problem, guide = new_problem(c, size, limit, limit, x, v, ends, GRID), np.empty(n, np.int64)
+    find_future(problem, None)
     _, low = guided(problem, guide)
     high = most(problem)
     labels = no_labels(n)
@@ -155,52 +117,6 @@ def plan_of(labels: Labels) -> tuple[NDArray[np.int64], float]:
 
 
 # --- bounds ----------------------------------------------------------------------------------------------------------
-
-
-@kernel
-def find_idle(
-    c: NDArray[np.int64],
-    size: NDArray[np.int64],
-    limit: NDArray[np.int64],
-    certain: NDArray[np.int64],
-    between: NDArray[np.int64],
-    idle: NDArray[np.int64],
-) -> None:
-    """Fill ``between`` and ``idle`` (see ``Problem``); a message that waits for ``certain`` bytes surely finds room."""
-    for i in range(len(c)):
-        m = i - 1
-        while m >= 0 and (limit[m] < 0 or c[m] + size[m] > c[i]):
-            m -= 1
-        between[i] = m
-        idle[i] = min(c[i] - size[m], c[m] + certain[m]) if m >= 0 else -1
-
-
-@kernel
-def find_future(p: Problem) -> None:
-    """Fill ``future`` (zeros so far), from the last message back."""
-    n, steps = p.future.shape
-    for i in range(n - 1, -1, -1):
-        step_i, reach = p.c[i] // p.grid, p.c[i] + p.limit[i] + p.size[i]
-        top = min(steps, reach // p.grid - step_i + 1)
-        for j in range(i + 1, n):
-            low = 0
-            if p.between[j] > i:
-                if p.idle[j] >= reach:
-                    break  # ``between`` could be sent before every further message, too
-                low = max(0, p.idle[j] // p.grid - step_i)
-            if p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
-                continue
-            added = value(p.v, p.x[j] - p.x[i])
-            # Ends before c_j: the link is idle, and j begins when it arrives.
-            split = -(-p.c[j] // p.grid) - step_i
-            w = added + p.future[j, (p.c[j] + p.size[j]) // p.grid - p.c[j] // p.grid]
-            for k in range(low, min(split, top)):
-                p.future[i, k] = max(p.future[i, k], w)
-            # Later ends: j begins there.
-            last = min(p.c[j] + p.limit[j], p.ends - p.size[j]) // p.grid - step_i
-            shift = step_i + p.size[j] // p.grid - p.c[j] // p.grid
-            for k in range(max(low, split), min(top, last + 1)):
-                p.future[i, k] = max(p.future[i, k], added + p.future[j, k + shift])
 
 
 @kernel

@@ -1,9 +1,21 @@
 """Messages of unequal sizes: a good plan, and an upper bound that is close to it.
 
-The bound comes from the priced programme (``priced``), the plan from a beam search that the programme guides
-(``beam``). Prices follow the subgradient (Held, Wolfe and Crowder, Mathematical Programming 6, 1974): they rise where
-the programme's own plan queues too much and fall where it leaves room, in steps of Polyak's length towards the best
-plan known, which are halved when the bound stands still. Every round gives a bound; the least of all is returned.
+With unequal sizes the room left at an arrival depends on which messages wait, which a label (end, gain) cannot carry.
+So room gets a price (Lagrangian relaxation: Fisher, Management Science 27(1), 1981). A message that waits while message
+i arrives pays ``price_i``; in return every plan receives L x the sum of all prices. For any prices >= 0
+
+    max over all plans of  gain + sum over i of price_i (L - messages queued after arrival i)
+
+is an upper bound of the best plan's gain: a plan that keeps to L loses nothing by it. What message j pays depends only
+on the byte at which it begins, as it waits during the arrivals j, j + 1, ... whose byte lies before that one. So the
+``programme`` finds the maximum. Under a byte limit B the bytes that wait are priced likewise. As in ``labels``, leaving
+a message out while the link is idle is never worth it; here that is used only where the message finds room whichever
+messages wait.
+
+The plan comes from a beam search (``beam``) that the programme guides. Prices follow the subgradient (Held, Wolfe and
+Crowder, Mathematical Programming 6, 1974): they rise where the programme's own plan queues too much and fall where it
+leaves room, in steps of Polyak's length towards the best plan known, which are halved when the bound stands still.
+Every round gives a bound; the least of all is returned.
 """
 
 from __future__ import annotations
@@ -11,10 +23,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.kernel import kernel
 from bufgym.model.buffer import UNLIMITED_BYTES
+from bufgym.model.qoi import value
 from bufgym.oracle import beam
-from bufgym.oracle.labels import MAX_CELLS
-from bufgym.oracle.priced import Problem, Programme, count_queued, find_future, follow
+from bufgym.oracle.programme import Problem, Room, find_future, new_problem, waiting_cost
 
 ROUNDS = 40
 """Price updates at most."""
@@ -28,25 +41,36 @@ WIDTH, LAST_WIDTH = 8, 64
 """States a message in the beam, likewise."""
 
 
-def best(p: Problem) -> tuple[NDArray[np.int64], float]:
+def best(
+    c: NDArray[np.int64],
+    size: NDArray[np.int64],
+    limit: NDArray[np.int64],
+    certain: NDArray[np.int64],
+    x: NDArray[np.float64],
+    v: NDArray[np.float64],
+    ends: int,
+    capacity: int,
+    max_bytes: int,
+) -> tuple[NDArray[np.int64], float]:
     """(messages of a plan that keeps to L and B, in order; an upper bound of any such plan's gain, H - 1)."""
-    n = len(p.c)
-    byte_limit = p.max_bytes < UNLIMITED_BYTES
-    room = np.array([[p.capacity], [p.max_bytes if byte_limit else 0]], np.float64)
+    n = len(c)
+    byte_limit = max_bytes < UNLIMITED_BYTES
+    rooms = np.array([[capacity], [max_bytes if byte_limit else 0]], np.float64)
     # A step in the price of a byte is to that of a message as a byte to a mean message.
-    scale = np.array([[1.0], [1 / p.size.mean() if byte_limit else 0.0]])
+    scale = np.array([[1.0], [1 / size.mean() if byte_limit else 0.0]])
     prices, kept_prices, queued = np.zeros((2, n)), np.zeros((2, n)), np.empty((2, n))
     message, begin, work = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     plan, plan_gain, bound = np.zeros(0, np.int64), 0.0, np.inf
     step, waited = 1.0, 0
+    p = new_problem(c, size, limit, certain, x, v, ends, GRID)
     states = beam.new_states(n, WIDTH)
     for _ in range(ROUNDS):
-        d = _programme(p, prices, GRID)
-        length, gain = beam.search(p, d, states, work)
+        room = _priced(p, prices, capacity, max_bytes)
+        length, gain = beam.search(p, room, states, work)
         if gain > plan_gain or not len(plan):
             plan, plan_gain = work[:length][::-1].copy(), gain
-        length, gain = follow(p, d, message, begin)
-        total = gain + float((room * prices).sum())
+        length, gain = follow(p, room, message, begin)
+        total = gain + float((rooms * prices).sum())
         waited = 0 if total < bound * (1 - ENOUGH / 10) else waited + 1
         if total < bound:
             bound, kept_prices = total, prices
@@ -55,27 +79,82 @@ def best(p: Problem) -> tuple[NDArray[np.int64], float]:
         if waited >= PATIENCE:
             step, waited = step / 2, 0
         count_queued(p, message, begin, length, queued)
-        slope = (queued - room) * scale
+        slope = (queued - rooms) * scale
         slope[(prices <= 0) & (slope < 0)] = 0.0
         squares = float(np.square(slope).sum())
         if squares == 0:
             break
         prices = np.maximum(0.0, prices + step * (total - plan_gain) / squares * slope * scale)
-    d = _programme(p, kept_prices, FINE_GRID)
-    length, gain = beam.search(p, d, beam.new_states(n, LAST_WIDTH), work)
+    p = new_problem(c, size, limit, certain, x, v, ends, FINE_GRID)
+    room = _priced(p, kept_prices, capacity, max_bytes)
+    length, gain = beam.search(p, room, beam.new_states(n, LAST_WIDTH), work)
     if gain > plan_gain:
         plan, plan_gain = work[:length][::-1].copy(), gain
-    _, gain = follow(p, d, message, begin)
-    return plan, max(plan_gain, min(bound, gain + float((room * kept_prices).sum())))
+    _, gain = follow(p, room, message, begin)
+    return plan, max(plan_gain, min(bound, gain + float((rooms * kept_prices).sum())))
 
 
-def _programme(p: Problem, prices: NDArray[np.float64], steps: int) -> Programme:
-    """The programme under ``prices`` [2, messages], filled, with so many grid ``steps`` to a mean message."""
-    n, furthest = len(p.c), max(0, int((p.limit + p.size).max()))
-    grid = max(1, int(p.size.mean()) // steps, furthest * n // MAX_CELLS)
+def _priced(p: Problem, prices: NDArray[np.float64], capacity: int, max_bytes: int) -> Room:
+    """Room at these prices [2, messages]; fills the programme's ``future`` under them."""
     before = np.concatenate([np.zeros((2, 1)), np.cumsum(prices, axis=1)], axis=1)
-    positions = np.arange((int(p.c[-1]) + furthest) // grid + 3) * grid
-    price = np.ascontiguousarray(before[:, np.searchsorted(p.c, positions, side="left")])
-    d = Programme(grid, price, before, np.empty((n, furthest // grid + 3)))
-    find_future(p, d)
-    return d
+    positions = np.arange(int(p.c[-1]) // p.grid + p.future.shape[1] + 1) * p.grid
+    until = np.ascontiguousarray(before[:, np.searchsorted(p.c, positions, side="left")])
+    room = Room(capacity, max_bytes, until, before)
+    p.future[:] = 0.0
+    find_future(p, room)
+    return room
+
+
+@kernel
+def follow(p: Problem, room: Room, message: NDArray[np.int64], begin: NDArray[np.int64]) -> tuple[int, float]:
+    """(length, gain less prices) of the programme's own best plan, which need not keep to the room.
+
+    ``message`` and ``begin``, the byte at which each begins: int64[messages], filled up to the length.
+    """
+    n, length, i, step, total = len(p.c), 0, -1, 0, 0.0
+    while True:
+        best, chosen, s = 0.0, -1, 0
+        for j in range(i + 1, n):
+            if i >= 0 and p.between[j] > i:
+                if p.idle[j] >= p.c[i] + p.limit[i] + p.size[i]:
+                    break
+                if step < p.idle[j] // p.grid:
+                    continue
+            if p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
+                continue
+            begins, w = p.c[j], 0.0
+            if step < -(-p.c[j] // p.grid):
+                w = p.future[j, (p.c[j] + p.size[j]) // p.grid - p.c[j] // p.grid]
+            elif step <= min(p.c[j] + p.limit[j], p.ends - p.size[j]) // p.grid:
+                begins = step * p.grid
+                w = p.future[j, step + p.size[j] // p.grid - p.c[j] // p.grid] - waiting_cost(p, room, j, step)
+            else:
+                continue
+            if i >= 0:
+                w += value(p.v, p.x[j] - p.x[i])
+            if w > best or (i < 0 and chosen < 0):
+                best, chosen, s = w, j, begins
+        if i < 0:
+            total = best
+        if chosen < 0:
+            return length, total
+        message[length], begin[length] = chosen, s
+        length += 1
+        # Ends are rounded down, as in ``future``.
+        waited = step >= -(-p.c[chosen] // p.grid)
+        step = step + p.size[chosen] // p.grid if waited else (p.c[chosen] + p.size[chosen]) // p.grid
+        i = chosen
+
+
+@kernel
+def count_queued(
+    p: Problem, message: NDArray[np.int64], begin: NDArray[np.int64], length: int, queued: NDArray[np.float64]
+) -> None:
+    """``queued``, float64[2, messages]: messages, and bytes, that this plan has in the queue after each arrival."""
+    queued[:, :] = 0.0
+    for k in range(length):
+        j = message[k]
+        while j < len(p.c) and p.c[j] < begin[k]:
+            queued[0, j] += 1.0
+            queued[1, j] += p.size[message[k]]
+            j += 1

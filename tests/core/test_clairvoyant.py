@@ -17,7 +17,7 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.oracle import clairvoyant, integer, labels
+from bufgym.oracle import clairvoyant, integer, labels, programme
 from bufgym.scenario import Episode, Interruption, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
@@ -292,7 +292,7 @@ def test_it_is_exact_to_the_byte(seed, equal, v):
     n, unit = int(rng.integers(1, 13)), int(rng.integers(1, 5))
     c = np.cumsum(rng.integers(0, 2 * unit + 1, n))
     size = np.full(n, unit) if equal else rng.integers(1, 2 * unit + 1, n)
-    limit = np.full(n, unit * rng.integers(1, 4)) if equal else rng.choice([labels.NEVER, 0, 1, 3, 9], n)
+    limit = np.full(n, unit * rng.integers(1, 4)) if equal else rng.choice([programme.NEVER, 0, 1, 3, 9], n)
     x = np.cumsum(rng.integers(0, 9, n) / 8)
     ends = int(rng.choice([2**62, c[-1] + rng.integers(-3, 4 * unit)]))
     problem = [part.tolist() for part in (c, size, limit, x)]
@@ -317,8 +317,8 @@ def middling(seed: int, n: int):
 def without_bounds(c, size, limit, x, v, ends) -> float:
     """The gain of the best of all labels, none left out for leading nowhere."""
     work, steps = np.empty((2, len(c)), np.int64), (limit + size).max() // 1_000 + 2
-    p = labels.Problem(c, size, limit, x, v, ends, work[0], work[1], 1_000, np.zeros((len(c), steps)))
-    labels.find_idle(p.c, p.size, p.limit, p.limit, p.between, p.idle)
+    p = programme.Problem(c, size, limit, x, v, ends, work[0], work[1], 1_000, np.zeros((len(c), steps)))
+    programme.find_idle(p.c, p.size, p.limit, p.limit, p.between, p.idle)
     return labels.plan_of(labels.fill(p, -np.inf, labels.no_labels(len(c))))[1]
 
 
@@ -336,7 +336,7 @@ def test_bounds_lose_nothing(grid, monkeypatch):
 def test_a_coarse_grid_loses_nothing(monkeypatch):
     problems = [middling(seed, 60 if JIT else 20) for seed in MIDDLING]
     fine = [labels.best(*problem)[1] for problem in problems]
-    monkeypatch.setattr(labels, "MAX_CELLS", 64)
+    monkeypatch.setattr(programme, "MAX_CELLS", 64)
     assert [labels.best(*problem)[1] for problem in problems] == pytest.approx(fine, abs=EXACT)
 
 
