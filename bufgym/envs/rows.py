@@ -188,9 +188,11 @@ class Rows:
 
     def observation(self, slots: NDArray[np.float32], context: NDArray[np.float32]) -> Observation:
         """The Dict observation whose arrays are views of ``slots`` and ``context``, batched or one row."""
-        observation = {name: slots[..., k, :] for name, k in self._slot_columns}
+        # Walked over with the fields' axis first, a view costs half of what an index costs.
+        by_slot, by_context = list(slots.swapaxes(0, -2)), list(context.T[..., np.newaxis])
+        observation = {name: by_slot[k] for name, k in self._slot_columns}
         for name, k in self._context_columns:
-            observation[name] = context[..., k : k + 1]
+            observation[name] = by_context[k]
         return observation
 
     def bad_action(self, name: str, action: Any) -> BufgymError:
