@@ -7,9 +7,13 @@ check the compiled code against its own text.
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import hashlib
 import os
 import shutil
+import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -17,6 +21,7 @@ from typing import Any, TypeVar, cast
 import numba
 import numba.extending
 import numpy as np
+from numba.core import caching
 from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -32,23 +37,55 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False, "forceinline":
 _PACKAGE = Path(__file__).resolve().parent
 
 
+def _sources() -> dict[Path, bytes]:
+    """Every source that compiled code rests on: those with kernels, and the modules whose names they import."""
+    texts = {path.relative_to(_PACKAGE): path.read_bytes() for path in sorted(_PACKAGE.rglob("*.py"))}
+    sources = {path: text for path, text in texts.items() if b"bufgym.kernel import" in text}
+    for text in list(sources.values()):
+        for line in text.decode().split("\nfrom bufgym")[1:]:
+            module, names = line.split(" import ", 1)
+            place = Path(*module.split("."))
+            names = names[1 : names.index(")")] if names.startswith("(") else names.split("\n", 1)[0]
+            files = [place / f"{name.strip()}.py" for name in names.split(",")]
+            for file in (place.with_suffix(".py") if place.name else place, place / "__init__.py", *files):
+                if file in texts:
+                    sources[file] = texts[file]
+    return sources
+
+
+def _writable(folder: Path) -> bool:
+    """Whether files can be written there, or the folder be made."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+def _temporary_folder() -> Path:
+    """A folder for this process and those that it starts. Its name cannot be foreseen: what lies there is run."""
+    folder = tempfile.mkdtemp(prefix="bufgym-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ["NUMBA_CACHE_DIR"] = folder
+    print(
+        "bufgym: compiled code cannot be kept, as neither the package nor the cache folder can be written; "
+        "set NUMBA_CACHE_DIR to a folder that can",
+        file=sys.stderr,
+    )
+    return Path(folder)
+
+
 def _cache_folder() -> str:
     """A folder for machine code that is valid for exactly this state of the package's sources.
 
     Numba renews a cached kernel when its own file changes but not when a kernel that it calls does. One folder for
     each state of all the sources keeps a stale callee from living on inside its caller.
     """
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     if os.environ.get("NUMBA_CACHE_DIR"):
         parent = Path(os.environ["NUMBA_CACHE_DIR"])
-    elif os.access(_PACKAGE, os.W_OK):
-        parent = _PACKAGE / "__pycache__"
     else:
-        parent = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "bufgym"
-    state = hashlib.sha256()
-    for path in sorted(_PACKAGE.rglob("*.py")):
-        source = path.read_bytes()
-        if b"bufgym.kernel import" in source:
-            state.update(source)
+        places = _PACKAGE / "__pycache__", Path(home) / "bufgym"
+        parent = next((place for place in places if _writable(place)), None) or _temporary_folder()
+    state = hashlib.sha256(b"".join(source for _, source in sorted(_sources().items())))
     folder = parent / f"kernels-{state.hexdigest()[:12]}"
     if not folder.exists():
         # Earlier states are useless, but a running process may still be writing into the latest ones.
@@ -57,17 +94,40 @@ def _cache_folder() -> str:
     return str(folder)
 
 
+class _CodeFiles(caching.IndexDataCacheFile):
+    """Numba's files of one kernel's machine code. Damaged ones are compiled anew; where none can be kept, none is."""
+
+    def load(self, key: Any) -> Any:
+        """The code compiled for ``key``; None if there is none."""
+        try:
+            return cast(Any, super()).load(key)
+        except Exception:  # a file cut short ends in many kinds of error
+            return None
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep the code compiled for ``key``."""
+        with contextlib.suppress(OSError):
+            cast(Any, super()).save(key, data)
+
+    def _load_index(self) -> Any:
+        try:
+            return cast(Any, super())._load_index()
+        except Exception:
+            return {}
+
+
 _FOLDER = _cache_folder() if JIT else ""
 
 
 def _compile(function: Callable[..., Any], *signature: Any) -> Any:
-    # Numba reads the folder when the decorator runs; other packages' caches stay where they were.
-    config, njit = cast(Any, numba.config), cast(Any, numba.njit)
-    before, config.CACHE_DIR = config.CACHE_DIR, _FOLDER or config.CACHE_DIR
+    # Numba reads the folder and makes the files' object when the decorator runs; other packages' stay as they were.
+    config, njit, module = cast(Any, numba.config), cast(Any, numba.njit), cast(Any, caching)
+    before = config.CACHE_DIR, module.IndexDataCacheFile
+    config.CACHE_DIR, module.IndexDataCacheFile = _FOLDER or config.CACHE_DIR, _CodeFiles
     try:
         return njit(*signature, cache=True, **_OPTIONS)(function)
     finally:
-        config.CACHE_DIR = before
+        config.CACHE_DIR, module.IndexDataCacheFile = before
 
 
 def kernel(function: Function) -> Function:

@@ -1,0 +1,78 @@
+"""Where compiled code is kept: it rests on the sources as they are, and neither damage nor a lack of room is fatal."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bufgym import kernel
+from tests.conftest import COMPILED
+
+TALE = """
+import os
+{before}
+from bufgym.kernel import kernel
+
+@kernel
+def double(k):
+    return k + k
+
+print(double(21))
+"""
+
+
+def run(tmp_path: Path, before: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a module with one kernel."""
+    file = tmp_path / "tale.py"
+    file.write_text(TALE.format(before=before))
+    done = subprocess.run(
+        [sys.executable, str(file)],
+        env={**os.environ, "PYTHONPATH": str(Path(kernel.__file__).parents[1]), **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "42\n"
+    return done
+
+
+def test_code_rests_on_the_constants_that_kernels_import() -> None:
+    sources = {str(path) for path in kernel._sources()}
+    assert {"sim/decisions.py", "observe/fields.py", "model/checks.py", "kernel.py"} <= sources | {"kernel.py"}
+    assert "cli/bench.py" not in sources
+
+
+needs_compilation = pytest.mark.skipif(not COMPILED, reason="nothing is kept without compilation")
+
+
+@needs_compilation
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+@pytest.mark.parametrize("left", [0.0, 0.5], ids=["empty", "half"])
+def test_damaged_code_is_compiled_anew(tmp_path: Path, ending: str, left: float) -> None:
+    run(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "code"))
+    (file,) = (tmp_path / "code").rglob(f"*.{ending}")
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(left * len(whole))])
+    assert run(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
+    assert len(file.read_bytes()) >= len(whole) - 8
+
+
+@needs_compilation
+def test_where_no_folder_can_be_written_a_temporary_one_serves(tmp_path: Path) -> None:
+    nowhere = "import os; os.environ.pop('NUMBA_CACHE_DIR', None); os.access = lambda *_: False"
+    done = run(tmp_path, before=nowhere, TMPDIR=str(tmp_path))
+    assert done.stderr.startswith("bufgym: compiled code cannot be kept")
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.glob("bufgym-*"))  # removed at the end
+
+
+@needs_compilation
+def test_a_full_disk_keeps_no_code(tmp_path: Path) -> None:
+    full = "import numba.core.caching as c\ndef full(*_): raise OSError(28, 'no space left')\n"
+    run(tmp_path, before=full + "c.IndexDataCacheFile._save_data = full", NUMBA_CACHE_DIR=str(tmp_path / "code"))
+    assert not list((tmp_path / "code").rglob("*.nbc"))
