@@ -8,6 +8,7 @@ from __future__ import annotations
 from agents.runs import prepare
 from agents.settings import Settings
 from bufgym.errors import BufgymError
+from bufgym.files import locked
 
 
 def main(settings: Settings | None = None) -> None:
@@ -21,7 +22,8 @@ def main(settings: Settings | None = None) -> None:
         # Only once the settings are known to be good: torch takes seconds to load.
         from agents import report, training
 
-        report.report(settings, folder, training.train_all(settings, folder))
+        with locked(folder):
+            report.report(settings, folder, training.train_all(settings, folder))
     except BufgymError as error:
         raise SystemExit(f"error: {error}") from None
     except OSError as error:

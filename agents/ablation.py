@@ -8,10 +8,8 @@ Oldest, whichever is better (``objectives.queue.SuiteObjective``). ``--runs runs
 
 from __future__ import annotations
 
-import concurrent.futures
 import itertools
 import json
-import multiprocessing
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -25,7 +23,7 @@ from agents.evaluation import ValidationSets
 from agents.objectives.objective import to_vector
 from agents.objectives.queue import EPISODES, suite_objectives
 from agents.page import columns_of, command, publish, table
-from agents.runs import MODEL, RUNS, prepare, read_settings
+from agents.runs import MODEL, RUNS, pool_of, prepare, read_settings
 from agents.settings import MOTION, Settings
 from bufgym import policies
 from bufgym.policies import weights
@@ -138,8 +136,7 @@ def train_variants(by_name: Mapping[str, Settings], seeds: int) -> dict[str, lis
     for variant in others:  # all meet the same validation episodes, whose bounds are found once
         if not (RUNS / variant.name).exists():
             shutil.copytree(validation, prepare(variant) / "validation")
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
+    with pool_of(os.cpu_count() or 1) as pool:
         jobs = {
             name: [pool.submit(trained, variant, seed) for seed in range(seeds)] for name, variant in by_name.items()
         }

@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,9 @@ import numpy as np
 from tqdm import tqdm
 
 from agents.settings import Settings
+from bufgym.benchmark.cluster import end_with
 from bufgym.errors import BufgymError
+from bufgym.files import locked, replaced
 
 RUNS = Path("runs")
 MODEL = "model.safetensors"
@@ -75,20 +78,22 @@ def prepare(settings: Settings) -> Path:
     """The run's folder: made for a new run, checked against these settings for one that goes on."""
     settings.checked()
     folder = RUNS / (settings.name or _default_name(settings.resume))
-    file = folder / "settings.json"
-    values = dataclasses.asdict(settings)
     if settings.resume:
-        if not file.exists():
+        if not (folder / "settings.json").exists():
             raise BufgymError(f"--resume: there is no run in {folder}")
-        before = read_settings(folder)
-        changed = [name for name in values if name not in FREE and before.get(name) != values[name]]
-        if changed:
-            changes = ", ".join(f"{name} was {before.get(name)!r}, now {values[name]!r}" for name in changed)
-            raise BufgymError(f"--resume: give the settings that the run in {folder} began with: {changes}")
     elif folder.exists():
         raise BufgymError(f"{folder} exists: choose another --name, or --resume it")
     folder.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps({"command": settings.command, **values}, indent=2) + "\n", encoding="utf-8")
+    with locked(folder):
+        values = dataclasses.asdict(settings)
+        if settings.resume:
+            before = read_settings(folder)
+            changed = [name for name in values if name not in FREE and before.get(name) != values[name]]
+            if changed:
+                changes = ", ".join(f"{name} was {before.get(name)!r}, now {values[name]!r}" for name in changed)
+                raise BufgymError(f"--resume: give the settings that the run in {folder} began with: {changes}")
+        with replaced(folder / "settings.json") as file:
+            file.write_text(json.dumps({"command": settings.command, **values}, indent=2) + "\n", encoding="utf-8")
     return folder
 
 
@@ -118,6 +123,12 @@ def _default_name(resume: bool) -> str:
     return f"train-{max(numbers, default=0) + (0 if resume and numbers else 1)}"
 
 
+def pool_of(workers: int) -> concurrent.futures.ProcessPoolExecutor:
+    """So many processes, which end when this one does. Fresh interpreters: torch's threads do not survive a fork."""
+    context = multiprocessing.get_context("spawn")
+    return concurrent.futures.ProcessPoolExecutor(workers, context, end_with, (os.getpid(),))
+
+
 def each_seed(train: Callable[[Settings, Path, int, int], Run], settings: Settings, folder: Path) -> list[Run]:
     """``train`` (settings, the run's folder, seed, line of its progress bar) for every seed, a process each."""
     seeds = range(settings.seed, settings.seed + settings.seeds)
@@ -126,12 +137,23 @@ def each_seed(train: Callable[[Settings, Path, int, int], Run], settings: Settin
         write_notes(folder / f"seed-{seed}", settings, [seed])
     if len(seeds) == 1:
         return [train(settings, folder, seeds[0], 0)]
-    workers = min(len(seeds), os.cpu_count() or 1)
-    # A fresh interpreter each: torch's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-        jobs = [pool.submit(train, settings, folder, seed, line) for line, seed in enumerate(seeds)]
-        return [job.result() for job in jobs]
+    waiting = list(seeds)
+    runs: dict[int, Run] = {}
+    while waiting:
+        with pool_of(min(len(waiting), os.cpu_count() or 1)) as pool:
+            jobs = {seed: pool.submit(train, settings, folder, seed, seed - seeds[0]) for seed in waiting}
+            before = len(waiting)
+            for seed, job in jobs.items():
+                try:
+                    runs[seed] = job.result()
+                except BrokenProcessPool:
+                    continue
+                waiting.remove(seed)
+        if len(waiting) == before:
+            raise BufgymError("a seed's process ended before its training did (killed, or out of memory?); --resume it")
+        if waiting:
+            print(f"a seed's process ended before its training did: {len(waiting)} seeds go on", file=sys.stderr)
+    return [runs[seed] for seed in seeds]
 
 
 # --- a seed's curves -------------------------------------------------------------------------------------------------

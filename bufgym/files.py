@@ -72,6 +72,31 @@ def replaced(target: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """``folder`` is this process's alone while the block runs; a kill releases it.
+
+    Raises BufgymError: another process holds it.
+    """
+    from filelock import FileLock, Timeout
+
+    file = folder / ".lock"
+    lock = FileLock(file, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        rule = "wait until it has ended, or choose another folder"
+        raise BufgymError(f"{folder}: another process is writing there; {rule}") from None
+    except PermissionError:  # nor can anybody write there
+        yield
+        return
+    try:
+        yield
+    finally:
+        file.unlink(missing_ok=True)
+        lock.release()
+
+
 def shipped(inside: str, checkout: str, pattern: str) -> dict[str, Path]:
     """Stem -> path of the files that come with bufgym; empty where there are none.
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import itertools
+import os
+import threading
+import time
 from collections.abc import Iterable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
@@ -13,12 +18,38 @@ from bufgym.errors import BufgymError
 BACKENDS = ("loky", "threading", "sequential", "ray", "dask")
 
 
+PATIENCE_S = 1.0
+"""How often a worker looks whether the process that began it is still there."""
+
+
+@functools.cache
+def end_with(parent: int) -> None:
+    """From now on this process, if ``parent`` (a process number) began it, ends soon after that has ended.
+
+    A parent that is killed takes none of its workers along: they would hold its pipes and files for minutes.
+    """
+    if os.getppid() == parent:
+        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(PATIENCE_S)
+    os._exit(1)
+
+
+class WorkerDiedError(BufgymError):
+    """A worker process ended in the middle of its work: killed, out of memory, or crashed by compiled code."""
+
+
 def spread(
     calls: Iterable[tuple[Any, tuple[Any, ...]]], count: int, jobs: int, backend: str, address: str | None
 ) -> Iterator[Any]:
     """The results of these (function, arguments), ``count`` at most, in the order in which they become ready.
 
     ``address``: of the head of the Ray or Dask cluster; None: one on this machine, begun and ended here.
+
+    Raises WorkerDiedError: what other workers had not handed over by then is lost.
     """
     joblib = _imported("joblib", "bench")
     wrapped = (joblib.delayed(function)(*arguments) for function, arguments in calls)
@@ -28,7 +59,12 @@ def spread(
         at_once = 4 * joblib.effective_n_jobs(jobs) if ray else count
         for _ in range(0, count, at_once):
             some = itertools.islice(wrapped, at_once)
-            yield from joblib.Parallel(n_jobs=jobs, return_as="list" if ray else "generator_unordered")(some)
+            try:
+                yield from joblib.Parallel(n_jobs=jobs, return_as="list" if ray else "generator_unordered")(some)
+            except BrokenProcessPool:
+                raise WorkerDiedError(
+                    "a worker process ended before its work did (killed, or out of memory?)"
+                ) from None
 
 
 @contextmanager

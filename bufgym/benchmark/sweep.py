@@ -12,7 +12,9 @@ import datetime
 import hashlib
 import importlib.util
 import itertools
+import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,6 +27,7 @@ from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
 from bufgym.benchmark.run import bar, by_trace, check_distinct, run
 from bufgym.benchmark.tasks import Task
 from bufgym.errors import BufgymError, line_in
+from bufgym.files import locked
 from bufgym.scenario import suites
 from bufgym.scenario.suites import Setting
 
@@ -128,6 +131,9 @@ class Shard:
         return f"{self.label}-{self.trace}-{self.seeds[0]}"
 
 
+_TRIES = 3
+"""So many times in a row a worker may die without a shard finished."""
+
 _LOADED: set[str] = set()
 """Policy files that this process has run for a shard."""
 
@@ -142,8 +148,9 @@ def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
     return run(sweep.policies, scenario, sweep.capacities, shard.seeds, label=shard.label)
 
 
-def _attempt(number: int, shard: Shard, load: Load | None) -> tuple[int, list[Row] | Exception]:
+def _attempt(number: int, shard: Shard, load: Load | None, parent: int) -> tuple[int, list[Row] | Exception]:
     """The shard's number and its rows, or what went wrong: joblib throws finished shards away when one raises."""
+    cluster.end_with(parent)
     try:
         return number, run_shard(shard, load)
     except BufgymError as error:
@@ -193,27 +200,29 @@ def run_sweep(
     form = form or _form(out)
     whole, parts = out / f"rows.{form}", out / "parts"
     shards = sweep.shards()
-    manifest.claim(out, _manifest(sweep, shards, command))
-    if whole.exists():
-        rows = read_rows(whole, layout)
-    else:
-        parts.mkdir(exist_ok=True)
-        files = [parts / f"{shard.name}.{form}" for shard in shards]
-        missing = [(shard, file) for shard, file in zip(shards, files, strict=True) if not file.exists()]
-        with bar(len(shards), progress, unit="shard", done=len(shards) - len(missing)) as advance:
-            for k, part in _spread([shard for shard, _ in missing], jobs, backend, address, load):
-                write_rows(part, missing[k][1], layout)
-                advance(1)
-        rows = [row for shard, file in zip(shards, files, strict=True) for row in _read(file, shard)]
-        write_rows(rows, whole, layout)
-    if not (out / "timeline.json").exists():
-        example = sweep.task.example(
-            sweep.policies, rows, lambda row: sweep.setting(row["scenario"], row["seed"] // SEEDS_PER_TRACE)
-        )
-        if example is not None:
-            manifest.write_json(out / "timeline.json", example)
-    shutil.rmtree(parts, ignore_errors=True)
-    return rows
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out):
+        manifest.claim(out, _manifest(sweep, shards, command))
+        if whole.exists():
+            rows = read_rows(whole, layout)
+        else:
+            parts.mkdir(exist_ok=True)
+            files = [parts / f"{shard.name}.{form}" for shard in shards]
+            missing = [(shard, file) for shard, file in zip(shards, files, strict=True) if not file.exists()]
+            with bar(len(shards), progress, unit="shard", done=len(shards) - len(missing)) as advance:
+                for k, part in _spread([shard for shard, _ in missing], jobs, backend, address, load):
+                    write_rows(part, missing[k][1], layout)
+                    advance(1)
+            rows = [row for shard, file in zip(shards, files, strict=True) for row in _read(file, shard)]
+            write_rows(rows, whole, layout)
+        if not (out / "timeline.json").exists():
+            example = sweep.task.example(
+                sweep.policies, rows, lambda row: sweep.setting(row["scenario"], row["seed"] // SEEDS_PER_TRACE)
+            )
+            if example is not None:
+                manifest.write_json(out / "timeline.json", example)
+        shutil.rmtree(parts, ignore_errors=True)
+        return rows
 
 
 def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, Any]:
@@ -288,9 +297,10 @@ def _read(file: Path, shard: Shard) -> list[Row]:
 def _spread(
     shards: Sequence[Shard], jobs: int, backend: str, address: str | None, load: Load | None
 ) -> Iterator[tuple[int, list[Row]]]:
-    """(number, rows) of each shard, as they become ready; after an error no further ones are begun."""
-    if not shards:
-        return
+    """(number, rows) of each shard, as they become ready; after an error no further ones are begun.
+
+    Where a worker dies, what is not there yet is run again, as long as that brings it nearer to its end.
+    """
     if backend == "sequential" or (backend == "loky" and jobs == 1):
         for k, shard in enumerate(shards):
             yield k, run_shard(shard)
@@ -298,11 +308,22 @@ def _spread(
     if backend == "threading":
         load = None  # this process has run the policy file
     failed: list[Exception] = []
-    calls = ((_attempt, (k, u, load)) for k, u in itertools.takewhile(lambda _: not failed, enumerate(shards)))
-    for k, result in cluster.spread(calls, len(shards), jobs, backend, address):
-        if isinstance(result, Exception):
-            failed.append(result)
-        else:
-            yield k, result
+    waiting, vain = dict(enumerate(shards)), 0
+    while waiting and not failed:
+        now = itertools.takewhile(lambda _: not failed, list(waiting.items()))
+        calls = ((_attempt, (k, shard, load, os.getpid())) for k, shard in now)
+        before = len(waiting)
+        try:
+            for k, result in cluster.spread(calls, before, jobs, backend, address):
+                if isinstance(result, Exception):
+                    failed.append(result)
+                else:
+                    del waiting[k]
+                    yield k, result
+        except cluster.WorkerDiedError as error:
+            vain = vain + 1 if len(waiting) == before else 0
+            if vain == _TRIES:
+                raise
+            print(f"bufgym: {error}; {len(waiting)} shards are run again", file=sys.stderr)
     if failed:
         raise failed[0]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,18 @@ from bufgym.cli import main
 
 THREE = ("afr", "random", "drop-oldest")
 TINY = Sweep("interruption-v1", THREE, capacities=(2, 4), seeds=3)
+
+
+def bufgym(*words: object, **environment: str) -> subprocess.Popen[str]:
+    """The command in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "bufgym", *map(str, words)],
+        env=os.environ | environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
 
 
 def contents(folder: Path) -> dict[str, tuple[bytes, int]]:

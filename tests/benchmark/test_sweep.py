@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sweep_cases import THREE, TINY, contents, interrupt
+from sweep_cases import THREE, TINY, bufgym, contents, interrupt
 
 from bufgym import policies
 from bufgym.benchmark import run, sweep
@@ -26,18 +23,6 @@ pytest.importorskip("joblib", reason="a sweep needs joblib")
 
 WORDS = ["bench", "--suite", "interruption-v1", "--policies", ",".join(THREE), "--capacity", "2,4", "--seeds", "3"]
 """The same as ``TINY``, typed."""
-
-
-def bufgym(*words: object, **environment: str) -> subprocess.Popen[str]:
-    """The command in a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "bufgym", *map(str, words)],
-        env=os.environ | environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
 
 
 def finished(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -161,9 +146,7 @@ def test_a_run_that_was_killed_goes_on_where_it_was(
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.02)
     process.kill()
-    process.wait()
-    os.killpg(process.pid, signal.SIGKILL)  # loky's workers, which would hold the pipes for minutes
-    process.communicate()
+    process.communicate()  # once the workers, who hold the pipes too, have ended
     kept = contents(killed / "parts")
     shards = {"lte-v1": 24, "topics-v1": 18, "fleet-v1": 12}[suite]
     assert 3 <= len(kept) < shards and not (killed / "rows.csv").exists()

@@ -1,0 +1,103 @@
+"""A sweep's processes: a folder is one run's, workers end with their parent, and one that dies costs one line."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from sweep_cases import THREE, bufgym, fails
+
+from bufgym.benchmark import cluster
+from bufgym.cli import main
+from bufgym.files import locked
+
+pytest.importorskip("joblib", reason="a sweep needs joblib")
+
+POLICY = """
+import os, signal, time
+from pathlib import Path
+from bufgym.policies import ACCEPT, REJECT, register
+
+@register("{name}")
+def {name}(buffer, arrival, memory):
+    \"\"\"Accept where there is room.\"\"\"
+    {body}
+    return ACCEPT if len(buffer.slots) < buffer.capacity else REJECT
+"""
+
+
+def words(policy: Path, out: Path) -> list[object]:
+    """A sweep over two processes with the policy in this file."""
+    name = policy.stem
+    sweep = ["bench", "--suite", "interruption-v1", "--policies", name, "--capacity", 2, "--seeds", 1]
+    return [*sweep, "--policy-file", policy, "--format", "csv", "--jobs", 2, "--out", out]
+
+
+def policy_file(folder: Path, name: str, body: str) -> Path:
+    """A policy that does this before each decision."""
+    file = folder / f"{name}.py"
+    file.write_text(POLICY.format(name=name, body=body), encoding="utf-8")
+    return file
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_their_parent(how: signal.Signals, tmp_path: Path) -> None:
+    begun = tmp_path / "begun"
+    body = f"Path({str(begun)!r}).touch(); time.sleep(0.5)"
+    process = bufgym(*words(policy_file(tmp_path, "sleepy", body), tmp_path / "out"))
+    deadline = time.monotonic() + 100
+    while not begun.exists():
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.02)
+    process.send_signal(how)
+    process.wait(10)
+    # Nobody of its session is left: 5 s are asked, a busy machine may take a little more.
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            break
+        time.sleep(0.1)
+    else:
+        os.killpg(process.pid, signal.SIGKILL)
+        pytest.fail("workers live on")
+    assert "Traceback" not in process.communicate()[1]
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_is_one_line_and_a_retry(tmp_path: Path) -> None:
+    dead = tmp_path / "dead"
+    body = f"Path({str(dead)!r}).exists() or (Path({str(dead)!r}).touch(), os.kill(os.getpid(), signal.SIGKILL))"
+    process = bufgym(*words(policy_file(tmp_path, "frail", body), tmp_path / "out"))
+    out, err = process.communicate(timeout=100)
+    assert process.returncode == 0, err
+    lines = [line for line in err.splitlines() if "shard/s" not in line and line.strip()]
+    assert len(lines) == 1 and lines[0].startswith("bufgym: a worker process ended before its work did"), err
+    assert (tmp_path / "out" / "rows.csv").exists() and "frail" in out
+
+
+@pytest.mark.slow
+def test_one_that_always_dies_is_an_error(tmp_path: Path) -> None:
+    process = bufgym(*words(policy_file(tmp_path, "doomed", "os.kill(os.getpid(), 9)"), tmp_path / "out"))
+    _, err = process.communicate(timeout=100)
+    assert process.returncode == 2
+    assert err.splitlines()[-1].startswith("bufgym: error: a worker process ended before its work did"), err
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["bench", "--suite", "interruption-v1", "--policies", THREE[0], "--capacity", 2, "--seeds", 1]
+    command += ["--backend", "sequential", "--format", "csv", "--out", tmp_path]
+    with locked(tmp_path):
+        fails(command, f"{tmp_path}: another process is writing there", capsys)
+    assert not list(tmp_path.iterdir())
+    assert main([str(word) for word in command]) == 0
+    assert ".lock" not in {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_process_of_its_own_does_not_end_with_a_stranger() -> None:
+    cluster.end_with(1 if os.getppid() != 1 else 2)
