@@ -47,6 +47,7 @@ def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | N
     Exact for equal sizes where every arrival asks for a decision; an upper bound otherwise (see ``Plan.certified``).
     """
     check_limits(capacity, max_bytes)
+    episode.check_one_queue()
     arrivals = np.asarray(episode.arrivals)
     n = len(arrivals)
     capacity = min(capacity, n)

@@ -62,14 +62,16 @@ class Senders:
 
     def load(self, i: int, episode: Episode) -> None:
         """Begin ``episode`` at sender ``i``: empty buffer, idle socket, nothing arrived."""
+        if not isinstance(episode, Episode):
+            raise BufgymError(f"episode: {episode!r} is not a bufgym.scenario Episode")
         link = episode.link
         if len(episode.arrivals) > self.batch.arrivals.shape[1]:
             most = self.batch.arrivals.shape[1]
             raise BufgymError(f"episode of {len(episode.arrivals)} messages: these senders have room for {most}")
-        numbers = episode.arrivals["topic"]
-        if self.topics and not (numbers.min() >= 0 and numbers.max() < len(self.topics)):
-            unknown = numbers.min() if numbers.min() < 0 else numbers.max()
+        if self.topics and (unknown := episode.arrivals["topic"].max()) >= len(self.topics):
             raise BufgymError(f"episode: unknown topic {unknown}; the senders know {len(self.topics)}, from 0 on")
+        if not self.topics:
+            episode.check_one_queue()
         first_knot, last_knot, after = self._knots.place(link.trace, i)
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
