@@ -60,7 +60,7 @@ def test_a_message_that_breaks_a_rule(fields: dict[str, Any], message: str) -> N
 def test_a_part_of_an_episode_is_none(name: str) -> None:
     """Its messages no longer have the numbers by which kernels find what became of them."""
     episode = scenario.get(name).draw(Streams.seeded(2))
-    with pytest.raises(BufgymError, match="^message 0: seq = 2: must be its place in the list of arrivals, 0"):
+    with pytest.raises(BufgymError, match=r"^message 0: seq = 2: must be its place in the list of arrivals, 0"):
         replace(episode, arrivals=episode.arrivals[2:])
 
 
@@ -134,7 +134,7 @@ def test_x_of_topics_falls_only_where_topics_are_used() -> None:
 
 @pytest.mark.parametrize("what", [None, 5, FleetEpisode((THREE,), STEADY)])
 def test_senders_load_episodes_only(what: Any) -> None:
-    with pytest.raises(BufgymError, match="is not a bufgym.scenario Episode"):
+    with pytest.raises(BufgymError, match=r"is not a bufgym\.scenario Episode"):
         Senders(1, 2, qoi.exponential(), max_messages=4).load(0, what)
 
 
