@@ -82,4 +82,5 @@ def run_fleet(
     for c, episode in enumerate(episodes):
         fleet.load(c, episode)
     fleet.run(policy, memory)
+    fleet.senders.check_untouched(policy)
     return fleet

@@ -16,6 +16,7 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, copies_of, topic_table
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode
+from bufgym.sim.audit import check_untouched
 from bufgym.sim.rollout import roll_out
 from bufgym.sim.shared_link import Shares
 from bufgym.sim.state import new_batch
@@ -110,6 +111,12 @@ class Senders:
             senders["window"], senders["ack_delay_us"] = 1, 0
         roll_out(self.batch._replace(parameters=policy.parameter_array), shares, memory, policy)
 
+    def check_untouched(self, policy: Policy) -> None:
+        """An error if ``policy`` has written to what it saw while it ran every sender to its end."""
+        for i, episode in enumerate(self.episodes):
+            if episode is not None:
+                check_untouched(self.batch, i, episode.arrivals, self._topic_table, policy.name)
+
 
 def padded(rows: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
     """float64[rows, longest]: rows of different lengths as one array, filled up with zeros."""
@@ -152,4 +159,5 @@ def run(
     for i, episode in enumerate(episodes):
         senders.load(i, episode)
     senders.run(policy, memory)
+    senders.check_untouched(policy)
     return senders
