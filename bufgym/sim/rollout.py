@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for
+from bufgym.kernel import compile_for, interruptible
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
 from bufgym.policies.registry import Policy, runs_compiled, signatures
@@ -23,6 +23,9 @@ from bufgym.sim.socket import credit
 from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type, named
 from bufgym.sim.transition import next_event, sender_of
 from bufgym.sim.view import arrival_of, view
+
+_SHORT = 200_000
+"""Arrivals times numbers that a policy reads at each: a rollout below that takes no more than some milliseconds."""
 
 
 def rollout(
@@ -127,7 +130,13 @@ def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float
 
 def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
     """Run every sender to its end under ``policy``, compiled where the policy is."""
-    if runs_compiled(policy):
-        compiled_rollout(shares is not None)(batch, shares, memory, *policy.compiled, policy.hears_departures)
-    else:
+    if not runs_compiled(policy):
         python_rollout(batch, shares, memory, policy)
+        return
+    compiled = compiled_rollout(shares is not None)
+    arguments = batch, shares, memory, *policy.compiled, policy.hears_departures
+    # What it may do at each arrival grows with what it remembers and reads.
+    if batch.senders["arrivals"].sum() * (memory.shape[1] + len(batch.parameters)) < _SHORT:
+        compiled(*arguments)
+    else:
+        interruptible(lambda: compiled(*arguments))
