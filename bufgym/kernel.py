@@ -14,7 +14,9 @@ import os
 import shutil
 import sys
 import tempfile
+import threading
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -25,6 +27,7 @@ from numba.core import caching
 from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+Result = TypeVar("Result")
 
 JIT = not cast(Any, numba.config).DISABLE_JIT
 """False where compilation is off and every kernel runs as its Python source."""
@@ -143,6 +146,28 @@ def compile_for(signature: Any, function: Function) -> Function:
     if not JIT:
         return function
     return cast(Function, _compile(function, signature))
+
+
+def interruptible(work: Callable[[], Result]) -> Result:
+    """``work()``, which may spend minutes in kernels, while Ctrl-C is answered at once.
+
+    Python heeds a signal only in its main thread, and there only between two of its own instructions: so that thread
+    waits while another works (60 us). After a KeyboardInterrupt that one goes on until its kernel ends or the process.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return work()
+    future: Future[Result] = Future()
+
+    def carry_out() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:  # it belongs to the thread that waits
+            future.set_exception(error)
+
+    threading.Thread(target=carry_out, daemon=True).start()
+    while not future.done():
+        wait([future], 0.5)  # where a signal does not end a wait (Windows), half a second does
+    return future.result()
 
 
 def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:

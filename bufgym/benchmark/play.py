@@ -9,7 +9,7 @@ from bufgym.envs.step import action_of
 from bufgym.errors import BufgymError
 from bufgym.model.buffer import HOLD
 from bufgym.policies import Policy
-from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, Senders, answer_of, named, python_view
+from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, Senders, answer_of, named, python_arrival, python_view
 
 
 class Player:
@@ -59,7 +59,7 @@ class Player:
                     f"policy {self.policy.name}: sends slot {choice}: must be 0..{senders.capacity - 1}, or HOLD"
                 )
             return senders.capacity if choice == HOLD else choice
-        answer = self.policy.on_arrival(buffer, batch.arrivals[i, sender.next], memory)
+        answer = self.policy.on_arrival(buffer, python_arrival(batch, i), memory)
         decision = answer_of(self.policy, "on_arrival", answer)
         try:
             return action_of(decision, senders.capacity)

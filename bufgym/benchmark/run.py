@@ -73,6 +73,7 @@ def run(
                             key |= {"policy": policy.name, "capacity": capacity}
                             for cells in result:
                                 row = key | cells
+                                task.verify(policy, row)
                                 rows.append({name: row[name] for name in task.layout})
                         advance(len(batch))
     return rows

@@ -19,10 +19,14 @@ from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
 from bufgym.kernel import item, kernel
-from bufgym.traces.trace import Trace
+from bufgym.model.checks import whole
+from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Trace
 
 FOREVER = 2**62
 """A time that never comes, us."""
+
+MAX_TIME_US = MAX_DURATION_S * US_PER_S
+"""The latest arrival of a message, and the longest delay, us."""
 
 LOOP, HOLD, STOP = 0, 1, 2
 _AFTER = {"loop": LOOP, "hold": HOLD, "stop": STOP}
@@ -40,9 +44,31 @@ class Link:
     """From the end of a message's transmission to its receipt at the server, us."""
 
     def __post_init__(self) -> None:
-        for name in ("offset_us", "propagation_us"):
-            if getattr(self, name) < 0:
-                raise BufgymError(f"link on {self.trace.name}: {name} = {getattr(self, name)}: must be >= 0")
+        if not isinstance(self.trace, Trace):
+            raise BufgymError(f"trace: {self.trace!r} is not a bufgym.traces Trace")
+        whole("offset_us", self.offset_us, 0, FOREVER - 1)
+        whole("propagation_us", self.propagation_us, 0, MAX_TIME_US)
+
+    def check_reach(self, last_us: int, total_bytes: int, pauses: int = 0, pause_us: int = 0) -> None:
+        """An error unless every time and byte position of a run over this link stays within 64 bits.
+
+        Messages of ``total_bytes`` in all arrive until ``last_us``; the socket pauses so many times, for acks. What
+        it takes is bounded by whole laps of what repeats at the trace's end, two more for each time that it begins.
+        """
+        trace = self.trace
+        lap_us, lap_bytes = trace.duration_us, trace.total_bytes
+        until_us, until_bytes = max(last_us + self.offset_us, lap_us) + pauses * pause_us, lap_bytes + total_bytes
+        if trace.after == "hold":
+            lap_us -= int(trace.time_us[-2])
+            lap_bytes -= int(trace.cumulative_bytes[-2])
+        if trace.after != "stop" and lap_bytes > 0:
+            until_us += (total_bytes // lap_bytes + 2 * (1 + pauses)) * lap_us
+            until_bytes = trace.total_bytes + (until_us // lap_us + 1) * lap_bytes
+        if until_us >= FOREVER // 2 or until_bytes >= FOREVER:
+            raise BufgymError(
+                f"link on {trace.name}: may need {until_us:.3g} us, and pass {until_bytes:.3g} bytes, for messages of "
+                f"{total_bytes} bytes until {last_us} us: must stay below 2**61 us and 2**62 bytes"
+            )
 
     def carried_by(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]:
         """C at these times (int64[n], us, not decreasing): int64[n], bytes, rounded down as in ``position_at``."""

@@ -20,13 +20,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import kernel
+from bufgym.kernel import interruptible, kernel
 from bufgym.model.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
 from bufgym.model.qoi import Value
 from bufgym.oracle import labels, unequal
 from bufgym.oracle.programme import NEVER
 from bufgym.policies.registry import register
 from bufgym.scenario import Episode
+
+_SHORT = 2_000
+"""Messages of an episode whose plan is found in a fraction of a second on any link."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,14 @@ def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | N
     Exact for equal sizes where every arrival asks for a decision; an upper bound otherwise (see ``Plan.certified``).
     """
     check_limits(capacity, max_bytes)
+    episode.check_one_queue()
+    if len(episode.arrivals) < _SHORT:
+        return _plan(episode, capacity, v, max_bytes)
+    return interruptible(lambda: _plan(episode, capacity, v, max_bytes))
+
+
+def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> Plan:
+    """See ``clairvoyant``."""
     arrivals = np.asarray(episode.arrivals)
     n = len(arrivals)
     capacity = min(capacity, n)

@@ -6,11 +6,25 @@ from collections.abc import Sequence
 from typing import Any
 
 from bufgym.errors import BufgymError
-from bufgym.model.checks import above_0, between
+from bufgym.model.checks import above_0, between, whole
+from bufgym.model.link import MAX_TIME_US
 from bufgym.model.qoi import Value
 from bufgym.traces import Motion, Trace
+from bufgym.traces.trace import MAX_DURATION_S
+from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
-__all__ = ["above_0", "as_tuple", "check_stream", "check_value", "positive", "rate", "recordings"]
+__all__ = [
+    "above_0",
+    "as_tuple",
+    "check_stream",
+    "check_value",
+    "delay",
+    "duration",
+    "message_bytes",
+    "positive",
+    "rate",
+    "recordings",
+]
 
 MAX_RATE_HZ = 100_000
 """Arrivals are counted in whole microseconds: ten to a period at least."""
@@ -23,16 +37,35 @@ def positive(scenario: object, *names: str) -> None:
 
 
 def rate(rate_hz: Any) -> None:
-    """``rate_hz`` is a number > 0 and at most ``MAX_RATE_HZ``."""
+    """``rate_hz`` is a number > 0, at most ``MAX_RATE_HZ``, and gives a message in the longest time there is."""
     above_0("rate_hz", rate_hz)
-    if rate_hz > MAX_RATE_HZ:
-        raise BufgymError(f"rate_hz = {rate_hz}: must be at most {MAX_RATE_HZ}")
+    if not 1 / MAX_DURATION_S <= rate_hz <= MAX_RATE_HZ:
+        raise BufgymError(f"rate_hz = {rate_hz}: must be at most {MAX_RATE_HZ}, and at least {1 / MAX_DURATION_S:g}")
+
+
+def duration(duration_s: Any) -> None:
+    """``duration_s`` is a number > 0 and at most that of a trace."""
+    above_0("duration_s", duration_s)
+    if duration_s > MAX_DURATION_S:
+        raise BufgymError(f"duration_s = {duration_s}: must be at most {MAX_DURATION_S}")
+
+
+def delay(name: str, us: Any) -> None:
+    """A delay in whole microseconds, at most the longest time there is."""
+    whole(name, us, 0, MAX_TIME_US)
+
+
+def message_bytes(name: str, size: Any) -> None:
+    """The (mean) size of messages: a number > 0, at most ``MAX_MESSAGE_BYTES``."""
+    above_0(name, size)
+    if size > MAX_MESSAGE_BYTES:
+        raise BufgymError(f"{name} = {size}: must be at most {MAX_MESSAGE_BYTES}")
 
 
 def check_stream(stream: Any) -> None:
     """The parameters that every stream of messages has: rate_hz, size_bytes, jitter and size_cv."""
     rate(stream.rate_hz)
-    above_0("size_bytes", stream.size_bytes)
+    message_bytes("size_bytes", stream.size_bytes)
     between("jitter", stream.jitter, 0, 1, "of a period")
     between("size_cv", stream.size_cv, 0, 10)
 

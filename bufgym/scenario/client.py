@@ -18,11 +18,21 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import records
 from bufgym.model import qoi
 from bufgym.model.buffer import MESSAGE
-from bufgym.model.checks import above_0, whole
+from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, check_window
-from bufgym.scenario.checks import as_tuple, check_stream, check_value, positive, recordings
+from bufgym.scenario.arrivals import read_only
+from bufgym.scenario.checks import (
+    as_tuple,
+    check_stream,
+    check_value,
+    delay,
+    duration,
+    message_bytes,
+    positive,
+    recordings,
+)
 from bufgym.scenario.draws import place, place_link, scaled, sizes
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace
@@ -61,7 +71,7 @@ class Stream:
             for name, size in self.encodings.items():
                 if name not in ENCODINGS:
                     raise BufgymError(f"unknown encoding {name!r}; known: {', '.join(ENCODINGS)}")
-                above_0(f"bytes in {name}", size)
+                message_bytes(f"bytes in {name}", size)
         except BufgymError as error:
             raise BufgymError(f"topic {self.topic.name!r}: {error}") from None
 
@@ -109,10 +119,11 @@ class Client:
             if not getattr(self, name):
                 raise BufgymError(f"{name}: a client needs at least one")
         check_topics(self.topics)
-        positive(self, "duration_s", "scale")
+        duration(self.duration_s)
+        positive(self, "scale")
         check_window(self.window)
-        whole("propagation_us", self.propagation_us)
-        whole("round_trip_us", self.ack_delay_us)
+        delay("propagation_us", self.propagation_us)
+        delay("round_trip_us", self.ack_delay_us)
         whole("consumers", self.consumers, 1)
         check_value(self)
         for stream in self.streams:
@@ -155,7 +166,7 @@ class Client:
         arrivals["topic"], arrivals["size_bytes"], arrivals["x"] = numbers[order], sizes_bytes[order], xs[order]
         trace, offset_us = place_link(self._links, streams.link, self.random_offset)
         return Episode(
-            arrivals,
+            read_only(arrivals),
             Link(trace, offset_us, int(self.propagation_us)),
             window=self.window,
             ack_delay_us=self.ack_delay_us,

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import records
-from bufgym.model.buffer import MESSAGE
 from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_ack_delay, check_window
+from bufgym.scenario.arrivals import check_messages, read_only, sealed
+from bufgym.traces.workload import MAX_MESSAGES
 
 
 class Streams(NamedTuple):
@@ -40,10 +40,15 @@ class Streams(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One drawn episode; nothing in it is random any more."""
+    """One drawn episode, checked when it is made; nothing in it is random any more.
+
+    Raises:
+        BufgymError: a message breaks a rule (see ``bufgym.scenario.arrivals``), another parameter is out of its range,
+            or times or bytes on this link would not stay within 64 bits.
+    """
 
     arrivals: NDArray[Any]
-    """MESSAGE[n], in order of arrival (``arrival_us`` non-decreasing from 0, x non-decreasing)."""
+    """MESSAGE[n], read-only, in order of arrival (``arrival_us`` never falls, nor does x on any topic)."""
     link: Link
     """The capacity trace that carries them, and where on it the episode begins."""
     first_decision: int = 0
@@ -58,10 +63,33 @@ class Episode:
     """int64[n], bytes of the messages in other encodings, by name; where one is missing, sizes stay the same."""
     consumers: int = 1
     """Receivers of each message: a client that sends copies sends so many."""
+    one_scene: bool = field(init=False, repr=False)
+    """Whether x falls nowhere, topics apart: only then all messages can share one queue."""
 
     def __post_init__(self) -> None:
         check_window(self.window)
         check_ack_delay(self.ack_delay_us)
+        check_link(self.link)
+        arrivals = sealed(self.arrivals)
+        total_bytes, rises = check_messages(arrivals)
+        object.__setattr__(self, "arrivals", arrivals)
+        object.__setattr__(self, "one_scene", rises)
+        n = len(arrivals)
+        whole("first_decision", self.first_decision)
+        whole("last_decision", self.last_decision, 0, 2**62)
+        whole("consumers", self.consumers, 1, MAX_MESSAGES // n)
+        for name, size_bytes in self.encodings.items():
+            if np.shape(size_bytes) != (n,):
+                raise BufgymError(f"encodings[{name!r}]: must be int64[{n}], the bytes of each message")
+        pauses = n if self.ack_delay_us else 0
+        self.link.check_reach(int(arrivals["arrival_us"][-1]), total_bytes, pauses, self.ack_delay_us)
+
+    def check_one_queue(self) -> None:
+        """An error unless one queue without topics can hold the messages: then x must not fall on any of them."""
+        if not self.one_scene:
+            raise BufgymError(
+                "episode: x falls from one message to the next, as each topic has its own: not for one queue"
+            )
 
     def with_uniforms(self, rng: np.random.Generator) -> Episode:
         """The same episode with a fresh uniform draw beside each arrival, for randomised policies.
@@ -70,7 +98,7 @@ class Episode:
         """
         arrivals = self.arrivals.copy()
         arrivals["uniform"] = rng.random(len(arrivals))
-        return replace(self, arrivals=arrivals)
+        return replace(self, arrivals=read_only(arrivals))
 
     def encoded(self, encoding: str) -> Episode:
         """The same messages in another encoding."""
@@ -78,7 +106,7 @@ class Episode:
             return self
         arrivals = self.arrivals.copy()
         arrivals["size_bytes"] = self.encodings[encoding]
-        return replace(self, arrivals=arrivals)
+        return replace(self, arrivals=read_only(arrivals))
 
     def copied(self, topics: int) -> Episode:
         """One copy of each message for each consumer: copy c of topic t is on topic c x ``topics`` + t."""
@@ -86,7 +114,14 @@ class Episode:
         arrivals = np.repeat(self.arrivals, self.consumers).view(type(self.arrivals))
         arrivals["topic"] += topics * np.tile(np.arange(self.consumers), n)
         arrivals["seq"] = np.arange(len(arrivals))
-        return replace(self, arrivals=arrivals, consumers=1)
+        return replace(self, arrivals=read_only(arrivals), consumers=1)
+
+
+def check_link(link: Any) -> Link:
+    """The link, or an error if it is none."""
+    if not isinstance(link, Link):
+        raise BufgymError(f"link: {link!r} is not a bufgym.model.link Link")
+    return link
 
 
 class Scenario(Protocol):
@@ -106,30 +141,3 @@ class Scenario(Protocol):
 
     def draw(self, streams: Streams) -> Episode:
         """One episode."""
-
-
-def messages(
-    arrival_us: NDArray[np.int64], size_bytes: NDArray[np.int64] | int, x: NDArray[np.float64] | None = None
-) -> NDArray[Any]:
-    """MESSAGE[n] from columns; x defaults to the frame index. Times and x must not decrease, sizes be >= 1 byte."""
-    arrivals = unchecked_messages(arrival_us, size_bytes, x)
-    if len(arrivals) == 0:
-        raise BufgymError("an episode needs at least one message")
-    if arrivals["arrival_us"][0] < 0 or (np.diff(arrivals["arrival_us"]) < 0).any():
-        raise BufgymError("arrival times must be >= 0 and must not decrease")
-    if arrivals["size_bytes"].min() < 1:
-        raise BufgymError(f"message size {arrivals['size_bytes'].min()} bytes: must be >= 1")
-    if not np.isfinite(arrivals["x"]).all() or (np.diff(arrivals["x"]) < 0).any():
-        raise BufgymError("coordinates x must be finite numbers and must not decrease")
-    return arrivals
-
-
-def unchecked_messages(
-    arrival_us: NDArray[np.int64], size_bytes: NDArray[np.int64] | int, x: NDArray[np.float64] | None
-) -> NDArray[Any]:
-    """``messages`` for columns that are known to keep the rules."""
-    arrivals = records(len(arrival_us), MESSAGE)
-    arrivals["seq"] = np.arange(len(arrival_us))
-    arrivals["arrival_us"], arrivals["size_bytes"] = arrival_us, size_bytes
-    arrivals["x"] = arrivals["seq"] if x is None else x
-    return arrivals

@@ -14,7 +14,8 @@ from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.scenario import registry
-from bufgym.scenario.episode import Episode, Streams
+from bufgym.scenario.arrivals import check_messages, read_only, sealed
+from bufgym.scenario.episode import Episode, Streams, check_link
 from bufgym.scenario.uplink import Uplink
 
 MAX_ROBOTS = 256
@@ -23,19 +24,26 @@ MAX_ROBOTS = 256
 
 @dataclass(frozen=True, eq=False)
 class FleetEpisode:
-    """One drawn episode of a cell; nothing in it is random any more."""
+    """One drawn episode of a cell, checked when it is made as an ``Episode`` is; nothing in it is random any more."""
 
     arrivals: tuple[NDArray[Any], ...]
-    """MESSAGE[n] of each robot, in order of arrival."""
+    """MESSAGE[n] of each robot, read-only, in order of arrival."""
     link: Link
     """The cell's, shared by all."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "arrivals", tuple(self.arrivals))
-        check_robots(self.robots)
+        check_robots(len(self.arrivals))
+        check_link(self.link)
+        robots, last_us, total_bytes = [], 0, 0
         for i, arrivals in enumerate(self.arrivals):
-            if len(arrivals) == 0:
-                raise BufgymError(f"arrivals of robot {i}: an episode needs at least one message")
+            try:
+                robots.append(sealed(arrivals))
+                total_bytes += check_messages(robots[i])[0]
+            except BufgymError as error:
+                raise BufgymError(f"arrivals of robot {i}: {error}") from None
+            last_us = max(last_us, int(robots[i]["arrival_us"][-1]))
+        self.link.check_reach(last_us, total_bytes)
+        object.__setattr__(self, "arrivals", tuple(robots))
 
     @property
     def robots(self) -> int:
@@ -105,10 +113,10 @@ class FleetScenario:
 
     def _beside(self, arrival_us: NDArray[np.int64], streams: Streams) -> NDArray[Any]:
         """MESSAGE[n] of one more robot whose camera ticks at these times."""
-        arrivals = self._stream.draw(streams).arrivals
+        arrivals = self._stream.draw(streams).arrivals.copy()
         arrivals["arrival_us"] = arrival_us
         self.uplink.move(arrivals, streams.arrival)
-        return arrivals
+        return read_only(arrivals)
 
     @functools.cached_property
     def _cell(self) -> Uplink:

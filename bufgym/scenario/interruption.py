@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.checks import whole
-from bufgym.model.link import Link
+from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
-from bufgym.scenario.checks import check_value, positive, rate
-from bufgym.scenario.episode import Episode, Streams, messages
+from bufgym.scenario.arrivals import messages, read_only
+from bufgym.scenario.checks import check_value, message_bytes, positive, rate
+from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Trace
 
 LAWS = ("fixed", "uniform", "log-uniform", "geometric")
@@ -59,8 +60,13 @@ class Interruption:
             object.__setattr__(self, name, whole(name, getattr(self, name)))
         if not 1 <= self.t_min <= self.t_max <= 10**6:
             raise BufgymError(f"t_min = {self.t_min}, t_max = {self.t_max}: need 1 <= t_min <= t_max <= 1000000")
-        positive(self, "size_bytes", "t_mean")
+        message_bytes("size_bytes", self.size_bytes)
+        positive(self, "t_mean")
         rate(self.rate_hz)
+        if self.period_us * self.max_messages > MAX_TIME_US:
+            raise BufgymError(
+                f"t_max = {self.t_max} messages at rate_hz = {self.rate_hz}: must arrive within {MAX_TIME_US} us"
+            )
         if not self.t_mean >= self.t_min:
             raise BufgymError(f"t_mean = {self.t_mean}: must be at least t_min = {self.t_min}")
         check_value(self)
@@ -123,7 +129,8 @@ class Interruption:
     @functools.cached_property
     def _table(self) -> NDArray[Any]:
         """MESSAGE[t_max + 2]: every episode is a prefix of this table."""
-        return messages(np.arange(self.max_messages, dtype=np.int64) * self.period_us, int(self.size_bytes))
+        arrivals = messages(np.arange(self.max_messages, dtype=np.int64) * self.period_us, int(self.size_bytes))
+        return read_only(arrivals)
 
 
 @functools.lru_cache(maxsize=64)

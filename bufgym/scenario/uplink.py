@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
-from bufgym.scenario.checks import as_tuple, check_stream, check_value, positive, recordings
+from bufgym.scenario.arrivals import read_only, unchecked_messages
+from bufgym.scenario.checks import as_tuple, check_stream, check_value, delay, duration, recordings
 from bufgym.scenario.draws import place, place_link, scaled, shipped, sizes
-from bufgym.scenario.episode import Episode, Streams, unchecked_messages
+from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace
+from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import Workload
 
 
@@ -72,14 +73,16 @@ class Uplink:
         if not self.scale or not all(math.isfinite(s) and s > 0 for s in self.scale):
             raise BufgymError(f"scale = {self.scale}: every factor must be a number > 0")
         check_stream(self)
-        positive(self, "duration_s")
-        whole("propagation_us", self.propagation_us)
+        duration(self.duration_s)
+        delay("propagation_us", self.propagation_us)
         if self.size_bytes < 1:
             raise BufgymError(f"size_bytes = {self.size_bytes}: must be at least 1")
         if self.link_offset_s is not None and not (
-            len(self.link_offset_s) == 2 and 0 <= self.link_offset_s[0] <= self.link_offset_s[1] < math.inf
+            len(self.link_offset_s) == 2 and 0 <= self.link_offset_s[0] <= self.link_offset_s[1] <= MAX_DURATION_S
         ):
-            raise BufgymError(f"link_offset_s = {self.link_offset_s}: must be (from, to) with 0 <= from <= to, s")
+            raise BufgymError(
+                f"link_offset_s = {self.link_offset_s}: must be (from, to) with 0 <= from <= to <= {MAX_DURATION_S}, s"
+            )
         if self.workload is not None and not isinstance(self.workload, Workload):
             raise BufgymError(f"workload: {self.workload!r} is not a bufgym.traces Workload")
         if self.workload is not None and self.workload.x is not None and self.motion:
@@ -102,7 +105,7 @@ class Uplink:
         arrivals = self._stream(streams.arrival) if self.workload is None else _replayed(self.workload)
         self.move(arrivals, streams.arrival)
         trace, offset_us = place_link(self._links, streams.link, self.random_offset, self.link_offset_s)
-        return Episode(arrivals, Link(trace, offset_us, int(self.propagation_us)))
+        return Episode(read_only(arrivals), Link(trace, offset_us, int(self.propagation_us)))
 
     def move(self, arrivals: NDArray[Any], rng: np.random.Generator) -> None:
         """Give these messages the x of one of the recordings, if there are any, from a place drawn at random."""

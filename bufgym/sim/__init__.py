@@ -26,7 +26,7 @@ from bufgym.sim.decisions import (
     decide,
     has_room,
 )
-from bufgym.sim.rollout import answer_of, python_view
+from bufgym.sim.rollout import answer_of, python_arrival, python_view
 from bufgym.sim.rules import age_until
 from bufgym.sim.senders import Senders, padded, run
 from bufgym.sim.socket import credit
@@ -72,6 +72,7 @@ __all__ = [
     "next_event",
     "offer",
     "padded",
+    "python_arrival",
     "python_view",
     "run",
     "view",

@@ -37,6 +37,8 @@ class Fleet:
 
     def load(self, c: int, episode: FleetEpisode) -> None:
         """Begin ``episode`` in cell ``c``: empty buffers, idle sockets, nothing arrived."""
+        if not isinstance(episode, FleetEpisode):
+            raise BufgymError(f"episode: {episode!r} is not a bufgym.scenario FleetEpisode")
         if episode.robots != self.robots:
             raise BufgymError(f"episode of {episode.robots} robots: the cell has {self.robots}")
         for robot, i in enumerate(self.rows(c)):
@@ -80,4 +82,5 @@ def run_fleet(
     for c, episode in enumerate(episodes):
         fleet.load(c, episode)
     fleet.run(policy, memory)
+    fleet.senders.check_untouched(policy)
     return fleet

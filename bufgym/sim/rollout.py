@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for
+from bufgym.kernel import compile_for, interruptible
+from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
 from bufgym.policies.registry import Policy, runs_compiled, signatures
 from bufgym.sim.decisions import answer_dequeue, answer_send, decide
@@ -22,6 +23,9 @@ from bufgym.sim.socket import credit
 from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type, named
 from bufgym.sim.transition import next_event, sender_of
 from bufgym.sim.view import arrival_of, view
+
+_SHORT = 200_000
+"""Arrivals times numbers that a policy reads at each: a rollout below that takes no more than some milliseconds."""
 
 
 def rollout(
@@ -68,8 +72,27 @@ def compiled_rollout(shared: bool) -> Any:
     return compile_for(numba.types.void(batch_type(), shares, memory, *functions, numba.types.boolean), rollout)
 
 
-python_view = getattr(view, "py_func", view)
-"""``view`` for Python callers, over a ``named`` batch: the compiled kernel must not hand its arrays to Python."""
+_view = getattr(view, "py_func", view)
+
+
+def python_view(batch: Batch, i: int) -> Buffer:
+    """``view`` for Python callers, over a ``named`` batch: the compiled kernel must not hand its arrays to Python.
+
+    It is read-only. Kernels keep marks in the rows of several topics: these are a copy.
+    """
+    buffer: Buffer = _view(batch, i)
+    buffer.slots.flags.writeable = False
+    if len(buffer.topics) > 1:
+        return buffer._replace(topics=buffer.topics.copy())
+    buffer.topics.flags.writeable = False
+    return buffer
+
+
+def python_arrival(batch: Batch, i: int) -> Any:
+    """The arrival that waits for a decision, read-only, for Python callers over a ``named`` batch."""
+    row = batch.arrivals[i]
+    row.flags.writeable = False
+    return row[batch.senders[i].next]
 
 
 def answer_of(policy: Policy, hook: str, answer: Any) -> int:
@@ -93,7 +116,7 @@ def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float
                 continue
             buffer = python_view(records, i)
             if event == DECISION:
-                answer = policy.on_arrival(buffer, records.arrivals[i, records.senders[i].next], memory[i])
+                answer = policy.on_arrival(buffer, python_arrival(records, i), memory[i])
                 decide(batch, i, answer_of(policy, "on_arrival", answer))
             elif event == DEQUEUE:
                 answer_dequeue(batch, i, bool(answer_of(policy, "on_dequeue", policy.on_dequeue(buffer, memory[i]))))
@@ -107,7 +130,13 @@ def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float
 
 def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
     """Run every sender to its end under ``policy``, compiled where the policy is."""
-    if runs_compiled(policy):
-        compiled_rollout(shares is not None)(batch, shares, memory, *policy.compiled, policy.hears_departures)
-    else:
+    if not runs_compiled(policy):
         python_rollout(batch, shares, memory, policy)
+        return
+    compiled = compiled_rollout(shares is not None)
+    arguments = batch, shares, memory, *policy.compiled, policy.hears_departures
+    # What it may do at each arrival grows with what it remembers and reads.
+    if batch.senders["arrivals"].sum() * (memory.shape[1] + len(batch.parameters)) < _SHORT:
+        compiled(*arguments)
+    else:
+        interruptible(lambda: compiled(*arguments))

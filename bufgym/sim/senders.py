@@ -16,6 +16,7 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, copies_of, topic_table
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode
+from bufgym.sim.audit import check_untouched
 from bufgym.sim.rollout import roll_out
 from bufgym.sim.shared_link import Shares
 from bufgym.sim.state import new_batch
@@ -62,14 +63,16 @@ class Senders:
 
     def load(self, i: int, episode: Episode) -> None:
         """Begin ``episode`` at sender ``i``: empty buffer, idle socket, nothing arrived."""
+        if not isinstance(episode, Episode):
+            raise BufgymError(f"episode: {episode!r} is not a bufgym.scenario Episode")
         link = episode.link
         if len(episode.arrivals) > self.batch.arrivals.shape[1]:
             most = self.batch.arrivals.shape[1]
             raise BufgymError(f"episode of {len(episode.arrivals)} messages: these senders have room for {most}")
-        numbers = episode.arrivals["topic"]
-        if self.topics and not (numbers.min() >= 0 and numbers.max() < len(self.topics)):
-            unknown = numbers.min() if numbers.min() < 0 else numbers.max()
+        if self.topics and (unknown := episode.arrivals["topic"].max()) >= len(self.topics):
             raise BufgymError(f"episode: unknown topic {unknown}; the senders know {len(self.topics)}, from 0 on")
+        if not self.topics:
+            episode.check_one_queue()
         first_knot, last_knot, after = self._knots.place(link.trace, i)
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
@@ -107,6 +110,12 @@ class Senders:
         if not client.awaits_acks:
             senders["window"], senders["ack_delay_us"] = 1, 0
         roll_out(self.batch._replace(parameters=policy.parameter_array), shares, memory, policy)
+
+    def check_untouched(self, policy: Policy) -> None:
+        """An error if ``policy`` has written to what it saw while it ran every sender to its end."""
+        for i, episode in enumerate(self.episodes):
+            if episode is not None:
+                check_untouched(self.batch, i, episode.arrivals, self._topic_table, policy.name)
 
 
 def padded(rows: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
@@ -150,4 +159,5 @@ def run(
     for i, episode in enumerate(episodes):
         senders.load(i, episode)
     senders.run(policy, memory)
+    senders.check_untouched(policy)
     return senders

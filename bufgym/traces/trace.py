@@ -7,6 +7,7 @@ same on every machine. For example, 1 MB/s for one second is the two knots (0, 0
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -105,12 +106,12 @@ class Trace:
     def __hash__(self) -> int:
         return hash((self.name, self.after, self.time_us.size, self.duration_us, self.total_bytes))
 
-    @property
+    @functools.cached_property
     def duration_us(self) -> int:
         """Time of the last knot, microseconds."""
         return int(self.time_us[-1])
 
-    @property
+    @functools.cached_property
     def total_bytes(self) -> int:
         """Bytes that the link can carry from the first knot to the last."""
         return int(self.cumulative_bytes[-1])

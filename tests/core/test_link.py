@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from fractions import Fraction
 
 import naive
 import numpy as np
@@ -124,5 +126,64 @@ def test_a_new_trace_for_every_episode_takes_no_more_memory(monkeypatch):
 
 @pytest.mark.parametrize("name", ["offset_us", "propagation_us"])
 def test_errors(name):
-    with pytest.raises(BufgymError, match=f"{name} = -1: must be >= 0"):
+    with pytest.raises(BufgymError, match=f"{name} = -1: must be a whole number from 0 to"):
         Link(trace(KNOTS, "loop"), **{name: -1})
+
+
+def huge_traces(rng: np.random.Generator) -> list[tuple[int, int]]:
+    """Knots whose times and bytes are of any size below 2^62, as are the products in each segment."""
+    knots = [(0, 0)]
+    for _ in range(rng.integers(1, 6)):
+        bits = int(rng.integers(1, 60))
+        us = int(rng.integers(1, 2**bits))
+        most = min((2**62 - 1) // us, 2**62 - 1 - knots[-1][1])
+        carried = int(rng.integers(0, most, endpoint=True)) >> int(rng.integers(0, 40))
+        if knots[-1][0] + us >= 2**62:
+            break
+        knots.append((knots[-1][0] + us, knots[-1][1] + carried))
+    return knots if len(knots) > 1 and knots[-1][1] > 0 else [(0, 0), (3, 7)]
+
+
+class Laps:
+    """As ``naive.Link``, without counting the laps one by one."""
+
+    def __init__(self, knots, after):
+        self.after, self.once = after, naive.Link(knots, "stop")
+        self.us, self.bytes = knots[-1]
+        (from_us, from_bytes), self.end = knots[-2:]
+        self.rate = Fraction(self.bytes - from_bytes, self.us - from_us)
+
+    def bytes_by(self, t_us):
+        if self.after == "loop":
+            laps, t_us = divmod(t_us, self.us)
+            return laps * self.bytes + self.once.bytes_by(t_us)
+        beyond = max(0, t_us - self.us) if self.after == "hold" else 0
+        return self.once.bytes_by(min(t_us, self.us)) + beyond * self.rate
+
+    def first_time(self, position):
+        if self.after == "loop":
+            laps = (position - 1) // self.bytes
+            return laps * self.us + self.once.first_time(position - laps * self.bytes)
+        if self.after == "hold" and position > self.bytes and self.rate:
+            return self.us + math.ceil((position - self.bytes) / self.rate)
+        return self.once.first_time(position)
+
+
+@pytest.mark.parametrize("after", ["loop", "hold", "stop"])
+def test_exact_wherever_the_result_is_below_2_to_the_62(after):
+    """Random traces, times and positions of every size, against fractions: no product wraps around."""
+    rng, checked = np.random.default_rng(7), 0
+    for _ in range(300):
+        knots = huge_traces(rng)
+        carried, first_time = kernels(knots, after)
+        twin = Laps(knots, after)
+        for _ in range(10):
+            t_us, position = (int(rng.integers(1, 2 ** int(rng.integers(1, 62)))) for _ in range(2))
+            exact, at = int(twin.bytes_by(t_us)), twin.first_time(position)
+            if exact < 2**62:
+                assert carried(t_us) == exact
+                checked += 1
+            if at is None or at < FOREVER:
+                assert first_time(position) == (FOREVER if at is None else at)
+                checked += 1
+    assert checked > 3_000

@@ -189,6 +189,8 @@ def test_uniform_draws():
         ({"t_min": 1.5}, "t_min = 1.5"),
         ({"t_max": 9.5}, "t_max = 9.5"),
         ({"rate_hz": 3e6}, "rate_hz = 3000000.0"),
+        ({"size_bytes": 10**18}, "size_bytes = 1000000000000000000: must be at most 10000000000"),
+        ({"rate_hz": 1e-6}, "t_max = 400 messages at rate_hz = 1e-06: must arrive within 10000000000000 us"),
     ],
 )
 def test_bad_interruptions(parameters, rule):
@@ -206,7 +208,12 @@ def test_bad_interruptions(parameters, rule):
         ({"jitter": float("nan")}, "jitter = nan"),
         ({"size_cv": -0.1}, "size_cv = -0.1: must lie between 0 and 10"),
         ({"duration_s": 0.001}, "rate_hz x duration_s = 0 messages"),
-        ({"propagation_us": -5}, "propagation_us = -5: must be a whole number >= 0"),
+        ({"propagation_us": -5}, "propagation_us = -5: must be a whole number from 0 to 10000000000000"),
+        ({"propagation_us": 2**62}, "propagation_us = 4611686018427387904: must be a whole number from 0 to"),
+        ({"propagation_us": 2**63}, "propagation_us = 9223372036854775808: must be a whole number from 0 to"),
+        ({"size_bytes": 10**18}, "size_bytes = 1000000000000000000: must be at most 10000000000"),
+        ({"duration_s": 1e9, "rate_hz": 1e-6}, "duration_s = 1000000000.0: must be at most 10000000"),
+        ({"rate_hz": 1e-300}, "rate_hz = 1e-300: must be at most 100000, and at least 1e-07"),
         ({"propagation_us": 0.5}, "propagation_us = 0.5"),
         ({"rate_hz": float("inf")}, "rate_hz = inf"),
         ({"traces": "lte-a"}, "traces: 'lte-a'"),
@@ -224,11 +231,11 @@ def test_bad_uplinks(parameters, rule):
     ("columns", "rule"),
     [
         (([], 5), "at least one message"),
-        (([0, 2, 1], 5), "must be >= 0 and must not decrease"),
-        (([-1, 2], 5), "must be >= 0 and must not decrease"),
-        (([0, 1], [5, 0]), "message size 0 bytes: must be >= 1"),
-        (([0, 1], 5, [1.0, 0.5]), "coordinates x must be finite numbers and must not decrease"),
-        (([0, 1], 5, [0.0, float("nan")]), "coordinates x must be finite"),
+        (([0, 2, 1], 5), "message 2: arrival_us = 1: times must be >= 0, must not decrease"),
+        (([-1, 2], 5), "message 0: arrival_us = -1: times must be >= 0"),
+        (([0, 1], [5, 0]), "message 1: size_bytes = 0: must be at least 1 byte"),
+        (([0, 1], 5, [1.0, 0.5]), "message 1: x = 0.5: must be a finite number, and not less"),
+        (([0, 1], 5, [0.0, float("nan")]), "message 1: x = nan: must be a finite number"),
     ],
 )
 def test_bad_messages(columns, rule):

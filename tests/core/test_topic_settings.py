@@ -52,7 +52,10 @@ def test_bad_lists_of_topics():
 
 @pytest.mark.parametrize(
     ("topic", "complaint"),
-    [([0, 2], "episode: unknown topic 2; the senders know 2, from 0 on"), ([0, -1], "episode: unknown topic -1")],
+    [
+        ([0, 2], "episode: unknown topic 2; the senders know 2, from 0 on"),
+        ([0, -1], "message 1: topic = -1: must be >= 0"),
+    ],
 )
 def test_an_episode_with_an_unknown_topic(topic, complaint):
     with pytest.raises(BufgymError, match=complaint):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -323,8 +324,9 @@ def test_given_episodes() -> None:
     seen, _ = envs.reset(seed=0, options={"episodes": [None, three_topics()]})
     assert same({name: seen[name][1] for name in seen}, first)
     assert env.rows.senders.episodes[0].arrivals["topic"].tolist() == [0, 1, 2, 0, 1, 0, 2]
-    unknown = three_topics()
-    unknown.arrivals["topic"][3] = 3
+    arrivals = three_topics().arrivals.copy()
+    arrivals["topic"][3] = 3
+    unknown = replace(three_topics(), arrivals=arrivals)
     with pytest.raises(BufgymError, match="unknown topic 3; the senders know 3"):
         env.reset(options={"episode": unknown})
 

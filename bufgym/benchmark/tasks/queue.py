@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from bufgym.benchmark.episodes import TIE
 from bufgym.benchmark.rows import RUNS, Row
 from bufgym.benchmark.score import BASELINE, scores
 from bufgym.benchmark.summary import Quantity, Standing, Summary
@@ -49,6 +50,12 @@ class QueueTask(Task):
                 f"policy {policy.name}: it plans for a sender that asks at every arrival, not with decide_at = "
                 f"{self.decide_at!r}; its H is an upper bound there"
             )
+
+    def verify(self, policy: Policy, row: Row) -> None:
+        best = row["clairvoyant"]
+        if best is not None and not policy.unbounded and row["qoi"] > best * (1 + TIE):
+            place = f"policy {row['policy']}, L = {row['capacity']}, trace {row['trace']}, seed {row['seed']}"
+            raise BufgymError(f"{place}: H = {row['qoi']:.12g} is above {best:.12g}, which no policy can reach")
 
     def play(
         self, policies: Sequence[Policy], scenario: Any, episodes: Sequence[Episode], capacity: int

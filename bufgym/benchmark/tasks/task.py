@@ -50,6 +50,10 @@ class Task(ABC):
         if policy.privileged is not None and self.no_plan:
             raise BufgymError(f"policy {policy.name}: it plans with {self.no_plan}")
 
+    def verify(self, policy: Policy, row: Row) -> None:
+        """An error for a row that cannot be true."""
+        return None
+
     def by_trace(self, scenario: Any) -> list[tuple[str, Any]]:
         """The scenario split into one for each of its traces: (label, scenario). Equal names get a number."""
         traces = getattr(scenario, "traces", None)

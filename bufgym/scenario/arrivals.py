@@ -1,0 +1,122 @@
+"""The messages of an episode, MESSAGE[n]: how they are made, and the rules that they keep."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.errors import BufgymError
+from bufgym.kernel import item, kernel, records
+from bufgym.model.buffer import MESSAGE
+from bufgym.model.link import MAX_TIME_US
+from bufgym.model.topics import MAX_TOPICS
+
+MAX_TOTAL_BYTES = 2**60
+"""Of all messages of an episode: with what a link carries meanwhile it stays far below 2**63."""
+
+_RULES = {
+    "seq": "must be its place in the list of arrivals, {k}",
+    "arrival_us": f"times must be >= 0, must not decrease, and must be at most {MAX_TIME_US} us",
+    "size_bytes": f"must be at least 1 byte, and all messages together at most {MAX_TOTAL_BYTES}",
+    "topic": "must be >= 0",
+    "x": "must be a finite number, and not less than that of the message before it on its topic",
+    "uniform": "must lie in [0, 1)",
+}
+"""What is demanded of each field."""
+_FIELDS = tuple(_RULES)
+_SEQ, _TIME, _SIZE, _TOPIC, _X, _UNIFORM = range(len(_FIELDS))
+_LARGEST = sys.float_info.max
+
+
+def messages(
+    arrival_us: NDArray[np.int64], size_bytes: NDArray[np.int64] | int, x: NDArray[np.float64] | None = None
+) -> NDArray[Any]:
+    """MESSAGE[n] from columns; x defaults to the frame index. Times and x must not decrease, sizes be >= 1 byte."""
+    arrivals = unchecked_messages(arrival_us, size_bytes, x)
+    check_messages(arrivals)
+    return arrivals
+
+
+def unchecked_messages(
+    arrival_us: NDArray[np.int64], size_bytes: NDArray[np.int64] | int, x: NDArray[np.float64] | None
+) -> NDArray[Any]:
+    """``messages`` for columns that an ``Episode`` checks before anything else is done with them."""
+    arrivals = records(len(arrival_us), MESSAGE)
+    arrivals["seq"] = np.arange(len(arrival_us))
+    arrivals["arrival_us"], arrivals["size_bytes"] = arrival_us, size_bytes
+    arrivals["x"] = arrivals["seq"] if x is None else x
+    return arrivals
+
+
+def read_only(arrivals: NDArray[Any]) -> NDArray[Any]:
+    """The same array, which its maker hands over: nobody writes to it any more, so that nobody needs a copy."""
+    arrivals.flags.writeable = False
+    return arrivals
+
+
+def sealed(arrivals: Any) -> NDArray[Any]:
+    """These messages where nobody writes to them: copied, unless they and the array that they lie in are read-only."""
+    if not isinstance(arrivals, np.ndarray) or arrivals.dtype != MESSAGE or arrivals.ndim != 1:
+        raise BufgymError("arrivals: must be MESSAGE[n], as bufgym.scenario.messages makes it")
+    memory = arrivals if arrivals.base is None else arrivals.base
+    fixed = not arrivals.flags.writeable and isinstance(memory, np.ndarray) and not memory.flags.writeable
+    return arrivals if fixed and arrivals.flags.c_contiguous else read_only(arrivals.copy())
+
+
+def check_messages(arrivals: NDArray[Any]) -> tuple[int, bool]:
+    """(bytes of all messages, whether x never falls from one to the next); an error for what breaks ``_RULES``.
+
+    Kernels rely on it: they find a message's entries by its ``seq``, and count bytes and microseconds in 64 bits.
+    """
+    if len(arrivals) == 0:
+        raise BufgymError("an episode needs at least one message")
+    broken, k, total_bytes, rises = _checked(arrivals)
+    if broken < 0 and not rises:
+        broken, k = _checked_by_topic(arrivals, np.full(MAX_TOPICS, -_LARGEST))
+    if broken >= 0:
+        name = _FIELDS[broken]
+        raise BufgymError(f"message {k}: {name} = {arrivals[k][name]}: {_RULES[name].format(k=k)}")
+    return total_bytes, rises
+
+
+@kernel
+def _checked(arrivals: NDArray[Any]) -> tuple[int, int, int, bool]:
+    """(the field that breaks its rule or -1, the message, bytes of all, whether x falls nowhere)."""
+    before_us, total_bytes, before_x, rises = 0, 0, -_LARGEST, True
+    for k in range(len(arrivals)):
+        message = item(arrivals, k)
+        at_us, size_bytes, x = message.arrival_us, message.size_bytes, message.x
+        if message.seq != k:
+            return _SEQ, k, 0, False
+        if not before_us <= at_us <= MAX_TIME_US:
+            return _TIME, k, 0, False
+        if not 1 <= size_bytes <= MAX_TOTAL_BYTES - total_bytes:
+            return _SIZE, k, 0, False
+        if message.topic < 0:
+            return _TOPIC, k, 0, False
+        if not -_LARGEST <= x <= _LARGEST:  # NaN is not either
+            return _X, k, 0, False
+        if not 0.0 <= message.uniform < 1.0:
+            return _UNIFORM, k, 0, False
+        if x < before_x:
+            rises = False
+        before_us, before_x = at_us, x
+        total_bytes += size_bytes
+    return -1, 0, total_bytes, rises
+
+
+@kernel
+def _checked_by_topic(arrivals: NDArray[Any], latest_x: NDArray[np.float64]) -> tuple[int, int]:
+    """(the field, the message) where x falls on one topic, -1 if nowhere.
+
+    ``latest_x``: of each topic that can have an x of its own; all others count as one with the last of these.
+    """
+    for k in range(len(arrivals)):
+        topic = min(item(arrivals, k).topic, len(latest_x) - 1)
+        if item(arrivals, k).x < latest_x[topic]:
+            return _X, k
+        latest_x[topic] = item(arrivals, k).x
+    return -1, 0

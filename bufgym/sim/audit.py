@@ -1,0 +1,89 @@
+"""After a run: whether what a policy saw is still what happened.
+
+Compiled policies see the sender's own records, which spares a copy at every decision, and Numba lets them write there.
+So a benchmark's run is checked when it is over: a policy that changed a message, or a topic's rules, has no result.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from bufgym.errors import BufgymError
+from bufgym.kernel import at, item, kernel
+from bufgym.sim.state import NEVER, Batch
+
+_ARRIVAL, _QUEUED, _BYTES, _LOG, _TOPIC = range(1, 6)
+_FOUND = {
+    _ARRIVAL: "a message that arrived is not as the episode has it",
+    _QUEUED: "a queued message is not as it arrived",
+    _BYTES: "the queue's bytes are not those of its messages",
+    _LOG: "not every message was sent, dropped or queued exactly once",
+    _TOPIC: "a topic's rules are not as they were",
+}
+
+
+def check_untouched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArray[Any], policy: str) -> None:
+    """An error if sender ``i``'s finished run does not agree with its episode: MESSAGE[n] and TOPIC[topics]."""
+    found = _touched(batch, i, arrivals, topics)
+    if found:
+        raise BufgymError(f"policy {policy}: wrote to what it may only read: {_FOUND[found]}")
+
+
+@kernel
+def _same(a: Any, b: Any) -> bool:
+    """Whether two MESSAGE records are the same message."""
+    return bool(
+        a.seq == b.seq
+        and a.arrival_us == b.arrival_us
+        and a.size_bytes == b.size_bytes
+        and a.topic == b.topic
+        and a.x == b.x
+        and a.uniform == b.uniform
+    )
+
+
+@kernel
+def _touched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArray[Any]) -> int:
+    """What does not agree, 0 if all does."""
+    sender = batch.senders[i]
+    dequeued, dropped, backlog_bytes, last = 0, 0, 0, -1
+    for k in range(len(arrivals)):
+        if not _same(at(batch.arrivals, i, k), item(arrivals, k)):
+            return _ARRIVAL
+        entry = at(batch.log, i, k)
+        dequeued += entry.dequeued_us != NEVER
+        dropped += entry.dropped_us != NEVER
+        if entry.dequeued_us != NEVER and (
+            entry.dropped_us != NEVER or entry.dequeued_us < item(arrivals, k).arrival_us
+        ):
+            return _LOG
+    for k in range(sender.occupancy):
+        slot = at(batch.slots, i, sender.first + k)
+        if not (last < slot.seq < len(arrivals) and _same(slot, item(arrivals, slot.seq))):
+            return _QUEUED
+        entry = at(batch.log, i, slot.seq)
+        if entry.dequeued_us != NEVER or entry.dropped_us != NEVER:
+            return _QUEUED
+        backlog_bytes += slot.size_bytes
+        last = slot.seq
+    if backlog_bytes != sender.backlog_bytes:
+        return _BYTES
+    # Each of them writes one entry: as many entries as events means that no two were about one message.
+    counted = dequeued == sender.dequeued and dropped == sender.evicted + sender.rejected
+    if not counted or dequeued + dropped + sender.occupancy != sender.next:
+        return _LOG
+    for k in range(len(topics)):
+        now, then = at(batch.topics, i, k), item(topics, k)
+        if (
+            now.priority != then.priority
+            or now.weight != then.weight
+            or now.period_us != then.period_us
+            or now.limit != then.limit
+            or now.no_drop != then.no_drop
+            or now.deadline_us != then.deadline_us
+            or now.v_start != then.v_start
+        ):
+            return _TOPIC
+    return 0

@@ -1,0 +1,171 @@
+"""An episode is checked when it is made: kernels index by it and count in 64 bits, whoever made it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bufgym import policies, scenario
+from bufgym.errors import BufgymError
+from bufgym.model import qoi
+from bufgym.model.buffer import MESSAGE
+from bufgym.model.link import MAX_TIME_US, Link
+from bufgym.model.topics import Topic
+from bufgym.oracle import clairvoyant
+from bufgym.scenario import SCENARIOS, Episode, FleetEpisode, FleetScenario, Streams, messages
+from bufgym.sim import Senders, run
+from bufgym.traces import Trace
+
+STEADY = Link(Trace.constant(1e6, 10))
+THREE = messages(np.array([0, 10, 20]), 5)
+
+
+def changed(**fields: Any) -> Any:
+    """Three messages whose middle one has other numbers."""
+    arrivals = THREE.copy()
+    for name, number in fields.items():
+        arrivals[name][1] = number
+    return arrivals
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"seq": 10**9}, "seq = 1000000000: must be its place in the list of arrivals, 1"),
+        ({"seq": -(10**9)}, "seq = -1000000000: must be its place in the list of arrivals, 1"),
+        ({"arrival_us": -1}, "arrival_us = -1: times must be >= 0, must not decrease"),
+        ({"arrival_us": MAX_TIME_US + 1}, "arrival_us = 10000000000001: .* at most 10000000000000 us"),
+        ({"size_bytes": 0}, "size_bytes = 0: must be at least 1 byte"),
+        ({"size_bytes": -5}, "size_bytes = -5: must be at least 1 byte"),
+        ({"size_bytes": 2**60}, ".* all messages together at most 1152921504606846976"),
+        ({"topic": -1}, "topic = -1: must be >= 0"),
+        ({"x": np.nan}, "x = nan: must be a finite number"),
+        ({"x": np.inf}, "x = inf: must be a finite number"),
+        ({"x": -1.0}, "x = -1.0: .* not less than that of the message before it on its topic"),
+        ({"uniform": 1.0}, r"uniform = 1.0: must lie in \[0, 1\)"),
+        ({"uniform": np.nan}, r"uniform = nan: must lie in \[0, 1\)"),
+    ],
+)
+def test_a_message_that_breaks_a_rule(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(BufgymError, match=f"^message 1: {message}"):
+        Episode(changed(**fields), STEADY)
+    with pytest.raises(BufgymError, match=f"^arrivals of robot 1: message 1: {message}"):
+        FleetEpisode((THREE, changed(**fields)), STEADY)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_part_of_an_episode_is_none(name: str) -> None:
+    """Its messages no longer have the numbers by which kernels find what became of them."""
+    episode = scenario.get(name).draw(Streams.seeded(2))
+    with pytest.raises(BufgymError, match=r"^message 0: seq = 2: must be its place in the list of arrivals, 0"):
+        replace(episode, arrivals=episode.arrivals[2:])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"arrivals": THREE[:0]}, "an episode needs at least one message"),
+        ({"arrivals": None}, "arrivals: must be MESSAGE"),
+        ({"arrivals": np.zeros(3)}, "arrivals: must be MESSAGE"),
+        ({"arrivals": np.zeros((3, 1), MESSAGE)}, "arrivals: must be MESSAGE"),
+        ({"link": None}, "link: None is not a bufgym.model.link Link"),
+        ({"window": 0}, "window = 0"),
+        ({"consumers": 0}, "consumers = 0: must be a whole number from 1 to 3333333"),
+        ({"consumers": 10**9}, "consumers = 1000000000"),
+        ({"first_decision": 0.5}, "first_decision = 0.5"),
+        ({"last_decision": 2**63}, "last_decision = 9223372036854775808"),
+        ({"encodings": {"json": np.ones(2, np.int64)}}, r"encodings\['json'\]: must be int64\[3\]"),
+    ],
+)
+def test_other_parameters(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(BufgymError, match=message):
+        replace(Episode(THREE, STEADY), **changes)
+
+
+def test_another_encoding_keeps_the_rules_too() -> None:
+    episode = Episode(THREE, STEADY, encodings={"json": np.array([5, 0, 5])})
+    with pytest.raises(BufgymError, match="message 1: size_bytes = 0"):
+        episode.encoded("json")
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_nobody_writes_to_an_episode(name: str) -> None:
+    streams = Streams.seeded(1)
+    drawn = scenario.get(name).draw(streams)
+    for episode in (drawn, drawn.with_uniforms(streams.policy), drawn.encoded("json"), drawn.copied(9)):
+        with pytest.raises(ValueError, match="read-only"):
+            episode.arrivals["x"] = 7
+    cell = FleetScenario.of(2).draw(streams)
+    with pytest.raises(ValueError, match="read-only"):
+        cell.arrivals[1]["x"] = 7
+
+
+def test_what_its_maker_writes_later_does_not_reach_it() -> None:
+    arrivals = THREE.copy()
+    episode, part = Episode(arrivals, STEADY), arrivals[:2]
+    part.flags.writeable = False
+    shorter = Episode(part, STEADY)
+    arrivals["seq"] = 10**9
+    assert episode.arrivals["seq"].tolist() == [0, 1, 2]
+    assert shorter.arrivals["seq"].tolist() == [0, 1]
+
+
+def test_every_second_record_of_an_array() -> None:
+    arrivals = np.repeat(THREE, 2)[::2]
+    senders = run(policies.get("drop-oldest"), [Episode(arrivals, STEADY)], 2, qoi.exponential())
+    assert senders.batch.senders["transmitted"].tolist() == [3]
+
+
+def test_x_of_topics_falls_only_where_topics_are_used() -> None:
+    """Each topic has an x of its own: 0, 1 | 5, 7. One queue would see it fall from 5 to 1."""
+    arrivals = messages(np.arange(4), 5)
+    arrivals["x"], arrivals["topic"] = [0, 5, 1, 7], [0, 1, 0, 1]
+    episode = Episode(arrivals, STEADY)
+    senders = Senders(1, 2, qoi.exponential(), max_messages=4, topics=[Topic("a"), Topic("b")])
+    senders.load(0, episode)
+    one_queue = Senders(1, 2, qoi.exponential(), max_messages=4)
+    for refused in (lambda: one_queue.load(0, episode), lambda: clairvoyant(episode, 2, qoi.exponential())):
+        with pytest.raises(BufgymError, match="x falls from one message to the next"):
+            refused()
+
+
+@pytest.mark.parametrize("what", [None, 5, FleetEpisode((THREE,), STEADY)])
+def test_senders_load_episodes_only(what: Any) -> None:
+    with pytest.raises(BufgymError, match=r"is not a bufgym\.scenario Episode"):
+        Senders(1, 2, qoi.exponential(), max_messages=4).load(0, what)
+
+
+# --- 64 bits ---------------------------------------------------------------------------------------------------------
+
+
+def slow(after: str, carried: int = 1) -> Link:
+    """So many bytes in 10^7 s, the longest trace there is."""
+    return Link(Trace("slow", np.array([0, MAX_TIME_US]), np.array([0, carried]), after=after))  # type: ignore[arg-type]
+
+
+def test_a_link_that_would_take_longer_than_64_bits_can_count() -> None:
+    """1 byte in 10^13 us: 230,000 bytes take 2.3 x 10^18 us, and 2^61 is 2.306 x 10^18."""
+    for after in ("loop", "hold"):
+        Episode(messages(np.array([0]), 220_000), slow(after))
+        with pytest.raises(BufgymError, match=r"link on slow: may need 2.31e\+18 us, .* must stay below 2\*\*61 us"):
+            Episode(messages(np.array([0]), 231_000), slow(after))
+    Episode(messages(np.array([0]), 10**10), slow("stop"))  # carries one byte and ends
+    # Two robots of a cell share it, and so do their bytes.
+    with pytest.raises(BufgymError, match=r"link on slow: may need 3e\+18 us"):
+        FleetEpisode((messages(np.array([0]), 150_000),) * 2, slow("loop"))
+
+
+def test_a_link_that_would_carry_more_than_64_bits_can_count() -> None:
+    """2^61 bytes in a microsecond, and again in the next: two messages 1 us apart are all it may meet."""
+    fast = Link(Trace("fast", np.array([0, 1]), np.array([0, 2**61])))
+    with pytest.raises(BufgymError, match=r"link on fast: .* must stay below 2\*\*61 us and 2\*\*62 bytes"):
+        Episode(messages(np.array([0, 10]), 5), fast)
+
+
+def test_pauses_for_acks_count_too() -> None:
+    """3 messages and an ack delay of 2^60 us: the last ack comes after 3 x 2^60 us."""
+    with pytest.raises(BufgymError, match=r"may need 3.46e\+18 us"):
+        Episode(THREE, STEADY, ack_delay_us=2**60)
