@@ -106,14 +106,17 @@ class MinGap(Policy):
 
 
 class OrbBuf(Policy):
-    """Drop the message with the most similar queued neighbours, the first of equals; where none has two: the tail."""
+    """Drop the message with the most similar neighbours, the first of equals; the head's is the one that left last."""
 
     def __init__(self, v):
         self.v = v
 
     def full(self, queue, newcomer, L, last_dequeued, previous):
-        similar = [1 - self.v(c["x"] - a["x"]) for a, c in zip(queue, queue[2:], strict=False)]
-        return 1 + similar.index(max(similar)) if similar else L - 1
+        if L < 3:
+            return L - 1
+        older = ([last_dequeued] if last_dequeued else []) + queue
+        similar = [1 - self.v(c["x"] - a["x"]) for a, c in zip(older, older[2:], strict=False)]
+        return (0 if last_dequeued else 1) + similar.index(max(similar))
 
 
 class LinearAlpha(Afr):
