@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 
+from naive_fragments import BestEffort, FrameDropper, Reliable, ZenohDrop
 from naive_queues import (
     ACCEPT,
     REJECT,
@@ -240,7 +241,10 @@ def twins(v):
         "dds-keep-all": DropNewest,
         "lifespan": Lifespan,
         "time-filter": lambda separation_s=0.1: Spaced("us", separation_s * 1e6),
-        "zenoh-drop": DropNewest,
+        "zenoh-drop": ZenohDrop,
+        "ros2-best-effort": BestEffort,
+        "ros2-reliable-udp": Reliable,
+        "webrtc-frame-dropper": FrameDropper,
         "zenoh-ring": KeepLast,
         "foxglove-sdk": lambda depth=1024: KeepLast(depth),
         "foxglove-backlog": FoxgloveBacklog,
@@ -248,7 +252,7 @@ def twins(v):
         "codel": Codel,
         "red": Red,
         **dict.fromkeys(["fifo", "strict-priority", "age-greedy", "edf", "ros-native"], OldestThatHelps),
-        **dict.fromkeys(["robofleet", "robofleet-released"], lambda: OldestThatHelps(1)),
+        **dict.fromkeys(["robofleet", "robofleet-literal", "robofleet-released"], lambda: OldestThatHelps(1)),
         "test-anything": Anything,
     }
 

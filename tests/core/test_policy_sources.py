@@ -34,6 +34,14 @@ SETTINGS = [
     "time-filter:separation_s=0.004",
     "foxglove-sdk:depth=3",
     "foxglove-backlog:limit_mb=0.006",
+    # Messages of the random episodes have some hundred bytes each and come ms apart.
+    "zenoh-drop:batch_size=300,queue_size=2,so_sndbuf=100,wait_before_drop=50,max_wait_before_drop_fragments=1000",
+    "zenoh-drop:batch_size=700,queue_size=1,so_sndbuf=1,rate_memory_s=0.01",
+    "ros2-best-effort:queue_kb=2",
+    "ros2-best-effort:queue_kb=1,rate_memory_s=0.01",
+    "ros2-reliable-udp:queue_kb=1,depth=2",
+    "ros2-reliable-udp:queue_kb=2,rate_memory_s=0.01",
+    "webrtc-frame-dropper",
     "codel:target_ms=2,interval_ms=5",
     "codel:target_ms=1,interval_ms=1",
     "red:weight=0.5,max_p=0.5",
@@ -149,7 +157,6 @@ def test_depths():
     ("name", "twin"),
     [
         ("dds-keep-all", "drop-newest"),
-        ("zenoh-drop", "drop-newest"),
         ("zenoh-ring", "drop-oldest"),
         ("foxglove-sdk", "drop-oldest"),
     ],
