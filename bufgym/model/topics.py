@@ -1,8 +1,8 @@
 """Topics: what a robot publishes side by side over one uplink, and what its operator asks for each.
 
-The terms are Robofleet's (github ut-amrl/robofleet_client): a topic has a priority, may have a rate limit, and may be
-``no_drop``. Beyond Robofleet, every topic has a weight and a V of its own, so that H = sum of weight x H of the topic,
-and may have a deadline, after which its messages count as late.
+The terms are Robofleet's [sikand2021robofleet]: a topic has a priority, may have a rate limit, and may be ``no_drop``.
+Beyond Robofleet, every topic has a weight and a V of its own, so that H = sum of weight x H of the topic, and may have
+a deadline, after which its messages count as late.
 """
 
 from __future__ import annotations

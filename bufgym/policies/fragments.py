@@ -74,7 +74,7 @@ BATCH, BATCHES, SOCKET, WAIT, MORE, FORGETS = range(6)  # where the parameters o
         "rate_memory_s": 1.0,
     },
     memory=PIPE,
-    source="Zenoh, congestion control DROP (zenoh), measured against version 1.10.2",
+    source="Zenoh, congestion control DROP [zenoh], measured against version 1.10.2",
     compile=True,
 )
 def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -110,7 +110,7 @@ def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     "ros2-best-effort",
     parameters={"queue_kb": 200.0, "rate_memory_s": 1.0},
     memory=PIPE,
-    source="ROS 2 over Fast DDS and UDP, RELIABILITY best effort (fastdds)",
+    source="ROS 2 over Fast DDS and UDP, RELIABILITY best effort [fastdds]",
     compile=True,
 )
 def ros2_best_effort(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -134,7 +134,7 @@ def ros2_best_effort(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     "ros2-reliable-udp",
     parameters={"queue_kb": 200.0, "depth": 10.0, "rate_memory_s": 1.0},
     memory=PIPE,
-    source="ROS 2 over Fast DDS and UDP, RELIABILITY reliable, HISTORY KEEP_LAST(depth) (fastdds)",
+    source="ROS 2 over Fast DDS and UDP, RELIABILITY reliable, HISTORY KEEP_LAST(depth) [fastdds]",
     compile=True,
 )
 def ros2_reliable_udp(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:

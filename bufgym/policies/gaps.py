@@ -69,13 +69,18 @@ def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return victim if victim < s else REJECT
 
 
-@register("orbbuf", source="ORBBuf (IROS 2021), Jrdevil-Wang/ORBBuf, with Sim = 1 - V(motion gap)", compile=True)
+@register(
+    "orbbuf",
+    source="ORBBuf [wang2021orbbuf], released code (Jrdevil-Wang/ORBBuf), with Sim = 1 - V(motion gap)",
+    compile=True,
+)
 def orbbuf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops the message whose neighbours are most similar, first of equals; the newcomer is always kept.
 
-    The head's older neighbour is the message that left last; while none has left, the head stays. The tail stays, but
-    for L < 3, where it goes. The released similarity compares images (and is a random stub there); without images,
-    Sim = 1 - V(motion gap).
+    The head's older neighbour is the message that left last; while none has left, the head stays. (After slot 0 or 1
+    was dropped the code compares the head with the newest message instead, its `last_frame_`; that is not followed.)
+    The tail stays, but for L < 3, where it goes. The released similarity compares images (and is a random stub there);
+    without images, Sim = 1 - V(motion gap).
     """
     L = buffer.capacity
     if len(buffer.slots) < L:

@@ -1,6 +1,6 @@
 """Robofleet's client, as published and as released, and native ROS; `rosbridge` is in ``middleware.py``.
 
-Robofleet (Sikand et al. 2021) limits each topic's rate, queues ``no_drop`` messages, keeps one slot for any other
+Robofleet [sikand2021robofleet] limits each topic's rate, queues ``no_drop`` messages, keeps one slot for any other
 topic, and sends while fewer than n_T messages are in flight: sent, and not yet acknowledged (by a pong, in its terms).
 In the paper the topic with the largest priority x wait goes first. The released scheduler (MessageSchedulerLib.hpp of
 github ut-amrl/robofleet_client_lib) sorts by the same product in ascending order, so that the smallest goes first. Here
@@ -68,7 +68,7 @@ def longest_wait(buffer: Buffer, memory: Memory) -> int:
     "robofleet",
     on_send=longest_wait,
     for_topics=True,
-    source="Robofleet, Sikand et al. 2021, as published",
+    source="Robofleet [sikand2021robofleet], as published",
     compile=True,
 )
 def robofleet(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -80,7 +80,7 @@ def robofleet(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     "robofleet-literal",
     on_send=longest_wait,
     for_topics=True,
-    source="Robofleet (sikand2021robofleet), rate limits by the letter: since last transmitted",
+    source="Robofleet [sikand2021robofleet], rate limits by the letter: since last transmitted",
     client=ClientSettings(limit_since_sent=True),
     compile=True,
 )
@@ -125,7 +125,7 @@ def shortest_wait(buffer: Buffer, memory: Memory) -> int:
     memory={"flushing": 0.0},
     on_send=shortest_wait,
     for_topics=True,
-    source="Robofleet, released code (ut-amrl/robofleet_client_lib)",
+    source="Robofleet [sikand2021robofleet], released code (ut-amrl/robofleet_client_lib)",
     client=ClientSettings(limit_at_send=True, flush_no_drop=True),
     compile=True,
 )

@@ -100,7 +100,7 @@ def fill(memory: Memory, size_bytes: float, period_us: float) -> None:
             ("level_bytes", "target", "average_bytes", "ratio", "count", "large_left", "large_part", "above"), 0.0
         ),
     },
-    source="WebRTC, modules/video_coding/utility/frame_dropper (webrtc)",
+    source="WebRTC, modules/video_coding/utility/frame_dropper [webrtc]",
     compile=True,
 )
 def webrtc_frame_dropper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import naive
@@ -270,3 +272,22 @@ def test_red_averages():
     assert averages == [
         (pytest.approx(average), count) for average, count in ((0.8, -1), (1.44, -1), (1.952, -1), (2.3616, 0))
     ]
+
+
+# --- references ------------------------------------------------------------------------------------------------------
+
+ROOT = Path(__file__).parents[2]
+KEYS = set(re.findall(r"^@\w+\{(\w+),", (ROOT / "docs/references.bib").read_text(encoding="utf-8"), re.M))
+
+
+def test_keys_in_brackets_are_references():
+    for path in sorted((ROOT / "bufgym").rglob("*.py")):
+        cited = set(re.findall(r"\[([a-z]+(?:19|20)\d\d[a-z0-9]*)\]", path.read_text(encoding="utf-8")))
+        assert cited <= KEYS, path
+
+
+@pytest.mark.parametrize("name", [*policies.names()])
+def test_a_source_that_is_a_paper_has_its_key(name):
+    source = policies.get(name).source
+    if re.search(r"paper|et al\.|RFC|\b(19|20)\d\d\b|AFR \[|ORBBuf|Robofleet", source):
+        assert set(re.findall(r"\[(\w+)\]", source)) & KEYS, source

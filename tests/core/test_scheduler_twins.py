@@ -155,7 +155,7 @@ def no_drop_is_kept_while_others_could_go(senders, topics):
     n = int(senders.batch.senders[0]["arrivals"])
     rows, arrivals = np.asarray(senders.batch.log[0])[:n], np.asarray(senders.batch.arrivals[0])[:n]
     free = np.array([not topic.no_drop for topic in topics])[arrivals["topic"]]
-    for lost in np.flatnonzero(~free & (rows["dropped_us"] != NEVER)):
+    for lost in np.flatnonzero(~free & (rows["dropped_us"] != NEVER) & (rows["limited"] == 0)):
         at_us = arrivals["arrival_us"][lost]
         assert rows["dropped_us"][lost] == at_us  # rejected when it came: no_drop is never evicted
         later = [(rows[field] == NEVER) | (rows[field] > at_us) for field in ("dequeued_us", "dropped_us")]
