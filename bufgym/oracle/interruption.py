@@ -1,4 +1,4 @@
-"""The best possible QoI in one interruption whose length T is known (AFR paper, Sec. III-C).
+"""The best possible QoI in one interruption whose length T is known (AFR [wang2022afr], Sec. III-C).
 
 Message 0 was sent before, message T + 1 is sent after, and L of the T between can be kept: L + 1 gaps that add up to
 T + 1. V is concave, so equal gaps are best. ``ideal`` and ``integer`` count the information gained after message 0, as

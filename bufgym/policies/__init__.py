@@ -11,11 +11,13 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     aqm,
     checkpointing,
     classic,
+    fragments,
     gaps,
     middleware,
     robofleet,
     sampling,
     schedulers,
+    webrtc,
 )
 from bufgym.policies.registry import ClientSettings, Policy, get, names, register, register_later, runs_compiled
 from bufgym.policies.schedulers import make_room

@@ -1,4 +1,4 @@
-"""AFR, Adaptive Frame Rate: thin the queue to an even, adaptive frame rate.
+"""AFR, Adaptive Frame Rate [wang2022afr]: thin the queue to an even, adaptive frame rate.
 
 Variables are the paper's: dropping rate r, counter c, dropping position p; L the capacity, s the queued messages. One
 message in r is kept; among those kept before r grew, every second one is evicted, oldest pair first.
@@ -45,7 +45,11 @@ def afr_departure(buffer: Buffer, memory: Memory) -> None:
 
 
 @register(
-    "afr", memory=MEMORY, on_departure=afr_departure, source="AFR paper, released code (Jrdevil-Wang/AFR)", compile=True
+    "afr",
+    memory=MEMORY,
+    on_departure=afr_departure,
+    source="AFR [wang2022afr], released code (Jrdevil-Wang/AFR)",
+    compile=True,
 )
 def afr(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Adaptive Frame Rate as released: an even, adaptive frame rate."""
@@ -57,8 +61,8 @@ def afr(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return thin(r, c, p, r, s, L, memory)
 
 
-@register("afr-paper", memory=MEMORY, source="AFR paper, Sec. IV-A, Algorithm 1 (literal text)", compile=True)
-@register("afr-paper", memory=MEMORY, source="AFR paper, Sec. IV-A, Algorithm 1 (literal text)", compile=True)
+@register("afr-paper", memory=MEMORY, source="AFR [wang2022afr], Sec. IV-A, Algorithm 1 (literal text)", compile=True)
+@register("afr-paper", memory=MEMORY, source="AFR [wang2022afr], Sec. IV-A, Algorithm 1 (literal text)", compile=True)
 def afr_paper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Adaptive Frame Rate by the letter of the paper: s/L < 2/3, p not moved at departures."""
     r, c, p = memory[R], memory[C], memory[P]

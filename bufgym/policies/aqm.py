@@ -77,7 +77,7 @@ def codel_dequeue(buffer: Buffer, memory: Memory) -> bool:
         ("first_above_us", "drop_next_us", "count", "lastcount", "dropping", "again", "maxpacket_bytes"), 0.0
     ),
     on_dequeue=codel_dequeue,
-    source="CoDel, RFC 8289",
+    source="CoDel, RFC 8289 [nichols2018codel]",
     compile=True,
 )
 def codel(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -97,7 +97,7 @@ AVERAGE, COUNT = range(2)  # and its memory
     "red",
     parameters={"min_th": 0.25, "max_th": 0.75, "max_p": 0.1, "weight": 0.2},
     memory={"average": 0.0, "count": -1.0},
-    source="Random Early Detection, Floyd and Jacobson 1993",
+    source="Random Early Detection, Floyd and Jacobson 1993 [floyd1993red]",
     compile=True,
 )
 def red(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:

@@ -29,7 +29,7 @@ def growing_gap(r: float, p: float, L: int, alpha: float) -> float:
     parameters={"alpha": 1.302},
     memory=MEMORY,
     on_departure=afr_departure,
-    source="LINEAR, Bringmann et al., Online Checkpointing with Improved Worst-Case Guarantees, arXiv 1302.4216",
+    source="LINEAR, Bringmann et al. [bringmann2015checkpointing]",
     compile=True,
 )
 def linear_alpha(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -76,7 +76,7 @@ FIRST = 0
 @register(
     "steady",
     memory={"first": 0.0},
-    source="Moreno et al., steady algorithm of the package downstream (PyPI)",
+    source="steady algorithm, Moreno et al. [moreno2024downsampling], as in the package downstream (PyPI)",
     compile=True,
 )
 def steady(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:

@@ -43,7 +43,7 @@ def latest_only(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return keep_last(len(buffer.slots), 1)
 
 
-@register("random", source="AFR paper, Eq. 9", compile=True)
+@register("random", source="AFR paper [wang2022afr], Eq. 9", compile=True)
 def random(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Random Drop: the victim is uniform over the L queued messages and the newcomer."""
     L = buffer.capacity

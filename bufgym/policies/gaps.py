@@ -69,19 +69,26 @@ def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return victim if victim < s else REJECT
 
 
-@register("orbbuf", source="ORBBuf (IROS 2021), Jrdevil-Wang/ORBBuf, with Sim = 1 - V(motion gap)", compile=True)
+@register(
+    "orbbuf",
+    source="ORBBuf [wang2021orbbuf], released code (Jrdevil-Wang/ORBBuf), with Sim = 1 - V(motion gap)",
+    compile=True,
+)
 def orbbuf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """A full queue drops the message whose two queued neighbours are most similar; the newcomer is always kept.
+    """A full queue drops the message whose neighbours are most similar, first of equals; the newcomer is always kept.
 
-    The released similarity compares images (and is a random stub there); without images, Sim = 1 - V(motion gap).
-    The head and the tail have no two queued neighbours: for L < 3 the tail goes.
+    The head's older neighbour is the message that left last; while none has left, the head stays. (After slot 0 or 1
+    was dropped the code compares the head with the newest message instead, its `last_frame_`; that is not followed.)
+    The tail stays, but for L < 3, where it goes. The released similarity compares images (and is a random stub there);
+    without images, Sim = 1 - V(motion gap).
     """
     L = buffer.capacity
     if len(buffer.slots) < L:
         return ACCEPT
     victim, most_similar = L - 1, -np.inf
-    for k in range(1, L - 1):
-        similar = 1 - value(buffer.v, buffer.slots[k + 1].x - buffer.slots[k - 1].x)
+    for k in range(0 if buffer.dequeued > 0 and L > 2 else 1, L - 1):
+        older = buffer.slots[k - 1].x if k > 0 else buffer.dequeued_x
+        similar = 1 - value(buffer.v, buffer.slots[k + 1].x - older)
         if similar > most_similar:
             victim, most_similar = k, similar
     return victim

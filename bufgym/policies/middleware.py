@@ -64,12 +64,6 @@ def time_filter(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return keep_last(s, buffer.capacity)
 
 
-@register("zenoh-drop", source="Zenoh congestion control DROP", compile=True)
-def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Zenoh DROP: put drops the newcomer when full; the 1 ms that it first waits for room is left out."""
-    return keep_first(len(buffer.slots), buffer.capacity)
-
-
 @register("zenoh-ring", source="Zenoh RingChannel(L)", compile=True)
 def zenoh_ring(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Zenoh RingChannel: keeps the newest L."""

@@ -79,6 +79,8 @@ class ClientSettings:
     """Whether it keeps to the scenario's in-flight window n_T; if not, it sends whenever the link is free."""
     limit_at_send: bool = False
     """Whether rate limits hold messages back at the socket, keeping the latest, instead of dropping at arrival."""
+    limit_since_sent: bool = False
+    """Whether rate limits at arrival count from the message of the topic that was sent last, not the one kept last."""
     flush_no_drop: bool = False
     """Whether no_drop messages are sent even when the window is full."""
     copies: bool = False

@@ -18,7 +18,7 @@ def reservoir_departure(buffer: Buffer, memory: Memory) -> None:
     "reservoir",
     memory={"seen": 0.0},
     on_departure=reservoir_departure,
-    source="Vitter, Random sampling with a reservoir, 1985 (algorithm R)",
+    source="Vitter, Random sampling with a reservoir, 1985 [vitter1985reservoir] (algorithm R)",
     compile=True,
 )
 def reservoir(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -38,7 +38,7 @@ COUNT = 0
     "decimate",
     parameters={"every": 3.0},
     memory={"count": 0.0},
-    source="fixed decimation, 30 to 10 frames/s (Golodetz et al. 2018)",
+    source="fixed decimation, 30 to 10 frames/s (Golodetz et al. 2018 [golodetz2018collaborative])",
     compile=True,
 )
 def decimate(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -53,7 +53,7 @@ def decimate(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 @register(
     "keyframe",
     parameters={"step": 0.05},
-    source="motion keyframes, a threshold on distance or angle (Dong et al.)",
+    source="motion keyframes of collaborative mapping, a threshold on distance or angle",
     compile=True,
 )
 def keyframe(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:

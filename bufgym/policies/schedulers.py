@@ -136,17 +136,16 @@ def most_aged(buffer: Buffer, memory: Memory) -> int:
     "age-greedy",
     on_send=most_aged,
     for_topics=True,
-    source="age of information: Kaul et al. 2012; greedy by weighted age: Kadota et al. 2018",
+    source="age of information [kaul2012status]; greedy by weighted age [kadota2018scheduling]",
     compile=True,
 )
 def age_greedy(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The topic with the largest weight x age of information first.
 
     The age of a topic is the time since its newest *sent* message arrived at the sender: the age at the server once
-    everything sent is there (S. Kaul, R. Yates, M. Gruteser, "Real-time status: how often should one update?", 2012). A
-    topic that has sent nothing is as old as its oldest queued message. Candidates are the oldest of each topic. This is
-    the greedy policy, which sends where the age is highest, of I. Kadota et al., "Scheduling Policies for Minimizing
-    Age of Information in Broadcast Wireless Networks", 2018, with the ages weighted as in their sum.
+    everything sent is there [kaul2012status]. A topic that has sent nothing is as old as its oldest queued message.
+    Candidates are the oldest of each topic. This is the greedy policy of [kadota2018scheduling], which sends where the
+    age is highest, with the ages weighted as in their sum.
     """
     return make_room(buffer, arrival)
 
@@ -165,7 +164,7 @@ def earliest_deadline(buffer: Buffer, memory: Memory) -> int:
     "edf",
     on_send=earliest_deadline,
     for_topics=True,
-    source="earliest deadline first, Liu and Layland 1973",
+    source="earliest deadline first, Liu and Layland 1973 [liu1973scheduling]",
     compile=True,
 )
 def edf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:

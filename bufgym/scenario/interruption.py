@@ -1,4 +1,4 @@
-"""One interruption of unknown length: the AFR paper's model."""
+"""One interruption of unknown length: the model of the AFR paper [wang2022afr]."""
 
 from __future__ import annotations
 

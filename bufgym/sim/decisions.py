@@ -41,7 +41,7 @@ def arrive(batch: Batch, i: int) -> int:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
     if sender.limit_at_send == 0 and rules.too_soon(batch, i, arrival.topic):
         at(batch.log, i, sender.next).limited = 1
-        decision = REJECT  # always valid: a no_drop topic has no rate limit
+        decision = REJECT
     else:
         asked = sender.first_decision <= sender.next <= sender.last_decision
         if asked and not (sender.ask_when_full == 1 and has_room(batch, i)):
@@ -80,9 +80,13 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
 
 @kernel
 def can_reject(batch: Batch, i: int) -> bool:
-    """Whether the arrival at hand may be dropped: always, but for a no_drop message that could be kept somehow."""
-    topic = at(batch.arrivals, i, batch.senders[i].next).topic
-    return not rules.no_drop(batch, i, topic) or (not has_room(batch, i) and rules.refuge(batch, i) < 0)
+    """Whether the arrival at hand may be dropped: always, but for a no_drop message that could be kept somehow.
+
+    Its rate limit comes first: what comes too soon is dropped even on a no_drop topic.
+    """
+    sender = batch.senders[i]
+    topic, limited = at(batch.arrivals, i, sender.next).topic, at(batch.log, i, sender.next).limited == 1
+    return limited or not rules.no_drop(batch, i, topic) or (not has_room(batch, i) and rules.refuge(batch, i) < 0)
 
 
 @kernel

@@ -106,7 +106,8 @@ class Senders:
             memory = policy.new_memory(len(self), self.capacity)
         senders, client = self.batch.senders, policy.client
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
-        senders["limit_at_send"], senders["flush_no_drop"] = client.limit_at_send, client.flush_no_drop
+        for rule in ("limit_at_send", "limit_since_sent", "flush_no_drop"):
+            senders[rule] = getattr(client, rule)
         if not client.awaits_acks:
             senders["window"], senders["ack_delay_us"] = 1, 0
         roll_out(self.batch._replace(parameters=policy.parameter_array), shares, memory, policy)

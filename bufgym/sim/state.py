@@ -42,6 +42,10 @@ SENDER = np.dtype(
         ("window", np.int64),  # n_T: messages sent and not yet acked, at most
         ("ack_delay_us", np.int64),  # from the end of a message's transmission to its ack
         ("limit_at_send", np.int64),  # 1: rate limits hold back at the socket, 0: they drop at arrival
+        (
+            "limit_since_sent",
+            np.int64,
+        ),  # 1: at arrival they count from the message sent last, 0: from the one kept last
         ("flush_no_drop", np.int64),  # 1: no_drop messages are sent even when the window is full
         # episode
         ("arrivals", np.int64),  # messages in all

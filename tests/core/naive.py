@@ -91,6 +91,7 @@ class Sender:
         self.position = 0  # bytes of the link used up when it has
         self.last_dequeued = None
         self.previous = None  # the arrival before this one, kept or not
+        self.periods = []  # running mean of the time between arrivals, us, of which the newest weighs 1/8
         self.dequeued, self.transmitted, self.dropped, self.order = {}, {}, {}, []
         self.rejected = self.evicted = self.invalid = 0
 
@@ -98,6 +99,10 @@ class Sender:
         for message in messages:
             # (1) all that the link finishes up to and including now leaves, and successors start
             self.advance(message["us"])
+            if self.previous is not None:
+                period = message["us"] - self.previous["us"]
+                mean = self.periods[-1] if self.periods else float(period)
+                self.periods.append(mean + (period - mean) / 8)
             # (2) the policy decides
             fits = self.fits(self.queue, message)
             asked = first_decision <= message["seq"] <= last_decision

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 
+from naive_fragments import BestEffort, FrameDropper, Reliable, ZenohDrop
 from naive_queues import (
     ACCEPT,
     REJECT,
@@ -106,14 +107,17 @@ class MinGap(Policy):
 
 
 class OrbBuf(Policy):
-    """Drop the message with the most similar queued neighbours, the first of equals; where none has two: the tail."""
+    """Drop the message with the most similar neighbours, the first of equals; the head's is the one that left last."""
 
     def __init__(self, v):
         self.v = v
 
     def full(self, queue, newcomer, L, last_dequeued, previous):
-        similar = [1 - self.v(c["x"] - a["x"]) for a, c in zip(queue, queue[2:], strict=False)]
-        return 1 + similar.index(max(similar)) if similar else L - 1
+        if L < 3:
+            return L - 1
+        older = ([last_dequeued] if last_dequeued else []) + queue
+        similar = [1 - self.v(c["x"] - a["x"]) for a, c in zip(older, older[2:], strict=False)]
+        return (0 if last_dequeued else 1) + similar.index(max(similar))
 
 
 class LinearAlpha(Afr):
@@ -237,7 +241,10 @@ def twins(v):
         "dds-keep-all": DropNewest,
         "lifespan": Lifespan,
         "time-filter": lambda separation_s=0.1: Spaced("us", separation_s * 1e6),
-        "zenoh-drop": DropNewest,
+        "zenoh-drop": ZenohDrop,
+        "ros2-best-effort": BestEffort,
+        "ros2-reliable-udp": Reliable,
+        "webrtc-frame-dropper": FrameDropper,
         "zenoh-ring": KeepLast,
         "foxglove-sdk": lambda depth=1024: KeepLast(depth),
         "foxglove-backlog": FoxgloveBacklog,
@@ -245,7 +252,7 @@ def twins(v):
         "codel": Codel,
         "red": Red,
         **dict.fromkeys(["fifo", "strict-priority", "age-greedy", "edf", "ros-native"], OldestThatHelps),
-        **dict.fromkeys(["robofleet", "robofleet-released"], lambda: OldestThatHelps(1)),
+        **dict.fromkeys(["robofleet", "robofleet-literal", "robofleet-released"], lambda: OldestThatHelps(1)),
         "test-anything": Anything,
     }
 

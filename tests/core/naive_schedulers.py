@@ -153,6 +153,7 @@ TWINS = {
     "age-greedy": AgeGreedy,
     "edf": Edf,
     "robofleet": Robofleet,
+    "robofleet-literal": Robofleet,
     "robofleet-released": RobofleetReleased,
     "ros-native": RosNative,
 }

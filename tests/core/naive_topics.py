@@ -53,6 +53,7 @@ class Sender:
         schedules=False,
         drops_heads=False,
         limit_at_send=False,
+        limit_since_sent=False,
         flush_no_drop=False,
     ):
         self.link, self.capacity, self.decide_at = link, capacity, decide_at
@@ -61,7 +62,7 @@ class Sender:
         self.max_bytes = math.inf if max_bytes is None else max_bytes
         self.window, self.ack_delay_us, self.propagation_us = window, ack_delay_us, propagation_us
         self.schedules, self.drops_heads = schedules, drops_heads
-        self.limit_at_send, self.flush_no_drop = limit_at_send, flush_no_drop
+        self.limit_at_send, self.limit_since_sent, self.flush_no_drop = limit_at_send, limit_since_sent, flush_no_drop
         self.queues = [[] for _ in self.rules]
         self.arrived = [[] for _ in self.rules]  # all that came, kept or not
         self.kept = [[] for _ in self.rules]  # all that was ever enqueued
@@ -183,7 +184,7 @@ class Sender:
         lane = self.lane(message)
         if self.queues[lane][0] is not message or not self.window_open(message):
             return False
-        if self.limit_at_send and self.sent[lane]:
+        if self.limit_at_send and self.sent[lane] and not self.rules[lane].no_drop:
             return self.now - self.dequeued[self.sent[lane][-1]["seq"]] >= self.rules[lane].period_us
         return True
 
@@ -208,9 +209,12 @@ class Sender:
 
     def too_soon(self, message):
         lane = self.lane(message)
-        if self.limit_at_send or not self.kept[lane]:
+        since_us = [self.dequeued[m["seq"]] for m in self.sent[lane]]
+        if not self.limit_since_sent:
+            since_us = [m["us"] for m in self.kept[lane]]
+        if self.limit_at_send or not since_us:
             return False
-        return message["us"] - self.kept[lane][-1]["us"] < self.rules[lane].period_us
+        return message["us"] - since_us[-1] < self.rules[lane].period_us
 
     def fits(self, message, without=None):
         """Whether the message has room, ``without`` one that is queued."""

@@ -65,7 +65,8 @@ CAPACITIES = range(1, 13) if JIT else (1, 3, 8)
 
 LEAVES_ROOM = (
     *("decimate", "keyframe", "time-filter", "latest-only", "ros-keep-last"),
-    *("steady", "lifespan", "codel", "red", "robofleet", "robofleet-released"),
+    *("steady", "lifespan", "codel", "red", "robofleet", "robofleet-literal", "robofleet-released"),
+    *("zenoh-drop", "ros2-best-effort", "ros2-reliable-udp", "webrtc-frame-dropper"),
 )
 """These drop where others would not yet."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import naive
@@ -34,6 +36,14 @@ SETTINGS = [
     "time-filter:separation_s=0.004",
     "foxglove-sdk:depth=3",
     "foxglove-backlog:limit_mb=0.006",
+    # Messages of the random episodes have some hundred bytes each and come ms apart.
+    "zenoh-drop:batch_size=300,queue_size=2,so_sndbuf=100,wait_before_drop=50,max_wait_before_drop_fragments=1000",
+    "zenoh-drop:batch_size=700,queue_size=1,so_sndbuf=1,rate_memory_s=0.01",
+    "ros2-best-effort:queue_kb=2",
+    "ros2-best-effort:queue_kb=1,rate_memory_s=0.01",
+    "ros2-reliable-udp:queue_kb=1,depth=2",
+    "ros2-reliable-udp:queue_kb=2,rate_memory_s=0.01",
+    "webrtc-frame-dropper",
     "codel:target_ms=2,interval_ms=5",
     "codel:target_ms=1,interval_ms=1",
     "red:weight=0.5,max_p=0.5",
@@ -149,7 +159,6 @@ def test_depths():
     ("name", "twin"),
     [
         ("dds-keep-all", "drop-newest"),
-        ("zenoh-drop", "drop-newest"),
         ("zenoh-ring", "drop-oldest"),
         ("foxglove-sdk", "drop-oldest"),
     ],
@@ -263,3 +272,22 @@ def test_red_averages():
     assert averages == [
         (pytest.approx(average), count) for average, count in ((0.8, -1), (1.44, -1), (1.952, -1), (2.3616, 0))
     ]
+
+
+# --- references ------------------------------------------------------------------------------------------------------
+
+ROOT = Path(__file__).parents[2]
+KEYS = set(re.findall(r"^@\w+\{(\w+),", (ROOT / "docs/references.bib").read_text(encoding="utf-8"), re.M))
+
+
+def test_keys_in_brackets_are_references():
+    for path in sorted((ROOT / "bufgym").rglob("*.py")):
+        cited = set(re.findall(r"\[([a-z]+(?:19|20)\d\d[a-z0-9]*)\]", path.read_text(encoding="utf-8")))
+        assert cited <= KEYS, path
+
+
+@pytest.mark.parametrize("name", [*policies.names()])
+def test_a_source_that_is_a_paper_has_its_key(name):
+    source = policies.get(name).source
+    if re.search(r"paper|et al\.|RFC|\b(19|20)\d\d\b|AFR \[|ORBBuf|Robofleet", source):
+        assert set(re.findall(r"\[(\w+)\]", source)) & KEYS, source
