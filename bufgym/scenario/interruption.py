@@ -57,11 +57,13 @@ class Interruption:
             raise BufgymError(f"law = {self.law!r}: must be one of {', '.join(LAWS)}")
         for name in ("t_min", "t_max", "size_bytes"):
             object.__setattr__(self, name, whole(name, getattr(self, name)))
-        if not 1 <= self.t_min <= self.t_max <= 10**6:
+        if not 1 <= self.t_max <= 10**6:
+            raise BufgymError(f"t_max = {self.t_max}: must lie between 1 and 1000000")
+        if self.law != "fixed" and not 1 <= self.t_min <= self.t_max:
             raise BufgymError(f"t_min = {self.t_min}, t_max = {self.t_max}: need 1 <= t_min <= t_max <= 1000000")
         positive(self, "size_bytes", "t_mean")
         rate(self.rate_hz)
-        if not self.t_mean >= self.t_min:
+        if self.law == "geometric" and not self.t_mean >= self.t_min:
             raise BufgymError(f"t_mean = {self.t_mean}: must be at least t_min = {self.t_min}")
         check_value(self)
         object.__setattr__(self, "lengths", tuple(whole("lengths", T) for T in self.lengths))

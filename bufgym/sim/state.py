@@ -56,6 +56,7 @@ SENDER = np.dtype(
         ("now_us", np.int64),
         ("next", np.int64),  # the next arrival, or the one that waits for a decision
         ("waiting", np.int64),  # NOTHING_WAITS, ARRIVAL_WAITS or SOCKET_WAITS
+        ("evictions", np.int64),  # messages evicted for that arrival so far
         # buffer
         ("first", np.int64),  # column of the head
         ("occupancy", np.int64),

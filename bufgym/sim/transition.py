@@ -16,8 +16,10 @@ from bufgym.sim.decisions import arrive, choose, oldest_sendable
 from bufgym.sim.shared_link import Shares, join, next_in_cell
 from bufgym.sim.socket import begin_transmission, dequeue, finish_transmission, may_dequeue, next_ack_us
 from bufgym.sim.state import (
+    ARRIVAL_WAITS,
     CARRIES,
     CHOSEN,
+    DECISION,
     DEPARTURE,
     DEQUEUE,
     END,
@@ -82,8 +84,10 @@ def load_row(
 def next_event(batch: Batch, shares: Shares | None, c: int) -> int:
     """Move cell ``c`` on to its next DEPARTURE, DECISION, DEQUEUE, SEND or END (see the package's text).
 
-    The event is about sender ``sender_of(shares, c)``.
+    The event is about sender ``sender_of(shares, c)``. While its arrival waits, the DECISION is due again.
     """
+    if batch.senders[sender_of(shares, c)].waiting == ARRIVAL_WAITS:
+        return DECISION
     while True:
         i = sender_of(shares, c)
         if shares is None and batch.senders[i].link != CARRIES and batch.senders[i].busy > 0:
