@@ -103,8 +103,8 @@ AVERAGE, COUNT = range(2)  # and its memory
 def red(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """RED: rejects at random, the more the higher the average occupancy; a full queue drops the tail.
 
-    Thresholds are fractions of L, or of B where bytes fill it more. The paper's term for idle times needs the link's bandwidth and is left out: an
-    arrival at an empty queue is one sample of 0.
+    Thresholds are fractions of L, or of B where bytes fill it more. The paper's term for idle times needs the link's
+    bandwidth and is left out: an arrival at an empty queue is one sample of 0.
     """
     min_th, max_th, max_p = buffer.parameters[MIN_TH], buffer.parameters[MAX_TH], buffer.parameters[MAX_P]
     occupancy = max(len(buffer.slots), buffer.capacity * (buffer.backlog_bytes / buffer.max_bytes))

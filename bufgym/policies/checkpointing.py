@@ -18,7 +18,7 @@ from bufgym.policies.registry import Arrival, Memory, register
 
 @kernel
 def full_length(buffer: Buffer, arrival: Arrival) -> int:
-    """How many messages a full queue holds: L, or under a byte limit as many as B has room for, if all are like these."""
+    """How many messages a full queue holds: L, or if B has less room than that, as many like these as it has for."""
     like_these = float(buffer.max_bytes) * (len(buffer.slots) + 1) / (buffer.backlog_bytes + arrival.size_bytes)
     return int(min(float(buffer.capacity), like_these))
 

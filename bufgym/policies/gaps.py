@@ -44,8 +44,8 @@ def min_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue rejects a newcomer nearer than beta even gaps T / (s + 1) to the tail, else as min-gap.
 
-    T is the time from the arrival of the message dequeued last to now, which the s queued messages (L, if bytes suffice)
-    should divide evenly.
+    T is the time from the arrival of the message dequeued last to now, which the s queued messages should divide evenly
+    (L of them, but where B is what is full).
     """
     beta, s = buffer.parameters[0], len(buffer.slots)
     if has_space(buffer, arrival):

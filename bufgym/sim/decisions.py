@@ -96,7 +96,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     """Carry out a decision on the arrival at hand; False if it was invalid and did what a queue does instead.
 
     That is: accept where there is room, reject where there is none; for a no_drop message evict the oldest message of
-    the lowest priority. If B has no room even after an eviction, the arrival goes on waiting: the policy is asked again.
+    the lowest priority. If B has no room even after an eviction, the arrival waits on and the policy is asked again.
     """
     sender = batch.senders[i]
     arrival = at(batch.arrivals, i, sender.next)

@@ -40,7 +40,7 @@ def queue_of(s: int, capacity: int, parameters: NDArray[np.float64] = NO_PARAMET
 
 def newcomer(uniform: float = 0.0) -> Any:
     """A MESSAGE of one byte."""
-    made = records(1, MESSAGE)
+    made = np.zeros(1, MESSAGE).view(np.recarray)
     made["uniform"], made["size_bytes"] = uniform, 1
     return made[0]
 

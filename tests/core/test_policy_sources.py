@@ -226,7 +226,7 @@ def test_codel_leaves_a_good_queue_alone():
 
 
 def red_and_memory(spec):
-    """RED as a function of the occupancy of a queue with L = 8, the arrival's draw and the memory; and its fresh memory."""
+    """RED as a function of the occupancy of a queue with L = 8, the arrival's draw and the memory; a fresh memory."""
     policy = policies.get(spec)
 
     def red(s, uniform, memory):
