@@ -217,8 +217,7 @@ def test_the_oracle_is_a_name_where_there_is_one_interruption(trace: str, capsys
     lines = capsys.readouterr().out.splitlines()
     assert "note: oracle does not compete: it knows the future" in lines
     told = {line.split()[0]: line.split()[1:] for line in lines if line.startswith(("oracle", "clairvoyant", "afr"))}
-    assert told["oracle"] == told["clairvoyant"] != told["afr"]
-    assert told["oracle"][2] == "0.00%"
+    assert told["oracle"][1:3] == told["clairvoyant"][1:3] != told["afr"][1:3]  # QoI and regret
     fails(["bench", "--trace", trace, *QUICK, "--policies", "oracle"], "policy oracle: it plans for one", capsys)
 
 

@@ -19,8 +19,8 @@ from bufgym.policies.registry import Policy, runs_compiled, signatures
 from bufgym.sim.decisions import answer_dequeue, answer_send, decide
 from bufgym.sim.shared_link import Shares, shares_type
 from bufgym.sim.socket import credit
-from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type, named
-from bufgym.sim.transition import next_event, sender_of
+from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type, named
+from bufgym.sim.transition import move_on, next_event, sender_of
 from bufgym.sim.view import arrival_of, view
 
 
@@ -38,7 +38,9 @@ def rollout(
     for c in range(len(batch.senders) if shares is None else len(shares.cells)):
         event = NOTHING
         while event != END:
-            event = next_event(batch, shares, c)
+            # After a decision for which B has no room yet the arrival waits on, and the same DECISION is due again.
+            if event != DECISION or batch.senders[sender_of(shares, c)].waiting != ARRIVAL_WAITS:
+                event = move_on(batch, shares, c)
             # One view for all events: the kernels are inlined, and so the loop's code stays small.
             if event == END or (event == DEPARTURE and not hears_departures):
                 continue

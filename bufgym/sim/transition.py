@@ -88,6 +88,12 @@ def next_event(batch: Batch, shares: Shares | None, c: int) -> int:
     """
     if batch.senders[sender_of(shares, c)].waiting == ARRIVAL_WAITS:
         return DECISION
+    return move_on(batch, shares, c)
+
+
+@kernel
+def move_on(batch: Batch, shares: Shares | None, c: int) -> int:
+    """``next_event`` for a cell in which no arrival waits."""
     while True:
         i = sender_of(shares, c)
         if shares is None and batch.senders[i].link != CARRIES and batch.senders[i].busy > 0:
