@@ -42,14 +42,17 @@ def arrive(batch: Batch, i: int) -> int:
     if sender.limit_at_send == 0 and rules.too_soon(batch, i, arrival.topic):
         at(batch.log, i, sender.next).limited = 1
         decision = REJECT  # always valid: a no_drop topic has no rate limit
-    elif arrival.size_bytes > sender.max_bytes:
-        decision = REJECT  # whatever goes
     else:
         asked = sender.first_decision <= sender.next <= sender.last_decision
-        if asked and not (sender.ask_when_full == 1 and has_room(batch, i)):
+        decision = ACCEPT
+        if sender.screens == 1:
+            sender.evictions = 0
+            asked = asked and not (sender.ask_when_full == 1 and has_room(batch, i))
+            if arrival.size_bytes > sender.max_bytes:
+                asked, decision = False, REJECT  # it can't fit, whatever goes
+        if asked:
             sender.waiting = ARRIVAL_WAITS
             return DECISION
-        decision = ACCEPT
     seq = sender.next
     while sender.next == seq:  # a no_drop message may need several evictions
         decide(batch, i, decision)
@@ -115,7 +118,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         sender.invalid += 1
     if victim >= 0:
         remove(batch, i, victim)
-        if sender.backlog_bytes + arrival.size_bytes > sender.max_bytes:
+        if sender.screens == 1 and sender.backlog_bytes + arrival.size_bytes > sender.max_bytes:
             sender.evictions += 1
             return valid
     if enqueue:
@@ -135,7 +138,6 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     sender.previous_us, sender.previous_x = arrival.arrival_us, arrival.x
     sender.departures = 0
     sender.waiting = NOTHING_WAITS
-    sender.evictions = 0
     sender.next += 1
     return valid
 

@@ -36,11 +36,11 @@ def rollout(
 ) -> None:
     """Run every sender of the batch to its end under one policy; ``memory`` is float64[n, entries]."""
     for c in range(len(batch.senders) if shares is None else len(shares.cells)):
-        event = NOTHING
+        event, again = NOTHING, False
         while event != END:
-            # After a decision for which B has no room yet the arrival waits on, and the same DECISION is due again.
-            if event != DECISION or batch.senders[sender_of(shares, c)].waiting != ARRIVAL_WAITS:
+            if not again:
                 event = move_on(batch, shares, c)
+            again = False
             # One view for all events: the kernels are inlined, and so the loop's code stays small.
             if event == END or (event == DEPARTURE and not hears_departures):
                 continue
@@ -48,6 +48,7 @@ def rollout(
             buffer = view(batch, i)
             if event == DECISION:
                 decide(batch, i, on_arrival(buffer, arrival_of(batch, i), memory[i]))
+                again = batch.senders[i].waiting == ARRIVAL_WAITS  # B has no room yet: the same DECISION is due again
             elif event == DEQUEUE:
                 answer_dequeue(batch, i, on_dequeue(buffer, memory[i]))
             elif event == SEND:

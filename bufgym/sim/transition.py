@@ -11,6 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from bufgym.kernel import at, kernel, records
+from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import FOREVER
 from bufgym.sim.decisions import arrive, choose, oldest_sendable
 from bufgym.sim.shared_link import Shares, join, next_in_cell
@@ -73,6 +74,7 @@ def load_row(
     batch.senders[i] = _BEGINNING[0]
     sender = batch.senders[i]
     sender.capacity, sender.max_bytes, sender.ask_when_full = buffer
+    sender.screens = 1 if sender.ask_when_full == 1 or sender.max_bytes < UNLIMITED_BYTES else 0
     sender.first_decision, sender.last_decision = decisions
     sender.first_knot, sender.last_knot, sender.after, sender.offset_us, sender.propagation_us = link
     sender.segment_now, sender.segment_finish = sender.first_knot, sender.first_knot
