@@ -22,7 +22,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     **Action** ``Discrete(L + 2)``: 0..L-1 evict that slot (0 = oldest) and enqueue the newcomer; L rejects the
     newcomer; L + 1 accepts it. ``action_masks()`` and ``info["action_mask"]``, bool[L + 2], say which are valid. An
     invalid action does what a plain queue does: it accepts where there is room, else it rejects;
-    ``info["invalid"]`` counts these actions.
+    ``info["invalid"]`` counts these actions. Where B has no room for the newcomer even after an eviction, the next step
+    is about the same arrival again; an arrival larger than B is dropped without a step.
 
     **Observation** a Dict with one float32 array for each field of ``bufgym.observe.FIELDS``: slot fields of shape
     (L + 1,) with the newcomer last, context fields of shape (1,), all in [0, 1].

@@ -140,7 +140,7 @@ def run(
 ) -> Senders:
     """The senders after ``policy`` ran through each of ``episodes``, one sender each.
 
-    The queue of an unbounded policy has room for all messages, whatever ``capacity`` says.
+    The queue of an unbounded policy has room for all messages, whatever ``capacity`` and ``max_bytes`` say.
     """
     if not episodes:
         raise BufgymError("no episode to run")
@@ -152,7 +152,7 @@ def run(
         topics = copies_of(topics, copies)
     longest = max(len(episode.arrivals) for episode in episodes)
     if policy.unbounded:
-        capacity = longest
+        capacity, max_bytes = longest, None
         topics = [replace(topic, limit=None) for topic in topics]
     senders = Senders(
         len(episodes), capacity, v, max_messages=longest, max_bytes=max_bytes, decide_at=decide_at, topics=topics
