@@ -236,7 +236,7 @@ def outcomes_in_env(model: Any, scenario: Any, masked: bool, flat: bool, fields:
     envs.reset(options={"episodes": episodes})
     rows = envs.rows
     while not rows.output.terminated.all():
-        observation: Any = rows.observation(rows.output.slots, rows.output.context)
+        observation: Any = rows.observation()
         if flat:
             space = envs.single_observation_space
             single = [{key: column[i] for key, column in observation.items()} for i in range(4)]
@@ -311,7 +311,7 @@ def test_an_agent_for_topics_is_a_scheduler() -> None:
     envs.reset(options={"episodes": [episode]})
     rows = envs.rows
     while not rows.output.terminated.all():
-        observation = rows.observation(rows.output.slots, rows.output.context)
+        observation = rows.observation()
         action, _ = model.predict(observation, deterministic=True, action_masks=rows.output.action_mask)
         rows.step(np.asarray(action, np.int64))
     senders = run(policy, [episode], 6, client.value, topics=client.topics)
