@@ -57,24 +57,25 @@ class ObservationForm:
         self._slot_fields = len(slot_fields)
         self._first_context = len(slot_fields) * self._width
         self.numbers = self._first_context + len(context_fields)
-        self._slots = [(field.name, k) for k, field in enumerate(slot_fields) if field.name in names]
-        self._context = [(field.name, k) for k, field in enumerate(context_fields) if field.name in names]
-        slot_columns, context_columns = [k for _, k in self._slots], [k for _, k in self._context]
+        self._fields = [(name, k) for k, name in enumerate(known) if name in names]
+        slot_columns = [k for _, k in self._fields if k < self._slot_fields]
+        context_columns = [k - self._slot_fields for _, k in self._fields if k >= self._slot_fields]
         numbers = [k * self._width + entry for k in slot_columns for entry in range(self._width)]
         numbers += [self._first_context + k for k in context_columns]
         everything = len(numbers) == self.numbers
         self._numbers = None if everything else np.array(numbers)
         self._columns = None if everything else (np.array(slot_columns, int), np.array(context_columns, int))
-        self.space = self._space([field for field in fields if field.name in names])
+        self.space = self._space([fields[k] for _, k in self._fields])
 
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Views of ``rows``, one row of numbers or many: (slots [..., fields, L + 1], context [..., fields])."""
-        first = self._first_context
-        slots = rows[..., :first].reshape(*rows.shape[:-1], self._slot_fields, self._width)
-        return slots, rows[..., first:]
+        """Views of ``rows``, one row of numbers or n: slots [(n,) fields, L + 1] and context [(n,) fields]."""
+        first, fields, width = self._first_context, self._slot_fields, self._width
+        if rows.ndim == 1:
+            return rows[:first].reshape(fields, width), rows[first:]
+        return rows[:, :first].reshape(len(rows), fields, width), rows[:, first:]
 
     def of(self, rows: NDArray[np.float32]) -> Observation:
-        """The observation of ``rows``, one row of numbers or many, in this form."""
+        """The observation of ``rows``, one row of numbers or n, in this form."""
         if self.form == "flat":
             return rows if self._numbers is None else rows.take(self._numbers, axis=-1)
         slots, context = self.split(rows)
@@ -84,11 +85,10 @@ class ObservationForm:
             parts = {"slots": slots.swapaxes(-1, -2), "context": context}
             return {name: parts[name] for name in self.space}
         # Walked over with the fields' axis first, a view costs half of what an index costs.
-        by_slot, by_context = list(slots.swapaxes(0, -2)), list(context.T[..., np.newaxis])
-        observation = {name: by_slot[k] for name, k in self._slots}
-        for name, k in self._context:
-            observation[name] = by_context[k]
-        return observation
+        if rows.ndim > 1:
+            slots, context = slots.swapaxes(0, 1), context.T
+        arrays = [*slots, *context[..., np.newaxis]]
+        return {name: arrays[k] for name, k in self._fields}
 
     def _space(self, fields: Sequence[Field]) -> Any:
         boxes = [_box([field], self._width if field.per == "slot" else 1) for field in fields]
