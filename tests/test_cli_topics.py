@@ -150,7 +150,7 @@ def test_bad_options(options: list[str], naming: str, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("old", "new", "naming"),
     [
-        ("priority = 20", "priority = -1", "mine.toml: topic 'pose': priority = -1: must be a number > 0"),
+        ("priority = 20", "priority = -1", "mine.toml: topic 'pose': priority = -1: must be a number >= 0"),
         ("priority = 20", "priorty = 20", "mine.toml: topic 'pose': unknown key 'priorty'"),
         ("rate_hz = 10", "rate_hz = 0", "mine.toml: topic 'pose': rate_hz = 0: must be a number > 0"),
         ("duration_s", "window = 0\nduration_s", "mine.toml: window = 0: n_T must be a whole number"),

@@ -24,6 +24,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     newcomer; L + 1 accepts it. ``info["action_mask"]``, int8[L + 2], says which are valid, as
     ``action_space.sample(mask)`` takes it; ``action_masks()``, bool[L + 2], as sb3-contrib does. An invalid action does
     what a plain queue does: it accepts where there is room, else it rejects; ``info["invalid"]`` counts these actions.
+    Where B has no room for the newcomer even after an eviction, the next step is about the same arrival again; an
+    arrival larger than B is dropped without a step.
 
     **Observation** a Dict with one float32 array for each field of ``bufgym.observe.FIELDS``: slot fields of shape
     (L + 1,) with the newcomer last, context fields of shape (1,), all in [0, 1]. With ``observation="flat"`` it is one

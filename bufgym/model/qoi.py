@@ -1,4 +1,4 @@
-"""Quantity of Information: how much of the scene the server has seen (AFR paper, Eq. 2-6).
+"""Quantity of Information: how much of the scene the server has seen (AFR [wang2022afr], Eq. 2-6).
 
 For the received messages in order, with coordinates x_1 <= x_2 <= ...,
 

@@ -1,8 +1,8 @@
 """Topics: what a robot publishes side by side over one uplink, and what its operator asks for each.
 
-The terms are Robofleet's (github ut-amrl/robofleet_client): a topic has a priority, may have a rate limit, and may be
-``no_drop``. Beyond Robofleet, every topic has a weight and a V of its own, so that H = sum of weight x H of the topic,
-and may have a deadline, after which its messages count as late.
+The terms are Robofleet's [sikand2021robofleet]: a topic has a priority, may have a rate limit, and may be ``no_drop``.
+Beyond Robofleet, every topic has a weight and a V of its own, so that H = sum of weight x H of the topic, and may have
+a deadline, after which its messages count as late.
 """
 
 from __future__ import annotations
@@ -35,11 +35,13 @@ class Topic:
     name: str
     """Unique among the topics of a client."""
     priority: float = 1.0
-    """p of Robofleet's schedulers: of two topics that wait equally long, the higher priority is sent first."""
+    """p of Robofleet's schedulers: of two topics that wait equally long, the higher priority is sent first. With 0 it
+    goes when nothing else waits."""
     rate_limit_hz: float | None = None
-    """Messages that come sooner than 1 / rate after the last one kept are dropped; None for no limit."""
+    """Messages that come sooner than 1 / rate after the last one kept are dropped, on a no_drop topic too; None for no
+    limit."""
     no_drop: bool = False
-    """Its messages may not be dropped."""
+    """Its messages may not be dropped, once the rate limit has let them pass."""
     limit: int | None = None
     """Its messages in the buffer at most (a publisher's queue size); None for as many as the buffer holds."""
     weight: float | None = None
@@ -53,7 +55,7 @@ class Topic:
         if not isinstance(self.name, str) or not self.name:
             raise BufgymError(f"topic {self.name!r}: a name must be a non-empty text")
         for name, zero, optional in (
-            ("priority", False, False),
+            ("priority", True, False),
             ("weight", True, True),
             ("rate_limit_hz", False, True),
             ("deadline_s", False, True),
@@ -69,9 +71,8 @@ class Topic:
             whole(f"topic {self.name!r}: limit", self.limit, 1, MAX_CAPACITY)
         if self.value is not None and not isinstance(self.value, Value):
             raise self._wrong("value", "must be a V of bufgym.model.qoi")
-        for name, limit in (("rate_limit_hz", "rate limit"), ("limit", "limit")):
-            if self.no_drop and getattr(self, name) is not None:
-                raise self._wrong(name, f"a no_drop topic can't have a {limit}, which drops messages")
+        if self.no_drop and self.limit is not None:
+            raise self._wrong("limit", "a no_drop topic can't have a limit, which drops messages")
 
     def _wrong(self, name: str, rule: str) -> BufgymError:
         return BufgymError(f"topic {self.name!r}: {name} = {getattr(self, name)!r}: {rule}")

@@ -1,4 +1,4 @@
-"""The best possible QoI in one interruption whose length T is known (AFR paper, Sec. III-C).
+"""The best possible QoI in one interruption whose length T is known (AFR [wang2022afr], Sec. III-C).
 
 Message 0 was sent before, message T + 1 is sent after, and L of the T between can be kept: L + 1 gaps that add up to
 T + 1. V is concave, so equal gaps are best. ``ideal`` and ``integer`` count the information gained after message 0, as
@@ -36,6 +36,13 @@ def integer(capacity: int, T: int, v: Value) -> float:
     gaps = min(capacity, T) + 1
     q, longer = divmod(T + 1, gaps)
     return longer * v(q + 1) + (gaps - longer) * v(q)
+
+
+def evenly_kept(capacity: int, T: int) -> NDArray[np.int64]:
+    """Of messages 1..T those that ``integer`` keeps; none where there is no room for any."""
+    gaps = min(capacity, T) + 1
+    kept: NDArray[np.int64] = np.arange(1, gaps) * (T + 1) // gaps
+    return kept
 
 
 def by_length(dropped: NDArray[np.int64], v: Value) -> NDArray[np.float64]:

@@ -5,17 +5,19 @@ import os
 from pathlib import Path
 
 from bufgym import files
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT, after, before, is_first
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, after, before, has_space, is_first
 from bufgym.policies import (  # noqa: F401  (each registers its policies)
     afr,
     aqm,
     checkpointing,
     classic,
+    fragments,
     gaps,
     middleware,
     robofleet,
     sampling,
     schedulers,
+    webrtc,
 )
 from bufgym.policies.registry import ClientSettings, Policy, get, names, register, register_later, runs_compiled
 from bufgym.policies.schedulers import make_room
@@ -29,6 +31,7 @@ __all__ = [
     "after",
     "before",
     "get",
+    "has_space",
     "is_first",
     "load",
     "make_room",

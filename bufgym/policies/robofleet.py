@@ -1,9 +1,11 @@
 """Robofleet's client, as published and as released, and native ROS; `rosbridge` is in ``middleware.py``.
 
-Robofleet (Sikand et al. 2021) limits each topic's rate, queues ``no_drop`` messages, keeps one slot for any other
+Robofleet [sikand2021robofleet] limits each topic's rate, queues ``no_drop`` messages, keeps one slot for any other
 topic, and sends while fewer than n_T messages are in flight: sent, and not yet acknowledged (by a pong, in its terms).
 In the paper the topic with the largest priority x wait goes first. The released scheduler (MessageSchedulerLib.hpp of
-github ut-amrl/robofleet_client_lib) sorts by the same product in ascending order, so that the smallest goes first.
+github ut-amrl/robofleet_client_lib) sorts by the same product in ascending order, so that the smallest goes first. Here
+a rate limit counts from the message kept last; in the paper's words t_tau is the time since the topic was last
+transmitted, which is `robofleet-literal`.
 
 Robofleet's queue of ``no_drop`` messages has no limit. Here it has the sender's L, and makes room as the other
 schedulers do. On a sender that knows one topic only, both clients keep one slot, and native ROS drops its oldest.
@@ -66,11 +68,27 @@ def longest_wait(buffer: Buffer, memory: Memory) -> int:
     "robofleet",
     on_send=longest_wait,
     for_topics=True,
-    source="Robofleet, Sikand et al. 2021, as published",
+    source="Robofleet [sikand2021robofleet], as published",
     compile=True,
 )
 def robofleet(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Robofleet as published: one slot a topic, no_drop queued and sent first, then the largest priority x wait."""
+    return overwrite(buffer, arrival)
+
+
+@register(
+    "robofleet-literal",
+    on_send=longest_wait,
+    for_topics=True,
+    source="Robofleet [sikand2021robofleet], rate limits by the letter: since last transmitted",
+    client=ClientSettings(limit_since_sent=True),
+    compile=True,
+)
+def robofleet_literal(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """Robofleet by the letter: as `robofleet`, but what comes within 1 / rate of the topic's last *sending* is dropped.
+
+    A message that waits in its slot is overwritten for as long as nothing of its topic was sent.
+    """
     return overwrite(buffer, arrival)
 
 
@@ -107,7 +125,7 @@ def shortest_wait(buffer: Buffer, memory: Memory) -> int:
     memory={"flushing": 0.0},
     on_send=shortest_wait,
     for_topics=True,
-    source="Robofleet, released code (ut-amrl/robofleet_client_lib)",
+    source="Robofleet [sikand2021robofleet], released code (ut-amrl/robofleet_client_lib)",
     client=ClientSettings(limit_at_send=True, flush_no_drop=True),
     compile=True,
 )

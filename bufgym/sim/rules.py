@@ -121,11 +121,14 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
 
 @kernel
 def too_soon(batch: Batch, i: int, topic: int) -> bool:
-    """Whether the arrival at hand comes sooner after the last one kept than its topic's rate limit allows."""
-    if batch.senders[i].topics == 1:
+    """Whether the arrival at hand comes sooner after the last one kept (or sent) than its topic's rate limit allows."""
+    sender = batch.senders[i]
+    if sender.topics == 1:
         return False
     rules = at(batch.topics, i, topic)
-    return bool(rules.kept_us >= 0 and batch.senders[i].now_us - rules.kept_us < rules.period_us)
+    if sender.limit_since_sent == 1:
+        return bool(rules.dequeued > 0 and sender.now_us - rules.last_dequeue_us < rules.period_us)
+    return bool(rules.kept_us >= 0 and sender.now_us - rules.kept_us < rules.period_us)
 
 
 @kernel
@@ -144,24 +147,41 @@ def no_drop(batch: Batch, i: int, topic: int) -> bool:
 
 
 @kernel
+def could_fit(batch: Batch, i: int) -> bool:
+    """Whether the arrival at hand would fit by its bytes if all went that may be dropped."""
+    sender = batch.senders[i]
+    spare_bytes = sender.max_bytes - sender.backlog_bytes - at(batch.arrivals, i, sender.next).size_bytes
+    k = 0
+    while spare_bytes < 0 and k < sender.occupancy:
+        slot = at(batch.slots, i, sender.first + k)
+        if not no_drop(batch, i, slot.topic):
+            spare_bytes += slot.size_bytes
+        k += 1
+    return bool(spare_bytes >= 0)
+
+
+@kernel
 def refuge(batch: Batch, i: int) -> int:
     """The slot that goes for a no_drop message when nothing else helps: lowest priority, oldest; -1 if none may."""
     sender = batch.senders[i]
-    size_bytes = at(batch.arrivals, i, sender.next).size_bytes
     best = -1
     lowest = 0.0
+    if not could_fit(batch, i):
+        return best
     for k in range(sender.occupancy):
         slot = at(batch.slots, i, sender.first + k)
         priority = at(batch.topics, i, slot.topic).priority
-        fits = sender.backlog_bytes - slot.size_bytes + size_bytes <= sender.max_bytes
-        if fits and not no_drop(batch, i, slot.topic) and (best < 0 or priority < lowest):
+        if not no_drop(batch, i, slot.topic) and (best < 0 or priority < lowest):
             best, lowest = k, priority
     return best
 
 
 @kernel
 def sendable(batch: Batch, i: int, k: int) -> bool:
-    """Whether slot ``k`` may be sent by the window and, where rate limits hold back at the socket, by its own."""
+    """Whether slot ``k`` may be sent by the window and, where rate limits hold back at the socket, by its own.
+
+    There a ``no_drop`` topic is not limited: the client that does so, Robofleet's released one, has no such limit.
+    """
     sender = batch.senders[i]
     full = sender.dequeued - sender.acked >= sender.window
     if sender.topics == 1:
@@ -169,7 +189,6 @@ def sendable(batch: Batch, i: int, k: int) -> bool:
     rules = at(batch.topics, i, at(batch.slots, i, sender.first + k).topic)
     if full and not (sender.flush_no_drop == 1 and rules.no_drop == 1):
         return False
-    held_back = (
-        sender.limit_at_send == 1 and rules.dequeued > 0 and sender.now_us - rules.last_dequeue_us < rules.period_us
-    )
-    return not held_back
+    if sender.limit_at_send == 0 or rules.no_drop == 1 or rules.dequeued == 0:
+        return True
+    return bool(sender.now_us - rules.last_dequeue_us >= rules.period_us)

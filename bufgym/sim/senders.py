@@ -106,7 +106,8 @@ class Senders:
             memory = policy.new_memory(len(self), self.capacity)
         senders, client = self.batch.senders, policy.client
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
-        senders["limit_at_send"], senders["flush_no_drop"] = client.limit_at_send, client.flush_no_drop
+        for rule in ("limit_at_send", "limit_since_sent", "flush_no_drop"):
+            senders[rule] = getattr(client, rule)
         if not client.awaits_acks:
             senders["window"], senders["ack_delay_us"] = 1, 0
         roll_out(self.batch._replace(parameters=policy.parameter_array), shares, memory, policy)
@@ -139,7 +140,7 @@ def run(
 ) -> Senders:
     """The senders after ``policy`` ran through each of ``episodes``, one sender each.
 
-    The queue of an unbounded policy has room for all messages, whatever ``capacity`` says.
+    The queue of an unbounded policy has room for all messages, whatever ``capacity`` and ``max_bytes`` say.
     """
     if not episodes:
         raise BufgymError("no episode to run")
@@ -151,7 +152,7 @@ def run(
         topics = copies_of(topics, copies)
     longest = max(len(episode.arrivals) for episode in episodes)
     if policy.unbounded:
-        capacity = longest
+        capacity, max_bytes = longest, None
         topics = [replace(topic, limit=None) for topic in topics]
     senders = Senders(
         len(episodes), capacity, v, max_messages=longest, max_bytes=max_bytes, decide_at=decide_at, topics=topics

@@ -53,6 +53,7 @@ class Sender:
         schedules=False,
         drops_heads=False,
         limit_at_send=False,
+        limit_since_sent=False,
         flush_no_drop=False,
     ):
         self.link, self.capacity, self.decide_at = link, capacity, decide_at
@@ -61,7 +62,7 @@ class Sender:
         self.max_bytes = math.inf if max_bytes is None else max_bytes
         self.window, self.ack_delay_us, self.propagation_us = window, ack_delay_us, propagation_us
         self.schedules, self.drops_heads = schedules, drops_heads
-        self.limit_at_send, self.flush_no_drop = limit_at_send, flush_no_drop
+        self.limit_at_send, self.limit_since_sent, self.flush_no_drop = limit_at_send, limit_since_sent, flush_no_drop
         self.queues = [[] for _ in self.rules]
         self.arrived = [[] for _ in self.rules]  # all that came, kept or not
         self.kept = [[] for _ in self.rules]  # all that was ever enqueued
@@ -77,6 +78,7 @@ class Sender:
         self.dequeued, self.transmitted, self.dropped, self.order = {}, {}, {}, []
         self.limited = set()  # dropped by a rate limit
         self.rejected = self.evicted = self.invalid = 0
+        self.evictions = 0  # of those, for the newcomer
 
     # --- what there is ---------------------------------------------------------------------------------------------
 
@@ -106,14 +108,18 @@ class Sender:
                 self.drop(message)
                 self.limited.add(message["seq"])
                 self.rejected += 1
+            elif message["bytes"] > self.max_bytes:
+                self.drop(message)
+                self.rejected += 1
             else:
                 asked = first_decision <= message["seq"] <= last_decision
-                decision = ACCEPT
-                if asked and not (self.decide_at == "overflow" and self.fits(message)):
-                    self.newcomer = message
-                    decision = yield "decision"
-                    self.newcomer = None
-                self.carry_out(decision, message)
+                asked = asked and not (self.decide_at == "overflow" and self.fits(message))
+                self.newcomer = message if asked else None
+                self.evictions, settled = 0, False
+                while not settled:
+                    decision = (yield "decision") if asked else ACCEPT
+                    settled = self.carry_out(decision, message)
+                self.newcomer = None
             self.arrived[self.lane(message)].append(message)
             self.to_come -= 1
             yield from self.offer()
@@ -183,7 +189,7 @@ class Sender:
         lane = self.lane(message)
         if self.queues[lane][0] is not message or not self.window_open(message):
             return False
-        if self.limit_at_send and self.sent[lane]:
+        if self.limit_at_send and self.sent[lane] and not self.rules[lane].no_drop:
             return self.now - self.dequeued[self.sent[lane][-1]["seq"]] >= self.rules[lane].period_us
         return True
 
@@ -208,29 +214,34 @@ class Sender:
 
     def too_soon(self, message):
         lane = self.lane(message)
-        if self.limit_at_send or not self.kept[lane]:
+        since_us = [self.dequeued[m["seq"]] for m in self.sent[lane]]
+        if not self.limit_since_sent:
+            since_us = [m["us"] for m in self.kept[lane]]
+        if self.limit_at_send or not since_us:
             return False
-        return message["us"] - self.kept[lane][-1]["us"] < self.rules[lane].period_us
+        return message["us"] - since_us[-1] < self.rules[lane].period_us
 
-    def fits(self, message, without=None):
-        """Whether the message has room, ``without`` one that is queued."""
-        rest = [m for m in self.slots() if m is not without]
-        own = [m for m in rest if self.lane(m) == self.lane(message)]
-        return (
-            len(rest) < self.capacity
-            and len(own) < self.rules[self.lane(message)].limit
-            and sum(m["bytes"] for m in rest) + message["bytes"] <= self.max_bytes
-        )
+    def within_limit(self, message):
+        return len(self.queues[self.lane(message)]) < self.rules[self.lane(message)].limit
+
+    def fits(self, message):
+        enough_bytes = sum(m["bytes"] for m in [*self.slots(), message]) <= self.max_bytes
+        return len(self.slots()) < self.capacity and self.within_limit(message) and enough_bytes
 
     def evictable(self, message):
-        """Queued messages any one of which makes room for this one and may be dropped."""
-        return [m for m in self.slots() if not self.rules[self.lane(m)].no_drop and self.fits(message, without=m)]
+        """Queued messages that may go for this one: it fits once all have, if its topic is at its limit its own."""
+        may_go = [m for m in self.slots() if not self.rules[self.lane(m)].no_drop]
+        stays_bytes = sum(m["bytes"] for m in self.slots() if m not in may_go)
+        if stays_bytes + message["bytes"] > self.max_bytes:
+            return []
+        return [m for m in may_go if self.within_limit(message) or self.lane(m) == self.lane(message)]
 
     def must_keep(self, message):
         no_drop = self.rules[self.lane(message)].no_drop
         return no_drop and (self.fits(message) or bool(self.evictable(message)))
 
     def carry_out(self, decision, message):
+        """Whether the message has been enqueued or dropped; if not, the policy is asked again."""
         slots = self.slots()
         if decision == ACCEPT and self.fits(message):
             self.enqueue(message)
@@ -238,18 +249,27 @@ class Sender:
             self.drop(message)
             self.rejected += 1
         elif 0 <= decision < len(slots) and slots[decision] in self.evictable(message):
-            self.remove(slots[decision])
-            self.enqueue(message)
+            return self.make_way(slots[decision], message)
         else:
             # What a queue does, but a no_drop message drives out the least important.
             self.invalid += 1
             if not self.fits(message) and self.must_keep(message):
-                self.remove(min(self.evictable(message), key=lambda m: self.rules[self.lane(m)].priority))
+                lowest = min(self.evictable(message), key=lambda m: self.rules[self.lane(m)].priority)
+                return self.make_way(lowest, message)
             if self.fits(message):
                 self.enqueue(message)
             else:
                 self.drop(message)
                 self.rejected += 1
+        return True
+
+    def make_way(self, victim, message):
+        self.remove(victim)
+        self.evictions += 1
+        if not self.fits(message):
+            return False
+        self.enqueue(message)
+        return True
 
     def enqueue(self, message):
         self.queues[self.lane(message)].append(message)

@@ -169,7 +169,7 @@ def test_a_file_may_say_all_that_a_topic_takes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "rule"),
     [
-        (A + "priority = -1\n", "topic 'a': priority = -1: must be a number > 0"),
+        (A + "priority = -1\n", "topic 'a': priority = -1: must be a number >= 0"),
         (A.replace("rate_hz = 2", "rate_hz = 0"), "topic 'a': rate_hz = 0: must be a number > 0"),
         (A.replace("rate_hz = 2", "rate_hz = inf"), "topic 'a': rate_hz = inf: must be a number > 0"),
         (A.replace("rate_hz = 2", "rate_hz = 1e6"), "topic 'a': rate_hz = 1000000.0: must be at most 100000"),

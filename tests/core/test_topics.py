@@ -291,3 +291,34 @@ def test_gaps_behind_a_message_that_was_held_back():
 
         after_run(episode([1, 4, 8], x=[5, 6, 7]), topics, on_arrival=note, on_send=scripted(HOLD, HOLD, HOLD, 0))
         assert gaps[2] == (1 * MS, 5, [(0, 7 * MS), (7 * MS, 4 * MS)])
+
+
+def test_a_rate_limit_comes_before_no_drop():
+    # 10 Hz: 1 comes too soon and is dropped, though there is room and its topic is no_drop; nobody is asked.
+    command = (Topic("command", no_drop=True, rate_limit_hz=10), Topic("camera"))
+    asked = []
+
+    def note(buffer, arrival, memory):
+        asked.append(int(arrival.seq))
+        return ACCEPT
+
+    senders = after_run(episode([0, 50, 100]), command, on_arrival=note)
+    assert order(senders) == asked == [0, 2]
+    log_row, sender = np.asarray(senders.batch.log[0]), senders.batch.senders[0]
+    assert log_row["limited"].tolist() == [0, 1, 0] and (sender["rejected"], sender["invalid"]) == (1, 0)
+    # What passed it is kept, whatever the policy says.
+    senders = after_run(episode([0, 50, 100]), command, on_arrival=lambda b, a, m: REJECT)
+    assert order(senders) == [0, 2]
+    # Where limits hold back at the socket, no_drop topics have none: Robofleet's released client.
+    senders = after_run(episode([0, 50, 100]), command, client=ClientSettings(limit_at_send=True))
+    assert log(senders)["dequeued_us"] == {0: 0, 1: 50 * MS, 2: 100 * MS}
+
+
+def test_a_rate_limit_since_the_last_sending():
+    # 10 Hz, and nothing crosses before 200 ms. Since the last one kept: 0, 2 and 4 pass. Since the last one sent: 0 was
+    # at 0 ms, so 2, 3 and 4 pass; 2 goes at 201 ms, and 5 at 250 ms comes too soon.
+    pose, times = (Topic("pose", rate_limit_hz=10), Topic("other")), [0, 50, 100, 150, 200, 250]
+    blocked = {"knots": ((0, 0), (200_000, 0), (1_200_000, 1_000_000)), "after": "hold"}
+    for client, dropped in (({}, {1, 3, 5}), ({"limit_since_sent": True}, {1, 5})):
+        senders = after_run(episode(times, **blocked), pose, client=ClientSettings(**client))
+        assert log(senders)["dropped_us"].keys() == dropped

@@ -25,6 +25,9 @@ TWIN_V = {
 """V functions and their twins."""
 V = st.sampled_from(list(TWIN_V))
 
+CLIENT_RULES = ("limit_at_send", "limit_since_sent", "flush_no_drop")
+"""Settings of the client that change what a sender does."""
+
 
 def decision(uniform: float, capacity: int) -> int:
     """Any decision, impossible ones included: -3 is none at all, then ACCEPT, REJECT, and slots beyond the last."""
@@ -77,7 +80,8 @@ class TopicCase:
         senders.load(0, case.episode)
         rows = senders.batch.senders
         rows["ask_at_send"], rows["ask_at_dequeue"] = self.schedules, self.drops_heads
-        rows["limit_at_send"], rows["flush_no_drop"] = self.client.limit_at_send, self.client.flush_no_drop
+        for rule in CLIENT_RULES:
+            rows[rule] = getattr(self.client, rule)
         return senders
 
     def policy(self, *, compile: bool) -> policies.Policy:
@@ -105,8 +109,7 @@ class TopicCase:
             propagation_us=episode.link.propagation_us,
             schedules=self.schedules,
             drops_heads=self.drops_heads,
-            limit_at_send=self.client.limit_at_send,
-            flush_no_drop=self.client.flush_no_drop,
+            **{rule: getattr(self.client, rule) for rule in CLIENT_RULES},
         )
 
     def twin_events(self, twin: naive_topics.Sender) -> Any:
@@ -129,18 +132,15 @@ def twin_rules(topic: Topic, v: qoi.Value) -> naive_topics.Rules:
 @st.composite
 def topic_rules(draw: st.DrawFn, name: str) -> Topic:
     no_drop = draw(st.sampled_from([False, False, True]))
-    droppable = {
-        "rate_limit_hz": draw(st.sampled_from([None, 50.0, 300.0, 1e6 / 700, 1e6])),
-        "limit": draw(st.sampled_from([None, None, 1, 2, 3])),
-    }
     return Topic(
         name,
-        priority=draw(st.sampled_from([0.5, 1.0, 20.0])),
+        priority=draw(st.sampled_from([0.0, 0.5, 1.0, 20.0])),
+        rate_limit_hz=draw(st.sampled_from([None, 50.0, 300.0, 1e6 / 700, 1e6])),
+        limit=None if no_drop else draw(st.sampled_from([None, None, 1, 2, 3])),
         no_drop=no_drop,
         weight=draw(st.sampled_from([None, 0.0, 0.3, 4.0])),
         value=draw(st.one_of(st.none(), V)),
         deadline_s=draw(st.sampled_from([None, 0.001, 0.02])),
-        **({} if no_drop else droppable),
     )
 
 
@@ -161,7 +161,7 @@ def topic_cases(draw: st.DrawFn, min_topics: int = 0, max_messages: int = 60) ->
         ],
     )
     topics = tuple(draw(topic_rules(f"topic {k}")) for k in range(n))
-    client = ClientSettings(limit_at_send=draw(st.booleans()), flush_no_drop=draw(st.booleans()))
+    client = ClientSettings(**{rule: draw(st.booleans()) for rule in CLIENT_RULES})
     return TopicCase(
         case,
         topics,

@@ -1,8 +1,8 @@
 """Readers of the logs of measuring tools: UCC's 4G and 5G CSV (G-NetTrack Pro), NYU-METS (iPerf), Sabre's JSON.
 
-Sources: D. Raca et al., "Beyond Throughput, The Next Generation: a 5G Dataset with Channel and Context Metrics",
-MMSys 2020; L. Mei et al., "Realtime Mobile Bandwidth Prediction using LSTM Neural Networks", PAM 2019;
-K. Spiteri et al., "From Theory to Practice: Improving Bitrate Adaptation in the DASH Reference Player", MMSys 2018.
+Sources: UCC's 4G and 5G logs [raca2018beyond], [raca2020beyond]; NYU-METS, L. Mei et al., "Realtime Mobile Bandwidth
+Prediction using LSTM Neural Networks", PAM 2019 (extended: [mei2020realtime]); K. Spiteri et al., "From Theory to
+Practice: Improving Bitrate Adaptation in the DASH Reference Player", MMSys 2018.
 """
 
 from __future__ import annotations

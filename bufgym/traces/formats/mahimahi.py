@@ -1,8 +1,7 @@
 """Mahimahi packet-delivery traces: a whole number of ms a line, each an opportunity to deliver one 1500-byte packet.
 
-Format: the README of mahimahi's `traces/`, and `src/frontend/link_queue.cc` (R. Netravali et al., "Mahimahi",
-USENIX ATC 2015). A repeated number means several packets in that ms. After the last line the trace begins again,
-shifted by the last line's time.
+Format: the README of mahimahi's `traces/`, and `src/frontend/link_queue.cc` [netravali2015mahimahi]. A repeated
+number means several packets in that ms. After the last line the trace begins again, shifted by the last line's time.
 
 How delivery opportunities become capacity: the packets of ms m are through *at* m, so their bytes accrue at an even
 rate during the ms that ends there, (m - 1, m]. Ms 0 has none before it; its packets accrue together with those of ms 1.

@@ -2,9 +2,9 @@
 
 | format | a line | used by |
 |---|---|---|
-| `tum` | `t tx ty tz qx qy qz qw`: s, m, unit quaternion | TUM RGB-D (Sturm et al., IROS 2012); any odometry |
-| `euroc` | `t px py pz qw qx qy qz`: ns, m; blanks or commas | EuRoC (Burri et al., IJRR 2016) |
-| `kitti` | a 3x4 matrix row by row, m; the times (s, one a line) in another file | KITTI (Geiger et al., CVPR 2012) |
+| `tum` | `t tx ty tz qx qy qz qw`: s, m, unit quaternion | TUM RGB-D [sturm2012tum]; any odometry |
+| `euroc` | `t px py pz qw qx qy qz`: ns, m; blanks or commas | EuRoC [burri2016euroc] |
+| `kitti` | a 3x4 matrix row by row, m; the times (s, one a line) in another file | KITTI [geiger2012kitti] |
 
 The format is recognised by the first line: 12 numbers are KITTI's; a header with `timestamp [ns]`, or commas, EuRoC's;
 anything else must be TUM's.

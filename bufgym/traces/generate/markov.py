@@ -17,9 +17,8 @@ is too low.
 Both processes are Markov modulated in the sense of W. Fischer and K. Meier-Hellstern, "The Markov-modulated Poisson
 process (MMPP) cookbook", Performance Evaluation 18(2), 1993: a rate governed by a hidden chain.
 
-Fitted to: 30 Belgium 4G logs (J. van der Hooft et al., "HTTP/2-Based Adaptive Streaming of HEVC Video over 4G/LTE
-Networks", IEEE Communications Letters 20(11), 2016) for the ways of moving; the Solis WiFi traces (G. Lv, MIT licence)
-for the places. How well it fits: docs/generators.md.
+Fitted to: 30 Belgium 4G logs [vanderhooft2016http2] for the ways of moving; the Solis WiFi traces (G. Lv, MIT licence)
+[solis] for the places. How well it fits: docs/generators.md.
 """
 
 from __future__ import annotations

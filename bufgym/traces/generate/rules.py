@@ -1,7 +1,6 @@
 """Links by rule, without randomness: steady, a linear ramp, a tunnel, regular outages.
 
-The ramp of Robofleet's Fig. 5 is `ramp(100e6 / 8, 4e6 / 8, 15)`: 100 to 4 Mbit/s in 15 s (K. S. Sikand et al.,
-"Robofleet: Open Source Communication and Management for Fleets of Autonomous Robots", IROS 2021).
+The ramp of Robofleet's Fig. 5 is `ramp(100e6 / 8, 4e6 / 8, 15)`: 100 to 4 Mbit/s in 15 s [sikand2021robofleet].
 """
 
 from __future__ import annotations
