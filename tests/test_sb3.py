@@ -321,7 +321,7 @@ def test_networks_learn_from_other_forms(form: str, network: str, fields: Any) -
     envs = make_vec_env("bufgym/Uplink-v0", 2, seed=0, observation=form, info="mask", fields=fields, **WORLD)
     model = MaskablePPO(network, envs, n_steps=64, batch_size=64, n_epochs=1, seed=0, device="cpu").learn(128)
     assert model.num_timesteps == 128
-    model = untrained(MaskablePPO, network, envs)
+    model = untrained(MaskablePPO, network, envs, 6)
     scenario = replace(scenario_of("lte"), duration_s=2.0, size_bytes=1_000_000)
     episodes = [draw(scenario, seed) for seed in range(4)]
     senders = run(as_policy(model, fields=fields), episodes, L, scenario.value)

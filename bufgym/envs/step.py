@@ -74,7 +74,7 @@ class StepOutput(NamedTuple):
             ``TOPIC_SLOT_FIELDS`` too; then ``CONTEXT_FIELDS`` and ``TOPIC_CONTEXT_FIELDS`` likewise (a number each).
         action_mask: int8[n, L + 2]: 1 where an action is valid.
         reward_terms: float64[n, reward terms]: what each term adds in this step.
-        qoi: float64[n]: H of what was delivered so far.
+        qoi: float64[n]: H of what has reached the server so far.
         terminated: bool[n]: the episode is over.
     """
 
@@ -140,10 +140,10 @@ def write_rewards(batch: Batch, i: int, rewarded: NDArray[np.float64], output: S
 
 @kernel
 def delivered_qoi(batch: Batch, i: int) -> float:
-    """H of what row ``i`` has delivered so far."""
+    """H of what has reached row ``i``'s server so far."""
     sender = batch.senders[i]
-    # The 1 in H = 1 + sum of V, of each topic that delivered anything.
-    ones = 1.0 if sender.transmitted > 0 else 0.0
+    # The 1 in H = 1 + sum of V, of each topic of which anything was received.
+    ones = 1.0 if sender.credited > 0 else 0.0
     if sender.topics > 1:
         ones = 0.0
         for topic in range(sender.topics):
