@@ -429,6 +429,12 @@ def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
     assert policies.get("afr").name == "afr"  # nothing was registered
 
 
+@pytest.mark.parametrize("form", ["flat", "slots"])
+def test_a_slot_network_needs_named_fields(form: str) -> None:
+    with pytest.raises(BufgymError, match='observation="dict"'):
+        untrained(MaskablePPO, SlotPolicy, make_vec_env("bufgym/Uplink-v0", 2, observation=form, **WORLD))
+
+
 def test_the_slot_extractor_serves_other_policies() -> None:
     model = untrained(PPO, "MultiInputPolicy", policy_kwargs={"features_extractor_class": SlotExtractor})
     assert isinstance(model.policy.features_extractor, SlotExtractor)
