@@ -144,13 +144,16 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def observation(self) -> Observation:
         """Every row's, padded; fresh arrays."""
-        slots = np.zeros((self.num_envs, len(self._widest.slot_fields), self.padded_slots + 1), np.float32)
-        context = np.empty((self.num_envs, len(self._widest.context_fields)), np.float32)
+        form = self._widest.form
+        padded = np.zeros((self.num_envs, form.numbers), np.float32)
+        slots, context = form.split(padded)
         for rows, span in zip(self.groups, self.spans, strict=True):
-            slots[span, :, : rows.capacity] = rows.output.slots[:, :, :-1]
-            slots[span, :, -1] = rows.output.slots[:, :, -1]
-            context[span] = rows.output.context
-        return self._widest.observation(slots, context)
+            own_slots, own_context = rows.form.split(rows.output.flat)
+            slots[span, :, : rows.capacity] = own_slots[:, :, :-1]
+            slots[span, :, -1] = own_slots[:, :, -1]
+            context[span] = own_context
+        observation: Observation = form.of(padded)
+        return observation
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[n, padded slots + 2]: the valid actions of each row."""

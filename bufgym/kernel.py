@@ -195,6 +195,11 @@ def stretch(array: NDArray[Any], i: int, first: int, length: int) -> Any:
     return array[i, first : first + length]
 
 
+def table(array: NDArray[Any], i: int, first: int, rows: int, columns: int) -> Any:
+    """``array[i, first : first + rows * columns]`` as rows x columns, of an array in C order."""
+    return array[i, first : first + rows * columns].reshape(rows, columns)
+
+
 def prefetch(array: NDArray[Any], i: int, k: int) -> None:
     """Ask the processor to fetch ``array[i, k]`` into its cache, without waiting for it; nothing in plain Python."""
 
@@ -228,6 +233,19 @@ def _view(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return view._getvalue()
 
 
+def _table(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """LLVM's code of ``table``."""
+    from numba.np import arrayobj
+
+    whole = context.make_array(signature.args[0])(context, builder, arguments[0])
+    place = _place(context, builder, signature, arguments, arguments[1:3])
+    view = context.make_array(signature.return_type)(context, builder)
+    size, shape = whole.itemsize, list(arguments[3:5])
+    steps = [builder.mul(shape[1], size), size]
+    cast(Any, arrayobj).populate_array(view, place, shape, steps, size, whole.meminfo, whole.parent)
+    return view._getvalue()
+
+
 def _hint(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """LLVM's code of ``prefetch``."""
     from llvmlite import ir
@@ -252,4 +270,5 @@ def _compile_as(function: Callable[..., Any], typer: Callable[..., Any], code: C
 _compile_as(item, lambda array, k: array.dtype, _read)
 _compile_as(at, lambda array, i, k: array.dtype, _read)
 _compile_as(stretch, lambda array, i, first, length: array.copy(ndim=1), _view)
+_compile_as(table, lambda array, i, first, rows, columns: array.copy(ndim=2), _table)
 _compile_as(prefetch, lambda array, i, k: numba.types.void, _hint)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,8 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common import env_util
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.monitor import Monitor, get_monitor_files
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import bufgym
 from bufgym import policies
@@ -48,7 +51,9 @@ def some_actions(masks: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.parametrize("id", bufgym.ENVIRONMENTS)
 def test_the_checker_of_stable_baselines3_has_nothing_to_say(id: str) -> None:
-    check_env(gym.make(id, **SMALL[id]).unwrapped, warn=True)  # a warning is an error here
+    for form in ("dict", "flat", "slots"):
+        env = gym.make(id, observation=form, **SMALL[id]).unwrapped
+        check_env(env, warn=form != "slots")  # a warning is an error here; slots are for networks of one's own
 
 
 @pytest.mark.parametrize("id", bufgym.ENVIRONMENTS)
@@ -164,6 +169,73 @@ def test_seeds_and_options_hold_for_one_reset() -> None:
         envs.set_options([{}, {}])
 
 
+@pytest.mark.parametrize("monitored", [False, True])
+def test_the_arguments_of_stable_baselines3s_own(monitored: bool, tmp_path: Path) -> None:
+    """T = 20 always: each episode has 20 decisions, and what it delivers is written to the folder as Monitor does."""
+    envs = make_vec_env(
+        "bufgym/Interruption-v0",
+        n_envs=3,
+        seed=5,
+        start_index=2,
+        monitor_dir=str(tmp_path) if monitored else None,
+        env_kwargs={"t_max": 20, "law": "fixed"},
+        monitor_kwargs={"info_keywords": ("qoi", "dropped")},
+        wrapper_class=gym.wrappers.vector.TransformReward,
+        wrapper_kwargs={"func": lambda reward: 2 * reward},
+        capacity=L,
+    )
+    assert envs.num_envs == 3
+    assert envs.env_is_wrapped(gym.wrappers.vector.TransformReward) == [True] * 3
+    envs.reset()
+    for _ in range(40):
+        *_, infos = envs.step(np.full(3, L + 1))
+    assert infos[0]["episode"]["r"] == pytest.approx(2 * (infos[0]["qoi"] - 1))
+    assert infos[0]["episode"]["dropped"] == infos[0]["dropped"] == 20 - L
+    envs.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == (["2.monitor.csv"] if monitored else [])
+    if monitored:
+        (file,) = get_monitor_files(str(tmp_path))  # which ``load_results`` reads with pandas
+        header, *lines = Path(file).read_text().splitlines()
+        assert json.loads(header[1:])["env_id"] == "bufgym/Interruption-v0"
+        results = list(csv.DictReader(lines))
+        assert [row["l"] for row in results] == ["20"] * 6
+        assert [float(row["qoi"]) for row in results] == pytest.approx([infos[0]["qoi"]] * 6)
+        assert [float(row["r"]) for row in results] == pytest.approx([infos[0]["episode"]["r"]] * 6, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"vec_env_cls": DummyVecEnv}, "the native batch is the VecEnv"),
+        (
+            {"wrapper_class": gym.wrappers.FlattenObservation},
+            "wrapper_class = FlattenObservation: a native batch takes",
+        ),
+        ({"wrapper_class": lambda env: env}, "wrapper_class = <lambda>"),
+        ({"wrapper_kwargs": {"a": 1}}, "no wrapper_class"),
+        ({"monitor_kwargs": {"reset_keywords": ("a",)}}, "monitor_kwargs['reset_keywords']"),
+    ],
+)
+def test_what_a_native_batch_cannot_do_is_an_error(arguments: dict[str, Any], says: str) -> None:
+    with pytest.raises(BufgymError) as caught:
+        make_vec_env("bufgym/Interruption-v0", 2, **arguments)
+    assert says in str(caught.value)
+
+
+def test_what_has_no_native_batch_gets_stable_baselines3s_own(tmp_path: Path) -> None:
+    envs = make_vec_env(
+        lambda **settings: gym.make("bufgym/Interruption-v0", **settings),
+        2,
+        0,
+        monitor_dir=str(tmp_path),
+        wrapper_class=gym.wrappers.FlattenObservation,
+        env_kwargs=SMALL["bufgym/Interruption-v0"],
+    )
+    assert isinstance(envs, DummyVecEnv)
+    assert envs.env_is_wrapped(gym.wrappers.FlattenObservation) == [True] * 2
+    envs.close()
+
+
 def test_any_vector_environment_that_resets_in_the_same_step_will_do() -> None:
     envs = make_vec_env("CartPole-v1", 3, seed=0)
     assert envs.reset().shape == (3, 4)  # type: ignore[union-attr]
@@ -229,21 +301,33 @@ def flat_env() -> Any:
     return env_util.make_vec_env(lambda: gym.wrappers.FlattenObservation(gym.make("bufgym/Uplink-v0", **WORLD)), 2)
 
 
-def outcomes_in_env(model: Any, scenario: Any, masked: bool, flat: bool, fields: Any = None) -> list[Any]:
+def outcomes_in_env(model: Any, scenario: Any, masked: bool, form: str, fields: Any = None) -> list[Any]:
     """What the model reaches in the environment, decision by decision."""
     episodes = [draw(scenario, seed) for seed in range(4)]
-    envs = SenderVectorEnv(4, scenario, L, decide_at="arrival", fields=fields)
+    envs = SenderVectorEnv(4, scenario, L, decide_at="arrival", fields=fields, observation=form)
     envs.reset(options={"episodes": episodes})
     rows = envs.rows
     while not rows.output.terminated.all():
-        observation: Any = rows.observation(rows.output.slots, rows.output.context)
-        if flat:
-            space = envs.single_observation_space
-            single = [{key: column[i] for key, column in observation.items()} for i in range(4)]
-            observation = np.array([gym.spaces.flatten(space, row) for row in single])
+        observation: Any = rows.observation()
         masks = {"action_masks": rows.output.action_mask} if masked else {}
         rows.step(np.asarray(model.predict(observation, deterministic=True, **masks)[0], np.int64))
     return [outcome(rows.senders, i) for i in range(4)]
+
+
+@pytest.mark.parametrize(("form", "network"), [("flat", "MlpPolicy"), ("slots", "MultiInputPolicy")])
+@pytest.mark.parametrize("fields", [None, FIELDS])
+def test_networks_learn_from_other_forms(form: str, network: str, fields: Any) -> None:
+    """And as a policy they decide as they do in the environment: the order of the numbers is the same."""
+    envs = make_vec_env("bufgym/Uplink-v0", 2, seed=0, observation=form, info="mask", fields=fields, **WORLD)
+    model = MaskablePPO(network, envs, n_steps=64, batch_size=64, n_epochs=1, seed=0, device="cpu").learn(128)
+    assert model.num_timesteps == 128
+    model = untrained(MaskablePPO, network, envs, 6)
+    scenario = replace(scenario_of("lte"), duration_s=2.0, size_bytes=1_000_000)
+    episodes = [draw(scenario, seed) for seed in range(4)]
+    senders = run(as_policy(model, fields=fields), episodes, L, scenario.value)
+    ours = [outcome(senders, i) for i in range(4)]
+    assert any(result.delivered and result.dropped for result in ours)
+    assert repr(ours) == repr(outcomes_in_env(model, scenario, True, form, fields))
 
 
 @pytest.mark.slow
@@ -277,7 +361,9 @@ def test_any_model_decides_as_a_policy_what_it_does_in_the_environment(
     senders = run(policy, episodes, L, scenario.value)
     ours = [outcome(senders, i) for i in range(4)]
     assert any(result.delivered and result.dropped for result in ours)
-    assert repr(ours) == repr(outcomes_in_env(model, scenario, algorithm is MaskablePPO, flat))  # NaN is NaN
+    assert repr(ours) == repr(
+        outcomes_in_env(model, scenario, algorithm is MaskablePPO, "flat" if flat else "dict")
+    )  # NaN is NaN
     if algorithm is MaskablePPO:
         assert not senders.batch.senders["invalid"].any()
 
@@ -293,25 +379,26 @@ def test_a_slot_network_serves_every_L_and_a_few_fields_are_enough(tmp_path: Pat
         assert policy.name == "slots" and policy.compile
         senders = run(policy, episodes, L, scenario.value)
         ours = [outcome(senders, i) for i in range(4)]
-        assert repr(ours) == repr(outcomes_in_env(model, scenario, True, False, FIELDS))
+        assert repr(ours) == repr(outcomes_in_env(model, scenario, True, "dict", FIELDS))
         assert all(result.delivered and result.dropped for result in ours)
         assert (run(policy, episodes, 20, scenario.value).batch.senders["invalid"] == 0).all()
 
 
 @pytest.mark.slow
-def test_an_agent_for_topics_is_a_scheduler() -> None:
+@pytest.mark.parametrize(("form", "network"), [("dict", "MultiInputPolicy"), ("flat", "MlpPolicy")])
+def test_an_agent_for_topics_is_a_scheduler(form: str, network: str) -> None:
     """It drops and sends as in the environment, up to the last message: only there may a policy not hold."""
     client = scenario_of("topics", duration_s=0.5)
-    env = make_vec_env("bufgym/Topics-v0", 2, seed=0, capacity=6, duration_s=0.5)
-    model = untrained(MaskablePPO, "MultiInputPolicy", env)
+    env = make_vec_env("bufgym/Topics-v0", 2, seed=0, capacity=6, duration_s=0.5, observation=form)
+    model = untrained(MaskablePPO, network, env)
     policy = as_policy(model, "scheduler")
     assert policy.for_topics and policy.schedules
     episode = draw(client, 0)
-    envs = SenderVectorEnv(1, client, 6)
+    envs = SenderVectorEnv(1, client, 6, observation=form)
     envs.reset(options={"episodes": [episode]})
     rows = envs.rows
     while not rows.output.terminated.all():
-        observation = rows.observation(rows.output.slots, rows.output.context)
+        observation = rows.observation()
         action, _ = model.predict(observation, deterministic=True, action_masks=rows.output.action_mask)
         rows.step(np.asarray(action, np.int64))
     senders = run(policy, [episode], 6, client.value, topics=client.topics)
@@ -340,6 +427,12 @@ def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BufgymError, match="no such file"):
         as_policy(tmp_path / "none.zip")
     assert policies.get("afr").name == "afr"  # nothing was registered
+
+
+@pytest.mark.parametrize("form", ["flat", "slots"])
+def test_a_slot_network_needs_named_fields(form: str) -> None:
+    with pytest.raises(BufgymError, match='observation="dict"'):
+        untrained(MaskablePPO, SlotPolicy, make_vec_env("bufgym/Uplink-v0", 2, observation=form, **WORLD))
 
 
 def test_the_slot_extractor_serves_other_policies() -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -12,16 +13,13 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from bufgym.envs.rows import FleetRows, Observation, check_render_mode
+from bufgym.envs.observation import Observation
+from bufgym.envs.rows import FleetRows, check_render_mode
 from bufgym.errors import BufgymError
 from bufgym.scenario import FleetScenario, Uplink
 
 Infos = dict[str, dict[str, Any]]
 Spaces = dict[str, spaces.Space[Any]]
-
-_QUEUED, _FREE = "■", "·"
-_WIDEST = 32
-"""Up to this L a picture has a character for every slot of the buffer, beyond it two numbers."""
 
 
 class FleetEnv(ParallelEnv[str, Observation, int]):
@@ -35,9 +33,9 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     **Agents** ``robot_0`` .. ``robot_{N-1}``, N up to 256.
 
     **Action, observation** of each are those of ``SenderEnv``: ``Discrete(L + 2)``; a Dict with one key for each field
-    of ``bufgym.observe``, of what that robot has on board. ``infos[agent]["action_mask"]`` bool[L + 2] says which
-    actions are valid; with ``mask_in_observation`` so does ``observation["action_mask"]``, int8[L + 2]. ``state()`` is
-    every field of every robot, for critics that may see them all.
+    of ``bufgym.observe``, of what that robot has on board. ``infos[agent]["action_mask"]``, int8[L + 2], says which
+    actions are valid; with ``mask_in_observation`` so does ``observation["action_mask"]``. ``state()`` is every field
+    of every robot, for critics that may see them all.
 
     **Reward** "team": each robot gets the mean over all robots of the ``term`` (or weighted terms) that ``SenderEnv``
     calls reward; "own": its own. ``infos[agent]["reward_terms"]`` has each robot's own terms in any case.
@@ -51,14 +49,19 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     - ``scenario``: the name of an uplink, an ``Uplink`` (what each robot would have if it were alone) or a
       ``FleetScenario``.
     - ``capacity``: L of every robot, messages; ``max_bytes``: B, bytes.
-    - ``reward`` and ``term``: see above; ``fields``: names of the fields to observe.
-    - ``mask_in_observation``: see above; ``render_mode``: "ansi".
+    - ``reward`` and ``term``: see above; ``fields``, ``observation`` and ``info``: as of ``SenderEnv``.
+    - ``mask_in_observation``: see above; ``render_mode``: "ansi" or "rgb_array".
     - any further argument replaces a parameter of the uplink.
 
     ``reset(options={"episode": e})`` plays the ``FleetEpisode`` e; other options are ignored, as PettingZoo has it.
     """
 
-    metadata = {"name": "bufgym_fleet_v0", "render_modes": ["ansi"], "is_parallelizable": True, "render_fps": 10}
+    metadata = {
+        "name": "bufgym_fleet_v0",
+        "render_modes": ["ansi", "rgb_array"],
+        "is_parallelizable": True,
+        "render_fps": 10,
+    }
 
     def __init__(
         self,
@@ -70,17 +73,31 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         term: str | Mapping[str, float] = "retained",
         max_bytes: int | None = None,
         fields: Sequence[str] | None = None,
+        observation: str = "dict",
+        info: str = "full",
         mask_in_observation: bool = False,
         render_mode: str | None = None,
         **parameters: Any,
     ) -> None:
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
         fleet = FleetScenario.of(robots, scenario, **parameters)
-        self.rows = FleetRows(1, fleet, capacity, reward=reward, term=term, max_bytes=max_bytes, fields=fields)
+        if mask_in_observation and observation == "flat":
+            raise BufgymError("mask_in_observation: an observation 'flat' has no place for it; 'dict' and 'slots' have")
+        self.rows = FleetRows(
+            1,
+            fleet,
+            capacity,
+            reward=reward,
+            term=term,
+            max_bytes=max_bytes,
+            fields=fields,
+            observation=observation,
+            info=info,
+        )
         self.mask_in_observation = mask_in_observation
         self.possible_agents = [f"robot_{i}" for i in range(len(self.rows))]
         self.agents: list[str] = []
-        # PettingZoo's way to seed an agent's actions is to seed its space: each has one of its own.
+        # PettingZoo's way to seed an agent is to seed its spaces: each has its own.
         self.observation_spaces: Spaces = {agent: self._space() for agent in self.possible_agents}
         actions = self.rows.capacity + 2
         self.action_spaces: Spaces = {agent: spaces.Discrete(actions) for agent in self.possible_agents}
@@ -101,9 +118,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
             rows.seed(0, seeding.np_random(seed)[0])
         rows.reset(np.arange(len(rows)), [(options or {}).get("episode")])
         self.agents = list(self.possible_agents)
-        masks = rows.output.action_mask.copy()
-        infos = {agent: {"action_mask": masks[i], "invalid": 0} for i, agent in enumerate(self.agents)}
-        return self._observations(masks), infos
+        return self._observations(), self._infos(False)
 
     def step(
         self, actions: Mapping[str, int]
@@ -115,64 +130,55 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
             action = actions.get(agent)
             if action is None:
                 raise BufgymError(f"actions: none for {agent!r}; every robot decides at every tick")
-            if not 0 <= action < rows.capacity + 2:
-                raise rows.bad_action(f"actions[{agent!r}]", action)
-            self._actions[i] = action
+            self._actions[i] = rows.action(f"actions[{agent!r}]", action)
         rows.step(self._actions)
-        masks = rows.output.action_mask.copy()
         terminated = bool(rows.output.terminated[0])
         if terminated:
             self.agents = []
         return (
-            self._observations(masks),
+            self._observations(),
             dict(zip(agents, rows.rewards().tolist(), strict=True)),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, False),
-            {agent: rows.info(i, masks[i], terminated) for i, agent in enumerate(agents)},
+            self._infos(terminated),
         )
 
     def state(self) -> NDArray[np.float32]:
         """float32[N x fields]: robot by robot, every slot field, then every context field; chosen or not."""
-        output = self.rows.output
-        return np.concatenate([output.slots.reshape(len(self.rows), -1), output.context], axis=1).ravel()
+        return self.rows.output.flat.flatten()
 
-    def render(self) -> str | None:
-        """One line a robot: its buffer, whether it is sending, and what has become of its messages."""
+    def render(self) -> Any:
+        """One line a robot: its buffer, and what has become of its messages; as text, or as uint8[400, 800, 3]."""
         if self.render_mode is None:
-            gym.logger.warn("render() needs a render_mode: parallel_env(..., render_mode='ansi')")
+            gym.logger.warn("render() needs a render_mode: parallel_env(..., render_mode='ansi' or 'rgb_array')")
             return None
         if self.rows.senders.episodes[0] is None:
             raise gym.error.ResetNeeded("call reset() before render()")
-        senders = self.rows.senders.batch.senders
-        lines = [f"t = {senders['now_us'].max() / 1e6:.2f} s, {int(senders['busy'].sum())} of {len(senders)} sending"]
-        lines += [self._line(i) for i in range(len(senders))]
-        return "\n".join(lines)
+        from bufgym.envs.render import cell  # loaded by those who draw only
+
+        draw = cell.cell_ansi if self.render_mode == "ansi" else cell.cell_rgb_array
+        return draw(self.rows, self.possible_agents)
 
     def close(self) -> None:
         """Nothing to close."""
 
-    def _line(self, i: int) -> str:
-        sender, summary = self.rows.senders.batch.senders[i], self.rows.summary(i)
-        queued, L = int(sender["occupancy"]), self.rows.capacity
-        buffer = _QUEUED * queued + _FREE * (L - queued) if L <= _WIDEST else f"{queued}/{L}"
-        sending = "▶" if sender["busy"] else " "
-        counts = f"delivered {summary['delivered']:>4}  dropped {summary['dropped']:>4}  H {summary['qoi']:.2f}"
-        return f"{self.possible_agents[i]:<9} {buffer} {sending} {counts}"
-
-    def _space(self) -> spaces.Dict:
-        space = dict(self.rows.observation_space.spaces)
+    def _space(self) -> spaces.Space[Any]:
+        space: Any = copy.deepcopy(self.rows.observation_space)
         if self.mask_in_observation:
             space["action_mask"] = spaces.Box(0, 1, (self.rows.capacity + 2,), np.int8)
-        return spaces.Dict(space)
+        return cast(spaces.Space[Any], space)
 
-    def _observations(self, masks: NDArray[np.bool_]) -> dict[str, Observation]:
+    def _observations(self) -> dict[str, Observation]:
         rows = self.rows
-        slots, context = rows.output.slots.copy(), rows.output.context.copy()
-        observations = {agent: rows.observation(slots[i], context[i]) for i, agent in enumerate(self.possible_agents)}
+        observations = {agent: rows.observation(i) for i, agent in enumerate(self.possible_agents)}
         if self.mask_in_observation:
-            for observation, mask in zip(observations.values(), masks.astype(np.int8), strict=True):
+            for observation, mask in zip(observations.values(), rows.output.action_mask.copy(), strict=True):
                 observation["action_mask"] = mask
         return observations
+
+    def _infos(self, terminated: bool) -> Infos:
+        terms = self.rows.output.reward_terms.tolist()
+        return {agent: self.rows.info(i, terms[i], terminated) for i, agent in enumerate(self.possible_agents)}
 
 
 def parallel_env(**arguments: Any) -> FleetEnv:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
@@ -14,6 +15,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym import scenario as scenarios
+from bufgym.envs.observation import Observation, ObservationForm
 from bufgym.envs.step import StepOutput, begin_cells, begin_rows, step_cells, step_rows
 from bufgym.errors import BufgymError
 from bufgym.observe import (
@@ -29,8 +31,8 @@ from bufgym.scenario import FleetScenario, Scenario, Streams
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
 
-Observation = dict[str, NDArray[Any]]
-"""One array for each observed field."""
+INFOS = ("full", "mask", "none")
+"""How much ``info`` has: all of it; the action mask alone; nothing but the summary of an episode at its end."""
 
 
 def reward_weights(
@@ -58,14 +60,6 @@ def check_render_mode(render_mode: str | None, known: Sequence[str]) -> str | No
     return render_mode
 
 
-def delivered_qoi(senders: Senders, i: Any) -> Any:
-    """H of what row(s) ``i`` have delivered so far (``i``: an index or a slice)."""
-    sender, topics = senders.batch.senders[i], senders.batch.topics[i]
-    # The 1 in H = 1 + sum of V, of each topic that delivered anything.
-    ones = ((topics["received"] > 0) * topics["weight"]).sum(-1) if senders.topics else sender["transmitted"] > 0
-    return ones + sender["delivered_gain"]
-
-
 class Rows:
     """n senders, each with its own random streams, stepped together.
 
@@ -83,8 +77,13 @@ class Rows:
         decide_at: str = "arrival",
         reward: str | Mapping[str, float] = "retained",
         fields: Sequence[str] | None = None,
+        observation: str = "dict",
+        info: str = "full",
         **parameters: Any,
     ) -> None:
+        if info not in INFOS:
+            raise BufgymError(f"info = {info!r}: must be one of {', '.join(map(repr, INFOS))}")
+        self.shows_mask, self.shows_all = info != "none", info == "full"
         self.scenario = scenarios.get(scenario, **parameters)
         topics = self.scenario.topics
         self.senders = Senders(
@@ -102,23 +101,8 @@ class Rows:
         self.weights = reward_weights(reward, self.terms)
         self.slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
         self.context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
-        all_fields = self.slot_fields + self.context_fields
-        known = [field.name for field in all_fields]
-        for name in fields or ():
-            if name not in known:
-                raise BufgymError(f"fields: unknown field {name!r}; known: {', '.join(known)}")
-        chosen = known if fields is None else list(fields)
-        if not chosen:
-            raise BufgymError("fields: choose at least one field to observe")
-        self._slot_columns = [(f.name, k) for k, f in enumerate(self.slot_fields) if f.name in chosen]
-        self._context_columns = [(f.name, k) for k, f in enumerate(self.context_fields) if f.name in chosen]
-        self.observation_space = spaces.Dict(
-            {
-                f.name: spaces.Box(f.low, f.high, (self.capacity + 1 if f.per == "slot" else 1,), np.float32)
-                for f in all_fields
-                if f.name in chosen
-            }
-        )
+        self.form = ObservationForm(observation, self.slot_fields, self.context_fields, self.capacity, fields)
+        self.observation_space = self.form.space
         self.action_space = spaces.Discrete(self.capacity + 2)
         self.streams: list[Streams | None] = [None] * n
         self._draw: Callable[[Streams], Any] = self.scenario.draw
@@ -132,10 +116,10 @@ class Rows:
         """Zeroed arrays for what a step hands out."""
         n, L = len(self), self.capacity
         return StepOutput(
-            np.zeros((n, len(self.slot_fields), L + 1), np.float32),
-            np.zeros((n, len(self.context_fields)), np.float32),
-            np.zeros((n, L + 2), np.bool_),
+            np.zeros((n, self.form.numbers), np.float32),
+            np.zeros((n, L + 2), np.int8),
             np.zeros((n, len(self.terms))),
+            np.zeros(n),
             np.zeros(n, np.bool_),
         )
 
@@ -165,35 +149,47 @@ class Rows:
         return total
 
     def summary(self, i: Any) -> dict[str, Any]:
-        """QoI and message counts of the finished episode(s) of row(s) ``i`` (an index or a slice)."""
+        """QoI and message counts so far of the episode(s) of row(s) ``i`` (an index or a slice)."""
         sender = self.senders.batch.senders[i]
         return {
-            "qoi": delivered_qoi(self.senders, i),
+            "qoi": self.output.qoi[i],
             "arrived": sender["next"],
             "delivered": sender["transmitted"],
             "dropped": sender["rejected"] + sender["evicted"],
             "invalid": sender["invalid"],
         }
 
-    def info(self, i: int, action_mask: NDArray[np.bool_], terminated: bool) -> dict[str, Any]:
-        """Gymnasium's info of row ``i`` after a step: mask, invalid actions, reward terms; at the end its summary."""
-        info = {
-            "action_mask": action_mask,
-            "invalid": self.senders.batch.senders["invalid"].item(i),
-            "reward_terms": dict(zip(self._term_names, self.output.reward_terms[i].tolist(), strict=True)),
-        }
-        if terminated:
+    def info(self, i: int, terms: Sequence[float], ended: bool) -> dict[str, Any]:
+        """Gymnasium's info of row ``i`` after a reset or a step that gave the reward ``terms``; at the end its summary.
+
+        As much of it as was asked for: see ``INFOS``.
+        """
+        info: dict[str, Any] = {}
+        if self.shows_mask:
+            info["action_mask"] = self.output.action_mask[i].copy()
+        if self.shows_all:
+            info["qoi"] = self.output.qoi.item(i)
+            info["invalid"] = self.senders.batch.senders["invalid"].item(i)
+            info["reward_terms"] = dict(zip(self._term_names, terms, strict=True))
+        if ended:
             info |= {name: number.item() for name, number in self.summary(i).items()}
         return info
 
-    def observation(self, slots: NDArray[np.float32], context: NDArray[np.float32]) -> Observation:
-        """The Dict observation whose arrays are views of ``slots`` and ``context``, batched or one row."""
-        # Walked over with the fields' axis first, a view costs half of what an index costs.
-        by_slot, by_context = list(slots.swapaxes(0, -2)), list(context.T[..., np.newaxis])
-        observation = {name: by_slot[k] for name, k in self._slot_columns}
-        for name, k in self._context_columns:
-            observation[name] = by_context[k]
-        return observation
+    def observation(self, i: int | None = None) -> Observation:
+        """What the rows observe now, as views of ``output``; of row ``i`` alone, a copy."""
+        return self.form.of(self.output.flat if i is None else self.output.flat[i].copy())
+
+    def action(self, name: str, action: Any) -> int:
+        """``action`` as an int, or an error that calls it ``name``."""
+        try:
+            number = operator.index(action)
+        except TypeError:
+            raise BufgymError(
+                f"{name} = {action!r}: must be a whole number in 0..{self.capacity + 1} (L = {self.capacity})"
+            ) from None
+        if not 0 <= number < self.capacity + 2:
+            raise self.bad_action(name, number)
+        return number
 
     def bad_action(self, name: str, action: Any) -> BufgymError:
         """The error for an action outside of 0..L+1."""
@@ -219,8 +215,7 @@ class FleetRows(Rows):
         *,
         reward: str = "team",
         term: str | Mapping[str, float] = "retained",
-        max_bytes: int | None = None,
-        fields: Sequence[str] | None = None,
+        **options: Any,
     ) -> None:
         """``reward``: "team" or "own"; ``term``: what ``Rows`` calls reward; the rest as of ``Rows``."""
         if reward not in ("team", "own"):
@@ -228,7 +223,7 @@ class FleetRows(Rows):
                 f"reward = {reward!r}: must be 'team' (the mean over the robots) or 'own'; its term is `term`"
             )
         n = cells * scenario.robots
-        super().__init__(n, scenario.uplink, capacity, max_bytes=max_bytes, reward=term, fields=fields)
+        super().__init__(n, scenario.uplink, capacity, reward=term, **options)
         self.reward = reward
         self._draw = scenario.draw
         self.robots = scenario.robots

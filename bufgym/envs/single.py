@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import Observation, Rows, check_render_mode
+from bufgym.envs.observation import Observation
+from bufgym.envs.rows import Rows, check_render_mode
 from bufgym.errors import BufgymError
 from bufgym.scenario import Scenario
 
@@ -20,13 +21,15 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     """A robot's send buffer holds L messages, and a fading link empties it: decide at every arrival what to drop.
 
     **Action** ``Discrete(L + 2)``: 0..L-1 evict that slot (0 = oldest) and enqueue the newcomer; L rejects the
-    newcomer; L + 1 accepts it. ``action_masks()`` and ``info["action_mask"]``, bool[L + 2], say which are valid. An
-    invalid action does what a plain queue does: it accepts where there is room, else it rejects;
-    ``info["invalid"]`` counts these actions. Where B has no room for the newcomer even after an eviction, the next step
-    is about the same arrival again; an arrival larger than B is dropped without a step.
+    newcomer; L + 1 accepts it. ``info["action_mask"]``, int8[L + 2], says which are valid, as
+    ``action_space.sample(mask)`` takes it; ``action_masks()``, bool[L + 2], as sb3-contrib does. An invalid action does
+    what a plain queue does: it accepts where there is room, else it rejects; ``info["invalid"]`` counts these actions.
+    Where B has no room for the newcomer even after an eviction, the next step is about the same arrival again; an
+    arrival larger than B is dropped without a step.
 
     **Observation** a Dict with one float32 array for each field of ``bufgym.observe.FIELDS``: slot fields of shape
-    (L + 1,) with the newcomer last, context fields of shape (1,), all in [0, 1].
+    (L + 1,) with the newcomer last, context fields of shape (1,), all in [0, 1]. With ``observation="flat"`` it is one
+    array of the same numbers, slot fields first; with "slots" a Dict of ``slots`` (L + 1, slot fields) and ``context``.
 
     **Reward** one of the terms of ``bufgym.observe.REWARD_TERMS`` or a weighted sum of them: ``delivered`` and
     ``retained`` both add up to H - 1 over an episode (to H where nothing was delivered, H = 0).
@@ -42,8 +45,9 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     ``retained`` add up to H minus the weights of the topics of which anything was received.
 
     **Episode end** ``terminated`` when the episode's last message has left; never ``truncated``. In the step that
-    ends it, ``info`` also has ``qoi`` (H), ``arrived``, ``delivered`` and ``dropped`` (messages). An episode that asks
-    for no decision (``decide_at="overflow"`` and never full) ends with the first step, whose action has no effect.
+    ends it, ``info`` also has ``arrived``, ``delivered`` and ``dropped`` (messages). ``qoi``, H of what was delivered
+    so far, is there in every step: so episodes that a ``TimeLimit`` truncates have it too. An episode that asks for no
+    decision (``decide_at="overflow"`` and never full) ends with the first step, whose action has no effect.
 
     **Arguments**
 
@@ -52,7 +56,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``max_bytes``: B, bytes; None for no limit.
     - ``decide_at``: "arrival", or "overflow" to ask only when the buffer is full.
     - ``reward``: a term's name, or weights by name.
-    - ``fields``: names of the fields to observe; all by default.
+    - ``fields``: names of the fields to observe; all by default. ``observation``: "dict", "flat" or "slots".
+    - ``info``: "full"; "mask" for the action mask alone, and at an episode's end its summary; "none" for the summary.
     - ``render_mode``: "ansi" or "rgb_array".
     - any further argument replaces a parameter of the scenario (``t_max=100``).
 
@@ -73,6 +78,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         decide_at: str = "arrival",
         reward: str | Mapping[str, float] = "retained",
         fields: Sequence[str] | None = None,
+        observation: str = "dict",
+        info: str = "full",
         render_mode: str | None = None,
         **parameters: Any,
     ) -> None:
@@ -85,12 +92,15 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             decide_at=decide_at,
             reward=reward,
             fields=fields,
+            observation=observation,
+            info=info,
             **parameters,
         )
-        self.observation_space = cast(Any, self.rows.observation_space)
+        self.observation_space = self.rows.observation_space
         self.action_space = self.rows.action_space
         self._action = np.zeros(1, np.int64)
         self._weights = self.rows.weights.tolist()
+        self._no_terms = [0.0] * len(self._weights)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -102,26 +112,24 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             if name != "episode":
                 raise BufgymError(f"options[{name!r}]: unknown; known: episode")
         self.rows.reset(_ROW, [(options or {}).get("episode")])
-        return self._observation(), {"action_mask": self.action_masks(), "invalid": 0}
+        return self.rows.observation(0), self.rows.info(0, self._no_terms, False)
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         rows = self.rows
         if rows.senders.episodes[0] is None:
             raise gym.error.ResetNeeded("call reset() before step()")
-        if not 0 <= action < rows.capacity + 2:
-            raise rows.bad_action("action", action)
-        self._action[0] = action
+        self._action[0] = rows.action("action", action)
         rows.step(self._action)
         terminated = rows.output.terminated.item()
-        info = rows.info(0, self.action_masks(), terminated)
+        terms = rows.output.reward_terms[0].tolist()
         reward = 0.0
-        for weight, term in zip(self._weights, info["reward_terms"].values(), strict=True):
+        for weight, term in zip(self._weights, terms, strict=True):
             reward += weight * term
-        return self._observation(), reward, terminated, False, info
+        return rows.observation(0), reward, terminated, False, rows.info(0, terms, terminated)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[L + 2]: the actions that are valid now (the name that sb3-contrib looks for)."""
-        mask: NDArray[np.bool_] = self.rows.output.action_mask[0].copy()
+        mask: NDArray[np.bool_] = self.rows.output.action_mask[0].astype(np.bool_)
         return mask
 
     def render(self) -> Any:
@@ -132,7 +140,3 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         from bufgym.envs import render  # loaded by those who draw only
 
         return render.draw(self.rows.senders, 0, self.render_mode)
-
-    def _observation(self) -> Observation:
-        output = self.rows.output
-        return self.rows.observation(output.slots[0].copy(), output.context[0].copy())

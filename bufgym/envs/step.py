@@ -14,12 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import kernel, prefetch
+from bufgym.kernel import kernel, prefetch, stretch, table
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.link import FOREVER
 from bufgym.observe import (
+    CONTEXT_FIELDS,
     REWARD_TERMS,
+    SLOT_FIELDS,
+    TOPIC_CONTEXT_FIELDS,
     TOPIC_REWARD_TERMS,
+    TOPIC_SLOT_FIELDS,
     observe_context,
     observe_slots,
     observe_topic_context,
@@ -52,6 +56,12 @@ from bufgym.sim.shared_link import Shares, next_in_cell
 DELIVERED, RETAINED, AGE, LATE = range(len(REWARD_TERMS) + len(TOPIC_REWARD_TERMS))
 """Columns of ``StepOutput.reward_terms``."""
 
+_SLOT_FIELDS, _CONTEXT_FIELDS = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
+_ALL_SLOT_FIELDS, _ALL_CONTEXT_FIELDS = (
+    _SLOT_FIELDS + len(TOPIC_SLOT_FIELDS),
+    _CONTEXT_FIELDS + len(TOPIC_CONTEXT_FIELDS),
+)
+
 _AHEAD = 8
 """Rows to prefetch ahead: far enough for memory to answer in time, near enough for the answer to be in cache still."""
 
@@ -60,17 +70,18 @@ class StepOutput(NamedTuple):
     """What a step hands out of n rows; the kernels write these arrays in place.
 
     Fields:
-        slots: float32[n, slot fields, L + 1]: ``SLOT_FIELDS``, then with several topics ``TOPIC_SLOT_FIELDS``.
-        context: float32[n, context fields]: ``CONTEXT_FIELDS``, then with several topics ``TOPIC_CONTEXT_FIELDS``.
-        action_mask: bool[n, L + 2]: which actions are valid.
+        flat: float32[n, numbers]: field by field, each of ``SLOT_FIELDS`` (L + 1 numbers), with several topics each of
+            ``TOPIC_SLOT_FIELDS`` too; then ``CONTEXT_FIELDS`` and ``TOPIC_CONTEXT_FIELDS`` likewise (a number each).
+        action_mask: int8[n, L + 2]: 1 where an action is valid.
         reward_terms: float64[n, reward terms]: what each term adds in this step.
+        qoi: float64[n]: H of what has reached the server so far.
         terminated: bool[n]: the episode is over.
     """
 
-    slots: NDArray[np.float32]
-    context: NDArray[np.float32]
-    action_mask: NDArray[np.bool_]
+    flat: NDArray[np.float32]
+    action_mask: NDArray[np.int8]
     reward_terms: NDArray[np.float64]
+    qoi: NDArray[np.float64]
     terminated: NDArray[np.bool_]
 
 
@@ -128,32 +139,47 @@ def write_rewards(batch: Batch, i: int, rewarded: NDArray[np.float64], output: S
 
 
 @kernel
+def delivered_qoi(batch: Batch, i: int) -> float:
+    """H of what has reached row ``i``'s server so far."""
+    sender = batch.senders[i]
+    # The 1 in H = 1 + sum of V, of each topic of which anything was received.
+    ones = 1.0 if sender.credited > 0 else 0.0
+    if sender.topics > 1:
+        ones = 0.0
+        for topic in range(sender.topics):
+            if batch.topics[i, topic].received > 0:
+                ones += batch.topics[i, topic].weight
+    return float(ones + sender.delivered_gain)
+
+
+@kernel
 def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> None:
-    """Write row ``i``'s observation and action mask; without a decision due, zeros and L as the one valid action."""
+    """Write row ``i``'s observation, action mask and H; without a decision due, zeros and L as the one valid action."""
     sender = batch.senders[i]
     output.terminated[i] = ended
+    output.qoi[i] = delivered_qoi(batch, i)
     if sender.waiting == NOTHING_WAITS:
-        output.slots[i, :, :] = 0.0
-        output.context[i, :] = 0.0
+        output.flat[i, :] = 0.0
         output.action_mask[i, :] = False
         output.action_mask[i, sender.capacity] = True
         return
-    buffer = view(batch, i)
+    buffer, entries = view(batch, i), sender.capacity + 1
     if sender.topics > 1:
         arriving = sender.waiting == ARRIVAL_WAITS
         # When the socket asks there is no newcomer: the last arrival fills the argument and is not read.
         arrival = batch.arrivals[i, min(sender.next, sender.arrivals - 1)]
-        observe_topic_slots(buffer, arrival, arriving, output.slots[i])
-        observe_topic_context(buffer, arrival, arriving, output.context[i])
+        first = _ALL_SLOT_FIELDS * entries
+        observe_topic_slots(buffer, arrival, arriving, table(output.flat, i, 0, _ALL_SLOT_FIELDS, entries))
+        observe_topic_context(buffer, arrival, arriving, stretch(output.flat, i, first, _ALL_CONTEXT_FIELDS))
     else:
         arrival = arrival_of(batch, i)
-        observe_slots(buffer, arrival, output.slots[i])
-        observe_context(buffer, arrival, output.context[i])
+        observe_slots(buffer, arrival, table(output.flat, i, 0, _SLOT_FIELDS, entries))
+        observe_context(buffer, arrival, stretch(output.flat, i, _SLOT_FIELDS * entries, _CONTEXT_FIELDS))
     write_mask(batch, i, output.action_mask)
 
 
 @kernel
-def write_mask(batch: Batch, i: int, action_mask: NDArray[np.bool_]) -> None:
+def write_mask(batch: Batch, i: int, action_mask: NDArray[np.int8]) -> None:
     """Write which actions are valid for row ``i``, which waits for a decision."""
     sender = batch.senders[i]
     capacity = sender.capacity
@@ -189,10 +215,11 @@ def advance(batch: Batch, i: int) -> None:
 
 @kernel
 def begin_rows(batch: Batch, rows: NDArray[np.int64], rewarded: NDArray[np.float64], output: StepOutput) -> None:
-    """Bring freshly loaded rows to their first decision; ``output.reward_terms`` stay as they are."""
+    """Bring freshly loaded rows to their first decision; nothing is rewarded yet."""
     for i in rows:
         advance(batch, i)
         rewarded[i, :] = 0.0
+        output.reward_terms[i, :] = 0.0
         write_observation(batch, i, batch.senders[i].waiting == NOTHING_WAITS, output)
 
 
@@ -252,12 +279,13 @@ def decisions_due(batch: Batch, shares: Shares, c: int) -> bool:
 def begin_cells(
     batch: Batch, shares: Shares, cells: NDArray[np.int64], rewarded: NDArray[np.float64], output: StepOutput
 ) -> None:
-    """Bring freshly loaded cells to their first tick; ``output.reward_terms`` stay as they are."""
+    """Bring freshly loaded cells to their first tick; nothing is rewarded yet."""
     for c in cells:
         advance_cell(batch, shares, c)
         robots, ended = shares.cells[c].robots, not decisions_due(batch, shares, c)
         for i in range(c * robots, (c + 1) * robots):
             rewarded[i, :] = 0.0
+            output.reward_terms[i, :] = 0.0
             write_observation(batch, i, ended, output)
 
 

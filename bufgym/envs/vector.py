@@ -13,14 +13,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import Observation, Rows, check_render_mode
+from bufgym.envs.observation import Observation
+from bufgym.envs.rows import Rows, check_render_mode
 from bufgym.envs.step import StepOutput
 from bufgym.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
-
-_SUMMARY = ("qoi", "arrived", "delivered", "dropped")
-"""What the info of an ended row has besides that of every step."""
 
 
 class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
@@ -35,10 +33,11 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     Options of ``reset``: ``reset_mask`` (bool[n], rows to reset) and ``episodes`` (one a row, None where the next is
     drawn).
 
-    ``info`` has Gymnasium's form: ``info["action_mask"]`` bool[n, L + 2], ``info["invalid"]`` int64[n],
-    ``info["reward_terms"]`` float64[n] by name; with SAME_STEP autoreset ``info["final_obs"]`` and
-    ``info["final_info"]`` for rows that ended (``info["_final_obs"]`` says which). Arrays that a step hands out are
-    never written again while anyone holds them.
+    ``info`` has Gymnasium's form: ``info["action_mask"]`` int8[n, L + 2], ``info["qoi"]`` float64[n],
+    ``info["invalid"]`` int64[n], ``info["reward_terms"]`` float64[n] by name; with SAME_STEP autoreset
+    ``info["final_obs"]`` and ``info["final_info"]`` for rows that ended (``info["_final_obs"]`` says which). Rows that
+    end, truncated ones too, have their summary. Arrays that a step hands out are never written again while anyone
+    holds them.
     """
 
     metadata = {
@@ -79,9 +78,23 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._done = np.zeros(self.num_envs, np.bool_)
         self._every_row = np.ones(self.num_envs, np.bool_)
         self._pool: list[StepOutput] = []
+        self._generators: list[np.random.Generator | None] = [None] * self.num_envs
+        self._seeds: list[int] = [-1] * self.num_envs
 
     def _make_rows(self, n: int, scenario: Any, capacity: int, **options: Any) -> Rows:
         return Rows(n, scenario, capacity, **options)
+
+    @property  # type: ignore[misc]
+    def np_random(self) -> Any:
+        """Each row's generator, as in Gymnasium's ``SyncVectorEnv``."""
+        self._seed_the_rest()
+        return tuple(self._generators)
+
+    @property
+    def np_random_seed(self) -> Any:
+        """Each row's seed, likewise."""
+        self._seed_the_rest()
+        return tuple(self._seeds)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -92,7 +105,6 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
                 raise BufgymError(f"options[{name!r}]: unknown; known: reset_mask (bool[n]), episodes (one a row)")
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):
-            self._np_random, self._np_random_seed = seeding.np_random(int(seeds))
             seeds = [int(seeds) + i for i in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise BufgymError(f"seed: {len(seeds)} seeds for {self.num_envs} environments")
@@ -105,16 +117,20 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         chosen = np.flatnonzero(mask)
         for i in chosen.tolist():
             if seeds[i] is not None:
-                self.rows.seed(i, seeding.np_random(seeds[i])[0])
+                self._seed(i, seeds[i])
+        self._seed_the_rest()
         self.rows.reset(chosen, options.get("episodes"))
         self._steps[mask] = 0
         self._done = self._done & ~mask  # a new array: the last step may have handed out this one
-        return self._observation(), self._info(terms=False)
+        return self.rows.observation(), self._info()
 
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         rows = self.rows
+        actions = np.asarray(actions)
+        if actions.dtype.kind not in "iu":
+            raise BufgymError(f"actions are {actions.dtype}: must be whole numbers (int64)")
         actions = np.ascontiguousarray(actions, np.int64)
         if actions.shape != (self.num_envs,):
             raise BufgymError(f"actions have shape {actions.shape}: must be ({self.num_envs},)")
@@ -131,7 +147,6 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._steps += 1
         if restart:
             rows.reset(np.flatnonzero(self._done))
-            rows.output.reward_terms[self._done] = 0.0
             self._steps[self._done] = 0
         rewards = rows.rewards()
         terminated = rows.output.terminated & ~self._done if restart else rows.output.terminated.copy()
@@ -141,11 +156,11 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._done = terminated | truncated
         info = self._end(self._done) if self._done.any() else {}
         info |= self._info()
-        return self._observation(), rewards, terminated, truncated, info
+        return rows.observation(), rewards, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[n, L + 2]: the actions that are valid now in each row."""
-        return self.rows.output.action_mask.copy()
+        return self.rows.output.action_mask.astype(np.bool_)
 
     def render(self) -> Any:
         """Each row as the single environment renders it."""
@@ -159,42 +174,50 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def _end(self, done: NDArray[np.bool_]) -> dict[str, Any]:
         """The infos of rows that have ended; with SAME_STEP autoreset these rows begin anew at once."""
         rows = self.rows
-        ended = done & rows.output.terminated
-        summaries: dict[str, Any] = {}
-        if ended.any():
-            columns = rows.summary(slice(None))
-            for name in _SUMMARY:
-                summaries |= {name: np.where(ended, columns[name], 0), f"_{name}": ended}
+        last: dict[str, Any] = {}
+        for name, column in rows.summary(slice(None)).items():
+            last |= {name: np.where(done, column, 0), f"_{name}": done}
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
-            return summaries
+            return last
         # One observation for each row that ended, None for the others, as in Gymnasium's SyncVectorEnv.
         observations: NDArray[Any] = np.full(self.num_envs, None, object)
-        for i in np.flatnonzero(done):
-            observations[i] = rows.observation(rows.output.slots[i].copy(), rows.output.context[i].copy())
-        last = self._info() | {"_action_mask": done, "_invalid": done, "_reward_terms": done}
-        last["action_mask"] = last["action_mask"] & done[:, None]
-        last["invalid"] = np.where(done, last["invalid"], 0)
+        for i in np.flatnonzero(done).tolist():
+            observations[i] = rows.observation(i)
+        last |= _only(done, self._info())
         rows.reset(np.flatnonzero(done))
         self._steps[done] = 0
-        return {"final_obs": observations, "_final_obs": done, "final_info": summaries | last, "_final_info": done}
+        return {"final_obs": observations, "_final_obs": done, "final_info": last, "_final_info": done}
 
-    def _info(self, terms: bool = True) -> dict[str, Any]:
-        every_row = self._every_row
-        info: dict[str, Any] = {
-            "action_mask": self.rows.output.action_mask,
-            "_action_mask": every_row,
-            "invalid": self.rows.senders.batch.senders["invalid"].copy(),
-            "_invalid": every_row,
-        }
-        if terms:
-            columns: dict[str, Any] = {}
-            for k, term in enumerate(self.rows.terms):
-                columns |= {term.name: self.rows.output.reward_terms[:, k], f"_{term.name}": every_row}
-            info |= {"reward_terms": columns, "_reward_terms": every_row}
+    def _info(self) -> dict[str, Any]:
+        """What the info of every step has, as far as it was asked for."""
+        rows, every_row = self.rows, self._every_row
+        info: dict[str, Any] = {}
+        if rows.shows_mask:
+            info |= {"action_mask": rows.output.action_mask, "_action_mask": every_row}
+        if rows.shows_all:
+            terms: dict[str, Any] = {}
+            for k, term in enumerate(rows.terms):
+                terms |= {term.name: rows.output.reward_terms[:, k], f"_{term.name}": every_row}
+            info |= {
+                "qoi": rows.output.qoi,
+                "_qoi": every_row,
+                "invalid": rows.senders.batch.senders["invalid"].copy(),
+                "_invalid": every_row,
+                "reward_terms": terms,
+                "_reward_terms": every_row,
+            }
         return info
 
-    def _observation(self) -> Observation:
-        return self.rows.observation(self.rows.output.slots, self.rows.output.context)
+    def _seed(self, i: int, seed: int | None) -> None:
+        """Give row ``i`` streams of its own, from ``seed`` or where that is None from chance."""
+        generator, self._seeds[i] = seeding.np_random(seed)
+        self._generators[i] = generator
+        self.rows.seed(i, generator)
+
+    def _seed_the_rest(self) -> None:
+        for i, generator in enumerate(self._generators):
+            if generator is None:
+                self._seed(i, None)
 
     def _renew_output(self, keep: bool = False) -> None:
         """Let the next step write into arrays that nobody holds outside; ``keep``: with what the last step wrote."""
@@ -212,6 +235,19 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if keep and rows.output is not before:
             for new, old in zip(cast(Any, rows.output), before, strict=True):
                 new[...] = old
+
+
+def _only(rows: NDArray[np.bool_], info: dict[str, Any]) -> dict[str, Any]:
+    """``info`` of ``rows`` alone, zeros for the others; copies."""
+    own: dict[str, Any] = {}
+    for name, column in info.items():
+        if name.startswith("_"):
+            own[name] = rows
+        elif isinstance(column, dict):
+            own[name] = _only(rows, column)
+        else:
+            own[name] = np.where(rows if column.ndim == 1 else rows[:, None], column, 0)
+    return own
 
 
 def _count_own() -> int:

@@ -22,12 +22,16 @@ from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
+from bufgym.errors import BufgymError
+
 ACCEPT_BIAS = 2.0
 """Initial logit of accepting: exploration that drops messages where there is room learns little."""
 
 
 def field_names(space: spaces.Dict) -> tuple[list[str], list[str]]:
     """(slot fields, context fields) of a bufgym observation: L + 1 >= 2 entries, and one entry."""
+    if not isinstance(space, spaces.Dict) or "slots" in space or "context" in space:
+        raise BufgymError('a slot network observes named fields: make its environment with observation="dict"')
     slots = [name for name, box in space.items() if (box.shape or (1,))[0] > 1]
     return slots, [name for name in space if name not in slots]
 

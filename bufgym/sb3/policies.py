@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from bufgym.envs.observation import ObservationForm
 from bufgym.errors import BufgymError
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.observe import (
@@ -50,8 +51,8 @@ def as_policy(
         model: the model, its ``policy``, or the path of a saved one. A zip holds pickles, and reading it can run any
             code: read your own alone.
         name: the policy's name; by default that of the file or class.
-        fields: what a flat observation (a ``Box``, from ``FlattenObservation``) is made of, in the environment's own
-            order; by default every field. A ``Dict`` observation names its fields.
+        fields: what an observation "flat" or "slots" is made of, in the environment's own order; by default every
+            field. A "dict" names its fields.
 
     Raises:
         BufgymError: no such file, or a model that was trained on something else than a bufgym environment.
@@ -86,22 +87,24 @@ class _Decisions:
         self.capacity = int(getattr(actions, "n", 0)) - 2
         if self.capacity < 1:
             raise BufgymError(f"model {name}: action space {actions}: must be Discrete(L + 2), as bufgym's are")
-        self.flat = not isinstance(space, spaces.Dict)
-        names = fields if self.flat else list(space)
-        self.for_topics = any(field.name in (names or ()) for field in TOPIC_FIELDS)
-        self.slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if self.for_topics else ())
-        self.context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if self.for_topics else ())
-        boxes = {
-            field.name: spaces.Box(field.low, field.high, (self.capacity + 1 if field.per == "slot" else 1,))
-            for field in self.slot_fields + self.context_fields
-        }
+        form = "dict" if isinstance(space, spaces.Dict) else "flat"
+        if form == "dict" and {"slots", "context"} & set(space):
+            form = "slots"
+        names, numbers = list(space) if form == "dict" else fields, spaces.flatdim(space)
+        all_fields = SLOT_FIELDS + TOPIC_SLOT_FIELDS, CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS
+        if names is None:
+            self.for_topics = numbers == ObservationForm(form, *all_fields, self.capacity).numbers
+        else:
+            self.for_topics = any(field.name in names for field in TOPIC_FIELDS)
+        per_slot, context = all_fields if self.for_topics else (SLOT_FIELDS, CONTEXT_FIELDS)
+        known = [field.name for field in per_slot + context]
         for field in names or ():
-            if field not in boxes:
+            if field not in known:
                 raise BufgymError(f"model {name}: observes {field!r}, which is no field (bufgym list observations)")
-        self.fields = spaces.Dict({field: box for field, box in boxes.items() if names is None or field in names})
-        numbers, expected = (spaces.flatdim(part) for part in (space, self.fields))
+        self.form = ObservationForm(form, per_slot, context, self.capacity, names)
+        expected = spaces.flatdim(self.form.space)
         if numbers != expected:
-            rule = f"must be the {expected} of {', '.join(self.fields)} for L = {self.capacity}"
+            rule = f"must be the {expected} of {', '.join(names or known)} for L = {self.capacity}"
             raise BufgymError(f"model {name}: observes {numbers} numbers: {rule}")
 
     def on_arrival(self, buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
@@ -127,23 +130,18 @@ class _Decisions:
                 f"policy {self.name}: trained for L = {self.capacity}, not for L = {L}; only a network that scores "
                 "slots with masks (MaskablePPO with bufgym.sb3.SlotPolicy) serves every L"
             )
-        slots = np.zeros((len(self.slot_fields), L + 1), np.float32)
-        context = np.zeros(len(self.context_fields), np.float32)
+        row = np.zeros(self.form.numbers, np.float32)
+        slots, context = self.form.split(row)
         if self.for_topics:
             observe_topic_slots(buffer, arrival, arriving, slots)
             observe_topic_context(buffer, arrival, arriving, context)
         else:
             observe_slots(buffer, arrival, slots)
             observe_context(buffer, arrival, context)
-        columns = {field.name: slots[i] for i, field in enumerate(self.slot_fields)}
-        columns |= {field.name: context[i : i + 1] for i, field in enumerate(self.context_fields)}
-        observation: Any = {field: columns[field] for field in self.fields}
-        if self.flat:
-            observation = spaces.flatten(self.fields, observation)
         masks = {}
         if self.masked:
             mask = np.zeros(L + 2, np.bool_)
             mask[: len(buffer.slots)], mask[L:] = valid[:-2], valid[-2:]
             masks = {"action_masks": mask}
-        action, _ = self.agent.predict(observation, deterministic=True, **masks)
+        action, _ = self.agent.predict(self.form.of(row), deterministic=True, **masks)
         return int(action)

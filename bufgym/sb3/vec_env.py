@@ -13,39 +13,100 @@ from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 from stable_baselines3.common import env_util
-from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from bufgym.errors import BufgymError
 
 
-def make_vec_env(id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> VecEnv:
-    """``num_envs`` environments of that Gymnasium id for stable-baselines3; ``kwargs`` go to the environment.
+def make_vec_env(
+    env_id: str | Callable[..., gym.Env[Any, Any]],
+    n_envs: int = 1,
+    seed: int | None = None,
+    start_index: int = 0,
+    monitor_dir: str | None = None,
+    wrapper_class: Callable[..., Any] | None = None,
+    env_kwargs: dict[str, Any] | None = None,
+    vec_env_cls: type[Any] | None = None,
+    vec_env_kwargs: dict[str, Any] | None = None,
+    monitor_kwargs: dict[str, Any] | None = None,
+    wrapper_kwargs: dict[str, Any] | None = None,
+    **kwargs: Any,
+) -> VecEnv:
+    """``n_envs`` environments for stable-baselines3, with the arguments of its own ``make_vec_env``.
 
     The native batch where the id has one that can reset in the same step (all of bufgym's can), else
     stable-baselines3's own batch of single environments. With a ``seed``, environment i starts from seed + i at the
-    first reset.
+    first reset. ``kwargs`` go to the environment, as ``env_kwargs`` do.
+
+    On the native batch ``monitor_dir`` gets one file, ``<start_index>.monitor.csv``, with the episodes of all rows
+    (``load_results`` reads it); ``monitor_kwargs`` are ``info_keywords`` and ``override_existing``; ``wrapper_class``
+    is a ``gymnasium.vector.VectorWrapper``. Wrappers of single environments and ``vec_env_cls`` are errors there.
     """
-    entry = gym.spec(id).vector_entry_point
+    own = _settings(env_kwargs) | kwargs
+    if not _has_native_batch(env_id):
+        arguments = (start_index, monitor_dir, wrapper_class, own, vec_env_cls, vec_env_kwargs, monitor_kwargs)
+        return env_util.make_vec_env(env_id, n_envs, seed, *arguments, wrapper_kwargs)
+    if vec_env_cls is not None or vec_env_kwargs:
+        raise BufgymError(f"vec_env_cls and vec_env_kwargs: the native batch is the VecEnv; {_INSTEAD}")
+    envs: Any = gym.make_vec(
+        str(env_id),
+        n_envs,
+        vectorization_mode="vector_entry_point",
+        **{"autoreset_mode": AutoresetMode.SAME_STEP, **own},
+    )
+    if wrapper_class is not None:
+        if not (isinstance(wrapper_class, type) and issubclass(wrapper_class, VectorWrapper)):
+            name = getattr(wrapper_class, "__name__", repr(wrapper_class))
+            raise BufgymError(
+                f"wrapper_class = {name}: a native batch takes a gymnasium.vector.VectorWrapper; {_INSTEAD}"
+            )
+        envs = wrapper_class(envs, **_settings(wrapper_kwargs))
+    elif wrapper_kwargs:
+        raise BufgymError("wrapper_kwargs: there is no wrapper_class to give them to")
+    monitor = {"info_keywords": (), "override_existing": True, **_settings(monitor_kwargs)}
+    keywords, override = monitor.pop("info_keywords"), monitor.pop("override_existing")
+    for name in monitor:
+        raise BufgymError(
+            f"monitor_kwargs[{name!r}]: a native batch knows info_keywords, override_existing; {_INSTEAD}"
+        )
+    results = None
+    if monitor_dir is not None:
+        header: dict[str, Any] = {"t_start": time.time(), "env_id": str(env_id)}
+        results = ResultsWriter(str(Path(monitor_dir) / str(start_index)), header, tuple(keywords), override)
+    batch = GymVecEnv(envs, results=results, info_keywords=keywords)
+    if seed is not None:
+        batch.seed(seed)
+        batch.action_space.seed(seed + start_index)
+    return batch
+
+
+_INSTEAD = "stable_baselines3.common.env_util.make_vec_env has single environments"
+
+
+def _settings(given: dict[str, Any] | None) -> dict[str, Any]:
+    return dict(given or {})
+
+
+def _has_native_batch(env_id: Any) -> bool:
+    """Whether Gymnasium knows the id, and a native batch of it that can reset in the same step."""
+    if not isinstance(env_id, str):
+        return False
+    entry = gym.spec(env_id).vector_entry_point
     native = load_env_creator(entry) if isinstance(entry, str) else entry
     # Gymnasium's own native batches know NEXT_STEP only.
-    if native is None or "autoreset_mode" not in inspect.signature(native).parameters:
-        return env_util.make_vec_env(id, num_envs, seed, env_kwargs=kwargs)
-    kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
-    envs = GymVecEnv(gym.make_vec(id, num_envs, vectorization_mode="vector_entry_point", **kwargs))
-    if seed is not None:
-        envs.seed(seed)
-    return envs
+    return native is not None and "autoreset_mode" in inspect.signature(native).parameters
 
 
 class GymVecEnv(VecEnv):
@@ -53,13 +114,21 @@ class GymVecEnv(VecEnv):
 
     In the step that ends an episode its info has all that the environment reports at the end, ``terminal_observation``,
     ``TimeLimit.truncated``, and ``episode`` = {r: sum of rewards, l: steps, t: seconds since this object was made}, as
-    stable-baselines3's ``Monitor`` writes it. Infos of the steps between are empty (n dicts a step cost more than a
-    compiled step of n environments) unless ``step_infos``.
+    stable-baselines3's ``Monitor`` writes it, with the ``info_keywords`` of the last info, and to ``results`` if given.
+    Infos of the steps between are empty (n dicts a step cost more than a compiled step of n environments) unless
+    ``step_infos``.
 
     ``env_method(name)`` calls the batch's method once and returns its rows, so ``action_masks`` costs one call.
     """
 
-    def __init__(self, envs: VectorEnv[Any, Any, Any], *, step_infos: bool = False) -> None:
+    def __init__(
+        self,
+        envs: VectorEnv[Any, Any, Any],
+        *,
+        step_infos: bool = False,
+        results: ResultsWriter | None = None,
+        info_keywords: Sequence[str] = (),
+    ) -> None:
         mode = envs.metadata.get("autoreset_mode")
         if mode is None or AutoresetMode(mode) != AutoresetMode.SAME_STEP:
             raise BufgymError(
@@ -68,6 +137,8 @@ class GymVecEnv(VecEnv):
             )
         self.envs = envs
         self.step_infos = step_infos
+        self.results = results
+        self.info_keywords = tuple(info_keywords)
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
         self._vector_options: dict[str, Any] | None = None
         self._actions: NDArray[Any] = np.zeros(0)
@@ -98,21 +169,35 @@ class GymVecEnv(VecEnv):
             [_row(info, i) for i in range(self.num_envs)] if self.step_infos else [{} for _ in range(self.num_envs)]
         )
         for i in np.flatnonzero(done).tolist():
-            infos[i] = _row(info.get("final_info", {}), i) | {
+            last = _row(info.get("final_info", {}), i)
+            infos[i] = last | {
                 "terminal_observation": _final_observation(info["final_obs"], i),
                 "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                "episode": {
-                    "r": float(self._returns[i]),
-                    "l": int(self._lengths[i]),
-                    "t": time.perf_counter() - self._born,
-                },
+                "episode": self._episode(i, last),
             }
         self._returns[done] = 0.0
         self._lengths[done] = 0
         return observation, np.asarray(rewards, np.float32), done, infos
 
+    def _episode(self, i: int, last: Mapping[str, Any]) -> dict[str, Any]:
+        """What ``Monitor`` tells of the episode that environment ``i`` has ended with the info ``last``."""
+        episode = {
+            "r": float(self._returns[i]),
+            "l": int(self._lengths[i]),
+            "t": time.perf_counter() - self._born,
+        }
+        for name in self.info_keywords:
+            if name not in last:
+                raise BufgymError(f"info_keywords: {name!r} is not in an episode's last info: {', '.join(last)}")
+            episode[name] = last[name]
+        if self.results is not None:
+            self.results.write_row({**episode, "r": round(episode["r"], 6), "t": round(episode["t"], 6)})
+        return episode
+
     def close(self) -> None:
         self.envs.close()
+        if self.results is not None:
+            self.results.close()
 
     def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
         """Options of the next reset, in the vector environment's own form: ``{"episodes": [...]}``."""
@@ -145,8 +230,11 @@ class GymVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """True for ``Monitor``, whose work is done here (``evaluate_policy`` asks); a native batch has no others."""
-        return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
+        """True for ``Monitor``, whose work is done here (``evaluate_policy`` asks), and for wrappers of the batch."""
+        wrapped, envs = issubclass(wrapper_class, Monitor), self.envs
+        while isinstance(envs, VectorWrapper):
+            wrapped, envs = wrapped or isinstance(envs, wrapper_class), envs.env
+        return [wrapped for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         images: Any = self.envs.render()

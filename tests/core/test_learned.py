@@ -223,7 +223,7 @@ def test_an_exported_agent_decides_as_it_did(tmp_path):
     rows, memory = envs.rows, policy.new_memory(1, L)[0]
     met, differ, dequeued = 0, 0, set()
     while not rows.output.terminated.all():
-        observation = rows.observation(rows.output.slots, rows.output.context)
+        observation = rows.observation()
         actions, _ = model.predict(observation, deterministic=True, action_masks=rows.output.action_mask)
         batch = named(rows.senders.batch._replace(parameters=policy.parameter_array))
         for i in np.flatnonzero(~rows.output.terminated):

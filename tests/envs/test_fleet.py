@@ -22,7 +22,8 @@ from bufgym.traces import Trace
 
 pytest.importorskip("pettingzoo", reason="the extra [fleet] is not installed")
 
-from pettingzoo.test import parallel_api_test, parallel_seed_test
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
+from pettingzoo.utils.conversions import parallel_to_aec
 
 from bufgym.envs import FleetEnv, parallel_env
 
@@ -45,6 +46,31 @@ def test_pettingzoo_has_nothing_to_say(robots, mask_in_observation, capsys):
     parallel_api_test(make(), num_cycles=70)  # an episode has 60 ticks; a warning is an error here
     parallel_seed_test(make, num_cycles=20)
     assert "Passed" in capsys.readouterr().out
+
+
+# Remarks that are no rules: on observations that are dicts, and on zeros, which a robot sees at the end.
+@pytest.mark.filterwarnings("ignore:Observation")
+@pytest.mark.parametrize("options", [{}, {"mask_in_observation": True}, {"observation": "flat"}, {"info": "none"}])
+def test_pettingzoo_has_nothing_to_say_of_it_turn_by_turn(options):
+    def make():
+        return parallel_to_aec(parallel_env(robots=3, **SMALL, **options))
+
+    api_test(make(), num_cycles=70)
+    seed_test(make, num_cycles=20)
+
+
+@pytest.mark.parametrize("fields", [None, ["loss", "busy"]])
+@pytest.mark.parametrize("form", ["flat", "slots"])
+def test_every_form_is_that_of_the_rows(form, fields):
+    env = FleetEnv(3, "lte", observation=form, fields=fields, **SMALL)
+    envs = FleetVecEnv(1, 3, "lte", L, observation=form, fields=fields, parameters=PARAMETERS)
+    seen, rows = env.reset(seed=2)[0], envs.reset(seed=2)[0]
+    for _ in range(10):
+        for i, agent in enumerate(env.agents):
+            assert env.observation_space(agent).contains(seen[agent])
+            for own, row in [(seen[agent], rows)] if form == "flat" else [(seen[agent][k], rows[k]) for k in rows]:
+                assert np.array_equal(own, row[i])
+        seen, rows = env.step(dict.fromkeys(env.agents, L + 1))[0], envs.step(np.full(3, L + 1))[0]
 
 
 def test_one_robot_is_the_single_environment():
@@ -174,6 +200,23 @@ def test_as_text_every_robot_has_a_line():
     assert "0/100" in wide.render()
 
 
+@pytest.mark.parametrize("robots", [1, 3, 60])
+def test_as_an_image_every_robot_has_a_bar(robots):
+    env = FleetEnv(robots=robots, render_mode="rgb_array", **SMALL)
+    env.reset(seed=0)
+    shown = [env.render()]
+    for _ in range(12):
+        env.step(dict.fromkeys(env.agents, L + 1))
+    shown.append(env.render())
+    assert all(image.shape == (400, 800, 3) and image.dtype == np.uint8 for image in shown)
+    queued = [int((image == (0xE0, 0xA1, 0x00)).all(axis=-1).sum()) for image in shown]
+    assert queued[1] > queued[0] + 500  # the legend has the colour, too
+    assert (env.rows.senders.batch.senders["next"] == 12).all()  # drawing changes nothing
+    envs = FleetVecEnv(1, 2, "lte", L, parameters=PARAMETERS, render_mode="rgb_array")
+    envs.reset(seed=0)
+    assert [image.shape for image in envs.render()] == [(400, 800, 3)] * 2
+
+
 @pytest.mark.slow
 def test_256_robots():
     env = FleetEnv(robots=256, capacity=2, duration_s=0.5)
@@ -191,7 +234,9 @@ def test_256_robots():
         (lambda: FleetEnv(reward="all"), "reward = 'all': must be 'team'"),
         (lambda: FleetEnv(term="speed"), "unknown term 'speed'"),
         (lambda: FleetEnv(fields=["colour"]), "unknown field 'colour'"),
-        (lambda: FleetEnv(render_mode="rgb_array"), "render_mode = 'rgb_array'"),
+        (lambda: FleetEnv(render_mode="human"), "render_mode = 'human'"),
+        (lambda: FleetEnv(observation="flat", mask_in_observation=True), "'flat' has no place for it"),
+        (lambda: begun().step({"robot_0": 0, "robot_1": 1.7}), "actions['robot_1'] = 1.7: must be a whole number"),
         (lambda: FleetEnv(wheels=4), "no parameter 'wheels'"),
         (lambda: begun().step({"robot_0": 0}), "actions: none for 'robot_1'"),
         (lambda: begun().step({"robot_0": 0, "robot_1": L + 2}), "actions['robot_1'] = 6: must lie in 0..5"),

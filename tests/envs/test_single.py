@@ -55,8 +55,24 @@ def seen(env: SenderEnv) -> tuple[Buffer, Any]:
 
 
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
-def test_gymnasium_finds_nothing_to_complain_about(env_id: str) -> None:
-    check_env(gym.make(env_id, **({} if JIT else _smaller(env_id))).unwrapped)
+@pytest.mark.parametrize("observation", ["dict", "flat", "slots"])
+def test_gymnasium_finds_nothing_to_complain_about(env_id: str, observation: str) -> None:
+    check_env(gym.make(env_id, observation=observation, **({} if JIT else _smaller(env_id))).unwrapped)
+
+
+@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
+def test_a_mask_as_gymnasium_and_as_sb3_contrib_take_it(env_id: str) -> None:
+    env: Any = gym.make(env_id, **_smaller(env_id))
+    _, info = env.reset(seed=0)
+    for _ in range(20):
+        assert info["action_mask"].dtype == np.int8
+        assert env.unwrapped.action_masks().dtype == np.bool_
+        action = env.action_space.sample(info["action_mask"])  # as README has it
+        assert env.unwrapped.action_masks()[action]
+        _, _, ended, _, info = env.step(action)
+        assert info["invalid"] == 0
+        if ended:
+            _, info = env.reset()
 
 
 def _smaller(env_id: str) -> dict[str, Any]:
@@ -201,7 +217,7 @@ def test_an_invalid_action_does_what_a_queue_does(variant: str) -> None:
     (_, info), _ = env.reset(seed=2), queue.reset(seed=2)
     ended, invalid = False, 0
     while not ended:
-        mask = info["action_mask"]
+        mask = info["action_mask"].astype(bool)
         action = int(rng.choice(np.flatnonzero(~mask) if rng.random() < 0.5 and not mask.all() else np.arange(6)))
         instead = action if mask[action] else 5 if mask[5] else 4
         invalid += action != instead or not mask[action]
@@ -330,6 +346,20 @@ def test_wrong_arguments_are_named(arguments: dict[str, Any], says: str) -> None
     with pytest.raises(BufgymError) as caught:
         SenderEnv(**arguments)
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("action", [1.7, 3.0, np.float32(2), np.array([1]), "1", None])
+def test_an_action_that_is_no_whole_number(action: Any) -> None:
+    env = make("fading", "arrival")
+    env.reset(seed=0)
+    with pytest.raises(BufgymError, match=r"action = .*: must be a whole number in 0\.\.5 \(L = 4\)"):
+        env.step(action)
+
+
+def test_a_reset_rewards_nothing() -> None:
+    _, info = make("fading", "arrival").reset(seed=0)
+    assert info["reward_terms"] == {"delivered": 0.0, "retained": 0.0}
+    assert (info["qoi"], info["invalid"]) == (0.0, 0)
 
 
 @pytest.mark.parametrize("action", [-1, 6, 10**9])

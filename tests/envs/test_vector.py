@@ -43,9 +43,9 @@ def vector(case: str, **more: Any) -> SenderVectorEnv:
     return SenderVectorEnv(N, scenario, L, **arguments, **more)
 
 
-def single(case: str) -> SenderEnv:
+def single(case: str, **more: Any) -> SenderEnv:
     scenario, arguments = CASES[case]
-    return SenderEnv(scenario, L, **arguments)
+    return SenderEnv(scenario, L, **arguments, **more)
 
 
 def row(info: dict[str, Any], i: int) -> dict[str, Any]:
@@ -85,11 +85,33 @@ def actions_of(rng: np.random.Generator, masks: np.ndarray[Any, Any]) -> np.ndar
 @pytest.mark.parametrize("case", CASES)
 def test_equal_to_gymnasiums_vector_of_single_environments(case: str, mode: AutoresetMode, limit: int | None) -> None:
     """Row i is the single environment with seed s + i, bit for bit, in all that it hands out."""
+    check_equal_to_sync(case, mode, limit)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("case", ["fading", "topics"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"observation": "flat"},
+        {"observation": "flat", "fields": ["loss", "rank", "busy"], "info": "mask"},
+        {"observation": "slots", "info": "none"},
+        {"observation": "slots", "fields": ["loss", "rank", "busy"]},
+        {"observation": "slots", "fields": ["busy"]},
+    ],
+)
+def test_equal_in_every_form(case: str, mode: AutoresetMode, options: dict[str, Any]) -> None:
+    check_equal_to_sync(case, mode, None, **options)
+
+
+def check_equal_to_sync(case: str, mode: AutoresetMode, limit: int | None, **options: Any) -> None:
+    """The batch and Gymnasium's own vector of single environments hand out the same."""
 
     def one() -> gym.Env[Any, Any]:
-        return single(case) if limit is None else gym.wrappers.TimeLimit(single(case), limit)
+        env = single(case, **options)
+        return env if limit is None else gym.wrappers.TimeLimit(env, limit)
 
-    envs = vector(case, autoreset_mode=mode, max_episode_steps=limit)
+    envs = vector(case, autoreset_mode=mode, max_episode_steps=limit, **options)
     sync = SyncVectorEnv([one] * N, autoreset_mode=mode)
     assert envs.observation_space == sync.observation_space
     assert envs.action_space == sync.action_space
@@ -97,8 +119,9 @@ def test_equal_to_gymnasiums_vector_of_single_environments(case: str, mode: Auto
     assert envs.metadata["autoreset_mode"] == sync.metadata["autoreset_mode"]
     (observations, infos), (expected_observations, expected_infos) = envs.reset(seed=8), sync.reset(seed=8)
     assert_same(observations, expected_observations)
+    assert envs.np_random_seed == sync.np_random_seed == (8, 9, 10)
     for i in range(N):
-        assert_same_info(infos, expected_infos, i)
+        assert_same(row(infos, i), row(expected_infos, i))
     rng, truncations, episodes, questions = np.random.default_rng(1), 0, 0, set()
     for _ in range(STEPS):
         actions = actions_of(rng, envs.action_masks())
@@ -113,7 +136,13 @@ def test_equal_to_gymnasiums_vector_of_single_environments(case: str, mode: Auto
         if "final_obs" in infos:
             assert infos["final_obs"].dtype == expected_infos["final_obs"].dtype == object
         for i in range(N):
-            assert_same_info(infos, expected_infos, i)
+            own, expected_own = row(infos, i), row(expected_infos, i)
+            if step[3][i] and not step[2][i]:
+                # The wrapper that truncates asks for no summary.
+                last = own.get("final_info", own)
+                assert last["qoi"] == expected_own.get("final_info", expected_own)["qoi"]
+                assert last.pop("arrived") >= last.pop("delivered") + last.pop("dropped")
+            assert_same(own, expected_own)
             assert_same(envs.action_masks()[i], sync.envs[i].unwrapped.action_masks())
     assert (truncations > 0) == (limit is not None)
     assert limit is not None or episodes > N
@@ -121,14 +150,85 @@ def test_equal_to_gymnasiums_vector_of_single_environments(case: str, mode: Auto
         assert any({ARRIVAL_WAITS, SOCKET_WAITS} <= kinds for kinds in questions)
 
 
-def assert_same_info(infos: dict[str, Any], expected_infos: dict[str, Any], i: int) -> None:
-    """Row ``i`` of both infos."""
-    info, expected = row(infos, i), row(expected_infos, i)
-    if "reward_terms" not in expected:
-        # Ours has them in a step that resets as well: zeros, or with SAME_STEP those of the step before the reset.
-        terms = info.pop("reward_terms", {})
-        assert not any(terms.values()) or terms == info["final_info"]["reward_terms"]
-    assert_same(info, expected)
+@pytest.mark.parametrize("case", ["fading", "topics"])
+def test_the_forms_hold_the_same_numbers(case: str) -> None:
+    """flat is what ``FlattenObservation`` makes of the dict; slots are its slot fields side by side."""
+    several = {form: vector(case, observation=form) for form in ("dict", "flat", "slots")}
+    flattened = FlattenObservation(several["dict"])
+    assert several["flat"].single_observation_space == flattened.single_observation_space
+    seen: dict[str, Any] = {form: envs.reset(seed=4)[0] for form, envs in several.items()}
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        fields = seen["dict"]
+        assert_same(seen["flat"], np.concatenate(list(fields.values()), axis=1))
+        per_slot = [column for column in fields.values() if column.shape[1] == L + 1]
+        assert_same(seen["slots"]["slots"], np.stack(per_slot, axis=-1))
+        assert_same(seen["slots"]["context"], np.concatenate(list(fields.values())[len(per_slot) :], axis=1))
+        for form, envs in several.items():
+            assert envs.observation_space.contains(seen[form])
+        actions = actions_of(rng, several["dict"].action_masks())
+        seen = {form: envs.step(actions)[0] for form, envs in several.items()}
+
+
+def test_with_all_fields_nothing_is_copied() -> None:
+    for form in ("dict", "flat", "slots"):
+        envs = vector("fading", observation=form)
+        observation: Any = envs.reset(seed=0)[0]
+        for array in observation.values() if isinstance(observation, dict) else [observation]:
+            assert np.shares_memory(array, envs.rows.output.flat)
+        few: Any = vector("fading", observation=form, fields=["rank"]).reset(seed=0)[0]
+        assert few.shape == (N, L + 1) if form == "flat" else len(few) == 1
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_info_is_built_as_far_as_asked(mode: str) -> None:
+    """T = 2, all accepted: the second step delivers 0, 1, 2, 3 and ends the episode."""
+    summary = {"qoi": 1 + 3 * (1 - 0.618), "arrived": 4, "delivered": 4, "dropped": 0, "invalid": 0}
+    for info, always in (
+        ("full", {"action_mask", "qoi", "invalid", "reward_terms"}),
+        ("mask", {"action_mask"}),
+        ("none", set()),
+    ):
+        envs = SenderVectorEnv(2, "interruption", L, law="fixed", t_max=2, info=info, autoreset_mode=mode)
+        alone = SenderEnv("interruption", L, law="fixed", t_max=2, info=info)
+        for found in (envs.reset(seed=0)[1], envs.step(np.full(2, L + 1))[4]):
+            assert {name for name in found if not name.startswith("_")} == always
+        assert alone.reset(seed=0)[1].keys() == alone.step(L + 1)[4].keys() == always
+        found = envs.step(np.full(2, L + 1))[4]
+        last = found["final_info"] if mode == "SameStep" else found
+        assert row(last, 1).keys() == alone.step(L + 1)[4].keys() == always | summary.keys()
+        assert {name: last[name][1] for name in summary} == pytest.approx(summary)
+
+
+@pytest.mark.parametrize("stands", [True, False])
+def test_a_truncated_episode_has_its_qoi(stands: bool) -> None:
+    """Five of nine messages: over a link that stands still none is delivered; over a fast one five, one on its way."""
+    link = Trace.steps([(9.0, 0.0 if stands else 9e6), (1.0, 9e6)])
+    scenario = Uplink(traces=(link,), duration_s=0.3, random_offset=False)
+    settings: dict[str, Any] = {"scenario": scenario, "max_episode_steps": 5}
+    env = gym.make("bufgym/Uplink-v0", **settings)
+    envs: Any = gym.make_vec("bufgym/Uplink-v0", 2, vectorization_mode="vector_entry_point", **settings)
+    env.reset(seed=0), envs.reset(seed=0)
+    for _ in range(5):
+        *_, truncated, info = env.step(9)
+        *_, all_truncated, infos = envs.step(np.array([9, 9]))
+    assert truncated and all_truncated.all()
+    # 230 kB take 26 ms of the 33 ms to the next arrival, propagation 20 ms.
+    transmitted, received = (0, 0) if stands else (5, 4)
+    x = env.unwrapped.rows.senders.episodes[0].arrivals["x"][:received]  # type: ignore[attr-defined]
+    assert infos["delivered"].tolist() == [transmitted] * 2
+    assert infos["qoi"][0] == info["qoi"] == pytest.approx(scenario.value.information(x))
+
+
+def test_seeds_are_told_as_gymnasium_tells_them() -> None:
+    envs, sync = vector("interruption"), SyncVectorEnv([lambda: single("interruption")] * N)
+    envs.reset(seed=[4, 1, 9]), sync.reset(seed=[4, 1, 9])
+    assert envs.np_random_seed == sync.np_random_seed == (4, 1, 9)
+    envs.reset(seed=[None, 2, None]), sync.reset(seed=[None, 2, None])
+    assert envs.np_random_seed == sync.np_random_seed == (4, 2, 9)
+    assert [rng.random() for rng in envs.np_random] == [rng.random() for rng in sync.np_random]
+    unseeded = vector("interruption")
+    assert len(set(unseeded.np_random_seed)) == N
 
 
 @pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
@@ -177,7 +277,7 @@ def test_autoreset_by_hand() -> None:
     _, _, terminated, _, info = envs.step(np.array([L + 1, L + 1]))
     alone[1].step(L + 1)
     assert terminated.tolist() == [True, False]
-    assert info["_qoi"].tolist() == [True, False]
+    assert info["_arrived"].tolist() == [True, False]
     with pytest.raises(gym.error.ResetNeeded, match="reset_mask"):
         envs.step(np.array([0, 0]))
     observations, infos = envs.reset(options={"reset_mask": terminated})
@@ -199,8 +299,9 @@ def test_a_first_reset_may_leave_out_no_row() -> None:
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-def test_arrays_handed_out_are_never_written_again(mode: str) -> None:
-    envs = vector("fading", autoreset_mode=mode, max_episode_steps=9)
+@pytest.mark.parametrize("form", ["dict", "flat", "slots"])
+def test_arrays_handed_out_are_never_written_again(mode: str, form: str) -> None:
+    envs = vector("fading", autoreset_mode=mode, max_episode_steps=9, observation=form)
     rng = np.random.default_rng(0)
     held: list[Any] = [envs.reset(seed=3)]
     copies = [copy.deepcopy(held[0])]
@@ -223,8 +324,9 @@ def test_arrays_handed_out_are_never_written_again(mode: str) -> None:
             assert_same(a, b)
 
 
-def test_arrays_that_nobody_holds_are_used_again() -> None:
-    envs = vector("fading")
+@pytest.mark.parametrize("form", ["dict", "flat", "slots"])
+def test_arrays_that_nobody_holds_are_used_again(form: str) -> None:
+    envs = vector("fading", observation=form)
     envs.reset(seed=0)
     for _ in range(60):
         step = envs.step(np.full(N, L))
@@ -261,6 +363,8 @@ def test_gymnasiums_wrappers_understand_the_infos(mode: str) -> None:
         ({"autoreset_mode": "Sometimes"}, "autoreset_mode = 'Sometimes'"),
         ({"max_episode_steps": 0}, "max_episode_steps = 0"),
         ({"render_mode": "human"}, "render_mode = 'human'"),
+        ({"observation": "vector"}, "observation = 'vector': must be one of 'dict', 'flat', 'slots'"),
+        ({"info": "some"}, "info = 'some': must be one of 'full', 'mask', 'none'"),
     ],
 )
 def test_wrong_arguments_are_named(arguments: dict[str, Any], says: str) -> None:
@@ -282,5 +386,7 @@ def test_wrong_calls_are_named() -> None:
         envs.step(np.array([0, 5, 6]))
     with pytest.raises(BufgymError, match=r"actions\[1\] = -1"):
         envs.step(np.array([0, -1, 6]))
+    with pytest.raises(BufgymError, match="actions are float64: must be whole numbers"):
+        envs.step(np.array([0, 1.7, 2]))
     with pytest.raises(BufgymError, match="shape"):
         envs.step(np.zeros(N + 1, np.int64))

@@ -31,16 +31,8 @@ def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:
 
     Raises ResetNeeded where it has no episode, DependencyNotInstalled without matplotlib (the extra ``plot``).
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise gym.error.DependencyNotInstalled(
-            "render_mode='rgb_array' needs matplotlib: pip install bufgym[plot]"
-        ) from error
+    figure, canvas = canvas_of()
     scene = scene_of(senders, i)
-    figure = Figure(figsize=(_WIDTH_PX / _DPI, _HEIGHT_PX / _DPI), dpi=_DPI)
-    canvas: Any = FigureCanvasAgg(figure)  # its methods have no types
     ratios = (2, 4.2, 0.9) if scene.topics else (3, 3, 1.1)
     link, timeline, slots = figure.subplots(
         3, 1, height_ratios=ratios, gridspec_kw={"left": 0.155, "right": 0.985, "top": 0.93, "bottom": 0.03}
@@ -62,6 +54,24 @@ def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:
     _draw_link(link, senders, i, scene, start_s)
     (_draw_lanes if scene.topics else _draw_timeline)(timeline, scene)
     _draw_slots(slots, scene)
+    return pixels(canvas)
+
+
+def canvas_of() -> tuple[Any, Any]:
+    """(figure, canvas) of 800 x 400 pixels; DependencyNotInstalled without matplotlib."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise gym.error.DependencyNotInstalled(
+            "render_mode='rgb_array' needs matplotlib: pip install bufgym[plot]"
+        ) from error
+    figure = Figure(figsize=(_WIDTH_PX / _DPI, _HEIGHT_PX / _DPI), dpi=_DPI)
+    return figure, FigureCanvasAgg(figure)
+
+
+def pixels(canvas: Any) -> NDArray[np.uint8]:
+    """What is drawn there, uint8[400, 800, 3]."""
     canvas.draw()
     return np.asarray(canvas.buffer_rgba(), np.uint8)[..., :3].copy()
 

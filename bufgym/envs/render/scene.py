@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import delivered_qoi
+from bufgym.envs.step import delivered_qoi
 from bufgym.model.link import position_at
 from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, Senders
 
@@ -96,7 +96,7 @@ def scene_of(senders: Senders, i: int) -> Scene:
         # n messages span n - 1 periods.
         demand=1e6 * float(planned["size_bytes"][:-1].sum()) / span_us if span_us > 0 else 0.0,
         counts={name: int((states[:arrived] == state).sum()) for state, name in enumerate(STATES[:NEWCOMER])},
-        qoi=float(delivered_qoi(senders, i)),
+        qoi=delivered_qoi(senders.batch, i),
         topics=tuple(topic.name for topic in senders.topics),
         question=questions.get(waiting, ""),
     )
