@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import Observation, Rows, check_render_mode
+from bufgym.envs.rows import NUMBERED, Observation, Rows, check_render_mode
 from bufgym.errors import BufgymError
 from bufgym.scenario import Scenario
 
@@ -53,9 +53,16 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``reward``: a term's name, or weights by name.
     - ``fields``: names of the fields to observe; all by default.
     - ``render_mode``: "ansi" or "rgb_array".
-    - any further argument replaces a parameter of the scenario (``t_max=100``).
+    - ``bound``: whether the last ``info`` also has ``clairvoyant`` (the best H, or an upper bound of it), ``regret`` and
+      ``score`` (0 for Drop Oldest, 1 for the clairvoyant, NaN where they are equal). One queue only; it is found when
+      an episode ends, which takes a tenth of a second where episodes are long.
+    - any further argument replaces a parameter of the scenario (``t_max=100``), as an object or as
+      the text that the command line takes (``value="saturating:0.5"``, ``traces="lte-synthetic-0"``).
 
-    ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e.
+    ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e, ``reset(options={"trace": t, "seed": s})``
+    the episode behind that row of ``bufgym bench`` (``trace``: its label or number). On ``bufgym/Suite-v0`` the option
+    ``scenario``, the row's label, comes in addition, and ``trace`` may be left out, as the seed tells it. The sequence
+    that ``reset(seed=s)`` begins is another.
 
     Raises ``BufgymError`` for an argument, an option or an action that does not fit, ``ResetNeeded`` for a step before
     the first reset.
@@ -72,6 +79,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         decide_at: str = "arrival",
         reward: str | Mapping[str, float] = "retained",
         fields: Sequence[str] | None = None,
+        bound: bool = False,
         render_mode: str | None = None,
         **parameters: Any,
     ) -> None:
@@ -84,6 +92,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             decide_at=decide_at,
             reward=reward,
             fields=fields,
+            bound=bound,
             **parameters,
         )
         self.observation_space = cast(Any, self.rows.observation_space)
@@ -97,10 +106,13 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         super().reset(seed=seed)
         if seed is not None or self.rows.streams[0] is None:
             self.rows.seed(0, self.np_random)
-        for name in options or {}:
-            if name != "episode":
-                raise BufgymError(f"options[{name!r}]: unknown; known: episode")
-        self.rows.reset(_ROW, [(options or {}).get("episode")])
+        options = options or {}
+        for name in options:
+            if name not in ("episode", *NUMBERED):
+                raise BufgymError(f"options[{name!r}]: unknown; known: episode, {', '.join(NUMBERED)}")
+        if "episode" in options and len(options) > 1:
+            raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")
+        self.rows.reset(_ROW, [options.get("episode", options or None)])
         return self._observation(), {"action_mask": self.action_masks(), "invalid": 0}
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

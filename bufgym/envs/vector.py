@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from bufgym.envs.bound import BOUND
 from bufgym.envs.rows import Observation, Rows, check_render_mode
 from bufgym.envs.step import StepOutput
 from bufgym.errors import BufgymError
@@ -32,8 +33,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     ``autoreset_mode``: one of Gymnasium's. ``options``: the other arguments of ``SenderEnv``.
 
     ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do; a sequence seeds row by row.
-    Options of ``reset``: ``reset_mask`` (bool[n], rows to reset) and ``episodes`` (one a row, None where the next is
-    drawn).
+    Options of ``reset``: ``reset_mask`` (bool[n], rows to reset) and ``episodes`` (one a row: an ``Episode``, a dict of
+    the options that name one in ``SenderEnv``, or None where the next is drawn).
 
     ``info`` has Gymnasium's form: ``info["action_mask"]`` bool[n, L + 2], ``info["invalid"]`` int64[n],
     ``info["reward_terms"]`` float64[n] by name; with SAME_STEP autoreset ``info["final_obs"]`` and
@@ -163,7 +164,9 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         summaries: dict[str, Any] = {}
         if ended.any():
             columns = rows.summary(slice(None))
-            for name in _SUMMARY:
+            if rows.bound:
+                columns |= rows.bounds(ended, columns["qoi"])
+            for name in (*_SUMMARY, *(BOUND if rows.bound else ())):
                 summaries |= {name: np.where(ended, columns[name], 0), f"_{name}": ended}
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
             return summaries
