@@ -211,6 +211,16 @@ def test_regret_that_rests_on_an_upper_bound_says_so(capsys: pytest.CaptureFixtu
     assert any(line.startswith("note: regret rests on an upper bound") for line in lines)
 
 
+def test_the_oracle_is_a_name_where_there_is_one_interruption(trace: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--capacity", "3", "--seeds", "2", "--policies", "oracle,afr,clairvoyant"]
+    assert main(["bench", "--interruption", "--t-max", "30", *words]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "note: oracle does not compete: it knows the future" in lines
+    told = {line.split()[0]: line.split()[1:] for line in lines if line.startswith(("oracle", "clairvoyant", "afr"))}
+    assert told["oracle"][1:3] == told["clairvoyant"][1:3] != told["afr"][1:3]  # QoI and regret
+    fails(["bench", "--trace", trace, *QUICK, "--policies", "oracle"], "policy oracle: it plans for one", capsys)
+
+
 def test_the_clairvoyant_plans_for_a_sender_that_is_always_asked(
     trace: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -106,6 +106,11 @@ class Scores:
     resamples: int
     """Of the bootstrap."""
 
+    @property
+    def exact(self) -> bool:
+        """Whether the clairvoyant is exact in every cell; if not, regrets are upper bounds."""
+        return all(cell.exact for cell in self.cells)
+
 
 # --- the statistics --------------------------------------------------------------------------------------------------
 

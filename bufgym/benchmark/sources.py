@@ -1,12 +1,12 @@
 """Policies that are not registered: a model's file, or a function of a module. Loading one registers it.
 
-    mine.zip           a model of stable-baselines3 or sb3-contrib (``bufgym.sb3.as_policy``); reading it can run any code
+    mine.zip           a model of stable-baselines3 or sb3-contrib (``bufgym.sb3.as_policy``); it can run any code
     mine.safetensors   a learned policy (``bufgym.policies.load``); no code is run
-    module:function    a policy function, a ``Policy``, or a function without arguments that makes either; the module is
-                       imported, from the current folder too
+    module:function    a policy function, a ``Policy``, or a function without arguments that makes either; the module
+                       is imported, from the current folder too
 
-A file's policy is called by the file's stem, a function's by its own name. ``bufgym.policies.get`` itself reads no file:
-names also come from leaderboards and results of strangers.
+A file's policy is called by the file's stem, a function's by its own name. ``bufgym.policies.get`` itself reads no
+file: names also come from leaderboards and results of strangers.
 """
 
 from __future__ import annotations

@@ -109,6 +109,12 @@ COLUMNS = (
 )
 
 
+REGRET_AT_MOST = "regret, at most"
+"""The title of regrets of which some rest on a bound that is not certified."""
+UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exact here: it is at most this"
+"""The note below them."""
+
+
 def means(rows: Rows) -> list[dict[str, Any]]:
     """One entry for each (policy, capacity): means over its rows; capacity ascending, then QoI descending.
 
@@ -164,8 +170,7 @@ def markdown(rows: Rows) -> str:
 def notes(rows: Rows) -> list[str]:
     """What the reader of the means must know besides."""
     apart = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked(rows).items()]
-    bound = "note: regret rests on an upper bound of the best QoI, which is not exact here: it is at most this"
-    return [*apart, *([bound] if _inexact(rows) else []), *invalid(rows)]
+    return [*apart, *([f"note: {UPPER_BOUND}"] if _inexact(rows) else []), *invalid(rows)]
 
 
 def _inexact(rows: Rows) -> bool:
@@ -177,7 +182,7 @@ def _cells(rows: Rows) -> list[list[str]]:
     """Titles, then a line for each entry of ``means``; no regret where no row has one."""
     entries = means(rows)
     columns = [c for c in COLUMNS if c.key != "regret" or any(not math.isnan(entry["regret"]) for entry in entries)]
-    titles = ["regret, at most" if c.key == "regret" and _inexact(rows) else c.title for c in columns]
+    titles = [REGRET_AT_MOST if c.key == "regret" and _inexact(rows) else c.title for c in columns]
     return [titles, *([written(entry[c.key], c) for c in columns] for entry in entries)]
 
 

@@ -55,12 +55,17 @@ def _list_suites() -> str:
 def _list_policies() -> str:
     from bufgym import oracle, policies  # noqa: F401  (the oracle registers the clairvoyant)
 
+    parts = {
+        "": policies.names(for_topics=False),
+        "only where it is named": policies.names(named_only=True),
+        "made for several topics side by side": policies.names(for_topics=True),
+    }
     width = max(map(len, policies.names()))
     lines = []
-    for for_topics in (False, True):
-        if for_topics:
-            lines.append("  -- made for several topics side by side --")
-        for name in policies.names(for_topics=for_topics):
+    for title, names in parts.items():
+        if title:
+            lines.append(f"  -- {title} --")
+        for name in names:
             policy = policies.get(name)
             lines.append(f"  {name:<{width}}  {policy.summary}".rstrip())
             settings = ", ".join(f"{setting}={number:g}" for setting, number in policy.parameters.items())

@@ -29,6 +29,8 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
 
     **A step is one frame tick**: all cameras tick together, so at every step each robot decides about its newcomer at
     the same moment, knowing nothing of the others' decisions; then the cell carries what it can until the next tick.
+    Under a byte limit a robot may be asked again about the same newcomer (see ``SenderEnv``): that is one more step of
+    the same tick, in which robots without a decision due observe zeros and have one valid action, L, without effect.
 
     **Agents** ``robot_0`` .. ``robot_{N-1}``, N up to 256.
 

@@ -22,7 +22,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     **Action** ``Discrete(L + 2)``: 0..L-1 evict that slot (0 = oldest) and enqueue the newcomer; L rejects the
     newcomer; L + 1 accepts it. ``action_masks()`` and ``info["action_mask"]``, bool[L + 2], say which are valid. An
     invalid action does what a plain queue does: it accepts where there is room, else it rejects;
-    ``info["invalid"]`` counts these actions.
+    ``info["invalid"]`` counts these actions. Where B has no room for the newcomer even after an eviction, the next step
+    is about the same arrival again; an arrival larger than B is dropped without a step.
 
     **Observation** a Dict with one float32 array for each field of ``bufgym.observe.FIELDS``: slot fields of shape
     (L + 1,) with the newcomer last, context fields of shape (1,), all in [0, 1].
@@ -53,16 +54,16 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``reward``: a term's name, or weights by name.
     - ``fields``: names of the fields to observe; all by default.
     - ``render_mode``: "ansi" or "rgb_array".
-    - ``bound``: whether the last ``info`` also has ``clairvoyant`` (the best H, or an upper bound of it), ``regret`` and
-      ``score`` (0 for Drop Oldest, 1 for the clairvoyant, NaN where they are equal). One queue only; it is found when
-      an episode ends, which takes a tenth of a second where episodes are long.
+    - ``bound``: whether the last ``info`` also has ``clairvoyant`` (the best H, or an upper bound of it), ``regret``
+      and ``score`` (0 for Drop Oldest, 1 for the clairvoyant, NaN where they are equal). One queue only; found when an
+      episode ends, in a tenth of a second where it is long.
     - any further argument replaces a parameter of the scenario (``t_max=100``), as an object or as
       the text that the command line takes (``value="saturating:0.5"``, ``traces="lte-synthetic-0"``).
 
-    ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e, ``reset(options={"trace": t, "seed": s})``
-    the episode behind that row of ``bufgym bench`` (``trace``: its label or number). On ``bufgym/Suite-v0`` the option
-    ``scenario``, the row's label, comes in addition, and ``trace`` may be left out, as the seed tells it. The sequence
-    that ``reset(seed=s)`` begins is another.
+    ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e, and
+    ``reset(options={"trace": t, "seed": s})`` the one behind that row of ``bufgym bench`` (``trace``: its label or
+    number). On ``bufgym/Suite-v0`` the row's ``scenario`` comes in addition, and ``trace`` may be left out, as the seed
+    tells it. What ``reset(seed=s)`` begins is a sequence of others.
 
     Raises ``BufgymError`` for an argument, an option or an action that does not fit, ``ResetNeeded`` for a step before
     the first reset.

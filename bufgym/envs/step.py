@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel, prefetch
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT, UNLIMITED_BYTES
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.link import FOREVER
 from bufgym.observe import (
     REWARD_TERMS,
@@ -30,6 +30,7 @@ from bufgym.sim import (
     DECISION,
     DEPARTURE,
     END,
+    NOTHING_WAITS,
     SOCKET_WAITS,
     Batch,
     age_until,
@@ -127,11 +128,11 @@ def write_rewards(batch: Batch, i: int, rewarded: NDArray[np.float64], output: S
 
 
 @kernel
-def write_observation(batch: Batch, i: int, output: StepOutput) -> None:
-    """Write row ``i``'s observation and action mask."""
+def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> None:
+    """Write row ``i``'s observation and action mask; without a decision due, zeros and L as the one valid action."""
     sender = batch.senders[i]
-    output.terminated[i] = sender.waiting == 0
-    if sender.waiting == 0:
+    output.terminated[i] = ended
+    if sender.waiting == NOTHING_WAITS:
         output.slots[i, :, :] = 0.0
         output.context[i, :] = 0.0
         output.action_mask[i, :] = False
@@ -162,7 +163,7 @@ def write_mask(batch: Batch, i: int, action_mask: NDArray[np.bool_]) -> None:
         action_mask[i, capacity] = can_hold(batch, i)
         action_mask[i, capacity + 1] = False
         return
-    if sender.topics == 1 and sender.max_bytes == UNLIMITED_BYTES:
+    if sender.topics == 1:
         # The same as below, only faster.
         action_mask[i, : sender.occupancy] = True
         action_mask[i, sender.occupancy : capacity] = False
@@ -192,7 +193,7 @@ def begin_rows(batch: Batch, rows: NDArray[np.int64], rewarded: NDArray[np.float
     for i in rows:
         advance(batch, i)
         rewarded[i, :] = 0.0
-        write_observation(batch, i, output)
+        write_observation(batch, i, batch.senders[i].waiting == NOTHING_WAITS, output)
 
 
 @kernel
@@ -215,7 +216,7 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], rewarded: NDArray[np.flo
             answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
             advance(batch, i)
         write_rewards(batch, i, rewarded, output)
-        write_observation(batch, i, output)
+        write_observation(batch, i, sender.waiting == NOTHING_WAITS, output)
 
 
 # --- rows that share the link of a cell ------------------------------------------------------------------------------
@@ -223,16 +224,28 @@ def step_rows(batch: Batch, actions: NDArray[np.int64], rewarded: NDArray[np.flo
 
 @kernel
 def advance_cell(batch: Batch, shares: Shares, c: int) -> None:
-    """Run cell ``c`` to its next tick, where every robot has a decision due, or to the end of its episode."""
+    """Run cell ``c`` to its next tick with a decision due, or to the end of its episode.
+
+    At a tick every robot has a decision due, but for those whose message is larger than B.
+    """
     robots = shares.cells[c].robots
     event = next_event(batch, shares, c)
     while event == DEPARTURE:
         event = next_event(batch, shares, c)
-    if event == DECISION:
-        for _ in range(1, robots):
-            next_in_cell(batch, shares, c)
+    while event == DECISION and shares.cells[c].robot < robots:
+        next_in_cell(batch, shares, c)
     for i in range(c * robots, (c + 1) * robots):
         settle_gains(batch, i, event == END)
+
+
+@kernel
+def decisions_due(batch: Batch, shares: Shares, c: int) -> bool:
+    """Whether any robot of cell ``c`` has a decision due: until its episode ends, always between two steps."""
+    robots = shares.cells[c].robots
+    due = False
+    for i in range(c * robots, (c + 1) * robots):
+        due = due or batch.senders[i].waiting == ARRIVAL_WAITS
+    return due
 
 
 @kernel
@@ -242,25 +255,32 @@ def begin_cells(
     """Bring freshly loaded cells to their first tick; ``output.reward_terms`` stay as they are."""
     for c in cells:
         advance_cell(batch, shares, c)
-        robots = shares.cells[c].robots
+        robots, ended = shares.cells[c].robots, not decisions_due(batch, shares, c)
         for i in range(c * robots, (c + 1) * robots):
             rewarded[i, :] = 0.0
-            write_observation(batch, i, output)
+            write_observation(batch, i, ended, output)
 
 
 @kernel
 def step_cells(
     batch: Batch, shares: Shares, actions: NDArray[np.int64], rewarded: NDArray[np.float64], output: StepOutput
 ) -> None:
-    """One decision of every robot, as ``step_rows``; cells whose episode has ended stay as they are."""
+    """One decision of every robot that has one due, as ``step_rows``; cells that have ended stay as they are.
+
+    A cell moves on once none is due: robots that are asked again about the same arrival hold the others up.
+    """
     for c in range(len(shares.cells)):
         robots = shares.cells[c].robots
         first = c * robots
-        if batch.senders[first].waiting == ARRIVAL_WAITS:
-            for i in range(first, first + robots):
+        due = decisions_due(batch, shares, c)
+        for i in range(first, first + robots):
+            if batch.senders[i].waiting == ARRIVAL_WAITS:
                 decide(batch, i, decision_of(actions[i], batch.senders[i].capacity))
-                offer(batch, shares, i)
+                if batch.senders[i].waiting == NOTHING_WAITS:
+                    offer(batch, shares, i)
+        if due and not decisions_due(batch, shares, c):
             advance_cell(batch, shares, c)
+        ended = not decisions_due(batch, shares, c)
         for i in range(first, first + robots):
             write_rewards(batch, i, rewarded, output)
-            write_observation(batch, i, output)
+            write_observation(batch, i, ended, output)

@@ -133,6 +133,9 @@ class Buffer(NamedTuple):
     """n_T: messages that may be sent and not yet acked."""
     in_flight: int
     """Messages sent and not yet acked (without acks: not yet transmitted)."""
+    evictions: int
+    """Messages evicted so far for the arrival at hand: 0 when it is asked about first, more where it is asked again
+    because B still has no room for it. A policy that counts arrivals counts where this is 0."""
     parameters: NDArray[np.float64] = NO_PARAMETERS
     """float64[parameters], read-only: the policy's own settings, in the order of its registration, or its weights."""
 
@@ -163,6 +166,18 @@ def evict(slots: NDArray[Any], i: int, first: int, occupancy: int, k: int) -> in
 def row_width(capacity: int) -> int:
     """Columns of ``slots`` for L = ``capacity``: the message dequeued last, L queued, L more to pop without moving."""
     return 1 + 2 * capacity
+
+
+@kernel
+def has_space(buffer: Buffer, arrival: Any) -> bool:
+    """Whether the newcomer fits as the queue is, by messages and by bytes."""
+    return bool(len(buffer.slots) < buffer.capacity and buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes)
+
+
+@kernel
+def fill(buffer: Buffer) -> float:
+    """How full the queue is, by messages or by bytes, whichever is more: 1 = full."""
+    return max(len(buffer.slots) / buffer.capacity, buffer.backlog_bytes / buffer.max_bytes)
 
 
 @kernel

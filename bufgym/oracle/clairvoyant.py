@@ -20,10 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.errors import BufgymError
 from bufgym.kernel import interruptible, kernel
 from bufgym.model.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
 from bufgym.model.qoi import Value
 from bufgym.oracle import labels, unequal
+from bufgym.oracle.interruption import evenly_kept
 from bufgym.oracle.programme import NEVER
 from bufgym.policies.registry import register
 from bufgym.scenario import Episode
@@ -160,4 +162,27 @@ def privileged(episode: Episode, capacity: int, max_bytes: int, v: Value) -> NDA
 @register("clairvoyant", privileged=privileged, source="bufgym.oracle.clairvoyant", compile=True)
 def follow(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
     """Knows the whole link and workload beforehand: the bound that no other policy exceeds."""
+    return ACCEPT if memory[arrival.seq] > 0 else REJECT
+
+
+def integer_plan(episode: Episode, capacity: int, max_bytes: int, v: Value) -> NDArray[np.float64]:
+    """``evenly_kept`` as a policy's memory; an error unless the episode is one interruption."""
+    arrivals = np.asarray(episode.arrivals)
+    T, size = len(arrivals) - 2, int(arrivals["size_bytes"][0])
+    stands = T >= 1 and episode.link.carried_by(arrivals["arrival_us"])[T] == 0
+    even = (arrivals["x"] == np.arange(T + 2)).all() and (arrivals["size_bytes"] == size).all()
+    if not (stands and even and (episode.first_decision, episode.last_decision) == (1, T)):
+        raise BufgymError(
+            "policy oracle: it plans for one interruption (--interruption, interruption-v1), not for this"
+        )
+    kept = np.zeros(T + 2)
+    kept[evenly_kept(min(capacity, max_bytes // size), T)] = 1.0
+    return kept
+
+
+@register(
+    "oracle", privileged=integer_plan, named_only=True, source="AFR paper, Sec. III-C, in whole numbers", compile=True
+)
+def follow_integer_plan(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    """Knows T beforehand: the best whole-numbered gaps in one interruption, the only place where it plays."""
     return ACCEPT if memory[arrival.seq] > 0 else REJECT

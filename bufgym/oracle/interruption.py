@@ -38,6 +38,13 @@ def integer(capacity: int, T: int, v: Value) -> float:
     return longer * v(q + 1) + (gaps - longer) * v(q)
 
 
+def evenly_kept(capacity: int, T: int) -> NDArray[np.int64]:
+    """Of messages 1..T those that ``integer`` keeps; none where there is no room for any."""
+    gaps = min(capacity, T) + 1
+    kept: NDArray[np.int64] = np.arange(1, gaps) * (T + 1) // gaps
+    return kept
+
+
 def by_length(dropped: NDArray[np.int64], v: Value) -> NDArray[np.float64]:
     """H of each interruption of T = 0..t_max messages (float64[t_max + 1]), from a run through the longest of them.
 

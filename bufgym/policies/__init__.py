@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from bufgym import files
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT, after, before, is_first
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, after, before, has_space, is_first
 from bufgym.policies import (  # noqa: F401  (each registers its policies)
     afr,
     aqm,
@@ -31,6 +31,7 @@ __all__ = [
     "after",
     "before",
     "get",
+    "has_space",
     "is_first",
     "load",
     "make_room",

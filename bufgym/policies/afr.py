@@ -3,6 +3,9 @@
 Variables are the paper's: dropping rate r, counter c, dropping position p; L the capacity, s the queued messages. One
 message in r is kept; among those kept before r grew, every second one is evicted, oldest pair first.
 
+Under a byte limit B the queue is full where the newcomer does not fit, and a pass ends at its last message; r halves
+where at most 2/3 of L and of B are taken. An arrival that is asked about again goes on with the pass: it counts once.
+
 `afr` is the released code (github Jrdevil-Wang/AFR, transport_subscriber_link.cpp), `afr-paper` the literal text of
 the paper. They differ in the bound for halving r (3s <= 2L against s/L < 2/3) and in what a departure does to p: the
 code moves p along with the queue, the text says nothing about it.
@@ -11,7 +14,7 @@ code moves p along with the queue, the text says nothing about it.
 from __future__ import annotations
 
 from bufgym.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, fill, has_space
 from bufgym.policies.registry import Arrival, Memory, register
 
 R, C, P = range(3)  # where r, c and p lie in the memory
@@ -19,21 +22,25 @@ MEMORY = {"r": 1.0, "c": 0.0, "p": 0.0}
 
 
 @kernel
-def thin(r: float, c: float, p: float, gap: float, s: int, L: int, memory: Memory) -> int:
+def thin(r: float, c: float, p: float, gap: float, buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The part that code and text share, after r was halved or not: count, and evict at p when full.
 
     ``gap``: arrivals until the next one is kept; r in AFR (``checkpointing.py`` has another).
     """
-    c += 1
-    if c < gap:
-        memory[R], memory[C], memory[P] = r, c, p
-        return REJECT  # even when there is room: the rate has been lowered to one in r
-    c = (c - gap) % 1.0  # 0 in AFR; where a gap is no whole number, its fraction is carried on
+    s = len(buffer.slots)
+    if buffer.evictions == 0:
+        c += 1
+        if c < gap:
+            memory[R], memory[C], memory[P] = r, c, p
+            return REJECT  # even when there is room: the rate has been lowered to one in r
+        c = (c - gap) % 1.0  # 0 in AFR; where a gap is no whole number, its fraction is carried on
     decision = ACCEPT
-    if s == L:
+    if not has_space(buffer, arrival):
+        if p >= s:  # only under B, where fewer messages are queued than when this pass began
+            r, p = 2 * r, 0.0
         decision = int(p)
         p += 1
-        if p >= L:  # a whole pass done: every second message is gone, half the rate is left
+        if p >= s:  # a whole pass done: every second message is gone, half the rate is left
             r, p = 2 * r, 0.0
     memory[R], memory[C], memory[P] = r, c, p
     return decision
@@ -54,11 +61,10 @@ def afr_departure(buffer: Buffer, memory: Memory) -> None:
 def afr(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Adaptive Frame Rate as released: an even, adaptive frame rate."""
     r, c, p = memory[R], memory[C], memory[P]
-    L, s = buffer.capacity, len(buffer.slots)
-    if r > 1 and 3 * s <= 2 * L:
+    if r > 1 and buffer.evictions == 0 and fill(buffer) <= 2 / 3:
         r = r / 2
         c = c % r
-    return thin(r, c, p, r, s, L, memory)
+    return thin(r, c, p, r, buffer, arrival, memory)
 
 
 @register("afr-paper", memory=MEMORY, source="AFR [wang2022afr], Sec. IV-A, Algorithm 1 (literal text)", compile=True)
@@ -66,8 +72,7 @@ def afr(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 def afr_paper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Adaptive Frame Rate by the letter of the paper: s/L < 2/3, p not moved at departures."""
     r, c, p = memory[R], memory[C], memory[P]
-    L, s = buffer.capacity, len(buffer.slots)
-    if r > 1 and 3 * s < 2 * L:
+    if r > 1 and buffer.evictions == 0 and fill(buffer) < 2 / 3:
         r = r / 2
         c = c % r
-    return thin(r, c, p, r, s, L, memory)
+    return thin(r, c, p, r, buffer, arrival, memory)

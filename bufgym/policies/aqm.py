@@ -86,7 +86,7 @@ def codel(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     The defaults are the RFC's, for packets of 1500 bytes. For messages, choose a target of at least the time that
     one of them takes to transmit (200 kB at 6 MB/s: 33 ms), and an interval in proportion.
     """
-    return keep_first(len(buffer.slots), buffer.capacity)
+    return keep_first(buffer, arrival)
 
 
 MIN_TH, MAX_TH, MAX_P, WEIGHT = range(4)  # where RED's parameters lie
@@ -103,11 +103,12 @@ AVERAGE, COUNT = range(2)  # and its memory
 def red(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """RED: rejects at random, the more the higher the average occupancy; a full queue drops the tail.
 
-    Thresholds are fractions of L. The paper's term for idle times needs the link's bandwidth and is left out: an
-    arrival at an empty queue is one sample of 0.
+    Thresholds are fractions of L, or of B where bytes fill it more. The paper's term for idle times needs the link's
+    bandwidth and is left out: an arrival at an empty queue is one sample of 0.
     """
     min_th, max_th, max_p = buffer.parameters[MIN_TH], buffer.parameters[MAX_TH], buffer.parameters[MAX_P]
-    memory[AVERAGE] += buffer.parameters[WEIGHT] * (len(buffer.slots) - memory[AVERAGE])
+    occupancy = max(len(buffer.slots), buffer.capacity * (buffer.backlog_bytes / buffer.max_bytes))
+    memory[AVERAGE] += buffer.parameters[WEIGHT] * (occupancy - memory[AVERAGE])
     average = memory[AVERAGE] / buffer.capacity
     if min_th <= average < max_th:
         memory[COUNT] += 1  # arrivals since the last drop: spreads the drops evenly
@@ -120,4 +121,4 @@ def red(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         return REJECT
     else:
         memory[COUNT] = -1.0
-    return keep_first(len(buffer.slots), buffer.capacity)
+    return keep_first(buffer, arrival)

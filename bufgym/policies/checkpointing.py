@@ -10,9 +10,17 @@ the least that any rule can reach (Bringmann et al., arXiv 1302.4216; Bar-On et 
 from __future__ import annotations
 
 from bufgym.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, fill, has_space
 from bufgym.policies.afr import MEMORY, C, P, R, afr_departure, thin
+from bufgym.policies.classic import keep_last
 from bufgym.policies.registry import Arrival, Memory, register
+
+
+@kernel
+def full_length(buffer: Buffer, arrival: Arrival) -> int:
+    """How many messages a full queue holds: L, or if B has less room than that, as many like these as it has for."""
+    like_these = float(buffer.max_bytes) * (len(buffer.slots) + 1) / (buffer.backlog_bytes + arrival.size_bytes)
+    return int(min(float(buffer.capacity), like_these))
 
 
 @kernel
@@ -35,17 +43,18 @@ def growing_gap(r: float, p: float, L: int, alpha: float) -> float:
 def linear_alpha(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """LINEAR: evicts 1, 3, 5, ... pass after pass as AFR does, but keeps arrivals at times i^alpha."""
     r, c, p, alpha = memory[R], memory[C], memory[P], buffer.parameters[0]
-    L, s = buffer.capacity, len(buffer.slots)
-    lowered = r > 1 and 3 * s <= 2 * L
+    lowered = r > 1 and buffer.evictions == 0 and fill(buffer) <= 2 / 3
     if lowered:
         r = r / 2
-    gap = growing_gap(r, p, L, alpha)
+    gap = growing_gap(r, p, full_length(buffer, arrival), alpha)
     if lowered:
         c = c % gap
-    if r == 1 and s < L:  # the paper's stream never drains; here, with every pass undone, what finds room is kept
+    if r == 1 and has_space(
+        buffer, arrival
+    ):  # the paper's stream never drains; here, with every pass undone, what finds room is kept
         memory[R], memory[C] = r, 0.0
         return ACCEPT
-    return thin(r, c, p, gap, s, L, memory)
+    return thin(r, c, p, gap, buffer, arrival, memory)
 
 
 @kernel
@@ -94,5 +103,5 @@ def steady(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     for k in range(len(buffer.slots)):
         if site(buffer.slots[k].seq - first + 1, s) == place:
             return k
-    # Every site is some message's only where some were queued unasked: then the head makes room.
-    return ACCEPT if len(buffer.slots) < L else 0
+    # Every site is some message's only where some were queued unasked, or bytes are short: then the head makes room.
+    return keep_last(buffer, arrival, L)

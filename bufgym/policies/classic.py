@@ -3,51 +3,60 @@
 from __future__ import annotations
 
 from bufgym.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
 from bufgym.policies.registry import Arrival, Memory, register
 
 
 @kernel
-def keep_last(s: int, depth: float) -> int:
-    """Keep the newest ``depth`` messages: where so many are among the s queued, the head goes."""
-    return ACCEPT if s < depth else 0
+def keep_last(buffer: Buffer, arrival: Arrival, depth: float) -> int:
+    """Keep the newest ``depth`` messages: where so many are queued, or the newcomer does not fit, the head goes."""
+    return ACCEPT if len(buffer.slots) < depth and has_space(buffer, arrival) else 0
 
 
 @kernel
-def keep_first(s: int, L: int) -> int:
-    """Keep the s messages that are queued: the newcomer enters where there is room."""
-    return ACCEPT if s < L else REJECT
+def keep_first(buffer: Buffer, arrival: Arrival) -> int:
+    """Keep what is queued: the newcomer enters where there is room."""
+    return ACCEPT if has_space(buffer, arrival) else REJECT
+
+
+@kernel
+def uniform_draw(buffer: Buffer, arrival: Arrival) -> float:
+    """The arrival's uniform draw; each time that it is asked about again, the next of a congruential sequence."""
+    u = arrival.uniform
+    for _ in range(buffer.evictions):
+        u = 7919 * u % 1
+    return float(u)
 
 
 @register("drop-oldest", source="ROS 1 roscpp subscriber link; ROS 2 / DDS KEEP_LAST", compile=True)
 def drop_oldest(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ROS: a full queue loses its head."""
-    return keep_last(len(buffer.slots), buffer.capacity)
+    return keep_last(buffer, arrival, buffer.capacity)
 
 
 @register("drop-newest", source="drop tail; DDS KEEP_ALL, best effort", compile=True)
 def drop_newest(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Drop tail: a full queue rejects the newcomer."""
-    return keep_first(len(buffer.slots), buffer.capacity)
+    return keep_first(buffer, arrival)
 
 
 @register("replace-newest", source="replace tail", compile=True)
 def replace_newest(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Replace tail: the newcomer overwrites the newest queued message."""
-    return ACCEPT if len(buffer.slots) < buffer.capacity else buffer.capacity - 1
+    return ACCEPT if has_space(buffer, arrival) else len(buffer.slots) - 1
 
 
 @register("latest-only", source="mailbox of one message, as KEEP_LAST(1), the default depth of DDS", compile=True)
 def latest_only(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A queue of one: the newest replaces what waits."""
-    return keep_last(len(buffer.slots), 1)
+    return keep_last(buffer, arrival, 1)
 
 
 @register("random", source="AFR paper [wang2022afr], Eq. 9", compile=True)
 def random(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Random Drop: the victim is uniform over the L queued messages and the newcomer."""
-    L = buffer.capacity
-    if len(buffer.slots) < L:
+    """Random Drop: the victim is uniform over the queued messages and the newcomer, until it fits or is the victim."""
+    if has_space(buffer, arrival):
         return ACCEPT
-    victim = int(arrival.uniform * (L + 1))
-    return victim if victim < L else REJECT
+    s = len(buffer.slots)
+    victim = int(uniform_draw(buffer, arrival) * (s + 1))
+    return victim if victim < s else REJECT

@@ -90,7 +90,7 @@ def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     room_bytes = buffer.parameters[BATCHES] * batch_bytes + 2 * buffer.parameters[SOCKET]
     ahead_bytes = ahead_of_newcomer(buffer, memory, buffer.parameters[FORGETS])
     size_bytes = arrival.size_bytes
-    decision = keep_first(len(buffer.slots), buffer.capacity)
+    decision = keep_first(buffer, arrival)
     deadline_us, put_bytes = wait_us, 0.0
     while decision == ACCEPT and put_bytes < size_bytes:
         with_next_bytes = put_bytes + min(batch_bytes, size_bytes - put_bytes)
@@ -122,7 +122,7 @@ def ros2_best_effort(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """
     room_bytes, rate_memory_s = 1e3 * buffer.parameters[0], buffer.parameters[1]
     ahead_bytes = ahead_of_newcomer(buffer, memory, rate_memory_s)
-    decision = keep_first(len(buffer.slots), buffer.capacity)
+    decision = keep_first(buffer, arrival)
     filled_bytes = ahead_bytes + arrival.size_bytes
     if filled_bytes > room_bytes:
         decision, filled_bytes = REJECT, max(ahead_bytes, room_bytes)
@@ -147,9 +147,13 @@ def ros2_reliable_udp(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """
     room_bytes, rate_memory_s = 1e3 * buffer.parameters[0], buffer.parameters[2]
     depth = min(buffer.parameters[1], buffer.capacity)
+    decision = keep_last(buffer, arrival, depth)
+    if buffer.evictions > 0:  # asked again about a newcomer that the account has already
+        if decision >= 0:
+            memory[OWN] -= buffer.slots[0].size_bytes
+        return decision
     ahead_bytes = ahead_of_newcomer(buffer, memory, rate_memory_s)
     history_bytes = depth * arrival.size_bytes
-    decision = keep_last(len(buffer.slots), depth)
     fits_at_once = ahead_bytes + arrival.size_bytes <= room_bytes
     in_time = memory[RATE] == UNKNOWN or ahead_bytes + history_bytes <= memory[RATE] * depth * buffer.period_us
     if not fits_at_once and not in_time:

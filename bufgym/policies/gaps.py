@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from bufgym.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, loss, motion_gaps, time_gaps
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, has_space, loss, motion_gaps, time_gaps
 from bufgym.model.qoi import value
 from bufgym.policies.registry import Arrival, Memory, register
 
@@ -29,7 +29,7 @@ def smallest_time_gap(buffer: Buffer, arrival: Arrival, slots: int) -> int:
 def min_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged time gap (newcomer included, ties to the oldest)."""
     s = len(buffer.slots)
-    if s < buffer.capacity:
+    if has_space(buffer, arrival):
         return ACCEPT
     victim = smallest_time_gap(buffer, arrival, s + 1)
     return victim if victim < s else REJECT
@@ -42,15 +42,17 @@ def min_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     compile=True,
 )
 def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """A full queue rejects a newcomer nearer than beta even gaps T / (L + 1) to the tail, else as min-gap.
+    """A full queue rejects a newcomer nearer than beta even gaps T / (s + 1) to the tail, else as min-gap.
 
-    T is the time from the arrival of the message dequeued last to now, which L messages should divide evenly.
+    T is the time from the arrival of the message dequeued last to now, which the s queued messages should divide evenly
+    (L of them, but where B is what is full).
     """
-    beta, L, s = buffer.parameters[0], buffer.capacity, len(buffer.slots)
-    if s < L:
+    beta, s = buffer.parameters[0], len(buffer.slots)
+    if has_space(buffer, arrival):
         return ACCEPT
     T = arrival.arrival_us - buffer.dequeued_arrival_us
-    if arrival.arrival_us - buffer.slots[s - 1].arrival_us < beta * T / (L + 1):
+    near = arrival.arrival_us - buffer.slots[s - 1].arrival_us < beta * T / (s + 1)
+    if near and buffer.evictions == 0:
         return REJECT
     return smallest_time_gap(buffer, arrival, s)
 
@@ -59,7 +61,7 @@ def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged motion gap (newcomer included, ties to the oldest)."""
     s = len(buffer.slots)
-    if s < buffer.capacity:
+    if has_space(buffer, arrival):
         return ACCEPT
     victim, smallest = 0, np.inf
     for k in range(s + 1):
@@ -82,8 +84,8 @@ def orbbuf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     The tail stays, but for L < 3, where it goes. The released similarity compares images (and is a random stub there);
     without images, Sim = 1 - V(motion gap).
     """
-    L = buffer.capacity
-    if len(buffer.slots) < L:
+    L = len(buffer.slots)
+    if has_space(buffer, arrival):
         return ACCEPT
     victim, most_similar = L - 1, -np.inf
     for k in range(0 if buffer.dequeued > 0 and L > 2 else 1, L - 1):
@@ -101,7 +103,7 @@ def greedy_qoi(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     Rejecting adds nothing; evicting slot k adds the newcomer's gain less the loss of k. Once the gaps are even,
     replacing the tail costs least, arrival after arrival: the old prefix stays, and nothing that follows it is kept.
     """
-    if len(buffer.slots) < buffer.capacity:
+    if has_space(buffer, arrival):
         return ACCEPT
     decision, most = REJECT, 0.0
     for k in range(len(buffer.slots)):

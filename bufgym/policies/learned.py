@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
 from bufgym.observe import CONTEXT_FIELDS, FIELDS, SLOT_FIELDS, observe_context, observe_slots
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.scoring import (
@@ -61,15 +61,12 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     observe_slots(buffer, arrival, scratch.rows)
     read_context(scorer, scratch)
     common = begin(scorer, DROP, scratch)
-    free_bytes = buffer.max_bytes - buffer.backlog_bytes - arrival.size_bytes
     best, decision = -np.inf, REJECT
     for k in range(s + 1):
-        if k < s and free_bytes + buffer.slots[k].size_bytes < 0:
-            continue  # its place would not suffice
         dropped = score(scorer, DROP, common, k if k < s else L, scratch)
         if dropped > best:
             best, decision = dropped, k if k < s else REJECT
-    if s < L and free_bytes >= 0:
+    if has_space(buffer, arrival):
         common = begin(scorer, KEEP, scratch)
         if score(scorer, KEEP, common, L, scratch) >= best:
             decision = ACCEPT

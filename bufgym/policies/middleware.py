@@ -19,13 +19,13 @@ from bufgym.policies.registry import Arrival, ClientSettings, Memory, register
 )
 def ros_keep_last(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ROS 2 KEEP_LAST: the oldest unsent message goes when `depth` wait (at most L)."""
-    return keep_last(len(buffer.slots), min(buffer.parameters[0], buffer.capacity))
+    return keep_last(buffer, arrival, buffer.parameters[0])
 
 
 @register("dds-keep-all", source="DDS QoS HISTORY KEEP_ALL with best-effort RELIABILITY", compile=True)
 def dds_keep_all(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS KEEP_ALL, best effort: a full queue rejects the newcomer; reliable would block the publisher instead."""
-    return keep_first(len(buffer.slots), buffer.capacity)
+    return keep_first(buffer, arrival)
 
 
 def expired(buffer: Buffer, memory: Memory) -> bool:
@@ -45,7 +45,7 @@ def lifespan(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
     DDS removes a message when it expires; here it goes when it would be sent. Until then it is the next to go anyway.
     """
-    return keep_last(len(buffer.slots), buffer.capacity)
+    return keep_last(buffer, arrival, buffer.capacity)
 
 
 @register(
@@ -61,13 +61,13 @@ def time_filter(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     last_us = buffer.slots[s - 1].arrival_us if s > 0 else buffer.dequeued_arrival_us
     if s + buffer.dequeued > 0 and arrival.arrival_us - last_us < separation_us:
         return REJECT
-    return keep_last(s, buffer.capacity)
+    return keep_last(buffer, arrival, buffer.capacity)
 
 
 @register("zenoh-ring", source="Zenoh RingChannel(L)", compile=True)
 def zenoh_ring(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Zenoh RingChannel: keeps the newest L."""
-    return keep_last(len(buffer.slots), buffer.capacity)
+    return keep_last(buffer, arrival, buffer.capacity)
 
 
 @register(
@@ -78,7 +78,7 @@ def zenoh_ring(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 )
 def foxglove_sdk(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Foxglove SDK: a client's oldest message goes when `depth` wait (at most L)."""
-    return keep_last(len(buffer.slots), min(buffer.parameters[0], buffer.capacity))
+    return keep_last(buffer, arrival, buffer.parameters[0])
 
 
 @register(
@@ -92,7 +92,7 @@ def foxglove_backlog(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     buffered_bytes = buffer.backlog_bytes + buffer.left_bytes
     if buffered_bytes + arrival.size_bytes >= 1e6 * buffer.parameters[0]:
         return REJECT
-    return keep_first(len(buffer.slots), buffer.capacity)
+    return keep_first(buffer, arrival)
 
 
 @register(

@@ -124,6 +124,8 @@ class Policy:
     """How the program around it sends."""
     for_topics: bool = False
     """Whether it is made for several topics; on one queue it says little, and is left out unless it is named."""
+    named_only: bool = False
+    """Whether ``names`` leaves it out: it takes part where it is named, as it can't play everywhere."""
 
     @property
     def schedules(self) -> bool:
@@ -272,9 +274,17 @@ def register_later(name: str, make: Callable[[], Policy], *, for_topics: bool = 
     _REGISTRY.setdefault(name, Later(make, for_topics))
 
 
-def names(*, for_topics: bool | None = None) -> Iterator[str]:
-    """All registered names, in the order of their registration; True: those made for topics only, False: the others."""
-    return iter([name for name, entry in _REGISTRY.items() if for_topics in (None, entry.for_topics)])
+def names(*, for_topics: bool | None = None, named_only: bool = False) -> Iterator[str]:
+    """All registered names, in the order of their registration; True: those made for topics only, False: the others.
+
+    ``named_only``: instead those that take part only where they are named.
+    """
+    chosen = []
+    for name, entry in _REGISTRY.items():
+        apart = isinstance(entry, Policy) and entry.named_only
+        if apart == named_only and for_topics in (None, entry.for_topics):
+            chosen.append(name)
+    return iter(chosen)
 
 
 def get(spec: str | Policy) -> Policy:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer
-from bufgym.policies.classic import keep_last
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
+from bufgym.policies.classic import keep_last, uniform_draw
 from bufgym.policies.registry import Arrival, Memory, register
 
 SEEN = 0
@@ -22,13 +22,20 @@ def reservoir_departure(buffer: Buffer, memory: Memory) -> None:
     compile=True,
 )
 def reservoir(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Reservoir sampling: every arrival of the interruption is kept with the same probability."""
-    # With decide_at="overflow" messages enter unasked; all of them are still queued at the first decision.
-    memory[SEEN] = max(memory[SEEN], len(buffer.slots)) + 1
-    if len(buffer.slots) < buffer.capacity:
+    """Reservoir sampling: every arrival of the interruption is kept with the same probability.
+
+    Where one place is not enough for its bytes, others of the sample, drawn alike, go as well.
+    """
+    s = len(buffer.slots)
+    candidates = float(s)
+    if buffer.evictions == 0:
+        # With decide_at="overflow" messages enter unasked; all of them are still queued at the first decision.
+        memory[SEEN] = max(memory[SEEN], s) + 1
+        candidates = memory[SEEN]
+    if has_space(buffer, arrival):
         return ACCEPT
-    place = int(arrival.uniform * memory[SEEN])
-    return place if place < buffer.capacity else REJECT
+    place = int(uniform_draw(buffer, arrival) * candidates)
+    return place if place < s else REJECT
 
 
 COUNT = 0
@@ -44,10 +51,11 @@ COUNT = 0
 def decimate(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Fixed decimation: of the arrivals it is asked about, one in `every` is queued; the head goes when full."""
     n, every = memory[COUNT], buffer.parameters[0]
-    memory[COUNT] += 1
-    if n > 0 and n // every == (n - 1) // every:
-        return REJECT
-    return keep_last(len(buffer.slots), buffer.capacity)
+    if buffer.evictions == 0:
+        memory[COUNT] += 1
+        if n > 0 and n // every == (n - 1) // every:
+            return REJECT
+    return keep_last(buffer, arrival, buffer.capacity)
 
 
 @register(
@@ -62,4 +70,4 @@ def keyframe(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     last_x = buffer.slots[s - 1].x if s > 0 else buffer.dequeued_x  # the tail is never dropped before the head
     if s + buffer.dequeued > 0 and arrival.x - last_x < step:
         return REJECT
-    return keep_last(s, buffer.capacity)
+    return keep_last(buffer, arrival, buffer.capacity)

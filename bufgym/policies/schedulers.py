@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 from bufgym.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, is_first
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, is_first
 from bufgym.policies.registry import Arrival, Memory, register
 
 # --- what a newcomer drives out --------------------------------------------------------------------------------------
@@ -33,17 +33,26 @@ def same_topic(buffer: Buffer, a: Any, b: Any) -> bool:
 def fits(buffer: Buffer, arrival: Arrival) -> bool:
     """Whether the newcomer fits without a drop: by messages, by bytes, and by its topic's limit."""
     topic = topic_of(buffer, arrival)
-    enough_bytes = buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes
-    return bool(len(buffer.slots) < buffer.capacity and enough_bytes and topic.queued < topic.limit)
+    return has_space(buffer, arrival) and bool(topic.queued < topic.limit)
+
+
+@kernel
+def could_fit(buffer: Buffer, arrival: Arrival) -> bool:
+    """Whether the newcomer would fit by its bytes if all went that may be dropped."""
+    spare_bytes, k = buffer.max_bytes - buffer.backlog_bytes - arrival.size_bytes, 0
+    while spare_bytes < 0 and k < len(buffer.slots):
+        if topic_of(buffer, buffer.slots[k]).no_drop == 0:
+            spare_bytes += buffer.slots[k].size_bytes
+        k += 1
+    return bool(spare_bytes >= 0)
 
 
 @kernel
 def makes_room(buffer: Buffer, arrival: Arrival, k: int) -> bool:
-    """Whether slot ``k`` may be dropped and the newcomer fits once it is gone."""
+    """Whether slot ``k`` may be dropped for the newcomer, which fits then or once more have gone."""
     slot, topic = buffer.slots[k], topic_of(buffer, arrival)
-    enough_bytes = buffer.backlog_bytes - slot.size_bytes + arrival.size_bytes <= buffer.max_bytes
     within_limit = same_topic(buffer, slot, arrival) or topic.queued < topic.limit
-    return bool(topic_of(buffer, slot).no_drop == 0 and enough_bytes and within_limit)
+    return bool(topic_of(buffer, slot).no_drop == 0 and within_limit and could_fit(buffer, arrival))
 
 
 @kernel

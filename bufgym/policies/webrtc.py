@@ -106,7 +106,7 @@ def fill(memory: Memory, size_bytes: float, period_us: float) -> None:
 def webrtc_frame_dropper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """WebRTC's frame dropper: a leaky bucket at the rate the socket drains at; a full queue drops the newcomer."""
     ahead_bytes, period_us = ahead_of_newcomer(buffer, memory, FORGETS_S), max(1.0, buffer.period_us)
-    decision = keep_first(len(buffer.slots), buffer.capacity)
+    decision = keep_first(buffer, arrival)
     if memory[RATE] < UNKNOWN:
         retarget(memory, memory[RATE])
         leak(memory, period_us)

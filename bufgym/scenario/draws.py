@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import traces
 from bufgym.traces import Motion, Trace
+
+
+def beside(rng: np.random.Generator, number: int) -> np.random.Generator:
+    """Another generator, which follows from where ``rng`` stands and from ``number``; ``rng`` stays where it is."""
+    return np.random.default_rng([_state(rng)["state"]["state"], number])
+
+
+def skip(rng: np.random.Generator, count: int) -> None:
+    """Leave ``rng`` as ``rng.random(count)`` does, whatever the count."""
+    before = _state(rng)
+    cast(Any, rng.bit_generator).advance(count)
+    rng.bit_generator.state = {**before, "state": _state(rng)["state"]}  # with the half word that ``advance`` forgets
+
+
+def _state(rng: np.random.Generator) -> dict[str, Any]:
+    """Of a PCG64, the bit generator of ``Streams``."""
+    return cast(dict[str, Any], rng.bit_generator.state)
 
 
 def place(recordings: tuple[Motion, ...], rng: np.random.Generator, random_offset: bool) -> tuple[Motion, int]:

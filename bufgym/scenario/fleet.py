@@ -14,7 +14,7 @@ from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.scenario import registry
-from bufgym.scenario.arrivals import check_messages, read_only, sealed
+from bufgym.scenario.arrivals import check_messages, read_only, sealed, unchecked_messages
 from bufgym.scenario.episode import Episode, Streams, check_link
 from bufgym.scenario.uplink import Uplink
 
@@ -108,13 +108,13 @@ class FleetScenario:
     def draw(self, streams: Streams) -> FleetEpisode:
         """One episode."""
         first = self._cell.draw(streams)
-        others = [self._beside(first.arrivals["arrival_us"], streams) for _ in range(1, self.robots)]
+        others = [self._beside(first.arrivals["arrival_us"], streams, robot) for robot in range(1, self.robots)]
         return FleetEpisode((first.arrivals, *others), first.link)
 
-    def _beside(self, arrival_us: NDArray[np.int64], streams: Streams) -> NDArray[Any]:
+    def _beside(self, arrival_us: NDArray[np.int64], streams: Streams, robot: int) -> NDArray[Any]:
         """MESSAGE[n] of one more robot whose camera ticks at these times."""
-        arrivals = self._stream.draw(streams).arrivals.copy()
-        arrivals["arrival_us"] = arrival_us
+        sizes = self.uplink.drawn_sizes(streams.arrival, robot)
+        arrivals = unchecked_messages(arrival_us, sizes, None)
         self.uplink.move(arrivals, streams.arrival)
         return read_only(arrivals)
 
@@ -122,13 +122,6 @@ class FleetScenario:
     def _cell(self) -> Uplink:
         """The first robot's stream over the link of all."""
         return replace(self.uplink, scale=tuple(s * self.robots for s in self.uplink.scale))
-
-    @functools.cached_property
-    def _stream(self) -> Uplink:
-        """The sizes of another robot's messages; their times and motion come from elsewhere."""
-        return replace(
-            self.uplink, traces=self.uplink.traces[:1], scale=(1.0,), motion=(), jitter=0, random_offset=False
-        )
 
 
 def _uplink(spec: str | Uplink, **parameters: Any) -> Uplink:

@@ -58,7 +58,9 @@ class Interruption:
             raise BufgymError(f"law = {self.law!r}: must be one of {', '.join(LAWS)}")
         for name in ("t_min", "t_max", "size_bytes"):
             object.__setattr__(self, name, whole(name, getattr(self, name)))
-        if not 1 <= self.t_min <= self.t_max <= 10**6:
+        if not 1 <= self.t_max <= 10**6:
+            raise BufgymError(f"t_max = {self.t_max}: must lie between 1 and 1000000")
+        if self.law != "fixed" and not 1 <= self.t_min <= self.t_max:
             raise BufgymError(f"t_min = {self.t_min}, t_max = {self.t_max}: need 1 <= t_min <= t_max <= 1000000")
         message_bytes("size_bytes", self.size_bytes)
         positive(self, "t_mean")
@@ -67,7 +69,7 @@ class Interruption:
             raise BufgymError(
                 f"t_max = {self.t_max} messages at rate_hz = {self.rate_hz}: must arrive within {MAX_TIME_US} us"
             )
-        if not self.t_mean >= self.t_min:
+        if self.law == "geometric" and not self.t_mean >= self.t_min:
             raise BufgymError(f"t_mean = {self.t_mean}: must be at least t_min = {self.t_min}")
         check_value(self)
         object.__setattr__(self, "lengths", tuple(whole("lengths", T) for T in self.lengths))

@@ -17,11 +17,17 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import read_only, unchecked_messages
 from bufgym.scenario.checks import as_tuple, check_stream, check_value, delay, duration, recordings
-from bufgym.scenario.draws import place, place_link, scaled, shipped, sizes
+from bufgym.scenario.draws import beside, place, place_link, scaled, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace, read_workload
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import Workload
+
+_JITTER_HZ = 30.0
+"""At any rate an episode leaves its stream where the jitter of so many messages a second does, so that motion and all
+that follows are the same whatever ``rate_hz``, ``jitter`` and ``size_cv`` are."""
+_TIMES, _SIZES = 0, 1
+"""Generators ``beside`` the stream: of jitter at other rates, and of sizes (of robot r: r more)."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +35,8 @@ class Uplink:
     """A camera stream over capacity traces.
 
     Frames arrive at ``rate_hz``; the link is one of ``traces``, chosen at random, times one of ``scale``, from a random
-    offset on. x is one of the recordings in ``motion`` from a random offset on, or without one the frame index.
+    offset on. x is one of the recordings in ``motion`` from a random offset on, or without one the frame index. For one
+    seed, jitter, sizes and motion are drawn apart: other rates, jitters or sizes meet the same link and motion.
 
     With a ``workload``, a robot's recording is played as it is in place of the stream that ``rate_hz``, ``jitter``,
     ``size_bytes``, ``size_cv`` and ``duration_s`` describe. All its topics share the queue; it gives x if it has one.
@@ -122,12 +129,23 @@ class Uplink:
     def _stream(self, rng: np.random.Generator) -> NDArray[Any]:
         """MESSAGE[n] of the camera, x being the frame index."""
         n, period_us = self.max_messages, 1e6 / self.rate_hz
-        periods = np.arange(n, dtype=np.float64)
-        if self.jitter:
+        periods, jitter_draws = np.arange(n, dtype=np.float64), round(_JITTER_HZ * self.duration_s)
+        size = self.drawn_sizes(rng)
+        if self.jitter and n == jitter_draws:
             periods += self.jitter * rng.random(n)
+        else:
+            if self.jitter:
+                periods += self.jitter * beside(rng, _TIMES).random(n)
+            skip(rng, jitter_draws)
         arrival_us = (periods * period_us).astype(np.int64)
         arrival_us -= arrival_us[0]
-        return unchecked_messages(arrival_us, sizes(n, self.size_bytes, self.size_cv, rng), None)
+        return unchecked_messages(arrival_us, size, None)
+
+    def drawn_sizes(self, rng: np.random.Generator, robot: int = 0) -> NDArray[np.int64]:
+        """int64[n] bytes of the messages of one stream, or in a fleet of a robot's; ``rng`` stays where it is."""
+        return sizes(
+            self.max_messages, self.size_bytes, self.size_cv, beside(rng, _SIZES + robot) if self.size_cv else rng
+        )
 
 
 def _replayed(workload: Workload) -> NDArray[Any]:

@@ -5,7 +5,9 @@ policy decides; (3) if the socket is idle it dequeues the head at once. After th
 nothing sent is lost. The message in transmission is outside the buffer.
 
 ``next_event`` moves one sender on to its next event: the socket dequeued a message (DEPARTURE), an arrival asks for a
-decision (DECISION), or the episode is over (END). ``decide`` carries a decision out. Environments, rollouts and
+decision (DECISION), or the episode is over (END). ``decide`` carries a decision out. Under a byte limit B one eviction
+may not make room: then the same DECISION comes again, with the queue as it is now, until the arrival fits or is
+rejected. An arrival larger than B is dropped unasked. Environments, rollouts and
 benchmarks are loops around these two. Queue disciplines that drop at the head, such as CoDel, are asked before the
 socket dequeues it (DEQUEUE, ``answer_dequeue``), and a scheduler chooses what the socket dequeues (SEND,
 ``answer_send``).
@@ -37,6 +39,7 @@ from bufgym.sim.state import (
     DEQUEUE,
     END,
     NEVER,
+    NOTHING_WAITS,
     SEND,
     SOCKET_WAITS,
     Batch,
@@ -52,6 +55,7 @@ __all__ = [
     "DEQUEUE",
     "END",
     "NEVER",
+    "NOTHING_WAITS",
     "SEND",
     "SOCKET_WAITS",
     "Batch",

@@ -70,9 +70,11 @@ def run_fleet(
         raise BufgymError("no episode to run")
     robots = episodes[0].robots
     longest = max(len(arrivals) for episode in episodes for arrivals in episode.arrivals)
+    if policy.unbounded:
+        capacity, max_bytes = longest, None
     senders = Senders(
         robots * len(episodes),
-        longest if policy.unbounded else capacity,
+        capacity,
         v,
         max_messages=longest,
         max_bytes=max_bytes,

@@ -44,11 +44,18 @@ def arrive(batch: Batch, i: int) -> int:
         decision = REJECT
     else:
         asked = sender.first_decision <= sender.next <= sender.last_decision
-        if asked and not (sender.ask_when_full == 1 and has_room(batch, i)):
+        decision = ACCEPT
+        if sender.screens == 1:
+            sender.evictions = 0
+            asked = asked and not (sender.ask_when_full == 1 and has_room(batch, i))
+            if arrival.size_bytes > sender.max_bytes:
+                asked, decision = False, REJECT  # it can't fit, whatever goes
+        if asked:
             sender.waiting = ARRIVAL_WAITS
             return DECISION
-        decision = ACCEPT
-    decide(batch, i, decision)
+    seq = sender.next
+    while sender.next == seq:  # a no_drop message may need several evictions
+        decide(batch, i, decision)
     return NOTHING
 
 
@@ -64,18 +71,20 @@ def has_room(batch: Batch, i: int) -> bool:
 
 @kernel
 def can_evict(batch: Batch, i: int, k: int) -> bool:
-    """Whether evicting slot ``k`` makes the arrival at hand fit."""
+    """Whether slot ``k`` may go for the arrival at hand: any of one queue, even where more have to follow.
+
+    With several topics it is droppable, of the newcomer's topic if that is at its limit, and in the end bytes suffice.
+    """
     sender = batch.senders[i]
     if not 0 <= k < sender.occupancy:
         return False
-    slot = at(batch.slots, i, sender.first + k)
-    arrival = at(batch.arrivals, i, sender.next)
-    if sender.topics > 1 and (
-        at(batch.topics, i, slot.topic).no_drop == 1
-        or (slot.topic != arrival.topic and rules.at_limit(batch, i, arrival.topic))
-    ):
+    if sender.topics == 1:
+        return True
+    topic = at(batch.slots, i, sender.first + k).topic
+    arriving = at(batch.arrivals, i, sender.next).topic
+    if rules.no_drop(batch, i, topic) or (topic != arriving and rules.at_limit(batch, i, arriving)):
         return False
-    return bool(sender.backlog_bytes - slot.size_bytes + arrival.size_bytes <= sender.max_bytes)
+    return rules.could_fit(batch, i)
 
 
 @kernel
@@ -94,7 +103,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     """Carry out a decision on the arrival at hand; False if it was invalid and did what a queue does instead.
 
     That is: accept where there is room, reject where there is none; for a no_drop message evict the oldest message of
-    the lowest priority.
+    the lowest priority. If B has no room even after an eviction, the arrival waits on and the policy is asked again.
     """
     sender = batch.senders[i]
     arrival = at(batch.arrivals, i, sender.next)
@@ -109,8 +118,13 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         if not enqueue and rules.no_drop(batch, i, arrival.topic):
             victim = rules.refuge(batch, i)
             enqueue = victim >= 0
+    if not valid:
+        sender.invalid += 1
     if victim >= 0:
         remove(batch, i, victim)
+        if sender.screens == 1 and sender.backlog_bytes + arrival.size_bytes > sender.max_bytes:
+            sender.evictions += 1
+            return valid
     if enqueue:
         # The first message of all, or of its topic, is the 1 in H = 1 + sum of V.
         gain = rules.gain_behind(batch, i, sender.occupancy, arrival.topic, arrival.x)
@@ -123,8 +137,6 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     else:
         at(batch.log, i, sender.next).dropped_us = sender.now_us
         sender.rejected += 1
-    if not valid:
-        sender.invalid += 1
     if sender.topics > 1:
         rules.arrived_on_topic(batch, i, arrival, enqueue)
     sender.previous_us, sender.previous_x = arrival.arrival_us, arrival.x

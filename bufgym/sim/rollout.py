@@ -20,8 +20,8 @@ from bufgym.policies.registry import Policy, runs_compiled, signatures
 from bufgym.sim.decisions import answer_dequeue, answer_send, decide
 from bufgym.sim.shared_link import Shares, shares_type
 from bufgym.sim.socket import credit
-from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type, named
-from bufgym.sim.transition import next_event, sender_of
+from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type, named
+from bufgym.sim.transition import move_on, next_event, sender_of
 from bufgym.sim.view import arrival_of, view
 
 _SHORT = 200_000
@@ -40,9 +40,11 @@ def rollout(
 ) -> None:
     """Run every sender of the batch to its end under one policy; ``memory`` is float64[n, entries]."""
     for c in range(len(batch.senders) if shares is None else len(shares.cells)):
-        event = NOTHING
+        event, again = NOTHING, False
         while event != END:
-            event = next_event(batch, shares, c)
+            if not again:
+                event = move_on(batch, shares, c)
+            again = False
             # One view for all events: the kernels are inlined, and so the loop's code stays small.
             if event == END or (event == DEPARTURE and not hears_departures):
                 continue
@@ -50,6 +52,7 @@ def rollout(
             buffer = view(batch, i)
             if event == DECISION:
                 decide(batch, i, on_arrival(buffer, arrival_of(batch, i), memory[i]))
+                again = batch.senders[i].waiting == ARRIVAL_WAITS  # B has no room yet: the same DECISION is due again
             elif event == DEQUEUE:
                 answer_dequeue(batch, i, on_dequeue(buffer, memory[i]))
             elif event == SEND:

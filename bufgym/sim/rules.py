@@ -147,17 +147,31 @@ def no_drop(batch: Batch, i: int, topic: int) -> bool:
 
 
 @kernel
+def could_fit(batch: Batch, i: int) -> bool:
+    """Whether the arrival at hand would fit by its bytes if all went that may be dropped."""
+    sender = batch.senders[i]
+    spare_bytes = sender.max_bytes - sender.backlog_bytes - at(batch.arrivals, i, sender.next).size_bytes
+    k = 0
+    while spare_bytes < 0 and k < sender.occupancy:
+        slot = at(batch.slots, i, sender.first + k)
+        if not no_drop(batch, i, slot.topic):
+            spare_bytes += slot.size_bytes
+        k += 1
+    return bool(spare_bytes >= 0)
+
+
+@kernel
 def refuge(batch: Batch, i: int) -> int:
     """The slot that goes for a no_drop message when nothing else helps: lowest priority, oldest; -1 if none may."""
     sender = batch.senders[i]
-    size_bytes = at(batch.arrivals, i, sender.next).size_bytes
     best = -1
     lowest = 0.0
+    if not could_fit(batch, i):
+        return best
     for k in range(sender.occupancy):
         slot = at(batch.slots, i, sender.first + k)
         priority = at(batch.topics, i, slot.topic).priority
-        fits = sender.backlog_bytes - slot.size_bytes + size_bytes <= sender.max_bytes
-        if fits and not no_drop(batch, i, slot.topic) and (best < 0 or priority < lowest):
+        if not no_drop(batch, i, slot.topic) and (best < 0 or priority < lowest):
             best, lowest = k, priority
     return best
 

@@ -101,7 +101,7 @@ class Senders:
         return self.value if episode is None or episode.value is None else episode.value
 
     def draw_uniforms(self, i: int) -> None:
-        """Draw the uniforms of sender ``i``'s episode, unless it has them: few policies look, so they are drawn late."""
+        """Draw the uniforms of sender ``i``'s episode, unless it has them. Late, as only policies that play look."""
         rng, episode = self._uniforms[i], self.episodes[i]
         if rng is None or episode is None:
             return
@@ -172,7 +172,7 @@ def run(
 ) -> Senders:
     """The senders after ``policy`` ran through each of ``episodes``, one sender each.
 
-    The queue of an unbounded policy has room for all messages, whatever ``capacity`` says.
+    The queue of an unbounded policy has room for all messages, whatever ``capacity`` and ``max_bytes`` say.
     """
     if not episodes:
         raise BufgymError("no episode to run")
@@ -184,7 +184,7 @@ def run(
         topics = copies_of(topics, copies)
     longest = max(len(episode.arrivals) for episode in episodes)
     if policy.unbounded:
-        capacity = longest
+        capacity, max_bytes = longest, None
         topics = [replace(topic, limit=None) for topic in topics]
     senders = Senders(
         len(episodes), capacity, v, max_messages=longest, max_bytes=max_bytes, decide_at=decide_at, topics=topics

@@ -36,6 +36,7 @@ SENDER = np.dtype(
         ("capacity", np.int64),  # L, messages
         ("max_bytes", np.int64),  # B, bytes
         ("ask_when_full", np.int64),  # 1: only an arrival that finds no room asks for a decision
+        ("screens", np.int64),  # 1: an arrival may ask for no decision, or for several: ask_when_full, or a limit B
         ("ask_at_dequeue", np.int64),  # 1: the policy may drop the head before the socket dequeues it
         ("ask_at_send", np.int64),  # 1: a scheduler chooses which message the socket dequeues
         ("topics", np.int64),  # 1: one queue, whatever the messages' topics; else each topic has rules of its own
@@ -61,6 +62,7 @@ SENDER = np.dtype(
         ("now_us", np.int64),
         ("next", np.int64),  # the next arrival, or the one that waits for a decision
         ("waiting", np.int64),  # NOTHING_WAITS, ARRIVAL_WAITS or SOCKET_WAITS
+        ("evictions", np.int64),  # messages evicted for that arrival so far
         # buffer
         ("first", np.int64),  # column of the head
         ("occupancy", np.int64),

@@ -11,13 +11,16 @@ from typing import Any
 from numpy.typing import NDArray
 
 from bufgym.kernel import at, kernel, records
+from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import FOREVER
 from bufgym.sim.decisions import arrive, choose, oldest_sendable
 from bufgym.sim.shared_link import Shares, join, next_in_cell
 from bufgym.sim.socket import begin_transmission, dequeue, finish_transmission, may_dequeue, next_ack_us
 from bufgym.sim.state import (
+    ARRIVAL_WAITS,
     CARRIES,
     CHOSEN,
+    DECISION,
     DEPARTURE,
     DEQUEUE,
     END,
@@ -73,6 +76,7 @@ def load_row(
     batch.senders[i] = _BEGINNING[0]
     sender = batch.senders[i]
     sender.capacity, sender.max_bytes, sender.ask_when_full = buffer
+    sender.screens = 1 if sender.ask_when_full == 1 or sender.max_bytes < UNLIMITED_BYTES else 0
     sender.first_decision, sender.last_decision = decisions
     sender.first_knot, sender.last_knot, sender.after, sender.offset_us, sender.propagation_us = link
     sender.segment_now, sender.segment_finish = sender.first_knot, sender.first_knot
@@ -84,8 +88,16 @@ def load_row(
 def next_event(batch: Batch, shares: Shares | None, c: int) -> int:
     """Move cell ``c`` on to its next DEPARTURE, DECISION, DEQUEUE, SEND or END (see the package's text).
 
-    The event is about sender ``sender_of(shares, c)``.
+    The event is about sender ``sender_of(shares, c)``. While its arrival waits, the DECISION is due again.
     """
+    if batch.senders[sender_of(shares, c)].waiting == ARRIVAL_WAITS:
+        return DECISION
+    return move_on(batch, shares, c)
+
+
+@kernel
+def move_on(batch: Batch, shares: Shares | None, c: int) -> int:
+    """``next_event`` for a cell in which no arrival waits."""
     while True:
         i = sender_of(shares, c)
         if shares is None and batch.senders[i].link != CARRIES and batch.senders[i].busy > 0:

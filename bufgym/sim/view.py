@@ -80,6 +80,7 @@ def view(batch: Batch, i: int) -> Buffer:
         stretch(batch.topics, i, 0, sender.topics),
         sender.window,
         sender.dequeued - sender.acked,
+        sender.evictions,
         batch.parameters,
     )
 

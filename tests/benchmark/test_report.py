@@ -14,7 +14,7 @@ from report_cases import MANIFEST, QOI, TIMELINE, make
 
 from bufgym.benchmark import folder as inputs
 from bufgym.benchmark import report, table
-from bufgym.benchmark.report import style, timeline
+from bufgym.benchmark.report import style, tables, timeline
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.scenario import FleetScenario, suites
 
@@ -42,7 +42,7 @@ def test_the_ranking_in_markdown(folder: Path) -> None:
     """All episodes are alike, so every interval is a point. (95 - 80) / (100 - 80) = 0.75, and so on."""
     lines = report.markdown(folder).splitlines()
     assert lines[:3] == ["```", MANIFEST["command"], "```"]
-    at = lines.index("| # | policy | score | IQM | regret | better than afr |")
+    at = lines.index("| # | policy | score | IQM | regret, at most | better than afr |")
     assert [line.strip("| ").split(" | ") for line in lines[at + 2 : at + 7]] == [
         ["1", "&lt;b&gt;", *["0.750 [0.750, 0.750]"] * 2, "5.00 % [5.00, 5.00]", "1.000 [1.000, 1.000]"],
         ["2", "afr", *["0.500 [0.500, 0.500]"] * 2, "10.0 % [10.0, 10.0]", "–"],
@@ -65,6 +65,17 @@ def test_cells_in_markdown_are_marked_where_they_are_not_discriminative_or_the_b
     assert "Score, good:\n\n| policy | L = 2\\* | L = 4\\* |" in text
     assert text.index("Score, short") < text.index("Score, long") < text.index("Score, good")  # the manifest's order
     assert "Drop Oldest loses under 1 % there" in text and "upper bound" in text
+
+
+def test_regret_that_rests_on_an_upper_bound_says_so(folder: Path, tmp_path: Path) -> None:
+    exact = [dict(row, certified=True) for row in inputs.read(folder).rows]
+    for certified, where in ((False, folder), (True, make(tmp_path / "exact", rows=exact))):
+        run = inputs.read(where)
+        for text in (report.markdown(where), tables.plain(run, run.task.summary(run.rows, run.manifest["unranked"]))):
+            assert ("regret, at most" in text) is not certified
+        page = report.write(where).read_text(encoding="utf-8")
+        assert ("regret, at most" in page) is not certified
+        assert ("regret at most" in page) is not certified
 
 
 def test_no_notes_where_there_is_nothing_to_note(tmp_path: Path) -> None:

@@ -10,8 +10,9 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from bufgym.kernel import records
 from bufgym.model import qoi
-from bufgym.model.buffer import ACCEPT, REJECT
+from bufgym.model.buffer import ACCEPT, MESSAGE, NO_PARAMETERS, REJECT, TOPIC, UNLIMITED_BYTES, Buffer
 from bufgym.model.link import Link
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, messages
@@ -27,6 +28,21 @@ def decide_anything(buffer: Any, arrival: Any, memory: Any) -> int:
 # The twin draws from [accept, reject, 0, 1, ..., L + 1]: floor(uniform x (L + 4)) - 2, as ACCEPT is -2 and REJECT -1.
 assert (ACCEPT, REJECT) == (-2, -1)
 ANYTHING = Policy("test-anything", decide_anything, compile=True)
+
+
+def queue_of(s: int, capacity: int, parameters: NDArray[np.float64] = NO_PARAMETERS) -> Buffer:
+    """What a policy sees of s queued messages without bytes to speak of; the rest is 0."""
+    fields: dict[str, Any] = dict.fromkeys(Buffer._fields, 0)
+    fields.update(slots=records(s, MESSAGE), topics=records(1, TOPIC), v=qoi.exponential(0.5).array)
+    fields.update(capacity=capacity, max_bytes=UNLIMITED_BYTES, parameters=parameters)
+    return Buffer(**fields)
+
+
+def newcomer(uniform: float = 0.0) -> Any:
+    """A MESSAGE of one byte."""
+    made = np.zeros(1, MESSAGE).view(np.recarray)
+    made["uniform"], made["size_bytes"] = uniform, 1
+    return made[0]
 
 
 @dataclass

@@ -94,6 +94,7 @@ class Sender:
         self.periods = []  # running mean of the time between arrivals, us, of which the newest weighs 1/8
         self.dequeued, self.transmitted, self.dropped, self.order = {}, {}, {}, []
         self.rejected = self.evicted = self.invalid = 0
+        self.evictions = 0  # of those, for the arrival at hand
 
     def run(self, messages, first_decision=0, last_decision=math.inf):
         for message in messages:
@@ -108,13 +109,7 @@ class Sender:
             asked = first_decision <= message["seq"] <= last_decision
             if asked and self.decide_at == "overflow":
                 asked = not fits
-            decision = ACCEPT
-            if asked:
-                previous = self.previous if self.previous is not None else message
-                last_dequeued = self.last_dequeued if self.last_dequeued is not None else previous
-                decision = self.policy.decide(list(self.queue), message, self.capacity, last_dequeued, previous)
-            self.carry_out(decision, message)
-            self.previous = message
+            self.settle(message, asked)
             # (3) an idle socket takes the head at once
             if self.sending is None and self.queue:
                 self.take_head(message["us"], math.floor(self.link.bytes_by(message["us"])))
@@ -157,18 +152,34 @@ class Sender:
         enough_bytes = sum(m["bytes"] for m in queue) + message["bytes"] <= self.max_bytes
         return len(queue) < self.capacity and enough_bytes
 
+    def settle(self, message, asked):
+        """The policy is asked until the arrival fits or is rejected; what is larger than B is dropped unasked."""
+        previous = self.previous if self.previous is not None else message
+        last_dequeued = self.last_dequeued if self.last_dequeued is not None else previous
+        self.evictions, settled = 0, False
+        while not settled:
+            decision = ACCEPT
+            if message["bytes"] > self.max_bytes:
+                decision = REJECT
+            elif asked:
+                decision = self.policy.decide(list(self.queue), message, self.capacity, last_dequeued, previous)
+            settled = self.carry_out(decision, message)
+        self.previous = message
+
     def carry_out(self, decision, message):
+        """Whether the arrival has been enqueued or dropped; if not, its policy is asked again."""
         if decision == REJECT:
             self.drop(message)
             self.rejected += 1
-            return
+            return True
         if decision != ACCEPT and 0 <= decision < len(self.queue):
-            rest = self.queue[:decision] + self.queue[decision + 1 :]
-            if self.fits(rest, message):
-                self.drop(self.queue[decision], message["us"])
-                self.queue = [*rest, message]
-                self.evicted += 1
-                return
+            self.drop(self.queue.pop(decision), message["us"])
+            self.evicted += 1
+            self.evictions += 1
+            if not self.fits(self.queue, message):
+                return False
+            self.queue.append(message)
+            return True
         # What a queue does: accept where there is room, reject where there is none.
         fits = self.fits(self.queue, message)
         if decision != ACCEPT or not fits:
@@ -178,6 +189,7 @@ class Sender:
         else:
             self.drop(message)
             self.rejected += 1
+        return True
 
     def drop(self, message, now=None):
         self.dropped[message["seq"]] = message["us"] if now is None else now

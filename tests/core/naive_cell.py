@@ -52,14 +52,7 @@ class Cell:
                 self.give_until(now)
             before = now
             robot = self.robots[i]
-            previous = robot.previous if robot.previous is not None else message
-            last_dequeued = robot.last_dequeued if robot.last_dequeued is not None else previous
-            asked = robot.decide_at == "arrival" or not robot.fits(robot.queue, message)
-            decision = naive.ACCEPT
-            if asked:
-                decision = robot.policy.decide(list(robot.queue), message, robot.capacity, last_dequeued, previous)
-            robot.carry_out(decision, message)
-            robot.previous = message
+            robot.settle(message, robot.decide_at == "arrival" or not robot.fits(robot.queue, message))
             if robot.sending is None and robot.queue:
                 if not self.busy():
                     self.position = max(self.position, self.reached(now))

@@ -43,12 +43,12 @@ def best(link, messages, capacity, v, max_bytes=None, decide_at="arrival", first
 
     def options(sender, message):
         fits = sender.fits(sender.queue, message)
+        if message["bytes"] > sender.max_bytes:
+            return [naive.REJECT]
         asked = first_decision <= message["seq"] <= last_decision
         if not asked or (fits and decide_at == "overflow"):
             return [naive.ACCEPT]
-        slots = range(len(sender.queue))
-        can = [k for k in slots if sender.fits(sender.queue[:k] + sender.queue[k + 1 :], message)]
-        return [naive.REJECT, *([naive.ACCEPT] if fits else []), *can]
+        return [naive.REJECT, *([naive.ACCEPT] if fits else []), *range(len(sender.queue))]
 
     def added(before, after):
         """What the messages received since then have added to H."""
@@ -73,7 +73,9 @@ def best(link, messages, capacity, v, max_bytes=None, decide_at="arrival", first
         most = -math.inf
         for decision in options(sender, message):
             after, policy.decision = fork(sender), decision
-            after.carry_out(decision, message)
+            if not after.carry_out(decision, message):
+                most = max(most, from_here(after, n))
+                continue
             after.previous = message
             if after.sending is None and after.queue:
                 after.take_head(message["us"], math.floor(link.bytes_by(message["us"])))

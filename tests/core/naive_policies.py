@@ -22,6 +22,7 @@ from naive_queues import (
     Rosbridge,
     Spaced,
     one_of,
+    uniform_of,
 )
 
 
@@ -31,10 +32,12 @@ class Reservoir(Policy):
     n = 0
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        self.n = max(self.n, len(queue)) + 1  # what came unasked is all there
-        if len(queue) < L:
+        again, s = self.sender.evictions > 0, len(queue)
+        if not again:
+            self.n = max(self.n, s) + 1  # what came unasked is all there
+        if self.sender.fits(queue, newcomer):
             return ACCEPT
-        return one_of([*range(L), *[REJECT] * (self.n - L)], newcomer["uniform"])
+        return one_of([*range(s), *[REJECT] * (0 if again else self.n - s)], uniform_of(newcomer, self.sender))
 
     def departed(self, queue):
         self.n = len(queue)
@@ -46,10 +49,11 @@ class Decimate(Policy):
     n = 0
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        self.n += 1
-        if self.n not in range(1, self.n + 1, 3):
-            return REJECT
-        return ACCEPT if len(queue) < L else 0
+        if self.sender.evictions == 0:
+            self.n += 1
+            if self.n not in range(1, self.n + 1, 3):
+                return REJECT
+        return ACCEPT if self.sender.fits(queue, newcomer) else 0
 
 
 class Afr(Policy):
@@ -63,29 +67,39 @@ class Afr(Policy):
             self.p -= 1
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        filled = Fraction(len(queue), L)
+        filled, backlog = Fraction(len(queue), L), sum(m["bytes"] for m in queue)
+        if self.sender.max_bytes < math.inf:
+            filled = max(filled, Fraction(backlog, self.sender.max_bytes))
         low = filled <= Fraction(2, 3) if self.as_released else filled < Fraction(2, 3)
-        if self.r > 1 and low:
-            self.r //= 2
-            self.c %= self.gap(L)
-        return self.count(queue, L)
+        like_these = self.sender.max_bytes * (len(queue) + 1) / (backlog + newcomer["bytes"])
+        self.full_length = L if like_these >= L else math.floor(like_these)
+        if self.sender.evictions == 0:
+            if self.r > 1 and low:
+                self.r //= 2
+                self.c %= self.gap()
+        return self.count(queue, newcomer)
 
-    def gap(self, L):
+    def gap(self):
         return self.r
 
-    def count(self, queue, L):
-        self.c += 1
-        if self.c < self.gap(L):
-            return REJECT
-        self.c = math.fmod(self.c - self.gap(L), 1)
-        if len(queue) < L:
+    def count(self, queue, newcomer):
+        if self.sender.evictions == 0:
+            self.c += 1
+            if self.c < self.gap():
+                return REJECT
+            self.c = math.fmod(self.c - self.gap(), 1)
+        if self.sender.fits(queue, newcomer):
             return ACCEPT
+        self.end_pass(queue)
         victim = self.p
         self.p += 1
-        if self.p == L:
+        self.end_pass(queue)
+        return victim
+
+    def end_pass(self, queue):
+        if self.p >= len(queue):
             self.r *= 2
             self.p = 0
-        return victim
 
 
 class MinGap(Policy):
@@ -127,15 +141,15 @@ class LinearAlpha(Afr):
         super().__init__()
         self.alpha = alpha
 
-    def gap(self, L):
-        a = self.alpha
+    def gap(self):
+        a, L = self.alpha, self.full_length  # of a queue of messages like the present ones
         return float(self.r) ** a * float(L) ** (1 - a) * (float(L + self.p + 1) ** a - float(L + self.p) ** a)
 
-    def count(self, queue, L):
-        if self.r == 1 and len(queue) < L:
+    def count(self, queue, newcomer):
+        if self.r == 1 and self.sender.fits(queue, newcomer):
             self.c = 0
             return ACCEPT
-        return super().count(queue, L)
+        return super().count(queue, newcomer)
 
 
 class EvenReject(MinGap):
@@ -147,7 +161,7 @@ class EvenReject(MinGap):
 
     def full(self, queue, newcomer, L, last_dequeued, previous):
         even = self.beta * (newcomer["us"] - last_dequeued["us"]) / (L + 1)
-        if newcomer["us"] - queue[-1]["us"] < even:
+        if newcomer["us"] - queue[-1]["us"] < even and self.sender.evictions == 0:
             return REJECT
         gaps = self.gaps(queue, newcomer, last_dequeued, previous)[:L]
         return gaps.index(min(gaps))
@@ -175,7 +189,7 @@ class Steady(Policy):
             return REJECT
         if place in places:
             return places.index(place)
-        return ACCEPT if len(queue) < L else 0
+        return ACCEPT if self.sender.fits(queue, newcomer) else 0
 
 
 class GreedyQoi(Policy):
@@ -197,17 +211,13 @@ class GreedyQoi(Policy):
 
 
 class OldestThatHelps(Policy):
-    """On one queue, what is made for topics: the oldest whose going makes the newcomer fit; ``depth`` are kept."""
+    """On one queue, what is made for topics: the oldest goes until the newcomer fits; ``depth`` are kept."""
 
     def __init__(self, depth=math.inf):
         self.depth = depth
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        fits = self.sender.fits
-        helps = [k for k in range(len(queue)) if fits(queue[:k] + queue[k + 1 :], newcomer)]
-        if fits(queue, newcomer) and (len(queue) < self.depth or not helps):
-            return ACCEPT
-        return helps[0] if helps else REJECT
+        return ACCEPT if len(queue) < self.depth and self.sender.fits(queue, newcomer) else 0
 
 
 class Anything(Policy):

@@ -13,7 +13,9 @@ class Policy:
     sender = None  # whose policy it is
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        return self.full(queue, newcomer, L, last_dequeued, previous) if len(queue) == L else ACCEPT
+        if self.sender.fits(queue, newcomer):
+            return ACCEPT
+        return self.full(queue, newcomer, len(queue), last_dequeued, previous)
 
     def departed(self, queue):
         pass
@@ -43,11 +45,19 @@ def one_of(candidates, uniform):
     return candidates[math.floor(uniform * len(candidates))]
 
 
+def uniform_of(newcomer, sender):
+    """Its draw; for each time that it is asked about again, the next of Lehmer's sequence."""
+    uniform = newcomer["uniform"]
+    for _ in range(sender.evictions):
+        uniform = math.fmod(7919 * uniform, 1)
+    return uniform
+
+
 class Random(Policy):
     """The victim is uniform over the queue and the newcomer."""
 
     def full(self, queue, newcomer, L, last_dequeued, previous):
-        return one_of([*range(L), REJECT], newcomer["uniform"])
+        return one_of([*range(L), REJECT], uniform_of(newcomer, self.sender))
 
 
 class KeepLast(Policy):
@@ -57,7 +67,7 @@ class KeepLast(Policy):
         self.depth = depth
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        return 0 if len(queue) >= self.depth or len(queue) == L else ACCEPT
+        return 0 if len(queue) >= self.depth or not self.sender.fits(queue, newcomer) else ACCEPT
 
 
 class Lifespan(KeepLast):
@@ -93,7 +103,7 @@ class FoxgloveBacklog(Policy):
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
         waiting = sum(m["bytes"] for m in queue) + self.sender.left_bytes(newcomer["us"])
-        if waiting + newcomer["bytes"] >= self.limit or len(queue) == L:
+        if waiting + newcomer["bytes"] >= self.limit or not self.sender.fits(queue, newcomer):
             return REJECT
         return ACCEPT
 
@@ -162,7 +172,8 @@ class Red(Policy):
         self.average, self.count = 0, -1
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        self.average += self.weight * (len(queue) - self.average)
+        in_bytes = sum(m["bytes"] for m in queue) / self.sender.max_bytes
+        self.average += self.weight * (max(len(queue), L * in_bytes) - self.average)
         filled = self.average / L
         if self.min_th <= filled < self.max_th:
             self.count += 1
@@ -176,4 +187,4 @@ class Red(Policy):
             return REJECT
         else:
             self.count = -1
-        return REJECT if len(queue) == L else ACCEPT
+        return ACCEPT if self.sender.fits(queue, newcomer) else REJECT

@@ -26,12 +26,12 @@ class Fifo:
         return len(queue) < self.capacity and len(same) < limit and few_bytes
 
     def helpful(self, queue, newcomer):
-        """What may go, and makes the newcomer fit by going."""
-        return [
-            m
-            for m in queue
-            if not self.topics[m["topic"]].no_drop and self.fits([q for q in queue if q is not m], newcomer)
-        ]
+        """What may go, where the newcomer fits in the end; of its own topic while that is at its limit."""
+        droppable = [m for m in queue if not self.topics[m["topic"]].no_drop]
+        same = [m for m in queue if m["topic"] == newcomer["topic"]]
+        if sum(m["bytes"] for m in [*queue, newcomer]) - sum(m["bytes"] for m in droppable) > self.max_bytes:
+            return []
+        return droppable if len(same) < (self.topics[newcomer["topic"]].limit or math.inf) else same
 
     def decide(self, queue, newcomer):
         if self.fits(queue, newcomer):

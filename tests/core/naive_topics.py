@@ -78,6 +78,7 @@ class Sender:
         self.dequeued, self.transmitted, self.dropped, self.order = {}, {}, {}, []
         self.limited = set()  # dropped by a rate limit
         self.rejected = self.evicted = self.invalid = 0
+        self.evictions = 0  # of those, for the newcomer
 
     # --- what there is ---------------------------------------------------------------------------------------------
 
@@ -107,14 +108,18 @@ class Sender:
                 self.drop(message)
                 self.limited.add(message["seq"])
                 self.rejected += 1
+            elif message["bytes"] > self.max_bytes:
+                self.drop(message)
+                self.rejected += 1
             else:
                 asked = first_decision <= message["seq"] <= last_decision
-                decision = ACCEPT
-                if asked and not (self.decide_at == "overflow" and self.fits(message)):
-                    self.newcomer = message
-                    decision = yield "decision"
-                    self.newcomer = None
-                self.carry_out(decision, message)
+                asked = asked and not (self.decide_at == "overflow" and self.fits(message))
+                self.newcomer = message if asked else None
+                self.evictions, settled = 0, False
+                while not settled:
+                    decision = (yield "decision") if asked else ACCEPT
+                    settled = self.carry_out(decision, message)
+                self.newcomer = None
             self.arrived[self.lane(message)].append(message)
             self.to_come -= 1
             yield from self.offer()
@@ -216,25 +221,27 @@ class Sender:
             return False
         return message["us"] - since_us[-1] < self.rules[lane].period_us
 
-    def fits(self, message, without=None):
-        """Whether the message has room, ``without`` one that is queued."""
-        rest = [m for m in self.slots() if m is not without]
-        own = [m for m in rest if self.lane(m) == self.lane(message)]
-        return (
-            len(rest) < self.capacity
-            and len(own) < self.rules[self.lane(message)].limit
-            and sum(m["bytes"] for m in rest) + message["bytes"] <= self.max_bytes
-        )
+    def within_limit(self, message):
+        return len(self.queues[self.lane(message)]) < self.rules[self.lane(message)].limit
+
+    def fits(self, message):
+        enough_bytes = sum(m["bytes"] for m in [*self.slots(), message]) <= self.max_bytes
+        return len(self.slots()) < self.capacity and self.within_limit(message) and enough_bytes
 
     def evictable(self, message):
-        """Queued messages any one of which makes room for this one and may be dropped."""
-        return [m for m in self.slots() if not self.rules[self.lane(m)].no_drop and self.fits(message, without=m)]
+        """Queued messages that may go for this one: it fits once all have, if its topic is at its limit its own."""
+        may_go = [m for m in self.slots() if not self.rules[self.lane(m)].no_drop]
+        stays_bytes = sum(m["bytes"] for m in self.slots() if m not in may_go)
+        if stays_bytes + message["bytes"] > self.max_bytes:
+            return []
+        return [m for m in may_go if self.within_limit(message) or self.lane(m) == self.lane(message)]
 
     def must_keep(self, message):
         no_drop = self.rules[self.lane(message)].no_drop
         return no_drop and (self.fits(message) or bool(self.evictable(message)))
 
     def carry_out(self, decision, message):
+        """Whether the message has been enqueued or dropped; if not, the policy is asked again."""
         slots = self.slots()
         if decision == ACCEPT and self.fits(message):
             self.enqueue(message)
@@ -242,18 +249,27 @@ class Sender:
             self.drop(message)
             self.rejected += 1
         elif 0 <= decision < len(slots) and slots[decision] in self.evictable(message):
-            self.remove(slots[decision])
-            self.enqueue(message)
+            return self.make_way(slots[decision], message)
         else:
             # What a queue does, but a no_drop message drives out the least important.
             self.invalid += 1
             if not self.fits(message) and self.must_keep(message):
-                self.remove(min(self.evictable(message), key=lambda m: self.rules[self.lane(m)].priority))
+                lowest = min(self.evictable(message), key=lambda m: self.rules[self.lane(m)].priority)
+                return self.make_way(lowest, message)
             if self.fits(message):
                 self.enqueue(message)
             else:
                 self.drop(message)
                 self.rejected += 1
+        return True
+
+    def make_way(self, victim, message):
+        self.remove(victim)
+        self.evictions += 1
+        if not self.fits(message):
+            return False
+        self.enqueue(message)
+        return True
 
     def enqueue(self, message):
         self.queues[self.lane(message)].append(message)

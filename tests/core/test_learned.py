@@ -88,19 +88,15 @@ def twin(whole):
                 mixed = math.fsum(float(made.mix[j, i]) * f[made.context[j]] * f[made.slot[i]] for j, i in pairs)
             return score(made.drop, features(k)) + mixed
 
-        queued = [int(slot.size_bytes) for slot in buffer.slots]
-        choices = [(drop_score(k), k) for k in range(s) if fits(buffer, arrival, queued[k])]
+        choices = [(drop_score(k), k) for k in range(s)]
         choices.append((drop_score(L), REJECT))
         best = max(value for value, _ in choices)
-        if s < L and fits(buffer, arrival, 0) and score(made.accept, features(L)) >= best:
+        enough = buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes
+        if s < L and enough and score(made.accept, features(L)) >= best:
             return ACCEPT
         return next(decision for value, decision in choices if value == best)
 
     return Policy("twin", on_arrival)
-
-
-def fits(buffer, arrival, freed):
-    return buffer.backlog_bytes - freed + arrival.size_bytes <= buffer.max_bytes
 
 
 @given(cases(max_messages=80), VALUES, weights(), st.integers(1, 40))

@@ -69,13 +69,21 @@ def scores(whole, net, buffer, arrival, arriving):
     return [score(net, [seen[name][k] for name in whole.fields]) for k in range(buffer.capacity + 1)]
 
 
-def with_room(buffer, arrival, without=None):
-    """Whether the newcomer would fit, ``without`` one that is queued."""
-    rest = [m for k, m in enumerate(buffer.slots) if k != without]
+def with_room(buffer, arrival, rest):
+    """Whether the newcomer would fit if the ``rest`` were all that is queued."""
     own = sum(m.topic == arrival.topic for m in rest)
     bytes_then = sum(int(m.size_bytes) for m in rest) + int(arrival.size_bytes)
     enough = bytes_then <= buffer.max_bytes
     return len(rest) < buffer.capacity and own < buffer.topics[arrival.topic].limit and enough
+
+
+def may_go(buffer, arrival, k):
+    """Whether this one and others that may be dropped make room, of its own topic while that is at its limit."""
+    free = [m for m in buffer.slots if buffer.topics[m.topic].no_drop == 0]
+    own = [m for m in buffer.slots if m.topic == arrival.topic]
+    enough = with_room(buffer, arrival, [m for m in buffer.slots if buffer.topics[m.topic].no_drop == 1])
+    within = len(own) < buffer.topics[arrival.topic].limit or buffer.slots[k].topic == arrival.topic
+    return enough and within and any(m.seq == buffer.slots[k].seq for m in free)
 
 
 def twin(whole):
@@ -84,15 +92,11 @@ def twin(whole):
     def on_arrival(buffer, arrival, memory):
         stays = buffer.topics[arrival.topic].no_drop == 1
         drops = scores(whole, whole.drop, buffer, arrival, True)
-        choices = [
-            (drops[k], k)
-            for k, m in enumerate(buffer.slots)
-            if buffer.topics[m.topic].no_drop == 0 and with_room(buffer, arrival, without=k)
-        ]
+        choices = [(drops[k], k) for k in range(len(buffer.slots)) if may_go(buffer, arrival, k)]
         choices += [] if stays else [(drops[-1], REJECT)]
         best = max((value for value, _ in choices), default=-np.inf)
         accepted = scores(whole, whole.accept, buffer, arrival, True)[-1]
-        if with_room(buffer, arrival) and (stays or accepted >= best):
+        if with_room(buffer, arrival, buffer.slots) and (stays or accepted >= best):
             return ACCEPT
         return next((decision for value, decision in choices if value == best), REJECT)
 

@@ -16,7 +16,7 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.oracle import by_length, ideal, integer
-from bufgym.scenario import Interruption
+from bufgym.scenario import Interruption, Streams, registry
 from bufgym.sim import run
 
 # The number of examples is set where one of them is hundreds of runs.
@@ -86,6 +86,23 @@ def test_no_policy_beats_it(v):
             if name not in LEAVES_ROOM:
                 fits = np.array(LENGTHS) <= L
                 assert gained[fits] == pytest.approx(best[fits], abs=1e-9)
+
+
+@pytest.mark.parametrize("limits", [{}, {"max_bytes": 3 * 230_000}])
+def test_as_a_policy_it_reaches_its_number(limits):
+    v = qoi.exponential()
+    for L in CAPACITIES:
+        senders = run(policies.get("oracle"), EPISODES, L, v, **limits)
+        best = [integer(min(L, 3) if limits else L, T, v) for T in LENGTHS]
+        assert senders.batch.senders["delivered_gain"] == pytest.approx(best, abs=1e-9)
+        assert not senders.batch.senders["invalid"].any()
+
+
+def test_as_a_policy_it_plays_one_interruption_only():
+    assert "oracle" not in policies.names() and "oracle" in policies.names(named_only=True)
+    assert policies.get("oracle").unranked_because == "it knows the future"
+    with pytest.raises(BufgymError, match="policy oracle: it plans for one interruption"):
+        run(policies.get("oracle"), [registry.get("lte").draw(Streams.seeded(0))], 4, qoi.exponential())
 
 
 SCENARIO = Interruption(t_max=max(LENGTHS))

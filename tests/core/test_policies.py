@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import naive_policies as naive
 import numpy as np
 import pytest
-from cases import VALUES, cases, log, order, same
+from cases import VALUES, cases, log, newcomer, order, queue_of, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -60,12 +60,12 @@ def test_each_says_what_it_is(name):
 
 
 @pytest.mark.parametrize("name", ALL)
-@given(cases(max_bytes=False), VALUES)
+@given(cases(), VALUES)
 @settings(max_examples=25 if JIT else 8)
 def test_every_decision_is_possible_and_repeatable(name, case, v):
     policy = policies.get(name)
     if policy.unbounded:
-        case = replace(case, capacity=len(case.twin_messages))
+        case = replace(case, capacity=len(case.twin_messages), max_bytes=None)
     senders = case.run(policy, v)
     # Outside the arrivals that ask, a full queue rejects without being asked: those are not the policy's.
     if case.episode.first_decision == 0 and case.episode.last_decision > len(case.twin_messages):
@@ -132,7 +132,7 @@ def test_one_place_keeps_powers_of_two(name, T):
 def ask(on_arrival, L, s, r, c, p):
     """The decision with s of L messages queued, and the memory after it."""
     memory = np.array([r, c, p], np.float64)
-    decision = on_arrival(SimpleNamespace(capacity=L, slots=[None] * s), None, memory)
+    decision = on_arrival(queue_of(s, L), newcomer(), memory)
     return decision, *memory
 
 

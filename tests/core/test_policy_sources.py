@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import naive
 import numpy as np
 import pytest
-from cases import VALUES, cases, log, order, same
+from cases import VALUES, cases, log, newcomer, order, queue_of, same
 from hypothesis import given, settings
 
 from bufgym import policies
@@ -237,12 +236,11 @@ def test_codel_leaves_a_good_queue_alone():
 
 
 def red_and_memory(spec):
-    """RED as a function of the occupancy of a queue with L = 8, the arrival and the memory; and its fresh memory."""
+    """RED as a function of the occupancy of a queue with L = 8, the arrival's draw and the memory; a fresh memory."""
     policy = policies.get(spec)
 
-    def red(s, arrival, memory):
-        buffer = SimpleNamespace(capacity=8, slots=[None] * s, parameters=policy.parameter_array)
-        return policy.on_arrival(buffer, arrival, memory)
+    def red(s, uniform, memory):
+        return policy.on_arrival(queue_of(s, 8, policy.parameter_array), newcomer(uniform), memory)
 
     return red, policy.new_memory()[0]
 
@@ -250,16 +248,16 @@ def red_and_memory(spec):
 def test_red_drops_with_p_over_1_minus_count_p():
     # Half full, between 1/4 and 3/4: p_b = 0.1 x 1/2 = 0.05. Then 0.05 / (1 - 0.05 count): uniform over 20 arrivals.
     red, memory = red_and_memory("red:weight=1")  # the average is the occupancy
-    least, most = SimpleNamespace(uniform=0.0), SimpleNamespace(uniform=1 - 1e-9)
+    least, most = 0.0, 1 - 1e-9
     for count in range(19):
         p = 0.05 / (1 - 0.05 * count)
         for uniform, decision in ((p - 1e-9, REJECT), (p + 1e-9, ACCEPT)):
-            assert red(4, SimpleNamespace(uniform=uniform), memory.copy()) == decision
+            assert red(4, uniform, memory.copy()) == decision
         assert red(4, most, memory) == ACCEPT
     assert red(4, most, memory) == REJECT  # the 20th in any case
     # Below 1/4 none, from 3/4 on all.
-    for s, arrival, decision in ((1, least, ACCEPT), (6, most, REJECT), (8, most, REJECT)):
-        assert red(s, arrival, memory.copy()) == decision
+    for s, uniform, decision in ((1, least, ACCEPT), (6, most, REJECT), (8, most, REJECT)):
+        assert red(s, uniform, memory.copy()) == decision
 
 
 def test_red_averages():
@@ -267,7 +265,7 @@ def test_red_averages():
     red, memory = red_and_memory("red")
     averages = []
     for _ in range(4):
-        red(4, SimpleNamespace(uniform=0.9), memory)
+        red(4, 0.9, memory)
         averages.append(tuple(memory))
     assert averages == [
         (pytest.approx(average), count) for average, count in ((0.8, -1), (1.44, -1), (1.952, -1), (2.3616, 0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from bufgym import policies, scenario
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.scenario import LAWS, SCENARIOS, Interruption, Streams, Uplink, messages
+from bufgym.scenario.draws import place
 from bufgym.sim import run
 from bufgym.traces import Motion
 
@@ -162,6 +163,53 @@ def test_streams_are_separate():
     assert len({stream.random() for stream in Streams.seeded(9)}) == 3
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rate_hz": 10},
+        {"rate_hz": 60.0},
+        {"jitter": 0},
+        {"jitter": 0.9},
+        {"size_cv": 0.5},
+        {"rate_hz": 7, "jitter": 0, "size_cv": 1},
+    ],
+    ids=str,
+)
+def test_other_rates_jitters_and_sizes_meet_the_same_motion_and_link(changes, monkeypatch):
+    places = []
+
+    def noted(recordings, rng, random_offset):
+        motion, start_us = place(recordings, rng, random_offset)
+        places.append((motion.name, start_us))
+        return motion, start_us
+
+    monkeypatch.setattr("bufgym.scenario.uplink.place", noted)
+    made = Uplink(traces=(STEADY, FADING), motion=(WALK, replace(WALK, name="again"), replace(WALK, name="on")))
+    links = []
+    for scenario_ in (made, replace(made, **changes)):
+        streams = Streams.seeded(4)
+        links += [scenario_.draw(streams).link for _ in range(4)]  # one after the other, as an environment does
+    assert places[:4] == places[4:] and links[:4] == links[4:]
+    assert len(set(places)) == 4
+
+
+def test_an_episode_at_30_hz_draws_its_jitter_then_its_motion():
+    # As it always has: the episodes of the suites hang on it.
+    made = Uplink(traces=(STEADY,), motion=(WALK, replace(WALK, name="again")), duration_s=2)
+    episode, rng = made.draw(Streams.seeded(11)), Streams.seeded(11).arrival
+    arrival_us = ((np.arange(60) + 0.1 * rng.random(60)) * 1e6 / 30).astype(np.int64)
+    arrival_us -= arrival_us[0]
+    assert np.abs(episode.arrivals["arrival_us"] - arrival_us).max() <= 1
+    rng.integers(2)
+    x = WALK.at(arrival_us + int(rng.integers(WALK.time_us[-1])))
+    assert episode.arrivals["x"] == pytest.approx(x - x[0], abs=1e-4)
+
+
+def test_a_law_looks_at_its_own_parameters_only():
+    assert Interruption(law="log-uniform", t_min=500, t_max=600).t_mean == 100
+    assert Interruption(law="fixed", t_min=500, t_max=9).draw_length(np.random.default_rng(0)) == 9
+
+
 def test_uniform_draws():
     episode = Interruption().episode(20)
     episode_with_uniforms, again, other = (episode.with_uniforms(np.random.default_rng(s)) for s in (1, 1, 2))
@@ -180,7 +228,7 @@ def test_uniform_draws():
         ({"law": "normal"}, "law = 'normal': must be one of fixed, uniform, log-uniform, geometric"),
         ({"t_min": 0}, "t_min = 0, t_max = 400"),
         ({"t_min": 9, "t_max": 8}, "t_min = 9, t_max = 8"),
-        ({"t_mean": 0.5}, "t_mean = 0.5: must be at least t_min = 1"),
+        ({"law": "geometric", "t_mean": 0.5}, "t_mean = 0.5: must be at least t_min = 1"),
         ({"rate_hz": 0}, "rate_hz = 0: must be a number > 0"),
         ({"rate_hz": float("nan")}, "rate_hz = nan"),
         ({"rate_hz": "30"}, "rate_hz = '30'"),

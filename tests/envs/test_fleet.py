@@ -308,3 +308,27 @@ def test_weights_shared_by_all_robots_learn():
     assert any((weights != before[name]).any() for name, weights in model.policy.state_dict().items())
     actions, _ = model.predict(envs.reset(), action_masks=np.array(envs.env_method("action_masks")))
     assert actions.shape == (8,)
+
+
+def test_a_robot_that_is_asked_again_holds_the_others_up():
+    # B = 2500. Robot 0: 1000, 1000 and 500 are queued behind its first message, then 2000 comes: both of the oldest go.
+    # Robot 1's last message, 3000, is larger than B: it is dropped unasked.
+    arrivals = [
+        messages(np.arange(5), np.array(sizes)) for sizes in ([100, 1_000, 1_000, 500, 2_000], [100] * 4 + [3_000])
+    ]
+    link = Link(Trace("slow", np.array([0, 1_000_000, 2_000_000]), np.array([0, 10, 1_000_000]), "hold"))
+    episode = FleetEpisode((arrivals[0], arrivals[1]), link)
+    env = FleetEnv(2, FleetScenario.of(2, "lte"), 8, max_bytes=2_500)
+    seen, infos = env.reset(options={"episode": episode})
+    steps = []
+    while env.agents:
+        due = [infos[agent]["action_mask"].sum() > 1 for agent in env.agents]
+        steps.append((*due, *(int(8 * seen[agent]["occupancy"][0]) for agent in env.agents)))
+        actions = {a: 9 if (mask := infos[a]["action_mask"])[9] else 0 if mask[0] else 8 for a in env.agents}
+        seen, _, _, _, infos = env.step(actions)
+    # (is robot 0 asked, is robot 1, messages queued at either)
+    assert steps[:4] == [(True, True, 0, 0), (True, True, 0, 0), (True, True, 1, 1), (True, True, 2, 2)]
+    assert steps[4:] == [(True, False, 3, 0), (True, False, 2, 0)]
+    assert all(infos[agent]["invalid"] == 0 for agent in infos)
+    rollout = run_fleet(policies.get("drop-oldest"), [episode], 8, FleetScenario.of(2, "lte").value, max_bytes=2_500)
+    assert (np.asarray(env.rows.senders.batch.log)[:, :5] == np.asarray(rollout.senders.batch.log)).all()

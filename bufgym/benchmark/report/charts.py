@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from bufgym.benchmark.report import style
 from bufgym.benchmark.report.style import Figure
 from bufgym.benchmark.score import CellScore
 from bufgym.benchmark.summary import Quantity, Summary
-from bufgym.benchmark.table import percent
+from bufgym.benchmark.table import REGRET_AT_MOST, percent
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,8 @@ def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]
     ticks = sorted({at for curve in curves.values() for at, _ in curve})
     across = style.axis(**x, showgrid=False, tickvals=ticks, ticktext=[f"{tick:g}" for tick in ticks])
     across["range"] = [math.log10(ticks[0]) - 0.03, math.log10(ticks[-1]) + 0.03]
-    layout = style.layout(430, xaxis=across, yaxis=style.log_axis("regret", low, high, style.short_percent))
+    title = regret_title(cell for curve in curves.values() for _, cell in curve)
+    layout = style.layout(430, xaxis=across, yaxis=style.log_axis(title, low, high, style.short_percent))
     layout["annotations"] = _end_labels(context, curves, (low, high), 370)
     longest = max([len(policy) for policy in curves if policy in context.colours], default=0)
     layout["margin"] = {**layout["margin"], "r": max(120, 7 * longest + 12)}
@@ -241,6 +242,11 @@ def _end_labels(context: Context, curves: dict[str, Curve], span: tuple[float, f
         at = {"x": 1, "xref": "paper", "xanchor": "left", "xshift": 6, "y": y, "yshift": round(shift, 1)}
         labels.append({**style.note(style.text(policy), **at), "font": font})
     return labels
+
+
+def regret_title(cells: Iterable[CellScore]) -> str:
+    """The title of an axis of regrets."""
+    return "regret" if all(cell.exact for cell in cells) else REGRET_AT_MOST
 
 
 def regret_range(regrets: Sequence[float]) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from bufgym.benchmark import table
 from bufgym.benchmark.report import style
-from bufgym.benchmark.report.charts import Chart, Context, middle_first, regret_range, with_interval
+from bufgym.benchmark.report.charts import Chart, Context, middle_first, regret_range, regret_title, with_interval
 from bufgym.benchmark.report.style import Figure
 from bufgym.benchmark.score import CellScore
 
@@ -58,9 +58,10 @@ def _three(context: Context, cells: Mapping[str, CellScore], means: Mapping[str,
 
     low, high = regret_range([cells[name].regret.value for name in names])
     regrets = [max(cells[name].regret.value, low) for name in names]
-    column(regrets, "regret", [with_interval(cells[name].regret, table.percent) for name in names])
+    measure = regret_title(cells[name] for name in names)
+    column(regrets, measure, [with_interval(cells[name].regret, table.percent) for name in names])
     place = {"domain": [0, 0.31], "tickangle": 0}
-    axes = {"xaxis": style.log_axis("regret", low / 1.15, high, style.short_percent, (1, 3), **place)}
+    axes = {"xaxis": style.log_axis(measure, low / 1.15, high, style.short_percent, (1, 3), **place)}
     for key, title, start in (
         ("mean_sojourn_s", "mean sojourn time", 0.345),
         ("mean_age_s", "mean age of information", 0.69),

@@ -79,7 +79,8 @@ def plain(run: Run, summary: Summary) -> str:
     lines = [["policy", "rank", *(quantity.title for quantity in summary.quantities)]]
     for place in ranking(run, summary):
         lines.append([place.policy, "-" if place.rank is None else str(place.rank), *_texts(place)])
-    return "\n".join([*table.aligned(lines), *notes])
+    bound = [] if summary.scores.exact else [f"{table.UPPER_BOUND[0].upper()}{table.UPPER_BOUND[1:]}."]
+    return "\n".join([*table.aligned(lines), *bound, *notes])
 
 
 def intro(run: Run) -> list[str]:
@@ -131,7 +132,7 @@ def _score_tables(scores: Scores) -> list[str]:
     if heat.flat:
         out += ["", "\\* Drop Oldest loses under 1 % there: nothing to be gained, not counted in the ranking."]
     if heat.inexact:
-        out += ["", "† The clairvoyant is an upper bound there: the true scores lie further from 0."]
+        out += ["", "† The clairvoyant is an upper bound there: the true scores lie further from 0, regrets are lower."]
     return out
 
 

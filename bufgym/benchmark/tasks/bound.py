@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from bufgym.benchmark.rows import Row
 from bufgym.oracle import Plan, clairvoyant
+from bufgym.oracle.clairvoyant import privileged
 from bufgym.oracle.measure import regret
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, Scenario
@@ -30,9 +31,9 @@ def meet(
     max_bytes: int | None = None,
     decide_at: str = "arrival",
 ) -> Senders:
-    """The senders after ``policy`` met the episodes; a privileged policy reads the plans that are known already."""
+    """The senders after ``policy`` met the episodes; the clairvoyant reads the plans that are known already."""
     memory = None
-    if policy.privileged is not None and all(plan is not None for plan in plans):
+    if policy.privileged is privileged and all(plan is not None for plan in plans):
         memory = padded([plan.kept for plan in plans if plan is not None])
     return run(policy, episodes, capacity, scenario.value, max_bytes=max_bytes, decide_at=decide_at, memory=memory)
 

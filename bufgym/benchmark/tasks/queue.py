@@ -9,7 +9,7 @@ from typing import Any
 from bufgym.benchmark.rows import RUNS, Row
 from bufgym.benchmark.score import scores
 from bufgym.benchmark.summary import Quantity, Standing, Summary
-from bufgym.benchmark.table import percent, score
+from bufgym.benchmark.table import REGRET_AT_MOST, percent, score
 from bufgym.benchmark.tasks import bound, timeline
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.benchmark.tuned import tuned
@@ -84,6 +84,8 @@ class QueueTask(Task):
     def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
         scored = scores(rows, unranked=unranked, **options)
         quantities = self.quantities(scored.reference)
+        if not scored.exact:
+            quantities = tuple(q._replace(title=REGRET_AT_MOST) if q.key == "regret" else q for q in quantities)
         overall = [
             Standing(s.policy, s.ranked, {quantity.key: getattr(s, quantity.key) for quantity in quantities})
             for s in scored.standings
