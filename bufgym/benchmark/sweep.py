@@ -58,6 +58,8 @@ class Sweep:
     """A Python file that registers policies; it is run wherever shards run."""
     sources: tuple[str, ...] = ()
     """Files of models and functions of modules (``bufgym.benchmark.sources``), loaded wherever shards run."""
+    folder: str = field(default_factory=os.getcwd)
+    """Where the sources lie."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
 
@@ -146,7 +148,7 @@ def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
         load(sweep.policy_file)
         _LOADED.add(sweep.policy_file)
     for source in sweep.sources:
-        sources.load(source)
+        sources.load(source, sweep.folder)
     scenario = sweep.setting(shard.label, shard.trace).scenario
     return run(sweep.policies, scenario, sweep.capacities, shard.seeds, label=shard.label)
 
@@ -249,7 +251,7 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
         "seeds": sweep.seeds,
         "changes": dict(sweep.changes),
         "policy_file": code and hashlib.sha256(code).hexdigest()[:16],
-        "sources": sources.digests(sweep.sources) or None,
+        "sources": sources.digests(sweep.sources, sweep.folder) or None,
         "scenarios": {
             label: {
                 "about": setting.about,

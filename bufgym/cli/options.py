@@ -89,8 +89,8 @@ def split_policies(text: str) -> list[str]:
 
 
 SOURCES = (
-    "; also mine.safetensors, mine.zip of stable-baselines3 or sb3-contrib, and module:function (a policy, or what makes"
-    " one; from the current folder too): a zip and a module run code, so use only what you trust"
+    "; also mine.safetensors, mine.zip of stable-baselines3 or sb3-contrib, and module:function (a policy, or what"
+    " makes one; from the current folder too): a zip and a module run code, so use only what you trust"
 )
 """What ``--policies`` takes besides names, for commands that use ``loaded``."""
 

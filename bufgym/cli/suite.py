@@ -102,7 +102,7 @@ def run_suite(
         options.data,
         options.policy_file,
         sources,
-        given(options, changes),
+        changes=given(options, changes),
     )
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "run" if options.out is None or file is not None else Path(options.out)
