@@ -15,6 +15,7 @@ from bufgym.sim.state import (
     NOTHING_WAITS,
     UNASKED,
     Batch,
+    place_of,
 )
 
 # Weights of the running means: about the last 8 arrivals for the period, 16 for the service ratio.
@@ -153,7 +154,7 @@ def remove(batch: Batch, i: int, k: int) -> None:
     gone = at(batch.slots, i, sender.first + k)
     sender.backlog_bytes -= gone.size_bytes
     sender.retained_gain -= gone.gain
-    at(batch.log, i, gone.seq).dropped_us = sender.now_us
+    at(batch.log, i, place_of(batch, i, gone)).dropped_us = sender.now_us
     if sender.topics > 1:
         at(batch.topics, i, gone.topic).queued -= 1
     j = rules.kept_after(batch, i, k, gone.topic)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bufgym.kernel import at, kernel
 from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.rules import dequeued_on_topic, received_on_topic, sendable
-from bufgym.sim.state import CARRIES, FREED, HELD, IDLE, UNASKED, Batch
+from bufgym.sim.state import CARRIES, FREED, HELD, IDLE, UNASKED, Batch, place_of
 
 
 @kernel
@@ -30,13 +30,15 @@ def dequeue(batch: Batch, i: int, k: int) -> None:
     first = sender.first
     if k > 0:
         # All but its gain stands in the list of arrivals as well.
-        seq, gain = at(batch.slots, i, first + k).seq, at(batch.slots, i, first + k).gain
+        sent = at(batch.slots, i, first + k)
+        place, gain = place_of(batch, i, sent), sent.gain
         for j in range(first + k, first, -1):
             batch.slots[i, j] = at(batch.slots, i, j - 1)
-        batch.slots[i, first] = at(batch.arrivals, i, seq)
+        batch.slots[i, first] = at(batch.arrivals, i, place)
         at(batch.slots, i, first).gain = gain
     head = at(batch.slots, i, first)
-    batch.order[i, sender.dequeued] = head.seq
+    place = place_of(batch, i, head)
+    batch.order[i, sender.dequeued] = place
     sender.busy += 1
     sender.first += 1
     sender.occupancy -= 1
@@ -45,7 +47,7 @@ def dequeue(batch: Batch, i: int, k: int) -> None:
     sender.last_dequeue_us = sender.now_us
     sender.departures += 1
     sender.socket, sender.chosen = UNASKED, 0
-    entry = at(batch.log, i, head.seq)
+    entry = at(batch.log, i, place)
     entry.dequeued_us, entry.gain = sender.now_us, head.gain
     if sender.topics > 1:
         dequeued_on_topic(batch, i, head)

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import records
+from bufgym.kernel import kernel, records
 from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC, row_width
 from bufgym.model.documented import documented
 from bufgym.model.qoi import exponential
@@ -155,6 +155,12 @@ def new_batch(n: int, capacity: int, messages: int, topics: int, v: NDArray[np.f
         v,
         records((n, topics), TOPIC),
     )
+
+
+@kernel
+def place_of(batch: Batch, i: int, message: Any) -> int:
+    """Where ``message`` stands in the log: its ``seq``, but inside it, whatever a compiled policy wrote there."""
+    return int(max(0, min(message.seq, batch.senders[i].arrivals - 1)))
 
 
 @functools.cache

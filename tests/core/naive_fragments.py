@@ -57,7 +57,7 @@ class ZenohDrop(DropNewest):
     def decide(self, queue, newcomer, L, last_dequeued, previous):
         ahead = self.pipe.look(queue, self.sender, newcomer["us"])
         size, put = newcomer["bytes"], 0
-        if len(queue) == L:
+        if not self.sender.fits(queue, newcomer):
             self.pipe.note(ahead, 0)
             return REJECT
         for deadline in self.deadlines():
@@ -77,7 +77,8 @@ class BestEffort(DropNewest):
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
         ahead = self.pipe.look(queue, self.sender, newcomer["us"])
-        kept = newcomer["bytes"] if len(queue) < L and ahead + newcomer["bytes"] <= self.room else 0
+        at_once = ahead + newcomer["bytes"] <= self.room
+        kept = newcomer["bytes"] if at_once and self.sender.fits(queue, newcomer) else 0
         self.pipe.note(max(ahead, min(self.room, ahead + newcomer["bytes"])), kept)
         return ACCEPT if kept else REJECT
 
@@ -88,10 +89,13 @@ class Reliable(KeepLast):
         self.room, self.pipe = queue_kb * 1e3, Pipe(rate_memory_s)
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
+        decision = super().decide(queue, newcomer, L, last_dequeued, previous)
+        if self.sender.evictions > 0:
+            self.pipe.own -= queue[0]["bytes"] if decision == 0 else 0
+            return decision
         ahead, rate = self.pipe.look(queue, self.sender, newcomer["us"]), self.pipe.rate
         depth, size = min(self.depth, L), newcomer["bytes"]
         in_time = rate is None or ahead + depth * size <= rate * depth * self.sender.periods[-1]
-        decision = super().decide(queue, newcomer, L, last_dequeued, previous)
         kept = size - queue[0]["bytes"] if decision == 0 else size
         if ahead + size > self.room and not in_time:
             decision, kept = REJECT, 0
@@ -110,7 +114,7 @@ class FrameDropper(DropNewest):
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
         ahead = self.pipe.look(queue, self.sender, newcomer["us"])
-        keep = len(queue) < L
+        keep = self.sender.fits(queue, newcomer)
         if self.pipe.rate is not None:
             self.set_rates(self.pipe.rate)
             self.leak()

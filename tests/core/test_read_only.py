@@ -36,6 +36,17 @@ def renumbers(buffer: Any, arrival: Any, memory: Any) -> int:
     return ACCEPT if len(buffer.slots) < buffer.capacity else 0
 
 
+def numbers_queued_wildly(buffer: Any, arrival: Any, memory: Any) -> int:
+    if len(buffer.slots) > 0:
+        buffer.slots[0].seq = 10**9
+    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
+
+
+def numbers_arrivals_wildly(buffer: Any, arrival: Any, memory: Any) -> int:
+    arrival.seq = -(10**9)
+    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
+
+
 def moves(buffer: Any, arrival: Any, memory: Any) -> int:
     arrival.x *= 1000
     return ACCEPT if len(buffer.slots) < buffer.capacity else 0
@@ -59,6 +70,8 @@ def lifts_limits(buffer: Any, arrival: Any, memory: Any) -> int:
 
 WRITERS = {
     renumbers: "not every message was sent, dropped or queued exactly once",
+    numbers_queued_wildly: "not every message was sent, dropped or queued exactly once",
+    numbers_arrivals_wildly: "a message that arrived is not as the episode has it",
     moves: "a message that arrived is not as the episode has it",
     shrinks: "a message that arrived is not as the episode has it",
     shrinks_queued: "the queue's bytes are not those of its messages",
