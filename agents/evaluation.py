@@ -20,10 +20,11 @@ from agents.settings import Settings
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.run import run as run_policies
-from bufgym.benchmark.score import BASELINE, DISCRIMINATIVE, normalised_score, regret
+from bufgym.benchmark.score import DISCRIMINATIVE, regret
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.benchmark.tasks import bound
 from bufgym.errors import BufgymError
+from bufgym.oracle import measure
+from bufgym.oracle.measure import BASELINE, normalised_score
 from bufgym.policies import Policy
 from bufgym.sb3 import takes_masks
 from bufgym.scenario import Episode
@@ -121,7 +122,7 @@ class EvaluationSet:
         for key, result in zip(self._keys, outcomes, strict=True):
             fixed = self._fixed[*_name(key), BASELINE]
             known = {"clairvoyant": fixed["clairvoyant"], "certified": fixed["certified"]}
-            known["regret"] = bound.regret(result.qoi, known["clairvoyant"])
+            known["regret"] = measure.regret(result.qoi, known["clairvoyant"])
             rows.append({**key, "policy": name, **asdict(result), **known, "training_seed": training_seed})
         return rows
 

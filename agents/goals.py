@@ -22,11 +22,12 @@ from agents.page import columns_of, command, publish, table, written
 from agents.runs import MODEL, read_settings
 from bufgym import files, policies
 from bufgym.benchmark.bootstrap import Interval
-from bufgym.benchmark.score import BASELINE, regret, scores
+from bufgym.benchmark.score import regret, scores
 from bufgym.benchmark.sweep import Sweep
 from bufgym.errors import BufgymError
 from bufgym.oracle import law, online_optimum
 from bufgym.oracle.lengths import EveryLength
+from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy, registry
 from bufgym.scenario import Interruption
 from bufgym.scenario.suites import get as suite_of

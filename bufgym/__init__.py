@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 ENVIRONMENTS = {
     "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)"),
     "bufgym/Uplink-v0": ("lte", "a camera stream over bandwidth traces"),
+    "bufgym/Suite-v0": ("suite", "the episodes of a benchmark suite, split by split"),
     "bufgym/Topics-v0": ("topics", "many topics over one uplink: what to drop, and what to send next (Robofleet)"),
 }
 """Id -> (name of the scenario, what it is)."""

@@ -15,6 +15,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from bufgym import kernel
+
+kernel.compile_silently()  # tests count lines on stderr
+
 REPO = Path(__file__).resolve().parent.parent
 COMPILED = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
 

@@ -40,6 +40,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "bufgym/Interruption-v0": {"capacity": 3, "t_max": 20},
     "bufgym/Uplink-v0": {"capacity": 3, "duration_s": 1.0, "size_bytes": 1_000_000},
     "bufgym/Topics-v0": {"capacity": 3, "duration_s": 0.1},
+    "bufgym/Suite-v0": {"capacity": 3, "suite": "interruption-v1"},
 }
 L = 3
 

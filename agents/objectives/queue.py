@@ -20,9 +20,9 @@ from agents.objectives.objective import Objective
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.benchmark.run import by_trace, draw
-from bufgym.benchmark.score import BASELINE
-from bufgym.benchmark.tasks.bound import best, regret
+from bufgym.benchmark.tasks.bound import best
 from bufgym.oracle.lengths import EveryLength
+from bufgym.oracle.measure import BASELINE, regret
 from bufgym.policies import Policy, learned
 from bufgym.policies.learned import Weights
 from bufgym.scenario import Interruption, Uplink

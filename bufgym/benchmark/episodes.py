@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-
-TIE = 1e-9
-"""Two H that differ by less, relative to their size, are equal: sums of the same gaps in another order."""
+from bufgym.oracle.measure import TIE
 
 Numbers = NDArray[np.float64]
 Cell = tuple[str, int]

@@ -20,7 +20,10 @@ _KINDS = {
     **dict.fromkeys(("unranked", "scenarios", "changes"), dict),
 }
 
-_SAME = ["format", "bufgym", "suite", "split", "policies", "policy_file", "capacities", "seeds", "changes", "scenarios"]
+_SAME = [
+    *("format", "bufgym", "suite", "split", "policies", "policy_file", "sources"),
+    *("capacities", "seeds", "changes", "scenarios"),
+]
 """What two runs that share a folder must have in common."""
 
 

@@ -16,9 +16,9 @@ class Player:
     """Owns a policy's memory for each of ``n`` senders and turns its decisions into an environment's actions.
 
     Just before a decision the policy is called once for every departure since the one before, with the buffer as it is
-    now. Its uniform draws are the episode's (``Episode.with_uniforms``). An environment asks at arrivals, and with
-    several topics for what to send next. A policy that drops at dequeue, or has an unbounded queue, can't play: a
-    BufgymError says so.
+    now. Its uniform draws are the episode's; where an environment drew the episode, they come from its seed. It is
+    asked at arrivals, and with several topics for what to send next. A policy that drops at dequeue, or has an
+    unbounded queue, can't play: a BufgymError says so.
     """
 
     def __init__(self, policy: Policy, n: int = 1) -> None:
@@ -40,6 +40,7 @@ class Player:
 
         Where the socket asks: 0..L-1 send, L hold. BufgymError where no decision is due, or the policy gave none.
         """
+        senders.draw_uniforms(i)
         batch = named(senders.batch._replace(parameters=self._parameters))
         sender = batch.senders[i]
         if sender.waiting not in (ARRIVAL_WAITS, SOCKET_WAITS):

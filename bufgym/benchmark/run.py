@@ -14,19 +14,14 @@ from typing import Any
 
 from bufgym.benchmark import tasks
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.tasks.task import draw
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
+from bufgym.scenario.numbered import by_trace, draw
 
 __all__ = ["bar", "by_trace", "check_distinct", "draw", "run"]
 
 _BATCH_MESSAGES = 1_000_000
 """Messages held at a time (88 bytes each): many seeds run in several batches."""
-
-
-def by_trace(scenario: Any) -> list[tuple[str, Any]]:
-    """The scenario split into one for each of its traces: (label, scenario). Equal names get a number."""
-    return tasks.of(scenario).by_trace(scenario)
 
 
 def run(
@@ -58,7 +53,7 @@ def run(
     check_distinct(policies)
     for policy in policies:
         task.check(policy)
-    parts = task.by_trace(scenario)
+    parts = by_trace(scenario)
     at_once = max(1, _BATCH_MESSAGES // task.messages(scenario))
     batches = [numbers[k : k + at_once] for k in range(0, len(numbers), at_once)]
     rows: list[Row] = []

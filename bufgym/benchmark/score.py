@@ -33,11 +33,9 @@ from bufgym.benchmark.bootstrap import (
     stream,
     times_drawn,
 )
-from bufgym.benchmark.episodes import TIE, Cell, Numbers, Table
+from bufgym.benchmark.episodes import Cell, Numbers, Table
 from bufgym.errors import BufgymError
-
-BASELINE = "drop-oldest"
-"""What ROS does: its score is 0."""
+from bufgym.oracle.measure import BASELINE, TIE, normalised_score
 
 DISCRIMINATIVE = 0.01
 """A cell is discriminative, and counts, where the baseline's regret is at least this."""
@@ -115,14 +113,6 @@ class Scores:
 
 
 # --- the statistics --------------------------------------------------------------------------------------------------
-
-
-def normalised_score(h: Numbers, base: Numbers, best: Numbers) -> Numbers:
-    """(sum H - sum H_baseline) / (sum H_clairvoyant - sum H_baseline), from the three sums; not clipped.
-
-    0 is the baseline (Drop Oldest: what ROS does), 1 the clairvoyant; NaN where the baseline leaves nothing to gain.
-    """
-    return ratio(h - base, best - base, best - base > TIE * np.abs(best))
 
 
 def regret(h: Numbers, best: Numbers) -> Numbers:

@@ -21,18 +21,17 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import __version__, policies
-from bufgym.benchmark import cluster, manifest, tasks
+from bufgym.benchmark import cluster, manifest, sources, tasks
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
 from bufgym.benchmark.run import bar, by_trace, check_distinct, run
 from bufgym.benchmark.tasks import Task
-from bufgym.errors import BufgymError, line_in
+from bufgym.errors import BufgymError
 from bufgym.files import locked
 from bufgym.scenario import suites
+from bufgym.scenario.numbered import SEEDS_PER_TRACE
 from bufgym.scenario.suites import Setting
 
-SEEDS_PER_TRACE = 1000
-"""Episode s of trace k has the seed 1000 k + s: no two traces of a scenario share a draw."""
 _SEEDS_PER_SHARD = 25
 
 Load = Callable[[str | None], None]
@@ -57,6 +56,10 @@ class Sweep:
     """Folder of recordings, for suites that need one."""
     policy_file: str | None = None
     """A Python file that registers policies; it is run wherever shards run."""
+    sources: tuple[str, ...] = ()
+    """Files of models and functions of modules (``bufgym.benchmark.sources``), loaded wherever shards run."""
+    folder: str = field(default_factory=os.getcwd)
+    """Where the sources lie."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
 
@@ -144,6 +147,8 @@ def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
     if load is not None and sweep.policy_file is not None and sweep.policy_file not in _LOADED:
         load(sweep.policy_file)
         _LOADED.add(sweep.policy_file)
+    for source in sweep.sources:
+        sources.load(source, sweep.folder)
     scenario = sweep.setting(shard.label, shard.trace).scenario
     return run(sweep.policies, scenario, sweep.capacities, shard.seeds, label=shard.label)
 
@@ -157,7 +162,7 @@ def _attempt(number: int, shard: Shard, load: Load | None, parent: int) -> tuple
         return number, error
     except Exception as error:
         # A traceback stays behind in the process; where in the user's own file it was must be said here.
-        place = line_in(error, shard.sweep.policy_file or "")
+        place = sources.line_of(error, shard.sweep.policy_file)
         return number, error if place is None else BufgymError(f"{place}: {type(error).__name__}: {error}")
 
 
@@ -246,6 +251,7 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
         "seeds": sweep.seeds,
         "changes": dict(sweep.changes),
         "policy_file": code and hashlib.sha256(code).hexdigest()[:16],
+        "sources": sources.digests(sweep.sources, sweep.folder) or None,
         "scenarios": {
             label: {
                 "about": setting.about,

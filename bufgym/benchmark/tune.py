@@ -21,11 +21,11 @@ from typing import Any
 from bufgym import __version__, policies
 from bufgym.benchmark import table, tuned
 from bufgym.benchmark.bootstrap import Interval, written
-from bufgym.benchmark.episodes import TIE
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.score import BASELINE, Scores, scores
+from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.errors import BufgymError
+from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.scenario import suites
 
 

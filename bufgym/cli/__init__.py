@@ -16,10 +16,24 @@ import sys
 from collections.abc import Sequence
 
 from bufgym import __version__
-from bufgym.cli import bench, export, figures, fleet, leaderboard, listing, perf, play, report, topics, traces, tune
+from bufgym.cli import (
+    bench,
+    export,
+    figures,
+    fleet,
+    leaderboard,
+    listing,
+    perf,
+    play,
+    report,
+    topics,
+    traces,
+    tune,
+    warmup,
+)
 from bufgym.cli.listing import _LISTS, KINDS, environments
 from bufgym.cli.options import Parser, split_policies
-from bufgym.errors import BufgymError, line_in, printable
+from bufgym.errors import BufgymError, printable
 
 __all__ = ["KINDS", "_LISTS", "environments", "main", "split_policies"]
 
@@ -48,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _drop_output()
         return _failed(f"{file}{error.strerror or error}")
     except Exception as error:
-        place = line_in(error, policy_file) if policy_file else None
+        place = _in_the_callers_code(error, policy_file)
         if place is not None:
             return _failed(f"{place}: {type(error).__name__}: {error}")
         if policy_file and type(error).__module__.startswith("numba."):
@@ -78,7 +92,21 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"bufgym {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     # In the order in which --help shows them.
-    for module in (listing, bench, topics, fleet, report, tune, leaderboard, traces, figures, perf, play, export):
+    for module in (
+        listing,
+        bench,
+        topics,
+        fleet,
+        report,
+        tune,
+        leaderboard,
+        traces,
+        figures,
+        perf,
+        play,
+        export,
+        warmup,
+    ):
         module.add(commands)
     return parser
 
@@ -90,6 +118,15 @@ def _failed(message: str) -> int:
     with contextlib.suppress(OSError):
         print(f"bufgym: error: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
     return 2
+
+
+def _in_the_callers_code(error: Exception, policy_file: str | None) -> str | None:
+    """The file and line of the caller's own that the error came from; None if it came from elsewhere."""
+    if policy_file is None and "bufgym.benchmark.sources" not in sys.modules:
+        return None
+    from bufgym.benchmark import sources
+
+    return sources.line_of(error, policy_file)
 
 
 def _gist(error: Exception) -> str:

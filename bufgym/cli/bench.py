@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bufgym.cli.options import Commands, command, count, load_policies, policy_specs, refuse
+from bufgym.cli.options import Commands, command, count, load_policies, loaded, refuse
 from bufgym.cli.scenarios import scenario, scenario_options
 from bufgym.cli.suite import SUITE_OPTIONS, out_options, run_suite, suite_options, target, who_options
 from bufgym.cli.trace_bags import WORKLOAD_OPTIONS
@@ -63,7 +63,7 @@ def _scenario(options: argparse.Namespace) -> None:
             raise BufgymError("--drops needs --workload")
     options.capacity = options.capacity or [8]
     options.decide_at = options.decide_at or "arrival"
-    specs = policy_specs(options.policies) or policies.names(for_topics=False)
+    specs = loaded(options.policies)[0] or policies.names(for_topics=False)
     chosen = [policies.get(spec) for spec in specs]
     if options.decide_at == "overflow" and not options.policies:
         chosen = [policy for policy in chosen if policy.privileged is None]  # see QueueTask.check

@@ -88,19 +88,35 @@ def split_policies(text: str) -> list[str]:
     return specs
 
 
-def policies_option(parser: argparse._ActionsContainer, default: str) -> None:
-    """Add the option ``--policies``; ``policy_specs`` reads it."""
+SOURCES = (
+    "; also mine.safetensors, mine.zip of stable-baselines3 or sb3-contrib, and module:function (a policy, or what"
+    " makes one; from the current folder too): a zip and a module run code, so use only what you trust"
+)
+"""What ``--policies`` takes besides names, for commands that use ``loaded``."""
+
+
+def policies_option(parser: argparse._ActionsContainer, default: str, also: str = "") -> None:
+    """Add the option ``--policies``; ``policy_specs`` reads it, or ``loaded``."""
     parser.add_argument(
         "--policies",
         nargs="+",
         metavar="A,B:x=1,C",
-        help=f"policies, with settings as in decimate:every=2 (default: {default})",
+        help=f"policies, with settings as in decimate:every=2 (default: {default}){also}",
     )
 
 
 def policy_specs(texts: Sequence[str] | None) -> list[str]:
     """The policies that ``--policies`` names, with commas or as several words; none if it was not given."""
     return [spec for text in texts or () for spec in split_policies(text)]
+
+
+def loaded(texts: Sequence[str] | None) -> tuple[list[str], tuple[str, ...]]:
+    """The policies that ``--policies`` names, all of them registered now, and which of the words had to be loaded."""
+    from bufgym.benchmark import sources
+
+    words = policy_specs(texts)
+    found = tuple(word for word in words if sources.is_source(word))
+    return [sources.load(word) if word in found else word for word in words], found
 
 
 def given(options: argparse.Namespace, names: tuple[str, ...]) -> dict[str, Any]:

@@ -9,13 +9,13 @@ import sys
 from typing import Any
 
 from bufgym.cli.listing import environments
-from bufgym.cli.options import Commands, command, count, least_0, load_policies, natural, policy_file
+from bufgym.cli.options import Commands, command, count, least_0, load_policies, loaded, natural, policy_file
 from bufgym.errors import BufgymError
 
 
 def add(commands: Commands) -> None:
     play = command(commands, "play", _play, "watch a policy decide, in the terminal")
-    play.add_argument("--policies", default="afr", metavar="NAME", help="the policy, named as in bench (%(default)s)")
+    play.add_argument("--policies", default="afr", metavar="NAME", help="the policy, as in bench (%(default)s)")
     play.add_argument("--env", default="Uplink-v0", help="environment (%(default)s)")
     play.add_argument("--capacity", type=count, default=8, metavar="L", help="L, messages (%(default)s)")
     play.add_argument("--seed", type=natural, default=0, help="which episode: that of bench's seed (%(default)s)")
@@ -34,7 +34,8 @@ def _play(options: argparse.Namespace) -> None:
     from bufgym.benchmark.run import draw
 
     load_policies(options.policy_file)
-    policy = policies.get(options.policies)
+    (name,) = loaded([options.policies])[0]
+    policy = policies.get(name)
     known = environments()
     id = options.env if "/" in options.env else f"bufgym/{options.env}"
     if id not in known:

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bufgym.cli.options import (
+    SOURCES,
     capacities,
     episodes,
     given,
     load_policies,
+    loaded,
     policies_option,
     policy_file,
-    policy_specs,
 )
 from bufgym.errors import BufgymError
 
@@ -41,7 +42,7 @@ def suite_options(parser: argparse.ArgumentParser, default: str = "") -> None:
 def who_options(parser: argparse.ArgumentParser, policies: str, capacity: str, seeds: str) -> None:
     """Add the options that say who runs; the arguments tell the defaults."""
     group = parser.add_argument_group("who runs")
-    policies_option(group, policies)
+    policies_option(group, policies, SOURCES)
     group.add_argument("--capacity", type=capacities, metavar="L,...", help=f"capacities L, messages ({capacity})")
     group.add_argument("--seeds", type=episodes, metavar="N", help=f"episodes on each trace ({seeds})")
     policy_file(group)
@@ -91,15 +92,17 @@ def run_suite(
     if kind not in (None, suite.kind):
         raise BufgymError(f"suite {suite.name} is not one of {kind}: bufgym bench --suite {suite.name}")
     task = TASKS[suite.kind]
+    specs, sources = loaded(options.policies)
     sweep = Sweep(
         suite.name,
-        tuple(policy_specs(options.policies) or task.default_policies(suite.name)),
+        tuple(specs or task.default_policies(suite.name)),
         options.split or "test",
         tuple(options.capacity or ()),
         options.seeds,
         options.data,
         options.policy_file,
-        given(options, changes),
+        sources,
+        changes=given(options, changes),
     )
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "run" if options.out is None or file is not None else Path(options.out)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bufgym.cli.options import Commands, command, given, load_policies, policy_specs, positive, refuse
+from bufgym.cli.options import Commands, command, given, load_policies, loaded, positive, refuse
 from bufgym.cli.suite import SUITE_OPTIONS, out_options, run_suite, suite_options, target, who_options
 from bufgym.errors import BufgymError, printable
 
@@ -49,7 +49,7 @@ def _topics(options: argparse.Namespace) -> None:
 
     load_policies(options.policy_file)
     task = TASKS["topics"]
-    specs = policy_specs(options.policies) or task.default_policies(SUITE)
+    specs = loaded(options.policies)[0] or task.default_policies(SUITE)
     names = [policies.get(spec).name for spec in dict.fromkeys([*specs, task.baseline])]
     by_name = None if options.by_topic is None else policies.get(options.by_topic).name
     if by_name is not None and by_name not in names:

@@ -15,6 +15,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym import scenario as scenarios
+from bufgym.envs.bound import BOUND, check_one_queue, measured
 from bufgym.envs.observation import Observation, ObservationForm
 from bufgym.envs.step import StepOutput, begin_cells, begin_rows, step_cells, step_rows
 from bufgym.errors import BufgymError
@@ -28,6 +29,7 @@ from bufgym.observe import (
     RewardTerm,
 )
 from bufgym.scenario import FleetScenario, Scenario, Streams
+from bufgym.scenario.numbered import numbered
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
 
@@ -60,6 +62,17 @@ def check_render_mode(render_mode: str | None, known: Sequence[str]) -> str | No
     return render_mode
 
 
+NUMBERED = ("scenario", "trace", "seed")
+"""What names an episode of a benchmark: see ``bufgym.scenario.numbered``."""
+
+
+def _checked(names: Mapping[str, Any]) -> Mapping[str, Any]:
+    for name in names:
+        if name not in NUMBERED:
+            raise BufgymError(f"episode: {name!r} is unknown; known: {', '.join(NUMBERED)}")
+    return names
+
+
 class Rows:
     """n senders, each with its own random streams, stepped together.
 
@@ -79,6 +92,7 @@ class Rows:
         fields: Sequence[str] | None = None,
         observation: str = "dict",
         info: str = "full",
+        bound: bool = False,
         **parameters: Any,
     ) -> None:
         if info not in INFOS:
@@ -96,6 +110,9 @@ class Rows:
             topics=topics,
         )
         self.capacity = self.senders.capacity
+        self.bound = bound
+        if bound:
+            check_one_queue(self.senders)
         self.terms = REWARD_TERMS + (TOPIC_REWARD_TERMS if topics else ())
         self._term_names = [term.name for term in self.terms]
         self.weights = reward_weights(reward, self.terms)
@@ -128,10 +145,17 @@ class Rows:
         self.streams[i] = Streams.seeded(int(rng.integers(2**63)))
 
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
-        """Begin a new episode in each of ``rows``: ``episodes[i]``, or where that is None the next of its streams."""
+        """Begin a new episode in each of ``rows``: ``episodes[i]``, or where that is None the next of its streams.
+
+        An episode may be a dict: the arguments of ``numbered``.
+        """
         load = self.senders.load
         for i in rows.tolist():
-            load(i, self._next_episode(i) if episodes is None or episodes[i] is None else episodes[i])
+            given = None if episodes is None else episodes[i]
+            if given is None:
+                load(i, *self._next_episode(i))
+            else:
+                load(i, numbered(self.scenario, **_checked(given)) if isinstance(given, Mapping) else given)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
         begin_rows(self.senders.batch, rows, self.rewarded, self.output)
@@ -173,6 +197,8 @@ class Rows:
             info["reward_terms"] = dict(zip(self._term_names, terms, strict=True))
         if ended:
             info |= {name: number.item() for name, number in self.summary(i).items()}
+            if self.bound:
+                info |= measured(self.senders, i, info["qoi"])
         return info
 
     def observation(self, i: int | None = None) -> Observation:
@@ -191,14 +217,24 @@ class Rows:
             raise self.bad_action(name, number)
         return number
 
+    def bounds(self, ended: NDArray[np.bool_], qoi: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """By name float64[n]: what ``measured`` finds of the rows that have ``ended`` with this H; 0 elsewhere."""
+        columns = {name: np.zeros(len(self)) for name in BOUND}
+        for i in np.flatnonzero(ended).tolist():
+            for name, number in measured(self.senders, i, float(qoi[i])).items():
+                columns[name][i] = number
+        return columns
+
     def bad_action(self, name: str, action: Any) -> BufgymError:
         """The error for an action outside of 0..L+1."""
         return BufgymError(f"{name} = {action}: must lie in 0..{self.capacity + 1} (L = {self.capacity})")
 
-    def _next_episode(self, i: int) -> Any:
+    def _next_episode(self, i: int) -> tuple[Any, np.random.Generator]:
+        """The next episode of row ``i``'s streams, and what its uniform draws come from."""
         if self.streams[i] is None:
             self.seed(i, seeding.np_random()[0])
-        return self._draw(cast(Streams, self.streams[i]))
+        streams = cast(Streams, self.streams[i])
+        return self._draw(streams), streams.policy
 
 
 class FleetRows(Rows):
@@ -244,8 +280,9 @@ class FleetRows(Rows):
         for c in cells.tolist():
             episode = episodes[c] if episodes is not None else None
             if episode is None:
-                episode = self._next_episode(c * self.robots)
-            elif not episode.ticks_together:
+                self.fleet.load(c, *self._next_episode(c * self.robots))
+                continue
+            if not episode.ticks_together:
                 raise BufgymError("episode: in an environment the messages of all robots arrive at the same times")
             self.fleet.load(c, episode)
         begin_cells(self.senders.batch, self.fleet.shares, cells, self.rewarded, self.output)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.observation import Observation
-from bufgym.envs.rows import Rows, check_render_mode
+from bufgym.envs.rows import NUMBERED, Rows, check_render_mode
 from bufgym.errors import BufgymError
 from bufgym.scenario import Scenario
 
@@ -59,9 +59,16 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``fields``: names of the fields to observe; all by default. ``observation``: "dict", "flat" or "slots".
     - ``info``: "full"; "mask" for the action mask alone, and at an episode's end its summary; "none" for the summary.
     - ``render_mode``: "ansi" or "rgb_array".
-    - any further argument replaces a parameter of the scenario (``t_max=100``).
+    - ``bound``: whether the last ``info`` also has ``clairvoyant`` (the best H, or an upper bound of it), ``regret``
+      and ``score`` (0 for Drop Oldest, 1 for the clairvoyant, NaN where they are equal). One queue only; found when an
+      episode ends, in a tenth of a second where it is long.
+    - any further argument replaces a parameter of the scenario (``t_max=100``), as an object or as
+      the text that the command line takes (``value="saturating:0.5"``, ``traces="lte-synthetic-0"``).
 
-    ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e.
+    ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e, and
+    ``reset(options={"trace": t, "seed": s})`` the one behind that row of ``bufgym bench`` (``trace``: its label or
+    number). On ``bufgym/Suite-v0`` the row's ``scenario`` comes in addition, and ``trace`` may be left out, as the seed
+    tells it. What ``reset(seed=s)`` begins is a sequence of others.
 
     Raises ``BufgymError`` for an argument, an option or an action that does not fit, ``ResetNeeded`` for a step before
     the first reset.
@@ -80,6 +87,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         fields: Sequence[str] | None = None,
         observation: str = "dict",
         info: str = "full",
+        bound: bool = False,
         render_mode: str | None = None,
         **parameters: Any,
     ) -> None:
@@ -94,6 +102,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             fields=fields,
             observation=observation,
             info=info,
+            bound=bound,
             **parameters,
         )
         self.observation_space = self.rows.observation_space
@@ -108,10 +117,13 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         super().reset(seed=seed)
         if seed is not None or self.rows.streams[0] is None:
             self.rows.seed(0, self.np_random)
-        for name in options or {}:
-            if name != "episode":
-                raise BufgymError(f"options[{name!r}]: unknown; known: episode")
-        self.rows.reset(_ROW, [(options or {}).get("episode")])
+        options = options or {}
+        for name in options:
+            if name not in ("episode", *NUMBERED):
+                raise BufgymError(f"options[{name!r}]: unknown; known: episode, {', '.join(NUMBERED)}")
+        if "episode" in options and len(options) > 1:
+            raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")
+        self.rows.reset(_ROW, [options.get("episode", options or None)])
         return self.rows.observation(0), self.rows.info(0, self._no_terms, False)
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

@@ -30,8 +30,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     ``autoreset_mode``: one of Gymnasium's. ``options``: the other arguments of ``SenderEnv``.
 
     ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do; a sequence seeds row by row.
-    Options of ``reset``: ``reset_mask`` (bool[n], rows to reset) and ``episodes`` (one a row, None where the next is
-    drawn).
+    Options of ``reset``: ``reset_mask`` (bool[n], rows to reset) and ``episodes`` (one a row: an ``Episode``, a dict of
+    the options that name one in ``SenderEnv``, or None where the next is drawn).
 
     ``info`` has Gymnasium's form: ``info["action_mask"]`` int8[n, L + 2], ``info["qoi"]`` float64[n],
     ``info["invalid"]`` int64[n], ``info["reward_terms"]`` float64[n] by name; with SAME_STEP autoreset
@@ -177,6 +177,10 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         last: dict[str, Any] = {}
         for name, column in rows.summary(slice(None)).items():
             last |= {name: np.where(done, column, 0), f"_{name}": done}
+        if rows.bound:
+            ended = done & rows.output.terminated
+            for name, column in rows.bounds(ended, rows.output.qoi).items():
+                last |= {name: column, f"_{name}": ended}
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
             return last
         # One observation for each row that ended, None for the others, as in Gymnasium's SyncVectorEnv.

@@ -307,6 +307,12 @@ def get(spec: str | Policy) -> Policy:
     return entry.with_parameters(**numbers)
 
 
+def registered_as(function: OnArrival) -> Policy | None:
+    """The policy that ``register`` made of this function; None if there is none."""
+    made = (entry for entry in _REGISTRY.values() if isinstance(entry, Policy))
+    return next((policy for policy in made if policy.on_arrival is function), None)
+
+
 def runs_compiled(policy: Policy) -> bool:
     """Whether this policy's functions run inside compiled rollouts."""
     return policy.compile

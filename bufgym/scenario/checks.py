@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+from bufgym import traces
 from bufgym.errors import BufgymError
+from bufgym.model import qoi
 from bufgym.model.checks import above_0, between, whole
 from bufgym.model.link import MAX_TIME_US
 from bufgym.model.qoi import Value
@@ -71,22 +73,35 @@ def check_stream(stream: Any) -> None:
 
 
 def check_value(scenario: object) -> None:
-    """The parameter ``value`` is a ``Value``."""
+    """The parameter ``value`` is a ``Value``; text becomes one."""
     value = getattr(scenario, "value")  # noqa: B009  (every kind of scenario has it)
+    if isinstance(value, str):
+        value = qoi.parse(value)
+        object.__setattr__(scenario, "value", value)
     if not isinstance(value, Value):
-        raise BufgymError(f"value = {value!r}: must be a bufgym.model.qoi Value, such as qoi.exponential(0.618)")
+        raise BufgymError(f"value = {value!r}: must be a bufgym.model.qoi Value or text, such as 'exponential:0.618'")
 
 
 def recordings(scenario: object) -> None:
-    """The parameters ``traces`` and ``motion`` become tuples of Trace and Motion; a single one becomes a tuple, too."""
-    as_tuple(scenario, "traces", Trace, "a bufgym.traces Trace")
-    as_tuple(scenario, "motion", Motion, "a bufgym.traces Motion")
+    """The parameters ``traces`` and ``motion`` become tuples of Trace and Motion; a single one becomes a tuple, too.
+
+    Text names a shipped recording or a file; the motion "none" is none.
+    """
+    if getattr(scenario, "motion") in ("none", ["none"]):  # noqa: B009
+        object.__setattr__(scenario, "motion", ())
+    as_tuple(scenario, "traces", Trace, "a bufgym.traces Trace", traces.load)
+    as_tuple(scenario, "motion", Motion, "a bufgym.traces Motion", traces.load_motion)
 
 
-def as_tuple(scenario: object, name: str, kind: Any, what: str) -> None:
-    """The parameter becomes a tuple whose items are of that kind, ``what`` in words; a single one becomes a tuple."""
+def as_tuple(scenario: object, name: str, kind: Any, what: str, load: Callable[[str], Any] | None = None) -> None:
+    """The parameter becomes a tuple whose items are of that kind, ``what`` in words; a single one becomes a tuple.
+
+    ``load``: makes an item of text.
+    """
     value = getattr(scenario, name)
-    items = value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
+    items = list(value if isinstance(value, Sequence) and not isinstance(value, str) else (value,))
+    if load is not None:
+        items = [load(item) if isinstance(item, str) else item for item in items]
     for item in items:
         if not isinstance(item, kind):
             raise BufgymError(f"{name}: {item!r} is not {what}")

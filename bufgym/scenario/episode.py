@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
@@ -63,6 +64,8 @@ class Episode:
     """int64[n], bytes of the messages in other encodings, by name; where one is missing, sizes stay the same."""
     consumers: int = 1
     """Receivers of each message: a client that sends copies sends so many."""
+    value: Value | None = None
+    """The V that its QoI is measured with; None for that of its scenario."""
     one_scene: bool = field(init=False, repr=False)
     """Whether x falls nowhere, topics apart: only then all messages can share one queue."""
 
@@ -91,10 +94,17 @@ class Episode:
                 "episode: x falls from one message to the next, as each topic has its own: not for one queue"
             )
 
+    def valued(self, value: Value) -> Episode:
+        """The same episode with a V of its own."""
+        episode = copy.copy(self)  # nothing that is checked changes
+        object.__setattr__(episode, "value", value)
+        return episode
+
     def with_uniforms(self, rng: np.random.Generator) -> Episode:
         """The same episode with a fresh uniform draw beside each arrival, for randomised policies.
 
-        ``Scenario.draw`` leaves these draws at 0: an agent in an environment has randomness of its own.
+        ``Scenario.draw`` leaves these draws at 0: an agent in an environment has randomness of its own. Where a policy
+        plays there, ``Senders.draw_uniforms`` adds them.
         """
         arrivals = self.arrivals.copy()
         arrivals["uniform"] = rng.random(len(arrivals))

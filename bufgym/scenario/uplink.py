@@ -19,7 +19,7 @@ from bufgym.scenario.arrivals import read_only, unchecked_messages
 from bufgym.scenario.checks import as_tuple, check_stream, check_value, delay, duration, recordings
 from bufgym.scenario.draws import beside, place, place_link, scaled, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
-from bufgym.traces import Motion, Trace
+from bufgym.traces import Motion, Trace, read_workload
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import Workload
 
@@ -40,6 +40,9 @@ class Uplink:
 
     With a ``workload``, a robot's recording is played as it is in place of the stream that ``rate_hz``, ``jitter``,
     ``size_bytes``, ``size_cv`` and ``duration_s`` describe. All its topics share the queue; it gives x if it has one.
+
+    In place of an object, text is taken as on the command line: ``traces="lte-synthetic-0"`` (a shipped name or a file,
+    or a list of them), ``motion="drive-0"`` (or "none"), ``value="saturating:0.5"``, ``workload="drive.mcap"``.
     """
 
     traces: tuple[Trace, ...] = ()
@@ -90,6 +93,8 @@ class Uplink:
             raise BufgymError(
                 f"link_offset_s = {self.link_offset_s}: must be (from, to) with 0 <= from <= to <= {MAX_DURATION_S}, s"
             )
+        if isinstance(self.workload, str):
+            object.__setattr__(self, "workload", read_workload(self.workload))
         if self.workload is not None and not isinstance(self.workload, Workload):
             raise BufgymError(f"workload: {self.workload!r} is not a bufgym.traces Workload")
         if self.workload is not None and self.workload.x is not None and self.motion:

@@ -35,14 +35,14 @@ class Fleet:
         """The rows of the senders of cell ``c``."""
         return range(c * self.robots, (c + 1) * self.robots)
 
-    def load(self, c: int, episode: FleetEpisode) -> None:
-        """Begin ``episode`` in cell ``c``: empty buffers, idle sockets, nothing arrived."""
+    def load(self, c: int, episode: FleetEpisode, uniforms: np.random.Generator | None = None) -> None:
+        """Begin ``episode`` in cell ``c``: empty buffers, idle sockets, nothing arrived; ``uniforms`` as of Senders."""
         if not isinstance(episode, FleetEpisode):
             raise BufgymError(f"episode: {episode!r} is not a bufgym.scenario FleetEpisode")
         if episode.robots != self.robots:
             raise BufgymError(f"episode of {episode.robots} robots: the cell has {self.robots}")
         for robot, i in enumerate(self.rows(c)):
-            self.senders.load(i, episode.episode(robot))
+            self.senders.load(i, episode.episode(robot), uniforms)
         load_cell(self.senders.batch, self.shares, c)
 
     def run(self, policy: Policy, memory: NDArray[np.float64] | None = None) -> None:

@@ -75,7 +75,7 @@ def outcome(senders: Senders, i: int) -> Outcome:
     mean_sojourn, p95_sojourn = sojourns_s(transmitted_us - messages["arrival_us"])
     mean_age, peak_age, max_age = ages_s(transmitted_us + sender["propagation_us"], messages["arrival_us"])
     return Outcome(
-        qoi=weighted_qoi(senders, i, messages) if senders.topics else senders.value.information(messages["x"]),
+        qoi=weighted_qoi(senders, i, messages) if senders.topics else senders.value_of(i).information(messages["x"]),
         arrived=int(sender["next"]),
         delivered=len(messages),
         dropped=int((log["dropped_us"] != NEVER).sum()),

@@ -46,7 +46,7 @@ def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
     if sender.topics == 1:  # in slot -1 lies the message dequeued last
         if k == 0 and sender.dequeued == 0:
             return 0.0
-        return value(batch.v, x - at(batch.slots, i, sender.first + k - 1).x)
+        return value(batch.v[sender.v_start :], x - at(batch.slots, i, sender.first + k - 1).x)
     rules = at(batch.topics, i, topic)
     j = kept_before(batch, i, k, topic)
     if j < 0 and rules.dequeued == 0:

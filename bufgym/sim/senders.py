@@ -27,7 +27,8 @@ class Senders:
     """A batch of n senders that share L, B and V, each with an episode of its own.
 
     ``capacity`` (L, messages), ``max_bytes`` (B), ``decide_at``, ``value`` (V) and ``topics`` are the shared settings,
-    ``batch`` the arrays (see ``Batch``), ``episodes`` what each sender has loaded, None for nothing.
+    ``batch`` the arrays (see ``Batch``), ``episodes`` what each sender has loaded, None for nothing. An episode of one
+    queue may have a V of its own.
     """
 
     def __init__(
@@ -54,15 +55,20 @@ class Senders:
         self.value = v
         self.topics = check_topics(topics)
         self._topic_table, values = topic_table(self.topics, self.capacity, v)
+        self._v_starts = {v.array.tobytes(): 0}
         self.episodes: list[Episode | None] = [None] * n
+        self._uniforms: list[np.random.Generator | None] = [None] * n
         self._knots = Knots()
         self.batch = new_batch(n, self.capacity, max_messages, len(self._topic_table), values)
 
     def __len__(self) -> int:
         return len(self.episodes)
 
-    def load(self, i: int, episode: Episode) -> None:
-        """Begin ``episode`` at sender ``i``: empty buffer, idle socket, nothing arrived."""
+    def load(self, i: int, episode: Episode, uniforms: np.random.Generator | None = None) -> None:
+        """Begin ``episode`` at sender ``i``: empty buffer, idle socket, nothing arrived.
+
+        ``uniforms``: what ``draw_uniforms`` draws from; None for an episode that has its uniform draws.
+        """
         if not isinstance(episode, Episode):
             raise BufgymError(f"episode: {episode!r} is not a bufgym.scenario Episode")
         link = episode.link
@@ -76,7 +82,7 @@ class Senders:
         first_knot, last_knot, after = self._knots.place(link.trace, i)
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
-        self.episodes[i] = episode
+        self.episodes[i], self._uniforms[i] = episode, uniforms
         load_row(
             self.batch,
             i,
@@ -86,13 +92,39 @@ class Senders:
             (episode.first_decision, episode.last_decision),
             (first_knot, last_knot, after, link.offset_us, link.propagation_us),
             (episode.window, episode.ack_delay_us),
+            0 if episode.value is None else self._v_start(episode.value),
         )
+
+    def value_of(self, i: int) -> Value:
+        """The V that the QoI of sender ``i``'s episode is measured with; without topics."""
+        episode = self.episodes[i]
+        return self.value if episode is None or episode.value is None else episode.value
+
+    def draw_uniforms(self, i: int) -> None:
+        """Draw the uniforms of sender ``i``'s episode, unless it has them. Late, as only policies that play look."""
+        rng, episode = self._uniforms[i], self.episodes[i]
+        if rng is None or episode is None:
+            return
+        self.episodes[i], self._uniforms[i] = (episode := episode.with_uniforms(rng)), None
+        self.batch.arrivals["uniform"][i, : len(episode.arrivals)] = episode.arrivals["uniform"]
+
+    def _v_start(self, v: Value) -> int:
+        """Where V begins in the array of all V; a new one is put at its end."""
+        key = v.array.tobytes()
+        if key not in self._v_starts:
+            if self.topics:
+                raise BufgymError(f"episode: has V = {v.name} of its own; with several topics each topic has one")
+            values = np.concatenate([self.batch.v, v.array])
+            values.flags.writeable = False
+            self._v_starts[key] = len(self.batch.v)
+            self.batch = self.batch._replace(v=values)
+        return self._v_starts[key]
 
     def new_memory(self, policy: Policy, i: int) -> NDArray[np.float64]:
         """Fresh memory of ``policy`` for the episode of sender ``i``, float64[entries]."""
         memory: NDArray[np.float64] = policy.new_memory(1, self.capacity)[0]
         if policy.privileged is not None:
-            memory = policy.privileged(self.episodes[i], self.capacity, self.max_bytes, self.value)
+            memory = policy.privileged(self.episodes[i], self.capacity, self.max_bytes, self.value_of(i))
         return memory
 
     def run(self, policy: Policy, memory: NDArray[np.float64] | None = None, shares: Shares | None = None) -> None:

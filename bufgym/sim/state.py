@@ -48,6 +48,7 @@ SENDER = np.dtype(
             np.int64,
         ),  # 1: at arrival they count from the message sent last, 0: from the one kept last
         ("flush_no_drop", np.int64),  # 1: no_drop messages are sent even when the window is full
+        ("v_start", np.int64),  # of one queue: where its V begins in the array of all V
         # episode
         ("arrivals", np.int64),  # messages in all
         ("first_decision", np.int64),  # arrivals from this one to

@@ -58,12 +58,14 @@ def load_row(
     decisions: tuple[int, int],
     link: tuple[int, int, int, int, int],
     window: tuple[int, int],
+    v_start: int,
 ) -> None:
     """Put sender ``i`` at the beginning of an episode: empty buffer, idle socket, nothing arrived.
 
     ``topics``: TOPIC[topics], their settings; ``buffer``: capacity, max_bytes, ask_when_full;
     ``decisions``: first and last arrival that asks for one; ``link``: first and last knot, what follows the end,
-    offset_us, propagation_us; ``window``: n_T and the time from the end of a message's transmission to its ack, us.
+    offset_us, propagation_us; ``window``: n_T and the time from the end of a message's transmission to its ack, us;
+    ``v_start``: where V begins in the array of all V.
     """
     for k in range(len(arrivals)):
         batch.arrivals[i, k] = arrivals[k]
@@ -79,7 +81,7 @@ def load_row(
     sender.first_knot, sender.last_knot, sender.after, sender.offset_us, sender.propagation_us = link
     sender.segment_now, sender.segment_finish = sender.first_knot, sender.first_knot
     sender.window, sender.ack_delay_us = window
-    sender.arrivals, sender.topics = len(arrivals), len(topics)
+    sender.arrivals, sender.topics, sender.v_start = len(arrivals), len(topics), v_start
 
 
 @kernel

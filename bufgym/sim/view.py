@@ -76,7 +76,7 @@ def view(batch: Batch, i: int) -> Buffer:
         sender.period_us,
         sender.departures,
         sender.service_ratio,
-        batch.v,
+        batch.v[sender.v_start :],
         stretch(batch.topics, i, 0, sender.topics),
         sender.window,
         sender.dequeued - sender.acked,

@@ -25,10 +25,15 @@ print(double(21))
 """
 
 
+OURS = "import sys; __name__ = 'bufgym.tale'; sys.modules[__name__] = sys.modules['__main__']"
+"""Makes the module one of the package's."""
+
+
 def run(tmp_path: Path, before: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a module with one kernel."""
     file = tmp_path / "tale.py"
-    file.write_text(TALE.format(before=before))
+    if not file.exists():  # code is compiled anew where the source is newer
+        file.write_text(TALE.format(before=before))
     done = subprocess.run(
         [sys.executable, str(file)],
         env={**os.environ, "PYTHONPATH": str(Path(kernel.__file__).parents[1]), **environment},
@@ -60,6 +65,27 @@ def test_damaged_code_is_compiled_anew(tmp_path: Path, ending: str, left: float)
     file.write_bytes(whole[: int(left * len(whole))])
     assert run(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
     assert len(file.read_bytes()) >= len(whole) - 8
+
+
+@needs_compilation
+def test_long_compiling_is_announced_once_and_code_from_the_cache_never(tmp_path: Path) -> None:
+    impatient = f"from bufgym import kernel as k; k.PATIENCE_S = 0.0; {OURS}"
+    assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == kernel.NOTICE + "\n"
+    assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
+
+
+@needs_compilation
+@pytest.mark.parametrize(
+    "before",
+    [
+        "from bufgym import kernel as k; k.PATIENCE_S = 0.0",
+        f"from bufgym import kernel as k; k.PATIENCE_S = 1e6; {OURS}",
+        f"from bufgym import kernel as k; k.PATIENCE_S = 0.0; k.compile_silently(); {OURS}",
+    ],
+    ids=["not ours", "quick", "silent"],
+)
+def test_what_is_not_announced(tmp_path: Path, before: str) -> None:
+    assert run(tmp_path, before=before, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
 
 
 @needs_compilation

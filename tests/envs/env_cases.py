@@ -13,6 +13,14 @@ from bufgym.model.topics import Topic
 from bufgym.scenario import Client, Stream
 from bufgym.traces import Trace
 
+SMALL: dict[str, dict[str, Any]] = {
+    "bufgym/Interruption-v0": {"t_max": 20},
+    "bufgym/Uplink-v0": {"duration_s": 1.0},
+    "bufgym/Suite-v0": {"suite": "interruption-v1"},
+    "bufgym/Topics-v0": {"duration_s": 1.0},
+}
+"""Arguments that make episodes of every environment short."""
+
 STREAMS = (
     Stream(Topic("pose", priority=5, rate_limit_hz=18, deadline_s=0.05), 20, 400, jitter=0.5),
     Stream(Topic("image", weight=2, limit=3, value=qoi.saturating(3), deadline_s=0.2), 15, 6_000, size_cv=0.6),

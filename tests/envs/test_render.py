@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from env_cases import text
+from env_cases import SMALL, text
 
 import bufgym
 from bufgym.envs import SenderEnv, SenderVectorEnv, render
@@ -43,7 +43,7 @@ def test_a_frame_of_text_by_hand() -> None:
 
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
 def test_every_environment_draws_itself_in_both_modes(env_id: str) -> None:
-    smaller: dict[str, Any] = {"law": "fixed", "t_max": 20} if "Interruption" in env_id else {"duration_s": 1.0}
+    smaller = SMALL[env_id] | ({"law": "fixed"} if "Interruption" in env_id else {})
     for mode in ("ansi", "rgb_array"):
         env = gym.make(env_id, render_mode=mode, **smaller)
         plain = gym.make(env_id, **smaller)

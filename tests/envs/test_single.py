@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from env_cases import same
+from env_cases import SMALL, same
 from gymnasium.utils.env_checker import check_env
 
 import bufgym
@@ -76,7 +76,7 @@ def test_a_mask_as_gymnasium_and_as_sb3_contrib_take_it(env_id: str) -> None:
 
 
 def _smaller(env_id: str) -> dict[str, Any]:
-    return {"t_max": 20} if "Interruption" in env_id else {"duration_s": 1.0}
+    return SMALL[env_id]
 
 
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)

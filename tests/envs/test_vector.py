@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from env_cases import client, valid_action
+from env_cases import SMALL, client, valid_action
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, FlattenObservation, RecordEpisodeStatistics
 
@@ -18,6 +18,7 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Scenario, Uplink
+from bufgym.scenario.suites.mixture import SuiteScenario
 from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS
 from bufgym.traces import Trace
 
@@ -31,6 +32,7 @@ CASES: dict[str, tuple[Scenario, dict[str, Any]]] = {
         Uplink(traces=(DYING,), duration_s=0.8, value=qoi.saturating(3.0)),
         {"decide_at": "overflow", "reward": {"delivered": 0.3, "retained": 0.7}},
     ),
+    "suite": (SuiteScenario("interruption-v1"), {"bound": True}),  # three V side by side
     "topics": (client(duration_s=0.6, scale=2.0), {}),
     "topics in a window": (client(duration_s=0.6, window=3, round_trip_us=30_000), {"reward": "late"}),
 }
@@ -234,8 +236,7 @@ def test_seeds_are_told_as_gymnasium_tells_them() -> None:
 @pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
 def test_make_vec(env_id: str, mode: str) -> None:
-    smaller: dict[str, Any] = {"t_max": 20} if "Interruption" in env_id else {"duration_s": 1.0}
-    envs = gym.make_vec(env_id, num_envs=N, vectorization_mode=mode, capacity=3, **smaller)
+    envs = gym.make_vec(env_id, num_envs=N, vectorization_mode=mode, capacity=3, **SMALL[env_id])
     assert envs.num_envs == N
     assert envs.single_action_space == gym.spaces.Discrete(5)
     observations, _ = envs.reset(seed=2)

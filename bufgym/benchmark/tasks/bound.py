@@ -8,6 +8,7 @@ from dataclasses import replace
 from bufgym.benchmark.rows import Row
 from bufgym.oracle import Plan, clairvoyant
 from bufgym.oracle.clairvoyant import privileged
+from bufgym.oracle.measure import regret
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, Scenario
 from bufgym.sim import Senders, padded, run
@@ -43,8 +44,3 @@ def columns(policy: Policy, h: float, plan: Plan | None) -> Row:
         return {"clairvoyant": None, "certified": None, "regret": None}
     lost = None if policy.unbounded else regret(h, plan.qoi)
     return {"clairvoyant": plan.qoi, "certified": plan.certified, "regret": lost}
-
-
-def regret(h: float, most: float) -> float:
-    """1 - H / H of the clairvoyant; 0 where nothing could be delivered at all."""
-    return 1 - h / most if most > 0 else 0.0

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from bufgym.benchmark.bootstrap import ratio
-from bufgym.benchmark.episodes import TIE, Numbers
+from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import Quantity, Run, Summary, by_run, summarise
 from bufgym.benchmark.table import decimal, percent, score
 from bufgym.benchmark.tasks.task import Result, Task, counted
 from bufgym.errors import BufgymError
+from bufgym.oracle.measure import TIE
 from bufgym.policies import Policy, get, names
 from bufgym.scenario import FleetEpisode, FleetScenario
 from bufgym.sim.cell import run_fleet
@@ -50,9 +51,6 @@ class FleetTask(Task):
     def default_policies(self, suite: str) -> list[str]:
         """The ranked policies for one queue."""
         return [name for name in names(for_topics=False) if get(name).ranked]
-
-    def by_trace(self, scenario: FleetScenario) -> list[tuple[str, Any]]:
-        return [(label, replace(scenario, uplink=uplink)) for label, uplink in super().by_trace(scenario.uplink)]
 
     def messages(self, scenario: FleetScenario) -> int:
         return scenario.max_messages * scenario.robots

@@ -6,15 +6,15 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from bufgym.benchmark.episodes import TIE
 from bufgym.benchmark.rows import RUNS, Row
-from bufgym.benchmark.score import BASELINE, scores
+from bufgym.benchmark.score import scores
 from bufgym.benchmark.summary import Quantity, Standing, Summary
 from bufgym.benchmark.table import REGRET_AT_MOST, percent, score
 from bufgym.benchmark.tasks import bound, timeline
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.benchmark.tuned import tuned
 from bufgym.errors import BufgymError
+from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.policies import Policy, names
 from bufgym.scenario import Episode
 from bufgym.scenario.suites import Setting

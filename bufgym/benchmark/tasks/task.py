@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from bufgym.benchmark.rows import Layout, Row
 from bufgym.benchmark.summary import Quantity, Summary
 from bufgym.errors import BufgymError
 from bufgym.policies import Policy
-from bufgym.scenario import Streams
 from bufgym.scenario.suites import Setting
 
 Result = list[Row]
@@ -53,17 +52,6 @@ class Task(ABC):
     def verify(self, policy: Policy, row: Row) -> None:
         """An error for a row that cannot be true."""
         return None
-
-    def by_trace(self, scenario: Any) -> list[tuple[str, Any]]:
-        """The scenario split into one for each of its traces: (label, scenario). Equal names get a number."""
-        traces = getattr(scenario, "traces", None)
-        if traces is None:
-            return [(type(scenario).__name__.lower(), scenario)]
-        labels: list[str] = []
-        for trace in traces:
-            same = sum(other.name == trace.name for other in traces[: len(labels)])
-            labels.append(f"{trace.name}#{same + 1}" if same else trace.name)
-        return [(label, replace(scenario, traces=(trace,))) for label, trace in zip(labels, traces, strict=True)]
 
     def messages(self, scenario: Any) -> int:
         """How many messages the senders of one episode hold at most."""
@@ -109,12 +97,6 @@ class Task(ABC):
         ``setting_of`` gives the setting of a row, its scenario on that row's trace alone.
         """
         return None
-
-
-def draw(scenario: Any, seed: int) -> Any:
-    """The episode of this seed, with the uniform draws of randomised policies."""
-    streams = Streams.seeded(seed)
-    return scenario.draw(streams).with_uniforms(streams.policy)
 
 
 def counted(n: int, thing: str) -> str:

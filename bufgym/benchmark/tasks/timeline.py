@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.score import BASELINE
 from bufgym.benchmark.tasks import bound
-from bufgym.benchmark.tasks.task import draw
+from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
+from bufgym.scenario.numbered import draw
 from bufgym.sim import NEVER
 from bufgym.sim.metrics import outcome
 

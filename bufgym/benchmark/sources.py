@@ -1,0 +1,140 @@
+"""Policies that are not registered: a model's file, or a function of a module. Loading one registers it.
+
+    mine.zip           a model of stable-baselines3 or sb3-contrib (``bufgym.sb3.as_policy``); it can run any code
+    mine.safetensors   a learned policy (``bufgym.policies.load``); no code is run
+    module:function    a policy function, a ``Policy``, or a function without arguments that makes either; the module
+                       is imported, from the current folder too
+
+A file's policy is called by the file's stem, a function's by its own name. ``bufgym.policies.get`` itself reads no
+file: names also come from leaderboards and results of strangers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import inspect
+import os
+import re
+import sys
+from collections.abc import Iterable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from bufgym import policies
+from bufgym.errors import BufgymError, line_in
+from bufgym.policies import Policy, registry
+
+_FILES = (".zip", ".safetensors")
+_FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+"""``module:function``; a setting has a "=" behind the colon."""
+
+
+def is_source(spec: str) -> bool:
+    """Whether ``spec`` is to be loaded; else it is a name, perhaps with settings."""
+    return spec.endswith(_FILES) or (
+        _FUNCTION.fullmatch(spec) is not None and spec.partition(":")[0] not in policies.names()
+    )
+
+
+_NAMES: dict[tuple[str, str], str] = {}
+"""Name of the policy by (folder, source), for those that this process has loaded."""
+
+
+def load(source: str, folder: str | None = None) -> str:
+    """Register the policy in ``source``; its name. What is registered already stays as it is.
+
+    ``folder``: where a relative path begins and modules are looked for, besides Python's own places; None for the
+    current one.
+
+    Raises:
+        BufgymError: there is none, or another policy has its name.
+    """
+    place = folder or os.getcwd()
+    known = _NAMES.get((place, source))
+    if known is not None and known in policies.names():
+        return known
+    policy = _from_file(source, place) if source.endswith(_FILES) else _from_module(source, place)
+    if registry.registered_as(policy.on_arrival) is not policy:
+        if policy.name in policies.names():
+            raise BufgymError(f"{source}: there is a policy named {policy.name!r} already; give this one another name")
+        given = {f.name: getattr(policy, f.name) for f in fields(Policy) if f.name not in ("name", "on_arrival")}
+        registry.register(policy.name, **given)(policy.on_arrival)
+    _NAMES[place, source] = policy.name
+    return policy.name
+
+
+def line_of(error: Exception, policy_file: str | None) -> str | None:
+    """Where in the caller's code the error came from, that file or a module loaded here; None for nowhere there."""
+    modules = [str(_module_file(source, folder)) for folder, source in _NAMES if not source.endswith(_FILES)]
+    places = (line_in(error, file) for file in [*filter(None, [policy_file]), *modules])
+    return next(filter(None, places), None)
+
+
+def digests(sources: Iterable[str], folder: str) -> dict[str, str]:
+    """What tells one version of each from another: of its file, or of its module's."""
+    files = {
+        source: Path(folder, source) if source.endswith(_FILES) else _module_file(source, folder) for source in sources
+    }
+    return {source: hashlib.sha256(file.read_bytes()).hexdigest()[:16] for source, file in files.items()}
+
+
+def _from_file(source: str, folder: str) -> Policy:
+    # A path in the current folder stays as it was written, for messages.
+    path = Path(source) if folder == os.getcwd() else Path(folder, source)
+    if not source.endswith(".zip"):
+        return replace(policies.load(path), name=path.stem)
+    from bufgym.sb3 import as_policy
+
+    return as_policy(path, path.stem)
+
+
+def _from_module(source: str, folder: str) -> Policy:
+    module, _, name = source.partition(":")
+    found = getattr(_imported(source, folder), name, None)
+    if found is None:
+        raise BufgymError(f"{source}: the module {module} has no {name}")
+    if isinstance(found, Policy):
+        return found
+    if callable(found) and _needs(found) == 0:
+        found = found()
+        if isinstance(found, Policy):
+            return found
+    if not callable(found) or _needs(found) != 3:
+        rule = "must be a policy, a function (buffer, arrival, memory), or one without arguments that makes either"
+        raise BufgymError(f"{source}: {rule}")
+    return registry.registered_as(found) or Policy(name, found)
+
+
+def _imported(source: str, folder: str) -> Any:
+    place = source.partition(":")[0]
+    # The installed command, unlike python -m bufgym, does not look for modules in the current folder.
+    if folder not in map(os.path.abspath, sys.path):
+        sys.path.append(folder)
+    try:
+        return importlib.import_module(place)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{place}.".startswith(f"{error.name}."):
+            raise BufgymError(f"{source}: {place} imports {error.name}, which is not there") from None
+        here = f"in {folder} or among those installed"
+        raise BufgymError(f"{source}: neither a policy {place!r} nor a module of that name {here}") from None
+    except Exception as error:  # whatever the module does when it is run
+        raise BufgymError(f"{source}: cannot be imported: {type(error).__name__}: {error}") from None
+
+
+def _module_file(source: str, folder: str) -> Path:
+    file = _imported(source, folder).__file__
+    if file is None:
+        raise BufgymError(f"{source}: a module without a file")
+    return Path(file)
+
+
+def _needs(function: Any) -> int:
+    """Arguments without a default."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return -1
+    kinds = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+    return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters)

@@ -1,0 +1,65 @@
+"""What ``bufgym warmup`` compiles: each part is run once on as little as will do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from bufgym import policies, scenario
+from bufgym.benchmark.run import run
+from bufgym.envs import FleetVecEnv, SenderVectorEnv
+from bufgym.scenario import FleetScenario, Interruption, Uplink
+
+_L = 2
+
+
+def _uplink() -> Uplink:
+    """A second of video."""
+    return replace(scenario.get("lte"), duration_s=1.0)  # type: ignore[type-var,return-value]
+
+
+def _environments() -> None:
+    small: dict[str, dict[str, Any]] = {"interruption": {"t_max": 5}, "lte": {"duration_s": 1.0}}
+    small["topics"] = small["lte"]
+    for name, parameters in small.items():
+        batches = SenderVectorEnv(2, name, _L, **parameters)
+        batches.reset(seed=0)
+        batches.step(np.full(2, _L))
+    env = gymnasium.make("bufgym/Interruption-v0", capacity=_L)
+    env.reset(seed=0)
+    env.step(_L)
+
+
+def _bound() -> None:
+    for size_cv in (0.0, 0.5):
+        run([policies.get("drop-oldest")], replace(_uplink(), size_cv=size_cv), [_L], 1)
+
+
+def _policies() -> None:
+    run([policies.get(name) for name in policies.names(for_topics=False)], Interruption(t_max=5), [_L], 1)
+
+
+def _schedulers() -> None:
+    client = replace(scenario.get("topics"), duration_s=1.0)  # type: ignore[type-var]
+    run([policies.get(name) for name in policies.names(for_topics=True)], client, [_L], 1)
+
+
+def _fleets() -> None:
+    batches = FleetVecEnv(1, 2, "lte", _L, parameters={"duration_s": 1.0})
+    batches.reset(seed=0)
+    batches.step(np.full(2, _L))
+    run([policies.get("drop-oldest")], FleetScenario(2, _uplink()), [_L], 1)
+
+
+PARTS: dict[str, Callable[[], None]] = {
+    "environments": _environments,
+    "the clairvoyant": _bound,
+    "policies of one queue": _policies,
+    "policies of several topics": _schedulers,
+    "fleets": _fleets,
+}
+"""What each compiles -> what does it."""

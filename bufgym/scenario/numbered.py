@@ -1,0 +1,71 @@
+"""Which episode a seed stands for: the same in a row of a benchmark and in the reset of an environment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from bufgym.errors import BufgymError
+from bufgym.model.checks import whole
+from bufgym.scenario.episode import Streams
+
+SEEDS_PER_TRACE = 1000
+"""In a suite, episode s of trace k has the seed 1000 k + s: no two traces of a scenario share a draw."""
+
+
+def draw(scenario: Any, seed: int) -> Any:
+    """The episode of this seed, with the uniform draws of randomised policies."""
+    streams = Streams.seeded(seed)
+    return scenario.draw(streams).with_uniforms(streams.policy)
+
+
+def by_trace(scenario: Any) -> list[tuple[str, Any]]:
+    """The scenario split into one for each of its traces: (label, scenario). Equal names get a number."""
+    uplink = getattr(scenario, "uplink", None)
+    if uplink is not None:  # of robots that share it
+        return [(label, replace(scenario, uplink=part)) for label, part in by_trace(uplink)]
+    traces = getattr(scenario, "traces", None)
+    if traces is None:
+        return [(type(scenario).__name__.lower(), scenario)]
+    labels: list[str] = []
+    for trace in traces:
+        same = sum(other.name == trace.name for other in traces[: len(labels)])
+        labels.append(f"{trace.name}#{same + 1}" if same else trace.name)
+    return [(label, replace(scenario, traces=(trace,))) for label, trace in zip(labels, traces, strict=True)]
+
+
+def numbered(family: Any, seed: Any = None, trace: str | int | None = None, scenario: str | None = None) -> Any:
+    """The episode that the row of a benchmark with this seed, trace and scenario is about.
+
+    Args:
+        family: a ``Scenario``; that of a suite has ``members``.
+        seed: the row's.
+        trace: the row's, or its number from 0 on. To be left out where there is one alone, and in a suite: there the
+            seed tells it (``SEEDS_PER_TRACE``).
+        scenario: the row's; only in a suite.
+
+    Raises:
+        BufgymError: there is no such episode.
+    """
+    seed, members = whole("seed", seed), getattr(family, "members", None)
+    if members is None:
+        if scenario is not None:
+            raise BufgymError(f"scenario = {scenario!r}: only the episodes of a suite have one")
+        return draw(_part(family, trace), seed)
+    if scenario not in members:
+        raise BufgymError(f"scenario = {scenario!r}: must be one of {', '.join(members)}")
+    member = members[scenario]
+    return draw(_part(member, seed // SEEDS_PER_TRACE if trace is None else trace), seed).valued(member.value)
+
+
+def _part(scenario: Any, trace: str | int | None) -> Any:
+    """The scenario on that trace alone."""
+    parts = by_trace(scenario)
+    labels = [label for label, _ in parts]
+    if trace is None and len(parts) == 1:
+        trace = 0
+    if isinstance(trace, str) and trace in labels:
+        trace = labels.index(trace)
+    if not isinstance(trace, int) or not 0 <= trace < len(parts):
+        raise BufgymError(f"trace = {trace!r}: must be 0..{len(parts) - 1} or one of {', '.join(labels)}")
+    return parts[trace][1]

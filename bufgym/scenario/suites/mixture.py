@@ -1,0 +1,62 @@
+"""The scenarios of a suite as one: ``bufgym/Suite-v0``."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import ClassVar
+
+from bufgym.errors import BufgymError
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
+from bufgym.scenario import suites
+from bufgym.scenario.episode import Episode, Scenario, Streams
+
+
+@dataclass(frozen=True)
+class SuiteScenario:
+    """Every episode is of one of the scenarios in a split of a suite, each as likely as the others.
+
+    Episodes have the V of their own scenario. Suites of one queue alone.
+    """
+
+    suite: str = "lte-v1"
+    """Its name."""
+    split: str = "train"
+    """"train", "validation" or "test"."""
+    data: str | None = None
+    """Folder of recordings, for suites that need one."""
+
+    topics: ClassVar[tuple[Topic, ...]] = ()
+    """None: one queue."""
+
+    def __post_init__(self) -> None:
+        suite = suites.get(self.suite)
+        if suite.kind != "queue":
+            raise BufgymError(
+                f"suite {suite.name} is one of {suite.kind}: bufgym/Suite-v0 has those of one queue alone"
+            )
+        if self.split not in suites.SPLITS:
+            raise BufgymError(f"split = {self.split!r}: must be one of {', '.join(suites.SPLITS)}")
+
+    @functools.cached_property
+    def members(self) -> dict[str, Scenario]:
+        """The scenarios by label."""
+        settings = suites.get(self.suite).settings(self.split, self.data)
+        return {label: setting.scenario for label, setting in settings.items()}
+
+    @property
+    def value(self) -> Value:
+        """V of the first of them, as every episode brings its own."""
+        return next(iter(self.members.values())).value
+
+    @property
+    def max_messages(self) -> int:
+        """Arrivals of the longest episode of all."""
+        return max(member.max_messages for member in self.members.values())
+
+    def draw(self, streams: Streams) -> Episode:
+        """One episode."""
+        members = list(self.members.values())
+        member = members[int(streams.link.integers(len(members)))]
+        return member.draw(streams).valued(member.value)

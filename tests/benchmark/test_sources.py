@@ -1,0 +1,177 @@
+"""Policies from files and modules in ``bufgym bench``: by what names, in which processes, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sweep_cases import fails
+
+from bufgym import policies
+from bufgym.benchmark import sources
+from bufgym.benchmark.rows import read_rows
+from bufgym.cli import main
+from bufgym.errors import BufgymError
+from bufgym.policies import registry
+
+MODULE = """
+from bufgym.policies import ACCEPT, REJECT, Policy, register
+
+def newest(buffer, arrival, memory):
+    "The newest stay."
+    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
+
+def made():
+    return Policy("made-here", newest)
+
+def makes_a_function():
+    return newest
+
+whole = Policy("whole", newest, compile=True)
+
+@register("every", parameters={"every": 2}, memory={"count": 0})
+def every_other(buffer, arrival, memory):
+    "Every other one."
+    if len(buffer.slots) < buffer.capacity:
+        return ACCEPT
+    memory[0] += 1
+    return REJECT if memory[0] % buffer.parameters[0] else 0
+
+def afr(buffer, arrival, memory):
+    return REJECT
+
+def boom(buffer, arrival, memory):
+    return 1 // 0
+
+number = 3
+"""
+LINES = MODULE.split("\n")
+SHIPPED = Path(policies.__file__).parents[2] / "agents" / "pretrained" / "learned-time.safetensors"
+ONE = ["--interruption", "--law", "fixed", "--t-max", "12", "--capacity", "3", "--seeds", "1"]
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A module of policies in the current folder; its name differs from test to test, as Python imports one once."""
+    name = "m" + tmp_path.name.replace("-", "_").replace("[", "_").replace("]", "_")
+    (tmp_path / f"{name}.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    before = dict(registry._REGISTRY)
+    yield name
+    registry._REGISTRY.clear()
+    registry._REGISTRY.update(before)
+
+
+def rows_of(capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+    """The table's lines by policy, without the name."""
+    lines = capsys.readouterr().out.split("\n")
+    return {line.split()[0]: line.split(maxsplit=1)[1] for line in lines if len(line.split()) > 5}
+
+
+def test_functions_makers_and_policies_of_a_module(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [f"{module}:{name}" for name in ("newest", "made", "whole", "every_other")]
+    assert main(["bench", *ONE, "--policies", ",".join([*words, "every:every=3", "drop-oldest"])]) == 0
+    table = rows_of(capsys)
+    assert table["newest"] == table["made-here"] == table["whole"] == table["drop-oldest"]
+    assert table["every"] != table["every:every=3"]
+    assert sources.load(f"{module}:makes_a_function") == "newest"  # as there is already
+    assert main(["play", "--policies", f"{module}:newest", "--env", "Interruption-v0", "--speed", "0"]) == 0
+
+
+def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(SHIPPED, "own.safetensors")
+    assert main(["bench", *ONE, "--policies", "own.safetensors,learned-time"]) == 0
+    table = rows_of(capsys)
+    assert table["own"] == table["learned-time"]
+
+
+@pytest.mark.slow
+def test_a_trained_model_goes_by_its_stem(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A slot network decides as its exported weights do."""
+    contrib = pytest.importorskip("sb3_contrib")
+    from bufgym.sb3 import SlotPolicy, make_vec_env
+    from bufgym.sb3.export import export
+
+    envs = make_vec_env("bufgym/Interruption-v0", 2, capacity=3, t_max=20)
+    contrib.MaskablePPO(SlotPolicy, envs, n_steps=8, batch_size=16, seed=1, device="cpu").save("slots.zip")
+    export("slots.zip", "exported.safetensors", name="exported")
+    assert main(["bench", *ONE, "--policies", "slots.zip", "exported.safetensors"]) == 0
+    table = rows_of(capsys)
+    assert table["slots"] == table["exported"]
+    suite = ["--suite", "interruption-v1", "--capacity", "2", "--seeds", "1", "--jobs", "2", "--out", "kept"]
+    assert main(["bench", *suite, "--policies", "slots.zip", "--format", "csv"]) == 0
+    assert {row["policy"] for row in read_rows(Path("kept/rows.csv"))} == {"slots", "drop-oldest"}
+
+
+def test_workers_load_them_too_and_the_folder_knows_their_version(
+    module: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("joblib")
+    shutil.copy(SHIPPED, "own.safetensors")
+    words = ["bench", "--suite", "interruption-v1", "--capacity", "3", "--seeds", "1", "--format", "csv"]
+    words += ["--policies", f"own.safetensors,{module}:newest", "--jobs", "2", "--out", "kept"]
+    assert main(words) == 0
+    found = read_rows(Path("kept/rows.csv"))
+    by_policy = {name: [row["qoi"] for row in found if row["policy"] == name] for name in ("newest", "drop-oldest")}
+    assert by_policy["newest"] == by_policy["drop-oldest"] and len(found) == 9
+    held = json.loads(Path("kept/manifest.json").read_text())
+    assert held["policies"] == ["own", "newest", "drop-oldest"] and len(held["sources"]) == 2
+    assert f"--policies own.safetensors,{module}:newest" in held["command"]
+    capsys.readouterr()
+    assert main(words) == 0  # the same again
+    with Path(f"{module}.py").open("a") as file:
+        file.write("# changed\n")
+    capsys.readouterr()
+    fails(words, "sources is", capsys)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("number", "must be a policy, a function (buffer, arrival, memory), or one without arguments"),
+        ("nothing", "has no nothing"),
+        ("afr", "there is a policy named 'afr' already"),
+        ("boom", f"line {LINES.index('    return 1 // 0') + 1}: ZeroDivisionError"),
+    ],
+)
+def test_what_a_module_cannot_give(module: str, name: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    fails(["bench", *ONE, "--policies", f"{module}:{name}"], says, capsys)
+
+
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [
+        ("nowhere.zip", "nowhere.zip: no such file"),
+        ("nowhere.safetensors", "nowhere.safetensors: no such file"),
+        ("broken.zip", "broken.zip: no model of stable-baselines3"),
+        ("nowhere:policy", "nowhere:policy: neither a policy 'nowhere' nor a module of that name"),
+        ("broken:policy", "broken:policy: cannot be imported: ZeroDivisionError"),
+        ("needy:policy", "needy:policy: needy imports a_module_not_there, which is not there"),
+        ("afr:policy", "'policy' is not of the form parameter=number"),
+    ],
+)
+def test_what_cannot_be_loaded(module: str, word: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    if word.endswith(".zip"):
+        pytest.importorskip("stable_baselines3")
+    Path("broken.zip").write_text("no zip")
+    Path("broken.py").write_text("1 // 0\n")
+    Path("needy.py").write_text("import a_module_not_there\n")
+    fails(["bench", *ONE, "--policies", word], says, capsys)
+
+
+def test_two_files_of_one_name(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder in ("a", "b"):
+        Path(folder).mkdir()
+        shutil.copy(SHIPPED, f"{folder}/twice.safetensors")
+    both = "a/twice.safetensors,b/twice.safetensors"
+    fails(["bench", *ONE, "--policies", both], "b/twice.safetensors: there is a policy named 'twice' already", capsys)
+
+
+@pytest.mark.parametrize("word", ["os:system", "mine.zip", "mine.safetensors"])
+def test_a_name_from_elsewhere_loads_nothing(word: str) -> None:
+    """``policies.get`` also gets names from leaderboards and results of strangers."""
+    with pytest.raises(BufgymError, match=r"unknown policy"):
+        policies.get(word)

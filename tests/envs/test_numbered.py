@@ -1,0 +1,290 @@
+"""Episodes by their numbers in a benchmark, suites as environments, what an episode was worth, arguments as text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+import bufgym
+from bufgym import policies
+from bufgym.benchmark.play import Player
+from bufgym.benchmark.run import run
+from bufgym.benchmark.sweep import Sweep, run_sweep
+from bufgym.envs import SenderEnv, SenderVectorEnv
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.model import qoi
+from bufgym.scenario import Interruption, Uplink, suites
+from bufgym.scenario.numbered import draw
+from bufgym.traces import Trace, drive_motion, write_csv
+
+PLAYED = ("random", "drop-oldest")
+L = 2
+
+
+def played(env: Any, policy: str, **reset: Any) -> dict[str, Any]:
+    """The last info of the episode that ``policy`` plays."""
+    env.reset(**reset)
+    player, ended, info = Player(policies.get(policy)), False, {}
+    while not ended:
+        _, _, ended, _, info = env.step(player.action(env.unwrapped.rows.senders))
+    return info
+
+
+def score(rows: list[dict[str, Any]], row: dict[str, Any]) -> float:
+    """Between the Drop Oldest of the same episode and the clairvoyant."""
+    (base,) = [
+        other["qoi"]
+        for other in rows
+        if other["policy"] == "drop-oldest" and all(other[key] == row[key] for key in ("scenario", "trace", "seed"))
+    ]
+    gap = row["clairvoyant"] - base
+    return (row["qoi"] - base) / gap if gap > 1e-9 * row["clairvoyant"] else math.nan
+
+
+# --- suites ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mixed(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A suite of two scenarios, each with a V of its own, on two traces."""
+
+    def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
+        traces = tuple(Trace.steps([(1.0, 500_000), (2.0, 0)], name=f"{split}-{k}").scaled(1 + k / 2) for k in range(2))
+        common: dict[str, Any] = {"traces": traces, "rate_hz": 5, "duration_s": 5, "size_bytes": 100_000}
+        timed = Uplink(**common, value=qoi.saturating(3))
+        moving = Uplink(**common, motion=(drive_motion(3, 30),), value=qoi.exponential(0.4))
+        return {"time": suites.Setting(timed, "timed"), "motion": suites.Setting(moving, "moving")}
+
+    monkeypatch.setitem(suites.SUITES, "mixed-v1", suites.Suite("mixed-v1", "mixed", build, (L,), 2))
+    yield "mixed-v1"
+
+
+def test_the_numbers_of_a_row_lead_to_its_episode(mixed: str, tmp_path: Path) -> None:
+    """Alone and in a batch, for a randomised policy too; and what the episode was worth is what the row says."""
+    rows = run_sweep(Sweep(mixed, PLAYED), tmp_path, backend="sequential", form="csv", progress=False)
+    assert len(rows) == 2 * 2 * 2 * 2
+    env = gym.make("bufgym/Suite-v0", suite=mixed, split="test", capacity=L, bound=True)
+    infos = []
+    for row in rows:
+        numbers = {name: row[name] for name in ("scenario", "trace", "seed")}
+        infos.append(info := played(env, row["policy"], options=numbers))
+        assert info["qoi"] == pytest.approx(row["qoi"])
+        assert info["delivered"] == row["delivered"] and info["clairvoyant"] == pytest.approx(row["clairvoyant"])
+        assert info["regret"] == pytest.approx(row["regret"])
+        assert info["score"] == pytest.approx(score(rows, row), nan_ok=True)
+        del numbers["trace"]  # the seed tells it
+        assert played(env, row["policy"], options=numbers)["qoi"] == info["qoi"]
+    assert len({round(info["qoi"], 9) for info in infos}) > 8  # they differ
+    envs: Any = gym.make_vec("bufgym/Suite-v0", len(rows), suite=mixed, split="test", capacity=L, bound=True)
+    _, _ = envs.reset(
+        options={"episodes": [{name: row[name] for name in ("scenario", "trace", "seed")} for row in rows]}
+    )
+    players = {name: Player(policies.get(name), len(rows)) for name in PLAYED}
+    last: list[dict[str, Any]] = [{} for _ in rows]
+    while not all(last):
+        senders = envs.unwrapped.rows.senders
+        due = senders.batch.senders["waiting"]
+        actions = [players[row["policy"]].action(senders, i) if due[i] else L for i, row in enumerate(rows)]
+        _, _, ended, _, info = envs.step(np.array(actions))
+        for i in np.flatnonzero(ended):
+            last[i] = last[i] or {name: info[name][i] for name in ("qoi", "clairvoyant", "regret", "score")}
+            players[rows[i]["policy"]].begin(i)
+    for ours, alone in zip(last, infos, strict=True):
+        assert ours == pytest.approx({name: alone[name] for name in ours}, nan_ok=True)
+
+
+def test_every_scenario_of_a_suite_is_drawn(mixed: str) -> None:
+    env = SenderEnv("suite", L, suite=mixed, split="train")
+    env.reset(seed=1)
+    drawn = []
+    for _ in range(20):
+        env.reset()
+        drawn.append((env.rows.senders.value_of(0).name, env.rows.senders.episodes[0].link.trace.name))  # type: ignore[union-attr]
+    assert {value for value, _ in drawn} == {"saturating:3", "exponential:0.4"}
+    assert {trace for _, trace in drawn} == {"train-0", "train-1"}
+
+
+def test_the_rows_of_a_bench_without_a_suite_are_found_too() -> None:
+    uplink = Uplink(traces=tuple(Trace.constant(2e6, 9, name="same") for _ in range(2)), duration_s=3)
+    env = SenderEnv(uplink, L)
+    for row in run([policies.get("random")], uplink, [L], 2):
+        info = played(env, "random", options={"trace": row["trace"], "seed": row["seed"]})
+        assert info["qoi"] == pytest.approx(row["qoi"])
+    assert row["trace"] == "same#2" and played(env, "random", options={"trace": 1, "seed": 1})["qoi"] == info["qoi"]
+    alone = SenderEnv(Interruption(t_max=30), L)
+    alone.reset(options={"seed": 5})
+    assert alone.rows.senders.episodes[0].last_decision == draw(Interruption(t_max=30), 5).last_decision  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"scenario": "time"}, "seed = None: must be a whole number"),
+        ({"scenario": "nowhere", "seed": 0}, "scenario = 'nowhere': must be one of time, motion"),
+        ({"seed": 0}, "scenario = None: must be one of time, motion"),
+        ({"scenario": "time", "seed": 2_000}, "trace = 2: must be 0..1 or one of test-0, test-1"),
+        ({"scenario": "time", "seed": 0, "trace": "b"}, "trace = 'b': must be 0..1"),
+        ({"episode": None, "seed": 0}, "options: an episode, or its scenario, trace, seed; not both"),
+        ({"number": 3}, "known: episode, scenario, trace, seed"),
+    ],
+)
+def test_no_such_episode(mixed: str, options: dict[str, Any], says: str) -> None:
+    with pytest.raises(BufgymError, match=says):
+        SenderEnv("suite", L, suite=mixed, split="test").reset(options=options)
+
+
+def test_what_has_no_such_numbers() -> None:
+    with pytest.raises(BufgymError, match="scenario = 'lte': only the episodes of a suite have one"):
+        SenderEnv("lte", L).reset(options={"scenario": "lte", "trace": 0, "seed": 0})
+    with pytest.raises(BufgymError, match=r"trace = None: must be 0..7 or one of lte-synthetic-0"):
+        SenderEnv("lte", L).reset(options={"seed": 0})
+    with pytest.raises(BufgymError, match="episode: 'label' is unknown; known: scenario, trace, seed"):
+        SenderVectorEnv(1, "interruption", L).reset(options={"episodes": [{"label": 1}]})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"suite": "topics-v1"}, "suite topics-v1 is one of topics: bufgym/Suite-v0 has those of one queue alone"),
+        ({"suite": "fleet-v1"}, "suite fleet-v1 is one of fleet"),
+        ({"suite": "lte-v9"}, "unknown suite 'lte-v9'"),
+        ({"split": "all"}, "split = 'all': must be one of train, validation, test"),
+        ({"suite": "lte-belgium-v1"}, "needs a folder of recordings"),
+    ],
+)
+def test_suites_that_make_no_environment(arguments: dict[str, Any], says: str) -> None:
+    with pytest.raises(BufgymError, match=says):
+        gym.make("bufgym/Suite-v0", **arguments)
+
+
+# --- what an episode was worth ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("T", "action", "h", "best", "score"),
+    [
+        (3, 1, 1.9375, 2.5, -3.5),  # reject all: 1 + V(4), where 1 + 2 V(2) was possible and Drop Oldest has 2.375
+        (3, 0, 2.375, 2.5, 0.0),  # the oldest goes each time: 1 + V(3) + V(1)
+        (2, 0, 2.25, 2.25, math.nan),  # whichever of the two is kept, 1 + V(1) + V(2)
+    ],
+)
+def test_the_bound_worked_by_hand(T: int, action: int, h: float, best: float, score: float) -> None:
+    """L = 1, V(d) = 1 - 0.5^d, an interruption of T messages."""
+    env = gym.make(
+        "bufgym/Interruption-v0",
+        capacity=1,
+        law="fixed",
+        t_max=T,
+        value="exponential:0.5",
+        bound=True,
+        disable_env_checker=True,
+    )
+    env.reset(seed=0)
+    ended, info, first = False, {}, action != 1
+    while not ended:
+        _, _, ended, _, info = env.step(2 if first else action)  # there is room for the first
+        assert ended or "score" not in info
+        first = False
+    found = [info[name] for name in ("qoi", "clairvoyant", "regret", "score")]
+    assert found == pytest.approx([h, best, 1 - h / best, score], nan_ok=True)
+
+
+def test_no_bound_unless_asked_for_nor_of_topics() -> None:
+    env = SenderEnv("interruption", 1, t_max=3)
+    assert "clairvoyant" not in played(env, "drop-oldest", seed=0)
+    with pytest.raises(BufgymError, match="bound = True: the clairvoyant is known for one queue"):
+        gym.make("bufgym/Topics-v0", bound=True)
+
+
+# --- arguments as text -----------------------------------------------------------------------------------------------
+
+TEXTS: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
+    ("bufgym/Interruption-v0", {"value": "saturating:4"}, {"value": qoi.saturating(4)}),
+    ("bufgym/Uplink-v0", {"traces": "lte-synthetic-3", "motion": "drive-1"}, {}),
+    ("bufgym/Uplink-v0", {"traces": ["lte-synthetic-3", "lte-synthetic-0"], "motion": "none", "scale": [0.5, 2]}, {}),
+    ("bufgym/Topics-v0", {"traces": "lte-synthetic-3", "motion": ["drive-0"], "value": "exponential:0.5"}, {}),
+    ("bufgym/Topics-v0", {"scenario": "examples/client.toml"}, {}),
+    ("bufgym/Suite-v0", {"suite": "interruption-v1", "split": "validation"}, {}),
+]
+
+
+@pytest.mark.parametrize(("env_id", "arguments", "objects"), TEXTS)
+def test_text_makes_what_objects_make_and_survives_json(
+    env_id: str, arguments: dict[str, Any], objects: dict[str, Any]
+) -> None:
+    env: Any = gym.make(env_id, capacity=3, **arguments)
+    again: Any = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    scenario = env.unwrapped.rows.scenario
+    for name, expected in objects.items():
+        assert getattr(scenario, name) == expected
+    if "traces" in arguments:
+        names = arguments["traces"]
+        assert [trace.name for trace in scenario.traces] == ([names] if isinstance(names, str) else names)
+        assert [motion.name for motion in scenario.motion] == [
+            name for name in np.atleast_1d(arguments["motion"]) if name != "none"
+        ]
+    assert again.unwrapped.rows.scenario.value == scenario.value
+    for first, second in zip(env.reset(seed=3), again.reset(seed=3), strict=True):
+        np.testing.assert_equal(first, second)
+
+
+def test_text_may_name_a_file(tmp_path: Path) -> None:
+    write_csv(Trace.steps([(1.0, 500_000), (2.0, 0)]), tmp_path / "mine.csv")
+    (tmp_path / "recording.csv").write_text("time_s,bytes\n0,1000\n0.5,2000\n1,500\n")
+    env: Any = gym.make(
+        "bufgym/Uplink-v0", traces=str(tmp_path / "mine.csv"), workload=str(tmp_path / "recording.csv"), motion="none"
+    )
+    env.reset(seed=0)
+    assert env.unwrapped.rows.senders.episodes[0].arrivals["size_bytes"].tolist() == [1000, 2000, 500]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"value": "linear:3"}, "V = 'linear:3': unknown kind 'linear'"),
+        ({"traces": "nowhere"}, "nowhere: no such file, and no shipped trace"),
+        ({"motion": ["drive-0", "nowhere"]}, "nowhere: no such file"),
+        ({"value": 3}, "value = 3: must be a bufgym.model.qoi Value or text"),
+        ({"workload": "nowhere.csv"}, "nowhere.csv"),
+        ({"scenario": "nowhere.toml"}, "nowhere.toml"),
+    ],
+)
+def test_text_that_names_nothing(arguments: dict[str, Any], says: str) -> None:
+    with pytest.raises((BufgymError, OSError), match=says):
+        gym.make("bufgym/Uplink-v0", **arguments)
+
+
+# --- chance ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", [id for id in bufgym.ENVIRONMENTS if "Topics" not in id])
+def test_a_randomised_policy_is_random_in_an_environment(env_id: str) -> None:
+    """Same seed same run, alone and as a row of a batch; other seeds and Drop Oldest differ; and the episode keeps
+    its draws, so that a rollout does the same."""
+    smaller: dict[str, Any] = {} if JIT else {"t_max": 30} if "Interruption" in env_id else {}
+    if "Suite" in env_id:
+        smaller = {"suite": "interruption-v1"}
+    elif "Uplink" in env_id:
+        smaller = {"duration_s": 4.0, "size_bytes": 1_000_000}
+    env: Any = gym.make(env_id, capacity=3, **smaller)
+
+    def sent(policy: str, seed: int) -> list[int]:
+        played(env, policy, seed=seed)
+        senders = env.unwrapped.rows.senders
+        return [int(k) for k in senders.batch.order[0, : senders.batch.senders[0]["transmitted"]]]
+
+    random = [sent("random", seed) for seed in range(4)]
+    assert random == [sent("random", seed) for seed in range(4)]
+    assert random != [sent("drop-oldest", seed) for seed in range(4)]
+    env.reset(seed=0)
+    player = Player(policies.get("random"))
+    player.action(env.unwrapped.rows.senders)
+    assert env.unwrapped.rows.senders.episodes[0].arrivals["uniform"].any()
