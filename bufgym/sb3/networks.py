@@ -30,7 +30,7 @@ ACCEPT_BIAS = 2.0
 
 def field_names(space: spaces.Dict) -> tuple[list[str], list[str]]:
     """(slot fields, context fields) of a bufgym observation: L + 1 >= 2 entries, and one entry."""
-    if not isinstance(space, spaces.Dict) or "slots" in space or "context" in space:
+    if not isinstance(space, spaces.Dict) or {"slots", "context"} & set(space.spaces):
         raise BufgymError('a slot network observes named fields: make its environment with observation="dict"')
     slots = [name for name, box in space.items() if (box.shape or (1,))[0] > 1]
     return slots, [name for name in space if name not in slots]
