@@ -177,8 +177,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         last: dict[str, Any] = {}
         for name, column in rows.summary(slice(None)).items():
             last |= {name: np.where(done, column, 0), f"_{name}": done}
-        if rows.bound:
-            ended = done & rows.output.terminated
+        ended = done & rows.output.terminated
+        if rows.bound and ended.any():
             for name, column in rows.bounds(ended, rows.output.qoi).items():
                 last |= {name: column, f"_{name}": ended}
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
