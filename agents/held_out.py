@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -47,6 +48,12 @@ def run_fixed(episodes: Sequence[Episode], scenario: Scenario, capacity: int) ->
     return outcomes
 
 
+def known_mean(numbers: Sequence[float]) -> float:
+    """The mean of those that are known; NaN where none is: a policy that delivered nothing has no delay."""
+    known = [number for number in numbers if not math.isnan(number)]
+    return float(np.mean(known)) if known else math.nan
+
+
 def summarise(outcomes: Mapping[str, Sequence[Outcome]], agent: str, resamples: int = 2000) -> list[dict[str, Any]]:
     """One row a policy, best QoI first: means over the episodes, and QoI minus the agent's with its 95 % interval.
 
@@ -55,7 +62,7 @@ def summarise(outcomes: Mapping[str, Sequence[Outcome]], agent: str, resamples: 
     reference = [result.qoi for result in outcomes[agent]]
     rows = []
     for name, results in outcomes.items():
-        means = {field.name: float(np.nanmean([getattr(o, field.name) for o in results])) for field in fields(Outcome)}
+        means = {field.name: known_mean([getattr(o, field.name) for o in results]) for field in fields(Outcome)}
         minus, low, high = paired_difference([result.qoi for result in results], reference, resamples=resamples)
         rows.append({"policy": name, **means, "minus_agent": minus, "minus_agent_95": [low, high]})
     return sorted(rows, key=lambda row: -row["qoi"])
