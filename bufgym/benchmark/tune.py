@@ -78,6 +78,9 @@ GRIDS = {
 FIXED = {
     "ros-keep-last": "it stands for ROS 2 as delivered, with its default depth of 10",
     "foxglove-sdk": "it stands for the Foxglove SDK as delivered, with its default backlog of 1024 messages",
+    "zenoh-drop": "it stands for Zenoh as delivered, with its default batches and waits",
+    "ros2-best-effort": "it stands for Fast DDS over UDP; the link's queue is a fact, not a choice",
+    "ros2-reliable-udp": "it stands for Fast DDS over UDP; the link's queue is a fact, not a choice",
     "foxglove-backlog": "it stands for ros-foxglove-bridge as delivered, with its default limit of 10 MB",
 }
 """What has parameters and is not tuned, and why."""

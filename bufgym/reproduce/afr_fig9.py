@@ -77,11 +77,11 @@ def full_queue(capacity: int, arrivals: int) -> tuple[Buffer, NDArray[Any]]:
             slots = records(capacity, MESSAGE)
             slots[:] = buffer.slots  # a copy: the sender goes on
             scalars = {f: v.item() for f, v in buffer._asdict().items() if isinstance(v, np.generic)}
-            captured.append(buffer._replace(slots=slots, **scalars))
+            captured.append(buffer._replace(slots=slots, topics=buffer.topics.copy(), **scalars))
         return 0
 
     sim.run(Policy("watch", watch), [episode], capacity, interruption.value)
-    return captured[0], np.ascontiguousarray(episode.arrivals[capacity + 1 : -1])
+    return captured[0], episode.arrivals[capacity + 1 : -1].copy()
 
 
 def inside_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], decisions: int) -> float:

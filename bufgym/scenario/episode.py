@@ -124,7 +124,8 @@ class Episode:
         arrivals = np.repeat(self.arrivals, self.consumers).view(type(self.arrivals))
         arrivals["topic"] += topics * np.tile(np.arange(self.consumers), n)
         arrivals["seq"] = np.arange(len(arrivals))
-        return replace(self, arrivals=read_only(arrivals), consumers=1)
+        encodings = {name: np.repeat(sizes, self.consumers) for name, sizes in self.encodings.items()}
+        return replace(self, arrivals=read_only(arrivals), encodings=encodings, consumers=1)
 
 
 def check_link(link: Any) -> Link:

@@ -227,11 +227,11 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         ({"streams": (Topic("a"),)}, "is not a bufgym.scenario.Stream"),
         ({"traces": ()}, "traces: a client needs at least one"),
         ({"consumers": 2_500_001}, "10000004 messages in all, with a copy for each of 2500001 consumers: must lie"),
-        ({"traces": "lte"}, "is not a bufgym.traces Trace"),
+        ({"traces": "lte"}, "lte: no such file, and no shipped trace"),
         ({"motion": (3,)}, "motion: 3 is not a bufgym.traces Motion"),
         ({"scale": 0}, "scale = 0: must be a number > 0"),
         ({"duration_s": math.nan}, "duration_s = nan: must be a number > 0"),
-        ({"value": "exponential"}, "value = 'exponential'"),
+        ({"value": "exponential:wide"}, "exponential:wide"),
     ],
 )
 def test_bad_clients(parameters: dict[str, Any], rule: str) -> None:

@@ -113,7 +113,7 @@ class Twin:
             "loss": lost * topic.share / self.top,
             "relative_loss": per(lost, max(2 * v(even_x) - v(2 * even_x), 1e-12)),
             "size": per(m["bytes"], np.mean([each["bytes"] for each in messages])),
-            "priority": topic.priority / max(each.priority for each in self.topics),
+            "priority": topic.priority / (max(each.priority for each in self.topics) or 1.0),
             "weight": topic.share / self.top,
             "no_drop": float(topic.no_drop),
             "oldest": float(bool(queue) and m is queue[0]),

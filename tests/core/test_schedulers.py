@@ -133,12 +133,12 @@ def test_no_drop_makes_its_way(name):
 
 
 def test_bytes():
-    # B = 3000 bytes. 4 needs 1000 more than are free: of its own topic 2 (500) would not do, so 3 (2000) goes.
+    # B = 3000 bytes. 4 needs 1000 more than are free: of its own topic 2 (500) goes, too little, then 3 (1500).
     senders = played(
         "fifo", "0 A, 1 A 500, 2 B 500, 3 B 1500, 4 B 1500, 5 A 3000", topics(), max_bytes=3_000, capacity=9
     )
-    # 1, 2 and 4 are 2500 bytes: none of them alone makes room for 5.
-    assert dropped(senders) == [3, 5]
+    # 5 needs all of B: 1 of its own topic goes, but 4 ranks above it, and so 5 is rejected.
+    assert dropped(senders) == [2, 3, 1, 5]
     assert count(senders, "invalid") == 0
 
 
