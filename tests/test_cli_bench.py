@@ -229,3 +229,10 @@ def test_the_clairvoyant_plans_for_a_sender_that_is_always_asked(
     assert "policy clairvoyant: it plans for a sender that asks at every arrival" in capsys.readouterr().err
     assert main(overflow) == 0
     assert "\nclairvoyant " not in capsys.readouterr().out
+
+
+def test_a_suites_run_is_never_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "manifest.json").write_text("{}", encoding="utf-8")
+    assert main(["bench", "--policies", "afr", "--seeds", "1", "--seconds", "1", "--out", str(tmp_path)]) == 2
+    assert "holds the run of a suite" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]

@@ -71,7 +71,12 @@ def _scenario(options: argparse.Namespace) -> None:
     stream, about = scenario(options)
     if options.out is not None:
         # Before the long work, so that a folder that cannot be made is known at once.
-        Path(options.out).mkdir(parents=True, exist_ok=True)
+        out = Path(options.out)
+        out.mkdir(parents=True, exist_ok=True)
+        if (out / "manifest.json").exists():
+            raise BufgymError(
+                f"{out}: holds the run of a suite; choose another --out (its rows are never written over)"
+            )
     settings = {"max_bytes": options.max_bytes, "decide_at": options.decide_at}
     rows = run(chosen, stream, options.capacity, options.seeds, progress=True, **settings)
     bounds = _bound_notes(rows, stream, options.decide_at) if options.workload is not None else []

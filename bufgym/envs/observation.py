@@ -46,6 +46,8 @@ class ObservationForm:
             raise BufgymError(f"observation = {form!r}: must be one of {', '.join(map(repr, FORMS))}")
         fields = (*slot_fields, *context_fields)
         known = [field.name for field in fields]
+        if isinstance(chosen, str):
+            raise BufgymError(f"fields = {chosen!r}: must be a list of names; known: {', '.join(known)}")
         for name in chosen or ():
             if name not in known:
                 raise BufgymError(f"fields: unknown field {name!r}; known: {', '.join(known)}")

@@ -149,6 +149,10 @@ class Rows:
 
         An episode may be a dict: the arguments of ``numbered``.
         """
+        if episodes is not None and (not isinstance(episodes, Sequence) or len(episodes) != len(self)):
+            raise BufgymError(
+                f"episodes = {episodes!r}: must be a list of {len(self)}, one a row; None where one is drawn"
+            )
         load = self.senders.load
         for i in rows.tolist():
             given = None if episodes is None else episodes[i]

@@ -56,7 +56,8 @@ class Link:
         it takes is bounded by whole laps of what repeats at the trace's end, two more for each time that it begins.
         """
         trace = self.trace
-        lap_us, lap_bytes = trace.duration_us, trace.total_bytes
+        # Python's integers, which do not overflow.
+        lap_us, lap_bytes, total_bytes = int(trace.duration_us), int(trace.total_bytes), int(total_bytes)
         until_us, until_bytes = max(last_us + self.offset_us, lap_us) + pauses * pause_us, lap_bytes + total_bytes
         if trace.after == "hold":
             lap_us -= int(trace.time_us[-2])

@@ -103,10 +103,11 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
     rows[fields.TIME_MERGED, last] = arrival.arrival_us - before_us + step_us
     rows[fields.MOTION_BEFORE, last] = arrival.x - before_x
     rows[fields.MOTION_MERGED, last] = arrival.x - before_x + step_x
-    rows[fields.LOSS, last] = merging_loss(
-        buffer.v, arrival.x - before_x, newcomer_gain, step_x, value(buffer.v, step_x)
+    rows[fields.LOSS, last] = max(
+        0.0,  # nothing is lost with a first message, which has no gap before it to merge
+        merging_loss(buffer.v, arrival.x - before_x, newcomer_gain, step_x, value(buffer.v, step_x)),
     )
-    rows[fields.RELATIVE_LOSS, last] = max(rows[fields.LOSS, last], 0.0)
+    rows[fields.RELATIVE_LOSS, last] = rows[fields.LOSS, last]
     rows[fields.SIZE, last] = arrival.size_bytes
     even = 1 / (buffer.capacity + 1)
     even_us, even_x = even * (arrival.arrival_us - buffer.dequeued_arrival_us), even * (arrival.x - buffer.dequeued_x)

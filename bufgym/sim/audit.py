@@ -12,15 +12,19 @@ from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
 from bufgym.kernel import at, item, kernel
+from bufgym.model.qoi import value
 from bufgym.sim.state import NEVER, Batch
 
-_ARRIVAL, _QUEUED, _BYTES, _LOG, _TOPIC = range(1, 6)
+_ARRIVAL, _QUEUED, _BYTES, _LOG, _TOPIC, _QOI = range(1, 7)
+_ROUNDING = 1e-9
+"""H is added up in another order here."""
 _FOUND = {
     _ARRIVAL: "a message that arrived is not as the episode has it",
     _QUEUED: "a queued message is not as it arrived",
     _BYTES: "the queue's bytes are not those of its messages",
     _LOG: "not every message was sent, dropped or queued exactly once",
     _TOPIC: "a topic's rules are not as they were",
+    _QOI: "H is not that of the messages that were received",
 }
 
 
@@ -86,4 +90,11 @@ def _touched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArray[Any])
             or now.v_start != then.v_start
         ):
             return _TOPIC
+    if sender.topics == 1:
+        qoi = 0.0
+        for k in range(1, sender.credited):
+            step = item(arrivals, at(batch.order, i, k)).x - item(arrivals, at(batch.order, i, k - 1)).x
+            qoi += value(batch.v[sender.v_start :], step)
+        if abs(qoi - sender.delivered_gain) > _ROUNDING * max(1.0, qoi):
+            return _QOI
     return 0

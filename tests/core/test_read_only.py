@@ -47,6 +47,18 @@ def numbers_arrivals_wildly(buffer: Any, arrival: Any, memory: Any) -> int:
     return ACCEPT if len(buffer.slots) < buffer.capacity else 0
 
 
+def moves_queued(buffer: Any, arrival: Any, memory: Any) -> int:
+    if len(buffer.slots) > 0:
+        buffer.slots[len(buffer.slots) - 1].x -= 0.5
+    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
+
+
+def praises_queued(buffer: Any, arrival: Any, memory: Any) -> int:
+    if len(buffer.slots) > 0:
+        buffer.slots[len(buffer.slots) - 1].gain = 1.0
+    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
+
+
 def moves(buffer: Any, arrival: Any, memory: Any) -> int:
     arrival.x *= 1000
     return ACCEPT if len(buffer.slots) < buffer.capacity else 0
@@ -72,6 +84,8 @@ WRITERS = {
     renumbers: "not every message was sent, dropped or queued exactly once",
     numbers_queued_wildly: "not every message was sent, dropped or queued exactly once",
     numbers_arrivals_wildly: "a message that arrived is not as the episode has it",
+    moves_queued: "H is not that of the messages that were received",
+    praises_queued: "H is not that of the messages that were received",
     moves: "a message that arrived is not as the episode has it",
     shrinks: "a message that arrived is not as the episode has it",
     shrinks_queued: "the queue's bytes are not those of its messages",

@@ -386,3 +386,20 @@ def test_a_given_episode_is_played() -> None:
     env.reset(options={"episode": SCENARIOS["interruption"].episode(3)})  # type: ignore[attr-defined]
     steps = [env.step(4) for _ in range(3)]
     assert [step[2] for step in steps] == [False, False, True]
+
+
+def test_losses_stay_in_the_box_while_nothing_was_kept() -> None:
+    """Messages are rejected and the next one waits: V saturates, so its gap is worth less than the one behind it."""
+    env = gym.make("bufgym/Uplink-v0", value="saturating:0.5").unwrapped
+    observation, _ = env.reset(seed=0)
+    for _ in range(3):
+        assert env.observation_space.contains(observation)
+        observation, *_ = env.step(8)
+
+
+def test_what_is_not_a_list_is_refused() -> None:
+    with pytest.raises(BufgymError, match="must be a list of names"):
+        gym.make("bufgym/Uplink-v0", fields="rank")
+    batch = gym.make_vec("bufgym/Uplink-v0", num_envs=3)
+    with pytest.raises(BufgymError, match="must be a list of 3, one a row"):
+        batch.reset(options={"episodes": [None]})
