@@ -35,7 +35,7 @@ test: $(READY)
 	NUMBA_DISABLE_JIT=0 $(PYTEST) $(PYTEST_ARGS)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -m "not slow" $(PYTEST_ARGS)
 
-# For the night: 100,000 broken files of each kind, 10,000 command lines, 1,000,000 episodes, others every day.
+# For the night: 100,000 broken files of each kind, 10,000 command lines, 1,000,000 episodes, 200 kills, others every day.
 fuzz: $(READY)
 	BUFGYM_FUZZ=100000 BUFGYM_FUZZ_SEED=$$(date +%Y%m%d) HYPOTHESIS_PROFILE=thorough $(PYTEST) tests/fuzz $(PYTEST_ARGS)
 

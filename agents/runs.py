@@ -81,7 +81,7 @@ def prepare(settings: Settings) -> Path:
     if settings.resume:
         if not (folder / "settings.json").exists():
             raise BufgymError(f"--resume: there is no run in {folder}")
-    elif folder.exists():
+    elif folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise BufgymError(f"{folder} exists: choose another --name, or --resume it")
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
