@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import kernel
+from bufgym.kernel import interruptible, kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.model.checks import whole
 from bufgym.model.qoi import Value
@@ -153,7 +153,8 @@ def online_optimum(
     decisions = np.zeros(math.comb(t_max, L + 1), np.min_scalar_type(L))
     if t_max >= L:
         best = np.empty(math.comb(t_max, L))
-        _solve(gain, weight, _binomials(t_max, L), np.zeros(L + 2, np.int64), best, decisions)
+        binomials, work = _binomials(t_max, L), np.zeros(L + 2, np.int64)
+        interruptible(lambda: _solve(gain, weight, binomials, work, best, decisions))
         value += best[0]  # of messages 1..L
     for array in (p, decisions):
         array.flags.writeable = False
