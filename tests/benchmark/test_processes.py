@@ -86,7 +86,7 @@ def test_one_that_always_dies_is_an_error(tmp_path: Path) -> None:
     process = bufgym(*words(policy_file(tmp_path, "doomed", "os.kill(os.getpid(), 9)"), tmp_path / "out"))
     _, err = process.communicate(timeout=100)
     assert process.returncode == 2
-    assert err.splitlines()[-1].startswith("bufgym: error: a worker process ended before its work did"), err
+    assert any(line.startswith("bufgym: error: a worker process ended before") for line in err.splitlines()), err
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
