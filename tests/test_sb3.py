@@ -440,3 +440,8 @@ def test_the_slot_extractor_serves_other_policies() -> None:
     model = untrained(PPO, "MultiInputPolicy", policy_kwargs={"features_extractor_class": SlotExtractor})
     assert isinstance(model.policy.features_extractor, SlotExtractor)
     assert model.policy.features_extractor.features_dim == (L + 1) * 20
+
+
+def test_the_number_of_environments_goes_by_its_name_here() -> None:
+    with pytest.raises(BufgymError, match="stable-baselines3 calls it n_envs"):
+        make_vec_env("bufgym/Uplink-v0", num_envs=2)

@@ -55,6 +55,8 @@ def make_vec_env(
     is a ``gymnasium.vector.VectorWrapper``. Wrappers of single environments and ``vec_env_cls`` are errors there.
     """
     own = _settings(env_kwargs) | kwargs
+    if "num_envs" in own:
+        raise BufgymError(f"num_envs = {own['num_envs']}: stable-baselines3 calls it n_envs")
     if not _has_native_batch(env_id):
         arguments = (start_index, monitor_dir, wrapper_class, own, vec_env_cls, vec_env_kwargs, monitor_kwargs)
         return env_util.make_vec_env(env_id, n_envs, seed, *arguments, wrapper_kwargs)
