@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -12,14 +11,9 @@ import numpy as np
 from bufgym import policies, scenario
 from bufgym.benchmark.run import run
 from bufgym.envs import FleetVecEnv, SenderVectorEnv
-from bufgym.scenario import FleetScenario, Interruption, Uplink
+from bufgym.scenario import FleetScenario, Interruption
 
 _L = 2
-
-
-def _uplink() -> Uplink:
-    """A second of video."""
-    return replace(scenario.get("lte"), duration_s=1.0)  # type: ignore[type-var,return-value]
 
 
 def _environments() -> None:
@@ -36,7 +30,7 @@ def _environments() -> None:
 
 def _bound() -> None:
     for size_cv in (0.0, 0.5):
-        run([policies.get("drop-oldest")], replace(_uplink(), size_cv=size_cv), [_L], 1)
+        run([policies.get("drop-oldest")], scenario.get("lte", duration_s=1.0, size_cv=size_cv), [_L], 1)
 
 
 def _policies() -> None:
@@ -44,7 +38,7 @@ def _policies() -> None:
 
 
 def _schedulers() -> None:
-    client = replace(scenario.get("topics"), duration_s=1.0)  # type: ignore[type-var]
+    client = scenario.get("topics", duration_s=1.0)
     run([policies.get(name) for name in policies.names(for_topics=True)], client, [_L], 1)
 
 
@@ -52,7 +46,7 @@ def _fleets() -> None:
     batches = FleetVecEnv(1, 2, "lte", _L, parameters={"duration_s": 1.0})
     batches.reset(seed=0)
     batches.step(np.full(2, _L))
-    run([policies.get("drop-oldest")], FleetScenario(2, _uplink()), [_L], 1)
+    run([policies.get("drop-oldest")], FleetScenario.of(2, "lte", duration_s=1.0), [_L], 1)
 
 
 PARTS: dict[str, Callable[[], None]] = {

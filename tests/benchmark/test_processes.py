@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 
@@ -100,4 +101,6 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_a_process_of_its_own_does_not_end_with_a_stranger() -> None:
+    before = threading.active_count()
     cluster.end_with(1 if os.getppid() != 1 else 2)
+    assert threading.active_count() == before
