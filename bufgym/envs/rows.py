@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bufgym import scenario as scenarios
 from bufgym.envs.bound import BOUND, check_one_queue, measured
 from bufgym.envs.observation import Observation, ObservationForm
-from bufgym.envs.step import StepOutput, begin_cells, begin_rows, step_cells, step_rows
+from bufgym.envs.step import StepOutput, step_cells, step_rows
 from bufgym.errors import BufgymError
 from bufgym.observe import (
     CONTEXT_FIELDS,
@@ -61,6 +61,9 @@ def check_render_mode(render_mode: str | None, known: Sequence[str]) -> str | No
         raise BufgymError(f"render_mode = {render_mode!r}: must be one of {known}")
     return render_mode
 
+
+NO_ACTIONS: NDArray[np.int64] = np.zeros(0, np.int64)
+"""For ``step_rows`` and ``step_cells``: episodes begin."""
 
 NUMBERED = ("scenario", "trace", "seed")
 """What names an episode of a benchmark: see ``bufgym.scenario.numbered``."""
@@ -125,6 +128,7 @@ class Rows:
         self._draw: Callable[[Streams], Any] = self.scenario.draw
         self.rewarded = np.zeros((n, len(self.terms)))
         self.output = self.new_output()
+        self._every = np.arange(n)
 
     def __len__(self) -> int:
         return len(self.senders)
@@ -162,11 +166,11 @@ class Rows:
                 load(i, numbered(self.scenario, **_checked(given)) if isinstance(given, Mapping) else given)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
-        begin_rows(self.senders.batch, rows, self.rewarded, self.output)
+        step_rows(self.senders.batch, rows, NO_ACTIONS, self.rewarded, self.output)
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """One decision in every row; the result is in ``self.output``."""
-        step_rows(self.senders.batch, actions, self.rewarded, self.output)
+        step_rows(self.senders.batch, self._every, actions, self.rewarded, self.output)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step."""
@@ -289,11 +293,13 @@ class FleetRows(Rows):
             if not episode.ticks_together:
                 raise BufgymError("episode: in an environment the messages of all robots arrive at the same times")
             self.fleet.load(c, episode)
-        begin_cells(self.senders.batch, self.fleet.shares, cells, self.rewarded, self.output)
+        step_cells(self.senders.batch, self.fleet.shares, cells, NO_ACTIONS, self.rewarded, self.output)
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """One decision of every robot; the result is in ``self.output``."""
-        step_cells(self.senders.batch, self.fleet.shares, actions, self.rewarded, self.output)
+        step_cells(
+            self.senders.batch, self.fleet.shares, self._every[: len(self.fleet)], actions, self.rewarded, self.output
+        )
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[rows]: each robot's own weighted sum, or for a "team" the mean of those in its cell."""

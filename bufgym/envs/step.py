@@ -207,42 +207,46 @@ def write_mask(batch: Batch, i: int, action_mask: NDArray[np.int8]) -> None:
 @kernel
 def advance(batch: Batch, i: int) -> None:
     """Run row ``i`` to its next decision, or to the end of its episode."""
-    event = next_event(batch, None, i)
+    event = DEPARTURE
     while event == DEPARTURE:
         event = next_event(batch, None, i)
     settle_gains(batch, i, event == END)
 
 
 @kernel
-def begin_rows(batch: Batch, rows: NDArray[np.int64], rewarded: NDArray[np.float64], output: StepOutput) -> None:
-    """Bring freshly loaded rows to their first decision; nothing is rewarded yet."""
-    for i in rows:
-        advance(batch, i)
-        rewarded[i, :] = 0.0
-        output.reward_terms[i, :] = 0.0
-        write_observation(batch, i, batch.senders[i].waiting == NOTHING_WAITS, output)
+def step_rows(
+    batch: Batch,
+    rows: NDArray[np.int64],
+    actions: NDArray[np.int64],
+    rewarded: NDArray[np.float64],
+    output: StepOutput,
+) -> None:
+    """One decision in each of ``rows``; where ``actions`` is empty, bring freshly loaded rows to their first one.
 
-
-@kernel
-def step_rows(batch: Batch, actions: NDArray[np.int64], rewarded: NDArray[np.float64], output: StepOutput) -> None:
-    """One decision in every row. ``rewarded``: float64[n, reward terms], the rewards of the episode so far.
-
-    A row without a decision due (its episode has ended, or asked for none) reports its end.
+    ``actions``: int64[n], by row; ``rewarded``: float64[n, reward terms], the rewards of the episode so far: at its
+    beginning nothing. A row without a decision due (its episode has ended, or asked for none) reports its end.
     """
-    for i in range(len(actions)):
+    begins, last = len(actions) == 0, len(rows) - 1
+    for r in range(len(rows)):
         # Every row's messages lie in memory of their own: fetch a later row's next one while this row is worked on.
-        later = min(i + _AHEAD, len(actions) - 1)
+        later = rows[min(r + _AHEAD, last)]
         soon = min(batch.senders[later].next + 1, batch.arrivals.shape[1] - 1)
         prefetch(batch.arrivals, later, soon)
         prefetch(batch.log, later, soon)
+        i = rows[r]
         sender = batch.senders[i]
-        if sender.waiting == ARRIVAL_WAITS:
+        asks = sender.waiting
+        if not begins and asks == ARRIVAL_WAITS:
             decide(batch, i, decision_of(actions[i], sender.capacity))
-            advance(batch, i)
-        elif sender.waiting == SOCKET_WAITS:
+        elif not begins and asks == SOCKET_WAITS:
             answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
+        if begins or asks != NOTHING_WAITS:
             advance(batch, i)
-        write_rewards(batch, i, rewarded, output)
+        if begins:
+            rewarded[i, :] = 0.0
+            output.reward_terms[i, :] = 0.0
+        else:
+            write_rewards(batch, i, rewarded, output)
         write_observation(batch, i, sender.waiting == NOTHING_WAITS, output)
 
 
@@ -256,7 +260,7 @@ def advance_cell(batch: Batch, shares: Shares, c: int) -> None:
     At a tick every robot has a decision due, but for those whose message is larger than B.
     """
     robots = shares.cells[c].robots
-    event = next_event(batch, shares, c)
+    event = DEPARTURE
     while event == DEPARTURE:
         event = next_event(batch, shares, c)
     while event == DECISION and shares.cells[c].robot < robots:
@@ -276,39 +280,36 @@ def decisions_due(batch: Batch, shares: Shares, c: int) -> bool:
 
 
 @kernel
-def begin_cells(
-    batch: Batch, shares: Shares, cells: NDArray[np.int64], rewarded: NDArray[np.float64], output: StepOutput
-) -> None:
-    """Bring freshly loaded cells to their first tick; nothing is rewarded yet."""
-    for c in cells:
-        advance_cell(batch, shares, c)
-        robots, ended = shares.cells[c].robots, not decisions_due(batch, shares, c)
-        for i in range(c * robots, (c + 1) * robots):
-            rewarded[i, :] = 0.0
-            output.reward_terms[i, :] = 0.0
-            write_observation(batch, i, ended, output)
-
-
-@kernel
 def step_cells(
-    batch: Batch, shares: Shares, actions: NDArray[np.int64], rewarded: NDArray[np.float64], output: StepOutput
+    batch: Batch,
+    shares: Shares,
+    cells: NDArray[np.int64],
+    actions: NDArray[np.int64],
+    rewarded: NDArray[np.float64],
+    output: StepOutput,
 ) -> None:
-    """One decision of every robot that has one due, as ``step_rows``; cells that have ended stay as they are.
+    """One decision of every robot of ``cells`` that has one due, or the first tick of cells, as ``step_rows``.
 
-    A cell moves on once none is due: robots that are asked again about the same arrival hold the others up.
+    Cells that have ended stay as they are. A cell moves on once no decision is due: robots that are asked again about
+    the same arrival hold the others up.
     """
-    for c in range(len(shares.cells)):
+    begins = len(actions) == 0
+    for c in cells:
         robots = shares.cells[c].robots
         first = c * robots
-        due = decisions_due(batch, shares, c)
+        due = begins or decisions_due(batch, shares, c)
         for i in range(first, first + robots):
-            if batch.senders[i].waiting == ARRIVAL_WAITS:
+            if not begins and batch.senders[i].waiting == ARRIVAL_WAITS:
                 decide(batch, i, decision_of(actions[i], batch.senders[i].capacity))
                 if batch.senders[i].waiting == NOTHING_WAITS:
                     offer(batch, shares, i)
-        if due and not decisions_due(batch, shares, c):
+        if due and (begins or not decisions_due(batch, shares, c)):
             advance_cell(batch, shares, c)
         ended = not decisions_due(batch, shares, c)
         for i in range(first, first + robots):
-            write_rewards(batch, i, rewarded, output)
+            if begins:
+                rewarded[i, :] = 0.0
+                output.reward_terms[i, :] = 0.0
+            else:
+                write_rewards(batch, i, rewarded, output)
             write_observation(batch, i, ended, output)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bufgym import kernel
+from bufgym.kernel import announce, cache
 from tests.conftest import COMPILED
 
 TALE = """
@@ -36,7 +36,7 @@ def run(tmp_path: Path, before: str = "", **environment: str) -> subprocess.Comp
         file.write_text(TALE.format(before=before))
     done = subprocess.run(
         [sys.executable, str(file)],
-        env={**os.environ, "PYTHONPATH": str(Path(kernel.__file__).parents[1]), **environment},
+        env={**os.environ, "PYTHONPATH": str(Path(cache.__file__).parents[2]), **environment},
         capture_output=True,
         text=True,
         check=False,
@@ -47,8 +47,8 @@ def run(tmp_path: Path, before: str = "", **environment: str) -> subprocess.Comp
 
 
 def test_code_rests_on_the_constants_that_kernels_import() -> None:
-    sources = {str(path) for path in kernel._sources()}
-    assert {"sim/decisions.py", "observe/fields.py", "model/checks.py", "kernel.py"} <= sources | {"kernel.py"}
+    sources = {str(path) for path in cache._sources()}
+    assert {"sim/decisions.py", "observe/fields.py", "model/checks.py", "kernel/arrays.py"} <= sources
     assert "cli/bench.py" not in sources
 
 
@@ -69,8 +69,8 @@ def test_damaged_code_is_compiled_anew(tmp_path: Path, ending: str, left: float)
 
 @needs_compilation
 def test_long_compiling_is_announced_once_and_code_from_the_cache_never(tmp_path: Path) -> None:
-    impatient = f"from bufgym import kernel as k; k.PATIENCE_S = 0.0; {OURS}"
-    assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == kernel.NOTICE + "\n"
+    impatient = f"from bufgym.kernel import announce as k; k.PATIENCE_S = 0.0; {OURS}"
+    assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == announce.NOTICE + "\n"
     assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
 
 
@@ -78,9 +78,9 @@ def test_long_compiling_is_announced_once_and_code_from_the_cache_never(tmp_path
 @pytest.mark.parametrize(
     "before",
     [
-        "from bufgym import kernel as k; k.PATIENCE_S = 0.0",
-        f"from bufgym import kernel as k; k.PATIENCE_S = 1e6; {OURS}",
-        f"from bufgym import kernel as k; k.PATIENCE_S = 0.0; k.compile_silently(); {OURS}",
+        "from bufgym.kernel import announce as k; k.PATIENCE_S = 0.0",
+        f"from bufgym.kernel import announce as k; k.PATIENCE_S = 1e6; {OURS}",
+        f"from bufgym.kernel import announce as k; k.PATIENCE_S = 0.0; k.compile_silently(); {OURS}",
     ],
     ids=["not ours", "quick", "silent"],
 )

@@ -1,0 +1,26 @@
+"""Compiled functions.
+
+A *kernel* is a plain Python function over arrays that the caller owns. Numba compiles it on its first call and keeps
+the machine code on disk; with ``NUMBA_DISABLE_JIT=1`` the same source runs as ordinary Python, which is how the tests
+check the compiled code against its own text.
+"""
+
+from bufgym.kernel.announce import compile_silently
+from bufgym.kernel.arrays import at, item, prefetch, records, stretch, table
+from bufgym.kernel.cache import FOLDER, JIT
+from bufgym.kernel.compile import compile_for, interruptible, kernel
+
+__all__ = [
+    "FOLDER",
+    "JIT",
+    "at",
+    "compile_for",
+    "compile_silently",
+    "interruptible",
+    "item",
+    "kernel",
+    "prefetch",
+    "records",
+    "stretch",
+    "table",
+]

@@ -1,0 +1,64 @@
+"""A word on stderr while compiling takes long."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from typing import Any, cast
+
+from numba.core import event
+
+PATIENCE_S = 1.0
+"""Compiling that takes longer is announced."""
+NOTICE = "bufgym: compiling, once (about 30 s; bufgym warmup does it beforehand)"
+
+
+class _Announcer(event.Listener):
+    """Writes ``NOTICE`` to stderr, once, when compiling has taken a process ``PATIENCE_S`` in all.
+
+    Numba tells of a kernel that it compiles, and of those that are compiled on the way; of one from the cache it
+    tells nothing.
+    """
+
+    def __init__(self) -> None:
+        self.done = False
+        self._depth, self._spent_s, self._began_s = 0, 0.0, 0.0
+        self._timer: threading.Timer | None = None
+
+    def on_start(self, compiling: Any) -> None:
+        if not _is_ours(compiling):
+            return
+        self._depth += 1
+        if self._depth == 1 and not self.done:
+            self._began_s = time.perf_counter()
+            self._timer = threading.Timer(max(0.0, PATIENCE_S - self._spent_s), self._say)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def on_end(self, compiling: Any) -> None:
+        if not _is_ours(compiling):
+            return
+        self._depth -= 1
+        if self._depth == 0 and self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+            self._spent_s += time.perf_counter() - self._began_s
+
+    def _say(self) -> None:
+        if not self.done and sys.stderr is not None:
+            print(NOTICE, file=sys.stderr, flush=True)
+        self.done = True
+
+
+def _is_ours(compiling: Any) -> bool:
+    return str(compiling.data["dispatcher"].py_func.__module__).split(".")[0] == "bufgym"
+
+
+_announcer = _Announcer()
+cast(Any, event).register("numba:compile", _announcer)
+
+
+def compile_silently() -> None:
+    """This process says nothing of compiling from now on."""
+    _announcer.done = True

@@ -1,0 +1,124 @@
+"""Where machine code is kept: a folder for exactly this state of the package's sources."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, cast
+
+import numba
+from numba.core import caching
+
+JIT = not cast(Any, numba.config).DISABLE_JIT
+"""False where compilation is off and every kernel runs as its Python source."""
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def _sources() -> dict[Path, bytes]:
+    """Every source that compiled code rests on: those with kernels, the modules whose names they import, and this."""
+    texts = {path.relative_to(_PACKAGE): path.read_bytes() for path in sorted(_PACKAGE.rglob("*.py"))}
+    sources = {
+        path: text for path, text in texts.items() if b"bufgym.kernel import" in text or path.parts[0] == "kernel"
+    }
+    for text in list(sources.values()):
+        for line in text.decode().split("\nfrom bufgym")[1:]:
+            module, names = line.split(" import ", 1)
+            place = Path(*module.split("."))
+            names = names[1 : names.index(")")] if names.startswith("(") else names.split("\n", 1)[0]
+            files = [place / f"{name.strip()}.py" for name in names.split(",")]
+            for file in (place.with_suffix(".py") if place.name else place, place / "__init__.py", *files):
+                if file in texts:
+                    sources[file] = texts[file]
+    return sources
+
+
+def _writable(folder: Path) -> bool:
+    """Whether files can be written there, or the folder be made."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+def _temporary_folder() -> Path:
+    """A folder for this process and those that it starts. Its name cannot be foreseen: what lies there is run."""
+    folder = tempfile.mkdtemp(prefix="bufgym-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ["NUMBA_CACHE_DIR"] = folder
+    print(
+        "bufgym: compiled code cannot be kept, as neither the package nor the cache folder can be written; "
+        "set NUMBA_CACHE_DIR to a folder that can",
+        file=sys.stderr,
+    )
+    return Path(folder)
+
+
+def _cache_folder() -> str:
+    """A folder for machine code that is valid for exactly this state of the package's sources.
+
+    Numba renews a cached kernel when its own file changes but not when a kernel that it calls does. One folder for
+    each state of all the sources keeps a stale callee from living on inside its caller.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        parent = Path(os.environ["NUMBA_CACHE_DIR"])
+    else:
+        places = _PACKAGE / "__pycache__", Path(home) / "bufgym"
+        parent = next((place for place in places if _writable(place)), None) or _temporary_folder()
+    state = hashlib.sha256(b"".join(source for _, source in sorted(_sources().items())))
+    folder = parent / f"kernels-{state.hexdigest()[:12]}"
+    if not folder.exists():
+        # Earlier states are useless, but a running process may still be writing into the latest ones.
+        for old in sorted(parent.glob("kernels-*"), key=lambda path: path.stat().st_mtime)[:-8]:
+            shutil.rmtree(old, ignore_errors=True)
+    return str(folder)
+
+
+class CodeFiles(caching.IndexDataCacheFile):
+    """Numba's files of one kernel's machine code. Damaged ones are compiled anew; where none can be kept, none is."""
+
+    def load(self, key: Any) -> Any:
+        """The code compiled for ``key``; None if there is none."""
+        try:
+            return cast(Any, super()).load(key)
+        except Exception:  # a file cut short ends in many kinds of error
+            return None
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep the code compiled for ``key``."""
+        with contextlib.suppress(OSError):
+            cast(Any, super()).save(key, data)
+
+    def _load_index(self) -> Any:
+        try:
+            return cast(Any, super())._load_index()
+        except Exception:
+            return {}
+
+
+FOLDER = _cache_folder() if JIT else ""
+"""Where machine code is kept; empty where nothing is compiled."""
+
+
+class Code(caching.FunctionCache):
+    """One kernel's machine code on disk, compiled in one of its ``roles``."""
+
+    def __init__(self, function: Any, role: str) -> None:
+        # Numba reads the folder and takes the class of the files here; other packages' stay as they were.
+        config, module = cast(Any, numba.config), cast(Any, caching)
+        before = config.CACHE_DIR, module.IndexDataCacheFile
+        config.CACHE_DIR, module.IndexDataCacheFile = FOLDER or config.CACHE_DIR, CodeFiles
+        try:
+            cast(Any, super()).__init__(function)
+        finally:
+            config.CACHE_DIR, module.IndexDataCacheFile = before
+        self._role = role
+
+    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
+        return (*cast(Any, super())._index_key(signature, codegen), self._role)

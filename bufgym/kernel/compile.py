@@ -1,0 +1,90 @@
+"""The one decorator for compiled functions, and what runs them."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from typing import Any, TypeVar, cast
+
+import numba
+from numba.core.registry import CPUDispatcher
+
+from bufgym.kernel.cache import JIT, Code
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+Result = TypeVar("Result")
+
+# Arithmetic follows IEEE 754 to the letter (no fast maths): single = batch and compiled = uncompiled, bit for bit.
+# Kernels work on arrays that their caller holds, so reference counting (_nrt) is off and one kernel is inlined into the
+# next: together that is five times faster. In return a kernel must neither allocate nor return an array to Python.
+# Compiling takes as long as the code is that is inlined: call a large kernel from one place.
+_OPTIONS = {"nopython": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+_INLINED = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+class _Kernel(CPUDispatcher):
+    """What Python calls. Other kernels call ``inlined``: the same function without a way in from Python.
+
+    Such a way in holds the whole code once more, and few kernels need one.
+    """
+
+    @functools.cached_property
+    def inlined(self) -> Any:
+        """What goes into other kernels."""
+        return _dispatcher(CPUDispatcher, cast(Any, self).py_func, "inlined", **_INLINED)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What stands for it where a kernel calls it."""
+        return cast(Any, numba).types.Dispatcher(self.inlined)
+
+
+def _dispatcher(kind: Any, function: Callable[..., Any], role: str, **options: bool) -> Any:
+    """Numba's compiler of ``function``, which keeps its code on disk by ``role``."""
+    dispatcher = kind(function, targetoptions={**_OPTIONS, **options})
+    dispatcher._cache = Code(function, role)
+    return dispatcher
+
+
+def kernel(function: Function) -> Function:
+    """Compile ``function`` on its first call, for the types that it is called with."""
+    if not JIT:
+        return function
+    return cast(Function, _dispatcher(_Kernel, function, "called", no_cfunc_wrapper=True))
+
+
+def compile_for(signature: Any, function: Function) -> Function:
+    """Compile ``function`` now for exactly ``signature``, so that it can be passed to other kernels as a value.
+
+    Functions of one signature share one type: the kernel that receives them is compiled once and serves them all.
+    """
+    if not JIT:
+        return function
+    compiled = _dispatcher(CPUDispatcher, function, "value")
+    compiled.compile(signature)
+    compiled.disable_compile()
+    return cast(Function, compiled)
+
+
+def interruptible(work: Callable[[], Result]) -> Result:
+    """``work()``, which may spend minutes in kernels, while Ctrl-C is answered at once.
+
+    Python heeds a signal only in its main thread, and there only between two of its own instructions: so that thread
+    waits while another works (60 us). After a KeyboardInterrupt that one goes on until its kernel ends or the process.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return work()
+    future: Future[Result] = Future()
+
+    def carry_out() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:  # it belongs to the thread that waits
+            future.set_exception(error)
+
+    threading.Thread(target=carry_out, daemon=True).start()
+    while not future.done():
+        wait([future], 0.5)  # where a signal does not end a wait (Windows), half a second does
+    return future.result()
