@@ -81,25 +81,28 @@ def _cache_folder() -> str:
 
 
 class CodeFiles(caching.IndexDataCacheFile):
-    """Numba's files of one kernel's machine code. Damaged ones are compiled anew; where none can be kept, none is."""
+    """Machine code on disk: a file for each signature, named by all that it depends on.
+
+    So processes that compile side by side never write into the same one, as Numba's numbered files let them. Damaged
+    files are compiled anew; where none can be kept, none is.
+    """
 
     def load(self, key: Any) -> Any:
         """The code compiled for ``key``; None if there is none."""
         try:
-            return cast(Any, super()).load(key)
+            return cast(Any, self)._load_data(self._file(key))
         except Exception:  # a file cut short ends in many kinds of error
             return None
 
     def save(self, key: Any, data: Any) -> None:
         """Keep the code compiled for ``key``."""
         with contextlib.suppress(OSError):
-            cast(Any, super()).save(key, data)
+            cast(Any, self)._save_data(self._file(key), data)
 
-    def _load_index(self) -> Any:
-        try:
-            return cast(Any, super())._load_index()
-        except Exception:
-            return {}
+    def _file(self, key: Any) -> str:
+        files = cast(Any, self)
+        depends_on = repr((files._version, files._source_stamp, key))
+        return f"{files._index_name.removesuffix('.nbi')}-{hashlib.sha256(depends_on.encode()).hexdigest()[:16]}.nbc"
 
 
 FOLDER = _cache_folder() if JIT else ""
@@ -107,18 +110,15 @@ FOLDER = _cache_folder() if JIT else ""
 
 
 class Code(caching.FunctionCache):
-    """One kernel's machine code on disk, compiled in one of its ``roles``."""
+    """One kernel's machine code on disk, as it is compiled for its ``role``."""
 
     def __init__(self, function: Any, role: str) -> None:
-        # Numba reads the folder and takes the class of the files here; other packages' stay as they were.
-        config, module = cast(Any, numba.config), cast(Any, caching)
-        before = config.CACHE_DIR, module.IndexDataCacheFile
-        config.CACHE_DIR, module.IndexDataCacheFile = FOLDER or config.CACHE_DIR, CodeFiles
+        config = cast(Any, numba.config)
+        before, config.CACHE_DIR = config.CACHE_DIR, FOLDER or config.CACHE_DIR  # read here only
         try:
             cast(Any, super()).__init__(function)
         finally:
-            config.CACHE_DIR, module.IndexDataCacheFile = before
-        self._role = role
-
-    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
-        return (*cast(Any, super())._index_key(signature, codegen), self._role)
+            config.CACHE_DIR = before
+        cache = cast(Any, self)
+        name, stamp = f"{cache._impl.filename_base}-{role}", cache._impl.locator.get_source_stamp()
+        cache._cache_file = cast(Any, CodeFiles)(cache._cache_path, name, stamp)

@@ -56,11 +56,10 @@ needs_compilation = pytest.mark.skipif(not COMPILED, reason="nothing is kept wit
 
 
 @needs_compilation
-@pytest.mark.parametrize("ending", ["nbi", "nbc"])
 @pytest.mark.parametrize("left", [0.0, 0.5], ids=["empty", "half"])
-def test_damaged_code_is_compiled_anew(tmp_path: Path, ending: str, left: float) -> None:
+def test_damaged_code_is_compiled_anew(tmp_path: Path, left: float) -> None:
     run(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "code"))
-    (file,) = (tmp_path / "code").rglob(f"*.{ending}")
+    (file,) = (tmp_path / "code").rglob("*.nbc")
     whole = file.read_bytes()
     file.write_bytes(whole[: int(left * len(whole))])
     assert run(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
