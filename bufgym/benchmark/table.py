@@ -168,6 +168,11 @@ def same(rows: Rows) -> dict[str, list[str]]:
     return {first: others for first, *others in groups.values() if others}
 
 
+def told_once(alike: Mapping[str, Sequence[str]]) -> list[str]:
+    """A note for each line that stands for several policies (see ``same``)."""
+    return [f"note: {', '.join(others)}: the same rows here as {first}" for first, others in alike.items()]
+
+
 def unranked(rows: Rows) -> dict[str, str]:
     """Policies among the rows that do not compete, and why."""
     reasons = {}
@@ -202,8 +207,7 @@ def markdown(rows: Rows, floor: Rows = ()) -> str:
 def notes(rows: Rows) -> list[str]:
     """What the reader of the means must know besides."""
     apart = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked(rows).items()]
-    alike = [f"note: {', '.join(others)}: the same rows here as {first}" for first, others in same(rows).items()]
-    return [*apart, *alike, *([f"note: {UPPER_BOUND}"] if _inexact(rows) else []), *invalid(rows)]
+    return [*apart, *told_once(same(rows)), *([f"note: {UPPER_BOUND}"] if _inexact(rows) else []), *invalid(rows)]
 
 
 def _inexact(rows: Rows) -> bool:
