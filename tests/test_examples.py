@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bufgym.benchmark import leaderboard
@@ -60,3 +61,22 @@ def test_a_model_of_stable_baselines3_gets_a_row(
     assert row.values["score"].value <= 1 and row.rank in (1, 2, 3)
     assert f"`{row.command}`" in capsys.readouterr().out
     assert row.command == "bufgym bench --suite interruption-v1 --policies mine/model.zip"
+
+
+def test_a_moment_is_missed_more_than_half_a_view_from_what_arrived(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frames 0 and 3 arrived, at 0 and 2: those at 0.5 and 1.6 are near one, that at 1 is not, nor that at 2.6."""
+    view = example("view_missed.py")
+    x, arrived = np.array([0.0, 0.5, 1.0, 1.6, 2.0, 2.6]), np.array([1, 0, 0, 0, 1, 0], bool)
+    assert view["missed"](x, arrived, 0.5) == 2 / 6
+    assert view["missed"](x, np.zeros(6, bool), 0.5) == 1
+    monkeypatch.setattr(sys, "argv", ["x", "--policies", "clairvoyant,afr", "--seeds", "1", "--seconds", "3"])
+    view["main"]()
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert lines[0][:2] == ["policy", "score"] and {line[0] for line in lines[1:4]} == {
+        "clairvoyant",
+        "afr",
+        "drop-oldest",
+    }
+    assert lines[1][:2] == ["clairvoyant", "1.000"]
