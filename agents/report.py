@@ -122,9 +122,9 @@ def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], be
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
     held_out = {"episodes": len(test.episodes), "traces": traces}
     notes = _save(folder, settings, runs, best, held_out=held_out, scores=entries)
-    left_out = {name for others in alike.values() for name in others} | set(unranked(rows))
-    bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in left_out}
-    bars = _not_below(bars)
+    apart = unranked(rows)
+    bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in apart}
+    bars, twins = _drawn(bars, alike)
     curves = [np.array(run.validation)[:, [0, 2]] for run in runs]
     draw(
         folder / "figure.png",
@@ -134,7 +134,7 @@ def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], be
         bars,
         f"{len(test.episodes)} episodes on held-out links" if traces else f"{len(test.episodes)} held-out episodes",
         lines=rules(validation),
-        notes=[f"{first}: also {', '.join(others)}" for first, others in alike.items() if first in bars],
+        notes=twins,
     )
     return notes
 
@@ -148,10 +148,15 @@ def rules(episodes: FixedEpisodes) -> dict[str, float]:
     return {name: fixed[name] for name in dict.fromkeys((BASELINE, "afr", best))}
 
 
-def _not_below(bars: Mapping[str, Interval]) -> dict[str, Interval]:
-    """Those of at least Drop Oldest's score, and the agents: the others are in the table alone, as they would squeeze
-    the rest of the figure."""
-    return {name: bar for name, bar in bars.items() if bar.value >= 0 or name.startswith("agent")}
+def _drawn(bars: Mapping[str, Interval], alike: Mapping[str, Sequence[str]]) -> tuple[dict[str, Interval], list[str]]:
+    """(The bars that are drawn, notes on those that stand for several policies).
+
+    Policies below Drop Oldest are in the table alone, as they would squeeze the rest of the figure; agents are not.
+    """
+    others = {name for names in alike.values() for name in names}
+    drawn = {name: bar for name, bar in bars.items() if name not in others}
+    drawn = {name: bar for name, bar in drawn.items() if bar.value >= 0 or name.startswith("agent")}
+    return drawn, [f"{first}: also {', '.join(names)}" for first, names in alike.items() if first in drawn]
 
 
 def table(entries: Sequence[dict[str, Any]], agent: str, alike: Mapping[str, Sequence[str]]) -> str:
@@ -210,12 +215,13 @@ def report_suite(
         cells=[dataclasses.asdict(cell) for cell in result.cells],
     )
     # Where no cell is discriminative, there are no scores to draw.
-    bars = _not_below({s.policy: s.score for s in result.standings if s.ranked and math.isfinite(s.score.value)})
+    ranked = {s.policy: s.score for s in result.standings if s.ranked and math.isfinite(s.score.value)}
+    bars, twins = _drawn(ranked, same(rows))
     rival = "that of AFR or Drop Oldest" if settings.algo == "evolution" else "AFR's"
     # By the last column the agent was chosen.
     curves = [np.array(run.validation)[:, [0, -1]] for run in runs]
     measure = f"regret over {rival}, on validation"
-    draw(home / "figure.png", runs, curves, measure, bars, "Test split")
+    draw(home / "figure.png", runs, curves, measure, bars, "Test split", notes=twins)
     return notes, next(s.score for s in result.standings if s.policy == f"agent ({settings.algo})")
 
 
