@@ -71,10 +71,6 @@ class Curve(BetweenUpdates):
         """Seconds of training, over all sessions."""
         return round(self.before + time.perf_counter() - self.began, 3)
 
-    def latest(self) -> str:
-        """The latest row, for people."""
-        return f"QoI {self.record.rows[-1][2]:.3f}" if self.record.rows else ""
-
     def _on_training_start(self) -> None:
         self.began = time.perf_counter()
 
@@ -135,7 +131,7 @@ class Validation(BetweenUpdates):
 class Progress(BetweenUpdates):
     """A bar with the time left on a terminal, a plain line every tenth of the way elsewhere."""
 
-    def __init__(self, source: Curve | Validation, settings: Settings, seed: int, line: int) -> None:
+    def __init__(self, source: Validation, settings: Settings, seed: int, line: int) -> None:
         super().__init__()
         self.source, self.steps, self.seed, self.line = source, settings.steps, seed, line
         self.bar: Any = None

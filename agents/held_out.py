@@ -1,27 +1,32 @@
-"""An agent and the fixed policies on held-out episodes of one environment."""
+"""An agent and the fixed policies on fixed episodes of one environment, scored as ``bufgym bench`` scores a row."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from agents.evaluation import play
+from agents.mixed_env import Cell, MixedEnv
 from agents.settings import Settings
 from bufgym import scenario as scenarios
+from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import draw
-from bufgym.benchmark.score import paired_difference
+from bufgym.benchmark.score import paired_difference, scores
+from bufgym.benchmark.tasks import bound
+from bufgym.oracle.measure import BASELINE, normalised_score, regret
 from bufgym.policies import registry
-from bufgym.scenario import Episode, Scenario, Uplink
+from bufgym.scenario import Scenario, Uplink
 from bufgym.sim import run
 from bufgym.sim.metrics import Outcome, outcome
 
 HELD_OUT_TRACES = 2
-HELD_OUT_SEED = 1_000_000_000
-"""Held-out episodes are drawn from this seed on."""
+FIRST_SEED = {"validation": 2_000_000_000, "test": 1_000_000_000}
+"""Episodes of a split are drawn from this seed on."""
 
 
 def split_scenario(settings: Settings) -> tuple[Scenario, Scenario]:
@@ -34,18 +39,51 @@ def split_scenario(settings: Settings) -> tuple[Scenario, Scenario]:
     return replace(base, traces=traces), replace(base, traces=held_out)
 
 
-def held_out_episodes(scenario: Scenario, count: int) -> list[Episode]:
-    """Episodes that no training run sees, with uniform draws for policies that randomise."""
-    return [draw(scenario, HELD_OUT_SEED + i) for i in range(count)]
+class FixedEpisodes:
+    """Episodes that no training run sees, beside what the clairvoyant and Drop Oldest reach on them.
 
+    ``validation``: new episodes on the traces that are trained on; ``test``: episodes on the held-out traces.
+    """
 
-def run_fixed(episodes: Sequence[Episode], scenario: Scenario, capacity: int) -> dict[str, list[Outcome]]:
-    """The outcomes of every registered policy of one queue, by name."""
-    outcomes = {}
-    for name in registry.names(for_topics=False):
-        senders = run(registry.get(name), episodes, capacity, scenario.value)
-        outcomes[name] = [outcome(senders, i) for i in range(len(episodes))]
-    return outcomes
+    def __init__(self, settings: Settings, split: str) -> None:
+        count = settings.validation_episodes if split == "validation" else settings.episodes
+        self.scenario = split_scenario(settings)[split == "test"]
+        self.capacity, self.decide_at = settings.capacity, settings.decide_at
+        # With uniform draws for policies that randomise.
+        self.episodes = [draw(self.scenario, FIRST_SEED[split] + i) for i in range(count)]
+        self._plans = [bound.best(episode, self.capacity, self.scenario) for episode in self.episodes]
+        self._base = math.fsum(result.qoi for result in self.run(BASELINE))
+        self._best = math.fsum(plan.qoi for plan in self._plans)
+
+    def run(self, policy: str) -> list[Outcome]:
+        """What a registered policy reaches."""
+        senders = run(registry.get(policy), self.episodes, self.capacity, self.scenario.value)
+        return [outcome(senders, i) for i in range(len(self.episodes))]
+
+    def run_fixed(self) -> dict[str, list[Outcome]]:
+        """What every registered policy of one queue reaches, by name."""
+        return {name: self.run(name) for name in registry.names(for_topics=False)}
+
+    def play(self, agent: Any) -> list[Outcome]:
+        """What a learner reaches."""
+        cell = Cell("", self.scenario, self.capacity)
+        return play(agent, MixedEnv([cell], [len(self.episodes)], decide_at=self.decide_at), self.episodes)
+
+    def score(self, outcomes: Sequence[Outcome]) -> float:
+        """0 for Drop Oldest, 1 for the clairvoyant; NaN where the two are equal."""
+        return float(normalised_score(math.fsum(result.qoi for result in outcomes), self._base, self._best))
+
+    def rows(self, outcomes: Mapping[str, Sequence[Outcome]]) -> list[Row]:
+        """The outcomes of all policies as rows of the benchmark."""
+        unbounded = {name for name in registry.names() if registry.get(name).unbounded}
+        rows = []
+        for name, results in outcomes.items():
+            for seed, (result, plan) in enumerate(zip(results, self._plans, strict=True)):
+                key = {"scenario": "", "trace": "", "seed": seed, "policy": name, "capacity": self.capacity}
+                known = {"clairvoyant": plan.qoi, "certified": plan.certified}
+                lost = None if name in unbounded else regret(result.qoi, plan.qoi)
+                rows.append({**key, **asdict(result), **known, "regret": lost})
+        return rows
 
 
 def known_mean(numbers: Sequence[float]) -> float:
@@ -54,15 +92,21 @@ def known_mean(numbers: Sequence[float]) -> float:
     return float(np.mean(known)) if known else math.nan
 
 
-def summarise(outcomes: Mapping[str, Sequence[Outcome]], agent: str, resamples: int = 2000) -> list[dict[str, Any]]:
-    """One row a policy, best QoI first: means over the episodes, and QoI minus the agent's with its 95 % interval.
+def summarise(
+    outcomes: Mapping[str, Sequence[Outcome]], rows: Sequence[Row], agent: str, resamples: int = 2000
+) -> list[dict[str, Any]]:
+    """One entry a policy, best QoI first: its score and regret, means over the episodes, QoI minus the agent's.
 
-    The interval is ``score.paired_difference``'s: policies meet the same episodes, so an episode's own QoI cancels.
+    ``rows``: those of the outcomes. ``score_95`` and ``minus_agent_95`` are 95 % intervals, paired as in ``score``:
+    policies meet the same episodes, so an episode's own QoI cancels.
     """
+    measured = {cell.policy: cell for cell in scores(rows, resamples=resamples).cells}
     reference = [result.qoi for result in outcomes[agent]]
-    rows = []
+    entries = []
     for name, results in outcomes.items():
-        means = {field.name: known_mean([getattr(o, field.name) for o in results]) for field in fields(Outcome)}
+        score, low, high = measured[name].score
+        entry = {"policy": name, "score": score, "score_95": [low, high], "regret": measured[name].regret.value}
+        entry |= {field.name: known_mean([getattr(o, field.name) for o in results]) for field in fields(Outcome)}
         minus, low, high = paired_difference([result.qoi for result in results], reference, resamples=resamples)
-        rows.append({"policy": name, **means, "minus_agent": minus, "minus_agent_95": [low, high]})
-    return sorted(rows, key=lambda row: -row["qoi"])
+        entries.append({**entry, "minus_agent": minus, "minus_agent_95": [low, high]})
+    return sorted(entries, key=lambda entry: -entry["qoi"])

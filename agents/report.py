@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 import math
 import shutil
@@ -12,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents import training
-from agents.evaluation import EvaluationSet, play, sweep_for, test_rows
-from agents.held_out import held_out_episodes, run_fixed, split_scenario, summarise
-from agents.mixed_env import Cell, MixedEnv
+from agents.evaluation import EvaluationSet, sweep_for, test_rows
+from agents.figure import draw
+from agents.held_out import FixedEpisodes, summarise
 from agents.objectives import fleet, topics
 from agents.page import written
 from agents.runs import Run, write_notes
@@ -26,8 +24,10 @@ from bufgym.benchmark import summary
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
-from bufgym.benchmark.table import aligned
+from bufgym.benchmark.table import aligned, same, told_once, unranked
 from bufgym.benchmark.tasks import TASKS
+from bufgym.files import shipped
+from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy, registry, weights
 
 COLUMNS = (
@@ -112,35 +112,66 @@ def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
 
 def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], best: Run) -> dict[str, Any]:
     """All agents and fixed policies on the held-out episodes; the best agent's notes."""
-    scenario = split_scenario(settings)[1]
-    episodes = held_out_episodes(scenario, settings.episodes)
-    outcomes = run_fixed(episodes, scenario, settings.capacity)
-    cell = Cell("held-out", scenario, settings.capacity)
+    test, validation = FixedEpisodes(settings, "test"), FixedEpisodes(settings, "validation")
+    outcomes = test.run_fixed()
     for run in runs:
-        env = MixedEnv([cell], [len(episodes)], decide_at=settings.decide_at)
-        outcomes[agent_name(run)] = play(training.load(settings, run), env, episodes)
-    rows = summarise(outcomes, agent_name(best))
-    print(table(rows, agent_name(best)))
-    traces = [trace.name for trace in getattr(scenario, "traces", ())]
-    held_out = {"episodes": len(episodes), "traces": traces}
-    notes = _save(folder, settings, runs, best, held_out=held_out, scores=rows)
-    measure = "QoI H, mean of the latest training episodes"
-    qoi = {row["policy"]: row["qoi"] for row in rows}
-    curves = [np.array(run.curve).reshape(-1, 3)[:, [0, 2]] for run in runs]
-    draw(folder / "figure.png", runs, curves, measure, qoi, "QoI H, mean", "Held-out episodes")
+        outcomes[agent_name(run)] = test.play(training.load(settings, run))
+    rows = test.rows(outcomes)
+    entries, alike = summarise(outcomes, rows, agent_name(best)), same(rows)
+    print(table(entries, agent_name(best), alike))
+    traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
+    held_out = {"episodes": len(test.episodes), "traces": traces}
+    notes = _save(folder, settings, runs, best, held_out=held_out, scores=entries)
+    apart = unranked(rows)
+    bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in apart}
+    bars, twins = _drawn(bars, alike)
+    curves = [np.array(run.validation)[:, [0, 2]] for run in runs]
+    draw(
+        folder / "figure.png",
+        runs,
+        curves,
+        f"score on {len(validation.episodes)} validation episodes",
+        bars,
+        f"{len(test.episodes)} episodes on held-out links" if traces else f"{len(test.episodes)} held-out episodes",
+        lines=rules(validation),
+        notes=twins,
+    )
     return notes
 
 
-def table(rows: Sequence[dict[str, Any]], agent: str) -> str:
-    """Best QoI first, with the difference to the agent and its 95 % interval."""
-    lines = [["policy", *(heading for heading, *_ in COLUMNS), "QoI - agent's [95 %]"]]
-    for row in rows:
-        low, high = row["minus_agent_95"]
-        difference = "" if row["policy"] == agent else f"{row['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]"
-        lines.append(
-            [row["policy"], *(format(row[name] * factor, spec) for _, name, factor, spec in COLUMNS), difference]
-        )
-    return "\n".join(aligned(lines))
+def rules(episodes: FixedEpisodes) -> dict[str, float]:
+    """The scores of Drop Oldest, AFR and the best fixed rule."""
+    apart = [name for name in registry.names(for_topics=False) if not registry.get(name).ranked]
+    fixed = {name: episodes.score(outcomes) for name, outcomes in episodes.run_fixed().items() if name not in apart}
+    learned = shipped("agents", "agents/pretrained", "*.safetensors")
+    best = max((name for name in fixed if name not in learned), key=lambda name: fixed[name])
+    return {name: fixed[name] for name in dict.fromkeys((BASELINE, "afr", best))}
+
+
+def _drawn(bars: Mapping[str, Interval], alike: Mapping[str, Sequence[str]]) -> tuple[dict[str, Interval], list[str]]:
+    """(The bars that are drawn, notes on those that stand for several policies).
+
+    Policies below Drop Oldest are in the table alone, as they would squeeze the rest of the figure; agents are not.
+    """
+    others = {name for names in alike.values() for name in names}
+    drawn = {name: bar for name, bar in bars.items() if name not in others}
+    drawn = {name: bar for name, bar in drawn.items() if bar.value >= 0 or name.startswith("agent")}
+    return drawn, [f"{first}: also {', '.join(names)}" for first, names in alike.items() if first in drawn]
+
+
+def table(entries: Sequence[dict[str, Any]], agent: str, alike: Mapping[str, Sequence[str]]) -> str:
+    """Best first, with the difference to the agent and its 95 % interval; ``alike``: policies that are one line."""
+    lines = [["policy", "score [95 %]", *(heading for heading, *_ in COLUMNS), "QoI - agent's [95 %]"]]
+    others = {name for names in alike.values() for name in names}
+    for entry in entries:
+        if entry["policy"] in others:
+            continue
+        low, high = entry["minus_agent_95"]
+        difference = "" if entry["policy"] == agent else f"{entry['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]"
+        score = written(Interval(entry["score"], *entry["score_95"]), ".3f")
+        numbers = [format(entry[name] * factor, spec) for _, name, factor, spec in COLUMNS]
+        lines.append([entry["policy"], score, *numbers, difference])
+    return "\n".join([*aligned(lines), "score: 0 is Drop Oldest, 1 the clairvoyant", *told_once(alike)])
 
 
 # --- on a suite ------------------------------------------------------------------------------------------------------
@@ -183,15 +214,14 @@ def report_suite(
         standings=[dataclasses.asdict(standing) for standing in result.standings],
         cells=[dataclasses.asdict(cell) for cell in result.cells],
     )
-    # Policies below Drop Oldest are in the table alone: they would squeeze the rest of the figure.
-    drawn = [s for s in result.standings if s.ranked and (s.score.value >= 0 or s.policy.startswith("agent"))]
     # Where no cell is discriminative, there are no scores to draw.
-    bars = {s.policy: s.score.value for s in drawn if math.isfinite(s.score.value)} or means
+    ranked = {s.policy: s.score for s in result.standings if s.ranked and math.isfinite(s.score.value)}
+    bars, twins = _drawn(ranked, same(rows))
     rival = "that of AFR or Drop Oldest" if settings.algo == "evolution" else "AFR's"
     # By the last column the agent was chosen.
     curves = [np.array(run.validation)[:, [0, -1]] for run in runs]
     measure = f"regret over {rival}, on validation"
-    draw(home / "figure.png", runs, curves, measure, bars, "normalised score", "Test split")
+    draw(home / "figure.png", runs, curves, measure, bars, "Test split", notes=twins)
     return notes, next(s.score for s in result.standings if s.policy == f"agent ({settings.algo})")
 
 
@@ -207,52 +237,3 @@ def standings(result: Scores) -> str:
     total = len({(cell.scenario, cell.capacity) for cell in result.cells})
     note = f"{counted} of {total} cells (scenario, L) count; score: 0 is {result.baseline}, 1 the clairvoyant"
     return "\n".join([*aligned(lines), note])
-
-
-# --- the figure ------------------------------------------------------------------------------------------------------
-
-
-def draw(
-    path: Path,
-    runs: Sequence[Run],
-    curves: Sequence[NDArray[Any]],
-    measure: str,
-    bars: Mapping[str, float],
-    unit: str,
-    title: str,
-) -> None:
-    """Learning curves on the left, every policy's result on the right.
-
-    Args:
-        path: the picture.
-        runs: one a curve.
-        curves: (steps, measure) of each run, float[rows, 2].
-        measure: what the curves show.
-        bars: policy -> result, best first.
-        unit: what the results are.
-        title: where they were reached.
-    """
-    if importlib.util.find_spec("matplotlib") is None:
-        print("no figure: matplotlib is not installed")
-        return
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 4.2 + 0.12 * max(0, len(bars) - 12)), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2)
-    for run, curve in zip(runs, curves, strict=True):
-        left.plot(curve[:, 0] / 1e6, curve[:, 1], label=f"seed {run.seed}")
-    left.set(xlabel="decisions, millions", ylabel=measure, title="Training")
-    left.grid(alpha=0.3)
-    if len(runs) > 1:
-        left.legend(frameon=False)
-    names, numbers = list(bars)[::-1], list(bars.values())[::-1]
-    colours = ["tab:orange" if name.startswith("agent") else "tab:blue" for name in names]
-    right.bar_label(right.barh(names, numbers, color=colours), fmt="%.3f", padding=3)
-    spread = max(numbers) - min(numbers) or 1.0
-    low = min(numbers) - 0.15 * spread
-    right.set(xlabel=f"{unit} (axis does not start at 0)" if low > 0 else unit, title=title)
-    right.set_xlim(low, max(numbers) + 0.2 * spread)
-    right.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=120)

@@ -11,11 +11,10 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from agents.settings import Settings
@@ -44,9 +43,8 @@ class Run:
     """Time spent training, over all its sessions, s."""
     curve: list[Numbers]
     """(steps, seconds, mean QoI of the latest training episodes, or an evolved agent's fitness), a row an update."""
-    validation: list[Numbers] = field(default_factory=list)
-    """(steps, seconds, measures; the last one is what the agent to keep is chosen by), a row a validation; none without
-    a suite."""
+    validation: list[Numbers]
+    """(steps, seconds, measures; the last one is what the agent to keep is chosen by), a row a validation."""
     file: str = "model.zip"
     """The kept agent's file in ``folder``."""
     best: Callable[..., Any] = min
@@ -64,11 +62,8 @@ class Run:
 
     @property
     def merit(self) -> float:
-        """The more the better: the best measure on validation, or without one the QoI in the last tenth of training."""
-        if self.validation:
-            return self.reached if self.best is max else -self.reached
-        last = [row[2] for row in self.curve[-max(1, len(self.curve) // 10) :]]
-        return float(np.mean(last)) if last else float("nan")
+        """The more the better: the best measure on validation."""
+        return self.reached if self.best is max else -self.reached
 
 
 # --- the run's folder ------------------------------------------------------------------------------------------------

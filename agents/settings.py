@@ -11,7 +11,8 @@ from bufgym import ENVIRONMENTS
 from bufgym.errors import BufgymError
 from bufgym.policies.learned import NAMES
 from bufgym.policies.weights import MAX_WIDTH
-from bufgym.scenario import Interruption, suites
+from bufgym.scenario import Interruption, Uplink, suites
+from bufgym.scenario.uplink import RGBD_BYTES
 
 TIME = ("rank", "time_before", "time_merged", "occupancy", "stalled", "service_ratio")
 """Fields that a queue and a clock can tell, as AFR's."""
@@ -93,9 +94,9 @@ class Settings:
     """Decisions to learn from, for each seed."""
     capacity: Count = 8
     """L, messages (without a suite)."""
-    size_bytes: Count = 500_000
-    """Mean message size (uplink only); 500 kB at 30 Hz is 1.5 times what the shipped traces carry."""
-    duration_s: Positive = 30.0
+    size_bytes: Count = RGBD_BYTES
+    """Mean message size (uplink only)."""
+    duration_s: Positive = Uplink.duration_s
     """Length of an episode (uplink only)."""
     decide_at: Literal["overflow", "arrival"] = "overflow"
     """When the agent is asked: only when the buffer is full, or at every arrival."""
@@ -123,9 +124,9 @@ class Settings:
     checkpoint_every: Count = 250_000
     """Steps."""
     validate_every: Count = 250_000
-    """Steps (with a suite)."""
+    """Steps."""
     validation_episodes: Count = 300
-    """About so many in each validation, over all scenarios and capacities."""
+    """About so many in each validation, with a suite over all scenarios and capacities."""
     test_seeds: Annotated[int, Range(0, 1000)] = 0
     """Test episodes on each trace of a suite; 0: as many as the suite says."""
     episodes: Count = 200

@@ -24,7 +24,7 @@ from agents import cma_es
 from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluation import EvaluationSet, ValidationSets, Verdict
-from agents.held_out import split_scenario
+from agents.held_out import FixedEpisodes, split_scenario
 from agents.mixed_env import MixedEnv, cells
 from agents.objectives.fleet import FleetObjective, fleet_of
 from agents.objectives.objective import policy_of as slot_policy_of
@@ -61,20 +61,16 @@ def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0) -> Ru
     model.set_logger(configure(str(home / "tensorboard"), ["tensorboard"]))
     curve = Curve(home / "curve.csv", model.num_timesteps)
     validation = validation_of(settings, folder, home, curve, model.num_timesteps)
-    progress = Progress(validation or curve, settings, seed, line)
+    progress = Progress(validation, settings, seed, line)
     left = settings.steps - model.num_timesteps
     if left > 0:
-        callbacks = [Checkpoints(home, settings.checkpoint_every), curve, *filter(None, [validation]), progress]
+        callbacks = [Checkpoints(home, settings.checkpoint_every), curve, validation, progress]
         # The library counts ``total_timesteps`` from here on when the count is not reset.
         model.learn(left, callbacks, reset_num_timesteps=False)
         save(model, home)
-    kept = checkpoints(home)[-1]
-    rows: list[Numbers] = []
-    best: Callable[..., Any] = min
-    if validation is not None:
-        validation.validate(model)
-        rows, best = validation.validations.rows, validation.validations.choose
-        kept = checkpoint(home, int(validation.validations.best[0]))
+    validation.validate(model)
+    rows, best = validation.validations.rows, validation.validations.choose
+    kept = checkpoint(home, int(validation.validations.best[0]))
     model.logger.close()
     env.close()
     shutil.copyfile(kept, home / "model.zip")
@@ -87,10 +83,18 @@ def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0) -> Ru
     return Run(seed, home, seconds, curve.record.rows, rows, file, best)
 
 
-def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, steps: int) -> Validation | None:
-    """What validates a learner of this kind of task; None without a suite."""
+def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, steps: int) -> Validation:
+    """What validates a learner of this kind of task."""
     if settings.kind == "environment":
-        return None
+        episodes = FixedEpisodes(settings, "validation")
+
+        def score(model: Any) -> Numbers:
+            outcomes = episodes.play(model)
+            return episodes.score(outcomes), float(np.mean([result.qoi for result in outcomes]))
+
+        # By QoI: it orders agents as the score does, and is known where nothing can be gained too.
+        validations = Validations(home, ("score", "qoi"), max, settings, steps)
+        return Validation(home, validations, score, lambda measures: f"validation score {measures[0]:.3f}", curve)
     if settings.kind == "fleet":
         objective = FleetObjective(settings, folder, settings.seed)
 

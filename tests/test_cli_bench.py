@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 from cli_cases import fails
 
@@ -59,7 +61,43 @@ def test_bench_takes_shipped_traces_and_all_policies_by_default(capsys: pytest.C
     text = capsys.readouterr().out
     assert "8 traces x 2 seeds" in text
     for name in policies.names():
-        assert (f"\n{name} " in text) != policies.get(name).for_topics
+        told = f"\n{name} " in text or re.search(rf"^note: .*\b{name}\b.*the same rows here", text, re.M)
+        assert bool(told) != policies.get(name).for_topics
+
+
+def test_bench_meets_the_episodes_of_the_environment_by_default(tmp_path: Path) -> None:
+    """Row (trace, seed) is what ``reset`` of bufgym/Uplink-v0 plays by these numbers; neither side has an argument."""
+    assert main(["bench", "--seeds", "1", "--policies", "drop-oldest", "--format", "csv", "--out", str(tmp_path)]) == 0
+    (row,) = (row for row in read_rows(tmp_path / "rows.csv") if row["trace"] == "lte-synthetic-3")
+    env = gym.make("bufgym/Uplink-v0", bound=True).unwrapped
+    _, info = env.reset(options={"trace": "lte-synthetic-3", "seed": 0})
+    ended = False
+    while not ended:
+        action = 9 if info["action_mask"][9] else 0  # accept, else evict the oldest
+        _, _, ended, _, info = env.step(action)
+    assert info["qoi"] == row["qoi"] and info["regret"] == pytest.approx(row["regret"]) and info["score"] == 0
+
+
+def test_the_default_task_is_worth_learning(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Drop Oldest loses at least 8 %, AFR at least 3 %, and on fewer than 3 % of the episodes nothing can be gained."""
+    chosen = ["drop-oldest", "drop-newest", "afr", "min-motion-gap"]
+    out = ["--format", "csv", "--out", str(tmp_path)]
+    assert main(["bench", "--seeds", "5", "--policies", ",".join(chosen), *out]) == 0
+    rows = read_rows(tmp_path / "rows.csv")
+    by_policy = {name: [row for row in rows if row["policy"] == name] for name in chosen}
+    lost = {
+        name: 1 - sum(r["qoi"] for r in own) / sum(r["clairvoyant"] for r in own) for name, own in by_policy.items()
+    }
+    assert lost["drop-oldest"] > 0.08 and lost["afr"] > 0.03 and lost["min-motion-gap"] < lost["afr"] - 0.01
+    flat = [all(row["regret"] < 1e-9 for row in met) for met in zip(*by_policy.values(), strict=True)]
+    assert sum(flat) < 0.03 * len(flat)
+
+
+def test_the_score_needs_no_row_of_the_baseline(trace: str, capsys: pytest.CaptureFixture[str]) -> None:
+    stream = ["--seconds", "6", "--fps", "10", "--bytes", "200000", "--seeds", "3", "--capacity", "2"]
+    assert main(["bench", "--trace", trace, *stream, "--policies", "clairvoyant"]) == 0
+    head, line = (text.split() for text in capsys.readouterr().out.splitlines()[6:8])
+    assert head[2] == "score" and line[:3] == ["clairvoyant", "2", "1.000"]
 
 
 def test_bench_of_one_interruption_has_regret(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import inspect
 import json
 import os
 import signal
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,10 +21,9 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard", "matplotlib"):
     pytest.importorskip(extra, reason="the extras [train] and [plot] are not installed")
 
 import train  # noqa: E402  (these need the extras)
-from agents import evaluation, held_out, runs, training  # noqa: E402
+from agents import figure, held_out, report, runs, training  # noqa: E402
 from agents.callbacks import Curve, checkpoints  # noqa: E402
 from agents.evaluation import ValidationSets, Verdict  # noqa: E402
-from agents.mixed_env import Cell, MixedEnv  # noqa: E402
 from agents.settings import Settings  # noqa: E402
 from bufgym.benchmark.rows import read_rows  # noqa: E402
 from bufgym.errors import BufgymError  # noqa: E402
@@ -41,6 +42,7 @@ TINY = Settings(
     batch_size=64,
     epochs=1,
     checkpoint_every=128,
+    validation_episodes=2,
     episodes=3,
 )
 SUITE = dataclasses.replace(
@@ -70,8 +72,18 @@ def curve_of(folder: Path) -> list[int]:
 
 
 @pytest.mark.parametrize("env", ["bufgym/Uplink-v0", "bufgym/Interruption-v0"])
-def test_a_run_leaves_its_results(env: str, capsys: pytest.CaptureFixture[str]) -> None:
-    train.main(dataclasses.replace(TINY, env=env, steps=128, network="plain" if "Inter" in env else "slots"))
+def test_a_run_leaves_its_results(
+    env: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures: list[dict[str, Any]] = []
+
+    def draw(*args: Any, **kwargs: Any) -> None:
+        pictures.append(inspect.signature(figure.draw).bind(*args, **kwargs).arguments)
+        figure.draw(*args, **kwargs)
+
+    monkeypatch.setattr(report, "draw", draw)
+    settings = dataclasses.replace(TINY, env=env, steps=128, duration_s=3.0)
+    train.main(dataclasses.replace(settings, network="plain" if "Inter" in env else "slots"))
     folder = Path("runs/tiny")
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     names = [row["policy"] for row in results["scores"]]
@@ -86,6 +98,16 @@ def test_a_run_leaves_its_results(env: str, capsys: pytest.CaptureFixture[str]) 
     assert notes["training"].startswith("python train.py --") and notes["seeds"] == [0]
     assert notes["scores"]["qoi"] == next(row["qoi"] for row in results["scores"] if row["policy"].startswith("agent"))
     assert json.loads((folder / "seed-0" / "notes.json").read_text(encoding="utf-8"))["seeds"] == [0]
+    # The curve begins with the untrained network; the bars are of ranked policies, each once, none below the floor.
+    (picture,) = pictures
+    assert [curve[:, 0].tolist() for curve in picture["curves"]] == [[0, 128]]
+    scores = {row["policy"]: row["score"] for row in results["scores"]}
+    bars = picture["bars"]
+    assert {"drop-oldest", "agent (seed 0)"} <= set(bars) and not {"rosbridge", "clairvoyant", "zenoh-ring"} & set(bars)
+    assert all(bar.value == scores[name] and (bar.value >= 0 or "agent" in name) for name, bar in bars.items())
+    assert any("zenoh-ring" in note for note in picture["notes"])
+    assert list(picture["lines"])[:2] == ["drop-oldest", "afr"] and picture["lines"]["drop-oldest"] == 0
+    assert max(picture["lines"].values()) <= 1 and not set(picture["lines"]) & {"learned-motion", "clairvoyant"}
     assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "model.zip").exists()
     assert list((folder / "seed-0" / "tensorboard").glob("events*"))
@@ -110,8 +132,8 @@ def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: pytest.MonkeyPatc
         patch.setattr(Curve, "_on_rollout_end", dies_half_way)
         training.train_seed(TINY, folder, 0)
     home = folder / "seed-0"
-    # The third rollout was collected, but not learnt from: it does not count.
-    assert [path.stem for path in checkpoints(home)] == ["000000000128", "000000000256"]
+    # The untrained agent was validated. The third rollout was collected, but not learnt from: it does not count.
+    assert [path.stem for path in checkpoints(home)] == ["000000000000", "000000000128", "000000000256"]
     assert curve_of(home) == [128, 256, 384]
     before = training.MaskablePPO.load(checkpoints(home)[-1])
 
@@ -120,7 +142,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: pytest.MonkeyPatc
     run = training.train_seed(again, folder, 0)
     assert curve_of(home) == [128, 256, 384, 512]
     assert run.seconds > 0
-    after = training.MaskablePPO.load(run.model)
+    after = training.MaskablePPO.load(checkpoints(home)[-1])
     assert (before.num_timesteps, after.num_timesteps) == (256, 512)
     # The optimizer went on counting, two gradient steps an update, and the learning rate on falling.
     counts = [int(state["step"]) for state in after.policy.optimizer.state_dict()["state"].values()]
@@ -156,8 +178,7 @@ def test_held_out_traces_are_never_trained_on() -> None:
 @pytest.mark.parametrize("decide_at", ["arrival", "overflow"])
 def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: str) -> None:
     """The agent's road (observations, actions, rows) and the policies' own are the same simulation."""
-    _, scenario = held_out.split_scenario(TINY)
-    episodes = held_out.held_out_episodes(scenario, 5)
+    test = held_out.FixedEpisodes(dataclasses.replace(TINY, decide_at=decide_at), "test")
 
     class DropOldest:
         """Accepts where that is possible, else evicts slot 0."""
@@ -166,10 +187,23 @@ def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: str) -> None
             masks = np.asarray(action_masks)
             return np.where(masks[:, -1], TINY.capacity + 1, np.where(masks[:, 0], 0, TINY.capacity)), None
 
-    env = MixedEnv([Cell("held-out", scenario, TINY.capacity)], [5], decide_at=decide_at)
-    outcomes = evaluation.play(DropOldest(), env, episodes)  # type: ignore[arg-type]
-    assert outcomes == held_out.run_fixed(episodes, scenario, TINY.capacity)["drop-oldest"]
+    outcomes = test.play(DropOldest())
+    assert outcomes == test.run_fixed()["drop-oldest"]
     assert any(outcome.dropped for outcome in outcomes)
+
+
+def test_episodes_are_scored_between_drop_oldest_and_the_clairvoyant() -> None:
+    settings = dataclasses.replace(TINY, duration_s=5.0, episodes=4, validation_episodes=3)
+    test, validation = (held_out.FixedEpisodes(settings, split) for split in ("test", "validation"))
+    assert (len(test.episodes), len(validation.episodes)) == (4, 3)
+    assert test.score(test.run("drop-oldest")) == 0 and test.score(test.run("clairvoyant")) == pytest.approx(1)
+    outcomes = {name: test.run(name) for name in ("drop-oldest", "afr", "rosbridge")}
+    entries = {entry["policy"]: entry for entry in held_out.summarise(outcomes, test.rows(outcomes), "afr")}
+    low, high = entries["afr"]["score_95"]
+    assert low <= entries["afr"]["score"] <= high and entries["afr"]["score"] == pytest.approx(
+        test.score(outcomes["afr"])
+    )
+    assert np.isnan(entries["rosbridge"]["score"]) and entries["afr"]["minus_agent"] == 0
 
 
 # --- on a suite ------------------------------------------------------------------------------------------------------
@@ -255,8 +289,8 @@ def test_dqn_goes_on_with_its_optimizer_and_a_fresh_replay() -> None:
     folder = runs.prepare(arguments)
     training.train_seed(dataclasses.replace(arguments, steps=256), folder, 0)
     before = training.MaskedDQN.load(checkpoints(folder / "seed-0")[-1])
-    run = training.train_seed(arguments, folder, 0)
-    after = training.load(arguments, run)
+    training.train_seed(arguments, folder, 0)
+    after = training.MaskedDQN.load(checkpoints(folder / "seed-0")[-1])
     assert (before.num_timesteps, after.num_timesteps) == (256, 512)
     counts = [
         {int(state["step"]) for state in model.policy.optimizer.state_dict()["state"].values()}

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from bufgym import policies
 from bufgym.errors import BufgymError, printable
+from bufgym.oracle.measure import BASELINE, normalised_score
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -96,6 +97,7 @@ class Column(NamedTuple):
 COLUMNS = (
     Column("policy", "policy", str),
     Column("L", "capacity", str),
+    Column("score", "score", score),
     Column("QoI", "qoi", "{:.3f}".format),
     Column("regret", "regret", "{:.2%}".format),
     Column("delivered", "delivered", "{:.1f}".format),
@@ -115,25 +117,60 @@ UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exac
 """The note below them."""
 
 
-def means(rows: Rows) -> list[dict[str, Any]]:
+def means(rows: Rows, floor: Rows = ()) -> list[dict[str, Any]]:
     """One entry for each (policy, capacity): means over its rows; capacity ascending, then QoI descending.
 
     Policies that do not compete (see ``unranked``) come after the others of a capacity. None and NaN count as missing;
-    a mean over nothing but missing numbers is NaN.
+    a mean over nothing but missing numbers is NaN. The score is computed on sums (``measure.normalised_score``); NaN
+    without a clairvoyant's H. ``floor``: rows of Drop Oldest on the same episodes, where it is not among ``rows``.
     """
     groups: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row["capacity"], row["policy"]), []).append(row)
+    base = {_episode(row): row["qoi"] for row in (*floor, *rows) if row["policy"] == BASELINE}
     entries: list[dict[str, Any]] = [
         {
             "policy": policy,
             "capacity": capacity,
             **{c.key: mean([row.get(c.key) for row in group]) for c in COLUMNS[2:]},
+            "score": _score(group, base),
         }
         for (capacity, policy), group in groups.items()
     ]
     apart = unranked(rows)
     return sorted(entries, key=lambda e: (e["capacity"], e["policy"] in apart, -e["qoi"], e["policy"]))
+
+
+def _episode(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(row.get(name) for name in ("scenario", "trace", "seed", "capacity"))
+
+
+def _score(group: Rows, base: Mapping[tuple[Any, ...], float]) -> float:
+    """Of one policy at one capacity; NaN where one of the three sums is not known, or L does not bind the policy."""
+    if any(row.get("regret") is None or _episode(row) not in base for row in group):
+        return math.nan
+    sums = [
+        math.fsum(h)
+        for h in zip(*((row["qoi"], base[_episode(row)], row["clairvoyant"]) for row in group), strict=True)
+    ]
+    return float(normalised_score(*sums))
+
+
+def same(rows: Rows) -> dict[str, list[str]]:
+    """Policies that no row tells apart: the first of them (Drop Oldest, where it is one) -> the others."""
+    fates: dict[str, list[str]] = {}
+    for row in rows:
+        fates.setdefault(row["policy"], []).append(repr({**row, "policy": ""}))
+    apart = unranked(rows)
+    groups: dict[tuple[Any, ...], list[str]] = {}
+    for name in sorted(fates, key=lambda name: name != BASELINE):
+        groups.setdefault((name in apart, *sorted(fates[name])), []).append(name)
+    return {first: others for first, *others in groups.values() if others}
+
+
+def told_once(alike: Mapping[str, Sequence[str]]) -> list[str]:
+    """A note for each line that stands for several policies (see ``same``)."""
+    return [f"note: {', '.join(others)}: the same rows here as {first}" for first, others in alike.items()]
 
 
 def unranked(rows: Rows) -> dict[str, str]:
@@ -149,9 +186,9 @@ def unranked(rows: Rows) -> dict[str, str]:
     return reasons
 
 
-def plain(rows: Rows) -> str:
-    """Aligned text, an empty line between capacities."""
-    cells = _cells(rows)
+def plain(rows: Rows, floor: Rows = ()) -> str:
+    """Aligned text, an empty line between capacities; ``floor`` as in ``means``."""
+    cells = _cells(rows, floor)
     out = []
     for k, line in enumerate(aligned(cells)):
         if k > 1 and cells[k][1] != cells[k - 1][1]:
@@ -160,9 +197,9 @@ def plain(rows: Rows) -> str:
     return "\n".join([*out, *notes(rows)])
 
 
-def markdown(rows: Rows) -> str:
-    """A Markdown table; numbers to the right."""
-    head, *body = _cells(rows)
+def markdown(rows: Rows, floor: Rows = ()) -> str:
+    """A Markdown table; numbers to the right; ``floor`` as in ``means``."""
+    head, *body = _cells(rows, floor)
     lines = notes(rows)
     return "\n".join([*markdown_table(head, body), *(["", *lines] if lines else [])])
 
@@ -170,7 +207,7 @@ def markdown(rows: Rows) -> str:
 def notes(rows: Rows) -> list[str]:
     """What the reader of the means must know besides."""
     apart = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked(rows).items()]
-    return [*apart, *([f"note: {UPPER_BOUND}"] if _inexact(rows) else []), *invalid(rows)]
+    return [*apart, *told_once(same(rows)), *([f"note: {UPPER_BOUND}"] if _inexact(rows) else []), *invalid(rows)]
 
 
 def _inexact(rows: Rows) -> bool:
@@ -178,10 +215,13 @@ def _inexact(rows: Rows) -> bool:
     return any(row.get("certified") is False and row.get("regret") is not None for row in rows)
 
 
-def _cells(rows: Rows) -> list[list[str]]:
-    """Titles, then a line for each entry of ``means``; no regret where no row has one."""
-    entries = means(rows)
-    columns = [c for c in COLUMNS if c.key != "regret" or any(not math.isnan(entry["regret"]) for entry in entries)]
+def _cells(rows: Rows, floor: Rows) -> list[list[str]]:
+    """Titles, then a line for each entry of ``means``, one for policies that are the ``same``; no score or regret where
+    no row has one."""
+    others = {name for alike in same(rows).values() for name in alike}
+    entries = [entry for entry in means(rows, floor) if entry["policy"] not in others]
+    bounded = {key for key in ("score", "regret") if any(not math.isnan(entry[key]) for entry in entries)}
+    columns = [c for c in COLUMNS if c.key in bounded or c.key not in ("score", "regret")]
     titles = [REGRET_AT_MOST if c.key == "regret" and _inexact(rows) else c.title for c in columns]
     return [titles, *([written(entry[c.key], c) for c in columns] for entry in entries)]
 

@@ -54,6 +54,7 @@ def _scenario(options: argparse.Namespace) -> None:
     from bufgym.benchmark import rows as files
     from bufgym.benchmark import table
     from bufgym.benchmark.run import run
+    from bufgym.oracle.measure import BASELINE
 
     if target(options) is not None:
         raise BufgymError(f"--out {options.out}: without --suite it must be a folder")
@@ -79,8 +80,11 @@ def _scenario(options: argparse.Namespace) -> None:
             )
     settings = {"max_bytes": options.max_bytes, "decide_at": options.decide_at}
     rows = run(chosen, stream, options.capacity, options.seeds, progress=True, **settings)
+    floor = []  # of the scores
+    if all(policy.name != BASELINE for policy in chosen):
+        floor = run([policies.get(BASELINE)], stream, options.capacity, options.seeds, bound=False, **settings)
     bounds = _bound_notes(rows, stream, options.decide_at) if options.workload is not None else []
-    print("\n".join([f"{about}\n\n{table.plain(rows)}", *bounds]))
+    print("\n".join([f"{about}\n\n{table.plain(rows, floor)}", *bounds]))
     if options.workload is not None:
         order = dict.fromkeys(entry["policy"] for entry in table.means(rows))
         _dropped(options, chosen, stream, list(order))
@@ -88,7 +92,7 @@ def _scenario(options: argparse.Namespace) -> None:
         written = files.write_rows(rows, Path(options.out) / f"rows.{form}")
         page = Path(options.out) / "table.md"
         with replaced(page) as temporary:
-            text = "\n".join([f"{about}\n\n{table.markdown(rows)}", *([""] if bounds else []), *bounds])
+            text = "\n".join([f"{about}\n\n{table.markdown(rows, floor)}", *([""] if bounds else []), *bounds])
             temporary.write_text(text + "\n", encoding="utf-8")
         print(f"\n{len(rows)} rows in {written}, this table in {page}")
 

@@ -23,41 +23,35 @@ if TYPE_CHECKING:
     from bufgym.scenario import Scenario, Uplink
     from bufgym.traces import Motion, Trace
 
-DEFAULTS = {
-    "fps": 30.0,
-    "bytes": 230_000,
-    "seconds": 60.0,
-    "jitter": 0.1,
-    "size_cv": 0.0,
-    "scale": 1.0,
-    "t_min": 1,
-    "t_max": 400,
-    "t_mean": 100.0,
-    "law": "log-uniform",
-}
-"""What holds where an option is not given (fps 1/s, bytes and seconds as named, t_* messages)."""
-
 _UPLINK_ONLY = ("trace", "motion", "seconds", "jitter", "size_cv", "scale", "workload", *WORKLOAD_OPTIONS)
 _STREAM_ONLY = ("fps", "bytes", "size_cv", "seconds", "jitter")
 _INTERRUPTION_ONLY = ("t_min", "t_max", "t_mean", "law")
 
+SCORE = "Score: 0 is Drop Oldest, 1 the clairvoyant; regret = 1 - QoI / the clairvoyant's."
+"""What the table's first columns are."""
+
+_PARAMETERS = {"fps": "rate_hz", "bytes": "size_bytes", "seconds": "duration_s"}
+"""Options whose parameter of the scenario has another name. Those that are not given have the scenario's defaults."""
+
 
 def scenario_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that ``scenario`` reads, ``--seeds`` apart."""
-    add = parser.add_argument_group("the stream and its link").add_argument
+    about = "what is not given is as in bufgym/Uplink-v0; the first lines of the output say how that is"
+    add = parser.add_argument_group("the stream and its link", about).add_argument
     add("--trace", nargs="+", metavar="FILE", help="bandwidth traces, files or shipped names (default: shipped LTE)")
     add("--motion", nargs="+", metavar="FILE", help="motion recordings, likewise; 'none': x is the frame index")
-    add("--fps", type=positive, help=f"messages a second (default: {DEFAULTS['fps']:g})")
-    add("--bytes", type=count, help=f"mean message size, bytes (default: {DEFAULTS['bytes']})")
-    add("--size-cv", type=least_0, help="coefficient of variation of the size (default: 0, all equal)")
-    add("--seconds", type=positive, help=f"length of an episode, s (default: {DEFAULTS['seconds']:g})")
-    add("--jitter", type=least_0, help=f"arrivals move by up to this part of a period (default: {DEFAULTS['jitter']})")
+    add("--fps", type=positive, help="messages a second")
+    add("--bytes", type=count, help="mean message size, bytes")
+    add("--size-cv", type=least_0, help="coefficient of variation of the size; 0: all equal")
+    add("--seconds", type=positive, help="length of an episode, s")
+    add("--jitter", type=least_0, help="arrivals move by up to this part of a period")
     add("--scale", type=positive, help="multiply the link's capacity (default: 1)")
     add(
         "--value",
         metavar="V",
         help="V of the QoI: exponential:BASE or saturating:DISTANCE"
-        " (default: exponential:0.367879 over motion, exponential:0.618 over frame indices)",
+        " (default: exponential:0.05 over motion, exponential:0.367879 over a recording's motion,"
+        " exponential:0.618 over frame indices)",
     )
     group = parser.add_argument_group("a recording of a robot in place of the stream")
     what = "MCAP, ROS 1 bag, rosbag2 (extra 'ros') or CSV; alone, played once from the start of each trace"
@@ -75,63 +69,59 @@ def scenario(options: argparse.Namespace) -> tuple[Scenario, str]:
     """The scenario that the options describe, and a few lines about it."""
     unused = _UPLINK_ONLY if options.interruption else _INTERRUPTION_ONLY
     refuse(options, unused, "cannot go with --interruption" if options.interruption else "needs --interruption")
-    settings = {**DEFAULTS, **given(options, tuple(DEFAULTS))}
     if options.interruption:
-        return _interruption(options, settings)
+        return _interruption(options)
     if options.workload is not None:
-        return _recording(options, settings)
+        return _recording(options)
     refuse(options, ("topics", "odom", "bridge_gaps"), "needs --workload")
     if options.motion is None:
         refuse_motion(options, "needs --motion, or --workload with --odom")
-    return _uplink(options, settings)
+    return _uplink(options)
 
 
-def _interruption(options: argparse.Namespace, settings: dict[str, Any]) -> tuple[Scenario, str]:
+def _given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Those of the options that the user gave, as parameters of the scenario."""
+    return {_PARAMETERS.get(name, name): value for name, value in given(options, names).items()}
+
+
+def _interruption(options: argparse.Namespace) -> tuple[Scenario, str]:
     from bufgym.scenario import Interruption
 
-    interruption = Interruption(
-        **{name: settings[name] for name in _INTERRUPTION_ONLY},
-        rate_hz=settings["fps"],
-        size_bytes=settings["bytes"],
-        value=_value(options, by_motion=False),
-    )
+    settings = _given(options, "fps", "bytes", *_INTERRUPTION_ONLY)
+    interruption = Interruption(**settings, value=_value(options, by_motion=False))
     law, t_min, t_max = interruption.law, interruption.t_min, interruption.t_max
     length = f"T = {t_max}" if law == "fixed" else f"T {law} on {t_min}..{t_max}"
     about = f"One interruption of T messages, {length}; V = {interruption.value.name} over frame indices."
-    return interruption, f"{about}\nMeans over {options.seeds} seeds. Regret = 1 - QoI / the clairvoyant's."
+    return interruption, f"{about}\nMeans over {options.seeds} seeds. {SCORE}"
 
 
-def _uplink(options: argparse.Namespace, settings: dict[str, Any]) -> tuple[Scenario, str]:
-    from bufgym import traces
+def _uplink(options: argparse.Namespace) -> tuple[Scenario, str]:
+    from bufgym import scenario, traces
     from bufgym.scenario import Uplink
 
+    settings = _given(options, *_STREAM_ONLY)
     motions = options.motion
     if motions is None:
         motions = [name for name in traces.shipped() if name.startswith("drive-")]
-    uplink = Uplink(
-        traces=_links(options),
-        motion=_motions(motions, options),
-        rate_hz=settings["fps"],
-        jitter=settings["jitter"],
-        size_bytes=settings["bytes"],
-        size_cv=settings["size_cv"],
-        duration_s=settings["seconds"],
-        scale=(settings["scale"],),
-        value=_value(options, by_motion=motions != ["none"]),
-    )
+    if options.value is not None or motions == ["none"]:
+        settings["value"] = _value(options, by_motion=False)
+    links, scale = _links(options), (options.scale or 1.0,)
+    uplink = scenario.get("lte", traces=links, motion=_motions(motions, options), scale=scale, **settings)
+    assert isinstance(uplink, Uplink)
     recorded = _some([_with_gaps(motion) for motion in uplink.motion])
     x = f"the camera's motion, in fields of view, from {recorded}" if uplink.motion else "the frame index"
     traces_met = f"{len(uplink.traces)} {'trace' if len(uplink.traces) == 1 else 'traces'}"
     about = [
-        f"{settings['fps']:g} messages/s of {settings['bytes']} bytes for {settings['seconds']:g} s"
-        f" over {_over(uplink, settings)}, from random offsets.",
+        f"{uplink.rate_hz:g} messages/s of {uplink.size_bytes} bytes for {uplink.duration_s:g} s"
+        f" over {_over(uplink)}, from random offsets.",
         *_measured(uplink, x),
         f"Means over {traces_met} x {options.seeds} seeds; every policy meets the same episodes.",
+        SCORE,
     ]
     return uplink, "\n".join(about)
 
 
-def _recording(options: argparse.Namespace, settings: dict[str, Any]) -> tuple[Scenario, str]:
+def _recording(options: argparse.Namespace) -> tuple[Scenario, str]:
     """A workload as it was recorded; with --seeds, from random places on each trace."""
     from bufgym.scenario import Uplink
     from bufgym.traces import read_workload
@@ -147,7 +137,7 @@ def _recording(options: argparse.Namespace, settings: dict[str, Any]) -> tuple[S
     uplink = Uplink(
         traces=_links(options),
         motion=motions,
-        scale=(settings["scale"],),
+        scale=(options.scale or 1.0,),
         random_offset=random_offset,
         value=_value(options, by_motion),
         workload=workload,
@@ -157,14 +147,14 @@ def _recording(options: argparse.Namespace, settings: dict[str, Any]) -> tuple[S
     shared = "; all topics share one queue" if len(workload.topics) > 1 else ""
     about = [
         *(printable(workload.source), "", *workload_lines(workload), ""),
-        f"Played over {_over(uplink, settings)}, {places}{shared}.",
+        f"Played over {_over(uplink)}, {places}{shared}.",
         *_measured(uplink, f"the motion, {source}, in fields of view" if by_motion else "the number of the message"),
     ]
-    return uplink, "\n".join(about)
+    return uplink, "\n".join([*about, SCORE])
 
 
 def _value(options: argparse.Namespace, by_motion: bool) -> Value:
-    """V as the options say, or the default over motion or over frame indices."""
+    """V as the options say, or the default over a recording's motion or over frame indices."""
     from bufgym.model import qoi
 
     if options.value is not None:
@@ -172,8 +162,8 @@ def _value(options: argparse.Namespace, by_motion: bool) -> Value:
     return qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential()
 
 
-def _over(uplink: Uplink, settings: dict[str, Any]) -> str:
-    scaled = f" x {settings['scale']:g}" if settings["scale"] != 1 else ""
+def _over(uplink: Uplink) -> str:
+    scaled = f" x {uplink.scale[0]:g}" if uplink.scale != (1.0,) else ""
     return _some([trace.name for trace in uplink.traces]) + scaled
 
 

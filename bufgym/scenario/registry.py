@@ -22,7 +22,7 @@ def _suite() -> Scenario:
 
 SCENARIOS: dict[str, tuple[Callable[[], Scenario], str]] = {
     "interruption": (Interruption, "one interruption of unknown length (AFR paper, Sec. III-B)"),
-    "lte": (uplink_over_lte, "30 Hz camera on a driving robot over the shipped synthetic LTE traces"),
+    "lte": (uplink_over_lte, "30 Hz RGB-D camera on a driving robot over the shipped synthetic LTE traces"),
     "topics": (client_over_lte, "the topics of Robofleet's example client over the shipped synthetic LTE traces"),
     "suite": (_suite, "the scenarios of a suite's split, one of them drawn for each episode"),
 }

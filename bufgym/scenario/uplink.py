@@ -155,6 +155,14 @@ def _replayed(workload: Workload) -> NDArray[Any]:
     return arrivals
 
 
+RGBD_BYTES = 1280 * 720 * (3 + 2)
+"""An uncompressed frame of 1280 x 720, as of a RealSense D455: a pixel has three bytes of colour and two of depth."""
+
+
 def uplink_over_lte() -> Uplink:
-    """A camera on a driving robot over the shipped synthetic LTE links."""
-    return Uplink(**shipped())
+    """An RGB-D camera on a driving robot over the shipped synthetic LTE links, which carry about two of its 30 frames a
+    second. V(1) = 0.95: a frame that shares nothing with the one before it is worth nearly a whole one.
+
+    Both were chosen so that the choice matters: Drop Oldest loses about 10 % of the clairvoyant's H, AFR about 7 %.
+    """
+    return Uplink(**shipped(), size_bytes=RGBD_BYTES, value=qoi.exponential(0.05))

@@ -59,3 +59,39 @@ def test_markdown() -> None:
     assert lines[0].startswith("| policy | L | QoI | delivered |")
     assert lines[1].count("---:") == lines[0].count("|") - 2
     assert lines[2] == "| a | 1 | 2.000 | 1.0 | 1.0 | 1.000 | 1.000 | 1.000 | 1.000 | 1.000 | 1.000 |"
+
+
+def scored(policy: str, seed: int, qoi: float, best: float = 9.0, **more: Any) -> dict[str, Any]:
+    more = {"trace": "t", "seed": seed, "clairvoyant": best, "regret": 1 - qoi / best, **more}
+    return row(policy, 8, qoi, **more)
+
+
+BASE = [scored("drop-oldest", 0, 4.0, delivered=3), scored("drop-oldest", 1, 5.0)]
+MINE = [scored("mine", 0, 6.0), scored("mine", 1, 7.0, best=11.0)]
+
+
+def test_the_score_leads_and_is_computed_on_sums() -> None:
+    """Drop Oldest has 4 + 5, the clairvoyant 9 + 11, mine 6 + 7: (13 - 9) / (20 - 9); an unbounded queue has none."""
+    free = [scored("rosbridge", seed, 12.0, regret=None) for seed in (0, 1)]
+    entries = {entry["policy"]: entry["score"] for entry in table.means([*BASE, *MINE, *free])}
+    assert entries["mine"] == 4 / 11 and entries["drop-oldest"] == 0 and math.isnan(entries["rosbridge"])
+    lines = table.plain([*BASE, *MINE, *free]).split("\n")
+    assert lines[0].split()[:5] == ["policy", "L", "score", "QoI", "regret"]
+    assert lines[1].split()[:4] == ["mine", "8", "0.364", "6.500"]
+    assert "score" not in table.plain(MINE)
+    assert table.plain(MINE, BASE).split("\n")[1].split()[2] == "0.364"
+    assert "drop-oldest" not in table.plain(MINE, BASE)
+
+
+def test_policies_that_no_row_tells_apart_are_one_line() -> None:
+    twins = [{**entry, "policy": name} for entry in BASE for name in ("ros-keep-last", "near")]
+    twins[-1] |= {"delivered": 2}
+    rows = [*twins, *BASE, *MINE]
+    assert table.same(rows) == {"drop-oldest": ["ros-keep-last"]}
+    lines = table.plain(rows).split("\n")
+    assert [line.split()[0] for line in lines[1:4]] == ["mine", "drop-oldest", "near"]
+    assert lines[4] == "note: ros-keep-last: the same rows here as drop-oldest"
+    assert "| drop-oldest |" in table.markdown(rows) and "| ros-keep-last |" not in table.markdown(rows)
+    # One that does not compete is a line of its own, whatever its rows.
+    unbounded = [{**entry, "policy": "rosbridge"} for entry in BASE]
+    assert table.same([*BASE, *unbounded]) == {}

@@ -1,0 +1,244 @@
+"""PPO in one file: a camera's send buffer on the native batch, invalid actions masked, one network for every slot.
+
+    pip install "bufgym[train]"
+    python examples/ppo.py
+
+It trains on six of the eight shipped links and tests on the other two, where ``bufgym bench`` has the same episodes:
+
+    bufgym bench --trace lte-synthetic-6 lte-synthetic-7 --seeds 40 --policies afr,min-motion-gap,drop-oldest
+
+Proximal policy optimisation (Schulman et al. 2017) with generalised advantage estimation (2016), as in CleanRL's
+``ppo.py``. What is particular to a buffer:
+
+- **The observation** is ``observation="slots"``: [L + 1, slot fields] for the queued messages and the newcomer, and a
+  vector of context. The same small network scores each slot, so a message's worth does not depend on its slot's number.
+- **Masks are logits**: an action that is not valid gets a logit of -1e9, in sampling and in learning.
+- **The reward** ``retained`` pays at once what a decision costs, so a short sight (gamma 0.9) keeps the noise of the
+  camera's motion out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.distributions import Categorical
+
+import bufgym  # noqa: F401  (registers the environments)
+from bufgym import policies, scenario
+from bufgym.benchmark.run import run
+from bufgym.errors import BufgymError
+
+TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
+TEST = ["lte-synthetic-6", "lte-synthetic-7"]
+
+
+@dataclass
+class Settings:
+    """What ``main`` takes; the options of the command line."""
+
+    seed: int = 0
+    capacity: int = 8
+    """L, messages."""
+    duration_s: float = 30.0
+    """Length of an episode."""
+    steps: int = 1_200_000
+    """Decisions to learn from."""
+    num_envs: int = 256
+    """Environments side by side, stepped by one compiled call."""
+    num_steps: int = 64
+    """Decisions of each environment between updates."""
+    minibatch: int = 2_048
+    """Decisions of one gradient step."""
+    epochs: int = 3
+    """Passes over the decisions of an update."""
+    learning_rate: float = 2e-3
+    """At the start; falls linearly to 0."""
+    gamma: float = 0.9
+    gae_lambda: float = 0.9
+    clip: float = 0.2
+    """How far the new probability of an action may move from the old one."""
+    width: int = 32
+    """Hidden units a layer."""
+    test_seeds: int = 40
+    """Test episodes on each held-out link."""
+
+
+class SlotNetwork(nn.Module):
+    """Slots [n, L + 1, fields] and context [n, fields] -> logits [n, L + 2] of all actions, and values [n]."""
+
+    def __init__(self, slot_fields: int, context_fields: int, width: int) -> None:
+        super().__init__()
+        self.slots = nn.Linear(slot_fields, 3 * width)
+        self.context = nn.Linear(context_fields, 3 * width)
+        """The first layers of all three parts below, computed at once."""
+        self.drop = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
+        """Of each slot; the newcomer's is that of rejecting it."""
+        self.accept = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
+        """Of the newcomer."""
+        self.value = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
+        """Of the mean over slots."""
+        nn.init.constant_(self.accept[-1].bias, 2.0)  # dropping messages where there is room teaches little
+
+    def forward(self, slots: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
+        first = torch.relu(self.slots(slots) + self.context(context)[:, None])
+        drop, accept, value = first.chunk(3, dim=-1)
+        logits = torch.cat([self.drop(drop)[..., 0], self.accept(accept[:, -1])], dim=1)
+        return logits, self.value(value.mean(dim=1))[:, 0]
+
+
+def masked(logits: Tensor, mask: Tensor) -> Tensor:
+    """The logits, those of invalid actions so low that they are never drawn and get no gradient."""
+    return logits.masked_fill(mask == 0, -1e9)
+
+
+def advantages_of(rewards: Tensor, values: Tensor, ended: Tensor, gamma: float, gae_lambda: float) -> Tensor:
+    """Generalised advantage estimation, [steps, n]; ``values`` [steps + 1, n], ``ended``: the step ended an episode."""
+    advantages, after = torch.zeros_like(rewards), torch.zeros(rewards.shape[1])
+    for t in reversed(range(len(rewards))):
+        goes_on = 1 - ended[t]
+        surprise = rewards[t] + gamma * goes_on * values[t + 1] - values[t]
+        after = surprise + gamma * gae_lambda * goes_on * after
+        advantages[t] = after
+    return advantages
+
+
+def make(traces: list[str], num_envs: int, settings: Settings, mode: gym.vector.AutoresetMode) -> gym.vector.VectorEnv:
+    """The native batch; the agent is asked where the buffer is full."""
+    return gym.make_vec(
+        "bufgym/Uplink-v0",
+        num_envs,
+        capacity=settings.capacity,
+        traces=traces,
+        duration_s=settings.duration_s,
+        decide_at="overflow",
+        observation="slots",
+        info="mask",
+        autoreset_mode=mode,
+    )
+
+
+class Test:
+    """The agent on the benchmark's episodes over the held-out links, against AFR, Drop Oldest and the clairvoyant."""
+
+    __test__ = False  # no class of pytest's
+
+    def __init__(self, settings: Settings) -> None:
+        uplink = scenario.get("lte", traces=TEST, duration_s=settings.duration_s)
+        fixed = [policies.get(name) for name in ("drop-oldest", "afr")]
+        rows = run(fixed, uplink, [settings.capacity], settings.test_seeds)
+        self.h = {p.name: sum(row["qoi"] for row in rows if row["policy"] == p.name) for p in fixed}
+        self.best = sum(row["clairvoyant"] for row in rows if row["policy"] == "afr")
+        self.episodes = [{"trace": trace, "seed": seed} for trace in TEST for seed in range(settings.test_seeds)]
+        self.envs = make(TEST, len(self.episodes), settings, gym.vector.AutoresetMode.NEXT_STEP)
+
+    def play(self, network: SlotNetwork) -> float:
+        """Sum of H where the network always does what it finds best."""
+        observation, info = self.envs.reset(options={"episodes": self.episodes})
+        h, live = 0.0, np.ones(len(self.episodes), np.bool_)
+        while live.any():
+            with torch.no_grad():
+                logits, _ = network(*tensors(observation))
+            actions = masked(logits, torch.from_numpy(info["action_mask"])).argmax(dim=1)
+            observation, _, ended, _, info = self.envs.step(actions.numpy())
+            if ended.any():
+                h += info["qoi"][ended & live].sum()
+            live &= ~ended
+        return float(h)
+
+    def regret(self, h: float) -> float:
+        """The share of the clairvoyant's H that was lost."""
+        return 1 - h / self.best
+
+    def score(self, h: float) -> float:
+        """0 for Drop Oldest, 1 for the clairvoyant."""
+        return (h - self.h["drop-oldest"]) / (self.best - self.h["drop-oldest"])
+
+
+def tensors(observation: dict[str, np.ndarray]) -> tuple[Tensor, Tensor]:
+    """(slots, context); the next step writes other arrays, so nothing is copied."""
+    return torch.from_numpy(observation["slots"]), torch.from_numpy(observation["context"])
+
+
+def main(settings: Settings) -> dict[str, float]:
+    """Train and test; the agent's regret and score and AFR's, and the CPU seconds of training."""
+    torch.manual_seed(settings.seed)
+    torch.set_num_threads(1)  # more only wait for one another on batches this small
+    envs = make(TRAIN, settings.num_envs, settings, gym.vector.AutoresetMode.SAME_STEP)
+    test = Test(settings)
+    fields = (space.shape[-1] for space in envs.single_observation_space.values())
+    network = SlotNetwork(*fields, settings.width)
+    optimizer = torch.optim.Adam(network.parameters(), settings.learning_rate, eps=1e-5)
+    steps, n = settings.num_steps, settings.num_envs
+    updates = max(1, settings.steps // (steps * n))
+    observation, info = envs.reset(seed=settings.seed)
+    (slots, context), mask = tensors(observation), torch.from_numpy(info["action_mask"])
+    print(f"afr: score {test.score(test.h['afr']):.3f}, regret {test.regret(test.h['afr']):.2%}")
+    spent_s = 0.0
+    for update in range(updates + 1):
+        if update % max(1, updates // 10) == 0 or update == updates:
+            h = test.play(network)
+            report = f"score {test.score(h):.3f}, regret {test.regret(h):.2%}, {spent_s:.0f} CPU seconds of training"
+            print(f"{update * steps * n:,} decisions: {report}", flush=True)
+        if update == updates:
+            break
+        began = time.process_time()
+        optimizer.param_groups[0]["lr"] = settings.learning_rate * (1 - update / updates)
+        # Play.
+        played: dict[str, list[Tensor]] = {}
+        for _ in range(steps):
+            with torch.no_grad():
+                logits, value = network(slots, context)
+                choice = Categorical(logits=masked(logits, mask), validate_args=False)
+                action = choice.sample()
+            decision = {"slots": slots, "context": context, "mask": mask, "action": action, "value": value}
+            observation, reward, ended, _, info = envs.step(action.numpy())
+            (slots, context), mask = tensors(observation), torch.from_numpy(info["action_mask"])
+            decision |= {"log_p": choice.log_prob(action), "reward": torch.from_numpy(reward).float()}
+            for name, column in (decision | {"ended": torch.from_numpy(ended).float()}).items():
+                played.setdefault(name, []).append(column)
+        with torch.no_grad():
+            played["value"].append(network(slots, context)[1])
+        batch = {name: torch.stack(column) for name, column in played.items()}
+        advantages = advantages_of(batch["reward"], batch["value"], batch["ended"], settings.gamma, settings.gae_lambda)
+        batch["target"] = advantages + batch["value"][:-1]
+        batch["advantage"] = advantages
+        # Learn.
+        flat = {name: batch[name].flatten(0, 1) for name in batch if name not in ("value", "reward", "ended")}
+        for _ in range(settings.epochs):
+            for chosen in torch.randperm(steps * n).split(settings.minibatch):
+                part = {name: column[chosen] for name, column in flat.items()}
+                logits, value = network(part["slots"], part["context"])
+                log_p = torch.log_softmax(masked(logits, part["mask"]), dim=1)
+                ratio = (log_p.gather(1, part["action"][:, None])[:, 0] - part["log_p"]).exp()
+                gain = (part["advantage"] - part["advantage"].mean()) / (part["advantage"].std() + 1e-8)
+                clipped = ratio.clamp(1 - settings.clip, 1 + settings.clip)
+                loss = -torch.min(ratio * gain, clipped * gain).mean()
+                loss = loss + 0.5 * (value - part["target"]).square().mean()
+                optimizer.zero_grad()
+                loss.backward()
+                nn.utils.clip_grad_norm_(network.parameters(), 0.5)
+                optimizer.step()
+        spent_s += time.process_time() - began
+    return {
+        "regret": test.regret(h),
+        "score": test.score(h),
+        "afr_regret": test.regret(test.h["afr"]),
+        "afr_score": test.score(test.h["afr"]),
+        "cpu_s": spent_s,
+    }
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    for name, default in vars(Settings()).items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=type(default), default=default, help="(%(default)s)")
+    try:
+        main(Settings(**vars(parser.parse_args())))
+    except BufgymError as error:
+        raise SystemExit(f"error: {error}") from None

@@ -1,0 +1,59 @@
+"""From stable-baselines3 to a row of the leaderboard: train on a suite's train split, run its test split, read the row.
+
+    pip install "bufgym[train]"
+    python examples/sb3_to_leaderboard.py --suite lte-v1 --steps 500000 --out mine
+
+The second half is what anybody does with a model of their own:
+
+    bufgym bench --suite lte-v1 --policies mine/model.zip,afr,drop-oldest --out mine/rows
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from sb3_contrib import MaskablePPO
+
+from bufgym.benchmark import leaderboard, manifest
+from bufgym.benchmark.rows import read_rows
+from bufgym.cli import main as bufgym
+from bufgym.sb3 import SlotPolicy, make_vec_env
+
+
+def train(suite: str, capacity: int, steps: int, num_envs: int, path: Path) -> None:
+    """A slot network, which serves every L, whatever L it learned at; the model as a zip."""
+    envs = make_vec_env("bufgym/Suite-v0", num_envs, seed=0, suite=suite, split="train", capacity=capacity)
+    batch = {"n_steps": 128, "batch_size": 16 * num_envs, "n_epochs": 4}
+    short_sight = {"gamma": 0.9, "gae_lambda": 0.9}  # the reward pays at once what a decision costs
+    model = MaskablePPO(SlotPolicy, envs, learning_rate=2e-3, device="cpu", seed=0, **batch, **short_sight)
+    model.learn(steps).save(path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--suite", default="lte-v1", help="of one queue, without recordings (%(default)s)")
+    parser.add_argument("--capacity", type=int, default=10, help="L to learn at (%(default)s)")
+    parser.add_argument("--steps", type=int, default=500_000, help="decisions to learn from (%(default)s)")
+    parser.add_argument("--num-envs", type=int, default=256, help="environments side by side (%(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("mine"), help="folder of the model and its rows (%(default)s)")
+    parser.add_argument("bench", nargs="*", metavar="-- --seeds N", help="more options of bufgym bench")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    model = options.out / "model.zip"
+    train(options.suite, options.capacity, options.steps, options.num_envs, model)
+    rows = options.out / "rows"
+    chosen = ["--policies", f"{model},afr,drop-oldest", "--format", "csv", "--out", str(rows)]
+    if code := bufgym(["bench", "--suite", options.suite, *chosen, *options.bench]):
+        raise SystemExit(code)
+    unranked = manifest.read(rows / "manifest.json")["unranked"]
+    board = leaderboard.entries(read_rows(rows / "rows.csv"), options.suite, unranked)
+    # By its file, as the command in the row names it.
+    board = [replace(entry, policy=str(model)) if entry.policy == model.stem else entry for entry in board]
+    leaderboard.write(board, options.out / "leaderboard.csv")
+    print((options.out / "leaderboard.md").read_text(encoding="utf-8"))
+
+
+if __name__ == "__main__":
+    main()
