@@ -15,7 +15,8 @@ from typing import Any
 from bufgym.benchmark import tasks
 from bufgym.benchmark.rows import Row
 from bufgym.errors import BufgymError
-from bufgym.policies import Policy
+from bufgym.policies import Policy, get, names
+from bufgym.policies.registry import OnArrival
 from bufgym.scenario.numbered import by_trace, draw
 
 __all__ = ["bar", "by_trace", "check_distinct", "draw", "run"]
@@ -25,7 +26,7 @@ _BATCH_MESSAGES = 1_000_000
 
 
 def run(
-    policies: Sequence[Policy],
+    policies: Sequence[Policy | str | OnArrival],
     scenario: Any,
     capacities: Sequence[int],
     seeds: int | Sequence[int],
@@ -37,7 +38,7 @@ def run(
     """Every policy at every capacity on every trace and seed; the rows of the scenario's task, in its ``layout``.
 
     Args:
-        policies: see ``bufgym.policies.get``.
+        policies: each a ``Policy``, a name or a policy function, as ``bufgym.policies.get`` takes them.
         scenario: a ``Scenario`` or a ``FleetScenario``; each of its traces is met on its own.
         capacities: L, messages.
         seeds: so many (0, 1, ...), or these.
@@ -50,6 +51,7 @@ def run(
     for name, entries in (("policies", policies), ("capacities", capacities), ("seeds", numbers)):
         if not entries:
             raise BufgymError(f"{name} = {seeds if name == 'seeds' else list(entries)}: need at least one")
+    policies = [get(policy) for policy in policies]
     check_distinct(policies)
     for policy in policies:
         task.check(policy)
@@ -79,7 +81,9 @@ def check_distinct(policies: Sequence[Policy]) -> None:
     names = [policy.name for policy in policies]
     for name in names:
         if names.count(name) > 1:
-            raise BufgymError(f"policies: {name!r} is given more than once")
+            own = [p for p in policies if p.name == name and not p.on_arrival.__module__.startswith("bufgym.")]
+            why = f"; {name!r} is a built-in policy's name, give your own another" if own and name in names() else ""
+            raise BufgymError(f"policies: {name!r} is given more than once{why}")
 
 
 @contextmanager
