@@ -6,7 +6,7 @@ strangers (leaderboards, results, configurations of clients) never get here.
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import inspect
 import os
 import re
@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, line_in
 
 _NAMED = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """A setting, as in ``decimate:every=2``, has a "=" behind the colon."""
@@ -64,11 +64,11 @@ def imported(text: str, folder: str, also: str = "") -> Any:
 
 def run_file(path: str, option: str) -> None:
     """Run the caller's Python file, which registers what is his own; ``option``: where it was named."""
-    import importlib.util
-
     if not Path(path).is_file():
         raise BufgymError(f"{path}: no such file ({option})")
-    spec = importlib.util.spec_from_file_location(f"bufgym_{option.strip('-').replace('-', '_')}_{Path(path).stem}", path)
+    spec = importlib.util.spec_from_file_location(
+        f"bufgym_{option.strip('-').replace('-', '_')}_{Path(path).stem}", path
+    )
     if spec is None or spec.loader is None:
         raise BufgymError(f"{path}: must be a Python file, named .py")
     module = importlib.util.module_from_spec(spec)
@@ -78,6 +78,12 @@ def run_file(path: str, option: str) -> None:
         spec.loader.exec_module(module)
     except SyntaxError as error:
         raise BufgymError(f"{path}, line {error.lineno}: {error.msg}") from None
+
+
+def line_of(error: Exception, *files: str | None) -> str | None:
+    """Where in the caller's code the error came from, these files or a module imported here; None for nowhere there."""
+    places = (line_in(error, file) for file in [*filter(None, files), *FILES])
+    return next(filter(None, places), None)
 
 
 def needs(function: Any) -> int:

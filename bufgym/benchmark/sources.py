@@ -16,10 +16,9 @@ import os
 from collections.abc import Iterable
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 from bufgym import modules, policies
-from bufgym.errors import BufgymError, line_in
+from bufgym.errors import BufgymError
 from bufgym.policies import Policy, registry
 
 _FILES = (".zip", ".safetensors")
@@ -27,9 +26,7 @@ _FILES = (".zip", ".safetensors")
 
 def is_source(spec: str) -> bool:
     """Whether ``spec`` is to be loaded; else it is a name, perhaps with settings."""
-    return spec.endswith(_FILES) or (
-        modules.is_named(spec) and spec.partition(":")[0] not in policies.names()
-    )
+    return spec.endswith(_FILES) or (modules.is_named(spec) and spec.partition(":")[0] not in policies.names())
 
 
 _NAMES: dict[tuple[str, str], str] = {}
@@ -57,12 +54,6 @@ def load(source: str, folder: str | None = None) -> str:
         registry.register(policy.name, **given)(policy.on_arrival)
     _NAMES[place, source] = policy.name
     return policy.name
-
-
-def line_of(error: Exception, *own_files: str | None) -> str | None:
-    """Where in the caller's code the error came from, these files or a module loaded here; None for nowhere there."""
-    places = (line_in(error, file) for file in [*filter(None, own_files), *modules.FILES])
-    return next(filter(None, places), None)
 
 
 def digests(sources: Iterable[str], folder: str) -> dict[str, str]:
@@ -103,4 +94,3 @@ def _module_file(source: str, folder: str) -> Path:
     if file is None:
         raise BufgymError(f"{source}: a module without a file")
     return Path(file)
-

@@ -45,8 +45,9 @@ class ObservationForm:
     - "flat": the row itself, as ``gymnasium.wrappers.FlattenObservation`` makes it of the dict;
     - "slots": ``slots`` [L + 1, slot fields] and ``context`` [context fields], as attention networks take them.
 
-    Only the fields that are ``chosen`` by name are observed (None: all of the tables), in the order of the tables, one's
-    own after those of their kind. With all of the tables nothing is copied. ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row.
+    Only the fields that are ``chosen`` by name are observed (None: all of the tables), in the tables' order, one's own
+    behind them. With all of the tables nothing is copied. ``space`` is the Gymnasium space of one observation,
+    ``numbers`` the length of a row.
     """
 
     def __init__(
@@ -67,10 +68,10 @@ class ObservationForm:
         names = known if chosen is None else list(chosen)
         for k, name in enumerate(names):
             if name not in known:
-                field = own_field(name)
-                if field is None:
+                found = own_field(name)
+                if found is None:
                     raise BufgymError(f"fields: unknown field {name!r}; known: {', '.join([*known, *OWN_FIELDS])}")
-                own[field.name], names[k] = field, field.name
+                own[found.name], names[k] = found, found.name
         if not names:
             raise BufgymError("fields: choose at least one field to observe")
         self.form = form

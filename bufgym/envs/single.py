@@ -56,7 +56,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``max_bytes``: B, bytes; None for no limit.
     - ``decide_at``: "arrival", or "overflow" to ask only when the buffer is full.
     - ``reward``: a term's name, or weights by name; those of ``bufgym.observe.OWN_TERMS`` count and show where named.
-    - ``fields``: names of the fields to observe, one's own among them; by default those of the tables. ``observation``: "dict", "flat" or "slots".
+    - ``fields``: names of the fields to observe, one's own among them; by default those of the tables.
+    - ``observation``: "dict", "flat" or "slots".
     - ``info``: "full"; "mask" for the action mask alone, and at an episode's end its summary; "none" for the summary.
     - ``render_mode``: "ansi" or "rgb_array".
     - ``bound``: whether the last ``info`` also has ``clairvoyant`` (the best H, or an upper bound of it), ``regret``

@@ -141,7 +141,7 @@ def tabulated(distances: Sequence[float], values: Sequence[float]) -> Value:
         raise BufgymError(f"V = tabulated: distances {d.tolist()}: must begin at 0 and increase")
     # Beyond the table V is constant: one more point lets the check see that corner too.
     check = np.append(d, 2 * d[-1])
-    return _checked(f"tabulated:{len(d)} points", _table(d, levels), check)
+    return _checked(f"tabulated:{len(d)} points", _table(d.tolist(), levels.tolist()), check)
 
 
 def _table(distances: Sequence[float], levels: Sequence[float]) -> list[float]:

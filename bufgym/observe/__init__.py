@@ -16,7 +16,17 @@ from bufgym.observe.fields import (
     Field,
     RewardTerm,
 )
-from bufgym.observe.own import OWN_FIELDS, OWN_TERMS, OwnField, OwnTerm, field, own_field, own_term, reward_term, terms_for
+from bufgym.observe.own import (
+    OWN_FIELDS,
+    OWN_TERMS,
+    OwnField,
+    OwnTerm,
+    field,
+    own_field,
+    own_term,
+    reward_term,
+    terms_for,
+)
 from bufgym.observe.queue import observe_context, observe_slots
 from bufgym.observe.topics import observe_topic_context, observe_topic_slots
 

@@ -91,7 +91,14 @@ Entry = TypeVar("Entry", OwnField, OwnTerm)
 
 
 def field(
-    name: str, *, per: str, unit: str = "", low: float = 0.0, high: float = 1.0, meaning: str = "", compile: bool = False
+    name: str,
+    *,
+    per: str,
+    unit: str = "",
+    low: float = 0.0,
+    high: float = 1.0,
+    meaning: str = "",
+    compile: bool = False,
 ) -> Callable[[Function], Function]:
     """Register the decorated function as the observation field ``name``; it comes back unchanged.
 
@@ -113,7 +120,9 @@ def field(
     if per not in ("slot", "context"):
         raise BufgymError(f"field {name!r}: per = {per!r}: must be 'slot' or 'context'")
     if not (is_number(low) and is_number(high) and -math.inf < low <= 0 <= high < math.inf and low < high):
-        raise BufgymError(f"field {name!r}: low = {low!r}, high = {high!r}: need low <= 0 <= high, as empty slots are 0")
+        raise BufgymError(
+            f"field {name!r}: low = {low!r}, high = {high!r}: need low <= 0 <= high, as empty slots are 0"
+        )
 
     def add(function: Function) -> Function:
         _check_function("field", name, function, 3 if per == "slot" else 2)
@@ -149,9 +158,7 @@ def reward_term(
         _check_function("reward term", name, function, 2)
         settings = {"parameters": dict(parameters or {}), "memory": dict(memory or {})}
         text = meaning or _first_line(function)
-        OWN_TERMS[name] = OwnTerm(
-            name, unit, text, function=function, one_queue=one_queue, compile=compile, **settings
-        )
+        OWN_TERMS[name] = OwnTerm(name, unit, text, function=function, one_queue=one_queue, compile=compile, **settings)
         return function
 
     return add

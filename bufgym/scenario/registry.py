@@ -82,7 +82,7 @@ def checked(scenario: Any, name: str) -> Scenario:
 
 
 def _is_count(number: Any) -> bool:
-    return isinstance(number, int | np.integer) and not isinstance(number, bool) and number >= 1
+    return isinstance(number, int | np.integer) and not isinstance(number, bool) and bool(number >= 1)
 
 
 def get(spec: str | Scenario, **overrides: Any) -> Scenario:
@@ -106,7 +106,7 @@ def get(spec: str | Scenario, **overrides: Any) -> Scenario:
         spec = checked(spec, type(spec).__name__)
     if not overrides:
         return spec
-    known = {f.name for f in fields(spec)} if is_dataclass(spec) else set()
+    known: set[str] = {f.name for f in fields(spec)} if is_dataclass(spec) else set()
     for name in overrides:
         if name not in known:
             has = ", ".join(sorted(known)) or "none (it is no dataclass)"
