@@ -144,7 +144,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         )
 
     def state(self) -> NDArray[np.float32]:
-        """float32[N x fields]: robot by robot, all slot fields of the tables, then all context fields; chosen or not."""
+        """float32[N x fields]: robot by robot, slot fields of the tables, then context fields; chosen or not."""
         return self.rows.output.flat[:, : self.rows.form.table_numbers].flatten()
 
     def render(self) -> Any:

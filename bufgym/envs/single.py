@@ -111,7 +111,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self._action = np.zeros(1, np.int64)
         self._weights = self.rows.weights.tolist()
         self._no_terms = [0.0] * len(self._weights)
-        self._ended = False
+        self._ended = True
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -131,10 +131,9 @@ class SenderEnv(gym.Env[Observation, np.int64]):
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         rows = self.rows
-        if rows.senders.episodes[0] is None:
-            raise gym.error.ResetNeeded("call reset() before step()")
         if self._ended:
-            raise gym.error.ResetNeeded("the episode has ended: call reset() before the next step()")
+            why = "" if rows.senders.episodes[0] is None else "the episode has ended: "
+            raise gym.error.ResetNeeded(f"{why}call reset() before step()")
         self._action[0] = rows.action("action", action)
         rows.step(self._action)
         terminated = self._ended = rows.output.terminated.item()

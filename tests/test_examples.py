@@ -1,0 +1,33 @@
+"""The examples, run as a user would, with settings small enough for a test."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parent.parent
+EXAMPLES = [
+    path
+    for path in sorted((REPO / "examples").glob("*.py"))
+    if all(part in path.read_text(encoding="utf-8") for part in ("def main(", '"--steps"', '"--seeds"'))
+]
+"""Those that take ``--steps`` and ``--seeds``; the others have tests of their own."""
+
+
+def test_every_point_of_extension_has_its_example() -> None:
+    assert {f"own_{what}" for what in ("scenario", "reward", "field", "value", "link")} <= {p.stem for p in EXAMPLES}
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_the_example_runs(path: Path) -> None:
+    command = [sys.executable, str(path), "--steps", "40", "--seeds", "1"]
+    environment = {**os.environ, "PYTHONPATH": str(REPO)}
+    done = subprocess.run(
+        command, cwd=path.parent, env=environment, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip()
