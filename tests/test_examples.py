@@ -31,3 +31,13 @@ def test_the_example_runs(path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip()
+
+
+def test_the_guide_shows_what_the_examples_do() -> None:
+    guide = (REPO / "docs" / "guide.md").read_text(encoding="utf-8")
+    section = guide.split("## Yours to change\n")[1].split("\n## ")[0]
+    text = "\n".join(path.read_text(encoding="utf-8") for path in EXAMPLES)
+    blocks = [block.split("```")[0] for block in section.split("```python\n")[1:]]
+    assert len(blocks) == 5
+    for block in blocks:
+        assert block in text, block

@@ -115,9 +115,7 @@ def check_bounds(field: OwnField, numbers: NDArray[np.float32]) -> None:
     inside = (numbers >= np.float32(field.low)) & (numbers <= np.float32(field.high))  # NaN is not
     if not inside.all():
         wrong = float(numbers[~inside].flat[0])
-        raise BufgymError(
-            f"field {field.name!r}: is {wrong:g}: must lie in [{field.low:g}, {field.high:g}], its bounds"
-        )
+        raise BufgymError(f"field {field.name!r}: is {wrong:g}: must lie in its bounds, {field.low:g}..{field.high:g}")
 
 
 class OwnFields:

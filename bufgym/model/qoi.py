@@ -165,6 +165,10 @@ def of_function(v: Callable[[float], float], name: str = "") -> Value:
     until = _SMALLEST
     while until < _LARGEST and not 0 <= at(4 * until) - at(until) <= _FLAT * abs(at(4 * until)):
         until *= 2
+    below, top = 0.0, at(until)
+    for _ in range(60):  # where V ends in a corner, that is where the table ends
+        middle = (below + until) / 2
+        below, until = (below, middle) if at(middle) >= top * (1 - 1e-12) else (middle, until)
     distances = [0.0, *np.geomspace(until / 1e4, until, POINTS - 1).tolist()]
     return _checked(name, _table(distances, [at(d) for d in distances]), np.append(distances, 2 * until))
 
