@@ -163,7 +163,12 @@ def of_function(v: Callable[[float], float], name: str = "") -> Value:
         return float(level)
 
     until = _SMALLEST
-    while until < _LARGEST and not 0 <= at(4 * until) - at(until) <= _FLAT * abs(at(4 * until)):
+    while until < _LARGEST:
+        low, high = at(until), at(4 * until)
+        if high < low:
+            raise BufgymError(f"V = {name}: V falls from d = {until:g} on, but must not decrease (Eq. 5)")
+        if high - low <= _FLAT * high:
+            break
         until *= 2
     below, top = 0.0, at(until)
     for _ in range(60):  # where V ends in a corner, that is where the table ends
