@@ -300,9 +300,10 @@ def get(spec: str | Policy | OnArrival) -> Policy:
         if not inspect.isfunction(spec):
             raise BufgymError(f"policy {spec!r}: must be a name, a Policy, or a function (buffer, arrival, memory)")
         return registered_as(spec) or Policy(spec.__name__, spec)
-    name, numbers = named_settings("policy", spec)
+    name = spec.partition(":")[0]
     if name not in _REGISTRY:
         raise BufgymError(f"unknown policy {name!r}; known: {', '.join(_REGISTRY)}")
+    _, numbers = named_settings("policy", spec)
     entry = _REGISTRY[name]
     if isinstance(entry, Later):
         entry = _REGISTRY[name] = entry.make()
