@@ -91,12 +91,18 @@ def test_bad_commands(command: list[str], naming: str, capsys: pytest.CaptureFix
     fails(command, naming, capsys)
 
 
-def test_ctrl_c_and_a_reader_that_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_and_a_reader_that_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     def interrupt(kind: Any) -> str:
         raise KeyboardInterrupt
 
     monkeypatch.setitem(cli._LISTS, "policies", lambda: interrupt(0))
     assert main(["list", "policies"]) == 130
+    assert capsys.readouterr().err == "bufgym: stopped\n"
+    monkeypatch.setattr("bufgym.benchmark.sweep.run_sweep", lambda *_, **__: interrupt(0))
+    assert main(["bench", "--suite", "interruption-v1", "--out", str(tmp_path)]) == 130
+    assert capsys.readouterr().err == "bufgym: stopped; the same command resumes it\n"
     program = "import sys; from bufgym.cli import main; sys.exit(main(['list']))"
     with subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

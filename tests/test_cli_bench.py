@@ -274,3 +274,13 @@ def test_a_suites_run_is_never_written_over(tmp_path: Path, capsys: pytest.Captu
     assert main(["bench", "--policies", "afr", "--seeds", "1", "--seconds", "1", "--out", str(tmp_path)]) == 2
     assert "holds the run of a suite" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+
+
+def test_a_python_file_is_no_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fails(["bench", "--policies", "mine.py"], "--policy-file mine.py registers its policies", capsys)
+
+
+def test_cells_without_a_score_say_why(capsys: pytest.CaptureFixture[str]) -> None:
+    chosen = ["--policies", "afr,drop-oldest", "--capacity", "8", "--seeds", "1", "--jobs", "1"]
+    assert main(["bench", "--suite", "interruption-v1", *chosen]) == 0
+    assert "Nothing is scored here: on these episodes Drop Oldest's regret is under 1 %" in capsys.readouterr().out

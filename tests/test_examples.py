@@ -1,82 +1,43 @@
-"""The examples run, with tiny settings, and do what they say."""
+"""The examples, run as a user would, with settings small enough for a test."""
 
 from __future__ import annotations
 
-import runpy
+import os
+import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
-from bufgym.benchmark import leaderboard
-
-torch = pytest.importorskip("torch", reason="the extra [train] is not installed")
-
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
-
-
-def example(name: str) -> dict[str, Any]:
-    """The names that an example defines; what stands under ``__main__`` is not run."""
-    return runpy.run_path(str(EXAMPLES / name))
+REPO = Path(__file__).resolve().parent.parent
+EXAMPLES = [
+    path
+    for path in sorted((REPO / "examples").glob("*.py"))
+    if all(part in path.read_text(encoding="utf-8") for part in ("def main(", '"--steps"', '"--seeds"'))
+]
+"""Those that take ``--steps`` and ``--seeds``; the others have tests of their own."""
 
 
-def test_ppo_trains_and_tests_on_the_benchmarks_episodes(capsys: pytest.CaptureFixture[str]) -> None:
-    ppo = example("ppo.py")
-    tiny = {"num_envs": 4, "num_steps": 8, "steps": 96, "minibatch": 16, "width": 8, "epochs": 1, "duration_s": 4.0}
-    result = ppo["main"](ppo["Settings"](**tiny, capacity=2, test_seeds=2))
-    assert 0 < result["afr_regret"] < 1 and 0 < result["regret"] <= 1 and result["score"] <= 1
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("afr: score") and lines[1].startswith("0 decisions:")
-    assert lines[-1].startswith("96 decisions:")
+def test_every_point_of_extension_has_its_example() -> None:
+    assert {f"own_{what}" for what in ("scenario", "reward", "field", "value", "link")} <= {p.stem for p in EXAMPLES}
 
 
-def test_ppo_never_draws_an_invalid_action() -> None:
-    ppo = example("ppo.py")
-    logits = ppo["masked"](torch.tensor([[50.0, 0.0, 1.0]]), torch.tensor([[0, 1, 1]], dtype=torch.int8))
-    assert logits.softmax(1)[0, 0] == 0 and logits.argmax() == 2
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_the_example_runs(path: Path) -> None:
+    command = [sys.executable, str(path), "--steps", "40", "--seeds", "1"]
+    environment = {**os.environ, "PYTHONPATH": str(REPO)}
+    done = subprocess.run(
+        command, cwd=path.parent, env=environment, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip()
 
 
-def test_ppos_advantages_by_hand() -> None:
-    """gamma = lambda = 1/2. Last: 1 + 3/2 - 2 = 0.5; first: 1 + 2/2 - 1 + 0.5/4 = 1.125, or 1 - 1 where it ended."""
-    ppo = example("ppo.py")
-    values = torch.tensor([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
-    ended = torch.tensor([[0.0, 1.0], [0.0, 0.0]])
-    advantages = ppo["advantages_of"](torch.ones(2, 2), values, ended, 0.5, 0.5)
-    assert advantages.tolist() == [[1.125, 0.0], [0.5, 0.5]]
-
-
-def test_a_model_of_stable_baselines3_gets_a_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
-    small = ["--suite", "interruption-v1", "--capacity", "4", "--steps", "512", "--num-envs", "4", "--out", "mine"]
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["x", *small, "--", "--seeds", "3", "--capacity", "4", "--jobs", "1"])
-    example("sb3_to_leaderboard.py")["main"]()
-    board = leaderboard.read(Path("mine/leaderboard.csv"))
-    assert {entry.policy for entry in board.values()} == {"mine/model.zip", "afr", "drop-oldest"}
-    row = board["interruption-v1/mine/model.zip"]
-    assert row.values["score"].value <= 1 and row.rank in (1, 2, 3)
-    assert f"`{row.command}`" in capsys.readouterr().out
-    assert row.command == "bufgym bench --suite interruption-v1 --policies mine/model.zip"
-
-
-def test_a_moment_is_missed_more_than_half_a_view_from_what_arrived(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Frames 0 and 3 arrived, at 0 and 2: those at 0.5 and 1.6 are near one, that at 1 is not, nor that at 2.6."""
-    view = example("view_missed.py")
-    x, arrived = np.array([0.0, 0.5, 1.0, 1.6, 2.0, 2.6]), np.array([1, 0, 0, 0, 1, 0], bool)
-    assert view["missed"](x, arrived, 0.5) == 2 / 6
-    assert view["missed"](x, np.zeros(6, bool), 0.5) == 1
-    monkeypatch.setattr(sys, "argv", ["x", "--policies", "clairvoyant,afr", "--seeds", "1", "--seconds", "3"])
-    view["main"]()
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert lines[0][:2] == ["policy", "score"] and {line[0] for line in lines[1:4]} == {
-        "clairvoyant",
-        "afr",
-        "drop-oldest",
-    }
-    assert lines[1][:2] == ["clairvoyant", "1.000"]
+def test_the_guide_shows_what_the_examples_do() -> None:
+    guide = (REPO / "docs" / "guide.md").read_text(encoding="utf-8")
+    section = guide.split("## Yours to change\n")[1].split("\n## ")[0]
+    text = "\n".join(path.read_text(encoding="utf-8") for path in EXAMPLES)
+    blocks = [block.split("```")[0] for block in section.split("```python\n")[1:]]
+    assert len(blocks) == 5
+    for block in blocks:
+        assert block in text, block

@@ -20,6 +20,7 @@ REPO = Path(__file__).resolve().parent.parent
 ROOMS = [
     "errors",
     "files",
+    "modules",
     "kernel",
     "traces",
     "model",

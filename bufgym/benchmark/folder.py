@@ -13,6 +13,7 @@ from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.errors import BufgymError, where
 
+_ROWS = ("rows.parquet", "rows.csv")
 _TIMELINE = {"scenario": str, "capacity": int, "arrival_s": list, "x": list, "rate": dict, "policies": dict}
 _LANE = {"qoi": (int, float), "received": list, "dropped": list}
 
@@ -54,12 +55,16 @@ def read(folder: Path) -> Run:
         raise BufgymError(f"{folder}: must be a folder that `bufgym bench --suite` wrote")
     entries = manifest.read(folder / "manifest.json")
     timeline = folder / "timeline.json"
+    if (folder / "parts").is_dir() and not any((folder / name).exists() for name in _ROWS):
+        raise BufgymError(
+            f"{folder}: this run is not finished; the command that began it resumes it: {entries['command']}"
+        )
     rows, rows_file = _rows(folder, TASKS[entries["task"]])
     return Run(folder, entries, rows, rows_file, _timeline(timeline) if timeline.exists() else None)
 
 
 def _rows(folder: Path, task: Task) -> tuple[list[Row], Path]:
-    for name in ("rows.parquet", "rows.csv"):
+    for name in _ROWS:
         path = folder / name
         if path.exists():
             rows = read_rows(path, task.layout)

@@ -15,7 +15,8 @@ from typing import Any
 from bufgym.benchmark import tasks
 from bufgym.benchmark.rows import Row
 from bufgym.errors import BufgymError
-from bufgym.policies import Policy
+from bufgym.policies import Policy, get, names
+from bufgym.policies.registry import OnArrival
 from bufgym.scenario.numbered import by_trace, draw
 
 __all__ = ["bar", "by_trace", "check_distinct", "draw", "run"]
@@ -25,7 +26,7 @@ _BATCH_MESSAGES = 1_000_000
 
 
 def run(
-    policies: Sequence[Policy],
+    policies: Sequence[Policy | str | OnArrival],
     scenario: Any,
     capacities: Sequence[int],
     seeds: int | Sequence[int],
@@ -37,7 +38,7 @@ def run(
     """Every policy at every capacity on every trace and seed; the rows of the scenario's task, in its ``layout``.
 
     Args:
-        policies: see ``bufgym.policies.get``.
+        policies: each a ``Policy``, a name or a policy function, as ``bufgym.policies.get`` takes them.
         scenario: a ``Scenario`` or a ``FleetScenario``; each of its traces is met on its own.
         capacities: L, messages.
         seeds: so many (0, 1, ...), or these.
@@ -50,19 +51,20 @@ def run(
     for name, entries in (("policies", policies), ("capacities", capacities), ("seeds", numbers)):
         if not entries:
             raise BufgymError(f"{name} = {seeds if name == 'seeds' else list(entries)}: need at least one")
-    check_distinct(policies)
-    for policy in policies:
+    chosen = [get(policy) for policy in policies]
+    check_distinct(chosen)
+    for policy in chosen:
         task.check(policy)
     parts = by_trace(scenario)
     at_once = max(1, _BATCH_MESSAGES // task.messages(scenario))
     batches = [numbers[k : k + at_once] for k in range(0, len(numbers), at_once)]
     rows: list[Row] = []
-    with bar(len(parts) * len(numbers) * len(capacities) * len(policies), progress) as advance:
+    with bar(len(parts) * len(numbers) * len(capacities) * len(chosen), progress) as advance:
         for trace, part in parts:
             for batch in batches:
                 episodes = [draw(part, seed) for seed in batch]
                 for capacity in capacities:
-                    for policy, results in zip(policies, task.play(policies, part, episodes, capacity), strict=True):
+                    for policy, results in zip(chosen, task.play(chosen, part, episodes, capacity), strict=True):
                         for seed, result in zip(batch, results, strict=True):
                             key = {"scenario": label, "trace": trace, "seed": seed}
                             key |= {"policy": policy.name, "capacity": capacity}
@@ -76,10 +78,12 @@ def run(
 
 def check_distinct(policies: Sequence[Policy]) -> None:
     """An error if two have one name: their rows could not be told apart."""
-    names = [policy.name for policy in policies]
-    for name in names:
-        if names.count(name) > 1:
-            raise BufgymError(f"policies: {name!r} is given more than once")
+    given = [policy.name for policy in policies]
+    for name in given:
+        if given.count(name) > 1:
+            own = [p for p in policies if p.name == name and not p.on_arrival.__module__.startswith("bufgym.")]
+            why = f"; {name!r} is a built-in policy's name, give your own another" if own and name in names() else ""
+            raise BufgymError(f"policies: {name!r} is given more than once{why}")
 
 
 @contextmanager

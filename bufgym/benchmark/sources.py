@@ -12,30 +12,21 @@ file: names also come from leaderboards and results of strangers.
 from __future__ import annotations
 
 import hashlib
-import importlib
-import inspect
 import os
-import re
-import sys
 from collections.abc import Iterable
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
-from bufgym import policies
-from bufgym.errors import BufgymError, line_in
+from bufgym import modules, policies
+from bufgym.errors import BufgymError
 from bufgym.policies import Policy, registry
 
 _FILES = (".zip", ".safetensors")
-_FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-"""``module:function``; a setting has a "=" behind the colon."""
 
 
 def is_source(spec: str) -> bool:
     """Whether ``spec`` is to be loaded; else it is a name, perhaps with settings."""
-    return spec.endswith(_FILES) or (
-        _FUNCTION.fullmatch(spec) is not None and spec.partition(":")[0] not in policies.names()
-    )
+    return spec.endswith(_FILES) or (modules.is_named(spec) and spec.partition(":")[0] not in policies.names())
 
 
 _NAMES: dict[tuple[str, str], str] = {}
@@ -65,13 +56,6 @@ def load(source: str, folder: str | None = None) -> str:
     return policy.name
 
 
-def line_of(error: Exception, policy_file: str | None) -> str | None:
-    """Where in the caller's code the error came from, that file or a module loaded here; None for nowhere there."""
-    modules = [str(_module_file(source, folder)) for folder, source in _NAMES if not source.endswith(_FILES)]
-    places = (line_in(error, file) for file in [*filter(None, [policy_file]), *modules])
-    return next(filter(None, places), None)
-
-
 def digests(sources: Iterable[str], folder: str) -> dict[str, str]:
     """What tells one version of each from another: of its file, or of its module's."""
     files = {
@@ -91,50 +75,22 @@ def _from_file(source: str, folder: str) -> Policy:
 
 
 def _from_module(source: str, folder: str) -> Policy:
-    module, _, name = source.partition(":")
-    found = getattr(_imported(source, folder), name, None)
-    if found is None:
-        raise BufgymError(f"{source}: the module {module} has no {name}")
+    modules.imported(source, folder, "a policy")
+    found = modules.find(source, folder)
     if isinstance(found, Policy):
         return found
-    if callable(found) and _needs(found) == 0:
+    if callable(found) and modules.needs(found) == 0:
         found = found()
         if isinstance(found, Policy):
             return found
-    if not callable(found) or _needs(found) != 3:
+    if not callable(found) or modules.needs(found) != 3:
         rule = "must be a policy, a function (buffer, arrival, memory), or one without arguments that makes either"
         raise BufgymError(f"{source}: {rule}")
-    return registry.registered_as(found) or Policy(name, found)
-
-
-def _imported(source: str, folder: str) -> Any:
-    place = source.partition(":")[0]
-    # The installed command, unlike python -m bufgym, does not look for modules in the current folder.
-    if folder not in map(os.path.abspath, sys.path):
-        sys.path.append(folder)
-    try:
-        return importlib.import_module(place)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{place}.".startswith(f"{error.name}."):
-            raise BufgymError(f"{source}: {place} imports {error.name}, which is not there") from None
-        here = f"in {folder} or among those installed"
-        raise BufgymError(f"{source}: neither a policy {place!r} nor a module of that name {here}") from None
-    except Exception as error:  # whatever the module does when it is run
-        raise BufgymError(f"{source}: cannot be imported: {type(error).__name__}: {error}") from None
+    return registry.registered_as(found) or Policy(source.partition(":")[2], found)
 
 
 def _module_file(source: str, folder: str) -> Path:
-    file = _imported(source, folder).__file__
+    file = modules.imported(source, folder).__file__
     if file is None:
         raise BufgymError(f"{source}: a module without a file")
     return Path(file)
-
-
-def _needs(function: Any) -> int:
-    """Arguments without a default."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return -1
-    kinds = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
-    return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from bufgym import __version__, policies
+from bufgym import __version__, modules, policies
 from bufgym.benchmark import cluster, manifest, sources, tasks
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
@@ -162,7 +162,7 @@ def _attempt(number: int, shard: Shard, load: Load | None, parent: int) -> tuple
         return number, error
     except Exception as error:
         # A traceback stays behind in the process; where in the user's own file it was must be said here.
-        place = sources.line_of(error, shard.sweep.policy_file)
+        place = modules.line_of(error, shard.sweep.policy_file)
         return number, error if place is None else BufgymError(f"{place}: {type(error).__name__}: {error}")
 
 

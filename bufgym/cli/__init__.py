@@ -15,7 +15,7 @@ import re
 import sys
 from collections.abc import Sequence
 
-from bufgym import __version__
+from bufgym import __version__, modules
 from bufgym.cli import (
     bench,
     export,
@@ -40,18 +40,17 @@ __all__ = ["KINDS", "_LISTS", "environments", "main", "split_policies"]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit code."""
-    policy_file: str | None = None
+    options: argparse.Namespace = argparse.Namespace()
     _open_output()
     try:
         options = _parser().parse_args(arguments)
-        policy_file = getattr(options, "policy_file", None)
         options.command(options)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader (head, less) has gone
         _drop_output()
         return 141
     except KeyboardInterrupt:
-        return 130
+        return _failed(f"stopped{'; the same command resumes it' if getattr(options, 'resumes', False) else ''}", 130)
     except BufgymError as error:
         return _failed(str(error))
     except OSError as error:
@@ -62,7 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _drop_output()
         return _failed(f"{file}{error.strerror or error}")
     except Exception as error:
-        place = _in_the_callers_code(error, policy_file)
+        policy_file = getattr(options, "policy_file", None)
+        place = modules.line_of(error, policy_file, getattr(options, "scenario_file", None))
         if place is not None:
             return _failed(f"{place}: {type(error).__name__}: {error}")
         if policy_file and type(error).__module__.startswith("numba."):
@@ -114,19 +114,11 @@ def _parser() -> argparse.ArgumentParser:
 # --- what went wrong, in one line ------------------------------------------------------------------------------------
 
 
-def _failed(message: str) -> int:
+def _failed(message: str, code: int = 2) -> int:
     with contextlib.suppress(OSError):
-        print(f"bufgym: error: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
-    return 2
-
-
-def _in_the_callers_code(error: Exception, policy_file: str | None) -> str | None:
-    """The file and line of the caller's own that the error came from; None if it came from elsewhere."""
-    if policy_file is None and "bufgym.benchmark.sources" not in sys.modules:
-        return None
-    from bufgym.benchmark import sources
-
-    return sources.line_of(error, policy_file)
+        kind = "error: " if code == 2 else ""
+        print(f"bufgym: {kind}{printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
+    return code
 
 
 def _gist(error: Exception) -> str:

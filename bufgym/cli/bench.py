@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bufgym.cli.options import Commands, command, count, load_policies, loaded, refuse
-from bufgym.cli.scenarios import scenario, scenario_options
+from bufgym.cli.scenarios import OWN, scenario, scenario_options
 from bufgym.cli.suite import SUITE_OPTIONS, out_options, run_suite, suite_options, target, who_options
 from bufgym.cli.trace_bags import WORKLOAD_OPTIONS
 from bufgym.errors import BufgymError
@@ -33,7 +33,7 @@ def add(commands: Commands) -> None:
 
 _FROZEN = (
     *("max_bytes", "decide_at", "interruption", "trace", "motion", "fps", "bytes", "size_cv", "seconds", "jitter"),
-    *("scale", "value", "law", "t_min", "t_max", "t_mean", "workload", "drops", *WORKLOAD_OPTIONS),
+    *("scale", "value", "law", "t_min", "t_max", "t_mean", "workload", "drops", *WORKLOAD_OPTIONS, *OWN),
 )
 """A suite has these of its own."""
 

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from bufgym.cli.options import Commands, command
+from bufgym.errors import BufgymError
 
 DEFAULT = "docs/leaderboard.csv"
 
@@ -34,6 +35,9 @@ def _leaderboard(options: argparse.Namespace) -> None:
 def _validate(options: argparse.Namespace) -> None:
     from bufgym.benchmark import leaderboard
 
+    if not Path(options.file).exists():
+        whose = f"{DEFAULT} is that of bufgym's repository" if options.file == DEFAULT else "as --file says"
+        raise BufgymError(f"{options.file}: no such file ({whose}); bufgym leaderboard --file FILE.csv writes one")
     entry = leaderboard.find(Path(options.file), options.row)
     again = leaderboard.validate(entry, data=options.data, jobs=options.jobs)
     print(f"{entry.name}: holds")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from bufgym.cli.options import Commands, columns, command, load_policies, policy_file
@@ -67,7 +67,7 @@ def _list_policies() -> str:
             lines.append(f"  -- {title} --")
         for name in names:
             policy = policies.get(name)
-            lines.append(f"  {name:<{width}}  {policy.summary}".rstrip())
+            lines.append(f"  {name:<{width}}  {policy.summary[:1].upper()}{policy.summary[1:]}".rstrip())
             settings = ", ".join(f"{setting}={number:g}" for setting, number in policy.parameters.items())
             if settings:
                 lines.append(f"  {'':<{width}}  settings: {settings}")
@@ -82,7 +82,8 @@ def _list_values() -> str:
         [
             ("exponential:BASE", _first_line(qoi.exponential)),
             ("saturating:DISTANCE", _first_line(qoi.saturating)),
-            ("(Python only)", f"bufgym.model.qoi.tabulated: {_first_line(qoi.tabulated)}"),
+            ("tabulated:D=V,...", _first_line(qoi.tabulated)),
+            ("module:function", _first_line(qoi.of_function)),
         ]
     )
 
@@ -92,23 +93,36 @@ def _first_line(function: Any) -> str:
 
 
 def _list_rewards() -> str:
-    from bufgym.observe import REWARD_TERMS, TOPIC_REWARD_TERMS
+    from bufgym.observe import OWN_TERMS, REWARD_TERMS, TOPIC_REWARD_TERMS
 
-    rows = [(term.name, term.unit, term.meaning) for term in REWARD_TERMS + TOPIC_REWARD_TERMS]
-    return _in_two_parts(rows, len(REWARD_TERMS))
+    parts = {
+        "": REWARD_TERMS,
+        _SEVERAL: TOPIC_REWARD_TERMS,
+        "where `reward` names it, on every environment": [t for t in OWN_TERMS.values() if not t.one_queue],
+        "the same, on those of one queue": [t for t in OWN_TERMS.values() if t.one_queue],
+    }
+    return _in_parts({title: [(t.name, t.unit, t.meaning) for t in terms] for title, terms in parts.items()})
 
 
 def _list_observations() -> str:
-    from bufgym.observe import FIELDS, TOPIC_FIELDS
+    from bufgym.observe import FIELDS, OWN_FIELDS, TOPIC_FIELDS
 
-    rows = [(field.name, field.per, field.group, field.unit, field.meaning) for field in FIELDS + TOPIC_FIELDS]
-    return _in_two_parts(rows, len(FIELDS))
+    parts = {"": FIELDS, _SEVERAL: TOPIC_FIELDS, "where `fields` names it": tuple(OWN_FIELDS.values())}
+    return _in_parts({title: [(f.name, f.per, f.group, f.unit, f.meaning) for f in parts[title]] for title in parts})
 
 
-def _in_two_parts(rows: Sequence[Sequence[str]], first: int) -> str:
-    """The ``first`` rows, which every environment has, then those of several topics, in the same columns."""
-    lines = columns(rows).split("\n")
-    return "\n".join([*lines[:first], "  -- with several topics besides --", *lines[first:]])
+_SEVERAL = "with several topics besides"
+
+
+def _in_parts(parts: Mapping[str, Sequence[Sequence[str]]]) -> str:
+    """The rows of all parts in the same columns, each part under its title; those that every environment has first."""
+    lines = columns([row for rows in parts.values() for row in rows]).split("\n")
+    text: list[str] = []
+    for title, rows in parts.items():
+        if title and rows:
+            text.append(f"  -- {title} --")
+        text += [lines.pop(0) for _ in rows]
+    return "\n".join(text)
 
 
 def _list_traces() -> str:

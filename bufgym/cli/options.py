@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NoReturn, TypeAlias, TypeVar
 
+from bufgym import modules
 from bufgym.errors import BufgymError, printable
 
 T = TypeVar("T")
@@ -115,6 +114,9 @@ def loaded(texts: Sequence[str] | None) -> tuple[list[str], tuple[str, ...]]:
     from bufgym.benchmark import sources
 
     words = policy_specs(texts)
+    for word in words:
+        if word.endswith(".py"):
+            raise BufgymError(f"--policies {word}: a Python file; --policy-file {word} registers its policies")
     found = tuple(word for word in words if sources.is_source(word))
     return [sources.load(word) if word in found else word for word in words], found
 
@@ -145,22 +147,8 @@ def policy_file(parser: argparse._ActionsContainer) -> None:
 
 def load_policies(path: str | None) -> None:
     """Run the user's Python file, which registers policies."""
-    if path is None:
-        return
-    import importlib.util
-
-    if not Path(path).is_file():
-        raise BufgymError(f"{path}: no such file (--policy-file)")
-    spec = importlib.util.spec_from_file_location(f"bufgym_policy_file_{Path(path).stem}", path)
-    if spec is None or spec.loader is None:
-        raise BufgymError(f"{path}: must be a Python file, named .py")
-    module = importlib.util.module_from_spec(spec)
-    # Compiled functions are pickled by their module's name.
-    sys.modules[spec.name] = module
-    try:
-        spec.loader.exec_module(module)
-    except SyntaxError as error:
-        raise BufgymError(f"{path}, line {error.lineno}: {error.msg}") from None
+    if path is not None:
+        modules.run_file(path, "--policy-file")
 
 
 # --- output ----------------------------------------------------------------------------------------------------------

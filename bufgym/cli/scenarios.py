@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from bufgym import modules
 from bufgym.cli.options import count, given, least_0, positive, refuse
 from bufgym.cli.trace_bags import (
     WORKLOAD_OPTIONS,
@@ -16,7 +17,7 @@ from bufgym.cli.trace_bags import (
     workload_lines,
     workload_options,
 )
-from bufgym.errors import printable
+from bufgym.errors import BufgymError, printable
 
 if TYPE_CHECKING:
     from bufgym.model.qoi import Value
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 _UPLINK_ONLY = ("trace", "motion", "seconds", "jitter", "size_cv", "scale", "workload", *WORKLOAD_OPTIONS)
 _STREAM_ONLY = ("fps", "bytes", "size_cv", "seconds", "jitter")
+OWN = ("scenario_file", "scenario")
+"""Options that name a scenario of one's own, which has all the others' answers itself."""
 _INTERRUPTION_ONLY = ("t_min", "t_max", "t_mean", "law")
 
 SCORE = "Score: 0 is Drop Oldest, 1 the clairvoyant; regret = 1 - QoI / the clairvoyant's."
@@ -38,7 +41,8 @@ def scenario_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that ``scenario`` reads, ``--seeds`` apart."""
     about = "what is not given is as in bufgym/Uplink-v0; the first lines of the output say how that is"
     add = parser.add_argument_group("the stream and its link", about).add_argument
-    add("--trace", nargs="+", metavar="FILE", help="bandwidth traces, files or shipped names (default: shipped LTE)")
+    links = "bandwidth traces: files, shipped names, or module:function, a seed -> Trace (default: shipped LTE)"
+    add("--trace", nargs="+", metavar="FILE", help=links)
     add("--motion", nargs="+", metavar="FILE", help="motion recordings, likewise; 'none': x is the frame index")
     add("--fps", type=positive, help="messages a second")
     add("--bytes", type=count, help="mean message size, bytes")
@@ -49,7 +53,7 @@ def scenario_options(parser: argparse.ArgumentParser) -> None:
     add(
         "--value",
         metavar="V",
-        help="V of the QoI: exponential:BASE or saturating:DISTANCE"
+        help="V of the QoI: exponential:BASE, saturating:DISTANCE, tabulated:D=V,..., or module:function of your own"
         " (default: exponential:0.05 over motion, exponential:0.367879 over a recording's motion,"
         " exponential:0.618 over frame indices)",
     )
@@ -63,10 +67,15 @@ def scenario_options(parser: argparse.ArgumentParser) -> None:
     add("--t-min", type=count, metavar="T", help="shortest, messages (default: 1)")
     add("--t-max", type=count, metavar="T", help="longest, messages (default: 400)")
     add("--t-mean", type=positive, metavar="T", help="mean of the geometric law (default: 100)")
+    add = parser.add_argument_group("a scenario of your own instead").add_argument
+    add("--scenario-file", metavar="FILE.py", help="a Python file that registers it; its code is run")
+    add("--scenario", metavar="NAME", help="which; also any other in 'bufgym list scenarios', or module:function")
 
 
 def scenario(options: argparse.Namespace) -> tuple[Scenario, str]:
     """The scenario that the options describe, and a few lines about it."""
+    if given(options, OWN):
+        return _own(options)
     unused = _UPLINK_ONLY if options.interruption else _INTERRUPTION_ONLY
     refuse(options, unused, "cannot go with --interruption" if options.interruption else "needs --interruption")
     if options.interruption:
@@ -82,6 +91,37 @@ def scenario(options: argparse.Namespace) -> tuple[Scenario, str]:
 def _given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Those of the options that the user gave, as parameters of the scenario."""
     return {_PARAMETERS.get(name, name): value for name, value in given(options, names).items()}
+
+
+def _own(options: argparse.Namespace) -> tuple[Scenario, str]:
+    """A scenario by its name, after the file that registers it was run."""
+    from bufgym import scenario as scenarios
+    from bufgym.benchmark.run import by_trace
+
+    described = ("interruption", "value", *_UPLINK_ONLY, *_STREAM_ONLY, *_INTERRUPTION_ONLY)
+    refuse(options, described, "cannot go with a scenario of your own, which says it itself")
+    before, name = dict(scenarios.SCENARIOS), options.scenario
+    if options.scenario_file is not None:
+        modules.run_file(options.scenario_file, "--scenario-file")
+    added = [key for key, entry in scenarios.SCENARIOS.items() if before.get(key) is not entry]
+    if name is None and len(added) != 1:
+        names = f"registers {', '.join(added)}: choose by --scenario" if added else "registers no scenario"
+        raise BufgymError(f"{options.scenario_file}: {names}")
+    name = name or added[0]
+    found = scenarios.get(name)
+    if found.topics:
+        raise BufgymError(f"scenario {name}: has several topics; bufgym bench runs those of one queue")
+    what = scenarios.SCENARIOS[name][1] if name in scenarios.SCENARIOS else type(found).__name__
+    traces = len(by_trace(found))
+    met = "" if traces == 1 else f"{traces} traces x "
+    return found, "\n".join(
+        [
+            f"Scenario {printable(name)}: {printable(what)}",
+            f"QoI = 1 + sum of V(step in x) over the messages received; V = {printable(found.value.name)}.",
+            f"Means over {met}{options.seeds} seeds; every policy meets the same episodes.",
+            SCORE,
+        ]
+    )
 
 
 def _interruption(options: argparse.Namespace) -> tuple[Scenario, str]:
@@ -158,7 +198,7 @@ def _value(options: argparse.Namespace, by_motion: bool) -> Value:
     from bufgym.model import qoi
 
     if options.value is not None:
-        return qoi.parse(options.value)
+        return qoi.load(options.value)
     return qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential()
 
 
@@ -176,11 +216,12 @@ def _measured(uplink: Uplink, x: str) -> list[str]:
 
 def _links(options: argparse.Namespace) -> tuple[Trace, ...]:
     from bufgym import traces
+    from bufgym.scenario.checks import links
 
     names = options.trace
     if names is None:
         names = [name for name in traces.shipped() if name.startswith("lte-")]
-    return tuple(traces.load(name) for name in names)
+    return tuple(trace for name in names for trace in links(name))
 
 
 def _motions(names: Sequence[str], options: argparse.Namespace) -> tuple[Motion, ...]:

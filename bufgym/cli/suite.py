@@ -104,6 +104,7 @@ def run_suite(
         sources,
         changes=given(options, changes),
     )
+    options.resumes = options.out is not None and file is None
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "run" if options.out is None or file is not None else Path(options.out)
         rows = run_sweep(

@@ -144,8 +144,8 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         )
 
     def state(self) -> NDArray[np.float32]:
-        """float32[N x fields]: robot by robot, every slot field, then every context field; chosen or not."""
-        return self.rows.output.flat.flatten()
+        """float32[N x fields]: robot by robot, slot fields of the tables, then context fields; chosen or not."""
+        return self.rows.output.flat[:, : self.rows.form.table_numbers].flatten()
 
     def render(self) -> Any:
         """One line a robot: its buffer, and what has become of its messages; as text, or as uint8[400, 800, 3]."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.observe import Field
+from bufgym.observe import OWN_FIELDS, Field, own_field
 
 Observation = Any
 """A dict of arrays, or for "flat" one array."""
@@ -20,18 +20,34 @@ FORMS = ("dict", "flat", "slots")
 """Names of the forms; ``ObservationForm`` says what each is."""
 
 
+class Place(NamedTuple):
+    """Where a field stands in a row of numbers.
+
+    Fields:
+        field: which.
+        first: its first number.
+        entries: how many it has.
+    """
+
+    field: Field
+    first: int
+    entries: int
+
+
 class ObservationForm:
     """What is observed of a queue of L = ``capacity`` messages, and how it is handed out.
 
-    A row of numbers holds the slot fields, each with L + 1 entries and the newcomer's last, then the context fields.
+    A row of numbers holds the slot fields, each with L + 1 entries and the newcomer's last, then the context fields; so
+    much is ``table_numbers``. Fields of one's own that are chosen follow (``places`` says where).
     ``form`` is one of
 
     - "dict": an array for each field, [L + 1] or [1];
     - "flat": the row itself, as ``gymnasium.wrappers.FlattenObservation`` makes it of the dict;
     - "slots": ``slots`` [L + 1, slot fields] and ``context`` [context fields], as attention networks take them.
 
-    Only the fields that are ``chosen`` by name are observed (None: all of them), in the order of the tables. With all
-    of them nothing is copied. ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row.
+    Only the fields that are ``chosen`` by name are observed (None: all of the tables), in the tables' order, one's own
+    behind them. With all of the tables nothing is copied. ``space`` is the Gymnasium space of one observation,
+    ``numbers`` the length of a row.
     """
 
     def __init__(
@@ -44,53 +60,74 @@ class ObservationForm:
     ) -> None:
         if form not in FORMS:
             raise BufgymError(f"observation = {form!r}: must be one of {', '.join(map(repr, FORMS))}")
-        fields = (*slot_fields, *context_fields)
-        known = [field.name for field in fields]
+        tables = {"slot": slot_fields, "context": context_fields}
+        known = [field.name for field in (*slot_fields, *context_fields)]
         if isinstance(chosen, str):
             raise BufgymError(f"fields = {chosen!r}: must be a list of names; known: {', '.join(known)}")
-        for name in chosen or ():
-            if name not in known:
-                raise BufgymError(f"fields: unknown field {name!r}; known: {', '.join(known)}")
+        own: dict[str, Field] = {}
         names = known if chosen is None else list(chosen)
+        for k, name in enumerate(names):
+            if name not in known:
+                found = own_field(name)
+                if found is None:
+                    raise BufgymError(f"fields: unknown field {name!r}; known: {', '.join([*known, *OWN_FIELDS])}")
+                own[found.name], names[k] = found, found.name
         if not names:
             raise BufgymError("fields: choose at least one field to observe")
         self.form = form
         self._width = capacity + 1
-        self._slot_fields = len(slot_fields)
-        self._first_context = len(slot_fields) * self._width
-        self.numbers = self._first_context + len(context_fields)
-        self._fields = [(name, k) for k, name in enumerate(known) if name in names]
-        slot_columns = [k for _, k in self._fields if k < self._slot_fields]
-        context_columns = [k - self._slot_fields for _, k in self._fields if k >= self._slot_fields]
-        numbers = [k * self._width + entry for k in slot_columns for entry in range(self._width)]
-        numbers += [self._first_context + k for k in context_columns]
-        everything = len(numbers) == self.numbers
-        self._numbers = None if everything else np.array(numbers)
-        self._columns = None if everything else (np.array(slot_columns, int), np.array(context_columns, int))
-        self.space = self._space([fields[k] for _, k in self._fields])
+        self._slot_fields, self._context_fields = len(slot_fields), len(context_fields)
+        self._first_context = self._slot_fields * self._width
+        self.table_numbers = self.numbers = self._first_context + self._context_fields
+        self.places: list[Place] = []
+        for per, entries in (("slot", self._width), ("context", 1)):
+            begins = 0 if per == "slot" else self._first_context
+            for k, field in enumerate(tables[per]):
+                if field.name in names:
+                    self.places.append(Place(field, begins + k * entries, entries))
+            for field in own.values():
+                if field.per == per:
+                    self.places.append(Place(field, self.numbers, entries))
+                    self.numbers += entries
+        self._tables_only = not own
+        self._arrays = [(name, k) for k, name in enumerate(known) if name in names]
+        everything = self._tables_only and len(self.places) == len(known)
+        self._numbers = None if everything else self._numbers_of("slot", "context")
+        self._parts = None if everything else (self._numbers_of("slot"), self._numbers_of("context"))
+        self.space = self._space([place.field for place in self.places])
+
+    def _numbers_of(self, *kinds: str) -> NDArray[np.int64]:
+        """Where in a row the numbers of the chosen fields stand."""
+        ranges = [range(place.first, place.first + place.entries) for place in self.places if place.field.per in kinds]
+        return np.array([number for numbers in ranges for number in numbers], np.int64)
 
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Views of ``rows``, one row of numbers or n: slots [(n,) fields, L + 1] and context [(n,) fields]."""
-        first, fields, width = self._first_context, self._slot_fields, self._width
+        first, end, fields, width = self._first_context, self.table_numbers, self._slot_fields, self._width
         if rows.ndim == 1:
-            return rows[:first].reshape(fields, width), rows[first:]
-        return rows[:, :first].reshape(len(rows), fields, width), rows[:, first:]
+            return rows[:first].reshape(fields, width), rows[first:end]
+        return rows[:, :first].reshape(len(rows), fields, width), rows[:, first:end]
 
     def of(self, rows: NDArray[np.float32]) -> Observation:
         """The observation of ``rows``, one row of numbers or n, in this form."""
         if self.form == "flat":
             return rows if self._numbers is None else rows.take(self._numbers, axis=-1)
-        slots, context = self.split(rows)
         if self.form == "slots":
-            if self._columns is not None:
-                slots, context = slots.take(self._columns[0], axis=-2), context.take(self._columns[1], axis=-1)
+            if self._parts is None:
+                slots, context = self.split(rows)
+            else:
+                slots, context = (rows.take(numbers, axis=-1) for numbers in self._parts)
+                slots = slots.reshape(*rows.shape[:-1], -1, self._width)
             parts = {"slots": slots.swapaxes(-1, -2), "context": context}
             return {name: parts[name] for name in self.space}
+        if not self._tables_only:
+            return {place.field.name: rows[..., place.first : place.first + place.entries] for place in self.places}
+        slots, context = self.split(rows)
         # Walked over with the fields' axis first, a view costs half of what an index costs.
         if rows.ndim > 1:
             slots, context = slots.swapaxes(0, 1), context.T
         arrays = [*slots, *context[..., np.newaxis]]
-        return {name: arrays[k] for name, k in self._fields}
+        return {name: arrays[k] for name, k in self._arrays}
 
     def _space(self, fields: Sequence[Field]) -> Any:
         boxes = [_box([field], self._width if field.per == "slot" else 1) for field in fields]

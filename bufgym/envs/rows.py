@@ -17,16 +17,19 @@ from numpy.typing import NDArray
 from bufgym import scenario as scenarios
 from bufgym.envs.bound import BOUND, check_one_queue, measured
 from bufgym.envs.observation import Observation, ObservationForm
+from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.step import StepOutput, step_cells, step_rows
 from bufgym.errors import BufgymError
+from bufgym.model.checks import is_number
 from bufgym.observe import (
     CONTEXT_FIELDS,
-    REWARD_TERMS,
+    OWN_TERMS,
     SLOT_FIELDS,
     TOPIC_CONTEXT_FIELDS,
-    TOPIC_REWARD_TERMS,
     TOPIC_SLOT_FIELDS,
-    RewardTerm,
+    OwnTerm,
+    own_term,
+    terms_for,
 )
 from bufgym.scenario import FleetScenario, Scenario, Streams
 from bufgym.scenario.numbered import numbered
@@ -38,21 +41,30 @@ INFOS = ("full", "mask", "none")
 
 
 def reward_weights(
-    reward: str | Mapping[str, float], terms: Sequence[RewardTerm] = REWARD_TERMS
-) -> NDArray[np.float64]:
-    """float64[reward terms] from one term's name or from weights by name."""
-    names = [term.name for term in terms]
+    reward: str | Mapping[str, float], several_topics: bool = False
+) -> tuple[NDArray[np.float64], tuple[OwnTerm, ...]]:
+    """(float64[reward terms], the terms named that are in no table) from one term's name or from weights by name."""
+    tables = [term.name for term in terms_for(several_topics)]
+    known = ", ".join([*tables, *(name for name in OWN_TERMS if name not in tables)])
     if not isinstance(reward, str | Mapping):
-        raise BufgymError(f"reward = {reward!r}: must be the name of a term ({', '.join(names)}) or weights by name")
+        raise BufgymError(f"reward = {reward!r}: must be the name of a term ({known}) or weights by name")
     weights = {reward: 1.0} if isinstance(reward, str) else dict(reward)
     if not weights:
-        raise BufgymError(f"reward = {reward!r}: give at least one term its weight; known: {', '.join(names)}")
+        raise BufgymError(f"reward = {reward!r}: give at least one term its weight; known: {known}")
+    own: dict[str, OwnTerm] = {}
     for name, weight in weights.items():
-        if name not in names:
-            raise BufgymError(f"reward = {reward!r}: unknown term {name!r}; known: {', '.join(names)}")
-        if not np.isfinite(weight):
+        if not (is_number(weight) and np.isfinite(weight)):
             raise BufgymError(f"reward = {reward!r}: the weight of {name!r} must be a finite number")
-    return np.array([weights.get(name, 0.0) for name in names], np.float64)
+        if name in tables:
+            continue
+        term = own_term(name) if isinstance(name, str) else None
+        if term is None:
+            raise BufgymError(f"reward = {reward!r}: unknown term {name!r}; known: {known}")
+        if several_topics and term.one_queue:
+            raise BufgymError(f"reward = {reward!r}: {name!r} is for one queue; each topic has settings of its own")
+        own[name] = term
+    numbers = [weights.get(name, 0.0) for name in tables] + [weights[name] for name in own]
+    return np.array(numbers, np.float64), tuple(own.values())
 
 
 def check_render_mode(render_mode: str | None, known: Sequence[str]) -> str | None:
@@ -113,12 +125,15 @@ class Rows:
             topics=topics,
         )
         self.capacity = self.senders.capacity
-        self.bound = bound
+        if not isinstance(bound, bool | np.bool_):
+            raise BufgymError(f"bound = {bound!r}: must be True or False")
+        self.bound = bool(bound)
         if bound:
             check_one_queue(self.senders)
-        self.terms = REWARD_TERMS + (TOPIC_REWARD_TERMS if topics else ())
+        weights, own_terms = reward_weights(reward, bool(topics))
+        self.terms = terms_for(bool(topics)) + own_terms
         self._term_names = [term.name for term in self.terms]
-        self.weights = reward_weights(reward, self.terms)
+        self.weights = weights
         self.slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
         self.context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
         self.form = ObservationForm(observation, self.slot_fields, self.context_fields, self.capacity, fields)
@@ -127,6 +142,9 @@ class Rows:
         self.streams: list[Streams | None] = [None] * n
         self._draw: Callable[[Streams], Any] = self.scenario.draw
         self.rewarded = np.zeros((n, len(self.terms)))
+        self._own_fields = OwnFields(self.form)
+        self._own_terms = OwnTerms(own_terms, len(self.terms) - len(own_terms), n)
+        self._has_own = bool(self._own_fields) or bool(self._own_terms)
         self.output = self.new_output()
         self._every = np.arange(n)
 
@@ -167,10 +185,14 @@ class Rows:
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
         step_rows(self.senders.batch, rows, NO_ACTIONS, self.rewarded, self.output)
+        if self._has_own:
+            self._begin_own(rows)
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """One decision in every row; the result is in ``self.output``."""
         step_rows(self.senders.batch, self._every, actions, self.rewarded, self.output)
+        if self._has_own:
+            self._step_own()
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step."""
@@ -237,6 +259,19 @@ class Rows:
         """The error for an action outside of 0..L+1."""
         return BufgymError(f"{name} = {action}: must lie in 0..{self.capacity + 1} (L = {self.capacity})")
 
+    def _begin_own(self, rows: NDArray[np.int64]) -> None:
+        """Fields and terms of one's own, for rows that begin an episode."""
+        self._own_terms.begin(self.senders.batch, rows)
+        if self._own_fields:
+            self._own_fields.write(self.senders.batch, self.output)
+
+    def _step_own(self) -> None:
+        """The same after a step of all rows."""
+        if self._own_terms:
+            self._own_terms.write(self.senders.batch, self.output)
+        if self._own_fields:
+            self._own_fields.write(self.senders.batch, self.output)
+
     def _next_episode(self, i: int) -> tuple[Any, np.random.Generator]:
         """The next episode of row ``i``'s streams, and what its uniform draws come from."""
         if self.streams[i] is None:
@@ -294,12 +329,16 @@ class FleetRows(Rows):
                 raise BufgymError("episode: in an environment the messages of all robots arrive at the same times")
             self.fleet.load(c, episode)
         step_cells(self.senders.batch, self.fleet.shares, cells, NO_ACTIONS, self.rewarded, self.output)
+        if self._has_own:
+            self._begin_own(rows)
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """One decision of every robot; the result is in ``self.output``."""
         step_cells(
             self.senders.batch, self.fleet.shares, self._every[: len(self.fleet)], actions, self.rewarded, self.output
         )
+        if self._has_own:
+            self._step_own()
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[rows]: each robot's own weighted sum, or for a "team" the mean of those in its cell."""

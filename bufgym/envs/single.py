@@ -51,12 +51,13 @@ class SenderEnv(gym.Env[Observation, np.int64]):
 
     **Arguments**
 
-    - ``scenario``: a name in ``bufgym.scenario.SCENARIOS`` or a scenario.
+    - ``scenario``: a name in ``bufgym.scenario.SCENARIOS``, ``module:function`` that makes one, or a scenario.
     - ``capacity``: L, messages.
     - ``max_bytes``: B, bytes; None for no limit.
     - ``decide_at``: "arrival", or "overflow" to ask only when the buffer is full.
-    - ``reward``: a term's name, or weights by name.
-    - ``fields``: names of the fields to observe; all by default. ``observation``: "dict", "flat" or "slots".
+    - ``reward``: a term's name, or weights by name; those of ``bufgym.observe.OWN_TERMS`` count and show where named.
+    - ``fields``: names of the fields to observe, one's own among them; by default those of the tables.
+    - ``observation``: "dict", "flat" or "slots".
     - ``info``: "full"; "mask" for the action mask alone, and at an episode's end its summary; "none" for the summary.
     - ``render_mode``: "ansi" or "rgb_array".
     - ``bound``: whether the last ``info`` also has ``clairvoyant`` (the best H, or an upper bound of it), ``regret``
@@ -71,7 +72,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     tells it. What ``reset(seed=s)`` begins is a sequence of others.
 
     Raises ``BufgymError`` for an argument, an option or an action that does not fit, ``ResetNeeded`` for a step before
-    the first reset.
+    a reset or after the end of the episode.
     """
 
     metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 10}
@@ -110,6 +111,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self._action = np.zeros(1, np.int64)
         self._weights = self.rows.weights.tolist()
         self._no_terms = [0.0] * len(self._weights)
+        self._ended = True
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -124,15 +126,17 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         if "episode" in options and len(options) > 1:
             raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")
         self.rows.reset(_ROW, [options.get("episode", options or None)])
+        self._ended = False
         return self.rows.observation(0), self.rows.info(0, self._no_terms, False)
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         rows = self.rows
-        if rows.senders.episodes[0] is None:
-            raise gym.error.ResetNeeded("call reset() before step()")
+        if self._ended:
+            why = "" if rows.senders.episodes[0] is None else "the episode has ended: "
+            raise gym.error.ResetNeeded(f"{why}call reset() before step()")
         self._action[0] = rows.action("action", action)
         rows.step(self._action)
-        terminated = rows.output.terminated.item()
+        terminated = self._ended = rows.output.terminated.item()
         terms = rows.output.reward_terms[0].tolist()
         reward = 0.0
         for weight, term in zip(self._weights, terms, strict=True):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -42,3 +44,26 @@ def whole(name: str, number: Any, least: int = 0, most: int | None = None, *, sy
         bounds = f">= {least}" if most is None else f"from {least} to {most}"
         raise BufgymError(f"{name} = {number!r}: {symbol and f'{symbol} '}must be a whole number {bounds}")
     return int(number)
+
+
+def named_settings(what: str, spec: str) -> tuple[str, dict[str, float]]:
+    """``"decimate:every=2"`` -> its name and its settings; ``what`` it is, for the message."""
+    name, _, settings = spec.partition(":")
+    numbers: dict[str, float] = {}
+    for setting in filter(None, settings.split(",")):
+        key, _, number = setting.partition("=")
+        try:
+            numbers[key.strip()] = float(number)
+        except ValueError:
+            raise BufgymError(f"{what} {spec!r}: {setting!r} is not of the form parameter=number") from None
+    return name, numbers
+
+
+def changed(what: str, parameters: Mapping[str, float], settings: Mapping[str, float]) -> dict[str, float]:
+    """The ``parameters`` with these ``settings``; an error for an unknown name or an unusable number."""
+    for name, number in settings.items():
+        if name not in parameters:
+            raise BufgymError(f"{what}: no parameter {name!r}; it has: {', '.join(parameters) or 'none'}")
+        if not (isinstance(number, int | float) and math.isfinite(number) and number > 0):
+            raise BufgymError(f"{what}: {name} = {number!r}: must be a number > 0")
+    return {**parameters, **{name: float(number) for name, number in settings.items()}}

@@ -11,15 +11,19 @@ of the camera (motion-based QoI); V is the same for both.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym import modules
 from bufgym.errors import BufgymError
 from bufgym.kernel import kernel
+from bufgym.model.checks import is_number
 
 EXPONENTIAL, SATURATING, TABULATED = 0, 1, 2
 
@@ -137,15 +141,58 @@ def tabulated(distances: Sequence[float], values: Sequence[float]) -> Value:
         raise BufgymError(f"V = tabulated: distances {d.tolist()}: must begin at 0 and increase")
     # Beyond the table V is constant: one more point lets the check see that corner too.
     check = np.append(d, 2 * d[-1])
-    return _checked(f"tabulated:{len(d)} points", [TABULATED, len(d), *d, *levels], check)
+    return _checked(f"tabulated:{len(d)} points", _table(d.tolist(), levels.tolist()), check)
+
+
+def _table(distances: Sequence[float], levels: Sequence[float]) -> list[float]:
+    """``Value.array`` of a table."""
+    return [TABULATED, len(distances), *distances, *levels]
+
+
+def of_function(v: Callable[[float], float], name: str = "") -> Value:
+    """Your own V(d) as a table of ``POINTS`` points, denser near 0, up to where it hardly grows; checked there.
+
+    Between two points it is straight: for V = 1 - b^d that is at most 0.002 below.
+    """
+    name = name or getattr(v, "__name__", "function")
+
+    def at(d: float) -> float:
+        level = v(d)
+        if not is_number(level) or not math.isfinite(level):
+            raise BufgymError(f"V = {name}: V({d:g}) = {level!r}: must be a number")
+        return float(level)
+
+    until = _SMALLEST
+    while until < _LARGEST:
+        low, high = at(until), at(4 * until)
+        if high < low:
+            raise BufgymError(f"V = {name}: V falls from d = {until:g} on, but must not decrease (Eq. 5)")
+        if high - low <= _FLAT * high:
+            break
+        until *= 2
+    below, top = 0.0, at(until)
+    for _ in range(60):  # where V ends in a corner, that is where the table ends
+        middle = (below + until) / 2
+        below, until = (below, middle) if at(middle) >= top * (1 - 1e-12) else (middle, until)
+    distances = [0.0, *np.geomspace(until / 1e4, until, POINTS - 1).tolist()]
+    return _checked(name, _table(distances, [at(d) for d in distances]), np.append(distances, 2 * until))
+
+
+POINTS = 65
+"""Of a table made of a function."""
+_SMALLEST, _LARGEST, _FLAT = 1e-3, 1e9, 1e-3
+"""Where the search for the end of a table begins and ends, and how little V may still grow there."""
 
 
 def parse(text: str) -> Value:
-    """``exponential:0.618`` or ``saturating:4``, as written on the command line."""
+    """``exponential:0.618``, ``saturating:4`` or ``tabulated:0=0,1=0.6,4=1``, as written on the command line."""
     kinds: dict[str, Callable[..., Value]] = {"exponential": exponential, "saturating": saturating}
     kind, _, number = text.partition(":")
+    if kind == "tabulated":
+        return _parse_table(text, number)
     if kind not in kinds:
-        raise BufgymError(f"V = {text!r}: unknown kind {kind!r}; known: {', '.join(kinds)} (as in exponential:0.618)")
+        known = f"{', '.join(kinds)} (as in exponential:0.618), tabulated (as in tabulated:0=0,1=0.6,4=1)"
+        raise BufgymError(f"V = {text!r}: unknown kind {kind!r}; known: {known}")
     if kind == "exponential" and not number:
         return exponential()
     try:
@@ -153,3 +200,34 @@ def parse(text: str) -> Value:
     except ValueError:
         raise BufgymError(f"V = {text!r}: {number!r} is not a number") from None
     return kinds[kind](parameter)
+
+
+def _parse_table(text: str, points: str) -> Value:
+    try:
+        pairs = [tuple(map(float, point.split("="))) for point in points.split(",")]
+        distances, levels = zip(*pairs, strict=True)
+    except ValueError:
+        raise BufgymError(f"V = {text!r}: must be of the form tabulated:distance=V,distance=V,...") from None
+    return tabulated(distances, levels)
+
+
+def load(v: Any) -> Value:
+    """V as a scenario takes it: a ``Value``, a function V(d), what ``parse`` reads, or ``module:function``.
+
+    That function is V(d) itself, or without arguments makes a V; its module is imported (see ``bufgym.modules``).
+    """
+    name = ""
+    if isinstance(v, str):
+        if not modules.is_named(v) or v.partition(":")[0] in ("exponential", "saturating", "tabulated"):
+            return parse(v)
+        name, v = v, modules.find(v)
+        if callable(v) and not isinstance(v, Value) and modules.needs(v) == 0:
+            v = v()
+    if isinstance(v, Value):
+        return replace(v, name=name or v.name)
+    if not inspect.isroutine(v):
+        raise BufgymError(
+            f"value = {name or v!r}: must be a bufgym.model.qoi Value, a function V(d), or text: 'exponential:0.618',"
+            " 'module:function'"
+        )
+    return of_function(v, name)

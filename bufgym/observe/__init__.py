@@ -1,5 +1,9 @@
-"""What an agent observes and is rewarded for: tables of fields, and the kernels that fill them from a robot's view."""
+"""What an agent observes and is rewarded for: tables of fields, and the kernels that fill them from a robot's view.
 
+``@field`` and ``@reward_term`` add one's own.
+"""
+
+from bufgym.observe import terms as _terms  # noqa: F401  (registers those that are computed where they are named)
 from bufgym.observe.fields import (
     CONTEXT_FIELDS,
     FIELDS,
@@ -12,12 +16,25 @@ from bufgym.observe.fields import (
     Field,
     RewardTerm,
 )
+from bufgym.observe.own import (
+    OWN_FIELDS,
+    OWN_TERMS,
+    OwnField,
+    OwnTerm,
+    field,
+    own_field,
+    own_term,
+    reward_term,
+    terms_for,
+)
 from bufgym.observe.queue import observe_context, observe_slots
 from bufgym.observe.topics import observe_topic_context, observe_topic_slots
 
 __all__ = [
     "CONTEXT_FIELDS",
     "FIELDS",
+    "OWN_FIELDS",
+    "OWN_TERMS",
     "REWARD_TERMS",
     "SLOT_FIELDS",
     "TOPIC_CONTEXT_FIELDS",
@@ -25,9 +42,16 @@ __all__ = [
     "TOPIC_REWARD_TERMS",
     "TOPIC_SLOT_FIELDS",
     "Field",
+    "OwnField",
+    "OwnTerm",
     "RewardTerm",
+    "field",
     "observe_context",
     "observe_slots",
     "observe_topic_context",
     "observe_topic_slots",
+    "own_field",
+    "own_term",
+    "reward_term",
+    "terms_for",
 ]

@@ -54,7 +54,7 @@ def latest_only(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 @register("random", source="AFR paper [wang2022afr], Eq. 9", compile=True)
 def random(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Random Drop: the victim is uniform over the queued messages and the newcomer, until it fits or is the victim."""
+    """Random Drop: a full queue drops one of its messages or the newcomer, each as likely as the others."""
     if has_space(buffer, arrival):
         return ACCEPT
     s = len(buffer.slots)

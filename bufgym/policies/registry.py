@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, Concatenate, NamedTuple, ParamSpec, cast
@@ -41,6 +40,7 @@ from numpy.typing import NDArray
 from bufgym.errors import BufgymError
 from bufgym.kernel import compile_for
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
+from bufgym.model.checks import changed, named_settings
 
 Arrival = Any
 """A MESSAGE record."""
@@ -176,16 +176,10 @@ class Policy:
 
     def with_parameters(self, **settings: float) -> Policy:
         """This policy with other settings, named accordingly; an error for an unknown name or an unusable number."""
-        for name, number in settings.items():
-            if name not in self.parameters:
-                known = ", ".join(self.parameters) or "none"
-                raise BufgymError(f"policy {self.name}: no parameter {name!r}; it has: {known}")
-            if not (isinstance(number, int | float) and math.isfinite(number) and number > 0):
-                raise BufgymError(f"policy {self.name}: {name} = {number!r}: must be a number > 0")
+        parameters = changed(f"policy {self.name}", self.parameters, settings)
         if not settings:
             return self
         label = ",".join(f"{name}={number:g}" for name, number in settings.items())
-        parameters = {**self.parameters, **{name: float(number) for name, number in settings.items()}}
         return replace(self, name=f"{self.name}:{label}", parameters=parameters)
 
     @functools.cached_property
@@ -201,19 +195,27 @@ def _compiled(*functions: Any) -> Functions:
 
 
 @functools.cache
-def signatures() -> tuple[Any, Any, Any, Any]:
-    """Numba types of ``on_arrival``, ``on_departure``, ``on_dequeue`` and ``on_send``."""
-    message, topic = numba.from_dtype(MESSAGE), numba.from_dtype(TOPIC)
-    int_, real = numba.types.int64, numba.types.float64
-    reals, constants = numba.types.Array(real, 1, "C"), numba.types.Array(real, 1, "C", readonly=True)
+def view_type() -> Any:
+    """Numba's type of a ``Buffer``."""
+    real = numba.types.float64
+    constants = numba.types.Array(real, 1, "C", readonly=True)
     types = {
-        "slots": numba.types.Array(message, 1, "C"),
+        "slots": numba.types.Array(numba.from_dtype(MESSAGE), 1, "C"),
         "v": constants,
         "parameters": constants,
-        "topics": numba.types.Array(topic, 1, "C"),
+        "topics": numba.types.Array(numba.from_dtype(TOPIC), 1, "C"),
         **dict.fromkeys(("dequeued_x", "previous_x", "left_fraction", "period_us", "service_ratio"), real),
     }
-    view = cast(Any, numba.types).NamedTuple(tuple(types.get(name, int_) for name in Buffer._fields), Buffer)
+    return cast(Any, numba.types).NamedTuple(
+        tuple(types.get(name, numba.types.int64) for name in Buffer._fields), Buffer
+    )
+
+
+@functools.cache
+def signatures() -> tuple[Any, Any, Any, Any]:
+    """Numba types of ``on_arrival``, ``on_departure``, ``on_dequeue`` and ``on_send``."""
+    int_, view, message = numba.types.int64, view_type(), numba.from_dtype(MESSAGE)
+    reals = numba.types.Array(numba.types.float64, 1, "C")
     return (
         int_(view, message, reals),
         numba.types.void(view, reals),
@@ -287,20 +289,21 @@ def names(*, for_topics: bool | None = None, named_only: bool = False) -> Iterat
     return iter(chosen)
 
 
-def get(spec: str | Policy) -> Policy:
-    """The policy that ``spec`` names: ``"afr"``, or with settings ``"decimate:every=2"``."""
+def get(spec: str | Policy | OnArrival) -> Policy:
+    """The policy that ``spec`` names: ``"afr"``, or with settings ``"decimate:every=2"``.
+
+    A policy function that is not registered makes one of its own name.
+    """
     if isinstance(spec, Policy):
         return spec
-    name, _, settings = spec.partition(":")
+    if not isinstance(spec, str):
+        if not inspect.isfunction(spec):
+            raise BufgymError(f"policy {spec!r}: must be a name, a Policy, or a function (buffer, arrival, memory)")
+        return registered_as(spec) or Policy(spec.__name__, spec)
+    name = spec.partition(":")[0]
     if name not in _REGISTRY:
         raise BufgymError(f"unknown policy {name!r}; known: {', '.join(_REGISTRY)}")
-    numbers: dict[str, float] = {}
-    for setting in filter(None, settings.split(",")):
-        key, _, number = setting.partition("=")
-        try:
-            numbers[key.strip()] = float(number)
-        except ValueError:
-            raise BufgymError(f"policy {spec!r}: {setting!r} is not of the form parameter=number") from None
+    _, numbers = named_settings("policy", spec)
     entry = _REGISTRY[name]
     if isinstance(entry, Later):
         entry = _REGISTRY[name] = entry.make()

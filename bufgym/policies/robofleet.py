@@ -85,7 +85,7 @@ def robofleet(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     compile=True,
 )
 def robofleet_literal(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Robofleet by the letter: as `robofleet`, but what comes within 1 / rate of the topic's last *sending* is dropped.
+    """Robofleet by the letter: as `robofleet`, but a topic's rate limit counts from when it was last sent, not kept.
 
     A message that waits in its slot is overwritten for as long as nothing of its topic was sent.
     """

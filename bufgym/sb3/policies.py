@@ -14,6 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from bufgym.envs.observation import ObservationForm
+from bufgym.envs.own import write_in_python
 from bufgym.errors import BufgymError
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.observe import (
@@ -22,10 +23,12 @@ from bufgym.observe import (
     TOPIC_CONTEXT_FIELDS,
     TOPIC_FIELDS,
     TOPIC_SLOT_FIELDS,
+    OwnField,
     observe_context,
     observe_slots,
     observe_topic_context,
     observe_topic_slots,
+    own_field,
 )
 from bufgym.policies import Policy
 from bufgym.policies.learned import policy as slot_policy
@@ -99,9 +102,12 @@ class _Decisions:
         per_slot, context = all_fields if self.for_topics else (SLOT_FIELDS, CONTEXT_FIELDS)
         known = [field.name for field in per_slot + context]
         for field in names or ():
-            if field not in known:
+            if field not in known and own_field(field) is None:
                 raise BufgymError(f"model {name}: observes {field!r}, which is no field (bufgym list observations)")
         self.form = ObservationForm(form, per_slot, context, self.capacity, names)
+        self.own = [place for place in self.form.places if isinstance(place.field, OwnField)]
+        if self.own and self.for_topics:
+            raise BufgymError(f"model {name}: observes fields of one's own; with several topics no policy can")
         expected = spaces.flatdim(self.form.space)
         if numbers != expected:
             rule = f"must be the {expected} of {', '.join(names or known)} for L = {self.capacity}"
@@ -138,6 +144,8 @@ class _Decisions:
         else:
             observe_slots(buffer, arrival, slots)
             observe_context(buffer, arrival, context)
+        for place in self.own:
+            write_in_python(place, buffer, arrival, arriving, row)
         masks = {}
         if self.masked:
             mask = np.zeros(L + 2, np.bool_)

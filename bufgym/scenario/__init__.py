@@ -13,7 +13,7 @@ from bufgym.scenario.configuration import read_client, robofleet_example
 from bufgym.scenario.episode import Episode, Scenario, Streams
 from bufgym.scenario.fleet import MAX_ROBOTS, FleetEpisode, FleetScenario
 from bufgym.scenario.interruption import LAWS, Interruption
-from bufgym.scenario.registry import SCENARIOS, get
+from bufgym.scenario.registry import SCENARIOS, get, register
 from bufgym.scenario.uplink import Uplink
 
 __all__ = [
@@ -32,5 +32,6 @@ __all__ = [
     "get",
     "messages",
     "read_client",
+    "register",
     "robofleet_example",
 ]

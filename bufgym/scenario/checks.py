@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-from bufgym import traces
+from bufgym import modules, traces
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.checks import above_0, between, whole
@@ -22,6 +24,7 @@ __all__ = [
     "check_value",
     "delay",
     "duration",
+    "links",
     "message_bytes",
     "positive",
     "rate",
@@ -73,36 +76,65 @@ def check_stream(stream: Any) -> None:
 
 
 def check_value(scenario: object) -> None:
-    """The parameter ``value`` is a ``Value``; text becomes one."""
+    """The parameter ``value`` is a ``Value``; text or a function becomes one (``qoi.load``)."""
     value = getattr(scenario, "value")  # noqa: B009  (every kind of scenario has it)
-    if isinstance(value, str):
-        value = qoi.parse(value)
-        object.__setattr__(scenario, "value", value)
     if not isinstance(value, Value):
-        raise BufgymError(f"value = {value!r}: must be a bufgym.model.qoi Value or text, such as 'exponential:0.618'")
+        object.__setattr__(scenario, "value", qoi.load(value))
 
 
 def recordings(scenario: object) -> None:
     """The parameters ``traces`` and ``motion`` become tuples of Trace and Motion; a single one becomes a tuple, too.
 
-    Text names a shipped recording or a file; the motion "none" is none.
+    Text names a shipped recording, a file, or for traces a generator (``links``); the motion "none" is none.
     """
     if getattr(scenario, "motion") in ("none", ["none"]):  # noqa: B009
         object.__setattr__(scenario, "motion", ())
-    as_tuple(scenario, "traces", Trace, "a bufgym.traces Trace", traces.load)
-    as_tuple(scenario, "motion", Motion, "a bufgym.traces Motion", traces.load_motion)
+    as_tuple(scenario, "traces", Trace, "a bufgym.traces Trace", links)
+    as_tuple(scenario, "motion", Motion, "a bufgym.traces Motion", lambda text: [traces.load_motion(text)])
 
 
-def as_tuple(scenario: object, name: str, kind: Any, what: str, load: Callable[[str], Any] | None = None) -> None:
+def as_tuple(
+    scenario: object, name: str, kind: Any, what: str, load: Callable[[str], Sequence[Any]] | None = None
+) -> None:
     """The parameter becomes a tuple whose items are of that kind, ``what`` in words; a single one becomes a tuple.
 
-    ``load``: makes an item of text.
+    ``load``: makes items of text.
     """
     value = getattr(scenario, name)
     items = list(value if isinstance(value, Sequence) and not isinstance(value, str) else (value,))
     if load is not None:
-        items = [load(item) if isinstance(item, str) else item for item in items]
+        items = [made for item in items for made in (load(item) if isinstance(item, str) else [item])]
     for item in items:
         if not isinstance(item, kind):
             raise BufgymError(f"{name}: {item!r} is not {what}")
     object.__setattr__(scenario, name, tuple(items))
+
+
+GENERATED = 8
+"""Links that a generator makes where no seeds are given."""
+_GENERATOR = re.compile(r"([A-Za-z_][\w.]*:[A-Za-z_]\w*)(?::(\d+)-(\d+))?")
+
+
+def links(text: str) -> list[Trace]:
+    """The traces that text names: a shipped one, a file, or a generator ``module:function``, a function seed -> Trace.
+
+    ``module:function:100-119`` makes those of these seeds, ``module:function`` of 0 to ``GENERATED`` - 1. The module is
+    imported (see ``bufgym.modules``).
+    """
+    match = _GENERATOR.fullmatch(text)
+    if match is None or Path(text).exists():
+        return [traces.load(text)]
+    name, first, last = match.groups()
+    seeds = range(GENERATED) if first is None else range(int(first), int(last) + 1)
+    if not 1 <= len(seeds) <= MAX_GENERATED:
+        raise BufgymError(f"traces = {text!r}: needs 1 to {MAX_GENERATED} seeds, as in {name}:0-99")
+    generate, made = modules.find(name), []
+    for seed in seeds:
+        trace = generate(seed) if callable(generate) else None
+        if not isinstance(trace, Trace):
+            raise BufgymError(f"traces = {text!r}: must be a function seed -> Trace; for seed {seed} it is {trace!r}")
+        made.append(trace)
+    return made
+
+
+MAX_GENERATED = 10_000

@@ -52,6 +52,8 @@ def numbered(family: Any, seed: Any = None, trace: str | int | None = None, scen
         if scenario is not None:
             raise BufgymError(f"scenario = {scenario!r}: only the episodes of a suite have one")
         return draw(_part(family, trace), seed)
+    if scenario is None:
+        raise BufgymError(f"scenario: missing; a suite's row has one besides its seed: one of {', '.join(members)}")
     if scenario not in members:
         raise BufgymError(f"scenario = {scenario!r}: must be one of {', '.join(members)}")
     member = members[scenario]

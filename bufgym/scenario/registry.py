@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar, cast
 
+import numpy as np
+
+from bufgym import modules
 from bufgym.errors import BufgymError
+from bufgym.model.qoi import Value
 from bufgym.scenario.configuration import client_over_lte, read_client
 from bufgym.scenario.episode import Scenario
 from bufgym.scenario.interruption import Interruption
@@ -29,26 +34,81 @@ SCENARIOS: dict[str, tuple[Callable[[], Scenario], str]] = {
 """Name -> (what makes it, one line about it)."""
 
 
+Maker = TypeVar("Maker", bound=Callable[[], Any])
+_BUILT_IN = frozenset(SCENARIOS)
+
+
+def register(name: str, about: str = "") -> Callable[[Maker], Maker]:
+    """Register what it decorates as the scenario ``name``; it comes back unchanged.
+
+    That is a class, or a function without arguments that returns a ``Scenario``. ``about``: a line about it, by default
+    the first of the docstring.
+
+    Raises:
+        BufgymError: the name is a built-in scenario's, empty, or holds a blank, ":" or "=".
+    """
+    if not isinstance(name, str) or not name or any(c in ":= \t\n" for c in name) or name.endswith(".toml"):
+        raise BufgymError(f"scenario {name!r}: a name must be non-empty, without spaces, ':', '=' and '.toml'")
+    if name in _BUILT_IN:
+        raise BufgymError(f"scenario {name!r}: a built-in scenario has this name")
+
+    def add(make: Maker) -> Maker:
+        if not callable(make):
+            raise BufgymError(f"scenario {name!r}: {make!r} is neither a class nor a function")
+        SCENARIOS[name] = make, about or (inspect.getdoc(make) or "").split("\n")[0]
+        _named.cache_clear()
+        return make
+
+    return add
+
+
 @functools.cache
 def _named(name: str) -> Scenario:
-    return SCENARIOS[name][0]()
+    return checked(SCENARIOS[name][0](), name)
+
+
+def checked(scenario: Any, name: str) -> Scenario:
+    """The scenario, or an error that says what a scenario must have."""
+    if not isinstance(getattr(scenario, "value", None), Value):
+        raise BufgymError(f"scenario {name}: {scenario!r} has no `value`, a bufgym.model.qoi Value")
+    for what, holds in (
+        ("method `draw(streams)` that returns an Episode", callable(getattr(scenario, "draw", None))),
+        ("`max_messages`, a whole number >= 1", _is_count(getattr(scenario, "max_messages", None))),
+        ("`topics`, a tuple; () for one queue", isinstance(getattr(scenario, "topics", None), tuple)),
+    ):
+        if not holds:
+            raise BufgymError(f"scenario {name}: {scenario!r} has no {what}")
+    return cast(Scenario, scenario)
+
+
+def _is_count(number: Any) -> bool:
+    return isinstance(number, int | np.integer) and not isinstance(number, bool) and bool(number >= 1)
 
 
 def get(spec: str | Scenario, **overrides: Any) -> Scenario:
     """The scenario of that name (or ``spec`` itself), with these parameters changed; BufgymError for unknown ones.
 
-    A name that ends in .toml is that of a client's configuration (``read_client``).
+    A name that ends in .toml is that of a client's configuration (``read_client``); ``module:function`` is imported
+    (see ``bufgym.modules``) and makes a scenario without arguments, or is one.
     """
     if isinstance(spec, str) and spec.endswith(".toml"):
         spec = read_client(spec)
+    elif isinstance(spec, str) and modules.is_named(spec):
+        found = modules.find(spec)
+        spec = checked(found() if callable(found) else found, spec)
     elif isinstance(spec, str):
         if spec not in SCENARIOS:
-            raise BufgymError(f"unknown scenario {spec!r}; known: {', '.join(SCENARIOS)}")
+            raise BufgymError(
+                f"unknown scenario {spec!r}; known: {', '.join(SCENARIOS)}, and module:function for one's own"
+            )
         spec = _named(spec)
+    else:
+        spec = checked(spec, type(spec).__name__)
     if not overrides:
         return spec
-    known = {f.name for f in fields(spec)}  # type: ignore[arg-type]
+    known: set[str] = {f.name for f in fields(spec)} if is_dataclass(spec) else set()
     for name in overrides:
         if name not in known:
-            raise BufgymError(f"{type(spec).__name__}: no parameter {name!r}; it has: {', '.join(sorted(known))}")
+            has = ", ".join(sorted(known)) or "none (it is no dataclass)"
+            raise BufgymError(f"{type(spec).__name__}: no parameter {name!r}; it has: {has}")
     return replace(spec, **overrides)  # type: ignore[type-var]

@@ -91,11 +91,14 @@ def python_view(batch: Batch, i: int) -> Buffer:
     return buffer
 
 
-def python_arrival(batch: Batch, i: int) -> Any:
-    """The arrival that waits for a decision, read-only, for Python callers over a ``named`` batch."""
+def python_arrival(batch: Batch, i: int, before: int = 0) -> Any:
+    """The arrival that waits for a decision, read-only, for Python callers over a ``named`` batch.
+
+    ``before``: the one so many before it.
+    """
     row = batch.arrivals[i]
     row.flags.writeable = False
-    return row[batch.senders[i].next]
+    return row[batch.senders[i].next - before]
 
 
 def answer_of(policy: Policy, hook: str, answer: Any) -> int:

@@ -73,7 +73,7 @@ def test_a_row_is_run_again_and_one_that_has_changed_is_refused(tiny: None, tmp_
         leaderboard.validate(better, jobs=1)
 
 
-def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any) -> None:
+def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "board.csv"
     path.write_text("suite,policy\na,b\n")
     with pytest.raises(BufgymError, match=r"board\.csv.*must have the columns"):
@@ -85,6 +85,9 @@ def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any) -> None:
         leaderboard.read(path)
     assert main(["validate", "lte-v1/nobody", "--file", str(REPO / "docs" / "leaderboard.csv")]) == 2
     assert "no row 'lte-v1/nobody'" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    assert main(["validate", "lte-v1/afr"]) == 2
+    assert "docs/leaderboard.csv is that of bufgym's repository" in capsys.readouterr().err
     assert main(["leaderboard", "no-suite", "--file", str(path)]) == 2
     with pytest.raises(BufgymError, match=r"written to a \.csv file"):
         leaderboard.write([], tmp_path / "board.txt")

@@ -48,6 +48,8 @@ def test_a_folder_must_hold_a_run(tmp_path: Path) -> None:
     folder = make(tmp_path / "run")
     (folder / "rows.csv").unlink()
     assert "no rows.parquet and no rows.csv" in refusal(folder)
+    (folder / "parts").mkdir()
+    assert f"not finished; the command that began it resumes it: {MANIFEST['command']}" in refusal(folder)
 
 
 @pytest.mark.parametrize(

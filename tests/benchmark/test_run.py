@@ -123,3 +123,16 @@ def test_bad_arguments_are_named(change: dict[str, Any], message: str) -> None:
     chosen = [policies.get(name) for name in given.pop("policies")]
     with pytest.raises(BufgymError, match=message):
         run.run(chosen, UPLINK, **given)
+
+
+def test_functions_and_names_are_policies_too() -> None:
+    def newest(buffer: Any, arrival: Any, memory: Any) -> int:
+        return policies.ACCEPT if len(buffer.slots) < buffer.capacity else 0
+
+    rows = run.run([newest, "drop-oldest", policies.get("afr")], UPLINK, [2], 1)
+    qoi_of = {row["policy"]: row["qoi"] for row in rows if row["trace"] == "slow"}
+    assert list(qoi_of) == ["newest", "drop-oldest", "afr"] and qoi_of["newest"] == qoi_of["drop-oldest"]
+    with pytest.raises(BufgymError, match="policy 3: must be a name, a Policy, or a function"):
+        run.run([3], UPLINK, [2], 1)  # type: ignore[list-item]
+    with pytest.raises(BufgymError, match="'afr' is given more than once; 'afr' is a built-in policy's name"):
+        run.run([Policy("afr", newest), "afr"], UPLINK, [2], 1)

@@ -129,7 +129,7 @@ def test_the_rows_of_a_bench_without_a_suite_are_found_too() -> None:
     [
         ({"scenario": "time"}, "seed = None: must be a whole number"),
         ({"scenario": "nowhere", "seed": 0}, "scenario = 'nowhere': must be one of time, motion"),
-        ({"seed": 0}, "scenario = None: must be one of time, motion"),
+        ({"seed": 0}, "scenario: missing; a suite's row has one besides its seed: one of time, motion"),
         ({"scenario": "time", "seed": 2_000}, "trace = 2: must be 0..1 or one of test-0, test-1"),
         ({"scenario": "time", "seed": 0, "trace": "b"}, "trace = 'b': must be 0..1"),
         ({"episode": None, "seed": 0}, "options: an episode, or its scenario, trace, seed; not both"),
@@ -252,7 +252,7 @@ def test_text_may_name_a_file(tmp_path: Path) -> None:
         ({"value": "linear:3"}, "V = 'linear:3': unknown kind 'linear'"),
         ({"traces": "nowhere"}, "nowhere: no such file, and no shipped trace"),
         ({"motion": ["drive-0", "nowhere"]}, "nowhere: no such file"),
-        ({"value": 3}, "value = 3: must be a bufgym.model.qoi Value or text"),
+        ({"value": 3}, "value = 3: must be a bufgym.model.qoi Value, a function"),
         ({"workload": "nowhere.csv"}, "nowhere.csv"),
         ({"scenario": "nowhere.toml"}, "nowhere.toml"),
     ],

@@ -403,3 +403,16 @@ def test_what_is_not_a_list_is_refused() -> None:
     batch = gym.make_vec("bufgym/Uplink-v0", num_envs=3)
     with pytest.raises(BufgymError, match="must be a list of 3, one a row"):
         batch.reset(options={"episodes": [None]})
+
+
+def test_an_episode_that_has_ended_takes_no_step() -> None:
+    env = SenderEnv(Interruption(t_max=3), 2)
+    with pytest.raises(gym.error.ResetNeeded, match=r"^call reset\(\) before step"):
+        env.step(0)
+    env.reset(seed=0)
+    while not env.step(0)[2]:
+        pass
+    with pytest.raises(gym.error.ResetNeeded, match="the episode has ended"):
+        env.step(0)
+    env.reset()
+    env.step(0)

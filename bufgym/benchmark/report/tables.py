@@ -13,6 +13,11 @@ from bufgym.benchmark.score import CellScore, Scores
 from bufgym.benchmark.summary import Standing, Summary, pair, title
 from bufgym.benchmark.summary import plain as blocks
 
+NOTHING_SCORED = (
+    "Nothing is scored here: on these episodes Drop Oldest's regret is under 1 % in every cell, so there is nothing to"
+    " be gained. More --seeds or another --capacity may have some."
+)
+
 
 @dataclass(frozen=True)
 class Place:
@@ -76,6 +81,8 @@ def plain(run: Run, summary: Summary) -> str:
     notes += table.invalid(run.task.senders(run.rows))
     if summary.scores is None:
         return "\n".join([*intro(run), "", blocks(summary, run.abouts), "", *run.task.legend, *notes])
+    if not any(cell.discriminative for cell in summary.scores.cells):
+        notes.append(NOTHING_SCORED)
     lines = [["policy", "rank", *(quantity.title for quantity in summary.quantities)]]
     for place in ranking(run, summary):
         lines.append([place.policy, "-" if place.rank is None else str(place.rank), *_texts(place)])

@@ -1,0 +1,318 @@
+"""Observation fields and reward terms of one's own, computed beside the built-in ones where an environment names them.
+
+Compiled functions are values of one function type, as policies are: the kernels here are compiled once for all of them.
+Others run in ordinary Python. Either way row i of a batch and the single environment call the same function.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.envs.observation import ObservationForm, Place
+from bufgym.envs.step import StepOutput
+from bufgym.errors import BufgymError
+from bufgym.kernel import at, compile_for, kernel, stretch
+from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
+from bufgym.model.documented import documented
+from bufgym.observe import OwnField, OwnTerm
+from bufgym.policies.registry import view_type
+from bufgym.sim import ARRIVAL_WAITS, NOTHING_WAITS, Batch, named, python_arrival, python_view, view
+from bufgym.sim.state import LOG_ENTRY, batch_type
+
+# Columns of ``marks``: counts of a sender at the step before, and until when that went.
+TRANSMITTED, CREDITED, DROPS, UNTIL = range(4)
+
+
+@documented
+class Step(NamedTuple):
+    """What happened in a step, for reward terms: the truth, of which the robot itself knows a part. Do not write to it.
+
+    A reset is no step: the first one begins with the episode.
+    """
+
+    messages: NDArray[Any]
+    """MESSAGE[arrived]: every message that has arrived so far, in order."""
+    log: NDArray[Any]
+    """LOG_ENTRY[arrived]: what became of each: ``transmitted_us``, ``dropped_us`` (-1: not so far) and the like."""
+    transmitted: NDArray[np.int64]
+    """int64[messages]: places in ``messages`` of those whose last byte crossed the link in this step, in order."""
+    delivered: NDArray[np.int64]
+    """int64[messages]: the same for those that reached the server, ``propagation_us`` later."""
+    drops: int
+    """Messages dropped in this step."""
+    from_us: int
+    """When the step begins, us."""
+    until_us: int
+    """When it ends: at the next decision, or with the episode's last delivery."""
+    propagation_us: int
+    """From a message's last byte on the link to the server, us."""
+    queued: int
+    """Messages in the buffer at its end."""
+    backlog_bytes: int
+    """Their bytes."""
+    capacity: int
+    """L, messages."""
+    ended: bool
+    """Whether the episode ends with it."""
+    topics: NDArray[Any]
+    """TOPIC[topics]: settings and past of each topic."""
+    parameters: NDArray[np.float64]
+    """float64[parameters], read-only: the term's settings, in the order of its registration."""
+
+
+# --- fields ----------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def last_arrival(batch: Batch, i: int) -> Any:
+    """The arrival that waits for a decision; where the socket asks, the one that came last."""
+    sender = batch.senders[i]
+    return at(batch.arrivals, i, sender.next if sender.waiting == ARRIVAL_WAITS else sender.next - 1)
+
+
+def write_slots(batch: Batch, function: Any, first: int, flat: NDArray[np.float32]) -> None:
+    """Write the field for every slot of each row that waits for a decision, in column ``first`` and those after it."""
+    for i in range(len(batch.senders)):
+        sender = batch.senders[i]
+        if sender.waiting != NOTHING_WAITS:
+            buffer, arrival = view(batch, i), last_arrival(batch, i)
+            for k in range(sender.occupancy):
+                flat[i, first + k] = function(buffer, arrival, k)
+            flat[i, first + sender.occupancy : first + sender.capacity + 1] = 0.0
+            if sender.waiting == ARRIVAL_WAITS:
+                flat[i, first + sender.capacity] = function(buffer, arrival, sender.occupancy)
+
+
+def write_context(batch: Batch, function: Any, first: int, flat: NDArray[np.float32]) -> None:
+    """The same for a field of the context."""
+    for i in range(len(batch.senders)):
+        if batch.senders[i].waiting != NOTHING_WAITS:
+            flat[i, first] = function(view(batch, i), last_arrival(batch, i))
+
+
+def write_in_python(place: Place, buffer: Buffer, arrival: Any, arriving: bool, row: NDArray[np.float32]) -> None:
+    """Write a field into a row of numbers by calling its function, compiled or not, from Python."""
+    field, first = cast(OwnField, place.field), place.first
+    if field.per == "context":
+        row[first] = field.function(buffer, arrival)
+    else:
+        s = len(buffer.slots)
+        row[first : first + place.entries] = 0.0
+        row[first : first + s] = [field.function(buffer, arrival, k) for k in range(s)]
+        if arriving:
+            row[first + place.entries - 1] = field.function(buffer, arrival, s)
+    check_bounds(field, row[first : first + place.entries])
+
+
+def check_bounds(field: OwnField, numbers: NDArray[np.float32]) -> None:
+    """An error if the field is out of the bounds that it was registered with."""
+    inside = (numbers >= np.float32(field.low)) & (numbers <= np.float32(field.high))  # NaN is not
+    if not inside.all():
+        wrong = float(numbers[~inside].flat[0])
+        raise BufgymError(f"field {field.name!r}: is {wrong:g}: must lie in its bounds, {field.low:g}..{field.high:g}")
+
+
+class OwnFields:
+    """The fields of one's own that a form observes, filled after each step."""
+
+    def __init__(self, form: ObservationForm) -> None:
+        self._places = [(place, place.field) for place in form.places if isinstance(place.field, OwnField)]
+        self._compiled = [_compiled_field(field) if field.compile else None for _, field in self._places]
+
+    def __bool__(self) -> bool:
+        return bool(self._places)
+
+    def write(self, batch: Batch, output: StepOutput) -> None:
+        """Write each field of every row that waits for a decision; the others' are 0 already."""
+        records = named(batch)
+        for (place, field), compiled in zip(self._places, self._compiled, strict=True):
+            if compiled is not None:
+                compiled(batch, place.first, output.flat)
+                check_bounds(field, output.flat[:, place.first : place.first + place.entries])
+                continue
+            for i in np.flatnonzero(batch.senders["waiting"] != NOTHING_WAITS).tolist():
+                arriving = bool(batch.senders["waiting"][i] == ARRIVAL_WAITS)
+                arrival = python_arrival(records, i, 0 if arriving else 1)
+                write_in_python(place, python_view(records, i), arrival, arriving, output.flat[i])
+
+
+# --- reward terms ----------------------------------------------------------------------------------------------------
+
+
+@kernel
+def step_of(batch: Batch, i: int, marks: NDArray[np.int64], ended: bool, parameters: NDArray[np.float64]) -> Step:
+    """The step of row ``i`` since the ``marks``, int64[n, marks]."""
+    sender = batch.senders[i]
+    arrived = sender.next + 1 if sender.waiting == ARRIVAL_WAITS else sender.next
+    return Step(
+        stretch(batch.arrivals, i, 0, arrived),
+        stretch(batch.log, i, 0, arrived),
+        stretch(batch.order, i, marks[i, TRANSMITTED], sender.transmitted - marks[i, TRANSMITTED]),
+        stretch(batch.order, i, marks[i, CREDITED], sender.credited - marks[i, CREDITED]),
+        sender.rejected + sender.evicted - marks[i, DROPS],
+        marks[i, UNTIL],
+        end_of_step(batch, i, ended),
+        sender.propagation_us,
+        sender.occupancy,
+        sender.backlog_bytes,
+        sender.capacity,
+        ended,
+        stretch(batch.topics, i, 0, sender.topics),
+        parameters,
+    )
+
+
+@kernel
+def end_of_step(batch: Batch, i: int, ended: bool) -> int:
+    """Now; at the end of an episode when the last message reached the server, if that is later."""
+    sender = batch.senders[i]
+    if not ended or sender.credited == 0:
+        return int(sender.now_us)
+    last = at(batch.log, i, at(batch.order, i, sender.credited - 1))
+    return int(max(sender.now_us, last.transmitted_us + sender.propagation_us))
+
+
+def write_term(
+    batch: Batch,
+    marks: NDArray[np.int64],
+    ended: NDArray[np.bool_],
+    memory: NDArray[np.float64],
+    function: Any,
+    parameters: NDArray[np.float64],
+    column: int,
+    reward_terms: NDArray[np.float64],
+) -> None:
+    """Write what the term is for the step of every row; ``memory`` is float64[n, entries]."""
+    for i in range(len(batch.senders)):
+        reward_terms[i, column] = function(step_of(batch, i, marks, ended[i], parameters), memory[i])
+
+
+class OwnTerms:
+    """The reward terms of one's own that an environment names, from column ``first`` of its terms on."""
+
+    def __init__(self, terms: Sequence[OwnTerm], first: int, n: int) -> None:
+        self._terms, self._first = terms, first
+        self._parameters = [term.parameter_array for term in terms]
+        self._memory = [np.zeros((n, max(1, len(term.memory)))) for term in terms]
+        self._compiled = [_compiled_term(term) if term.compile else None for term in terms]
+        self._marks = np.zeros((n, 4), np.int64)
+
+    def __bool__(self) -> bool:
+        return bool(self._terms)
+
+    def begin(self, batch: Batch, rows: NDArray[np.int64]) -> None:
+        """These rows begin an episode."""
+        self._marks[rows] = 0
+        self._marks[rows, UNTIL] = batch.arrivals["arrival_us"][rows, 0]
+        for term, memory in zip(self._terms, self._memory, strict=True):
+            memory[rows, : len(term.memory)] = list(term.memory.values())
+
+    def write(self, batch: Batch, output: StepOutput) -> None:
+        """Write each term of the step that all rows have just taken."""
+        records, ended = named(batch), output.terminated
+        for k, term in enumerate(self._terms):
+            column, parameters, compiled = self._first + k, self._parameters[k], self._compiled[k]
+            if compiled is not None:
+                compiled(batch, self._marks, ended, self._memory[k], parameters, column, output.reward_terms)
+            else:
+                for i in range(len(ended)):
+                    step = _read_only_step(_step_of(records, i, self._marks, bool(ended[i]), parameters))
+                    output.reward_terms[i, column] = term.function(step, self._memory[k][i])
+            if not np.isfinite(output.reward_terms[:, column]).all():
+                raise BufgymError(f"reward term {term.name!r}: is no finite number")
+        senders = batch.senders
+        self._marks[:, TRANSMITTED], self._marks[:, CREDITED] = senders["transmitted"], senders["credited"]
+        self._marks[:, DROPS] = senders["rejected"] + senders["evicted"]
+        self._marks[:, UNTIL] = senders["now_us"]
+
+
+# --- compiled once for all functions ---------------------------------------------------------------------------------
+
+_python_step_of = getattr(step_of, "py_func", step_of)
+
+
+def _step_of(*arguments: Any) -> Step:
+    return cast(Step, _python_step_of(*arguments))
+
+
+def _read_only_step(step: Step) -> Step:
+    for array in step:
+        if isinstance(array, np.ndarray):
+            array.flags.writeable = False
+    return step
+
+
+@functools.cache
+def _types() -> dict[str, Any]:
+    """Numba types that the signatures here are made of."""
+    types, message, log = cast(Any, numba.types), numba.from_dtype(MESSAGE), numba.from_dtype(LOG_ENTRY)
+    whole, constants = types.int64, types.Array(types.float64, 1, "C", readonly=True)
+    kinds = {
+        "messages": types.Array(message, 1, "C"),
+        "log": types.Array(log, 1, "C"),
+        "topics": types.Array(numba.from_dtype(TOPIC), 1, "C"),
+        "parameters": constants,
+        "ended": types.boolean,
+        **dict.fromkeys(("transmitted", "delivered"), types.Array(whole, 1, "C")),
+    }
+    step = types.NamedTuple(tuple(kinds.get(name, whole) for name in Step._fields), Step)
+    real, reals = types.float64, types.Array(types.float64, 1, "C")
+    return {
+        "slot": real(view_type(), message, whole),
+        "context": real(view_type(), message),
+        "term": real(step, reals),
+        "constants": constants,
+        "flat": types.Array(types.float32, 2, "C"),
+        "marks": types.Array(whole, 2, "C"),
+        "flags": types.Array(types.boolean, 1, "C"),
+        "table": types.Array(real, 2, "C"),
+    }
+
+
+def _compiled(what: str, name: str, kind: str, function: Callable[..., float]) -> Any:
+    try:
+        return compile_for(_types()[kind], function)
+    except cast(Any, numba).core.errors.NumbaError as error:
+        reason = " ".join(str(error).split())
+        rule = "leave out compile=True, and it runs as plain Python"
+        raise BufgymError(f"{what} {name!r}: Numba cannot compile it; {rule}: {reason[-300:]}") from None
+
+
+@functools.cache
+def _writer(per: str) -> Any:
+    types = _types()
+    function = cast(Any, numba.types).FunctionType(types[per])
+    signature = numba.types.void(batch_type(), function, numba.types.int64, types["flat"])
+    return compile_for(signature, write_slots if per == "slot" else write_context)
+
+
+@functools.cache
+def _term_writer() -> Any:
+    types = _types()
+    signature = numba.types.void(
+        batch_type(),
+        types["marks"],
+        types["flags"],
+        types["table"],
+        cast(Any, numba.types).FunctionType(types["term"]),
+        types["constants"],
+        numba.types.int64,
+        types["table"],
+    )
+    return compile_for(signature, write_term)
+
+
+def _compiled_field(field: OwnField) -> Callable[..., None]:
+    function, write = _compiled("field", field.name, field.per, field.function), _writer(field.per)
+    return lambda batch, first, flat: write(batch, function, first, flat)
+
+
+def _compiled_term(term: OwnTerm) -> Callable[..., None]:
+    function, write = _compiled("reward term", term.name, "term", term.function), _term_writer()
+    return lambda batch, marks, ended, memory, *rest: write(batch, marks, ended, memory, function, *rest)

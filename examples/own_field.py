@@ -1,0 +1,49 @@
+"""Observation fields of your own, one for each message and one for the whole queue.
+
+python examples/own_field.py
+"""
+
+import argparse
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import bufgym  # noqa: F401  (registers the environments)
+from bufgym.observe import field
+
+
+@field("waited_s", per="slot", high=1e4, compile=True)
+def waited_s(buffer: Any, arrival: Any, k: int) -> float:
+    """Seconds since message k arrived; the newcomer is k = len(buffer.slots)."""
+    if k == len(buffer.slots):
+        return 0.0
+    return (buffer.now_us - buffer.slots[k].arrival_us) / 1e6
+
+
+@field("standstill", per="context")
+def standstill(buffer: Any, arrival: Any) -> float:
+    """1 where the scene has not moved since the arrival before."""
+    return float(arrival.x == buffer.previous_x)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--steps", type=int, default=200, help="decisions of each environment")
+    parser.add_argument("--seeds", type=int, default=4, help="environments in the batch")
+    options = parser.parse_args()
+
+    fields = ["rank", "loss", "waited_s", "standstill"]
+    envs = gym.make_vec("bufgym/Uplink-v0", num_envs=options.seeds, fields=fields, observation="slots")
+    observation, _ = envs.reset(seed=0)
+    print({name: array.shape for name, array in observation.items()})
+    longest = 0.0
+    for _ in range(options.steps):
+        # Evict the oldest message; where there is none, a plain queue accepts.
+        observation, *_ = envs.step(np.zeros(options.seeds, np.int64))
+        longest = max(longest, float(observation["slots"][..., 2].max()))
+    print(f"a message waited {longest:.2f} s at most")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,369 @@
+"""Observation fields and reward terms of one's own: worked by hand, compiled as uncompiled, a batch as its rows."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from env_cases import SMALL, valid_action
+from gymnasium.utils.env_checker import check_env
+
+import bufgym
+from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.model.link import Link
+from bufgym.observe import FIELDS, OWN_FIELDS, OWN_TERMS, field, reward_term
+from bufgym.scenario import Episode, Uplink, messages
+from bufgym.sim.metrics import outcome, received
+from bufgym.traces import Trace
+
+SECOND_US = 1_000_000
+
+
+def waited(buffer: Any, arrival: Any, k: int) -> float:
+    """Seconds since slot k arrived, as a share of ten."""
+    arrival_us = arrival.arrival_us if k == len(buffer.slots) else buffer.slots[k].arrival_us
+    return (buffer.now_us - arrival_us) / 1e7
+
+
+def megabytes(buffer: Any, arrival: Any) -> float:
+    """Megabytes queued, and of the newcomer a tenth."""
+    return (buffer.backlog_bytes + 0.1 * arrival.size_bytes) / 1e6
+
+
+def dropped(step: Any, memory: Any) -> float:
+    """Minus the drops; the step's number in the last digits."""
+    memory[0] += 1
+    return -step.drops - 1e-6 * memory[0]
+
+
+@pytest.fixture(autouse=True)
+def own() -> Iterator[None]:
+    """Each function twice: in plain Python (``_py``) and compiled."""
+    fields, terms = dict(OWN_FIELDS), dict(OWN_TERMS)
+    for suffix, compiled in (("", True), ("_py", False)):
+        field(f"wait{suffix}", per="slot", unit="g/10 s", compile=compiled)(waited)
+        field(f"megabytes{suffix}", per="context", high=1e3, compile=compiled)(megabytes)
+        reward_term(f"dropped{suffix}", memory={"steps": 0}, compile=compiled)(dropped)
+    yield
+    for entries, before in ((OWN_FIELDS, fields), (OWN_TERMS, terms)):
+        entries.clear()
+        entries.update(before)  # type: ignore[arg-type]
+
+
+CHOSEN = ["loss", "wait", "wait_py", "occupancy", "megabytes", "megabytes_py"]
+EVERYWHERE = {"retained": 1.0, "delay": 0.1, "energy": 0.2, "dropped": 0.3, "dropped_py": 0.0}
+ONE_QUEUE = {**EVERYWHERE, "age": 0.1, "late:deadline_s=0.4": 0.5}
+
+
+def terms_of(env_id: str) -> dict[str, float]:
+    return EVERYWHERE if "Topics" in env_id else ONE_QUEUE
+
+
+# --- by hand ----------------------------------------------------------------------------------------------------------
+
+MB = 1_000_000
+
+
+def episode(bytes_per_s: float) -> Episode:
+    """Four messages of 1 MB, a second apart, over a steady link; half a second of propagation."""
+    arrivals = messages(np.arange(4) * SECOND_US, MB)
+    return Episode(arrivals, Link(Trace.steps([(100.0, bytes_per_s)]), 0, SECOND_US // 2))
+
+
+def sums(link: float, reward: dict[str, float], action: int) -> dict[str, float]:
+    """The sum of each term over the episode, L = 1, always this action."""
+    env = SenderEnv(Uplink(traces=(Trace.steps([(1.0, 1e6)]),)), 1, reward=reward)
+    _, info = env.reset(options={"episode": episode(link)})
+    assert set(info["reward_terms"].values()) == {0.0}  # a reset has them too
+    total, ended = dict.fromkeys(info["reward_terms"], 0.0), False
+    while not ended:
+        _, _, ended, _, info = env.step(action)
+        for name, number in info["reward_terms"].items():
+            total[name] += number
+    return total
+
+
+def test_terms_that_come_with_bufgym_by_hand() -> None:
+    # At 1 MB/s every message goes at once: each takes 1 s and half a second to the server, 1.5, 2.5, 3.5, 4.5 s.
+    # Until 2.5 s the age is t (3.125 s^2), then t - 1 until the last arrival at 3 s (1.5 to 2.0: 0.875 s^2).
+    every = {"delay": 0.0, "energy": 0.0, "age": 0.0, "late:deadline_s=1.4": 0.0, "late:deadline_s=1.6": 0.0}
+    total = sums(1e6, every, 2)
+    assert total["delay"] == pytest.approx(-6.0)
+    assert total["energy"] == pytest.approx(-4.0)
+    assert total["age"] == pytest.approx(-4.0)
+    assert (total["late:deadline_s=1.4"], total["late:deadline_s=1.6"]) == (-4.0, 0.0)
+    # At half of that, message 2 is evicted for message 3: 0, 1 and 3 arrive at 2.5, 4.5 and 6.5 s.
+    total = sums(0.5e6, {**every, "late:deadline_s=3": 0.0, "dropped": 1.0}, 0)
+    assert total["delay"] == pytest.approx(-9.5)
+    assert total["energy"] == pytest.approx(-3.0)
+    assert total["age"] == pytest.approx(-(3.125 + 0.5 * 2.75))
+    assert total["late:deadline_s=3"] == -2.0
+    assert math.ceil(total["dropped"]) == -1
+
+
+def test_a_step_tells_what_happened_in_it() -> None:
+    steps: list[tuple[float, ...]] = []
+
+    @reward_term("spy")
+    def spy(step: Any, memory: Any) -> float:
+        times = step.from_us / SECOND_US, step.until_us / SECOND_US
+        steps.append((*times, list(step.transmitted), list(step.delivered), step.drops, step.queued, step.ended))
+        for array in (step.messages, step.log, step.transmitted):
+            assert not array.flags.writeable
+        return float(len(step.messages))
+
+    total = sums(0.5e6, {"spy": 1.0}, 0)
+    assert steps == [
+        (0.0, 1.0, [], [], 0, 0, False),
+        (1.0, 2.0, [0], [], 0, 0, False),
+        (2.0, 3.0, [], [0], 0, 1, False),
+        (3.0, 6.5, [1, 3], [1, 3], 1, 0, True),
+    ]
+    assert total["spy"] == 2 + 3 + 4 + 4  # messages that have come by then
+
+
+# --- everywhere -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
+@pytest.mark.parametrize("form", ["dict", "flat", "slots"])
+def test_gymnasium_finds_nothing_to_complain_about(env_id: str, form: str) -> None:
+    env = gym.make(env_id, fields=CHOSEN, reward=terms_of(env_id), observation=form, **SMALL[env_id])
+    check_env(env.unwrapped)
+
+
+@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
+def test_compiled_and_plain_agree_and_sum_to_the_log(env_id: str) -> None:
+    arguments: dict[str, Any] = {"fields": CHOSEN, "reward": terms_of(env_id), "capacity": 4, **SMALL[env_id]}
+    dicts, flats = gym.make(env_id, **arguments).unwrapped, gym.make(env_id, observation="flat", **arguments)
+    assert isinstance(dicts, SenderEnv)
+    rng = np.random.default_rng(3)
+    for seed in range(3 if JIT else 1):
+        _, info = dicts.reset(seed=seed)
+        flats.reset(seed=seed)
+        total, ended = dict.fromkeys(info["reward_terms"], 0.0), False
+        while not ended:
+            action = valid_action(info["action_mask"], rng)
+            seen, reward, ended, _, info = dicts.step(action)
+            assert dicts.observation_space.contains(seen)
+            assert list(seen) == ["loss", "wait", "wait_py", "occupancy", "megabytes", "megabytes_py"]
+            for name in ("wait", "megabytes"):
+                np.testing.assert_array_equal(seen[name], seen[f"{name}_py"])
+            flat = gym.spaces.flatten(dicts.observation_space, seen)
+            np.testing.assert_array_equal(flats.step(action)[0], flat)
+            terms = info["reward_terms"]
+            assert terms["dropped"] == terms["dropped_py"]
+            assert reward == pytest.approx(sum(terms_of(env_id).get(name, 0.0) * terms[name] for name in terms))
+            for name, number in terms.items():
+                total[name] += number
+        senders = dicts.rows.senders
+        result, count = outcome(senders, 0), int(senders.batch.senders["transmitted"][0])
+        propagation_s = int(senders.batch.senders["propagation_us"][0]) / 1e6
+        assert total["delay"] == pytest.approx(-count * (result.mean_sojourn_s + propagation_s))
+        assert total["energy"] == pytest.approx(-received(senders, 0)["size_bytes"].sum() / 1e6)
+        assert round(total["dropped"]) == -result.dropped
+
+
+@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_a_batch_is_its_rows(env_id: str, mode: str) -> None:
+    arguments: dict[str, Any] = {"fields": CHOSEN, "reward": terms_of(env_id), "capacity": 3, **SMALL[env_id]}
+    singles = gym.vector.SyncVectorEnv(
+        [lambda: gym.make(env_id, **arguments) for _ in range(3)],
+        autoreset_mode=gym.vector.AutoresetMode(mode),
+    )
+    batch = gym.make_vec(env_id, num_envs=3, autoreset_mode=mode, **arguments)
+    (one, _), (many, infos) = singles.reset(seed=5), batch.reset(seed=5)
+    for step in range(120 if JIT else 20):
+        for name in many:
+            np.testing.assert_array_equal(one[name], many[name], err_msg=f"{name}, step {step}")
+        action = np.array(
+            [valid_action(mask, np.random.default_rng([step, i])) for i, mask in enumerate(infos["action_mask"])]
+        )
+        one, reward, *_ = singles.step(action)
+        many, rewards, _, _, infos = batch.step(action)
+        np.testing.assert_array_equal(reward, rewards)
+
+
+def test_age_on_a_fading_link_is_what_its_definition_says() -> None:
+    link = Trace.steps([(0.4, 9e6), (0.5, 0), (0.6, 2e6)])
+    env = SenderEnv(Uplink(traces=(link,), duration_s=4.0), 3, reward="age")
+    env.reset(seed=1)
+    age, ended = 0.0, False
+    while not ended:
+        _, reward, ended, _, _ = env.step(0)
+        age += reward
+    batch = env.rows.senders.batch
+    order = batch.order[0, : batch.senders["transmitted"][0]]
+    received_s = (batch.log["transmitted_us"][0][order] + 20_000) / 1e6
+    sent_s = batch.arrivals["arrival_us"][0] / 1e6
+    # Integrated from the first arrival to the last; until anything is received, the first counts as received.
+    grid = np.linspace(sent_s[0], sent_s[-1], 400_001)
+    newest_s = np.array([sent_s[0], *sent_s[order]])[np.searchsorted(received_s, grid, side="right")]
+    steps = np.diff(grid)
+    middle = ((grid - newest_s)[1:] + (grid - newest_s)[:-1]) / 2
+    assert age == pytest.approx(-(middle * steps).sum(), rel=1e-4)
+
+
+def test_a_fleet_has_them_too() -> None:
+    envs = FleetVecEnv(
+        2,
+        3,
+        capacity=3,
+        fields=CHOSEN,
+        term={"delay": 1.0, "dropped": 0.1},
+        reward="own",
+        parameters={"duration_s": 1.0},
+    )
+    envs.reset(seed=1)
+    done = np.zeros(6, np.bool_)
+    while not done.any():
+        seen, rewards, done, _, info = envs.step(np.zeros(6, np.int64))
+        np.testing.assert_array_equal(seen["wait"], seen["wait_py"])
+        terms = info["reward_terms"]
+        np.testing.assert_allclose(rewards, terms["delay"] + 0.1 * terms["dropped"])
+        assert envs.single_observation_space.contains({name: array[0] for name, array in seen.items()})
+
+
+def test_they_change_nothing_where_nobody_names_them() -> None:
+    env = SenderEnv("interruption", 4)
+    assert list(env.observation_space) == [known.name for known in FIELDS]
+    assert list(env.reset(seed=0)[1]["reward_terms"]) == ["delivered", "retained"]
+
+
+# --- as text ----------------------------------------------------------------------------------------------------------
+
+MODULE = """
+from bufgym.observe import field, reward_term
+
+@field("from_a_module", per="context")
+def seen(buffer, arrival):
+    return 0.25
+
+@reward_term("term_of_a_module")
+def paid(step, memory):
+    return 2.0
+
+def nothing(buffer, arrival):
+    return 0.0
+"""
+
+
+def test_a_spec_as_text_imports_what_it_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_text_module.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    arguments: dict[str, Any] = {"fields": ["rank", "own_text_module:seen"], "reward": {"own_text_module:paid": 3}}
+    spec = gym.make("bufgym/Interruption-v0", **arguments).spec
+    assert spec is not None
+    env = gym.make(gym.envs.registration.EnvSpec.from_json(spec.to_json()))
+    seen, _ = env.reset(seed=0)
+    assert list(seen) == ["rank", "from_a_module"] and seen["from_a_module"] == [0.25]
+    assert env.step(0)[1] == 6.0
+    with pytest.raises(BufgymError, match="own_text_module:nothing: is not registered as a field"):
+        SenderEnv(fields=["own_text_module:nothing"])
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"name": "rank", "per": "slot"}, "field 'rank': a built-in field has this name"),
+        ({"name": "my field", "per": "slot"}, "without spaces"),
+        ({"name": "mine", "per": "row"}, "per = 'row': must be 'slot' or 'context'"),
+        ({"name": "mine", "per": "slot", "low": 1.0, "high": 2.0}, "need low <= 0 <= high"),
+        ({"name": "mine", "per": "context"}, r"must be a function \(buffer, arrival\)"),
+    ],
+)
+def test_fields_that_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(BufgymError, match=message):
+        field(**arguments)(waited)
+
+
+def test_terms_that_are_refused() -> None:
+    for name in ("retained", "delay"):
+        with pytest.raises(BufgymError, match=f"reward term '{name}': a built-in reward term has this name"):
+            reward_term(name)(dropped)
+    with pytest.raises(BufgymError, match=r"must be a function \(step, memory\)"):
+        reward_term("mine")(waited)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"fields": ["rank", "waitd"]}, "unknown field 'waitd'; known: .*wait"),
+        ({"reward": "dely"}, "unknown term 'dely'; known: delivered, retained, delay"),
+        ({"reward": {"late:deadline=1": 1}}, "reward term late: no parameter 'deadline'; it has: deadline_s"),
+        ({"reward": {"late:deadline_s=0": 1}}, "deadline_s = 0.0: must be a number > 0"),
+        ({"reward": {"delay": "much"}}, "the weight of 'delay' must be a finite number"),
+        ({"scenario": "topics", "reward": "late:deadline_s=1"}, "is for one queue; each topic has settings of its own"),
+        ({"bound": "yes"}, "bound = 'yes': must be True or False"),
+    ],
+)
+def test_arguments_that_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(BufgymError, match=message):
+        SenderEnv(**arguments)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_numbers_that_are_refused(compiled: bool) -> None:
+    def far(buffer: Any, arrival: Any) -> float:
+        return 1.5
+
+    def nothing(step: Any, memory: Any) -> float:
+        return math.nan
+
+    field("far", per="context", compile=compiled)(far)
+    reward_term("nothing", compile=compiled)(nothing)
+    with pytest.raises(BufgymError, match=re.escape("field 'far': is 1.5: must lie in its bounds, 0..1")):
+        SenderVectorEnv(2, "interruption", fields=["far"]).reset(seed=0)
+    env = SenderEnv("interruption", reward={"nothing": 0})
+    env.reset(seed=0)
+    with pytest.raises(BufgymError, match="reward term 'nothing': is no finite number"):
+        env.step(0)
+
+
+@pytest.mark.skipif(not JIT, reason="nothing is compiled")
+def test_what_numba_cannot_compile_says_so_in_one_line() -> None:
+    @field("odd", per="context", compile=True)
+    def odd(buffer: Any, arrival: Any) -> float:
+        return float({"a": object()}["a"] is None)
+
+    with pytest.raises(BufgymError, match="field 'odd': Numba cannot compile it; leave out compile=True"):
+        SenderEnv("interruption", fields=["odd"])
+
+
+def test_a_trained_model_that_observes_them_is_a_policy() -> None:
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3 import PPO
+
+    from bufgym.benchmark import run
+    from bufgym.sb3 import as_policy, make_vec_env
+    from bufgym.scenario import Interruption
+
+    arguments: dict[str, Any] = {"t_max": 12, "fields": ["loss", "wait_py", "megabytes"], "observation": "dict"}
+    model = PPO(
+        "MultiInputPolicy",
+        make_vec_env("bufgym/Interruption-v0", 2, capacity=3, **arguments),
+        n_steps=8,
+        batch_size=16,
+        seed=1,
+    )
+    scenario = Interruption(t_max=12)
+    rows = run.run([as_policy(model, "mine")], scenario, [3], 3)
+    env = SenderEnv("interruption", 3, **arguments)
+    for row in rows:
+        seen, _ = env.reset(options={"seed": row["seed"]})
+        ended = False
+        while not ended:
+            seen, _, ended, _, info = env.step(int(model.predict(seen, deterministic=True)[0]))
+        assert info["qoi"] == pytest.approx(row["qoi"])
