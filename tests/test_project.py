@@ -29,6 +29,7 @@ ROOMS = [
     "sim",
     "oracle",
     "envs",
+    "expert",
     "sb3",
     "benchmark",
     "reproduce",

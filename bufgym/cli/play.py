@@ -30,7 +30,7 @@ def _play(options: argparse.Namespace) -> None:
     import gymnasium
 
     from bufgym import policies
-    from bufgym.benchmark.play import Player
+    from bufgym.expert import Player
     from bufgym.benchmark.run import draw
 
     load_policies(options.policy_file)
