@@ -97,7 +97,7 @@ class Clairvoyant:
     def _make_room(self) -> None:
         """Close the gaps that past episodes have left; where they were less than half, twice the room."""
         old, kept = self._ahead, int(np.diff(self._span).sum())
-        room = len(old.latest) * (1 if 2 * kept < len(old.latest) else 2)
+        room = len(old.latest) * (1 if 2 * (self._end - kept) > len(old.latest) else 2)
         pool = [np.zeros(room, array.dtype) for array in (old.latest, old.gain, old.follow)]
         self._end = 0
         for i, (begin, stop) in enumerate(self._span.tolist()):

@@ -125,6 +125,16 @@ def find_steps(
         latest[0, 0], gain[0, 0], follow[0, 0] = ALWAYS, 0.0, -1
         c, x = at(ahead.c, i, m), at(batch.arrivals, i, m).x
         soonest, reach = c + b, c + (room + 1) * b
+        # V is concave: what is best to follow m + 1 at byte e, or something before it, is best to follow m. Bytes that
+        # m + 1 cannot end at are less than a message further: what could be sent in the meantime cuts these off.
+        furthest = m + 1
+        if m + 1 < batch.senders[i].arrivals:
+            for k in range(at(ahead.begin, i, m + 1) + 1, at(ahead.stop, i, m + 1)):
+                furthest = max(furthest, ahead.follow[k])
+            c_next = at(ahead.c, i, m + 1)
+            if c_next > c:
+                while furthest + 1 < batch.senders[i].arrivals and at(ahead.c, i, furthest + 1) < c_next + 2 * b:
+                    furthest += 1
         for j in range(m + 1, batch.senders[i].arrivals):
             enough = soonest
             if at(ahead.between, i, j) > m:
