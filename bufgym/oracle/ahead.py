@@ -125,17 +125,21 @@ def find_steps(
         latest[0, 0], gain[0, 0], follow[0, 0] = ALWAYS, 0.0, -1
         c, x = at(ahead.c, i, m), at(batch.arrivals, i, m).x
         soonest, reach = c + b, c + (room + 1) * b
-        # V is concave: what is best to follow m + 1 at byte e, or something before it, is best to follow m. Bytes that
-        # m + 1 cannot end at are less than a message further: what could be sent in the meantime cuts these off.
+        # V is concave: what follows m best is what follows m + 1 best after the same byte, or something before it. Bytes
+        # that m + 1 cannot end at lie less than a message beyond c: there j could follow m + 1 if c_j is two beyond.
         furthest = m + 1
         if m + 1 < batch.senders[i].arrivals:
-            for k in range(at(ahead.begin, i, m + 1) + 1, at(ahead.stop, i, m + 1)):
+            begin, stop = at(ahead.begin, i, m + 1), at(ahead.stop, i, m + 1)
+            for k in range(begin + 1, stop):
                 furthest = max(furthest, ahead.follow[k])
             c_next = at(ahead.c, i, m + 1)
-            if c_next > c:
-                while furthest + 1 < batch.senders[i].arrivals and at(ahead.c, i, furthest + 1) < c_next + 2 * b:
-                    furthest += 1
-        for j in range(m + 1, batch.senders[i].arrivals):
+            while c_next > c and furthest + 1 < batch.senders[i].arrivals:
+                if at(ahead.c, i, furthest + 1) >= c_next + 2 * b:
+                    break
+                furthest += 1
+            if stop - begin == 1 or ahead.latest[begin + 1] < reach:
+                furthest = batch.senders[i].arrivals  # nothing follows m + 1 best: that is later than any
+        for j in range(m + 1, min(furthest + 1, batch.senders[i].arrivals)):
             enough = soonest
             if at(ahead.between, i, j) > m:
                 if at(ahead.idle, i, j) >= reach:
@@ -144,7 +148,7 @@ def find_steps(
             c_j = at(ahead.c, i, j)
             if c_j + b > ends or room == 0:
                 break
-            top = min(c_j + room * b, ends - b)
+            top = min(c_j + room * b, ends - b, reach)
             added = value(v, at(batch.arrivals, i, j).x - x)
             # Steps of j from the highest that may be reached late enough, down to the last that is late enough.
             begin, stop = at(ahead.begin, i, j), at(ahead.stop, i, j)
