@@ -80,7 +80,7 @@ def make(
                 options={"player": episode.player},
                 observations=episode.observations,
                 actions=episode.actions,
-                rewards=episode.rewards,  # type: ignore[arg-type]  # an array serves as well
+                rewards=episode.rewards,
                 terminations=[False] * (T - 1) + [True],
                 truncations=[False] * T,
                 infos=infos,
@@ -97,7 +97,7 @@ def make(
             try:
                 minari.create_dataset_from_buffers(
                     name,
-                    buffers(),  # type: ignore[arg-type]  # it goes through them once
+                    buffers(),
                     env=single,
                     algorithm_name=players[kind],
                     description=f"bufgym: {players[kind]} in {env}, {options or 'default settings'}, seed {seed}",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bufgym.envs.rows import FleetRows
 from bufgym.errors import BufgymError
 from bufgym.expert.experts import rows_of
-from bufgym.oracle.ahead import Ahead, find_steps, find_values, new_work
+from bufgym.oracle.ahead import NO_ROOM, Ahead, find_steps, find_values, new_work
 from bufgym.oracle.programme import find_idle
 from bufgym.sim import ARRIVAL_WAITS
 
@@ -41,7 +41,7 @@ class Clairvoyant:
         c, between, idle, begin, stop = numbers
         pool = np.zeros(_ROOM, np.int64), np.zeros(_ROOM), np.zeros(_ROOM, np.int32)
         self._ahead = Ahead(c, between, idle, np.zeros((n, 3), np.int64), begin, stop, *pool)
-        self._steps = [np.zeros((2, 1024), array.dtype) for array in pool]
+        self._steps = [np.zeros((2, 64), array.dtype) for array in pool]
         self._span = np.zeros((n, 2), np.int64)  # each row's part of the pool
         self._end = 0
         self._begun = np.zeros(n, np.int64)
@@ -78,7 +78,7 @@ class Clairvoyant:
         b, n = int(size[0]), len(arrivals)
         if (size != b).any():
             raise BufgymError(
-                f"expert.clairvoyant: row {i}: messages of {size.min()} to {size.max()} bytes: exact for equal sizes only"
+                f"expert.clairvoyant: row {i}: messages of {size.min()} to {size.max()} bytes: for equal sizes only"
             )
         if episode.window != 1 or episode.ack_delay_us:
             raise BufgymError(f"expert.clairvoyant: row {i}: the socket waits for acks: only known where it does not")
@@ -90,7 +90,10 @@ class Clairvoyant:
         find_idle(ahead.c[i, :n], size, limit, limit, ahead.between[i, :n], ahead.idle[i, :n])
         self._span[i] = 0
         while (end := find_steps(senders.batch, self._ahead, i, self._end, *self._steps)) < 0:
-            self._make_room()
+            if end == NO_ROOM:
+                self._make_room()
+            else:
+                self._steps = [np.zeros((2, 2 * steps.shape[1]), steps.dtype) for steps in self._steps]
         self._span[i], self._end = (self._end, end), end
         self._begun[i] = senders.begun[i]
 
@@ -98,7 +101,7 @@ class Clairvoyant:
         """Close the gaps that past episodes have left; where they were less than half, twice the room."""
         old, kept = self._ahead, int(np.diff(self._span).sum())
         room = len(old.latest) * (1 if 2 * (self._end - kept) > len(old.latest) else 2)
-        pool = [np.zeros(room, array.dtype) for array in (old.latest, old.gain, old.follow)]
+        pool: list[NDArray[Any]] = [np.zeros(room, array.dtype) for array in (old.latest, old.gain, old.follow)]
         self._end = 0
         for i, (begin, stop) in enumerate(self._span.tolist()):
             place = slice(self._end, self._end + stop - begin)
@@ -109,7 +112,6 @@ class Clairvoyant:
             self._span[i] = place.start, place.stop
             self._end = place.stop
         self._ahead = old._replace(latest=pool[0], gain=pool[1], follow=pool[2])
-        self._steps = [np.zeros((2, 2 * steps.shape[1]), steps.dtype) for steps in self._steps]
 
 
 def regrets(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -124,7 +126,7 @@ def best(values: NDArray[np.float64]) -> NDArray[np.int64]:
     order = np.array([L + 1, L, *range(L)])
     known = np.where(np.isnan(values), -np.inf, values)[:, order]
     chosen = order[np.argmax(known >= known.max(axis=1, keepdims=True) - _TIE, axis=1)]
-    return np.where(np.isnan(values).all(axis=1), L, chosen)
+    return np.asarray(np.where(np.isnan(values).all(axis=1), L, chosen), np.int64)
 
 
 def clairvoyant(env: Any) -> Clairvoyant:

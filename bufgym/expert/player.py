@@ -37,7 +37,7 @@ class Player:
     Just before a decision the policy is called once for every departure since the one before, with the buffer as it is
     now. Its uniform draws are the episode's; where an environment drew the episode, they come from its seed. It is
     asked at arrivals, and with several topics for what to send next, once at each decision; with a new episode it
-    forgets the one before. A policy that drops at dequeue, or has an unbounded queue, can't play: a BufgymError says so.
+    forgets the one before. A policy that drops at dequeue, or has an unbounded queue, can't play: a BufgymError.
     """
 
     def __init__(self, policy: Policy, n: int = 1) -> None:

@@ -1,4 +1,4 @@
-"""Episodes of a policy, recorded from the native batch: what data sets for imitation and offline learning are made of."""
+"""Episodes of a policy, recorded from the native batch: what data sets are made of."""
 
 from __future__ import annotations
 

@@ -3,14 +3,14 @@
 As in ``labels``, sizes are equal (b bytes) and C(t) counts the bytes that the link can carry. Two parts:
 
 *Ahead.* ``F(i, e)`` is the most that can be gained after message i, if that is sent, ends at byte e and nothing else of
-what arrived before it is kept. As a function of e it is a falling staircase, and the staircase of message i follows from
-those of all later ones: one backward sweep over the episode (``find_steps``) finds all of them exactly.
+what arrived before it is kept. As a function of e it is a falling staircase, and the staircase of message i follows
+from those of all later ones: one backward sweep over the episode (``find_steps``) finds all of them exactly.
 
 *From a queue.* A plan first sends some of the s messages that are queued after the action, and then only later
 arrivals, from where F knows the rest. But a queue of s messages is s transmissions without a pause, whatever is
 decided: decisions exchange messages, one an arrival, and never make the queue shorter. So the t-th of these, which
-begins at byte u_t, can send message m only if m was there before byte u_t, and s - t later ones were, too. A plan without
-this condition is a bound; nearly always it meets the condition anyway. If not, ``forced`` finds the best that does.
+begins at byte u_t, can send message m only if m was there before byte u_t, and s - t later ones were, too. A plan
+without this condition is a bound; nearly always it meets the condition anyway. If not, ``forced`` finds the best.
 """
 
 from __future__ import annotations
@@ -20,12 +20,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import at, kernel, stretch
+from bufgym.kernel import at, kernel
 from bufgym.model.qoi import value
 from bufgym.sim.state import ARRIVAL_WAITS, CARRIES, Batch
 
 ALWAYS = 2**62
 """A byte that no message ends after."""
+
+NO_ROOM, NO_WORK_SPACE = -1, -2
+"""What ``find_steps`` returns where it ran out of something."""
 
 _TIE = 1e-12
 """A gain must be better by so much to replace another."""
@@ -114,7 +117,7 @@ def find_steps(
     gain: NDArray[np.float64],
     follow: NDArray[np.int32],
 ) -> int:
-    """Find the steps of sender ``i``'s episode and put them at ``place``: where they end, or -1 if the room ran out.
+    """Find the steps of sender ``i``'s episode and put them at ``place``: where they end, NO_ROOM or NO_WORK_SPACE.
 
     ``latest``, ``gain``, ``follow``: [2, room for the steps of one message], work space.
     """
@@ -125,7 +128,7 @@ def find_steps(
         latest[0, 0], gain[0, 0], follow[0, 0] = ALWAYS, 0.0, -1
         c, x = at(ahead.c, i, m), at(batch.arrivals, i, m).x
         soonest, reach = c + b, c + (room + 1) * b
-        # V is concave: what follows m best is what follows m + 1 best after the same byte, or something before it. Bytes
+        # V is concave: what follows m best is what follows m + 1 best after the same byte, or one before it. Bytes
         # that m + 1 cannot end at lie less than a message beyond c: there j could follow m + 1 if c_j is two beyond.
         furthest = m + 1
         if m + 1 < batch.senders[i].arrivals:
@@ -159,7 +162,7 @@ def find_steps(
             if top < enough:
                 continue
             if held + stop - k > latest.shape[1]:
-                return -1
+                return NO_WORK_SPACE
             then, kept, old, best = 1 - now, 0, 0, -1.0
             while True:
                 late = -1
@@ -182,7 +185,7 @@ def find_steps(
                     kept += 1
             now, held = then, kept
         if place + held > len(ahead.latest):
-            return -1
+            return NO_ROOM
         ahead.begin[i, m], ahead.stop[i, m] = place, place + held
         for k in range(held):
             ahead.latest[place + k], ahead.gain[place + k] = latest[now, k], gain[now, k]
@@ -201,7 +204,7 @@ def step_of(ahead: Ahead, i: int, m: int, e: int) -> int:
             low = middle
         else:
             high = middle
-    return low
+    return int(low)
 
 
 @kernel
@@ -311,7 +314,7 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
 
 @kernel
 def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int) -> float:
-    """The most that is still gained with the first ``count`` of ``work.slots`` queued, behind a socket free at ``e``."""
+    """The most that is still gained with the first ``count`` of ``work.slots`` queued and the socket free at ``e``."""
     b, ends = ahead.link[i, 0], ahead.link[i, 2]
     until = min(count, (ends - e) // b)  # transmissions of this queue that are delivered
     most, sent, target = work.jump[0, 0], 0, work.target[0, 0]
@@ -329,14 +332,12 @@ def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int
             if gain + work.jump[t, k] >= most - _TIE:
                 most, sent, target = gain + work.jump[t, k], t, work.target[t, k]
     if possible(ahead, work, i, batch.senders[i].next, e, count, until, sent, target):
-        return most
+        return float(most)
     return forced(batch, ahead, work, i, e, count, until)
 
 
 @kernel
-def possible(
-    ahead: Ahead, work: Work, i: int, n: int, e: int, count: int, until: int, sent: int, target: int
-) -> bool:
+def possible(ahead: Ahead, work: Work, i: int, n: int, e: int, count: int, until: int, sent: int, target: int) -> bool:
     """Whether a plan that sends so many of the queue and then ``target`` keeps the socket as busy as it has to be."""
     b, m = ahead.link[i, 0], target
     for t in range(sent + 1, until + 1):

@@ -27,8 +27,8 @@ class Senders:
     """A batch of n senders that share L, B and V, each with an episode of its own.
 
     ``capacity`` (L, messages), ``max_bytes`` (B), ``decide_at``, ``value`` (V) and ``topics`` are the shared settings,
-    ``batch`` the arrays (see ``Batch``), ``episodes`` what each sender has loaded, None for nothing, ``begun``, int64[n],
-    how many it has begun. An episode of one queue may have a V of its own.
+    ``batch`` the arrays (see ``Batch``), ``episodes`` what each sender has loaded, None for nothing, ``begun``,
+    int64[n], how many it has begun. An episode of one queue may have a V of its own.
     """
 
     def __init__(

@@ -16,9 +16,9 @@ import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark import perf
-from bufgym.expert import Player
 from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
+from bufgym.expert import Player
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import run as run_senders

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
-from bufgym.expert import Player
 from bufgym.errors import BufgymError
+from bufgym.expert import Player
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link

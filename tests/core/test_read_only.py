@@ -9,10 +9,10 @@ import pytest
 
 from bufgym import scenario
 from bufgym.benchmark import run as bench
-from bufgym.expert import Player
 from bufgym.benchmark.tasks.queue import QueueTask
 from bufgym.envs import SenderEnv
 from bufgym.errors import BufgymError
+from bufgym.expert import Player
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic

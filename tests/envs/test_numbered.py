@@ -14,11 +14,11 @@ from gymnasium.envs.registration import EnvSpec
 
 import bufgym
 from bufgym import policies
-from bufgym.expert import Player
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.envs import SenderEnv, SenderVectorEnv
 from bufgym.errors import BufgymError
+from bufgym.expert import Player
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Uplink, suites
