@@ -105,10 +105,10 @@ class Clairvoyant:
         self._end = 0
         for i, (begin, stop) in enumerate(self._span.tolist()):
             place = slice(self._end, self._end + stop - begin)
-            for new, array in zip(pool, (old.latest, old.gain, old.follow), strict=True):
-                new[place] = array[begin:stop]
-            for bound in (old.begin, old.stop):
-                bound[i] += self._end - begin
+            pool[0][place], pool[1][place] = old.latest[begin:stop], old.gain[begin:stop]
+            pool[2][place] = old.follow[begin:stop]
+            old.begin[i] += self._end - begin
+            old.stop[i] += self._end - begin
             self._span[i] = place.start, place.stop
             self._end = place.stop
         self._ahead = old._replace(latest=pool[0], gain=pool[1], follow=pool[2])

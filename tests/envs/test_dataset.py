@@ -100,7 +100,13 @@ def test_minaris_own_collector_records_infos(tmp_path: Path, monkeypatch: pytest
         while not ended:
             _, _, ended, _, _ = env.step(4)
     made = env.create_dataset(
-        "bufgym/test-v0", algorithm_name="reject", author="a", author_email="a@b.c", code_permalink="c"
+        "bufgym/test-v0",
+        algorithm_name="reject",
+        author="a",
+        author_email="a@b.c",
+        code_permalink="c",
+        description="rejects everything",
+        eval_env=env.spec,
     )
     episode = next(iter(made))
     assert episode.infos["arrived"][-1] == 60
