@@ -87,6 +87,7 @@ def test_infos_have_the_same_entries_in_every_step() -> None:
             assert after.keys() == info.keys()
 
 
+@pytest.mark.filterwarnings("ignore:Implicitly cleaning up", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_minaris_own_collector_records_infos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     minari = pytest.importorskip("minari")
     pytest.importorskip("jax", reason="Minari's DataCollector needs jax")
