@@ -30,6 +30,7 @@ ROOMS = [
     "sim",
     "oracle",
     "envs",
+    "expert",
     "sb3",
     "benchmark",
     "reproduce",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -80,3 +82,12 @@ def test_a_moment_is_missed_more_than_half_a_view_from_what_arrived(
         "drop-oldest",
     }
     assert lines[1][:2] == ["clairvoyant", "1.000"]
+
+
+def test_imitation_prints_its_score_beside_afrs() -> None:
+    settings = ["--rounds", "2", "--episodes", "4", "--epochs", "1"]
+    command = [sys.executable, str(EXAMPLES / "imitation.py"), *settings]
+    done = subprocess.run(command, cwd=EXAMPLES.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "round 2: 2,400 states" in done.stdout
+    assert re.search(r"score of this network: -?[0-9.]+\nscore of afr: 0.[0-9]+", done.stdout)

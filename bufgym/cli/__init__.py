@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from bufgym import __version__, modules
 from bufgym.cli import (
     bench,
+    dataset,
     export,
     figures,
     fleet,
@@ -105,6 +106,7 @@ def _parser() -> argparse.ArgumentParser:
         perf,
         play,
         export,
+        dataset,
         warmup,
     ):
         module.add(commands)

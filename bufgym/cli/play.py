@@ -30,8 +30,8 @@ def _play(options: argparse.Namespace) -> None:
     import gymnasium
 
     from bufgym import policies
-    from bufgym.benchmark.play import Player
     from bufgym.benchmark.run import draw
+    from bufgym.expert import Player
 
     load_policies(options.policy_file)
     (name,) = loaded([options.policies])[0]

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
@@ -222,13 +223,14 @@ class Rows:
         if self.shows_mask:
             info["action_mask"] = self.output.action_mask[i].copy()
         if self.shows_all:
-            info["qoi"] = self.output.qoi.item(i)
-            info["invalid"] = self.senders.batch.senders["invalid"].item(i)
             info["reward_terms"] = dict(zip(self._term_names, terms, strict=True))
-        if ended:
+        if ended or self.shows_all:
+            # "full" has the same entries in every step, as recorders want it.
             info |= {name: number.item() for name, number in self.summary(i).items()}
-            if self.bound:
-                info |= measured(self.senders, i, info["qoi"])
+        if self.bound and ended:
+            info |= measured(self.senders, i, info["qoi"])
+        elif self.bound and self.shows_all:
+            info |= dict.fromkeys(BOUND, math.nan)
         return info
 
     def observation(self, i: int | None = None) -> Observation:

@@ -27,8 +27,8 @@ class Senders:
     """A batch of n senders that share L, B and V, each with an episode of its own.
 
     ``capacity`` (L, messages), ``max_bytes`` (B), ``decide_at``, ``value`` (V) and ``topics`` are the shared settings,
-    ``batch`` the arrays (see ``Batch``), ``episodes`` what each sender has loaded, None for nothing. An episode of one
-    queue may have a V of its own.
+    ``batch`` the arrays (see ``Batch``), ``episodes`` what each sender has loaded, None for nothing, ``begun``,
+    int64[n], how many it has begun. An episode of one queue may have a V of its own.
     """
 
     def __init__(
@@ -57,6 +57,7 @@ class Senders:
         self._topic_table, values = topic_table(self.topics, self.capacity, v)
         self._v_starts = {v.array.tobytes(): 0}
         self.episodes: list[Episode | None] = [None] * n
+        self.begun = np.zeros(n, np.int64)
         self._uniforms: list[np.random.Generator | None] = [None] * n
         self._knots = Knots()
         self.batch = new_batch(n, self.capacity, max_messages, len(self._topic_table), values)
@@ -83,6 +84,7 @@ class Senders:
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
         self.episodes[i], self._uniforms[i] = episode, uniforms
+        self.begun[i] += 1
         load_row(
             self.batch,
             i,

@@ -16,9 +16,9 @@ import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark import perf
-from bufgym.benchmark.play import Player
 from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
+from bufgym.expert import Player
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import run as run_senders
@@ -86,7 +86,6 @@ def test_a_player_in_the_environment_does_what_the_benchmark_does(name: str, sce
     player = Player(policy)
     for row in run([policy], scenario, [3], 2):
         env.reset(options={"episode": draw(scenario, row["seed"])})
-        player.begin()
         ended, info = False, {}
         while not ended:
             _, _, ended, _, info = env.step(player.action(env.rows.senders))

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
-from bufgym.benchmark.play import Player
 from bufgym.errors import BufgymError
+from bufgym.expert import Player
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
@@ -209,7 +209,6 @@ def test_in_an_environment_it_plays_as_it_promises(made):
     mean = 0.0
     for T in range(4, 17):
         env.reset(options={"episode": scenario.episode(T)})
-        player.begin()
         ended, info = False, {}
         while not ended:
             _, _, ended, _, info = env.step(player.action(env.rows.senders))

@@ -9,10 +9,10 @@ import pytest
 
 from bufgym import scenario
 from bufgym.benchmark import run as bench
-from bufgym.benchmark.play import Player
 from bufgym.benchmark.tasks.queue import QueueTask
 from bufgym.envs import SenderEnv
 from bufgym.errors import BufgymError
+from bufgym.expert import Player
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
@@ -103,7 +103,6 @@ def test_a_python_policy_cannot_write(writer: Any) -> None:
 def test_nor_can_a_player(writer: Any) -> None:
     env, player = SenderEnv(Uplink(traces=(EPISODE.link.trace,), size_bytes=200_000), 3), Player(Policy("test", writer))
     env.reset(seed=0)
-    player.begin()
     with pytest.raises(ValueError, match="read-only"):
         for _ in range(9):
             env.step(player.action(env.rows.senders))

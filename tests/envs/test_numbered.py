@@ -14,11 +14,11 @@ from gymnasium.envs.registration import EnvSpec
 
 import bufgym
 from bufgym import policies
-from bufgym.benchmark.play import Player
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.envs import SenderEnv, SenderVectorEnv
 from bufgym.errors import BufgymError
+from bufgym.expert import Player
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Uplink, suites
@@ -96,7 +96,6 @@ def test_the_numbers_of_a_row_lead_to_its_episode(mixed: str, tmp_path: Path) ->
         _, _, ended, _, info = envs.step(np.array(actions))
         for i in np.flatnonzero(ended):
             last[i] = last[i] or {name: info[name][i] for name in ("qoi", "clairvoyant", "regret", "score")}
-            players[rows[i]["policy"]].begin(i)
     for ours, alone in zip(last, infos, strict=True):
         assert ours == pytest.approx({name: alone[name] for name in ours}, nan_ok=True)
 
