@@ -21,6 +21,7 @@ from bufgym.cli import (
     export,
     figures,
     fleet,
+    gallery,
     leaderboard,
     listing,
     perf,
@@ -104,6 +105,7 @@ def _parser() -> argparse.ArgumentParser:
         figures,
         perf,
         play,
+        gallery,
         export,
         warmup,
     ):
