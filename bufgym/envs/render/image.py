@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.render.scene import DROPPED, NEWCOMER, QUEUED, SENDING, STATES, Scene, letter, link_rates, scene_of
+from bufgym.errors import install
 from bufgym.sim import Senders
 
 COLOURS = ("#2a9d5c", "#2f6fde", "#e0a100", "#d1495b", "#8e3bb8")
@@ -64,7 +65,7 @@ def canvas_of(width_px: int = _WIDTH_PX, height_px: int = _HEIGHT_PX) -> tuple[A
         from matplotlib.figure import Figure
     except ImportError as error:
         raise gym.error.DependencyNotInstalled(
-            "render_mode='rgb_array' needs matplotlib: pip install bufgym[plot]"
+            f"render_mode='rgb_array' needs matplotlib: {install('plot')}"
         ) from error
     figure = Figure(figsize=(width_px / _DPI, height_px / _DPI), dpi=_DPI)
     return figure, FigureCanvasAgg(figure)
