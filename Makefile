@@ -65,6 +65,7 @@ tutorials: $(READY)
 
 dist: $(READY)
 	rm -rf dist
+	$(PIP) install --quiet -c constraints.txt -e ".[dist]"
 	$(BIN)/python -m build
 	$(BIN)/python -m twine check --strict dist/*
 

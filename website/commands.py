@@ -29,7 +29,7 @@ def _commands(parser: argparse.ArgumentParser, before: str = "bufgym") -> list[t
 
 def _help(parser: argparse.ArgumentParser) -> str:
     width = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "100"  # where argparse reads the width from
+    os.environ["COLUMNS"] = "84"  # where argparse reads the width from; so much fits beside the menu
     try:
         return parser.format_help().rstrip()
     finally:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bufgym.scenario.suites import SUITES
-from website.markdown import code, table
+from website.markdown import table
 
 WORDS = """
 A suite is a frozen set of episodes that results are quoted on. It has a version in its name and never changes. Its
@@ -27,7 +27,7 @@ def page() -> str:
             suite.kind,
             ", ".join(map(str, suite.capacities)),
             suite.about,
-            code(f"`{suite.needs}`") if suite.needs else "nothing",
+            " and ".join(f"`{files}`" for files in suite.needs.split(" and ")) or "nothing",
         )
         for suite in SUITES.values()
     ]

@@ -11,7 +11,7 @@
 # %%
 import gymnasium as gym
 
-import bufgym  # noqa: F401  (registers the environments)
+import bufgym
 
 env = gym.make("bufgym/Interruption-v0", capacity=8, t_max=200)
 observation, info = env.reset(seed=0)

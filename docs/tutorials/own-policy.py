@@ -53,4 +53,8 @@ episode = draw(fading, seed=0)
 gallery.save(gallery.play(names, episode, 8, fading), episode, "own-policy.png", "A fading link, L = 8")
 
 # %% [markdown]
+# The policy thins one interruption evenly, but here it is hardly better than `drop-oldest`: while the link is slow,
+# messages leave at the head, and its place in the queue no longer fits. AFR moves its place with every departure. Give
+# `register` an `on_departure(buffer, memory)` that does the same, and try again.
+#
 # ![What the server saw under each policy](own-policy.png)
