@@ -286,4 +286,6 @@ def test_sb3_without_its_extra_names_it() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=REPO, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("bufgym.sb3 needs ") and "stable-baselines3" in done.stdout.partition("pip install ")[2]
+    assert (
+        done.stdout.startswith("bufgym.sb3 needs ") and "stable-baselines3" in done.stdout.partition("pip install ")[2]
+    )

@@ -15,7 +15,7 @@ import bufgym
 from bufgym import policies
 from bufgym.observe import FIELDS, TOPIC_FIELDS
 from bufgym.scenario.suites import SUITES
-from website import commands, environments, markdown, papers, suites, tutorials
+from website import cards, commands, environments, markdown, papers, suites, tutorials
 from website import policies as policy_page
 
 REPO = Path(__file__).resolve().parent.parent
@@ -63,6 +63,15 @@ def test_suites_and_commands_are_all_there() -> None:
     page = commands.page()
     assert "## bench\n" in page
     assert page.count("```text\nusage: bufgym") == page.count("\n## ") + page.count("\n### ")
+
+
+def test_cards_show_the_numbers_of_the_results() -> None:
+    page = cards.page()
+    motion = {suite: rest for suite, *rest in cards.scores(cards.CARDS["learned-motion"])}
+    assert motion["interruption-v1"] == ["0.51 [0.47, 0.55]", "0.982 [0.980, 0.983]", "0.965 [0.962, 0.967]"]
+    assert set(motion) == {"interruption-v1", "lte-v1", "outage-v1", "sustained-v1", "lte-belgium-v1"}
+    assert {name for name in policies.names() if name.startswith("learned-")} == set(cards.CARDS)
+    assert "python train.py --suite topics-v1" in page
 
 
 def test_every_paper_that_a_policy_names_is_in_the_list() -> None:

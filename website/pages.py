@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from website import commands, environments, papers, policies, suites
+from website import cards, commands, environments, papers, policies, suites
 
 
 def made() -> dict[str, str]:
@@ -10,6 +10,7 @@ def made() -> dict[str, str]:
     return {
         **environments.made(),
         "policies.md": policies.page(),
+        "cards.md": cards.page(),
         "suites.md": suites.page(),
         "commands.md": commands.page(),
         "papers.md": papers.page(),
