@@ -1,4 +1,4 @@
-"""What README and the guide tell users to type is there; policies run and tables come out as printed."""
+"""What README, start page and guide tell users to type is there; policies run and tables come out as printed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from bufgym import cli, policies, reproduce
 from bufgym.cli import main
 
 REPO = Path(__file__).resolve().parent.parent
-README = "\n".join((REPO / name).read_text(encoding="utf-8") for name in ("README.md", "docs/guide.md"))
+PAGES = ("README.md", "CONTRIBUTING.md", "docs/index.md", "docs/concepts.md", "docs/guide.md")
+README = "\n".join((REPO / name).read_text(encoding="utf-8") for name in PAGES)
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 SITE = re.findall(r"[\w/-]+\.md", (REPO / "mkdocs.yml").read_text(encoding="utf-8"))
 SPANS = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", README, flags=re.MULTILINE | re.DOTALL))
@@ -65,6 +66,25 @@ def test_policies_run_as_printed(
         assert f"\n{name} " in shown and "invalid" not in shown
     finally:
         policies.registry._REGISTRY.pop(name, None)
+
+
+@pytest.mark.slow
+def test_a_new_user_can_follow_start_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    text = (REPO / "docs" / "index.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    commands = [block.split()[1:] for language, block in blocks if not language and block.startswith("bufgym ")]
+    assert [words[0] for words in commands] == ["play", "gallery", "bench"]
+    for words in commands:
+        assert main([*words, *(["--speed", "0", "--steps", "20"] if words[0] == "play" else [])]) == 0
+    assert (tmp_path / "gallery" / "interruption.webp").exists()
+    shown = capsys.readouterr().out
+    (program,) = (block for language, block in blocks if language == "python")
+    exec(compile(program, "index.md", "exec"), {})
+    assert "decision 20" in shown and re.fullmatch(r"[\d.]+ \d+\n", capsys.readouterr().out)
 
 
 @pytest.mark.slow

@@ -91,7 +91,8 @@ def page(id: str) -> str:
     lines = [f"# {title(id)}", f"{about(id)[0].upper()}{about(id)[1:]}.", *_films(id), code(intro), _make(id)]
     lines += ["## Action", code(parts.get("Action", "") or parts["Action, observation"])]
     if topics:
-        lines += [code(parts["Several topics"])]
+        asked = re.sub(r"^\([^)]*\): ", "", parts["Several topics"])
+        lines += [code(asked[:1].upper() + asked[1:])]
     lines += ["## Observation", code(of_one["Observation"])]
     lines += ["Every field lies in [0, 1]. r is a reference: the field is 0.5 where the quantity is as large as r."]
     lines += [_fields(topics)]
