@@ -22,7 +22,7 @@ _SHADE, _HALF_SHADE_S = 0.4, 1.0
 """A gap of g s between messages received is shaded by _SHADE g / (g + _HALF_SHADE_S)."""
 _SHADED_S = 0.1
 """Shorter gaps stay white."""
-_NAMED_SHARE = 0.13
+_NAMED_SHARE = 0.16
 """Gaps that take more of the lane have room for a label."""
 
 
