@@ -12,13 +12,18 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 .DEFAULT_GOAL := help
-.PHONY: help train test fuzz claims format clean
+.PHONY: help train test fuzz claims docs gallery tutorials dist install-matrix format clean
 
 help:
 	@echo "make train    set up if needed, then train an agent        (ARGS=... go to train.py)"
 	@echo "make test     set up if needed, then check everything      (PYTEST_ARGS=... go to pytest)"
 	@echo "make fuzz     set up if needed, then feed it broken files, command lines and random episodes (nightly)"
 	@echo "make claims   set up if needed, then test every claim of the papers (nightly; DATA=folder of recordings)"
+	@echo "make docs     set up if needed, then build the site to build/site"
+	@echo "make gallery  set up if needed, then draw the films and the interactive page in docs/ again"
+	@echo "make tutorials    set up if needed, then run the tutorials and draw their pictures again"
+	@echo "make dist     set up if needed, then build and check wheel and sdist in dist/"
+	@echo "make install-matrix    install the wheel for each Python, with the newest and oldest dependencies (nightly)"
 	@echo "make format   set up if needed, then format and fix what can be fixed"
 	@echo "make clean    remove caches and build products; keeps .venv and results"
 	@echo ""
@@ -44,6 +49,29 @@ claims: $(READY)
 	mkdir -p build
 	$(BIN)/python -m bufgym reproduce --claims build/claims.md $(if $(DATA),--data $(DATA))
 	diff docs/claims.md build/claims.md
+
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo "build/site/index.html"
+
+gallery: $(READY)
+	$(BIN)/bufgym gallery all --out docs/gallery --interactive docs/interactive.html
+
+# Each draws its picture beside itself.
+tutorials: $(READY)
+	for page in docs/tutorials/*.py; do \
+	  (cd docs/tutorials && ../../$(BIN)/python $$(basename $$page)) || exit 1; done
+	rm -f docs/tutorials/*.csv
+
+dist: $(READY)
+	rm -rf dist
+	$(PIP) install --quiet -c constraints.txt -e ".[dist]"
+	$(BIN)/python -m build
+	$(BIN)/python -m twine check --strict dist/*
+
+# For the night: every Python that is here, each with the newest dependencies and with the oldest that pyproject allows.
+install-matrix: dist
+	.ci/install-matrix
 
 format: $(READY)
 	$(BIN)/ruff format .

@@ -9,7 +9,7 @@ envs = gym.make_vec("bufgym/Uplink-v0", num_envs=1024, capacity=8)
 
 import gymnasium as _gym
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 ENVIRONMENTS = {
     "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)"),

@@ -6,7 +6,9 @@ Anything else that escapes is a bug of bufgym.
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
+import re
 import traceback
 from os import PathLike
 
@@ -80,3 +82,29 @@ def line_in(error: Exception, file: str) -> str | None:
         if os.path.abspath(frame.f_code.co_filename) == os.path.abspath(file)
     ]
     return f"{file}, line {lines[-1]}" if lines else None
+
+
+def install(extra: str) -> str:
+    """The command that installs what an optional part needs.
+
+    It names the packages of the extra, and so works from a checkout and beside an installed bufgym alike: both carry
+    the list, and no package index need know bufgym.
+    """
+    try:
+        packages = _packages(importlib.metadata.requires("bufgym") or [], extra)
+    except importlib.metadata.PackageNotFoundError:  # a source tree that was never installed
+        packages = []
+    quoted = [name if re.fullmatch(r"[\w.-]+", name) else f'"{name}"' for name in packages]
+    return f"pip install {' '.join(quoted)}" if packages else f'pip install -e ".[{extra}]"'
+
+
+def _packages(requirements: list[str], extra: str) -> list[str]:
+    """What the extra asks for, with what the extras of bufgym's own that it names ask for."""
+    found: list[str] = []
+    for requirement in requirements:
+        package, _, condition = requirement.partition(";")
+        if not re.search(rf"""extra == ['"]{re.escape(extra)}['"]""", condition):
+            continue
+        own = re.fullmatch(r"bufgym\[([\w,-]+)\]", package.strip())
+        found += [name for e in own[1].split(",") for name in _packages(requirements, e)] if own else [package.strip()]
+    return found

@@ -34,12 +34,13 @@ ROOMS = [
     "sb3",
     "benchmark",
     "reproduce",
+    "gallery",
     "cli",
     "__main__",
 ]
 """The rooms of the house, top to bottom. Each imports only from itself and from rooms above it."""
 
-OUTSIDE = {"agents", "train", "tests"}
+OUTSIDE = {"agents", "train", "tests", "website"}
 """What imports bufgym, and is never imported by it."""
 
 TRAINING = [
@@ -247,8 +248,9 @@ def test_the_path_check_finds_what_it_should(top: str) -> None:
 def test_one_version_everywhere() -> None:
     import bufgym  # here, so that a package that is broken fails this test alone
 
-    version = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
-    assert bufgym.__version__ == version
+    version = bufgym.__version__
+    settings = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))
+    assert settings["tool"]["hatch"]["version"]["path"] == "bufgym/__init__.py"
     assert f"\nversion: {version}\n" in (REPO / "CITATION.cff").read_text(encoding="utf-8")
     try:
         installed = importlib.metadata.version("bufgym")
@@ -287,4 +289,6 @@ def test_sb3_without_its_extra_names_it() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=REPO, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("bufgym.sb3 needs ") and 'pip install "bufgym[train]"' in done.stdout
+    assert (
+        done.stdout.startswith("bufgym.sb3 needs ") and "stable-baselines3" in done.stdout.partition("pip install ")[2]
+    )

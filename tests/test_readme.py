@@ -1,4 +1,4 @@
-"""What README and the guide tell users to type is there; policies run and tables come out as printed."""
+"""What README, start page and guide tell users to type is there; policies run and tables come out as printed."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from bufgym import cli, policies, reproduce
 from bufgym.cli import main
 
 REPO = Path(__file__).resolve().parent.parent
-README = "\n".join((REPO / name).read_text(encoding="utf-8") for name in ("README.md", "docs/guide.md"))
+PAGES = ("README.md", "CONTRIBUTING.md", "docs/index.md", "docs/concepts.md", "docs/guide.md")
+README = "\n".join((REPO / name).read_text(encoding="utf-8") for name in PAGES)
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+SITE = re.findall(r"[\w/-]+\.md", (REPO / "mkdocs.yml").read_text(encoding="utf-8"))
 SPANS = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", README, flags=re.MULTILINE | re.DOTALL))
 
 
@@ -67,6 +69,25 @@ def test_policies_run_as_printed(
 
 
 @pytest.mark.slow
+def test_a_new_user_can_follow_start_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    text = (REPO / "docs" / "index.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    commands = [block.split()[1:] for language, block in blocks if not language and block.startswith("bufgym ")]
+    assert [words[0] for words in commands] == ["play", "gallery", "bench"]
+    for words in commands:
+        assert main([*words, *(["--speed", "0", "--steps", "20"] if words[0] == "play" else [])]) == 0
+    assert (tmp_path / "gallery" / "interruption.webp").exists()
+    shown = capsys.readouterr().out
+    (program,) = (block for language, block in blocks if language == "python")
+    exec(compile(program, "index.md", "exec"), {})
+    assert "decision 20" in shown and re.fullmatch(r"[\d.]+ \d+\n", capsys.readouterr().out)
+
+
+@pytest.mark.slow
 def test_the_table_is_what_its_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
     text = (REPO / "README.md").read_text(encoding="utf-8")
     command, table = re.findall(r"```\n(bufgym bench --policies [^\n]*)\n```\n\n```\n(.*?)```", text, re.DOTALL)[0]
@@ -83,5 +104,6 @@ def test_links_lead_somewhere(page: str) -> None:
     for target in re.findall(r"\]\(([^)]+)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL)):
         path, _, anchor = target.partition("#")
         if not target.startswith("http"):
-            assert not path or ((REPO / page).parent / path).exists(), target
+            # Pages that the site makes from the code are in its menu; tests/test_site.py builds it.
+            assert not path or path in SITE or ((REPO / page).parent / path).exists(), target
             assert not anchor or anchor in anchors, target

@@ -13,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 
 BACKENDS = ("loky", "threading", "sequential", "ray", "dask")
 
@@ -93,4 +93,4 @@ def _imported(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise BufgymError(f'{module} is missing: pip install "bufgym[{extra}]"') from None
+        raise BufgymError(f"{module} is missing: {install(extra)}") from None

@@ -9,7 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 from bufgym.files import replaced
 from bufgym.sim.metrics import Outcome
 
@@ -131,5 +131,5 @@ def _pyarrow() -> tuple[Any, Any]:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise BufgymError('Parquet files need pyarrow: pip install "bufgym[bench]" (or write .csv)') from None
+        raise BufgymError(f"Parquet files need pyarrow: {install('bench')} (or write .csv)") from None
     return pyarrow, pyarrow.parquet

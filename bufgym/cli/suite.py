@@ -18,7 +18,7 @@ from bufgym.cli.options import (
     policies_option,
     policy_file,
 )
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 
 if TYPE_CHECKING:
     from bufgym.benchmark.rows import Row
@@ -62,7 +62,7 @@ def target(options: argparse.Namespace) -> Path | None:
     from bufgym.benchmark.rows import checked_target, has_pyarrow
 
     if options.format == "parquet" and options.out is not None and not has_pyarrow():
-        raise BufgymError('--format parquet needs pyarrow: pip install "bufgym[bench]" (or --format csv)')
+        raise BufgymError(f"--format parquet needs pyarrow: {install('bench')} (or --format csv)")
     if options.out is None or not Path(options.out).suffix[1:].isalpha() or Path(options.out).is_dir():
         return None
     file = checked_target(options.out)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from bufgym.cli import trace_bags, trace_fetch, trace_fit, trace_generate
 from bufgym.cli.options import Commands, columns, command
-from bufgym.errors import BufgymError, TraceError, printable
+from bufgym.errors import BufgymError, TraceError, install, printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -150,7 +150,7 @@ def _plot(options: argparse.Namespace) -> None:
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise BufgymError('drawing needs matplotlib: pip install "bufgym[plot]"') from None
+        raise BufgymError(f"drawing needs matplotlib: {install('plot')}") from None
     out = Path(options.out)
     if out.suffix not in _PICTURES:
         raise BufgymError(f"--out {out}: must end in {', '.join(_PICTURES[:-1])} or {_PICTURES[-1]}")

@@ -11,7 +11,7 @@ from bufgym import oracle  # noqa: F401  (registers the clairvoyant, so that it 
 from bufgym.envs.fleet_vec import FleetVecEnv
 from bufgym.envs.single import SenderEnv
 from bufgym.envs.vector import SenderVectorEnv
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 
 if TYPE_CHECKING:
     from bufgym.envs.fleet import FleetEnv, parallel_env
@@ -27,5 +27,5 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != "pettingzoo":
             raise
-        raise BufgymError(f'{name} needs pettingzoo: pip install "bufgym[fleet]"') from None
+        raise BufgymError(f"{name} needs pettingzoo: {install('fleet')}") from None
     return getattr(fleet, name)

@@ -29,7 +29,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 
 Content = dict[str, Any]
 """A message's fields by the names of ROS 2; nested messages are Contents, or lists of them, arrays are numpy's."""
@@ -290,7 +290,7 @@ def _library(name: str) -> Any:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
         extra = "ros" if name.startswith("rosbags") else "robofleet"
-        raise BufgymError(f'encoding messages needs {error.name}: pip install "bufgym[{extra}]"') from None
+        raise BufgymError(f"encoding messages needs {error.name}: {install(extra)}") from None
 
 
 def _kind(kind: str) -> tuple[str, Callable[..., Content]]:

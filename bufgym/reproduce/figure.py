@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 from bufgym.reproduce.rows import Rows
 
 COLOURS = {
@@ -166,7 +166,7 @@ def save_picture(reproduction: Figure, rows: Rows, path: Path) -> Path:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure as Picture
     except ImportError:
-        raise BufgymError("drawing needs matplotlib: pip install 'bufgym[plot]'") from None
+        raise BufgymError(f"drawing needs matplotlib: {install('plot')}") from None
     # Not through pyplot: no window, no state that outlives the file.
     picture = Picture(figsize=reproduction.size_inches(rows), layout="constrained")
     FigureCanvasAgg(picture)

@@ -9,7 +9,7 @@
 ``export`` (or ``bufgym export``) writes a slot network to a file that bufgym runs without torch.
 """
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 
 try:
     from bufgym.sb3.export import export, weights_of
@@ -19,7 +19,7 @@ try:
 except ModuleNotFoundError as error:
     if (error.name or "").split(".")[0] not in ("stable_baselines3", "sb3_contrib", "torch"):
         raise
-    raise BufgymError(f'bufgym.sb3 needs {error.name}: pip install "bufgym[train]"') from None
+    raise BufgymError(f"bufgym.sb3 needs {error.name}: {install('train')}") from None
 
 __all__ = [
     "GymVecEnv",

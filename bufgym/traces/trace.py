@@ -200,7 +200,9 @@ class Trace:
         Args:
             interval_us: int64[K-1], length of each interval in microseconds, > 0.
             bytes_in_interval: int64[K-1], bytes transmitted in each, >= 0.
-            name, after, source: those of the trace.
+            name: that of the trace.
+            after: what follows its end.
+            source: where it comes from, in words.
         """
         lengths = _whole_numbers(interval_us, "interval_us")
         counts = _whole_numbers(bytes_in_interval, "bytes_in_interval")

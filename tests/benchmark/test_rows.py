@@ -155,6 +155,6 @@ def test_a_file_that_is_not_there_is_an_ordinary_error(tmp_path: Path) -> None:
 
 def test_parquet_without_pyarrow_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)  # importing it now fails
-    with pytest.raises(BufgymError, match=r'pip install "bufgym\[bench\]" \(or write \.csv\)'):
+    with pytest.raises(BufgymError, match=r"pip install .*pyarrow.* \(or write \.csv\)"):
         write_rows(HARD, tmp_path / "rows.parquet")
     assert list(tmp_path.iterdir()) == []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 import sys
 from typing import Any
 
@@ -17,7 +18,7 @@ pytest.importorskip("flatbuffers", reason="extra robofleet")
 from flatbuffers import number_types as fbtypes
 from flatbuffers.table import Table
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 from bufgym.reproduce import encodings, run
 from bufgym.reproduce.encodings import ENCODINGS, KINDS, content, encode, sizes, stores
 from bufgym.reproduce.robofleet_table1 import PAPER, Reproduction, fitted, of_paper
@@ -350,7 +351,7 @@ def test_without_the_library_the_extra_is_named(
 ) -> None:
     stores.cache_clear()
     monkeypatch.setitem(sys.modules, library, None)  # None there makes the import fail
-    with pytest.raises(BufgymError, match=rf"needs {library}: pip install \"bufgym\[{extra}\]\""):
+    with pytest.raises(BufgymError, match=re.escape(f"needs {library}: {install(extra)}")):
         encode("PoseStamped", content("PoseStamped"), encoding)
     assert len(encode("PoseStamped", content("PoseStamped"), "json")) > 0  # which needs neither
 

@@ -14,7 +14,7 @@ from bufgym.benchmark.report.charts import Chart, Context
 from bufgym.benchmark.report.timeline import timeline
 from bufgym.benchmark.score import DISCRIMINATIVE, CellScore
 from bufgym.benchmark.summary import Summary, title
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 
 CHARTS = (charts.ranking, charts.capacities, charts.outages, costs.delays, timeline, costs.memory)
 """Each is None where the run has nothing to show in it."""
@@ -74,7 +74,7 @@ def _libraries() -> tuple[Any, Any, str]:
         import plotly.graph_objects as graphs
         from plotly.offline import get_plotlyjs
     except ImportError:
-        raise BufgymError('the report needs plotly and Jinja: pip install "bufgym[report]"') from None
+        raise BufgymError(f"the report needs plotly and Jinja: {install('report')}") from None
     return jinja2, graphs, get_plotlyjs()
 
 

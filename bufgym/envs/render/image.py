@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.render.scene import DROPPED, NEWCOMER, QUEUED, SENDING, STATES, Scene, letter, link_rates, scene_of
+from bufgym.errors import install
 from bufgym.sim import Senders
 
 COLOURS = ("#2a9d5c", "#2f6fde", "#e0a100", "#d1495b", "#8e3bb8")
@@ -57,21 +58,21 @@ def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:
     return pixels(canvas)
 
 
-def canvas_of() -> tuple[Any, Any]:
-    """(figure, canvas) of 800 x 400 pixels; DependencyNotInstalled without matplotlib."""
+def canvas_of(width_px: int = _WIDTH_PX, height_px: int = _HEIGHT_PX) -> tuple[Any, Any]:
+    """(figure, canvas) of so many pixels; DependencyNotInstalled without matplotlib."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
         raise gym.error.DependencyNotInstalled(
-            "render_mode='rgb_array' needs matplotlib: pip install bufgym[plot]"
+            f"render_mode='rgb_array' needs matplotlib: {install('plot')}"
         ) from error
-    figure = Figure(figsize=(_WIDTH_PX / _DPI, _HEIGHT_PX / _DPI), dpi=_DPI)
+    figure = Figure(figsize=(width_px / _DPI, height_px / _DPI), dpi=_DPI)
     return figure, FigureCanvasAgg(figure)
 
 
 def pixels(canvas: Any) -> NDArray[np.uint8]:
-    """What is drawn there, uint8[400, 800, 3]."""
+    """What is drawn there, uint8[height, width, 3]."""
     canvas.draw()
     return np.asarray(canvas.buffer_rgba(), np.uint8)[..., :3].copy()
 

@@ -26,7 +26,7 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 from bufgym.traces.formats.bag_files import MAX_TOPICS, SOURCES
 from bufgym.traces.formats.bag_poses import PoseCollector
 from bufgym.traces.formats.faults import StrPath, fault, os_errors
@@ -151,7 +151,7 @@ def _damage_errors(path: StrPath) -> Iterator[None]:
     except BufgymError:
         raise
     except ModuleNotFoundError as error:
-        raise BufgymError(f'{path}: reading recordings needs {error.name}: pip install "bufgym[ros]"') from None
+        raise BufgymError(f"{path}: reading recordings needs {error.name}: {install('ros')}") from None
     except Exception as error:
         # Parsers of binary formats raise nearly anything on bytes that are not what they should be.
         words = " ".join(str(error).split()) or "no more data"

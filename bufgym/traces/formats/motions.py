@@ -27,7 +27,8 @@ def read_motion(
     Args:
         path: the file.
         settings: how the motion of a trajectory is measured, by default `MotionSettings()`.
-        format, times: of a trajectory, see `trajectories.read_poses`.
+        format: of a trajectory, see `trajectories.read_poses`.
+        times: of a trajectory, likewise.
 
     Raises:
         TraceError: the file cannot be read, or a line breaks a rule of its format. The message names the file, the

@@ -1,0 +1,44 @@
+"""Does an installed bufgym work? An episode, a benchmark, an error. With ``--oldest FILE``: the oldest dependencies.
+
+Needs nothing but bufgym and what it brings.
+"""
+
+import re
+import sys
+import tomllib
+
+
+def oldest(pyproject: str) -> list[str]:
+    """Each dependency at the lowest version that the file allows."""
+    with open(pyproject, "rb") as file:
+        dependencies = tomllib.load(file)["project"]["dependencies"]
+    found = [re.fullmatch(r"([\w-]+)>=([\d.]+).*", dependency) for dependency in dependencies]
+    without = [dependency for dependency, match in zip(dependencies, found, strict=True) if match is None]
+    if without:
+        raise SystemExit(f"{pyproject}: no lowest version: {', '.join(without)}")
+    return [f"{match[1]}=={match[2]}" for match in found if match]
+
+
+def check() -> None:
+    """Play an episode and compare two policies."""
+    import gymnasium as gym
+
+    import bufgym
+    from bufgym.cli import main
+
+    env = gym.make("bufgym/Uplink-v0", capacity=4, duration_s=5.0)
+    _, info = env.reset(seed=0)
+    ended = False
+    while not ended:
+        _, _, ended, _, info = env.step(env.action_space.sample(info["action_mask"]))
+    assert info["arrived"] == info["delivered"] + info["dropped"] == 150, info
+    assert main(["bench", "--policies", "learned-motion,afr,drop-oldest", "--seconds", "5", "--seeds", "1"]) == 0
+    assert main(["report", "nowhere"]) == 2
+    print(f"bufgym {bufgym.__version__} on Python {sys.version.split()[0]}")
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--oldest"]:
+        print("\n".join(oldest(sys.argv[2])))
+    else:
+        check()

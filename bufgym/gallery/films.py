@@ -1,0 +1,173 @@
+"""The films of the gallery, by name, and how they are written: animated WebP of at most 300 kB each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import policies
+from bufgym.benchmark.play import Player
+from bufgym.benchmark.run import draw
+from bufgym.envs import SenderEnv
+from bufgym.envs.render.image import COLOURS, canvas_of, pixels
+from bufgym.errors import BufgymError, install
+from bufgym.gallery import comparison
+from bufgym.gallery.played import fading, play
+from bufgym.scenario import Episode, Interruption, Scenario, get, suites
+from bufgym.scenario.numbered import numbered
+
+Frames = Iterator[NDArray[np.uint8]]
+
+FRAME_MS, LAST_MS = 140, 2500
+"""How long each image is shown, and the last one."""
+MAX_BYTES = 300_000
+"""Of a film."""
+_COLOURS = 48
+"""The films are line art: so many colours are enough."""
+_COUNT = 24
+"""Images of a film that an environment renders."""
+QUEUE = ("drop-oldest", "afr", "min-motion-gap", "learned-motion")
+"""The policies that are shown on one queue."""
+
+
+class Film(NamedTuple):
+    """One film."""
+
+    environment: str
+    """The environment whose episode it shows."""
+    about: str
+    """What there is to see."""
+    frames: Callable[[], Frames]
+    """Makes its images."""
+
+
+def write_film(name: str, folder: Path) -> Path:
+    """Write the film to ``folder/name.webp`` and return that path; BufgymError for an unknown name."""
+    if name not in FILMS:
+        raise BufgymError(f"unknown film {name!r}; known: {', '.join(FILMS)}")
+    try:
+        from PIL import Image
+    except ImportError:
+        raise BufgymError(f"the gallery needs Pillow, which comes with matplotlib: {install('plot')}") from None
+    pictures = [Image.fromarray(frame) for frame in FILMS[name].frames()]
+    palette = _palette(pictures)
+    pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE).convert("RGB") for picture in pictures]
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.webp"
+    durations = [FRAME_MS] * (len(pictures) - 1) + [LAST_MS]
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, lossless=True, method=4
+    )
+    return path
+
+
+def _palette(pictures: Sequence[Any]) -> Any:
+    """One palette for all images, so that nothing flickers: of the middle and the last one, and of each state."""
+    from PIL import Image
+
+    width, height = pictures[-1].size
+    sample = Image.new("RGB", (width, 2 * height + 40 * len(COLOURS)), "white")
+    sample.paste(pictures[len(pictures) // 2], (0, 0))
+    sample.paste(pictures[-1], (0, height))
+    for k, colour in enumerate(COLOURS):
+        sample.paste(Image.new("RGB", (width, 40), colour), (0, 2 * height + 40 * k))
+    return sample.quantize(_COLOURS, method=Image.Quantize.MEDIANCUT)
+
+
+def _compared(names: Sequence[str], episode: Episode, scenario: Scenario, title: str) -> Frames:
+    return comparison.frames(play(names, episode, 8, scenario), episode, title)
+
+
+def _readme() -> Frames:
+    scenario = fading()
+    title = "The link fades; the send buffer holds 8 messages. What does the server see?"
+    return _compared(("drop-oldest", "learned-motion"), draw(scenario, 0), scenario, title)
+
+
+def _uplink() -> Frames:
+    scenario = get("lte", duration_s=20.0, scale=(0.7,))
+    episode = numbered(scenario, seed=1, trace="lte-synthetic-5")
+    return _compared(QUEUE, episode, scenario, "A camera on a driving robot over LTE, L = 8")
+
+
+def _interruption() -> Frames:
+    scenario = Interruption(law="fixed", t_max=60)
+    title = "One interruption of 60 messages, L = 8: nobody knows how long it will last"
+    return _compared(QUEUE, draw(scenario, 0), scenario, title)
+
+
+def _suite() -> Frames:
+    scenario = suites.get("outage-v1").settings("test")["outage-10s"].scenario
+    return _compared(QUEUE, draw(scenario, 0), scenario, "An episode of the suite outage-v1, L = 8")
+
+
+def _topics() -> Frames:
+    scenario = get("topics", duration_s=20.0)
+    episode = draw(scenario, 0)
+    films = [_rendered_topics(name, episode) for name in ("robofleet", "learned-scheduler")]
+    return _stacked(("robofleet", "learned-scheduler"), films)
+
+
+def _rendered_topics(name: str, episode: Episode) -> list[NDArray[np.uint8]]:
+    """Images of ``bufgym/Topics-v0`` at even times while this policy plays."""
+    env = SenderEnv("topics", 32, duration_s=20.0, render_mode="rgb_array", info="none")
+    senders, player = env.rows.senders, Player(policies.get(name))
+    env.reset(options={"episode": episode})
+    times_us = np.linspace(0, int(episode.arrivals["arrival_us"][-1]), _COUNT + 1)[1:].tolist()
+    pictures: list[NDArray[np.uint8]] = []
+    ended = False
+    while not ended:
+        ended = env.step(player.action(senders))[2]
+        while len(pictures) < _COUNT and (ended or senders.batch.senders[0]["now_us"] >= times_us[len(pictures)]):
+            pictures.append(env.render())
+    return pictures
+
+
+def _fleet() -> Frames:
+    titles, films = zip(*map(_rendered_cell, ("drop-oldest", "learned-motion")), strict=True)
+    return _stacked(titles, films)
+
+
+def _rendered_cell(name: str) -> tuple[str, list[NDArray[np.uint8]]]:
+    """A title with how it ends, and images of ``FleetEnv`` while every robot plays this policy."""
+    from bufgym.envs import parallel_env
+
+    env = parallel_env(robots=8, capacity=8, duration_s=12.0, scale=(0.7,), info="none", render_mode="rgb_array")
+    env.reset(seed=1)
+    player, senders, ticks = Player(policies.get(name), 8), env.rows.senders, 12 * 30
+    shown = set(np.linspace(ticks / _COUNT, ticks, _COUNT).astype(int).tolist())
+    pictures = []
+    for tick in range(1, ticks + 1):
+        env.step({agent: player.action(senders, i) for i, agent in enumerate(env.agents)})
+        if tick in shown:
+            pictures.append(env.render())
+    h = float(env.rows.summary(slice(None))["qoi"].mean())
+    return f"{name}: H = {h:.2f} in the end, mean over the robots", pictures
+
+
+def _stacked(names: Sequence[str], films: Sequence[Sequence[NDArray[np.uint8]]]) -> Frames:
+    """The films one below the other, each with its policy's name."""
+    for pictures in zip(*films, strict=True):
+        yield np.concatenate([_titled(name, picture) for name, picture in zip(names, pictures, strict=True)])
+
+
+def _titled(name: str, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    figure, canvas = canvas_of(picture.shape[1], 24)
+    figure.text(0.012, 0.45, name, fontsize=10.5, weight="bold", va="center")
+    return np.concatenate([pixels(canvas), picture])
+
+
+FILMS: dict[str, Film] = {
+    "fading-link": Film(
+        "bufgym/Uplink-v0", "a link fades and comes back: Drop Oldest beside the learned agent", _readme
+    ),
+    "interruption": Film("bufgym/Interruption-v0", "one interruption: which messages stay queued", _interruption),
+    "uplink": Film("bufgym/Uplink-v0", "a camera on a driving robot over LTE", _uplink),
+    "suite": Film("bufgym/Suite-v0", "a blackout of ten seconds, from the suite outage-v1", _suite),
+    "topics": Film("bufgym/Topics-v0", "eight topics over one uplink: Robofleet beside the learned scheduler", _topics),
+    "fleet": Film("bufgym_fleet_v0", "eight robots share one cell: Drop Oldest beside the learned agent", _fleet),
+}

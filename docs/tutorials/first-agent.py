@@ -1,0 +1,76 @@
+# %% [markdown]
+# # 1. Your first agent
+#
+# In this tutorial you train an agent that decides what to drop, compare it with fixed policies, and look at what the
+# server sees. It needs the extras `train` and `plot`; `make train` has set up both.
+#
+# ## The environment
+#
+# A camera sends 30 images a second. The link stops for T images, and nobody knows T. The buffer holds L = 8.
+
+# %%
+import gymnasium as gym
+
+import bufgym
+
+env = gym.make("bufgym/Interruption-v0", capacity=8, t_max=200)
+observation, info = env.reset(seed=0)
+print(env.action_space)  # evict slot 0..7, reject, accept
+print(sorted(observation))
+
+# %% [markdown]
+# Every number in the observation lies in [0, 1]. The mask says which actions are valid now: the buffer is still empty,
+# so nothing can be evicted.
+
+# %%
+print(info["action_mask"])
+
+# %% [markdown]
+# ## Training
+#
+# `make_vec_env` gives stable-baselines3 a native batch: one compiled step for all environments. `SlotPolicy` scores
+# each queued message with one small network, so what it learns does not depend on L.
+
+# %%
+from sb3_contrib import MaskablePPO
+
+from bufgym.sb3 import SlotPolicy, as_policy, make_vec_env
+
+envs = make_vec_env("bufgym/Interruption-v0", 64, seed=0, capacity=8, t_max=200)
+model = MaskablePPO(SlotPolicy, envs, n_steps=128, batch_size=2048, n_epochs=4, learning_rate=3e-3, gamma=1.0, seed=0)
+model.learn(65_536)
+
+# %% [markdown]
+# ## Comparing
+#
+# `as_policy` makes the model a policy like any other. All policies meet the same episodes.
+
+# %%
+from bufgym import policies
+from bufgym.benchmark import run, table
+from bufgym.scenario import Interruption
+
+mine = as_policy(model, "my-agent")
+scenario = Interruption(t_max=200)
+chosen = [mine, *map(policies.get, ("learned-motion", "afr", "drop-oldest"))]
+rows = run.run(chosen, scenario, capacities=[8], seeds=20)
+print(table.plain(rows))
+
+# %% [markdown]
+# The agent is trained for seconds only. `make train` trains longer, and the [guide](../guide.md#training) says how the
+# shipped agents were made.
+#
+# ## What did the server see?
+
+# %%
+from bufgym import gallery
+from bufgym.scenario.numbered import draw
+
+one = Interruption(law="fixed", t_max=60)
+episode = draw(one, seed=0)
+gallery.save(
+    gallery.play([mine, "afr", "drop-oldest"], episode, 8, one), episode, "first-agent.png", "60 messages, L = 8"
+)
+
+# %% [markdown]
+# ![What the server saw of one interruption](first-agent.png)

@@ -1,0 +1,60 @@
+# %% [markdown]
+# # 3. Your own policy
+#
+# A policy is one function. It sees the buffer and the newcomer, and says which slot to evict, or `REJECT`, or `ACCEPT`.
+# Here is one that keeps the queue even: when the buffer is full, it drops every second message in turn.
+
+# %%
+from bufgym.policies import ACCEPT, REJECT, register
+
+
+@register("every-second", memory={"slot": 0})
+def every_second(buffer, arrival, memory):
+    "A full queue evicts slots 1, 3, 5, ... in turn; after a pass it rejects one newcomer and begins again."
+    if len(buffer.slots) < buffer.capacity:
+        return ACCEPT
+    slot = 1 + int(memory[0])
+    if slot >= len(buffer.slots):
+        memory[0] = 0
+        return REJECT
+    memory[0] += 1  # the slots behind move up by one, so the next odd one is one further
+    return slot
+
+
+# %% [markdown]
+# `memory` is the policy's own state, fresh for each episode. Settings go into `parameters={"name": number}` and are
+# read as `buffer.parameters`. With `compile=True` the same function runs compiled.
+#
+# ## Against the others
+
+# %%
+from bufgym import policies, scenario
+from bufgym.benchmark import run, table
+
+names = ["every-second", "min-motion-gap", "afr", "drop-oldest"]
+rows = run.run([policies.get(name) for name in names], scenario.get("lte", duration_s=20.0), capacities=[8], seeds=2)
+print(table.plain(rows))
+
+# %% [markdown]
+# Put the function into a file, and every command takes it:
+#
+# ```
+# bufgym bench --policy-file mine.py --policies every-second,afr,drop-oldest
+# ```
+#
+# ## The picture
+
+# %%
+from bufgym import gallery
+from bufgym.scenario.numbered import draw
+
+fading = gallery.fading()
+episode = draw(fading, seed=0)
+gallery.save(gallery.play(names, episode, 8, fading), episode, "own-policy.png", "A fading link, L = 8")
+
+# %% [markdown]
+# The policy thins one interruption evenly, but here it is hardly better than `drop-oldest`: while the link is slow,
+# messages leave at the head, and its place in the queue no longer fits. AFR moves its place with every departure. Give
+# `register` an `on_departure(buffer, memory)` that does the same, and try again.
+#
+# ![What the server saw under each policy](own-policy.png)

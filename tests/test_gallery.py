@@ -1,0 +1,144 @@
+"""The gallery: films show what the simulator says, and the interactive page holds bufgym's own numbers."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bufgym import gallery
+from bufgym.cli import main
+from bufgym.envs.render.scene import DELIVERED, DROPPED, QUEUED, SENDING
+from bufgym.gallery import comparison, interactive
+from bufgym.scenario import Interruption
+from bufgym.scenario.numbered import draw
+
+REPO = Path(__file__).resolve().parent.parent
+FILMS = REPO / "docs" / "gallery"
+MAX_ALL_BYTES = 2_000_000
+
+
+def shipped_data() -> dict[str, Any]:
+    """What docs/interactive.html draws."""
+    text = (REPO / "docs" / "interactive.html").read_text(encoding="utf-8")
+    found = re.search(r"^const data = (\{.*\});$", text, re.MULTILINE)
+    assert found is not None
+    data: dict[str, Any] = json.loads(found[1])
+    return data
+
+
+def test_an_interruption_second_by_second() -> None:
+    """T = 4, L = 2 under Drop Oldest: 3 evicts 1, 4 evicts 2; the link returns half a period after 4."""
+    scenario = Interruption(law="fixed", t_max=4, rate_hz=10)
+    (run,) = gallery.play(["drop-oldest"], draw(scenario, 0), 2, scenario)
+    assert run.received.tolist() == [0, 3, 4, 5]
+    assert comparison.states_at(run, 250_000).tolist() == [SENDING, QUEUED, QUEUED, -1, -1, -1]
+    assert comparison.states_at(run, 300_000).tolist() == [SENDING, DROPPED, QUEUED, QUEUED, -1, -1]
+    after = [DELIVERED, DROPPED, DROPPED, DELIVERED, DELIVERED, DELIVERED]
+    assert comparison.states_at(run, 900_000).tolist() == after
+    assert run.longest_gap_s == pytest.approx(0.3)
+    # Gaps of 3, 1 and 1 with V = 1 - 0.618^d.
+    assert run.h == pytest.approx(1 + (1 - 0.618**3) + 2 * (1 - 0.618))
+
+
+def test_what_the_readme_says_of_its_film() -> None:
+    scenario = gallery.fading()
+    oldest, learned = gallery.play(["drop-oldest", "learned-motion"], draw(scenario, 0), 8, scenario)
+    assert len(oldest.received) == len(learned.received) == 196
+    assert 3.0 < oldest.longest_gap_s < 3.2 and learned.longest_gap_s < 0.7
+    assert learned.h > oldest.h + 1
+
+
+def test_a_comparison_is_an_image_of_all_policies(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    scenario = Interruption(law="fixed", t_max=20)
+    episode = draw(scenario, 0)
+    runs = gallery.play(["afr", "drop-oldest"], episode, 4, scenario)
+    frames = list(comparison.frames(runs, episode, "two", count=2))
+    assert [frame.shape for frame in frames] == [(330, 800, 3)] * 2
+    assert not np.array_equal(*frames)
+    assert gallery.save(runs, episode, tmp_path / "two.png").stat().st_size > 1000
+
+
+def test_the_films_in_docs_are_small_and_all_there() -> None:
+    sizes = {path.stem: path.stat().st_size for path in FILMS.glob("*.webp")}
+    assert set(sizes) == set(gallery.FILMS)
+    assert max(sizes.values()) < gallery.films.MAX_BYTES
+    assert sum(sizes.values()) < MAX_ALL_BYTES
+
+
+def test_the_command_lists_films_and_refuses_others(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["gallery"]) == 0
+    listed = capsys.readouterr().out
+    assert all(f"\n  {name} " in listed for name in gallery.FILMS)
+    assert main(["gallery", "nonsense"]) == 2
+    assert "unknown film 'nonsense'; known: fading-link" in capsys.readouterr().err
+
+
+# --- the interactive page --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("capacity", interactive.CAPACITIES)
+@pytest.mark.parametrize("policy", [*interactive.POLICIES, "oracle"])
+def test_the_page_holds_bufgyms_numbers(policy: str, capacity: int) -> None:
+    assert shipped_data()["interruptions"][str(capacity)][policy] == interactive.interruptions(policy, capacity)
+
+
+@pytest.mark.slow
+def test_the_page_is_what_the_command_writes(tmp_path: Path) -> None:
+    assert main(["gallery", "--interactive", str(tmp_path / "page.html")]) == 0
+    assert (tmp_path / "page.html").read_text() == (REPO / "docs" / "interactive.html").read_text()
+
+
+def test_nobody_beats_the_best_possible() -> None:
+    data = shipped_data()
+    for runs in data["interruptions"].values():
+        for name in interactive.POLICIES:
+            assert all(h <= best + 1e-3 for h, best in zip(runs[name]["h"], runs["oracle"]["h"], strict=True))
+    for link in data["links"].values():
+        assert all(run["h"] <= link["runs"]["clairvoyant"]["h"] + 1e-3 for run in link["runs"].values())
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_browser_shows_them(scheme: str) -> None:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium on this machine")
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    data, page_url = shipped_data(), (REPO / "docs" / "interactive.html").as_uri()
+    said: list[str] = []
+    asked: list[str] = []
+    with playwright.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        page = browser.new_page(color_scheme=scheme, viewport={"width": 390, "height": 800})
+        page.on("console", lambda message: said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(page_url)
+        page.check("input[name=L][value='4']")
+        page.fill("#length", "37")
+        shown = page.eval_on_selector_all(".run[data-policy]", ROWS)
+        assert not page.is_visible("#link")
+        page.check("input[value=link]")
+        page.select_option("#link", "lte-synthetic-5")
+        over_link = page.eval_on_selector_all(".run[data-policy]", ROWS)
+        assert not page.is_visible("#length")
+        width = page.evaluate("document.documentElement.scrollWidth")
+        browser.close()
+    assert said == [] and asked == [page_url] and width <= 390
+    runs = data["interruptions"]["4"]
+    assert shown == [[p, f"{run['h'][36]:.3f}", [0, *run["kept"][36], 38]] for p, run in runs.items()]
+    link = data["links"]["lte-synthetic-5"]["runs"]
+    assert [[p, h, f"{sum(1 << k for k in received):x}"] for p, h, received in over_link] == [
+        [p, f"{run['h']:.3f}", run["received"]] for p, run in link.items()
+    ]
+
+
+ROWS = """rows => rows.map(row => [row.dataset.policy, row.querySelector(".h").firstChild.textContent.trim().slice(4),
+    row.dataset.received.split(" ").map(Number)])"""

@@ -1,0 +1,1 @@
+"""The site's pages that are made from the code: environments, policies, suites, commands, papers."""

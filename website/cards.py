@@ -1,0 +1,105 @@
+"""The cards of the agents that come with bufgym; their numbers are read from the pages of their results."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from website.markdown import table
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+
+
+@dataclass(frozen=True)
+class Card:
+    """What the results do not say."""
+
+    results: str
+    """The page of its results."""
+    decides: str
+    sees: str
+    limits: str
+    fails: str
+
+
+CARDS = {
+    "learned-motion": Card(
+        results="agents.md",
+        decides="what to drop from one queue, of any L",
+        sees="the queue, the clock, the socket, odometry and V",
+        limits="trained on camera streams of one topic, with V exponential or saturating",
+        fails="With a saturating V over a fading link it has more regret than AFR, and much more than `greedy-qoi`;"
+        " likewise on a steady link of a tenth of the demand. In blackouts `min-motion-gap` is a little better.",
+    ),
+    "learned-time": Card(
+        results="agents-time.md",
+        decides="what to drop from one queue, of any L",
+        sees="the queue, the clock and the socket; neither odometry nor V",
+        limits="trained on the same episodes as learned-motion",
+        fails="With bursts or Poisson arrivals it has several times AFR's regret. On the Belgium 4G logs it has about"
+        " AFR's, in some cells more.",
+    ),
+    "learned-scheduler": Card(
+        results="topics.md",
+        decides="what to drop and what to send next, of many topics",
+        sees="each queued message and its topic: priority, age, limits, size, window",
+        limits="trained on the topics of Robofleet's example client",
+        fails="Where the link is ample it is only level with Robofleet's published client.",
+    ),
+}
+
+
+def page() -> str:
+    """The whole page."""
+    lines = [
+        "# Agent cards",
+        "These agents come with bufgym. Use them as any other policy: `bufgym bench --policies learned-motion,afr`."
+        " The [guide](guide.md#training) says how to train your own.",
+    ]
+    for name, card in CARDS.items():
+        facts = [
+            ("Decides", card.decides),
+            ("Sees", card.sees),
+            (
+                "Is",
+                "one small network that scores each message, evolved; the best of five seeds on validation",
+            ),
+            ("Trained by", f"`{trained_by(card)}`"),
+            ("Limits", card.limits),
+            ("Where it fails", card.fails),
+        ]
+        lines += [
+            f"## {name}",
+            table(("", ""), facts),
+            *_scores(card),
+            f"[All training seeds, cell by cell]({card.results})",
+        ]
+    return "\n\n".join(lines)
+
+
+def trained_by(card: Card) -> str:
+    """The command that made it, as the page of its results has it."""
+    found = re.search(r"`(python train\.py [^`]*)`", _text(card))
+    assert found is not None
+    return found[1]
+
+
+def scores(card: Card) -> list[tuple[str, str, str, str]]:
+    """(suite, regret over AFR's, score of the agents, AFR's score), each with its interval over all training seeds."""
+    rows = []
+    for part in re.split(r"^## ", _text(card), flags=re.MULTILINE)[1:]:
+        regret = re.search(r"^\| all \| ([^|]+) \|", part, re.MULTILINE)
+        score = re.search(r"^Scores .*: agents ([\d.]+ \[[^\]]+\]).* afr ([\d.]+ \[[^\]]+\])", part, re.MULTILINE)
+        if regret and score:
+            rows.append((part.split("\n")[0], regret[1], score[1], score[2]))
+    return rows
+
+
+def _scores(card: Card) -> list[str]:
+    rows = scores(card)
+    return [table(("suite", "regret / AFR's", "score", "AFR's score"), rows)] if rows else []
+
+
+def _text(card: Card) -> str:
+    return (DOCS / card.results).read_text(encoding="utf-8")

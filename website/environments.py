@@ -1,0 +1,157 @@
+"""A page for each environment, from its docstring and the tables of fields and rewards."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import bufgym
+from bufgym import scenario
+from bufgym.gallery import FILMS
+from bufgym.observe import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS
+from bufgym.scenario import FleetScenario
+from website.markdown import code, parameters, table
+
+FLEET = "bufgym_fleet_v0"
+
+
+@dataclass(frozen=True)
+class Version:
+    """One version of an environment."""
+
+    name: str
+    """As at the end of its id."""
+    since: str
+    """The release of bufgym that brought it."""
+    what: str
+    """What it is, or what changed."""
+
+
+HISTORY = {
+    "bufgym/Interruption-v0": (Version("v0", "0.1.0", "first version"),),
+    "bufgym/Uplink-v0": (Version("v0", "0.1.0", "first version"),),
+    "bufgym/Suite-v0": (Version("v0", "0.1.0", "first version"),),
+    "bufgym/Topics-v0": (Version("v0", "0.1.0", "first version"),),
+    FLEET: (Version("v0", "0.1.0", "first version"),),
+}
+"""Every environment's versions, newest first."""
+
+
+TOPICS = """\
+Many topics share one uplink: decide at every arrival what to drop, and at every free socket what to send next."""
+
+
+def made() -> dict[str, str]:
+    """Name on the site -> Markdown."""
+    found = {f"environments/{slug(id)}.md": page(id) for id in HISTORY}
+    return {"environments/index.md": index(), **found}
+
+
+def slug(id: str) -> str:
+    """The last part of a page's address."""
+    return "fleet" if id == FLEET else id.split("/")[1].split("-")[0].lower()
+
+
+def about(id: str) -> str:
+    """What it is, in a line."""
+    return "robots that share one cell (PettingZoo)" if id == FLEET else bufgym.ENVIRONMENTS[id][1]
+
+
+def title(id: str) -> str:
+    """How its page is headed."""
+    return "FleetEnv" if id == FLEET else id.removeprefix("bufgym/")
+
+
+def index() -> str:
+    """The list of all environments with their films."""
+    rows = [(f"[`{title(id)}`]({slug(id)}.md)", about(id)) for id in HISTORY]
+    films = "\n\n".join(
+        f"[![{about(id)}](../gallery/{slug(id)}.webp)]({slug(id)}.md)\n\n`{title(id)}`: {about(id)}." for id in HISTORY
+    )
+    return "\n\n".join(
+        [
+            "# Environments",
+            "All environments are one simulator of one sender, met in different episodes. Actions, observations and"
+            " rewards are the same throughout.",
+            table(("environment", "episode"), rows),
+            films,
+        ]
+    )
+
+
+def page(id: str) -> str:
+    """One environment's page."""
+    kind: Any = _class(id)
+    parts = sections(inspect.getdoc(kind) or "")
+    topics = id == "bufgym/Topics-v0"
+    of_one = sections(inspect.getdoc(_class("bufgym/Uplink-v0")) or "")
+    intro = TOPICS if topics else parts[""]
+    lines = [f"# {title(id)}", f"{about(id)[0].upper()}{about(id)[1:]}.", *_films(id), code(intro), _make(id)]
+    lines += ["## Action", code(parts.get("Action", "") or parts["Action, observation"])]
+    if topics:
+        asked = re.sub(r"^\([^)]*\): ", "", parts["Several topics"])
+        lines += [code(asked[:1].upper() + asked[1:])]
+    lines += ["## Observation", code(of_one["Observation"])]
+    lines += ["Every field lies in [0, 1]. r is a reference: the field is 0.5 where the quantity is as large as r."]
+    lines += [_fields(topics)]
+    lines += ["## Reward", code(parts["Reward"]), _rewards(topics)]
+    lines += ["## Episode end", code(parts["Episode end"])]
+    lines += ["## Arguments", code(parts["Arguments"])]
+    lines += [
+        "## Parameters of the scenario",
+        "Each is an argument of the environment, too.",
+        parameters(_scenario(id)),
+    ]
+    lines += ["## Versions", table(("version", "since", "change"), [(v.name, v.since, v.what) for v in HISTORY[id]])]
+    lines += ["[When a version changes](../stability.md)"]
+    return "\n\n".join(lines)
+
+
+def sections(docstring: str) -> dict[str, str]:
+    """The paragraphs of a docstring under their bold headings; those before the first under ""."""
+    parts = re.split(r"^\*\*([^*]+)\*\*", docstring, flags=re.MULTILINE)
+    bodies = [parts[0], *parts[2::2]]
+    found = dict(zip(["", *parts[1::2]], (body.strip(" :\n") for body in bodies), strict=True))
+    # The list of arguments ends where plain paragraphs begin again.
+    return {name: body[:1].upper() + body[1:] for name, body in found.items()}
+
+
+def _class(id: str) -> Any:
+    from bufgym.envs import FleetEnv, SenderEnv
+
+    return FleetEnv if id == FLEET else SenderEnv
+
+
+def _scenario(id: str) -> Any:
+    if id == FLEET:
+        return FleetScenario.of(4, "lte").uplink
+    return scenario.get(bufgym.ENVIRONMENTS[id][0])
+
+
+def _make(id: str) -> str:
+    if id == FLEET:
+        return "```python\nfrom bufgym.envs import parallel_env\n\nenv = parallel_env(robots=8, capacity=8)\n```"
+    return f'```python\nimport bufgym\nimport gymnasium as gym\n\nenv = gym.make("{id}")\n```'
+
+
+def _films(id: str) -> list[str]:
+    """Its films, each with the command that makes it."""
+    return [
+        f"![{film.about}](../gallery/{name}.webp)\n\n*{film.about[0].upper()}{film.about[1:]}. Made by*"
+        f" `bufgym gallery {name} --out docs/gallery`"
+        for name, film in FILMS.items()
+        if film.environment == id and name == slug(id)
+    ]
+
+
+def _fields(topics: bool) -> str:
+    fields = FIELDS + TOPIC_FIELDS if topics else FIELDS
+    rows = [(f"`{f.name}`", f.per, f.group, f.unit, code(f.meaning)) for f in fields]
+    return table(("field", "per", "takes", "unit", "meaning"), rows)
+
+
+def _rewards(topics: bool) -> str:
+    terms = REWARD_TERMS + TOPIC_REWARD_TERMS if topics else REWARD_TERMS
+    return table(("term", "unit", "meaning"), [(f"`{t.name}`", t.unit, t.meaning) for t in terms])

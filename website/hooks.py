@@ -1,0 +1,52 @@
+"""What MkDocs calls while it builds the site (``hooks`` in mkdocs.yml): adds the pages that are made from the code."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+REPO = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(REPO))
+
+from website import pages, tutorials  # noqa: E402  (MkDocs loads this file without its package)
+
+FROM_ROOT = {
+    "CHANGELOG.md": "changelog.md",
+    "CODE_OF_CONDUCT.md": "code-of-conduct.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "README.md": "index.md",
+    "SECURITY.md": "security.md",
+}
+"""Files beside the folder of documents, and what they are called on the site."""
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add what is not a file in docs/."""
+    for name, page in FROM_ROOT.items():
+        if page != "index.md":
+            text = (REPO / name).read_text(encoding="utf-8")
+            files.append(File.generated(config, page, content=_of_root(text)))
+    made = {name: text.encode() for name, text in pages.made().items()} | tutorials.made()
+    for name, content in made.items():
+        files.append(File.generated(config, name, content=content))
+    for example in sorted((REPO / "examples").iterdir()):
+        if example.is_file():
+            files.append(File.generated(config, f"examples/{example.name}", abs_src_path=str(example)))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Links to files beside docs/ lead to their copies on the site."""
+    for name, page in FROM_ROOT.items():
+        markdown = markdown.replace(f"](../{name}", f"]({page}")
+    return markdown.replace("](../examples/", "](examples/")
+
+
+def _of_root(text: str) -> str:
+    """A file of the root as a page: its links as they would be from docs/."""
+    return re.sub(r"\]\((?!https?:|#)(docs/)?", lambda link: "](" if link[1] else "](../", text)

@@ -1,0 +1,67 @@
+"""Small pieces of Markdown."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+from collections.abc import Iterable, Sequence
+from dataclasses import fields
+from typing import Any
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table; bars and line breaks in cells are made harmless."""
+    lines = [head, ["---"] * len(head), *([_cell(cell) for cell in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.replace("|", "\\|").split())
+
+
+def code(text: str) -> str:
+    """Text as code, single backquotes for the double ones of docstrings."""
+    return re.sub(r"``([^`]+)``", r"`\1`", text)
+
+
+def cited(text: str, up: str = "") -> str:
+    """Keys of papers in brackets as links to the list of papers."""
+    return re.sub(r"\[([a-z]+\d{4}[a-z]+|zenoh|fastdds|webrtc)\]", rf"[\1]({up}papers.md#\1)", text)
+
+
+def attributes(class_: type[Any]) -> dict[str, str]:
+    """Name -> the string below it, of a dataclass's fields, its bases' included."""
+    found: dict[str, str] = {}
+    for base in reversed(class_.__mro__[:-1]):
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, text in zip(definition.body, definition.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                    found[field.target.id] = inspect.cleandoc(str(text.value.value))
+    return found
+
+
+def parameters(example: Any) -> str:
+    """A table of a dataclass's fields: name, value in ``example``, meaning."""
+    meanings = attributes(type(example))
+    rows = [(f"`{f.name}`", _value(getattr(example, f.name)), code(meanings.get(f.name, ""))) for f in fields(example)]
+    return table(("parameter", "default", "meaning"), rows)
+
+
+def _value(value: Any) -> str:
+    """A default as text; objects by their names."""
+    names = _names(value) if isinstance(value, tuple) else []
+    if names:
+        return ", ".join(names if len(names) < 4 else [names[0], "...", names[-1]])
+    if hasattr(value, "name"):
+        return str(value.name)
+    return f"`{value!r}`"
+
+
+def _names(entries: Iterable[Any]) -> list[str]:
+    """What the entries are called: traces and recordings, or the topics of streams."""
+    named = [getattr(entry, "topic", entry) for entry in entries]
+    return [str(entry.name) for entry in named if hasattr(entry, "name")]

@@ -1,0 +1,17 @@
+"""All pages that are made from the code, by their names on the site."""
+
+from __future__ import annotations
+
+from website import cards, commands, environments, papers, policies, suites
+
+
+def made() -> dict[str, str]:
+    """Name -> Markdown."""
+    return {
+        **environments.made(),
+        "policies.md": policies.page(),
+        "cards.md": cards.page(),
+        "suites.md": suites.page(),
+        "commands.md": commands.page(),
+        "papers.md": papers.page(),
+    }
