@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies
-from bufgym.benchmark.play import Player
+from bufgym.expert import Player
 from bufgym.benchmark.run import draw
 from bufgym.envs import SenderEnv
 from bufgym.envs.render.image import COLOURS, canvas_of, pixels
