@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies
-from bufgym.expert import Player
 from bufgym.benchmark.run import draw
 from bufgym.envs import SenderEnv
 from bufgym.envs.render.image import COLOURS, canvas_of, pixels
 from bufgym.errors import BufgymError, install
+from bufgym.expert import Player
 from bufgym.gallery import comparison
 from bufgym.gallery.played import fading, play
 from bufgym.scenario import Episode, Interruption, Scenario, get, suites
