@@ -32,7 +32,9 @@ def check_untouched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArra
     """An error if sender ``i``'s finished run does not agree with its episode: MESSAGE[n] and TOPIC[topics]."""
     found = _touched(batch, i, arrivals, topics)
     if found:
-        raise BufgymError(f"policy {policy}: wrote to what it may only read: {_FOUND[found]}")
+        raise BufgymError(
+            f"policy {policy}: wrote to what it may only read: {_FOUND[found]} (run {i + 1} of the batch)"
+        )
 
 
 @kernel
@@ -90,11 +92,27 @@ def _touched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArray[Any])
             or now.v_start != then.v_start
         ):
             return _TOPIC
-    if sender.topics == 1:
-        qoi = 0.0
-        for k in range(1, sender.credited):
-            step = item(arrivals, at(batch.order, i, k)).x - item(arrivals, at(batch.order, i, k - 1)).x
-            qoi += value(batch.v[sender.v_start :], step)
-        if abs(qoi - sender.delivered_gain) > _ROUNDING * max(1.0, qoi):
-            return _QOI
+    gained = 0.0
+    for topic in range(sender.topics):
+        gained += _gained(batch, i, arrivals, topic)
+    if abs(gained - sender.delivered_gain) > _ROUNDING * max(1.0, gained):
+        return _QOI
     return 0
+
+
+@kernel
+def _gained(batch: Batch, i: int, arrivals: NDArray[Any], topic: int) -> float:
+    """What sender ``i`` has gained by the received messages of one topic, or of its one queue, without the 1."""
+    sender, gained, before = batch.senders[i], 0.0, -1
+    several = sender.topics > 1
+    weight, v_start = 1.0, sender.v_start
+    if several:
+        weight, v_start = at(batch.topics, i, topic).weight, at(batch.topics, i, topic).v_start
+    for k in range(sender.credited):
+        seq = at(batch.order, i, k)
+        if several and item(arrivals, seq).topic != topic:
+            continue
+        if before >= 0:
+            gained += weight * value(batch.v[v_start:], item(arrivals, seq).x - item(arrivals, before).x)
+        before = seq
+    return gained

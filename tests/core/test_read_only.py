@@ -119,6 +119,19 @@ def test_marks_on_topics_are_on_a_copy() -> None:
     assert lifted.batch.senders.tobytes() == honest.batch.senders.tobytes()
 
 
+def test_h_of_several_topics_is_added_up_again() -> None:
+    """As honest as it was run, the sum stands; with anything added it does not."""
+    arrivals = messages(np.arange(40) * 10_000, 4_000)
+    arrivals["topic"] = np.arange(40) % 2
+    rules = [Topic("a", weight=2.0), Topic("b", value=qoi.saturating(4))]
+    policy = Policy("test-honest", lambda buffer, arrival, memory: keep(buffer))
+    senders = run(policy, [Episode(arrivals, EPISODE.link)], 3, V, topics=rules)
+    senders.check_untouched(policy)
+    senders.batch.senders["delivered_gain"] += 1e-3
+    with pytest.raises(BufgymError, match="H is not that of the messages that were received"):
+        senders.check_untouched(policy)
+
+
 @pytest.mark.parametrize("writer", WRITERS)
 def test_a_compiled_policy_that_writes_has_no_result(writer: Any) -> None:
     told = f"policy test-writer: wrote to what it may only read: {WRITERS[writer]}"
