@@ -80,6 +80,12 @@ def test_the_command_lists_films_and_refuses_others(capsys: pytest.CaptureFixtur
     assert "unknown film 'nonsense'; known: fading-link" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("target", [".", "nowhere/page.html", "/dev/null"])
+def test_the_page_goes_to_a_file_only(target: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["gallery", "--interactive", target]) == 2
+    assert f"{target}: must be a file in a folder that exists" in capsys.readouterr().err
+
+
 # --- the interactive page --------------------------------------------------------------------------------------------
 
 

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from bufgym.cli.options import Commands, columns, command
+from bufgym.errors import BufgymError
 
 
 def add(commands: Commands) -> None:
@@ -20,8 +21,11 @@ def _gallery(options: argparse.Namespace) -> None:
     from bufgym.files import replaced
 
     if options.interactive is not None:
+        target = Path(options.interactive)
+        if not target.parent.is_dir() or (target.exists() and not target.is_file()):
+            raise BufgymError(f"{target}: must be a file in a folder that exists (--interactive)")
         page = gallery.page()
-        with replaced(Path(options.interactive)) as temporary:
+        with replaced(target) as temporary:
             temporary.write_text(page, encoding="utf-8")
         print(f"wrote {options.interactive}")
     elif not options.names:

@@ -66,6 +66,8 @@ WORK = (
     ("bufgym.benchmark.perf", "measure"),
     ("bufgym.traces.datasets.fetch", "fetch_dataset"),
     ("bufgym.cli.figures", "_text"),
+    ("bufgym.gallery", "page"),
+    ("bufgym.gallery", "write_film"),
     ("bufgym.cli.play", "_play"),
 )
 """What takes long, downloads, or needs a terminal."""
