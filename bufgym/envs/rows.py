@@ -20,6 +20,7 @@ from bufgym.envs.bound import BOUND, check_one_queue, measured
 from bufgym.envs.observation import Observation, ObservationForm
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.step import StepOutput, step_cells, step_rows
+from bufgym.envs.threads import Threads
 from bufgym.errors import BufgymError
 from bufgym.model.checks import is_number
 from bufgym.observe import (
@@ -37,8 +38,9 @@ from bufgym.scenario.numbered import numbered
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
 
-INFOS = ("full", "mask", "none")
-"""How much ``info`` has: all of it; the action mask alone; nothing but the summary of an episode at its end."""
+INFOS = ("full", "steady", "mask", "none")
+"""How much ``info`` has: all of it; all of it and the summary so far, so that every step has the same entries; the
+action mask alone; nothing but the summary of an episode at its end."""
 
 
 def reward_weights(
@@ -109,11 +111,12 @@ class Rows:
         observation: str = "dict",
         info: str = "full",
         bound: bool = False,
+        num_threads: int = 1,
         **parameters: Any,
     ) -> None:
         if info not in INFOS:
             raise BufgymError(f"info = {info!r}: must be one of {', '.join(map(repr, INFOS))}")
-        self.shows_mask, self.shows_all = info != "none", info == "full"
+        self.shows_mask, self.shows_all, self.is_steady = info != "none", info in ("full", "steady"), info == "steady"
         self.scenario = scenarios.get(scenario, **parameters)
         topics = self.scenario.topics
         self.senders = Senders(
@@ -147,7 +150,7 @@ class Rows:
         self._own_terms = OwnTerms(own_terms, len(self.terms) - len(own_terms), n)
         self._has_own = bool(self._own_fields) or bool(self._own_terms)
         self.output = self.new_output()
-        self._every = np.arange(n)
+        self._threads = Threads(np.arange(n), num_threads)
 
     def __len__(self) -> int:
         return len(self.senders)
@@ -191,7 +194,8 @@ class Rows:
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """One decision in every row; the result is in ``self.output``."""
-        step_rows(self.senders.batch, self._every, actions, self.rewarded, self.output)
+        batch, rewarded, output = self.senders.batch, self.rewarded, self.output
+        self._threads.each(lambda rows: step_rows(batch, rows, actions, rewarded, output))
         if self._has_own:
             self._step_own()
 
@@ -223,13 +227,14 @@ class Rows:
         if self.shows_mask:
             info["action_mask"] = self.output.action_mask[i].copy()
         if self.shows_all:
+            info["qoi"] = self.output.qoi.item(i)
+            info["invalid"] = self.senders.batch.senders["invalid"].item(i)
             info["reward_terms"] = dict(zip(self._term_names, terms, strict=True))
-        if ended or self.shows_all:
-            # "full" has the same entries in every step, as recorders want it.
+        if ended or self.is_steady:
             info |= {name: number.item() for name, number in self.summary(i).items()}
         if self.bound and ended:
             info |= measured(self.senders, i, info["qoi"])
-        elif self.bound and self.shows_all:
+        elif self.bound and self.is_steady:
             info |= dict.fromkeys(BOUND, math.nan)
         return info
 
@@ -309,6 +314,7 @@ class FleetRows(Rows):
         self._draw = scenario.draw
         self.robots = scenario.robots
         self.fleet = Fleet(self.senders, scenario.robots)
+        self._threads = Threads(np.arange(cells), options.get("num_threads", 1))
 
     def seed(self, i: int, rng: np.random.Generator) -> None:
         """Give row ``i`` streams of its own if it is the first of its cell; the others need none."""
@@ -336,9 +342,8 @@ class FleetRows(Rows):
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """One decision of every robot; the result is in ``self.output``."""
-        step_cells(
-            self.senders.batch, self.fleet.shares, self._every[: len(self.fleet)], actions, self.rewarded, self.output
-        )
+        batch, shares, rewarded, output = self.senders.batch, self.fleet.shares, self.rewarded, self.output
+        self._threads.each(lambda cells: step_cells(batch, shares, cells, actions, rewarded, output))
         if self._has_own:
             self._step_own()
 

@@ -58,7 +58,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``reward``: a term's name, or weights by name; those of ``bufgym.observe.OWN_TERMS`` count and show where named.
     - ``fields``: names of the fields to observe, one's own among them; by default those of the tables.
     - ``observation``: "dict", "flat" or "slots".
-    - ``info``: "full"; "mask" for the action mask alone, and at an episode's end its summary; "none" for the summary.
+    - ``info``: "full"; "steady" for the summary so far in every step, as recorders want it; "mask" for the action mask
+      alone, and at an episode's end its summary; "none" for the summary.
     - ``render_mode``: "ansi" or "rgb_array".
     - ``bound``: whether the last ``info`` also has ``clairvoyant`` (the best H, or an upper bound of it), ``regret``
       and ``score`` (0 for Drop Oldest, 1 for the clairvoyant, NaN where they are equal). One queue only; found when an
@@ -111,7 +112,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self._action = np.zeros(1, np.int64)
         self._weights = self.rows.weights.tolist()
         self._no_terms = [0.0] * len(self._weights)
-        self._ended = True
+        self.rows.output.terminated[0] = True  # kept with the other arrays, so that a snapshot of them has it
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -126,17 +127,17 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         if "episode" in options and len(options) > 1:
             raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")
         self.rows.reset(_ROW, [options.get("episode", options or None)])
-        self._ended = False
+        self.rows.output.terminated[0] = False  # even where no arrival asks: the first step tells
         return self.rows.observation(0), self.rows.info(0, self._no_terms, False)
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         rows = self.rows
-        if self._ended:
+        if rows.output.terminated.item():
             why = "" if rows.senders.episodes[0] is None else "the episode has ended: "
             raise gym.error.ResetNeeded(f"{why}call reset() before step()")
         self._action[0] = rows.action("action", action)
         rows.step(self._action)
-        terminated = self._ended = rows.output.terminated.item()
+        terminated = rows.output.terminated.item()
         terms = rows.output.reward_terms[0].tolist()
         reward = 0.0
         for weight, term in zip(self._weights, terms, strict=True):

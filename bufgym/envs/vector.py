@@ -27,7 +27,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     With several topics some rows may ask what to drop and others what to send: the field ``socket_asks`` says which.
 
     ``num_envs``: n, rows. ``max_episode_steps`` truncates episodes, as Gymnasium's ``TimeLimit`` does.
-    ``autoreset_mode``: one of Gymnasium's. ``options``: the other arguments of ``SenderEnv``.
+    ``autoreset_mode``: one of Gymnasium's. ``num_threads``: threads that share the rows of a step (default 1); what
+    comes out is the same. ``options``: the other arguments of ``SenderEnv``.
 
     ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do; a sequence seeds row by row.
     Options of ``reset``: ``reset_mask`` (bool[n], rows to reset) and ``episodes`` (one a row: an ``Episode``, a dict of
@@ -60,6 +61,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         rows = self._make_rows(whole("num_envs", num_envs, 1), scenario, capacity, **options)
         if max_episode_steps is not None and max_episode_steps < 1:
             raise BufgymError(f"max_episode_steps = {max_episode_steps}: must be >= 1, or None for no limit")
+        if rows.is_steady:
+            raise BufgymError("info = 'steady': is for recorders of a single environment; a batch has 'full'")
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:

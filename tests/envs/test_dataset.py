@@ -79,7 +79,7 @@ def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
 def test_infos_have_the_same_entries_in_every_step() -> None:
     """As recorders that stack them step by step want it."""
     for options in ({}, {"bound": True}):
-        env = SenderEnv("lte", 4, **SHORT, **options)
+        env = SenderEnv("lte", 4, info="steady", **SHORT, **options)
         _, info = env.reset(seed=0)
         ended = False
         while not ended:
@@ -93,7 +93,7 @@ def test_minaris_own_collector_records_infos(tmp_path: Path, monkeypatch: pytest
     pytest.importorskip("jax", reason="Minari's DataCollector needs jax")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     env = minari.DataCollector(
-        gym.make("bufgym/Uplink-v0", capacity=4, **SHORT), record_infos=True, data_format="arrow"
+        gym.make("bufgym/Uplink-v0", capacity=4, info="steady", **SHORT), record_infos=True, data_format="arrow"
     )
     for seed in range(2):
         env.reset(seed=seed)

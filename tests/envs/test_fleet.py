@@ -293,7 +293,7 @@ def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
 @pytest.mark.parametrize("reward", ["team", "own"])
 def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
     cells, robots = 2, 3
-    envs = FleetVecEnv(cells, robots, "lte", L, reward=reward, parameters=PARAMETERS)
+    envs = FleetVecEnv(cells, robots, "lte", L, reward=reward, num_threads=2, parameters=PARAMETERS)
     fleets = [FleetEnv(robots, "lte", L, reward=reward, **PARAMETERS) for _ in range(cells)]
     seen, info = envs.reset(seed=11)
     each = [fleet.reset(seed=11 + c * robots) for c, fleet in enumerate(fleets)]

@@ -106,6 +106,23 @@ def test_equal_in_every_form(case: str, mode: AutoresetMode, options: dict[str, 
     check_equal_to_sync(case, mode, None, **options)
 
 
+@pytest.mark.parametrize("case", ["fading", "topics"])
+def test_threads_change_nothing(case: str) -> None:
+    """Three rows in two threads are what they are in one, and more threads than rows are as many."""
+    one, two, many = vector(case), vector(case, num_threads=2), vector(case, num_threads=9)
+    assert [len(part) for part in two.rows._threads.parts] == [2, 1] and len(many.rows._threads.parts) == N
+    for envs in (one, two, many):
+        envs.reset(seed=8)
+    rng = np.random.default_rng(1)
+    for _ in range(STEPS):
+        actions = actions_of(rng, one.action_masks())
+        (observations, *results), *others = (envs.step(actions) for envs in (one, two, many))
+        for observed, *rest in others:
+            assert_same(observed, observations)
+            for result, expected in zip(rest, results, strict=True):
+                assert_same(result, expected)
+
+
 def check_equal_to_sync(case: str, mode: AutoresetMode, limit: int | None, **options: Any) -> None:
     """The batch and Gymnasium's own vector of single environments hand out the same."""
 
@@ -365,13 +382,23 @@ def test_gymnasiums_wrappers_understand_the_infos(mode: str) -> None:
         ({"max_episode_steps": 0}, "max_episode_steps = 0"),
         ({"render_mode": "human"}, "render_mode = 'human'"),
         ({"observation": "vector"}, "observation = 'vector': must be one of 'dict', 'flat', 'slots'"),
-        ({"info": "some"}, "info = 'some': must be one of 'full', 'mask', 'none'"),
+        ({"info": "some"}, "info = 'some': must be one of 'full', 'steady', 'mask', 'none'"),
     ],
 )
 def test_wrong_arguments_are_named(arguments: dict[str, Any], says: str) -> None:
     with pytest.raises(BufgymError) as caught:
         SenderVectorEnv(**arguments)
     assert says in str(caught.value)
+
+
+def test_a_batch_has_no_steady_infos() -> None:
+    with pytest.raises(BufgymError, match="info = 'steady': is for recorders"):
+        vector("fading", info="steady")
+
+
+def test_no_threads_are_an_error() -> None:
+    with pytest.raises(BufgymError, match="num_threads = 0: must be"):
+        vector("fading", num_threads=0)
 
 
 def test_wrong_calls_are_named() -> None:

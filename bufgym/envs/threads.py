@@ -1,0 +1,35 @@
+"""Several threads on one step: kernels hold no lock of Python's, and rows share nothing that a step writes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.model.checks import whole
+
+
+class Threads:
+    """Does the same work on each part of a batch at once: the first part here, each other one in a thread."""
+
+    def __init__(self, numbers: NDArray[np.int64], num_threads: int) -> None:
+        """``numbers``: int64[n], rows or cells; ``num_threads``: at most that many parts of them."""
+        parts = np.array_split(numbers, min(whole("num_threads", num_threads, 1), len(numbers)))
+        self.parts = [np.ascontiguousarray(part) for part in parts]
+        self._pool: ThreadPoolExecutor | None = None
+        self._process = 0
+
+    def each(self, work: Callable[[NDArray[np.int64]], None]) -> None:
+        """``work`` on every part; returns when all is done."""
+        if len(self.parts) == 1:
+            work(self.parts[0])
+            return
+        if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
+            self._pool, self._process = ThreadPoolExecutor(len(self.parts) - 1, "bufgym"), os.getpid()
+        running = [self._pool.submit(work, part) for part in self.parts[1:]]
+        work(self.parts[0])
+        for part in running:
+            part.result()
