@@ -136,7 +136,7 @@ def test_trace_plot_without_matplotlib(
     trace: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    fails(["trace", "plot", trace, "--out", "x.png"], "bufgym[plot]", capsys)
+    fails(["trace", "plot", trace, "--out", "x.png"], "pip install matplotlib", capsys)
 
 
 def test_reproduce_lists_and_dispatches(

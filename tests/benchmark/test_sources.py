@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -66,9 +67,12 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def rows_of(capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
-    """The table's lines by policy, without the name."""
+    """The table's lines by policy, without the name; those that a note calls the same have the same line."""
     lines = capsys.readouterr().out.split("\n")
-    return {line.split()[0]: line.split(maxsplit=1)[1] for line in lines if len(line.split()) > 5}
+    table = {line.split()[0]: line.split(maxsplit=1)[1] for line in lines if len(line.split()) > 5}
+    for names, first in re.findall(r"^note: (.*): the same rows here as (.*)$", "\n".join(lines), re.MULTILINE):
+        table |= dict.fromkeys(names.split(", "), table[first])
+    return table
 
 
 def test_functions_makers_and_policies_of_a_module(module: str, capsys: pytest.CaptureFixture[str]) -> None:
