@@ -138,7 +138,7 @@ def test_with_equal_sizes_it_is_a_limit_of_messages(policy):
 
 
 def test_fixed_policies_no_longer_do_the_same():
-    episodes = [draw(registry.get("lte", size_cv=0.5), seed) for seed in range(3)]
+    episodes = [draw(registry.get("lte", size_bytes=230_000, size_cv=0.5), seed) for seed in range(3)]
     names = ("drop-oldest", "drop-newest", "replace-newest", "random", "reservoir", "min-gap", "min-motion-gap", "afr")
     rows = {
         name: run(policies.get(name), episodes, 32, V, max_bytes=2_500_000) for name in (*names, "orbbuf", "steady")
