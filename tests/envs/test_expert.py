@@ -141,7 +141,8 @@ def test_values_are_those_of_all_action_sequences(case: tuple[Episode, int], v: 
 
 def test_the_value_at_the_start_is_the_clairvoyants() -> None:
     """On real links, where the sweep leaves most successors out."""
-    envs = SenderVectorEnv(48, "lte", 8, duration_s=10.0, size_bytes=500_000, info="none")
+    n, duration_s = (48, 10.0) if JIT else (2, 1.0)
+    envs = SenderVectorEnv(n, "lte", 8, duration_s=duration_s, size_bytes=500_000, info="none")
     envs.reset(seed=0)
     values, senders = expert.clairvoyant(envs).values(), envs.rows.senders
     for i, episode in enumerate(senders.episodes):
@@ -149,12 +150,15 @@ def test_the_value_at_the_start_is_the_clairvoyants() -> None:
         assert np.nanmax(values[i]) == pytest.approx(oracle.clairvoyant(episode, 8, senders.value_of(i)).qoi, abs=1e-9)
 
 
+FAMILIES = (SHORT, Interruption(t_max=90, law="fixed", value=V), replace(SHORT, rate_hz=60))
+
+
 @pytest.mark.parametrize("capacity", [1, 4])
-@pytest.mark.parametrize("steps_at_random", [0, 15, 60])
-@pytest.mark.parametrize("family", [SHORT, Interruption(t_max=90, law="fixed", value=V), replace(SHORT, rate_hz=60)])
+@pytest.mark.parametrize("steps_at_random", [0, 15, 60] if JIT else [0, 5])
+@pytest.mark.parametrize("family", FAMILIES if JIT else [replace(SHORT, duration_s=0.5)])
 def test_who_follows_it_earns_what_it_says(family: Any, steps_at_random: int, capacity: int) -> None:
     """From the start and after actions at random, in a batch, whose rows are those of the single environment."""
-    n, rng = 6, np.random.default_rng(1)
+    n, rng = 6 if JIT else 2, np.random.default_rng(1)
     envs = SenderVectorEnv(n, family, capacity, autoreset_mode="Disabled")
     envs.reset(options={"episodes": [draw(family, seed) for seed in range(n)]})
     know = expert.clairvoyant(envs)
@@ -174,7 +178,8 @@ def test_who_follows_it_earns_what_it_says(family: Any, steps_at_random: int, ca
 
 def test_many_episodes_share_its_room() -> None:
     """Steps of past episodes make room for new ones, and those of the others stay what they were."""
-    envs = SenderVectorEnv(16, replace(SHORT, duration_s=10.0), 4, autoreset_mode="SameStep")
+    n, steps, duration_s = (16, 150, 10.0) if JIT else (3, 8, 0.5)
+    envs = SenderVectorEnv(n, replace(SHORT, duration_s=duration_s), 4, autoreset_mode="SameStep")
     envs.reset(seed=0)
     know = expert.clairvoyant(envs)
     for size in (1, 60):  # first so little that it has to grow
@@ -182,8 +187,8 @@ def test_many_episodes_share_its_room() -> None:
         know._ahead = know._ahead._replace(**dict(zip(("latest", "gain", "follow"), pool, strict=True)))
         know._span[:], know._end, know._begun[:] = 0, 0, 0
         envs.reset(seed=size)
-        for _ in range(150):
-            envs.reset(options={"reset_mask": np.random.default_rng(size).random(16) < 0.3})
+        for _ in range(steps):
+            envs.reset(options={"reset_mask": np.random.default_rng(size).random(n) < 0.3})
             assert np.array_equal(know.values(), expert.clairvoyant(envs).values(), equal_nan=True)
 
 
