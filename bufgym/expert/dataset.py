@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 
 from bufgym.envs import SenderVectorEnv
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 from bufgym.expert.record import KINDS, ROWS, record
 
 VARIABLE = "MINARI_DATASETS_PATH"
@@ -53,7 +53,7 @@ def make(
         from minari import namespace as namespaces
         from minari.data_collector import EpisodeBuffer
     except ImportError as error:
-        raise BufgymError(f'data sets need {error.name}: pip install "bufgym[dataset]"') from None
+        raise BufgymError(f"data sets need {error.name}: {install('dataset')}") from None
     env = env if "/" in env else f"bufgym/{env}"
     known = [id for id in gym.registry if id.startswith("bufgym/")]
     if env not in known:
