@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 
 from bufgym.benchmark import leaderboard
+from bufgym.kernel import JIT
+
+pytestmark = pytest.mark.skipif(not JIT, reason="they train and measure, which takes compiled code")
 
 torch = pytest.importorskip("torch", reason="the extra [train] is not installed")
 
