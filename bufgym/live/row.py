@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
+from bufgym.kernel import located
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
-from bufgym.policies.registry import Policy, runs_compiled
+from bufgym.policies.registry import Policy, runs_compiled, signatures
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders
 from bufgym.sim.rollout import compiled_rollout, python_rollout
@@ -62,6 +63,8 @@ class Row:
         self.senders.follow(policy)
         self.memory = policy.new_memory(1, self.senders.capacity)
         self._use(self.senders.batch, room)
+        self._functions = tuple(map(located, signatures(), policy.compiled)) if runs_compiled(policy) else None
+        self._rollout: Any = compiled_rollout(False) if self._functions else None
 
     def _use(self, batch: Batch, room: int) -> None:
         """Go on with these arrays, of which the messages that have not come yet are free."""
@@ -156,11 +159,10 @@ class Row:
 
     def _advance(self) -> None:
         """Carry out all that is due."""
-        policy = self.policy
-        if runs_compiled(policy):
-            compiled_rollout(False)(self.batch, None, self.memory, *policy.compiled, policy.hears_departures)
+        if self._functions is None:
+            python_rollout(self.batch, None, self.memory, self.policy)
         else:
-            python_rollout(self.batch, None, self.memory, policy)
+            self._rollout(self.batch, None, self.memory, *self._functions, self.policy.hears_departures)
 
     def _tell(self, now_us: int, position: int) -> None:
         """A knot. Those before the last one are looked up no more."""

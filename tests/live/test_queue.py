@@ -66,7 +66,7 @@ def test_the_policy_sees_how_much_of_the_message_in_transmission_is_left() -> No
 
 @pytest.mark.parametrize("name", PLAYABLE)
 @given(data=st.data())
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_a_log_replayed_makes_the_same_decisions(name: str, data: st.DataObject) -> None:
     """Whatever the clock does (it may step back), the sizes, the progress and the order of calls; also where the
     row has to forget settled messages again and again (room 8)."""
