@@ -28,6 +28,7 @@ ROOMS = [
     "scenario",
     "sim",
     "oracle",
+    "live",
     "envs",
     "sb3",
     "benchmark",

@@ -23,6 +23,7 @@ from bufgym.cli import (
     fleet,
     leaderboard,
     listing,
+    live,
     perf,
     play,
     report,
@@ -104,6 +105,7 @@ def _parser() -> argparse.ArgumentParser:
         figures,
         perf,
         play,
+        live,
         export,
         warmup,
     ):

@@ -70,14 +70,14 @@ def compile_for(signature: Any, function: Function) -> Function:
     return cast(Function, compiled)
 
 
-class _Located(types.WrapperAddressProtocol):  # type: ignore[misc]
+class _Located(types.WrapperAddressProtocol):
     """A compiled function together with where its machine code lies."""
 
     def __init__(self, function: Any, signature: Any) -> None:
         self._numba_type_ = types.FunctionType(signature)
         self._signature = signature
         self._function = function  # kept, and its code with it
-        self._address = _get_wrapper_address(function, signature)
+        self._address = cast(Any, _get_wrapper_address)(function, signature)
 
     def __wrapper_address__(self) -> int:
         return int(self._address)
@@ -86,12 +86,12 @@ class _Located(types.WrapperAddressProtocol):  # type: ignore[misc]
         return self._signature
 
 
-def located(signature: Any, compiled: Function) -> Function:
+def located(signature: Any, compiled: Any) -> Any:
     """What ``compile_for`` returned, for calls that are short: Numba looks up where it lies here, not at each call.
 
     That takes 0.1 ms a function; in return the kernel's calls of it are slower, by a few ns.
     """
-    return cast(Function, _Located(compiled, signature)) if JIT else compiled
+    return _Located(compiled, signature) if JIT else compiled
 
 
 def interruptible(work: Callable[[], Result]) -> Result:

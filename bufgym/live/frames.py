@@ -44,9 +44,7 @@ class Frame(NamedTuple):
 
 def header(frame: Frame) -> bytes:
     """What goes before the frame's body."""
-    return _HEADER.pack(
-        _MAGIC, frame.kind, len(frame.body), frame.number, frame.seq, frame.at_us, frame.x, frame.topic
-    )
+    return _HEADER.pack(_MAGIC, frame.kind, len(frame.body), frame.number, frame.seq, frame.at_us, frame.x, frame.topic)
 
 
 def parse(data: bytes | bytearray | memoryview, max_body_bytes: int) -> tuple[Frame, int]:

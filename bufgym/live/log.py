@@ -18,7 +18,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from bufgym.errors import BufgymError
 from bufgym.live.extra import needs
@@ -95,7 +95,7 @@ class LogFile:
     def close(self) -> None:
         """Finish the file. A log that was not closed can be read as well."""
         if not self._file.closed:
-            self._writer.finish()
+            cast(Any, self._writer).finish()
             self._file.close()
 
     def __enter__(self) -> LogFile:

@@ -20,6 +20,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -158,7 +159,8 @@ class PolicyQueue:
             now_us = self._stamp(at_us)
             carried = self._row.carried(now_us, self._unsent())
             uniform = float(self._uniforms.random())
-            seq = self._row.put(now_us, size_bytes, x, topic, uniform)
+            with self._deciding():
+                seq = self._row.put(now_us, size_bytes, x, topic, uniform)
             self._latest_x[scene] = x
             self._held[seq] = Item(message, seq, -1, now_us, size_bytes, x, topic)
             self._tell(
@@ -181,7 +183,8 @@ class PolicyQueue:
         with self._lock:
             if not self._closed:
                 self._closed = True
-                self._row.close()
+                with self._deciding():
+                    self._row.close()
                 self._settle(self._stamp(None), None)
                 self._wake()
 
@@ -226,7 +229,8 @@ class PolicyQueue:
                 raise BufgymError("no message was handed out that has not left yet")
             item = self._away.popleft()
             now_us = self._stamp(None)
-            carried = self._row.gone(now_us)
+            with self._deciding():
+                carried = self._row.gone(now_us)
             self._tell({"event": "gone", "us": now_us, "seq": item.seq, "carried": carried})
             self._settle(now_us, None)
 
@@ -249,6 +253,17 @@ class PolicyQueue:
     def _drained(self) -> bool:
         """Whether nothing will ever be handed out any more."""
         return self._closed and not self._held and not self._ready
+
+    @contextmanager
+    def _deciding(self) -> Iterator[None]:
+        """A policy that raises an error ends its queue: whoever waits for a message is told that none comes."""
+        try:
+            yield
+        except BaseException:
+            self._closed = True
+            self._held.clear()
+            self._wake()
+            raise
 
     def _stamp(self, at_us: int | None) -> int:
         """A time for what happens now: after all others, whatever the clock does."""
@@ -286,9 +301,7 @@ class PolicyQueue:
         number = self._number
         while number < dequeued:
             item = self._held.pop(self._row.dequeued_seq(number))
-            self._ready.append(
-                Item(item.message, item.seq, number, item.at_us, item.size_bytes, item.x, item.topic)
-            )
+            self._ready.append(Item(item.message, item.seq, number, item.at_us, item.size_bytes, item.x, item.topic))
             self._tell({"event": "dequeued", "us": now_us, "seq": item.seq})
             number += 1
         changed, self._number = number > self._number, number

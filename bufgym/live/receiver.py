@@ -11,7 +11,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from bufgym.errors import BufgymError
 from bufgym.live.channels import Channel, TcpChannel, WebSocketChannel
@@ -133,6 +133,7 @@ class Receiver:
         self._streams.move_to_end(name)
         if stream.task is not None:
             stream.task.cancel()  # the sender has given that connection up
+            await asyncio.wait([stream.task])
         stream.task = asyncio.current_task()
         if len(self._streams) > MAX_STREAMS:
             _, oldest = self._streams.popitem(last=False)
@@ -142,16 +143,25 @@ class Receiver:
         while True:
             frame = await channel.receive()
             if frame.kind != DATA or frame.number > stream.expected:
-                raise FrameError(f"frame of kind {frame.kind}, number {frame.number}: must be message {stream.expected}")
+                raise FrameError(
+                    f"frame of kind {frame.kind}, number {frame.number}: must be message {stream.expected}"
+                )
             if frame.number == stream.expected:
-                stream.expected += 1
                 answer = self._on_message(
                     Received(
-                        name.hex(), frame.number, frame.seq, frame.at_us, frame.x, frame.topic, frame.body, time.time_ns()
+                        name.hex(),
+                        frame.number,
+                        frame.seq,
+                        frame.at_us,
+                        frame.x,
+                        frame.topic,
+                        frame.body,
+                        time.time_ns(),
                     )
                 )
                 if inspect.isawaitable(answer):
                     await answer
+                stream.expected += 1
             await channel.send(Frame(ACK, frame.number))
 
 
@@ -179,7 +189,7 @@ class Recording(contextlib.AbstractContextManager["Recording"]):
     def __init__(self, path: str | Path) -> None:
         with needs("mcap"):
             from mcap.writer import Writer
-        self._file = Path(path).open("wb")
+        self._file = Path(path).open("wb")  # noqa: SIM115  (open as long as this is)
         self._writer = Writer(self._file)
         self._writer.start(profile="", library="bufgym")
         schema = self._writer.register_schema("bufgym.live.Received", "jsonschema", b'{"type": "object"}')
@@ -202,7 +212,7 @@ class Recording(contextlib.AbstractContextManager["Recording"]):
     def close(self) -> None:
         """Finish the file."""
         if not self._file.closed:
-            self._writer.finish()
+            cast(Any, self._writer).finish()
             self._file.close()
 
     def __exit__(self, *_: object) -> None:

@@ -94,8 +94,8 @@ def _trace(records: Sequence[Record]) -> Trace:
 
 
 def _differences(records: Sequence[Record], senders: Senders) -> list[str]:
-    """What became of each message, live and here."""
-    log = senders.batch.log[0]
+    """What became of each message, live and here; of what happened last a log that breaks off may not tell all."""
+    log, last_us = senders.batch.log[0], records[-1]["us"]
     found = []
     for event, column in (("dequeued", "dequeued_us"), ("gone", "transmitted_us"), ("dropped", "dropped_us")):
         live = np.full(len(log), NEVER)
@@ -103,6 +103,6 @@ def _differences(records: Sequence[Record], senders: Senders) -> list[str]:
             live[record["seq"]] = record["us"]
         found += [
             f"message {seq}: {event} at {live[seq]} us, in the simulator at {log[column][seq]} us (-1: never)"
-            for seq in np.flatnonzero(live != log[column])
+            for seq in np.flatnonzero((live != log[column]) & ((live != NEVER) | (log[column] < last_us)))
         ]
     return found

@@ -32,9 +32,7 @@ class Sender:
     messages that the receiver has not acked: as many as the queue's window.
     """
 
-    def __init__(
-        self, queue: PolicyQueue, connect: Callable[[], Awaitable[Channel]], leaves: Leaves = "acked"
-    ) -> None:
+    def __init__(self, queue: PolicyQueue, connect: Callable[[], Awaitable[Channel]], leaves: Leaves = "acked") -> None:
         """``connect`` makes a connection to the receiver, again and again if need be."""
         if leaves not in ("acked", "sent", "written"):
             raise BufgymError(f"leaves = {leaves!r}: must be 'acked', 'sent' or 'written'")
@@ -103,8 +101,8 @@ class Sender:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _send_all(self, channel: Channel) -> None:
-        for item in list(self._unacked):
-            await self._send(channel, item)
+        for unacked in list(self._unacked):
+            await self._send(channel, unacked)
         while (item := await self.queue.aget()) is not None:
             self._unacked.append(item)
             await self._send(channel, item)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from live_cases import Bench
 
 from bufgym import policies
 from bufgym.errors import BufgymError
 from bufgym.live import PolicyQueue, replay
 from bufgym.model.topics import Topic
-from live_cases import Bench
 
 PLAYABLE = [name for name in policies.names() if policies.get(name).ranked]
 ONE_QUEUE = [name for name in policies.names(for_topics=False) if policies.get(name).ranked]
@@ -58,7 +58,7 @@ def test_the_policy_sees_how_much_of_the_message_in_transmission_is_left() -> No
         bench.left = left
         bench.put(at_us)
         bench.take()
-    # 0 goes at once; then its 700, then with 1 in the socket too 700 + 1000; less later. At least its last byte is left.
+    # 0 goes at once; then 700 of it are left, then with 1 in the socket 700 + 1000; its last byte is left until gone.
     assert seen == [(0, 0, 10, 0), (1, 700, 20, 1), (1, 1700, 30, 2), (1, 1650, 40, 2), (1, 1001, 50, 2)]
     bench.gone(60)
     assert replay(bench.records).differences == ()
@@ -169,3 +169,21 @@ def test_nothing_leaves_that_was_not_handed_out() -> None:
     bench.put(10)
     with pytest.raises(BufgymError, match="handed out"):
         bench.queue.gone()
+
+
+def test_a_policy_that_raises_an_error_ends_its_queue() -> None:
+    @policies.register("breaks")
+    def breaks(buffer: Any, arrival: Any, memory: Any) -> int:
+        "Divide by the slots that are left."
+        return policies.ACCEPT if 1 // (buffer.capacity - len(buffer.slots)) else policies.REJECT
+
+    bench = Bench("breaks", 1)
+    bench.put(10)
+    bench.put(20)
+    with pytest.raises(ZeroDivisionError):
+        bench.put(30)
+    item = bench.queue.get()
+    assert item is not None and item.seq == 0
+    assert bench.queue.get() is None
+    with pytest.raises(BufgymError, match="closed"):
+        bench.put(40)
