@@ -2,7 +2,7 @@
 
 The sender greets with the name of its stream; the receiver answers with the number of the message that it expects
 next, so that after a broken connection nothing is sent twice that arrived once, and nothing is lost, and with the
-largest body that it takes. Then each message (DATA) is answered by an ACK with its number.
+largest body that it takes. Then each message (DATA) is answered by an ACK with its number. A sender that has sent all says GOODBYE.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from __future__ import annotations
 import struct
 from typing import Final, NamedTuple
 
-GREETING, DATA, ACK = 1, 2, 3
-_KINDS: Final = (GREETING, DATA, ACK)
+GREETING, DATA, ACK, GOODBYE = 1, 2, 3, 4
+_KINDS: Final = (GREETING, DATA, ACK, GOODBYE)
 
 _HEADER: Final = struct.Struct("!2sBxIQQqdI")
 """Magic, kind, bytes of the body, number, seq, when it was put (us), x, topic."""
@@ -30,7 +30,7 @@ class Frame(NamedTuple):
     """One thing said."""
 
     kind: int
-    """GREETING, DATA or ACK."""
+    """GREETING, DATA, ACK or GOODBYE."""
     number: int
     """Of the message: its place among those that the socket dequeued; in a receiver's greeting the next expected."""
     seq: int = 0
@@ -58,7 +58,7 @@ def parse(data: bytes | bytearray | memoryview, max_body_bytes: int) -> tuple[Fr
     magic, kind, body_bytes, number, seq, at_us, x, topic = _HEADER.unpack_from(data)
     if magic != _MAGIC or kind not in _KINDS:
         raise FrameError(f"header {bytes(data[:3])!r}: must begin with {_MAGIC!r} and a kind of {_KINDS}")
-    most_bytes = {GREETING: STREAM_BYTES, DATA: max_body_bytes, ACK: 0}[kind]
+    most_bytes = {GREETING: STREAM_BYTES, DATA: max_body_bytes}.get(kind, 0)
     if body_bytes > most_bytes:
         raise FrameError(f"body of {body_bytes} bytes: must be at most {most_bytes}")
     return Frame(kind, number, seq, at_us, x, topic), body_bytes

@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple, cast
 from bufgym.errors import BufgymError
 from bufgym.live.channels import Channel, TcpChannel, WebSocketChannel
 from bufgym.live.extra import needs
-from bufgym.live.frames import ACK, DATA, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError
+from bufgym.live.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError
 
 MAX_STREAMS: Final = 64
 """Senders that are remembered, the latest."""
@@ -142,6 +142,9 @@ class Receiver:
         await channel.send(Frame(GREETING, stream.expected, self._max_body_bytes))
         while True:
             frame = await channel.receive()
+            if frame.kind == GOODBYE:
+                self._streams.pop(name, None)
+                return
             if frame.kind != DATA or frame.number > stream.expected:
                 raise FrameError(
                     f"frame of kind {frame.kind}, number {frame.number}: must be message {stream.expected}"

@@ -10,7 +10,7 @@ from typing import Final, Literal
 
 from bufgym.errors import BufgymError
 from bufgym.live.channels import Channel
-from bufgym.live.frames import ACK, DATA, GREETING, STREAM_BYTES, Frame, FrameError
+from bufgym.live.frames import ACK, DATA, GOODBYE, GREETING, STREAM_BYTES, Frame, FrameError
 from bufgym.live.queue import Item, PolicyQueue
 
 Leaves = Literal["acked", "sent", "written"]
@@ -110,6 +110,7 @@ class Sender:
                 await self._an_ack()
         while self._unacked:
             await self._an_ack()
+        await channel.send(Frame(GOODBYE, 0))
 
     async def _send(self, channel: Channel, item: Item) -> None:
         if len(item.message) > self._max_body_bytes:
