@@ -1,8 +1,9 @@
 """What sender and receiver say to each other: a header of fixed length, and a body.
 
-The sender greets with the name of its stream; the receiver answers with the number of the message that it expects
-next, so that after a broken connection nothing is sent twice that arrived once, and nothing is lost, and with the
-largest body that it takes. Then each message (DATA) is answered by an ACK with its number. A sender that has sent all says GOODBYE.
+The sender greets with the name of its stream. The receiver answers with the number of the message that it expects next,
+so that after a broken connection nothing is sent twice that arrived once, and nothing is lost, and with the largest
+body that it takes. Then each message (DATA) is answered by an ACK with its number. A sender that has sent all says
+GOODBYE.
 """
 
 from __future__ import annotations
