@@ -29,6 +29,7 @@ ROOMS = [
     "scenario",
     "sim",
     "oracle",
+    "live",
     "envs",
     "expert",
     "sb3",

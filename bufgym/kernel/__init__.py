@@ -8,7 +8,7 @@ check the compiled code against its own text.
 from bufgym.kernel.announce import compile_silently
 from bufgym.kernel.arrays import at, item, prefetch, records, stretch, table
 from bufgym.kernel.cache import FOLDER, JIT
-from bufgym.kernel.compile import compile_for, interruptible, kernel
+from bufgym.kernel.compile import compile_for, interruptible, kernel, located
 
 __all__ = [
     "FOLDER",
@@ -19,6 +19,7 @@ __all__ = [
     "interruptible",
     "item",
     "kernel",
+    "located",
     "prefetch",
     "records",
     "stretch",

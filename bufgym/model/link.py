@@ -78,6 +78,19 @@ class Link:
         _positions(trace.time_us, trace.cumulative_bytes, _AFTER[trace.after], t_us + self.offset_us, carried)
         return carried
 
+    def carried_at(self, t_us: int) -> int:
+        """C at one time, bytes, rounded down."""
+        trace = self.trace
+        us, size, after = trace.time_us, trace.cumulative_bytes, _AFTER[trace.after]
+        return int(position_at(us, size, 0, len(us) - 1, after, 0, t_us + self.offset_us)[0])
+
+    def time_at(self, position: int) -> int:
+        """The first time, us, at which the link has carried ``position`` > 0 bytes; FOREVER if it never will."""
+        trace = self.trace
+        us, size, after = trace.time_us, trace.cumulative_bytes, _AFTER[trace.after]
+        t_us = int(time_of(us, size, 0, len(us) - 1, after, 0, position)[0])
+        return t_us if t_us == FOREVER else t_us - self.offset_us
+
     @property
     def carries_bytes(self) -> int:
         """All bytes that the link will ever carry; FOREVER where it never stops."""

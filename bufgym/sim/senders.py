@@ -138,13 +138,17 @@ class Senders:
             memory = padded([self.new_memory(policy, i) for i in range(len(self))])
         elif memory is None:
             memory = policy.new_memory(len(self), self.capacity)
+        self.follow(policy)
+        roll_out(self.batch._replace(parameters=policy.parameter_array), shares, memory, policy)
+
+    def follow(self, policy: Policy) -> None:
+        """Ask where ``policy`` wants to be asked, and send as the client around it does."""
         senders, client = self.batch.senders, policy.client
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
         for rule in ("limit_at_send", "limit_since_sent", "flush_no_drop"):
             senders[rule] = getattr(client, rule)
         if not client.awaits_acks:
             senders["window"], senders["ack_delay_us"] = 1, 0
-        roll_out(self.batch._replace(parameters=policy.parameter_array), shares, memory, policy)
 
     def check_untouched(self, policy: Policy) -> None:
         """An error if ``policy`` has written to what it saw while it ran every sender to its end."""

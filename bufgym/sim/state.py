@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bufgym.kernel import kernel, records
 from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC, row_width
 from bufgym.model.documented import documented
+from bufgym.model.link import FOREVER
 from bufgym.model.qoi import exponential
 
 END, DEPARTURE, DECISION, DEQUEUE, SEND = range(5)
@@ -53,6 +54,8 @@ SENDER = np.dtype(
         ("arrivals", np.int64),  # messages in all
         ("first_decision", np.int64),  # arrivals from this one to
         ("last_decision", np.int64),  # this one ask for a decision
+        ("first_seq", np.int64),  # ``seq`` of the message in the first column; 0 but in a live row, which forgets
+        ("forgotten", np.int64),  # messages that it dequeued before those in ``order``; 0 but there
         ("first_knot", np.int64),  # of its trace, in the batch's knots
         ("last_knot", np.int64),
         ("after", np.int64),  # what follows the trace's end: LOOP, HOLD or STOP
@@ -115,6 +118,9 @@ LOG_ENTRY = np.dtype(
 NEVER = -1
 """A time in LOG_ENTRY: it has not happened."""
 
+NOT_YET = FOREVER - 1
+"""The arrival time of a message that a live row still waits for: the row stops there."""
+
 
 @documented
 class Batch(NamedTuple):
@@ -159,8 +165,8 @@ def new_batch(n: int, capacity: int, messages: int, topics: int, v: NDArray[np.f
 
 @kernel
 def place_of(batch: Batch, i: int, message: Any) -> int:
-    """Where ``message`` stands in the log: its ``seq``, but inside it, whatever a compiled policy wrote there."""
-    return int(max(0, min(message.seq, batch.senders[i].arrivals - 1)))
+    """Where ``message`` stands in the log: by its ``seq``, but inside it, whatever a compiled policy wrote there."""
+    return int(max(0, min(message.seq - batch.senders[i].first_seq, batch.senders[i].arrivals - 1)))
 
 
 @functools.cache

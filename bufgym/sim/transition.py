@@ -28,6 +28,7 @@ from bufgym.sim.state import (
     HELD,
     IDLE,
     NEVER,
+    NOT_YET,
     NOTHING,
     SEND,
     SENDER,
@@ -152,7 +153,7 @@ def next_on_link(batch: Batch, i: int) -> int:
     """
     sender = batch.senders[i]
     more = sender.next < sender.arrivals
-    arrives_us = at(batch.arrivals, i, sender.next).arrival_us if more else FOREVER - 1
+    arrives_us = at(batch.arrivals, i, sender.next).arrival_us if more else NOT_YET
     ack_us = next_ack_us(batch, i)
     if sender.finish_us <= arrives_us and sender.finish_us < ack_us:
         finish_transmission(batch, i, sender.finish_us)
@@ -160,7 +161,7 @@ def next_on_link(batch: Batch, i: int) -> int:
         sender.now_us = ack_us
         sender.acked += 1
         sender.socket = UNASKED
-    elif more:
+    elif arrives_us < NOT_YET:
         return arrive(batch, i)
     else:
         return END

@@ -64,7 +64,7 @@ def view(batch: Batch, i: int) -> Buffer:
         sender.max_bytes,
         sender.backlog_bytes,
         sender.now_us,
-        sender.dequeued,
+        sender.forgotten + sender.dequeued,
         dequeued_arrival_us,
         dequeued_x,
         previous_us,

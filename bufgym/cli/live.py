@@ -1,0 +1,220 @@
+"""``bufgym live``: the policies on real sockets."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Coroutine
+from typing import Any
+
+from bufgym.cli.options import (
+    Commands,
+    command,
+    count,
+    given,
+    least_0,
+    load_policies,
+    loaded,
+    natural,
+    policies_option,
+    policy_file,
+    positive,
+)
+from bufgym.errors import BufgymError
+
+PORT = 7410
+"""Of a receiver, where none is named."""
+TRANSPORTS = ("tcp", "websocket")
+DEFAULT_POLICIES = ("drop-oldest", "afr", "min-motion-gap", "learned-motion")
+
+
+def add(commands: Commands) -> None:
+    live = commands.add_parser("live", help="policies on real sockets, beside the simulator")
+    parts = live.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _add_ends(parts)
+    link = command(
+        parts, "link", _link, "a link of a trace's capacity between real sockets (a TCP proxy, without root)"
+    )
+    link.add_argument("--trace", required=True, metavar="FILE", help="bandwidth trace, a file or a shipped name")
+    link.add_argument("--to", required=True, metavar="HOST:PORT", help="where it leads")
+    link.add_argument("--port", type=natural, default=PORT + 1, help="where it begins (%(default)s)")
+    link.add_argument("--scale", type=positive, default=1.0, metavar="X", help="the trace's capacity times X")
+    link.add_argument("--delay-ms", type=least_0, default=0.0, metavar="MS", help="each way (%(default)g)")
+
+    validate = command(parts, "validate", _validate, "the same episodes on real sockets and in the simulator")
+    validate.add_argument("--trace", required=True, nargs="+", metavar="FILE", help="bandwidth traces, as in link")
+    policies_option(validate, ", ".join(DEFAULT_POLICIES))
+    policy_file(validate)
+    validate.add_argument("--capacity", type=count, default=8, metavar="L", help="L, messages (%(default)s)")
+    validate.add_argument("--seeds", type=count, default=1, help="episodes on each trace (%(default)s)")
+    validate.add_argument("--duration", type=positive, default=30.0, metavar="S", help="of each (%(default)g s)")
+    validate.add_argument("--size", type=count, default=230_000, metavar="BYTES", help="of a message (%(default)s)")
+    validate.add_argument("--scale", type=positive, default=1.0, metavar="X", help="the traces' capacity times X")
+    validate.add_argument("--transport", choices=TRANSPORTS, default="tcp", help="(%(default)s)")
+    validate.add_argument("--speed", type=positive, default=1.0, metavar="X", help="time runs X times as fast")
+
+    replay = command(parts, "replay", _replay, "a queue's log through the simulator: the same decisions?")
+    replay.add_argument("log", metavar="LOG.mcap", help="what send --log wrote")
+    policy_file(replay)
+
+
+def _add_ends(parts: Commands) -> None:
+    send = command(parts, "send", _send, "made-up frames along a shipped motion, to a receiver")
+    send.add_argument("to", nargs="?", default=f"127.0.0.1:{PORT}", metavar="HOST:PORT", help="(%(default)s)")
+    send.add_argument("--policies", default="afr", metavar="NAME", help="the policy, as in bench (%(default)s)")
+    policy_file(send)
+    send.add_argument("--capacity", type=count, default=8, metavar="L", help="L, messages (%(default)s)")
+    send.add_argument("--rate", type=positive, default=30.0, metavar="HZ", help="frames a second (%(default)g)")
+    send.add_argument("--size", type=count, default=230_000, metavar="BYTES", help="of a frame (%(default)s)")
+    send.add_argument("--duration", type=positive, default=30.0, metavar="S", help="(%(default)g s)")
+    send.add_argument("--motion", default="drive-0", metavar="FILE", help="gives x (%(default)s); or 'none'")
+    send.add_argument("--transport", choices=TRANSPORTS, default="tcp", help="(%(default)s)")
+    send.add_argument("--log", metavar="LOG.mcap", help="log every decision there, for replay")
+
+    receive = command(parts, "receive", _receive, "receive, ack and count what is sent here; Ctrl-C ends it")
+    receive.add_argument("--port", type=natural, default=PORT, help="(%(default)s)")
+    receive.add_argument("--host", default="127.0.0.1", help="address to listen on (%(default)s: this machine alone)")
+    receive.add_argument("--transport", choices=TRANSPORTS, default="tcp", help="(%(default)s)")
+    receive.add_argument("--out", metavar="FILE.mcap", help="write there what comes")
+    receive.add_argument("--messages", type=count, help="stop after so many")
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65_535:
+        raise BufgymError(f"{text}: must be HOST:PORT")
+    return host, int(port)
+
+
+def _run(work: Coroutine[Any, Any, None]) -> None:
+    import asyncio
+
+    asyncio.run(work)
+
+
+def _link(options: argparse.Namespace) -> None:
+    import asyncio
+
+    from bufgym import traces
+    from bufgym.live.shaped import ShapedLink
+    from bufgym.model.link import Link
+
+    trace, target = traces.load(options.trace).scaled(options.scale), _address(options.to)
+
+    async def forward() -> None:
+        link = ShapedLink(Link(trace, propagation_us=round(options.delay_ms * 1000)), target)
+        port = await link.listen(options.port)
+        link.begin()
+        print(f"127.0.0.1:{port} -> {options.to} over {trace.name}; Ctrl-C ends it", flush=True)
+        await asyncio.Event().wait()
+
+    _run(forward())
+
+
+def _validate(options: argparse.Namespace) -> None:
+    from bufgym import policies, traces
+    from bufgym.live.validate import table, validate
+    from bufgym.scenario import Uplink
+
+    load_policies(options.policy_file)
+    chosen = [policies.get(spec) for spec in loaded(options.policies)[0] or DEFAULT_POLICIES]
+    scenario = Uplink(
+        traces=tuple(traces.load(name) for name in options.trace),
+        motion=tuple(traces.load_motion(name) for name in traces.shipped() if name.startswith("drive-")),
+        size_bytes=options.size,
+        duration_s=options.duration,
+        scale=(options.scale,),
+        propagation_us=0,
+    )
+    print(
+        f"{options.duration:g} s, {options.size} bytes at 30 Hz, L = {options.capacity}, V = {scenario.value.name}, "
+        f"over {options.transport} (a window of one ack) and in the simulator\n"
+    )
+    wishes = given(options, ("seeds", "transport", "speed"))
+    print(table(validate(chosen, scenario, options.capacity, **wishes)))
+
+
+def _replay(options: argparse.Namespace) -> None:
+    from bufgym.live import replay
+
+    load_policies(options.policy_file)
+    played = replay(options.log)
+    stats = played.outcome
+    print(
+        f"{stats.arrived} put, {stats.delivered} delivered, {stats.dropped} dropped, {stats.in_transmission} in "
+        f"transmission, {stats.buffered} queued; QoI {stats.qoi:.3f}, longest gap {stats.longest_gap:g}"
+    )
+    if played.differences:
+        first = "; ".join(played.differences[:3])
+        raise BufgymError(f"{options.log}: the simulator decides otherwise {len(played.differences)} times: {first}")
+    print("The simulator makes the same decisions.")
+
+
+def _send(options: argparse.Namespace) -> None:
+    import asyncio
+    import contextlib
+    import math
+
+    from bufgym import policies, traces
+    from bufgym.live import LogFile, PolicyQueue
+    from bufgym.live.channels import TRANSPORTS as CONNECT
+    from bufgym.live.sender import Sender
+    from bufgym.model import qoi
+
+    load_policies(options.policy_file)
+    (name,) = loaded([options.policies])[0]
+    host, port = _address(options.to)
+    motion = None if options.motion == "none" else traces.load_motion(options.motion)
+
+    async def stream(queue: PolicyQueue) -> None:
+        loop, sender = asyncio.get_running_loop(), Sender(queue, lambda: CONNECT[options.transport](host, port))
+        sending, began_s, body = asyncio.create_task(sender.run()), loop.time(), bytes(options.size)
+        for k in range(round(options.rate * options.duration)):
+            await asyncio.sleep(began_s + k / options.rate - loop.time())
+            if sending.done():
+                break
+            x = None if motion is None else float(motion.at(round(k / options.rate * 1e6)))
+            queue.put(body, len(body), x)
+            if k % round(max(1.0, options.rate)) == 0:
+                print(
+                    f"{k / options.rate:4.0f} s: {k + 1} put, {queue.dropped} dropped, {len(queue)} queued", flush=True
+                )
+        queue.close()
+        await sending
+        print(f"all put, {queue.dropped} dropped, {len(sender.faults)} broken connections {list(sender.faults)[-1:]}")
+
+    with contextlib.ExitStack() as stack:
+        log = None if options.log is None else stack.enter_context(LogFile(options.log))
+        _run(stream(PolicyQueue(policies.get(name), options.capacity, value=qoi.exponential(math.exp(-1)), log=log)))
+
+
+def _receive(options: argparse.Namespace) -> None:
+    import asyncio
+    import contextlib
+
+    from bufgym.live.receiver import Received, Receiver, Recording
+
+    async def take(record: Any) -> None:
+        enough = asyncio.Event()
+        taken = 0
+
+        def on_message(message: Received) -> None:
+            nonlocal taken
+            record(message)
+            taken += 1
+            if taken % 30 == 1:
+                print(f"{taken} received, the last: {message.seq}, {len(message.body)} bytes", flush=True)
+            if taken == options.messages:
+                enough.set()
+
+        receiver = Receiver(on_message)
+        port = await receiver.listen(options.port, options.host, options.transport)
+        print(f"listening on {options.host}:{port}", flush=True)
+        try:
+            await enough.wait()
+            await asyncio.sleep(0.1)  # for the last ack
+        finally:
+            await receiver.close()
+            print(f"{taken} received; {len(receiver.faults)} broken connections {list(receiver.faults)[-1:]}")
+
+    with contextlib.ExitStack() as stack:
+        _run(take(stack.enter_context(Recording(options.out)) if options.out else lambda message: None))

@@ -1,0 +1,222 @@
+"""The receiving end: takes messages from any number of senders, acks each, and gives none twice."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import json
+import socket
+import time
+from collections import OrderedDict, deque
+from collections.abc import Awaitable, Callable, Coroutine
+from pathlib import Path
+from typing import Any, Final, NamedTuple, cast
+
+from bufgym.errors import BufgymError
+from bufgym.live.channels import Channel, TcpChannel, WebSocketChannel
+from bufgym.live.extra import needs
+from bufgym.live.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError
+
+MAX_STREAMS: Final = 64
+"""Senders that are remembered, the latest."""
+_GREETING_S: Final = 20.0
+"""Who has not greeted by then is no sender."""
+
+
+class Received(NamedTuple):
+    """A message that came."""
+
+    stream: str
+    """Whose, in hexadecimal digits."""
+    number: int
+    """Its place among those that the sender's socket dequeued."""
+    seq: int
+    """Its place among those that were put."""
+    at_us: int
+    """When it was put, by the sender's clock."""
+    x: float
+    topic: int
+    body: bytes | memoryview
+    received_ns: int
+    """By this system's clock."""
+
+
+class _Stream:
+    """What is known of one sender."""
+
+    def __init__(self, expected: int) -> None:
+        self.expected = expected
+        self.task: asyncio.Task[Any] | None = None
+        """That of its connection. To close a socket on which a task waits is no way to end it."""
+
+
+class Receiver:
+    """Listens, and calls ``on_message`` with each ``Received``, in each sender's order. It acks when that has returned.
+
+    A peer that does not speak as it should, or sends a frame of more than ``max_body_bytes``, is hung up on.
+    """
+
+    def __init__(
+        self,
+        on_message: Callable[[Received], Awaitable[None] | None],
+        *,
+        max_body_bytes: int = MAX_BODY_BYTES,
+    ) -> None:
+        self.faults: deque[str] = deque(maxlen=100)
+        """Why connections ended, the last 100."""
+        self._on_message = on_message
+        self._max_body_bytes = max_body_bytes
+        self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._listener: socket.socket | None = None
+        self._server: Any = None
+
+    async def listen(self, port: int = 0, host: str = "127.0.0.1", transport: str = "tcp") -> int:
+        """Begin to listen; the port (0: any that is free)."""
+        if transport == "tcp":
+            self._listener = await listener(host, port)
+            self._keep(self._accept(self._listener))
+            return int(self._listener.getsockname()[1])
+        if transport != "websocket":
+            raise BufgymError(f"transport {transport!r}: must be 'tcp' or 'websocket'")
+        with needs("websockets"):
+            from websockets.asyncio.server import serve
+        self._server = await serve(
+            lambda connection: self._serve(WebSocketChannel(connection, self._max_body_bytes)),
+            host,
+            port,
+            compression=None,
+            ping_interval=None,
+            max_size=self._max_body_bytes + HEADER_BYTES,
+            max_queue=1,
+        )
+        return int(next(iter(self._server.sockets)).getsockname()[1])
+
+    async def close(self) -> None:
+        """Hang up, and listen no more."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._listener is not None:
+            self._listener.close()
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+
+    def _keep(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _accept(self, listening: socket.socket) -> None:
+        while True:
+            connection, _ = await asyncio.get_running_loop().sock_accept(listening)
+            connection.setblocking(False)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._keep(self._serve(TcpChannel(connection, self._max_body_bytes)))
+
+    async def _serve(self, channel: Channel) -> None:
+        """One connection, to its end."""
+        try:
+            await self._take(channel, await asyncio.wait_for(channel.receive(), _GREETING_S))
+        except (OSError, TimeoutError) as error:
+            self.faults.append(f"{type(error).__name__}: {error}")
+        finally:
+            channel.close()
+
+    async def _take(self, channel: Channel, greeting: Frame) -> None:
+        if greeting.kind != GREETING:
+            raise FrameError(f"frame of kind {greeting.kind}: must be a greeting first")
+        name = bytes(greeting.body)
+        stream = self._streams.setdefault(name, _Stream(greeting.number))
+        self._streams.move_to_end(name)
+        if stream.task is not None:
+            stream.task.cancel()  # the sender has given that connection up
+            await asyncio.wait([stream.task])
+        stream.task = asyncio.current_task()
+        if len(self._streams) > MAX_STREAMS:
+            _, oldest = self._streams.popitem(last=False)
+            if oldest.task is not None:
+                oldest.task.cancel()
+        await channel.send(Frame(GREETING, stream.expected, self._max_body_bytes))
+        while True:
+            frame = await channel.receive()
+            if frame.kind == GOODBYE:
+                self._streams.pop(name, None)
+                return
+            if frame.kind != DATA or frame.number > stream.expected:
+                raise FrameError(
+                    f"frame of kind {frame.kind}, number {frame.number}: must be message {stream.expected}"
+                )
+            if frame.number == stream.expected:
+                answer = self._on_message(
+                    Received(
+                        name.hex(),
+                        frame.number,
+                        frame.seq,
+                        frame.at_us,
+                        frame.x,
+                        frame.topic,
+                        frame.body,
+                        time.time_ns(),
+                    )
+                )
+                if inspect.isawaitable(answer):
+                    await answer
+                stream.expected += 1
+            await channel.send(Frame(ACK, frame.number))
+
+
+async def listener(host: str, port: int, receive_buffer_bytes: int | None = None) -> socket.socket:
+    """A listening TCP socket."""
+    found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    family, kind, protocol, _, address = found[0]
+    listening = socket.socket(family, kind, protocol)
+    try:
+        listening.setblocking(False)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if receive_buffer_bytes is not None:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
+        listening.bind(address)
+        listening.listen()
+    except OSError as error:
+        listening.close()
+        raise BufgymError(f"{host}:{port}: {error.strerror or error}") from None
+    return listening
+
+
+class Recording(contextlib.AbstractContextManager["Recording"]):
+    """What was received, in an MCAP file: bodies on ``/topic_0`` and so on, the rest of each on ``/received``."""
+
+    def __init__(self, path: str | Path) -> None:
+        with needs("mcap"):
+            from mcap.writer import Writer
+        self._file = Path(path).open("wb")  # noqa: SIM115  (open as long as this is)
+        self._writer = Writer(self._file)
+        self._writer.start(profile="", library="bufgym")
+        schema = self._writer.register_schema("bufgym.live.Received", "jsonschema", b'{"type": "object"}')
+        self._channel = self._writer.register_channel("/received", "json", schema)
+        self._bodies: dict[int, int] = {}
+
+    def __call__(self, message: Received) -> None:
+        """Write one message; an ``on_message`` of ``Receiver``."""
+        if message.topic not in self._bodies:
+            topic = f"/topic_{message.topic}"
+            self._bodies[message.topic] = self._writer.register_channel(topic, "application/octet-stream", 0)
+        times = {"log_time": message.received_ns, "publish_time": message.at_us * 1000}
+        self._writer.add_message(
+            self._bodies[message.topic], data=bytes(message.body), sequence=message.seq % 2**32, **times
+        )
+        about = {**message._asdict(), "size_bytes": len(message.body)}
+        del about["body"]
+        self._writer.add_message(self._channel, data=json.dumps(about).encode(), sequence=message.seq % 2**32, **times)
+
+    def close(self) -> None:
+        """Finish the file."""
+        if not self._file.closed:
+            cast(Any, self._writer).finish()
+            self._file.close()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,108 @@
+"""A live queue's log through the simulator: the same arrivals over the link that the log measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bufgym.errors import BufgymError
+from bufgym.live.log import Record, of, read_log
+from bufgym.model.buffer import MESSAGE
+from bufgym.model.link import Link
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
+from bufgym.policies.registry import Policy, get
+from bufgym.scenario import Episode
+from bufgym.sim import Senders, run
+from bufgym.sim.metrics import Outcome, outcome
+from bufgym.sim.state import NEVER
+from bufgym.traces import Trace
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What the simulator made of a log."""
+
+    senders: Senders
+    """The one sender, after its run."""
+    episode: Episode
+    """The arrivals, and as the link's trace what it really carried."""
+    differences: tuple[str, ...]
+    """Decisions that the live queue made otherwise, a sentence each; none if the log is whole."""
+
+    @property
+    def outcome(self) -> Outcome:
+        """The statistics of the live run."""
+        return outcome(self.senders, 0)
+
+
+def replay(log: str | Path | Sequence[Record], policy: Policy | None = None) -> Replay:
+    """Run the messages of a log (a file, or its records) through the simulator, over the link that it measured.
+
+    ``policy``: the one that decided, where the registry does not know it by the name in the log.
+    """
+    records = log if isinstance(log, Sequence) and not isinstance(log, str) else read_log(log)
+    name = "the log" if records is log else str(log)
+    try:
+        return _replayed(records, policy)
+    except (KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
+        raise BufgymError(f"{name}: no sound log of a live queue: {type(error).__name__}: {error}") from None
+
+
+def _replayed(records: Sequence[Record], policy: Policy | None) -> Replay:
+    made = records[0]
+    if policy is None:
+        policy = replace(get(made["policy"]), parameters=made["parameters"])
+    topics = [Topic(**{**topic, "value": topic["value"] and _value(topic["value"])}) for topic in made["topics"]]
+    episode = Episode(_arrivals(records), Link(_trace(records)), window=made["window"])
+    senders = run(
+        policy,
+        [replace(episode, window=made["window"])],
+        made["capacity"],
+        _value(made["v"]),
+        max_bytes=made["max_bytes"],
+        decide_at=made["decide_at"],
+        topics=topics,
+    )
+    return Replay(senders, episode, tuple(_differences(records, senders)))
+
+
+def _value(v: Record) -> Value:
+    return Value(v["name"], np.array(v["numbers"], np.float64))
+
+
+def _arrivals(records: Sequence[Record]) -> np.ndarray[Any, Any]:
+    """MESSAGE[n] of the log."""
+    puts = list(of(records, "put"))
+    arrivals = np.zeros(len(puts), MESSAGE)
+    for name, column in (("seq", "seq"), ("arrival_us", "us"), ("size_bytes", "size_bytes"), ("topic", "topic")):
+        arrivals[name] = [put[column] for put in puts]
+    arrivals["x"], arrivals["uniform"] = [put["x"] for put in puts], [put["uniform"] for put in puts]
+    return arrivals
+
+
+def _trace(records: Sequence[Record]) -> Trace:
+    """What the link carried: a knot at each arrival, and wherever a message had left."""
+    told = [record for record in records if "carried" in record]
+    return Trace(
+        "live", np.array([0, 1, *(r["us"] for r in told)]), np.array([0, 0, *(r["carried"] for r in told)]), "stop"
+    )
+
+
+def _differences(records: Sequence[Record], senders: Senders) -> list[str]:
+    """What became of each message, live and here; of what happened last a log that breaks off may not tell all."""
+    log, last_us = senders.batch.log[0], records[-1]["us"]
+    found = []
+    for event, column in (("dequeued", "dequeued_us"), ("gone", "transmitted_us"), ("dropped", "dropped_us")):
+        live = np.full(len(log), NEVER)
+        for record in of(records, event):
+            live[record["seq"]] = record["us"]
+        found += [
+            f"message {seq}: {event} at {live[seq]} us, in the simulator at {log[column][seq]} us (-1: never)"
+            for seq in np.flatnonzero((live != log[column]) & ((live != NEVER) | (log[column] < last_us)))
+        ]
+    return found

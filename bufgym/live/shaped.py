@@ -1,0 +1,179 @@
+"""A link of a trace's capacity between real sockets: a TCP proxy in user space, without root.
+
+Towards the receiver it forwards as the simulator's link carries, byte position by byte position; what comes back is
+only delayed. Its own buffers are small, so that it hides no queue.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any, Final
+
+from bufgym.live.receiver import listener
+from bufgym.model.link import FOREVER, Link
+
+RECEIVE_BUFFER_BYTES: Final = 16_384
+_PIECE_BYTES: Final = 16_384
+_MOST_PIECES: Final = 4096
+"""On their way to the receiver at a time, at most."""
+_SLACK_S: Final = 0.005
+"""Where bytes come no later than this after the last ones had crossed, the link counts as busy all the time: an ack and
+the next message take their turns in programs, which is not the link's doing."""
+
+
+class ShapedLink:
+    """Forwards connections to ``target`` (host, port) at the pace of ``link``; ``speed``: how much faster time runs."""
+
+    def __init__(
+        self,
+        link: Link,
+        target: tuple[str, int],
+        *,
+        speed: float = 1.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._link = link
+        self._target = target
+        self._speed = speed
+        self._clock = clock
+        self._began_s = clock()
+        self._position = 0
+        self._open = asyncio.Event()
+        self._open.set()
+        self._sockets: set[socket.socket] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._turn = asyncio.Lock()
+        self.carried_bytes = 0
+        """Towards the receiver, so far."""
+
+    async def listen(self, port: int = 0, host: str = "127.0.0.1") -> int:
+        """Begin to listen; the port (0: any that is free)."""
+        listening = await listener(host, port, RECEIVE_BUFFER_BYTES)
+        self._sockets.add(listening)
+        self._keep(self._accept(listening))
+        return int(listening.getsockname()[1])
+
+    def begin(self) -> None:
+        """The trace begins now."""
+        self._began_s = self._clock()
+        self._position = 0
+
+    def cut(self) -> None:
+        """Break all connections, and take no new ones until ``mend``."""
+        self._open.clear()
+        for task in self._tasks:
+            if task.get_name() == "connection":
+                task.cancel()
+
+    def mend(self) -> None:
+        """Take connections again."""
+        self._open.set()
+
+    async def close(self) -> None:
+        """Break all connections, and listen no more."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        for one in self._sockets:
+            one.close()
+
+    # --- connections --------------------------------------------------------------------------------------------------
+
+    def _keep(self, work: Coroutine[Any, Any, None], name: str = "") -> None:
+        task = asyncio.create_task(work, name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _accept(self, listening: socket.socket) -> None:
+        while True:
+            near, _ = await asyncio.get_running_loop().sock_accept(listening)
+            near.setblocking(False)
+            if self._open.is_set():
+                self._keep(self._forward(near), "connection")
+            else:
+                near.close()
+
+    async def _forward(self, near: socket.socket) -> None:
+        """One connection, to its end."""
+        loop = asyncio.get_running_loop()
+        far = socket.socket()
+        tasks = []
+        try:
+            far.setblocking(False)
+            for one in (near, far):
+                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            await loop.sock_connect(far, self._target)
+            tasks = [asyncio.create_task(self._up(near, far)), asyncio.create_task(self._down(far, near))]
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        except OSError:
+            pass  # who listens no more: the sender connects again
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            near.close()
+            far.close()
+
+    async def _up(self, near: socket.socket, far: socket.socket) -> None:
+        """Towards the receiver, piece by piece when it has crossed; connections take turns."""
+        crossed: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_MOST_PIECES)
+        delivery = asyncio.create_task(self._deliver(crossed, far))
+        try:
+            while True:
+                waited, piece = await _piece(near)
+                if not piece:
+                    break
+                async with self._turn:
+                    crossed_s = self._crossed_s(len(piece), waited)
+                    await self._until(crossed_s)
+                self.carried_bytes += len(piece)
+                await crossed.put((crossed_s + self._link.propagation_us / 1e6, piece))
+            await crossed.join()
+        finally:
+            delivery.cancel()
+
+    async def _deliver(self, crossed: asyncio.Queue[tuple[float, bytes]], far: socket.socket) -> None:
+        """What has crossed arrives a propagation delay later."""
+        while True:
+            arrives_s, piece = await crossed.get()
+            await self._until(arrives_s)
+            await asyncio.get_running_loop().sock_sendall(far, piece)
+            crossed.task_done()
+
+    async def _down(self, far: socket.socket, near: socket.socket) -> None:
+        """Back to the sender."""
+        loop = asyncio.get_running_loop()
+        while piece := await loop.sock_recv(far, 65_536):
+            await asyncio.sleep(self._link.propagation_us / 1e6 / self._speed)
+            await loop.sock_sendall(near, piece)
+
+    # --- time and bytes -----------------------------------------------------------------------------------------------
+
+    def _now_s(self) -> float:
+        """The link's time."""
+        return (self._clock() - self._began_s) * self._speed
+
+    def _crossed_s(self, size_bytes: int, waited: bool) -> float:
+        """When so many more bytes have crossed, in the link's time; ``waited``: it may have been idle before."""
+        if waited:
+            idle_us = max(0, int((self._now_s() - _SLACK_S * self._speed) * 1e6))
+            self._position = max(self._position, self._link.carried_at(idle_us))
+        self._position += size_bytes
+        crossed_us = self._link.time_at(self._position)
+        return float("inf") if crossed_us == FOREVER else crossed_us / 1e6
+
+    async def _until(self, time_s: float) -> None:
+        """Sleep until then, in the link's time; for ever on a link that has stopped."""
+        while (rest_s := (time_s - self._now_s()) / self._speed) > 0:
+            await asyncio.sleep(min(rest_s, 1.0))
+
+
+async def _piece(connection: socket.socket) -> tuple[bool, bytes]:
+    """(whether it had to wait, the next bytes; none at the end)."""
+    try:
+        return False, connection.recv(_PIECE_BYTES)
+    except BlockingIOError:
+        return True, await asyncio.get_running_loop().sock_recv(connection, _PIECE_BYTES)

@@ -1,0 +1,97 @@
+"""Queues on real sockets, over shaped links: as in the simulator, and worse where the system's buffers hide a queue."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bufgym import policies
+from bufgym.live import replay
+from bufgym.live.channels import TRANSPORTS
+from bufgym.live.log import Record
+from bufgym.live.validate import Run, play, table, validate
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.scenario import Episode, Uplink, messages
+from bufgym.sim import run
+from bufgym.sim.metrics import outcome
+from bufgym.traces import Trace
+
+V = qoi.exponential(0.618)
+PERIOD_US, SIZE_BYTES = 33_333, 200_000
+
+
+def fade(n: int = 150, fade_s: int = 3) -> Episode:
+    """Video at 30 Hz over 4 MB/s, and from 1 s on for some time over a tenth of that."""
+    seconds, megabytes = np.array([0, 1, 1 + fade_s, 2 + fade_s]), np.array([0, 4, 4 + 0.4 * fade_s, 8 + 0.4 * fade_s])
+    trace = Trace("fade", seconds * 10**6, (megabytes * 10**6).astype(np.int64), "hold")
+    return Episode(messages(np.arange(n) * PERIOD_US, SIZE_BYTES), Link(trace))
+
+
+def live(episode: Episode, policy: str = "afr", capacity: int = 8, **settings: Any) -> list[Any]:
+    return asyncio.run(
+        asyncio.wait_for(play(policies.get(policy), episode, capacity, V, **{"speed": 2.0, **settings}), 60)
+    )
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_on_sockets_as_in_the_simulator(transport: str) -> None:
+    """Wide margins: on a quiet machine counts agree within 1 and QoI within 0.5 %."""
+    records: list[Record] = []
+    came = live(fade(), transport=transport, log=records)
+    simulated = outcome(run(policies.get("afr"), [fade()], 8, V), 0)
+    assert [message.number for message in came] == list(range(len(came)))
+    assert [message.seq for message in came] == sorted({message.seq for message in came})
+    assert len(came) == pytest.approx(simulated.delivered, rel=0.15)
+    assert V.information([message.x for message in came]) == pytest.approx(simulated.qoi, rel=0.08)
+    # The log tells exactly what came, and the simulator makes the same of it.
+    played = replay(records)
+    assert played.differences == ()
+    assert played.outcome.delivered == len(came)
+    assert played.outcome.qoi == V.information([message.x for message in came])
+
+
+def test_what_the_systems_buffers_hide_is_lost() -> None:
+    """With default buffers the system takes megabytes at once, which no policy can drop any more.
+
+    For 5 s of a fade they come one after the other, seconds late: QoI of what has come when the stream ends.
+    """
+    episode = fade(200, fade_s=5)
+
+    def in_time(**settings: Any) -> float:
+        came = live(episode, "min-motion-gap", **settings)
+        end_ns = came[0].received_ns + episode.arrivals["arrival_us"][-1] * 1000 // 2
+        return V.information([message.x for message in came if message.received_ns <= end_ns])
+
+    small, hidden = in_time(leaves="sent"), in_time(small=False, leaves="written")
+    print("QoI in time, small and default buffers:", small, hidden)
+    assert hidden < 0.9 * small
+
+
+def test_a_window_of_several_messages() -> None:
+    episode = fade(60)
+    several = Episode(episode.arrivals, episode.link, window=3)
+    records: list[Record] = []
+    came = live(several, log=records)
+    assert [message.number for message in came] == list(range(len(came)))
+    assert replay(records).differences == ()
+
+
+def test_validation_holds_both_side_by_side() -> None:
+    scenario = Uplink(traces=(fade().link.trace,), duration_s=3.0, random_offset=False, propagation_us=0, value=V)
+    chosen = [policies.get(name) for name in ("drop-oldest", "random")]
+    runs = validate(chosen, scenario, 4, speed=3.0)
+    assert [one.policy for one in runs] == ["drop-oldest", "random"]
+    for one in runs:
+        assert one.live_qoi == pytest.approx(one.simulated_qoi, rel=0.1)
+        assert 0 <= one.simulated_regret < 1
+
+
+def test_the_table_by_hand() -> None:
+    runs = [Run("afr", "a", 0, 9, 10, 4.0, 5.0, 5.0), Run("afr", "b", 0, 10, 10, 5.0, 5.0, 5.0)]
+    text = table(runs)
+    assert "| afr | 9.5 | 10.0 | 4.500 | 5.000 | 10.00% | 0.00% |" in text
+    assert "10.00% apart (median), 20.00% at most; delivered 0.5 and 1." in text
