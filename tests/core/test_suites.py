@@ -102,6 +102,27 @@ def test_paper_numbers_and_capacities() -> None:
         assert share == pytest.approx(0.5, rel=0.061)
 
 
+def test_5g_uplinks_are_split_by_day_without_the_runs_that_failed(shared_data: Path) -> None:
+    counts = {}
+    for split, days in (("train", "123"), ("validation", "4"), ("test", "5")):
+        built = scenarios("uplink-5g-v1", split, shared_data)
+        assert list(built) == ["time-230kB", "motion-230kB", "time-900kB", "motion-900kB"]
+        (names,) = {tuple(trace.name for trace in s.traces) for s in built.values() if isinstance(s, Uplink)}
+        assert {name[:8] for name in names} == {f"2024110{day}" for day in days}
+        counts[split] = len(names)
+    assert counts == {"train": 24, "validation": 6, "test": 12}
+
+
+def test_wifi_and_mmwave_uplinks_are_split_by_place(shared_data: Path) -> None:
+    for split, place, spot in (("train", "loc2", "p1"), ("validation", "loc1", "p2"), ("test", "loc3", "p3")):
+        wifi = scenarios("uplink-wifi-v1", split, shared_data)["motion-900kB"]
+        assert isinstance(wifi, Uplink) and all(f"_{place}_" in trace.name for trace in wifi.traces)
+        mmwave = scenarios("uplink-mmwave-v1", split, shared_data)["motion-900kB"]
+        assert isinstance(mmwave, Uplink)
+        ways = {trace.name.rpartition("-")[0].split("_5g_")[1] for trace in mmwave.traces}
+        assert ways > {f"away_{spot}", f"toward_{spot}"} and len(ways) == 3
+
+
 def test_generated_links_are_of_all_ways_of_moving() -> None:
     for split, times in (("train", 4), ("validation", 1), ("test", 2)):
         built = scenarios("generated-v1", split)
