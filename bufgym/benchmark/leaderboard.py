@@ -13,8 +13,9 @@ from typing import Any
 
 from bufgym import __version__
 from bufgym.benchmark import manifest, table
-from bufgym.benchmark.bootstrap import Interval, written
+from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Row
+from bufgym.benchmark.summary import shown
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.errors import BufgymError, where
@@ -191,7 +192,7 @@ def markdown(board: Sequence[Entry]) -> str:
         quantities = [quantity for quantity in task.quantities() if quantity.key in task.listed]
         lines = []
         for entry in group:
-            values = [" ".join(filter(None, written(entry.values[q.key], q.write))) for q in quantities]
+            values = [" ".join(filter(None, shown(entry.values[q.key], q))) for q in quantities]
             lines.append([str(entry.rank) if entry.rank else "–", entry.policy, *values, f"`{entry.command}`"])
         head = ["#", "policy", *(quantity.title for quantity in quantities), "command"]
         meanings = "; ".join(f"{quantity.title}: {quantity.about}" for quantity in quantities)

@@ -86,6 +86,8 @@ class Summary:
     """Of the bootstrap."""
     scores: Scores | None = None
     """Scores between the baseline and the clairvoyant, where one is known."""
+    notes: tuple[str, ...] = ()
+    """Sentences about single policies, below the ranking."""
 
     @property
     def counted_cells(self) -> int:
@@ -192,7 +194,13 @@ def summarise(
 
 def pair(standing: Standing, quantity: Quantity) -> tuple[str, str]:
     """(value, interval in brackets) as text; a dash and nothing where the policy has no value."""
-    return written(UNKNOWN if standing.policy == quantity.versus else standing[quantity.key], quantity.write)
+    return shown(UNKNOWN if standing.policy == quantity.versus else standing[quantity.key], quantity)
+
+
+def shown(interval: Interval, quantity: Quantity) -> tuple[str, str]:
+    """The same of a number; nothing in brackets where a quantity has no intervals at all."""
+    value, brackets = written(interval, quantity.write)
+    return value, "" if math.isnan(interval.low) and not quantity.interval else brackets
 
 
 def title(cell: Cell, abouts: Mapping[str, str]) -> str:

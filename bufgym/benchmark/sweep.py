@@ -149,8 +149,9 @@ def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
         _LOADED.add(sweep.policy_file)
     for source in sweep.sources:
         sources.load(source, sweep.folder)
-    scenario = sweep.setting(shard.label, shard.trace).scenario
-    return run(sweep.policies, scenario, sweep.capacities, shard.seeds, label=shard.label)
+    setting = sweep.setting(shard.label, shard.trace)
+    limits: dict[str, Any] = {} if setting.max_bytes is None else {"max_bytes": setting.max_bytes}
+    return run(sweep.policies, setting.scenario, sweep.capacities, shard.seeds, label=shard.label, **limits)
 
 
 def _attempt(number: int, shard: Shard, load: Load | None, parent: int) -> tuple[int, list[Row] | Exception]:

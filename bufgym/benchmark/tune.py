@@ -48,6 +48,10 @@ GRIDS = {
         {"beta": (0.25, 0.5, 0.8, 1, 1.1, 1.2, 1.39, 1.5, 1.7, 2)},
         "around 1.2 to 1.39; at 1 the newcomer may be as near as L messages spread evenly, at 2 twice as far",
     ),
+    "paced-motion-gap": Grid(
+        {"pace": (0.1, 0.35, 0.5, 0.7, 0.85, 1), "discount": (0.05, 0.2, 0.35, 0.5)},
+        "at pace 0.1 little is rejected, at 1 all nearer than an even spacing; at discount 0.05 all gaps count alike",
+    ),
     "lifespan": Grid(
         {"lifespan_s": (0.1, 0.2, 1, 2, 5, 20)},
         "from three frames of 30/s to the length of an outage; without an end it is drop-oldest",

@@ -36,7 +36,9 @@ def add(commands: Commands) -> None:
     for parser in (info, plot, validate, convert):
         parser.add_argument("files", nargs="+", metavar="FILE", help="a file, archive.zip:member, or a shipped name")
         parser.add_argument("--format", metavar="NAME", help="the files' format, where it is not to be detected")
-        parser.add_argument("--column", metavar="NAME", help="which column of rates, in UCC files (default DL_bitrate)")
+        parser.add_argument(
+            "--column", metavar="NAME", help="of UCC files (DL_bitrate, UL_bitrate), or which run of a list"
+        )
     plot.add_argument("--out", required=True, metavar="FILE", help="the picture to write: .png, .svg or .pdf")
     convert.add_argument("--to", metavar="NAME", help="csv or mahimahi; by default csv where --out ends in .csv")
     convert.add_argument("--out", required=True, metavar="PATH", help="the file to write; a folder for several files")

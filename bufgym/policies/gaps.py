@@ -72,6 +72,36 @@ def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 
 @register(
+    "paced-motion-gap",
+    parameters={"pace": 0.7, "discount": 0.35},
+    source="own rule: min-motion-gap at the pace of an even spacing, older gaps discounted",
+    compile=True,
+)
+def paced_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A full queue rejects a newcomer nearer than ``pace`` even spacings to the tail, else drops a small old gap.
+
+    The even spacing is X / (s + 1): X is the motion since the message dequeued last was taken, which the s queued
+    messages should divide evenly (L of them, but where B is what is full). What goes leaves the smallest merged motion
+    gap; that of slot k counts ``discount`` (1 - k / s) less, as the head is soon sent and the tail must last.
+    """
+    pace, discount = buffer.parameters[0], buffer.parameters[1]
+    s = len(buffer.slots)
+    if has_space(buffer, arrival):
+        return ACCEPT
+    even = (arrival.x - buffer.dequeued_x) / (s + 1)
+    step, _ = motion_gaps(buffer, arrival, s)
+    if step < pace * even and buffer.evictions == 0:
+        return REJECT
+    victim, smallest = 0, np.inf
+    for k in range(s):
+        before, after = motion_gaps(buffer, arrival, k)
+        merged = (before + after) * (1 - discount * (1 - k / s))
+        if merged < smallest:
+            victim, smallest = k, merged
+    return victim
+
+
+@register(
     "orbbuf",
     source="ORBBuf [wang2021orbbuf], released code (Jrdevil-Wang/ORBBuf), with Sim = 1 - V(motion gap)",
     compile=True,

@@ -167,6 +167,22 @@ class EvenReject(MinGap):
         return gaps.index(min(gaps))
 
 
+class PacedMotionGap(MinGap):
+    """A newcomer within ``pace`` even gaps of the tail goes, else the smallest gap, the older the smaller."""
+
+    def __init__(self, pace=0.7, discount=0.35):
+        super().__init__("x")
+        self.pace, self.discount = pace, discount
+
+    def full(self, queue, newcomer, L, last_dequeued, previous):
+        even = (newcomer["x"] - last_dequeued["x"]) / (L + 1)
+        if newcomer["x"] - queue[-1]["x"] < self.pace * even and self.sender.evictions == 0:
+            return REJECT
+        gaps = self.gaps(queue, newcomer, last_dequeued, previous)[:L]
+        counted = [gap * (1 - self.discount * (1 - k / L)) for k, gap in enumerate(gaps)]
+        return counted.index(min(counted))
+
+
 class Steady(Policy):
     """Of the numbers m, 2m, 4m, ... (m odd) the last few are kept: s + 1 if m = 1, else s - floor(log2 m)."""
 
@@ -245,6 +261,7 @@ def twins(v):
         "min-gap": lambda: MinGap("us"),
         "min-motion-gap": lambda: MinGap("x"),
         "even-reject": EvenReject,
+        "paced-motion-gap": PacedMotionGap,
         "orbbuf": lambda: OrbBuf(v),
         "greedy-qoi": lambda: GreedyQoi(v),
         "ros-keep-last": lambda depth=10: KeepLast(depth),

@@ -29,6 +29,7 @@ MS = 1_000
 SETTINGS = [
     "linear-alpha:alpha=2",
     "even-reject:beta=2",
+    "paced-motion-gap:pace=1.5,discount=0.5",
     "keyframe:step=0.5",
     "ros-keep-last:depth=2",
     "lifespan:lifespan_s=0.01",
@@ -130,6 +131,26 @@ def test_even_reject():
     assert interruption("even-reject", 3, 5)[0] == [2, 3, 5]
     # beta = 0.9: 1 against 0.9: 4 enters.
     assert interruption("even-reject:beta=0.9", 3, 4)[0] == [2, 3, 4]
+
+
+def test_paced_motion_gap():
+    # L = 3, the socket took message 0, x is the frame index. The even spacing at T is T / 4, of which 0.7 count; slots
+    # 0, 1, 2 count 0.65, 0.767, 0.883. At 4: 1 against 0.7, and of the gaps 2, 2, 2 the oldest is the least: 1 goes.
+    assert interruption("paced-motion-gap", 3, 4)[0] == [2, 3, 4]
+    # At 5: 1 against 0.875; gaps 3, 2, 2 count 1.95, 1.53, 1.77: 3 goes. At 6: 1 against 1.05: rejected.
+    assert interruption("paced-motion-gap", 3, 5)[0] == [2, 4, 5]
+    assert interruption("paced-motion-gap", 3, 6)[0] == [2, 4, 5]
+    # At 7: 2 against 1.225; gaps 4, 3, 3 count 2.6, 2.3, 2.65: 4 goes.
+    assert interruption("paced-motion-gap", 3, 7)[0] == [2, 5, 7]
+    assert interruption("paced-motion-gap:discount=0.01", 3, 5)[0] == [2, 4, 5]
+    assert interruption("paced-motion-gap:pace=0.9", 3, 5)[0] == [2, 3, 4]
+
+
+def test_paced_motion_gap_drops_the_head_of_a_still_camera():
+    arrivals = messages(np.arange(8) * 33_333, 230_000, np.zeros(8))
+    episode = Episode(arrivals, Link(Trace.steps([(1.0, 0.0), (1.0, 1e8)])))
+    # 0 is in transmission; of 1..7 the three newest are left.
+    assert order(run(policies.get("paced-motion-gap"), [episode], 3, V)) == [0, 5, 6, 7]
 
 
 def test_greedy_is_a_trap():

@@ -85,6 +85,9 @@ def seeds() -> list[tuple[str, bytes]]:
         "belgium": "belgium_4g/raw/*.log",
         "sabre": "belgium_4g/sabre_json/*foot*.json",
         "mbit": "norway_hsdpa/cooked/*bus*",
+        "nuttcp": "uplink_5g/*.gz",
+        "iperf3": "uplink_wifi/*.gz",
+        "runs": "uplink_mmwave/*.gz",
     }.items():
         for path in sorted(data.glob(pattern))[:3]:
             raw = path.read_bytes()

@@ -28,5 +28,8 @@ SAMPLES = {
     "rates": "time_s,bytes_per_s\n10,1000\n12,0\n12.5,4\n",
     "ucc": UCC_HEADER + "2019.12.16_13.40.04,0,72,20,D\n2019.12.16_13.40.05,0,0,8,I\n",
     "nyu": "0.5,Mbits/sec\n0,bits/sec\n43.3,Kbits/sec\n",
+    "nuttcp": "nuttcp-r: socket\n 3.1250 MB / 0.50 sec = 52.4288 Mbps 0 retrans\n 0.0000 MB / 1.00 sec = 0.0 Mbps\n",
+    "iperf3": '{"intervals":[{"sum":{"start":0,"end":1.5,"bytes":3000}},\n{"sum":{"start":1.5,"end":2,"bytes":7}}]}',
+    "runs": "####\nRun 1\n8,16,0\n####\nRun 3\n0.5,1.5\n8,4\n",
     "sabre": '[\n{"duration_ms": 725, "bandwidth_kbps": 36014},\n{"duration_ms": 1000, "bandwidth_kbps": 16}\n]\n',
 }

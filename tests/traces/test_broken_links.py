@@ -15,6 +15,8 @@ from bufgym.traces import FORMATS, read_trace
 from bufgym.traces.formats import links, mahimahi
 from bufgym.traces.formats import text as text_files
 
+NUTTCP = "nuttcp-t: v8.1.4: socket\n"
+
 BROKEN = [
     # Mahimahi: a lone bad line among good ones, which the fast way has to give up on.
     ("1\n2\nx\n4\n", "line 3: time in ms = x: must be a whole number >= 0"),
@@ -98,6 +100,45 @@ BROKEN = [
     ("[" * 100_000, "line 1: must be JSON .nested too deep"),
     ('[\n{"duration_ms": 1,}]', "line 2: .*: must be JSON"),
     (b'[\n{"\xff": 1}]', "line 2: .*: must be UTF-8 text"),
+    # nuttcp
+    ("nuttcp-t: v8.1.4: error from server\n", "line 1: .*error from server.*: must be a run that succeeded"),
+    ("nuttcp-t: v8.1.4: socket\n", "holds no measurement"),
+    (NUTTCP + "1.0000 MB / 1.00 sec = 83.886 Mbps\n", "line 2: Mbps = 83.886: must be MB / sec, 8.389"),
+    (NUTTCP + "1.0000 MB / 0.00 sec = 8.3886 Mbps\n", "line 2: sec = 0.00: must be from 0.01 to 3600"),
+    (NUTTCP + "1.0.0 MB / 1.00 sec = 8.3886 Mbps\n", "line 2: MB = 1.0.0: must be a finite number"),
+    (NUTTCP + "1e300 MB / 1.00 sec = 8.3886 Mbps\n", "line 2: .*: must be an interval, MB / sec = Mbps, or a remark"),
+    (NUTTCP + "9999999.0 MB / 1.00 sec = 8.3886 Mbps\n", "line 2: MB = 9999999.0: must be from 0 to 953674"),
+    (NUTTCP + "hello\n", "line 2: hello: must be an interval"),
+    # iperf3
+    ("{}", "must be an object with a list of intervals"),
+    ('{"intervals": []}', "holds no measurement"),
+    ('{"intervals": [], "error": "unable to connect"}', "error = 'unable to connect': must be a run that succeeded"),
+    ('{"intervals": [3]}', "line 1: 3: must hold sum, an object"),
+    ('{"intervals": [\n{"sum": {"start": 0, "end": 1}}]}', "line 2: .*: must hold bytes, a whole number"),
+    ('{"intervals": [{"sum": {"start": 0, "end": 1, "bytes": 1.5}}]}', "line 1: 1.5: must hold bytes, a whole number"),
+    ('{"intervals": [{"sum": {"start": 0, "end": 1, "bytes": -5}}]}', "line 1: bytes = -5: must be at least 0"),
+    ('{"intervals": [{"sum": {"start": 0, "end": true, "bytes": 5}}]}', "line 1: True: must hold end, a number"),
+    ('{"intervals": [{"sum": {"start": 0, "end": 0, "bytes": 5}}]}', "line 1: end = 0.*: must be after its start"),
+    ('{"intervals": [{"sum": {"start": 0, "end": 1e9, "bytes": 5}}]}', "line 1: end = 1000000000.0: must be from 0 to"),
+    ('{"intervals": [{"sum": {"start": NaN, "end": 1, "bytes": 5}}]}', "line 1: (start = nan: must be|must be JSON)"),
+    (
+        '{"intervals": [{"sum": {"start": 0, "end": 1, "bytes": 5}},\n{"sum": {"start": 2, "end": 3, "bytes": 5}}]}',
+        "line 2: start = 2.0: must begin where the interval above ended",
+    ),
+    ('{"intervals": [}', "line 1: .*: must be JSON"),
+    # Lists of runs
+    ("####\n", "has no run 1: must be one of none"),
+    ("Run 2\n1,2\n", "has no run 1: must be one of run 2"),
+    ("Run 1\n", "run 1 must have a line of Mbit/s"),
+    ("Run 1\n1,2\nRun 1\n1,2\n", "line 3: Run = 1: must be from 1 to 16, and no run's above"),
+    ("Run 17\n1,2\n", "line 1: Run = 17: must be from 1 to 16"),
+    ("####\n1,2\n", "line 2: 1,2: must come under a heading, Run 1"),
+    ("Run 1\n1,x\n", "line 2: Mbit/s = x: must be a finite number"),
+    ("Run 1\n1,-1\n", "line 2: Mbit/s = -1: must be from 0"),
+    ("Run 1\n1\n", "line 2: 1: must have a second line"),
+    ("Run 1\n0,1\n5,5,5\n", "line 3: samples = 3: must be as many as times in the line above .2."),
+    ("Run 1\n0,1\n5,5\n3,4\n", "line 4: run 1 must have one line, or pairs of them"),
+    ("Run 1\n1,0\n5,5\n", "line 3: time in s = 0: must not be before the line above"),
     # None of them
     ("", "is empty"),
     ("\n \n", "is empty"),

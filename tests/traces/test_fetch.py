@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import io
 import os
@@ -165,6 +166,15 @@ def test_the_sums_are_those_of_the_recorded_files(shared_data: Path, tmp_path: P
         assert all(file.known for file in done)
     logs = sorted((tmp_path / "ucc-5g").rglob("Download/**/*.csv"))
     assert len(logs) > 0 and b"DL_bitrate" in logs[0].read_bytes()[:400]
+
+
+def test_the_sums_of_uplinks_are_those_of_the_recorded_files(shared_data: Path) -> None:
+    for name, folder in (("perama-wifi", "uplink_wifi"), ("mmwave-uplink", "uplink_mmwave")):
+        known = {remote.path.replace("/", "_"): remote.sha256 for remote in datasets()[name].files}
+        recorded = sorted((shared_data / folder).glob("*.gz"))
+        assert len(known) == len(recorded) > 0
+        for path in recorded:
+            assert hashlib.sha256(gzip.decompress(path.read_bytes())).hexdigest() == known[path.stem]
 
 
 def test_the_cache_is_where_the_platform_has_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -11,12 +11,15 @@ import pytest
 from bufgym.cli import trace_fit
 from bufgym.cli.options import Parser
 from bufgym.errors import BufgymError
+from bufgym.scenario import suites
+from bufgym.scenario.suites.synthetic import both_values
 from bufgym.traces import Trace, write_csv
 from bufgym.traces.fit.compare import compare, held_out, ks_distance
 from bufgym.traces.fit.fit import fit_links, mode_of, rates_of
 from bufgym.traces.fit.statistics import autocorrelation, spells
-from bufgym.traces.generate import LinkParameters, OutageParameters, fitted_links, markov_link, read_links
+from bufgym.traces.generate import LinkParameters, OutageParameters, markov_link, read_links
 from bufgym.traces.generate.markov import link_rates
+from bufgym.traces.generate.parameters import LINKS, UPLINKS
 from bufgym.traces.trace import Float64Array
 
 KNOWN = LinkParameters(
@@ -206,7 +209,27 @@ def test_one_mode_for_all(tmp_path: Path) -> None:
     assert list(read_links(tmp_path / "links.json")) == ["walk"]
 
 
+def test_the_command_fits_what_a_suite_trains_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The links of the train split alone, each once though it carries several scenarios."""
+
+    def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
+        traces = [markov_link("known", seed, 100, links={"known": KNOWN}) for seed in range(1 + (split == "train"))]
+        return both_values(traces, ())
+
+    monkeypatch.setitem(suites.SUITES, "two-v7", suites.Suite("two-v7", "two links", build))
+    fit("--suite", "two-v7", "-o", str(tmp_path / "two.json"))
+    ((mode, link),) = read_links(tmp_path / "two.json").items()
+    assert (mode, link.recordings, link.seconds) == ("two", 2, 200)
+    assert '"made_by": "bufgym trace fit --suite two-v7 -o two.json"' in (tmp_path / "two.json").read_text()
+
+
 def test_what_the_command_refuses(tmp_path: Path) -> None:
+    with pytest.raises(BufgymError, match=r"needs recordings, FILE ... or --suite NAME"):
+        fit("-o", "b.json")
+    with pytest.raises(BufgymError, match=r"--suite: cannot go with FILE or --mode"):
+        fit("a.csv", "--suite", "lte-v1", "-o", "b.json")
+    with pytest.raises(BufgymError, match=r"--data: needs --suite"):
+        fit("a.csv", "--data", ".", "-o", "b.json")
     with pytest.raises(BufgymError, match=r"--page x.html: must end in .md"):
         fit("a.csv", "-o", "b.json", "--page", "x.html")
     write_csv(Trace.constant(1e6, 10), tmp_path / "short_1.csv")
@@ -222,4 +245,11 @@ def test_the_committed_parameters_are_the_fit_of_the_recordings(shared_data: Pat
     rows: dict[str, list[Float64Array]] = {}
     for file in files:
         rows.setdefault(mode_of(file), []).append(rates_of(file))
-    assert fit_links(rows) == fitted_links()
+    assert fit_links(rows) == read_links(LINKS)
+
+
+@pytest.mark.slow
+def test_the_committed_uplinks_are_the_fit_of_what_their_suites_train_on(shared_data: Path, tmp_path: Path) -> None:
+    names = "uplink-5g-v1,uplink-wifi-v1,uplink-mmwave-v1"
+    fit("--suite", names, "--data", str(shared_data), "-o", str(tmp_path / "uplinks.json"))
+    assert (tmp_path / "uplinks.json").read_bytes() == UPLINKS.read_bytes()

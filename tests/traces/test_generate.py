@@ -31,7 +31,7 @@ from bufgym.traces.generate import (
     tunnel,
 )
 from bufgym.traces.generate.markov import MAX_OUTAGE_S, link_rates
-from bufgym.traces.generate.parameters import LINKS, PROBABILITIES
+from bufgym.traces.generate.parameters import LINKS, PROBABILITIES, UPLINKS
 from bufgym.traces.generate.roaming import PHY_MBIT_PER_S, SENSITIVITY_DBM
 from bufgym.traces.motion import Motion
 from bufgym.traces.trace import Trace
@@ -88,8 +88,9 @@ def test_every_way_of_moving_has_a_link() -> None:
     assert set(MODES) <= set(fitted_links())
     for link in fitted_links().values():
         assert link.seconds >= 500
-    made_by = json.loads(LINKS.read_text(encoding="ascii"))["made_by"]
-    assert made_by.startswith("bufgym trace fit ")
+    assert {"uplink-5g", "uplink-wifi", "uplink-mmwave"} <= set(fitted_links())
+    for file in (LINKS, UPLINKS):
+        assert json.loads(file.read_text(encoding="ascii"))["made_by"].startswith("bufgym trace fit ")
 
 
 @given(seed=st.integers(0, 2**32), seconds=st.integers(1, 400), mode=st.sampled_from(MODES))

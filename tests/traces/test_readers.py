@@ -99,6 +99,9 @@ def test_belgium_raw_log(tmp_path: Path) -> None:
         ("Timestamp,DL_bitrate,UL_bitrate\n2019.12.16_13.40.04,72,20\n", "ucc"),
         ("0.57,Mbits/sec\n", "nyu"),
         ('[{"duration_ms": 5,\n"bandwidth_kbps": 8}]', "sabre"),
+        (" 1.0000 MB / 1.00 sec = 8.3886 Mbps\n", "nuttcp"),
+        ('{"intervals": [\n{"sum": {"start": 0, "end": 1, "bytes": 5}}]}', "iperf3"),
+        ("Run 1\n8,16\n", "runs"),
     ],
 )
 def test_same_trace_by_any_packing(tmp_path: Path, text: str, format: str) -> None:
@@ -177,3 +180,75 @@ def test_json_in_a_single_long_line(tmp_path: Path) -> None:
     sample = '{"duration_ms": 1000, "bandwidth_kbps": 8}'
     trace = read_trace(written(tmp_path, f"[{', '.join([sample] * 500)}]"))
     assert trace.duration_us == 500_000_000 and trace.total_bytes == 500_000
+
+
+# ---------------------------------------------------------------- speed tests
+
+NUTTCP = """Start time: 1730498381814
+[2024-11-01T14:59:42.722595-0700] nuttcp-t: v8.1.4: socket
+[2024-11-01T14:59:42.724539-0700]     3.1250 MB /   0.50 sec =   52.4220 Mbps     0 retrans   2599 KB-cwnd
+[2024-11-01T14:59:42.724540-0700]     0.0000 MB /   0.49 sec =    0.0000 Mbps     2 retrans      1 KB-cwnd
+[2024-11-01T14:59:43.702696-0700]     0.0625 MB /   0.50 sec =    1.0486 Mbps     0 retrans      1 KB-cwnd
+[2024-11-01T15:01:42.809697-0700]
+[2024-11-01T15:01:42.809794-0700] nuttcp-r: 3.1875 MB in 1.50 real seconds = 2176.00 KB/sec = 17.8258 Mbps
+End time: 1730498502868
+"""
+
+
+def test_nuttcp_intervals_follow_each_other_whenever_they_were_printed(tmp_path: Path) -> None:
+    # 3.125 MB are 3.125 * 2**20 = 3,276,800 bytes; 0.0625 MB are 65,536.
+    trace = read_trace(written(tmp_path, NUTTCP, "uplink.out"))
+    assert knots(trace) == [(0, 0), (500_000, 3_276_800), (990_000, 3_276_800), (1_490_000, 3_342_336)]
+    assert trace.name == "uplink" and "format nuttcp, detected, 3 intervals" in trace.source
+
+
+def test_nuttcp_without_stamps_and_with_its_closing_line(tmp_path: Path) -> None:
+    lines = (
+        " 11.2500 MB / 1.00 sec = 94.3690 Mbps\n 11.2500 MB / 1.00 sec = 94.3690 Mbps 1 %TX 2 %RX 0 retrans 0.2 msRTT\n"
+    )
+    assert knots(read_trace(written(tmp_path, lines))) == [(0, 0), (1_000_000, 11_796_480)]
+
+
+IPERF3 = """{"start": {"title": "\\"intervals\\": [7]", "test_start": {"omit": 1}},
+ "intervals": [
+  {"streams": [], "sum": {"start": 0, "end": 1, "bytes": 999, "omitted": true, "sender": false}},
+  {"streams": [], "sum": {"start": 0, "end": 1.000167, "bytes": 5473440, "omitted": false, "sender": false}},
+  {"streams": [], "sum": {"start": 1.000167, "end": 1.144206, "bytes": 0, "omitted": false, "sender": false}}],
+ "end": {"sum_received": {"bytes": 5473440}}}"""
+
+
+def test_iperf3_intervals_but_those_that_it_omits(tmp_path: Path) -> None:
+    trace = read_trace(written(tmp_path, IPERF3, "loc1.json"))
+    assert knots(trace) == [(0, 0), (1_000_167, 5_473_440), (1_144_206, 5_473_440)]
+    assert trace.source.endswith("(format iperf3, detected, measured by the receiver)")
+    one_line = IPERF3.replace("\n", "").replace('"sender": false', '"sender": true')
+    assert read_trace(written(tmp_path, one_line)).source.endswith("measured by the sender)")
+
+
+RUNS = """
+###############################
+Run 1
+8,16.0,0
+###############################
+Run 3
+0.5,1.5
+8,4
+0.1,-2
+7,7
+Run 2
+80,80
+"""
+
+
+def test_runs_of_a_list_with_and_without_times(tmp_path: Path) -> None:
+    # 8 Mbit/s are 1 MB/s: 100 kB in the 0.1 s of a sample.
+    path = written(tmp_path, RUNS, "walking.list")
+    first = read_trace(path)
+    assert knots(first) == [(0, 0), (100_000, 100_000), (200_000, 300_000), (300_000, 300_000)]
+    assert first.source.endswith("(format runs, detected, run 1 of 3, a sample each 0.1 s)")
+    third = read_trace(path, column="run 3")
+    assert knots(third) == [(0, 0), (1_000_000, 1_000_000), (2_000_000, 1_500_000)]
+    assert third.source.endswith("run 3 of 3, times as stated, the first of 2 pairs)")
+    assert read_trace(path, column="run 2").total_bytes == 2_000_000
+    with pytest.raises(BufgymError, match="has no run 4: must be one of run 1, run 3, run 2"):
+        read_trace(path, column="run 4")

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import csv
 import gzip
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bufgym.errors import TraceError
 from bufgym.traces import Trace, describe, members, read_trace
+from bufgym.traces.formats.speed_tests import runs_of
 
 SETS = {
     "belgium_4g": ("belgium_4g/csv/*.csv", "csv", 30),
@@ -119,3 +122,47 @@ def test_car_0002_fades_in_its_seconds_21_and_23(shared_data: Path) -> None:
     low = np.flatnonzero(rates < 500_000)
     assert low.tolist() == [21, 23, 73, 82, 128, 157, 294, 296, 395]
     assert (rates[[21, 23]] / 1e3).round(1).tolist() == [490.2, 222.3]
+
+
+def test_5g_uplinks_but_the_runs_that_failed(shared_data: Path) -> None:
+    """263 runs are sound; the other 4 are refused with what their server said. All together as the README says."""
+    paths, traces, failed = sorted((shared_data / "uplink_5g").glob("*.gz")), [], []
+    for path in paths:
+        try:
+            traces.append(read_trace(path))
+        except TraceError as error:
+            failed.append(str(error))
+    assert len(traces) == 263 and len(failed) == 4
+    assert all(
+        "error from server" not in trace.source and "format nuttcp, detected" in trace.source for trace in traces
+    )
+    assert all("must be a run that succeeded" in error for error in failed)
+    seconds = sum(trace.duration_us for trace in traces) / 1e6
+    assert sum(trace.total_bytes for trace in traces) / seconds == pytest.approx(5.27e6, abs=0.01e6)
+
+
+def test_a_5g_run_has_the_bytes_that_nuttcp_adds_up(shared_data: Path) -> None:
+    """Its last line says 1047.5190 MB in 120.63 s; the last tenth of a second has no interval of its own."""
+    trace = read_trace(shared_data / "uplink_5g" / "20241101_145941847.out.gz")
+    assert trace.duration_us == 120_500_000
+    assert trace.total_bytes / 2**20 == pytest.approx(1047.519, rel=1e-3)
+
+
+def test_wifi_uplinks_have_the_bytes_that_iperf3_adds_up(shared_data: Path) -> None:
+    paths = sorted((shared_data / "uplink_wifi").glob("*.json.gz"))
+    assert len(paths) == 38
+    for path in paths:
+        trace, received = read_trace(path), json.loads(gzip.decompress(path.read_bytes()))["end"]["sum_received"]
+        assert trace.total_bytes == received["bytes"], path.name
+        assert trace.duration_us / 1e6 == pytest.approx(received["end"], abs=1e-3)
+        assert trace.source.endswith("measured by the receiver)")
+
+
+def test_mmwave_uplinks_read_run_by_run(shared_data: Path) -> None:
+    paths = sorted((shared_data / "uplink_mmwave").glob("*.list.gz"))
+    traces = [read_trace(path, column=run) for path in paths for run in runs_of(path)]
+    assert len(paths) == 18 and len(traces) == 122
+    for trace in traces:
+        # Of a static run 11 to 18 s, of a walking one 43 to 63 s.
+        least, most = (11, 18) if trace.name.startswith("static") else (43, 63)
+        assert least < trace.duration_us / 1e6 < most, trace.source

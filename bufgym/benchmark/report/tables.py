@@ -78,7 +78,7 @@ def plain(run: Run, summary: Summary) -> str:
     """Aligned text: the ranking where there are scores, else a block for each cell; then the notes."""
     unranked = run.manifest["unranked"]
     notes = [f"{s.policy} has no rank: {unranked[s.policy]}." for s in summary.overall if not s.ranked]
-    notes += table.invalid(run.task.senders(run.rows))
+    notes += [*table.invalid(run.task.senders(run.rows)), *summary.notes]
     if summary.scores is None:
         return "\n".join([*intro(run), "", blocks(summary, run.abouts), "", *run.task.legend, *notes])
     if not any(cell.discriminative for cell in summary.scores.cells):
@@ -110,6 +110,8 @@ def _texts(place: Place) -> list[str]:
 def markdown(run: Run, summary: Summary) -> str:
     """The command, the ranking, then a table for each scenario or cell."""
     out = ["```", run.manifest["command"], "```", "", *_ranking(run, summary, summary.overall)]
+    if summary.notes:
+        out += ["", *(f"* {_plain(note)}" for note in summary.notes)]
     if summary.scores is not None:
         return "\n".join([*out, *_score_tables(summary.scores)]) + "\n"
     for cell, standings in summary.cells.items():

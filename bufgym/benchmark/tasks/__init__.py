@@ -1,4 +1,4 @@
-"""The kinds of experiment, each behind the protocol ``Task``: one queue, the topics of one client, a fleet of robots.
+"""The kinds of experiment, each behind the protocol ``Task``: one queue, the same under stress, topics, fleets.
 
 A new kind of task is one more file here and one more entry of ``TASKS``.
 """
@@ -10,12 +10,13 @@ from typing import Any
 
 from bufgym.benchmark.tasks.fleet import FleetTask
 from bufgym.benchmark.tasks.queue import QueueTask
+from bufgym.benchmark.tasks.stress import StressTask
 from bufgym.benchmark.tasks.task import Task
 from bufgym.benchmark.tasks.topics import TopicsTask
 
-__all__ = ["TASKS", "FleetTask", "QueueTask", "Task", "TopicsTask", "of"]
+__all__ = ["TASKS", "FleetTask", "QueueTask", "StressTask", "Task", "TopicsTask", "of"]
 
-TASKS: dict[str, Task] = {task.kind: task for task in (QueueTask(), TopicsTask(), FleetTask())}
+TASKS: dict[str, Task] = {task.kind: task for task in (QueueTask(), StressTask(), TopicsTask(), FleetTask())}
 """By ``Suite.kind``."""
 
 

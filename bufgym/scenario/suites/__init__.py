@@ -5,14 +5,15 @@ parameters by, ``test`` to report. Splits share no bandwidth trace and no motion
 one interruption): a policy that knows a trace by heart gains nothing elsewhere. A suite never changes; an improved one
 gets the next version.
 
-``Suite.kind`` names the task that the scenarios are for: one queue, the topics of one client, or a fleet of robots.
+``Suite.kind`` names the task that the scenarios are for: one queue, the same under stress, the topics of one client, or
+a fleet of robots.
 Messages of one queue have equal sizes, so that the clairvoyant's bound is exact.
 """
 
 from __future__ import annotations
 
 from bufgym.errors import BufgymError
-from bufgym.scenario.suites import recorded, shared_uplinks, synthetic
+from bufgym.scenario.suites import recorded, shared_uplinks, stress, synthetic
 from bufgym.scenario.suites.suite import CAPACITIES, SPLITS, Setting, Suite
 from bufgym.scenario.suites.synthetic import EPISODE_S, RATE_HZ, SIZE_BYTES, motion_value, time_value
 
@@ -30,7 +31,7 @@ __all__ = [
     "time_value",
 ]
 
-SUITES = {suite.name: suite for suite in (*synthetic.SUITES, *recorded.SUITES, *shared_uplinks.SUITES)}
+SUITES = {suite.name: suite for suite in (*synthetic.SUITES, *stress.SUITES, *recorded.SUITES, *shared_uplinks.SUITES)}
 """Every suite by name."""
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from bufgym.errors import BufgymError
 from bufgym.scenario.suites.suite import Build, Setting, Suite
-from bufgym.scenario.suites.synthetic import SIZE_BYTES, both_sizes, both_values
+from bufgym.scenario.suites.synthetic import SIZE_BYTES, TRACES, both_sizes, both_values
 from bufgym.traces import Motion, read_motion, read_trace
+from bufgym.traces.formats.speed_tests import runs_of
 
 _TUM = {
     "train": ("freiburg1_desk", "freiburg1_xyz", "freiburg2_desk"),
@@ -62,6 +66,66 @@ def _recorded(pattern: str, size_bytes: int) -> Build:
     return build
 
 
+_DAYS = {"train": ("20241101", "20241102", "20241103"), "validation": ("20241104",), "test": ("20241105",)}
+"""Of the drive from Los Angeles to Boston, by split: no two splits share a day, or a place."""
+
+_FAILED = ("20241101_170456963", "20241102_104344891", "20241103_110904624", "20241104_132730722")
+"""Runs that their server ended with an error."""
+
+
+def _uplink_5g(split: str, data: Path | None) -> dict[str, Setting]:
+    assert data is not None
+    paths = _evenly(
+        data, "uplink_5g/*.out.gz", split, lambda name: name[:8] in _DAYS[split] and name[:18] not in _FAILED
+    )
+    return both_sizes([read_trace(path) for path in paths], _tum(split, data))
+
+
+_PLACES = {"train": "loc2", "validation": "loc1", "test": "loc3"}
+"""Of the shipyard, by split. loc3, where links are slowest, tests; runs that name no place are left out."""
+
+
+def _uplink_wifi(split: str, data: Path | None) -> dict[str, Setting]:
+    assert data is not None
+    paths = _evenly(data, "uplink_wifi/*_server.json.gz", split, lambda name: f"_{_PLACES[split]}_" in name)
+    return both_sizes([read_trace(path) for path in paths], _tum(split, data))
+
+
+_MMWAVE = {
+    "train": ("static_5g_away_p1", "static_5g_toward_p1", "walking_5g_away"),
+    "validation": ("static_5g_away_p2", "static_5g_toward_p2", "walking_5g_toward"),
+    "test": ("static_5g_away_p3", "static_5g_toward_p3", "walking_5g_lateral"),
+}
+"""Files of runs, by split: no two share a place. Runs of 15 s (static) and 50 s (walking) begin again at their end."""
+
+
+def _uplink_mmwave(split: str, data: Path | None) -> dict[str, Setting]:
+    assert data is not None
+    traces = []
+    for name in _MMWAVE[split]:
+        path = _there(data / f"uplink_mmwave/{name}.list.gz")
+        traces += [replace(read_trace(path, column=run), name=f"{name}-{run.split()[1]}") for run in runs_of(path)]
+    return both_sizes(_at_most(traces, TRACES[split]), _tum(split, data))
+
+
+Item = TypeVar("Item")
+
+
+def _evenly(data: Path, pattern: str, split: str, belongs: Callable[[str], bool]) -> list[Path]:
+    """The files of a pattern whose names belong to the split, at most so many as it has traces elsewhere."""
+    names = sorted(path for path in data.glob(pattern) if belongs(path.name))
+    if not names:
+        raise BufgymError(f"{data / pattern}: holds no recording of the split {split}; this suite needs some")
+    return _at_most(names, TRACES[split])
+
+
+def _at_most(items: Sequence[Item], most: int) -> list[Item]:
+    """All, or of more than ``most`` so many, evenly spaced."""
+    if len(items) <= most:
+        return list(items)
+    return [items[k * len(items) // most] for k in range(most)]
+
+
 _WITH_TUM = "and tum_rgbd/*.groundtruth.txt.gz"
 
 SUITES = (
@@ -70,6 +134,19 @@ SUITES = (
         "30 Hz camera over the Belgium 4G logs with TUM RGB-D motion",
         _belgium,
         needs=f"belgium_4g/csv/*.csv {_WITH_TUM}",
+    ),
+    *(
+        Suite(name, f"30 Hz camera {over} with TUM RGB-D motion", build, needs=f"{pattern} {_WITH_TUM}")
+        for name, over, build, pattern in (
+            ("uplink-5g-v1", "over 5G uplinks of a drive, split by day", _uplink_5g, "uplink_5g/*.out.gz"),
+            (
+                "uplink-wifi-v1",
+                "over WiFi uplinks in a shipyard, split by place",
+                _uplink_wifi,
+                "uplink_wifi/*.json.gz",
+            ),
+            ("uplink-mmwave-v1", "over 5G mmWave uplinks, split by place", _uplink_mmwave, "uplink_mmwave/*.list.gz"),
+        )
     ),
     *(
         Suite(

@@ -26,6 +26,8 @@ class Setting:
     """What it is, in one line without a full stop."""
     outage_s: float | None = None
     """Length of the episode's one blackout, s; None where it has none of a known length."""
+    max_bytes: int | None = None
+    """B of every sender, bytes; None for no limit."""
 
 
 Build = Callable[[str, Path | None], dict[str, Setting]]

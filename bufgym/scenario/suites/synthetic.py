@@ -129,20 +129,20 @@ _SHIFT = {"train": 0.0, "validation": 1 / 3, "test": 5 / 6}
 """Shifts the rates of a split by this part of their spacing, so that no two splits share a rate."""
 
 
+def steady_links(split: str, label: str, share: float, count: int) -> tuple[Trace, ...]:
+    """Steady links, spread evenly within 6 % of the share of the demand."""
+    shares = [share * (0.94 + 0.12 * (k + _SHIFT[split]) / count) for k in range(count)]
+    return tuple(
+        Trace.constant(each * DEMAND_BYTES_PER_S, 300.0, name=f"steady-{label}-{FIRST_SEED[split] + k}")
+        for k, each in enumerate(shares)
+    )
+
+
 def _sustained(split: str, data: Path | None) -> dict[str, Setting]:
-    """Steady links, spread evenly within 6 % of the named share of the demand."""
-    first, count = FIRST_SEED[split], TRACES[split] // 3
     settings: dict[str, Setting] = {}
     for label, share in SHARES.items():
-        traces = [
-            Trace.constant(
-                share * (0.94 + 0.12 * (k + _SHIFT[split]) / count) * DEMAND_BYTES_PER_S,
-                300.0,
-                name=f"steady-{label}-{first + k}",
-            )
-            for k in range(count)
-        ]
-        settings |= both_values(traces, motions_of(split), suffix=f"-{label}")
+        links = steady_links(split, label, share, TRACES[split] // 3)
+        settings |= both_values(links, motions_of(split), suffix=f"-{label}")
     return settings
 
 

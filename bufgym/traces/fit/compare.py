@@ -50,7 +50,7 @@ class HeldOut:
     """Each recording against links fitted to the others of its mode; of a single recording, its halves."""
 
     parts: int
-    """How many recordings (or halves)."""
+    """How many recordings (or halves) were held out."""
     distance: float
     """Median of their Kolmogorov-Smirnov distances from what those links generate."""
     usual: float
@@ -78,19 +78,20 @@ def compare(link: LinkParameters, rows: Rows, sets: int = SETS) -> list[Row]:
     return [*compared, Row(KS_DISTANCE, real, *_middle(distances), p)]
 
 
-def held_out(mode: str, rows: Rows, sets: int = SETS) -> HeldOut:
-    """How far recordings are from links that were fitted without them."""
+def held_out(mode: str, rows: Rows, sets: int = SETS, most: int | None = None) -> HeldOut:
+    """How far recordings are from links that were fitted without them; of more than `most`, so many evenly spaced."""
     parts = list(rows) if len(rows) > 1 else [np.array(half) for half in np.array_split(rows[0], 2)]
+    count = len(parts) if most is None else min(most, len(parts))
     distances, usual, beyond = [], [], 0
-    for k, part in enumerate(parts):
+    for k in (len(parts) * i // count for i in range(count)):
         link = fit_links({mode: parts[:k] + parts[k + 1 :]})[mode]
-        generated = [traces[0] for traces in generated_sets(link, [part], sets)]
+        generated = [traces[0] for traces in generated_sets(link, [parts[k]], sets)]
         pooled = np.sort(np.concatenate(generated))
         single = [ks_distance(trace, pooled) for trace in generated]
-        distances.append(ks_distance(part, pooled))
+        distances.append(ks_distance(parts[k], pooled))
         usual += single
         beyond += bool(distances[-1] > np.quantile(single, 0.95))
-    return HeldOut(len(parts), float(np.median(distances)), float(np.median(usual)), beyond)
+    return HeldOut(count, float(np.median(distances)), float(np.median(usual)), beyond)
 
 
 def ks_distance(values: Float64Array, others: Float64Array) -> float:

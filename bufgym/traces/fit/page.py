@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +35,7 @@ _INTRODUCTION: Final = """\
 
 Made by `{command}`; do not edit.
 
-The generator is `bufgym/traces/generate/markov.py`, with its parameters in `links.json` beside it;
+The generator is `bufgym/traces/generate/markov.py`, with its parameters in `{file}` beside it;
 `bufgym/traces/fit/fit.py` fits them.
 
 How to read the tables. A *set* is as many generated traces as there are recordings of that mode, each as long as its
@@ -57,6 +58,7 @@ def write_page(
     page: Path,
     command: str,
     sets: int = SETS,
+    most_held_out: int | None = None,
 ) -> None:
     """Write the page and, if matplotlib is installed, a picture of each mode into `figures/` beside it.
 
@@ -66,17 +68,21 @@ def write_page(
         page: the file to write.
         command: what the page names as its origin.
         sets: generated sets for each comparison.
+        most_held_out: recordings of a mode that are held out at most, a fit each; by default all.
 
     Raises:
         TraceError: a file cannot be written.
     """
     compared = {mode: compare(links[mode], rows, sets) for mode, rows in recordings.items()}
     plain = {mode: compare(_without_memory(links[mode]), rows, sets) for mode, rows in recordings.items()}
-    unseen = {mode: held_out(mode, rows, sets) for mode, rows in recordings.items()}
+    unseen = {mode: held_out(mode, rows, sets, most_held_out) for mode, rows in recordings.items()}
     with os_errors(page, "written"):
         (page.parent / "figures").mkdir(parents=True, exist_ok=True)
         pictures = {mode: _picture(mode, links[mode], rows, page.parent) for mode, rows in recordings.items()}
-    parts = [_INTRODUCTION.format(command=command, sets=sets, level=_LEVEL), _summary(links, compared, plain, unseen)]
+    written = re.search(r"-o (\S+)", command)
+    file = "links.json" if written is None else written[1]
+    introduction = _INTRODUCTION.format(command=command, file=file, sets=sets, level=_LEVEL)
+    parts = [introduction, _summary(links, compared, plain, unseen)]
     parts += [_section(mode, links[mode], rows, pictures[mode]) for mode, rows in compared.items()]
     write_text(page, ["\n".join(parts)])
 

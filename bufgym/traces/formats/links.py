@@ -10,6 +10,9 @@
 | `ucc` | under a header with Timestamp, DL_bitrate and UL_bitrate, kbit/s | UCC 4G and 5G data sets |
 | `nyu` | `0.57,Mbits/sec`, a line a second | NYU-METS |
 | `sabre` | JSON: `[{"duration_ms": 1000, "bandwidth_kbps": 33809}, ...]` | Sabre |
+| `nuttcp` | `3.1250 MB / 0.50 sec = 52.4220 Mbps ...`, with or without a stamp, remarks around them | nuttcp |
+| `iperf3` | JSON: an object with `intervals` | `iperf3 --json` |
+| `runs` | `Run 1`, then a line of Mbit/s each 0.1 s, or of times and one of Mbit/s | 5G mmWave uplinks |
 
 Any of them may be gzip'd, or a zip's member (`archive.zip:member`; `archive.zip` if it has just one). The format is
 recognised by the first line that is not blank, and stated in the trace's `source`; a line that fits two formats is an
@@ -32,6 +35,15 @@ from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.logs import UCC_COLUMNS, fits_nyu, fits_sabre, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
+from bufgym.traces.formats.speed_tests import (
+    RUNS,
+    fits_iperf3,
+    fits_nuttcp,
+    fits_runs,
+    read_iperf3,
+    read_nuttcp,
+    read_runs,
+)
 from bufgym.traces.formats.tables import (
     CSV_HEADER,
     RATES_HEADER,
@@ -44,7 +56,7 @@ from bufgym.traces.formats.tables import (
 from bufgym.traces.formats.text import is_header, open_text
 from bufgym.traces.trace import After, Trace
 
-_SUFFIXES: Final = (".csv", ".log", ".txt", ".dat", ".json")
+_SUFFIXES: Final = (".csv", ".log", ".txt", ".dat", ".json", ".list", ".out")
 
 
 @dataclass(frozen=True)
@@ -70,6 +82,9 @@ FORMATS: Final[dict[str, Format]] = {
     "ucc": Format("header with Timestamp, DL_bitrate, UL_bitrate", fits_ucc, read_ucc, UCC_COLUMNS),
     "nyu": Format("number,unit with a unit such as Mbits/sec", fits_nyu, read_nyu),
     "sabre": Format("JSON list", fits_sabre, read_sabre),
+    "nuttcp": Format("nuttcp's log", fits_nuttcp, read_nuttcp),
+    "iperf3": Format("JSON object", fits_iperf3, read_iperf3),
+    "runs": Format("Run 1, or ###", fits_runs, read_runs, RUNS),
 }
 
 
@@ -80,8 +95,8 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
         path: the file, plain, gzip'd or zipped; `archive.zip:member` is a member of a zip.
         format: one of `FORMATS`; by default it is detected from the content.
         after: what follows the end of the trace (see `Trace`).
-        column: the one to read, where a format has several columns of rates (`ucc`: DL_bitrate, the default, or
-            UL_bitrate).
+        column: the one to read, where a format has several (`ucc`: DL_bitrate, the default, or UL_bitrate; `runs`:
+            run 1, the default, run 2, ...).
 
     Returns:
         The trace, named after the file; `source` states the file, the format, and anything notable about the reading.

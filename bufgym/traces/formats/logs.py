@@ -116,16 +116,16 @@ def read_sabre(path: StrPath) -> Knots:
     with open_text(path) as file:
         text = file.text()
     intervals = Intervals()
-    for line, sample in _items(path, text):
+    for line, sample in json_items(path, text):
         _add_sample(intervals, line, sample)
     return intervals.knots(path)
 
 
-def _items(path: StrPath, text: str) -> Iterator[tuple[Line, object]]:
-    """The items of the list, each with the line where it begins."""
+def json_items(path: StrPath, text: str, start: int = 0) -> Iterator[tuple[Line, object]]:
+    """The items of the list that begins at `start`, each with its line; a list from 0 on must be all of the text."""
     decoder = json.JSONDecoder(parse_constant=_no_constant)
     number, counted = 1, 0  # the line number of the place `counted`
-    mark = _mark(path, text, 0, "[")
+    mark = _mark(path, text, start, "[")
     if text.startswith("]", mark.end()):
         mark = _mark(path, text, mark.end(), "]")
     while mark[1] != "]":
@@ -134,10 +134,10 @@ def _items(path: StrPath, text: str) -> Iterator[tuple[Line, object]]:
         try:
             item, end = decoder.raw_decode(text, place)
         except (ValueError, RecursionError) as error:
-            raise _json_error(path, text, number, error) from error
+            raise json_error(path, text, number, error) from error
         yield Line(path, number, text[place : min(end, place + _SHOWN_CHARACTERS)]), item
         mark = _mark(path, text, end, ",]")
-    if mark.end() < len(text):
+    if start == 0 and mark.end() < len(text):
         raise _error_at(path, text, mark.end(), "must be nothing after the list")
 
 
@@ -179,7 +179,8 @@ def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not a finite number")
 
 
-def _json_error(path: StrPath, text: str, number: int, error: Exception) -> TraceError:
+def json_error(path: StrPath, text: str, number: int, error: Exception) -> TraceError:
+    """What to raise about text that is no JSON; `number`: the line, where the error does not know it."""
     if isinstance(error, json.JSONDecodeError):
         value = text[error.pos : error.pos + _SHOWN_CHARACTERS]
         return fault(path, f"must be JSON ({error.msg})", line=error.lineno, value=value)

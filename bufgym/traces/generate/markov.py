@@ -18,7 +18,8 @@ Both processes are Markov modulated in the sense of W. Fischer and K. Meier-Hell
 process (MMPP) cookbook", Performance Evaluation 18(2), 1993: a rate governed by a hidden chain.
 
 Fitted to: 30 Belgium 4G logs [vanderhooft2016http2] for the ways of moving; the Solis WiFi traces (G. Lv, MIT licence)
-[solis] for the places. How well it fits: docs/generators.md.
+[solis] for the places; the training links of the suites over uplinks. How well it fits: docs/generators.md and
+docs/generators-uplink.md.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def markov_link(
 
     Args:
         mode: one of `links`: foot, bicycle, bus, tram, train, car; wifi-cafe, wifi-campus, wifi-office,
-            wifi-restr.
+            wifi-restr; uplink-5g, uplink-wifi, uplink-mmwave.
         seed: >= 0. Modes with the same seed share their uniform draws, so they are good and bad at the same times.
         duration_s: whole seconds, 1 to 10**6.
         mean_bytes_per_s: scale this very trace to that mean, 1 to 10**10; by default rates are the recordings', and the

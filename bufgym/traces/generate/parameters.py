@@ -1,6 +1,7 @@
 """Parameters of fitted links, and the file that holds them: one entry for each mode, that is, way of moving.
 
-`links.json` beside this module is what `bufgym trace fit` wrote for public recordings; it states the command.
+`links.json` and `uplinks.json` beside this module are what `bufgym trace fit` wrote for public recordings, of downlinks
+and of uplinks; each states its command.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from bufgym.traces.formats.text import write_text
 from bufgym.traces.generate.ranges import Between, check_ranges, checked, is_finite
 
 LINKS: Final = Path(__file__).with_name("links.json")
+UPLINKS: Final = Path(__file__).with_name("uplinks.json")
 
 # Where the distribution of the rates is tabulated, and the same in standard deviations; -3 and 3 stand for the least
 # and the greatest rate.
@@ -102,8 +104,8 @@ class LinkParameters:
 
 @functools.cache
 def fitted_links() -> Mapping[str, LinkParameters]:
-    """Mode -> link, of the links that come with bufgym; for WiFi the mode is a place."""
-    return read_links(LINKS)
+    """Mode -> link, of the links that come with bufgym; for WiFi downlinks the mode is a place."""
+    return read_links(LINKS) | read_links(UPLINKS)
 
 
 def read_links(path: StrPath) -> dict[str, LinkParameters]:

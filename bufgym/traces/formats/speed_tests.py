@@ -1,0 +1,203 @@
+"""Readers of speed tests: logs of nuttcp, JSON of iperf3, and lists of runs.
+
+Sources of the recordings that they were checked on: M. Ghoshal et al., "A First Large-Scale Study of Operational 5G
+Standalone Networks", CoNEXT 2025 (nuttcp); the WiFi measurements of an industrial robot in a shipyard,
+github.com/minarady1/wifi_for_industrial_robotics (iperf3); M. Ghoshal et al., "An In-Depth Study of Uplink Performance
+of 5G mmWave Networks", 5G-MeMU 2022 (lists).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any, Final
+
+from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES, Intervals, Knots, Rate, held_rates
+from bufgym.traces.formats.logs import json_error, json_items
+from bufgym.traces.formats.tables import MAX_MBIT_PER_S
+from bufgym.traces.formats.text import Line, open_text
+from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
+
+# --- nuttcp ----------------------------------------------------------------------------------------------------------
+
+MAX_INTERVAL_S: Final = 3600
+"""Of a speed test; a longer interval is no measurement of a link that changes."""
+
+_STAMP: Final = r"(?:\[[0-9T:.+ -]+\] *)?"
+_INTERVAL: Final = re.compile(_STAMP + r"([0-9.]+) +MB +/ +([0-9.]+) +sec += +([0-9.]+) +Mbps\b(?!.*%)(.*)")
+_REMARK: Final = re.compile(_STAMP + r"(?:nuttcp(?:-[tr])?:.*|[0-9.]+ +MB +/.*%.*|(?:Start|End) time: *[0-9]+|)")
+_MBIT_PER_MB: Final = 2**20 * 8e-6
+# The interval's length is printed with two decimals.
+_LENGTH_ERROR: Final = 0.02
+
+
+def fits_nuttcp(text: str) -> bool:
+    """A remark of nuttcp or a first interval, with or without a stamp of time before it."""
+    return bool(text) and (_INTERVAL.fullmatch(text) or _REMARK.fullmatch(text)) is not None
+
+
+def read_nuttcp(path: StrPath) -> Knots:
+    """Lines `[time]  MB / s = Mbps ...` with remarks around them; MB are 2**20 bytes.
+
+    Intervals follow each other with the length that each line states: the stamps say when lines were printed, which
+    they are in bursts. A failed run ("error") is no recording, and is refused, as are rates that the bytes contradict.
+    """
+    intervals = Intervals()
+    with open_text(path) as file:
+        for line in file.lines():
+            match = _INTERVAL.fullmatch(line.text)
+            if match is None:
+                if "error" in line.text.lower():
+                    raise line.error(line.text, "must be a run that succeeded")
+                if not _REMARK.fullmatch(line.text):
+                    raise line.error(line.text, "must be an interval, MB / sec = Mbps, or a remark of nuttcp")
+                continue
+            megabytes = line.decimal("MB", match[1], 0, MAX_INTERVAL_BYTES / 2**20)
+            length_s = line.decimal("sec", match[2], 0.01, MAX_INTERVAL_S)
+            stated = line.decimal("Mbps", match[3], 0, MAX_MBIT_PER_S)
+            computed = megabytes * _MBIT_PER_MB / length_s
+            if abs(stated - computed) > _LENGTH_ERROR * computed + 0.01:
+                raise line.error(match[3], f"must be MB / sec, {computed:.4g}", "Mbps")
+            intervals.add(line, round(length_s * US_PER_S), round(megabytes * 2**20))
+    return intervals.knots(path, f"{len(intervals)} intervals")
+
+
+# --- iperf3 ----------------------------------------------------------------------------------------------------------
+
+_INTERVALS: Final = re.compile(r'(?<!\\)"intervals"\s*:\s*(?=\[)')
+# Of one interval to the next; both are the same clock, written with six decimals.
+_MAX_STEP_S: Final = 1e-3
+
+
+def fits_iperf3(text: str) -> bool:
+    """The opening bracket of an object."""
+    return text.startswith("{")
+
+
+def read_iperf3(path: StrPath) -> Knots:
+    """The JSON of `iperf3 --json`: `intervals[].sum` with `start`, `end`, `bytes`. Intervals that iperf3 omitted from
+    its own result are left out. The note says on which side it was measured: the sender counts what went into its
+    socket, the receiver what came out.
+    """
+    with open_text(path) as file:
+        text = file.text()
+    try:
+        report = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise json_error(path, text, 1, error) from error
+    if not isinstance(report, dict) or not isinstance(report.get("intervals"), list):
+        raise fault(path, "must be an object with a list of intervals, as iperf3 --json writes it")
+    if report.get("error"):
+        raise fault(path, "must be a run that succeeded", value=str(report["error"])[:60], field="error")
+    place = _INTERVALS.search(text)
+    assert place is not None  # a key of the object
+    intervals, sides, previous_s = Intervals(), set[str](), None
+    for line, item in json_items(path, text, place.end()):
+        measured = _member(line, item, "sum", dict)
+        if measured.get("omitted"):
+            continue
+        start_s, end_s = (_seconds(line, measured, name) for name in ("start", "end"))
+        count = _member(line, measured, "bytes", int)
+        if previous_s is not None and abs(start_s - previous_s) > _MAX_STEP_S:
+            raise line.error(start_s, f"must begin where the interval above ended ({previous_s:g} s)", "start")
+        length_us = round(end_s * US_PER_S) - round((start_s if previous_s is None else previous_s) * US_PER_S)
+        if length_us <= 0:
+            raise line.error(end_s, f"must be after its start ({start_s:g} s)", "end")
+        if count < 0:
+            raise line.error(count, "must be at least 0", "bytes")
+        intervals.add(line, length_us, count)
+        sides.add("sender" if measured.get("sender") else "receiver")
+        previous_s = end_s
+    return intervals.knots(path, f"measured by the {' and the '.join(sorted(sides)) or 'nobody'}")
+
+
+def _member(line: Line, item: Any, name: str, kind: type) -> Any:
+    """The member of an object; an error if there is none, or none of that kind."""
+    value = item.get(name) if isinstance(item, dict) else None
+    if not isinstance(value, kind) or isinstance(value, bool):
+        what = {dict: "an object", int: "a whole number", float: "a number"}[kind]
+        raise line.error(line.text if value is None else value, f"must hold {name}, {what}")
+    return value
+
+
+def _seconds(line: Line, measured: dict[str, Any], name: str) -> float:
+    value = measured.get(name)
+    seconds = float(value) if type(value) is int and abs(value) < 2**53 else value
+    value = _member(line, {name: seconds}, name, float)
+    if not 0 <= value <= MAX_DURATION_S:
+        raise line.error(value, f"must be from 0 to {MAX_DURATION_S}", name)
+    return float(value)
+
+
+# --- lists of runs ---------------------------------------------------------------------------------------------------
+
+MAX_RUNS: Final = 16
+RUNS: Final = tuple(f"run {number}" for number in range(1, MAX_RUNS + 1))
+"""What `column` chooses from."""
+
+RUN_STEP_S: Final = 0.1
+"""Between the samples of a run without times; the runs that have times have this step."""
+
+_RUN: Final = re.compile(r"Run ([0-9]{1,3})")
+_RULER: Final = re.compile(r"#{3,}")
+
+
+def fits_runs(text: str) -> bool:
+    """The heading of a run, or the ruler above it."""
+    return (_RUN.fullmatch(text) or _RULER.fullmatch(text)) is not None
+
+
+def read_runs(path: StrPath, column: str = RUNS[0]) -> Knots:
+    """One run of a file that has several: under its heading `Run N` a line of Mbit/s, or first one of times in s.
+
+    Lines hold a whole run, so the file is read at once. Without times the samples are `RUN_STEP_S` apart. Where a run
+    has further pairs of lines, of another network at the same time, the first is read; the note counts them.
+    """
+    runs = runs_of(path)
+    if column not in runs:
+        raise fault(path, f"has no {column}: must be one of {', '.join(runs) or 'none'}")
+    lines = runs[column]
+    if not lines:
+        raise fault(path, f"{column} must have a line of Mbit/s")
+    if len(lines) > 1 and len(lines) % 2:
+        raise lines[-1].error(None, f"{column} must have one line, or pairs of them: times in s, Mbit/s")
+    rates = lines[min(1, len(lines) - 1)]
+    cells = _cells(rates)
+    times = _cells(lines[0]) if len(lines) > 1 else [f"{RUN_STEP_S * k:.1f}" for k in range(len(cells))]
+    if len(times) != len(cells):
+        raise rates.error(len(cells), f"must be as many as times in the line above ({len(times)})", "samples")
+    steps = "times as stated" if len(lines) > 1 else f"a sample each {RUN_STEP_S:g} s"
+    note = f"{column} of {len(runs)}, {steps}" + (f", the first of {len(lines) // 2} pairs" if len(lines) > 2 else "")
+    return held_rates(path, _rates(lines[0], times, rates, cells))._replace(note=note)
+
+
+def runs_of(path: StrPath) -> dict[str, list[Line]]:
+    """The runs of a file with their lines, in its order, which need not be that of their numbers."""
+    with open_text(path) as file:
+        text = file.text()
+    runs: dict[str, list[Line]] = {}
+    for number, content in enumerate(text.split("\n"), 1):
+        line = Line(path, number, content.strip())
+        match = _RUN.fullmatch(line.text)
+        if match is not None:
+            name = f"run {int(match[1])}"
+            if name not in RUNS or name in runs:
+                raise line.error(match[1], f"must be from 1 to {MAX_RUNS}, and no run's above", "Run")
+            runs[name] = []
+        elif line.text and not _RULER.fullmatch(line.text):
+            if not runs:
+                raise line.error(line.text, "must come under a heading, Run 1")
+            runs[next(reversed(runs))].append(line)
+    return runs
+
+
+def _cells(line: Line) -> list[str]:
+    return [cell.strip() for cell in line.text.split(",")]
+
+
+def _rates(timed: Line, times: list[str], line: Line, cells: list[str]) -> Iterator[Rate]:
+    for time, cell in zip(times, cells, strict=True):
+        start_us = round(timed.decimal("time in s", time, 0, MAX_DURATION_S) * US_PER_S)
+        yield Rate(line, time, start_us, line.decimal("Mbit/s", cell, 0, MAX_MBIT_PER_S) * 0.125)
