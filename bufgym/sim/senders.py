@@ -140,6 +140,7 @@ class Senders:
             memory = policy.new_memory(len(self), self.capacity)
         senders, client = self.batch.senders, policy.client
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
+        senders["measures"] = policy.measures
         for rule in ("limit_at_send", "limit_since_sent", "flush_no_drop"):
             senders[rule] = getattr(client, rule)
         if not client.awaits_acks:
