@@ -73,9 +73,7 @@ def as_policy(
         return slot_policy(name, weights_of(network), about)
     if not decisions.for_topics:
         return Policy(name, decisions.on_arrival, about=about, reads_rate=True)
-    return Policy(
-        name, decisions.on_arrival, on_send=decisions.on_send, about=about, reads_rate=True, for_topics=True
-    )
+    return Policy(name, decisions.on_arrival, on_send=decisions.on_send, about=about, reads_rate=True, for_topics=True)
 
 
 def takes_masks(agent: Any) -> bool:

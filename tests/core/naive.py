@@ -155,7 +155,7 @@ class Sender:
     def measure(self, now):
         """What left the socket and in how much time, in all and since the last arrival, and means of their ratio.
 
-        The newest of a mean over w seconds weighs what it took / (what it took + w); at first w is all that came before.
+        The newest of a mean over w weighs what it took / (what it took + w); at first w is all that came before.
         """
         if self.previous is None:
             return {"sent": 0, "us": 0, "drained": 0, "drained_us": 0} | dict.fromkeys(("short", "medium", "long"), 0.0)

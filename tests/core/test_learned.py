@@ -25,7 +25,14 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS, observe_context, observe_slots
+from bufgym.observe import (
+    CONTEXT_FIELDS,
+    ON_BOARD_FIELDS,
+    SLOT_FIELDS,
+    observe_context,
+    observe_on_board,
+    observe_slots,
+)
 from bufgym.policies import learned
 from bufgym.policies import weights as weights_file
 from bufgym.policies.learned import NAMES, Network, Weights
@@ -36,7 +43,7 @@ from bufgym.sim.metrics import outcome
 
 V = qoi.exponential(0.618)
 SLOT_NAMES = [field.name for field in SLOT_FIELDS]
-CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS]
+CONTEXT_NAMES = [field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS)]
 
 
 @st.composite
@@ -74,7 +81,8 @@ def twin(whole):
         s, L = len(buffer.slots), buffer.capacity
         slots, context = np.zeros((len(SLOT_NAMES), L + 1)), np.zeros(len(CONTEXT_NAMES))
         observe_slots(buffer, arrival, slots)
-        observe_context(buffer, arrival, context)
+        observe_context(buffer, arrival, context[: len(CONTEXT_FIELDS)])
+        observe_on_board(buffer, arrival, context[len(CONTEXT_FIELDS) :])
 
         def features(k):
             seen = dict(zip(SLOT_NAMES, slots[:, k], strict=True)) | dict(zip(CONTEXT_NAMES, context, strict=True))
