@@ -27,6 +27,7 @@ from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.observe import (
     CONTEXT_FIELDS,
+    FIELDS,
     ON_BOARD_FIELDS,
     SLOT_FIELDS,
     observe_context,
@@ -261,7 +262,7 @@ def test_export_takes_over_what_the_run_noted(tmp_path):
     weights, metadata = weights_file.read(tmp_path / "one.safetensors")
     assert {key: metadata[key] for key in noted} == noted
     assert weights.widths == (8, 8)
-    assert set(weights.fields) == set(NAMES)
+    assert set(weights.fields) == {field.name for field in FIELDS}
 
     (tmp_path / "notes.json").write_text("{", encoding="utf-8")
     with pytest.raises(BufgymError, match=r"notes\.json: cannot be read"):
