@@ -124,6 +124,20 @@ class Buffer(NamedTuple):
     """Messages dequeued since the previous arrival."""
     service_ratio: float
     """Running mean of departures per arrival: 1 = the link keeps up, 0 = it stands still."""
+    period_square: float
+    """Running mean of the squared time between arrivals, us^2; how far it exceeds ``period_us`` ** 2 says how bursty
+    they are."""
+    drained_bytes: int
+    """Bytes that left the socket between the previous arrival and this one."""
+    drained_us: int
+    """How much of that time it had bytes to send, us."""
+    short_rate_bytes_per_s: float
+    """The link's rate, bytes/s: what left the socket in the time that it had bytes to send, a running mean over about
+    the last 0.1 s of that time; 0 before the first."""
+    medium_rate_bytes_per_s: float
+    """The same over about 0.5 s."""
+    long_rate_bytes_per_s: float
+    """The same over about 2 s."""
     v: NDArray[np.float64]
     """float64[entries]: the value function, for ``qoi.value(buffer.v, distance)``; with several topics each from its
     ``v_start`` on."""

@@ -16,6 +16,7 @@ from bufgym.observe.fields import (
     Field,
     RewardTerm,
 )
+from bufgym.observe.on_board import ON_BOARD_FIELDS, observe_on_board
 from bufgym.observe.own import (
     OWN_FIELDS,
     OWN_TERMS,
@@ -33,6 +34,7 @@ from bufgym.observe.topics import observe_topic_context, observe_topic_slots
 __all__ = [
     "CONTEXT_FIELDS",
     "FIELDS",
+    "ON_BOARD_FIELDS",
     "OWN_FIELDS",
     "OWN_TERMS",
     "REWARD_TERMS",
@@ -47,6 +49,7 @@ __all__ = [
     "RewardTerm",
     "field",
     "observe_context",
+    "observe_on_board",
     "observe_slots",
     "observe_topic_context",
     "observe_topic_slots",

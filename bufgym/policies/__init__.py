@@ -14,6 +14,7 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     fragments,
     gaps,
     middleware,
+    planner,
     robofleet,
     sampling,
     schedulers,

@@ -25,7 +25,15 @@ from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
-from bufgym.observe import CONTEXT_FIELDS, FIELDS, SLOT_FIELDS, observe_context, observe_slots
+from bufgym.observe import (
+    CONTEXT_FIELDS,
+    FIELDS,
+    ON_BOARD_FIELDS,
+    SLOT_FIELDS,
+    observe_context,
+    observe_on_board,
+    observe_slots,
+)
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.scoring import (
     DROP,
@@ -42,8 +50,10 @@ from bufgym.policies.scoring import (
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 
-SLOTS, CONTEXT = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
-NAMES = tuple(field.name for field in FIELDS)
+SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
+CONTEXT = TABLE + len(ON_BOARD_FIELDS)
+ON_BOARD = tuple(field.name for field in ON_BOARD_FIELDS)
+NAMES = tuple(field.name for field in FIELDS) + ON_BOARD
 
 STILL = 0.07
 """The link stands still while its service ratio (running mean of departures per arrival) is below this: from the first
@@ -57,7 +67,11 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     at = end_of(buffer.parameters, 0, 2) if buffer.service_ratio < STILL else 0
     scorer = unpack(buffer.parameters, at if at < len(buffer.parameters) else 0, 2)
     scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
-    observe_context(buffer, arrival, scratch.context)
+    observe_context(buffer, arrival, scratch.context[:TABLE])
+    for i in range(scorer.context):
+        if scorer.fields[i] >= TABLE:
+            observe_on_board(buffer, arrival, scratch.context[TABLE:])
+            break
     observe_slots(buffer, arrival, scratch.rows)
     read_context(scorer, scratch)
     common = begin(scorer, DROP, scratch)
@@ -105,7 +119,16 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
     """The policy that these weights make; it works for every L."""
     scratch = max(scorer.scratch for scorer in (weights, weights.still or weights))
     numbers = tuple(weights.parameters().tolist())
-    return Policy(name, on_arrival, weights=numbers, work=(scratch, SLOTS), source=source, about=summary, compile=True)
+    return Policy(
+        name,
+        on_arrival,
+        weights=numbers,
+        work=(scratch, SLOTS),
+        source=source,
+        about=summary,
+        reads_rate=not set(ON_BOARD).isdisjoint(weights.fields),
+        compile=True,
+    )
 
 
 def random_weights(fields: tuple[str, ...], widths: tuple[int, ...], rng: np.random.Generator) -> Weights:

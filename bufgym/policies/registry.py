@@ -31,7 +31,7 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Any, Concatenate, NamedTuple, ParamSpec, cast
+from typing import Any, Concatenate, NamedTuple, ParamSpec, cast, get_type_hints
 
 import numba
 import numpy as np
@@ -120,6 +120,9 @@ class Policy:
     """Whether its queue grows without limit, whatever L is; no bound for L messages holds for it."""
     privileged: Privileged | None = None
     """(episode, L, B, V) -> memory, for policies that know the future, which no robot does."""
+    reads_rate: bool = False
+    """Whether a policy that comes with bufgym reads the link's rate, which is measured for those alone that do, as it
+    takes time; for all others it is."""
     client: ClientSettings = ClientSettings()
     """How the program around it sends."""
     for_topics: bool = False
@@ -141,6 +144,11 @@ class Policy:
     def drops_at_dequeue(self) -> bool:
         """Whether it is asked about each head before the socket takes it."""
         return self.on_dequeue is not _keep
+
+    @property
+    def measures(self) -> bool:
+        """Whether the link's rate is to be measured for it."""
+        return self.reads_rate or not getattr(self.on_arrival, "__module__", "").startswith("bufgym.")
 
     @property
     def unranked_because(self) -> str:
@@ -204,7 +212,7 @@ def view_type() -> Any:
         "v": constants,
         "parameters": constants,
         "topics": numba.types.Array(numba.from_dtype(TOPIC), 1, "C"),
-        **dict.fromkeys(("dequeued_x", "previous_x", "left_fraction", "period_us", "service_ratio"), real),
+        **{name: real for name, kind in get_type_hints(Buffer).items() if kind is float},
     }
     return cast(Any, numba.types).NamedTuple(
         tuple(types.get(name, numba.types.int64) for name in Buffer._fields), Buffer

@@ -9,7 +9,7 @@ hidden layer ``drop.0.weight`` [inputs, outputs] and ``drop.0.bias`` [outputs], 
     name          the policy's
     about         a sentence: what it does (may be absent)
     fields        the observation's fields that it reads, in the order of the networks' inputs
-    observation   hash of the table that defines them (``bufgym.observe.FIELDS``)
+    observation   hash of what defines them (``bufgym.observe.FIELDS``, and those of ``ON_BOARD_FIELDS`` among them)
     bufgym        version that wrote the file
     sha256        of fields and tensors
 
@@ -34,7 +34,7 @@ from safetensors.numpy import save as serialized
 from bufgym import __version__
 from bufgym.errors import BufgymError, where
 from bufgym.files import read_whole, replaced
-from bufgym.observe import FIELDS, TOPIC_FIELDS
+from bufgym.observe import FIELDS, ON_BOARD_FIELDS, TOPIC_FIELDS
 from bufgym.policies import learned, learned_topics
 from bufgym.policies.learned import Weights
 from bufgym.policies.learned_topics import TopicWeights
@@ -60,12 +60,12 @@ STILL = "still."
 """Prefix of the second scorer's tensors, whose hidden layers are its own; a file may lack them all."""
 
 
-def observation_hash(topics: bool = False) -> str:
+def observation_hash(topics: bool = False, names: Sequence[str] = ()) -> str:
     """SHA-256 of the fields' definitions: weights trained on other definitions would decide nonsense.
 
-    ``topics``: with the fields that only several topics have.
+    ``topics``: with the fields that only several topics have; those beside the tables count where ``names`` has them.
     """
-    fields = FIELDS + TOPIC_FIELDS if topics else FIELDS
+    fields = [*FIELDS, *(TOPIC_FIELDS if topics else ()), *(field for field in ON_BOARD_FIELDS if field.name in names)]
     table = [(field.name, field.per, field.unit, field.meaning) for field in fields]
     return hashlib.sha256(json.dumps(table).encode()).hexdigest()
 
@@ -114,7 +114,7 @@ def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any
         "format": FORMAT,
         **about,
         "fields": list(weights.fields),
-        "observation": observation_hash(isinstance(weights, TopicWeights)),
+        "observation": observation_hash(isinstance(weights, TopicWeights), weights.fields),
         "bufgym": __version__,
         "sha256": _sha256(weights.fields, tensors),
     }
@@ -231,7 +231,7 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
         refuse("name", "must be non-empty, without spaces, ':', ',' or '='")
     if not isinstance(about, str) or not about.isprintable():
         refuse("about", "must be one line of text")
-    if metadata["observation"] != observation_hash(kind is TopicWeights):
+    if metadata["observation"] != observation_hash(kind is TopicWeights, fields if isinstance(fields, list) else ()):
         versions = f"(bufgym {metadata['bufgym']} wrote it, this is {__version__})"
         refuse("observation", f"trained on other observations than this bufgym's: train it again {versions}")
     if not isinstance(fields, list) or not fields:

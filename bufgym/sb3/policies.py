@@ -72,8 +72,8 @@ def as_policy(
     if masked and isinstance(getattr(network, "mlp_extractor", None), SlotScorer) and not decisions.for_topics:
         return slot_policy(name, weights_of(network), about)
     if not decisions.for_topics:
-        return Policy(name, decisions.on_arrival, about=about)
-    return Policy(name, decisions.on_arrival, on_send=decisions.on_send, about=about, for_topics=True)
+        return Policy(name, decisions.on_arrival, about=about, reads_rate=True)
+    return Policy(name, decisions.on_arrival, on_send=decisions.on_send, about=about, reads_rate=True, for_topics=True)
 
 
 def takes_masks(agent: Any) -> bool:

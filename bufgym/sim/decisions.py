@@ -5,8 +5,10 @@ from __future__ import annotations
 from bufgym.kernel import at, kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, push
 from bufgym.sim import rules
+from bufgym.sim.socket import held_bytes, left_of
 from bufgym.sim.state import (
     ARRIVAL_WAITS,
+    CARRIES,
     CHOSEN,
     CLEARED,
     DECISION,
@@ -20,6 +22,8 @@ from bufgym.sim.state import (
 
 # Weights of the running means: about the last 8 arrivals for the period, 16 for the service ratio.
 _PERIOD_WEIGHT, _SERVICE_WEIGHT = 1 / 8, 1 / 16
+# Over how much sending time the link's rate is averaged, us.
+_SHORT_US, _MEDIUM_US, _LONG_US = 100_000, 500_000, 2_000_000
 
 # --- at an arrival ----------------------------------------------------------------------------------------------------
 
@@ -35,9 +39,12 @@ def arrive(batch: Batch, i: int) -> int:
     if sender.next > 0:
         gap_us = arrives_us - sender.previous_us
         if sender.next == 1:
-            sender.period_us = float(gap_us)
+            sender.period_us, sender.period_square = float(gap_us), float(gap_us) * gap_us
         sender.period_us += _PERIOD_WEIGHT * (gap_us - sender.period_us)
+        sender.period_square += _PERIOD_WEIGHT * (float(gap_us) * gap_us - sender.period_square)
         sender.service_ratio += _SERVICE_WEIGHT * (sender.departures - sender.service_ratio)
+        if sender.measures == 1:
+            measure_rate(batch, i)
     else:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
     if sender.limit_at_send == 0 and rules.too_soon(batch, i, arrival.topic):
@@ -58,6 +65,28 @@ def arrive(batch: Batch, i: int) -> int:
     while sender.next == seq:  # a no_drop message may need several evictions
         decide(batch, i, decision)
     return NOTHING
+
+
+@kernel
+def measure_rate(batch: Batch, i: int) -> None:
+    """How fast the link carried what left the socket since the previous arrival, as the bytes left in it tell.
+
+    A running mean over about the time w gives an interval of u us the weight u / (u + w); before so much has been seen
+    w is what has been seen. Time without bytes to send says nothing, and counts for nothing.
+    """
+    sender = batch.senders[i]
+    held = held_bytes(batch, i)
+    sender.left_bytes = left_of(batch, i, held)
+    sent_bytes = sender.dequeued_bytes - sender.left_bytes
+    sending_us = sender.carried_us + (sender.now_us - sender.began_us if sender.link == CARRIES else 0)
+    sent, us = sent_bytes - sender.sent_bytes, sending_us - sender.sending_us
+    sender.drained_bytes, sender.drained_us = sent, us
+    if us > 0:
+        seen_us = sender.sending_us
+        sender.short_rate += (sent - sender.short_rate * us) / (us + min(_SHORT_US, seen_us))
+        sender.medium_rate += (sent - sender.medium_rate * us) / (us + min(_MEDIUM_US, seen_us))
+        sender.long_rate += (sent - sender.long_rate * us) / (us + min(_LONG_US, seen_us))
+    sender.sent_bytes, sender.sending_us = sent_bytes, sending_us
 
 
 @kernel

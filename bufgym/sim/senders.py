@@ -145,6 +145,7 @@ class Senders:
         """Ask where ``policy`` wants to be asked, and send as the client around it does."""
         senders, client = self.batch.senders, policy.client
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
+        senders["measures"] = policy.measures
         for rule in ("limit_at_send", "limit_since_sent", "flush_no_drop"):
             senders[rule] = getattr(client, rule)
         if not client.awaits_acks:

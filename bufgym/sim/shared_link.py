@@ -122,7 +122,7 @@ def join(batch: Batch, shares: Shares, i: int) -> None:
     cell, sender = shares.cells[c], batch.senders[i]
     if cell.busy == 0 and sender.link == IDLE:
         cell.position = max(cell.reached, cell.position)  # what an idle cell could have carried is gone
-    sender.link = CARRIES
+    sender.link, sender.began_us = CARRIES, sender.now_us
     cell.busy += 1
     shares.goals[c, robot] = cell.served + next_size_bytes(batch, i)
 

@@ -44,6 +44,7 @@ def dequeue(batch: Batch, i: int, k: int) -> None:
     sender.occupancy -= 1
     sender.backlog_bytes -= head.size_bytes
     sender.dequeued += 1
+    sender.dequeued_bytes += head.size_bytes
     sender.last_dequeue_us = sender.now_us
     sender.departures += 1
     sender.socket, sender.chosen = UNASKED, 0
@@ -63,12 +64,36 @@ def next_size_bytes(batch: Batch, i: int) -> int:
 
 
 @kernel
+def held_bytes(batch: Batch, i: int) -> int:
+    """All bytes of the messages in the socket, those transmitted included."""
+    sender = batch.senders[i]
+    if sender.busy == 0:
+        return 0
+    total_bytes = at(batch.slots, i, sender.first - 1).size_bytes
+    for k in range(sender.transmitted, sender.dequeued - 1):
+        total_bytes += at(batch.arrivals, i, at(batch.order, i, k)).size_bytes
+    return int(total_bytes)
+
+
+@kernel
+def left_of(batch: Batch, i: int, total_bytes: int) -> int:
+    """Those of the ``held_bytes`` that are not yet transmitted."""
+    sender = batch.senders[i]
+    if sender.busy == 0 or (sender.busy == 1 and sender.last_dequeue_us == sender.now_us):
+        return total_bytes
+    waiting_bytes = total_bytes - next_size_bytes(batch, i)
+    carried_bytes = carried_by(batch.knot_us, batch.knot_bytes, sender, sender.now_us)
+    left_bytes = sender.position - carried_bytes + waiting_bytes
+    return int(min(total_bytes, max(0, left_bytes)))
+
+
+@kernel
 def begin_transmission(batch: Batch, i: int) -> None:
     """The link of sender ``i`` alone begins with the next message in the socket: at once if it was freed, else now."""
     sender = batch.senders[i]
     if sender.link == IDLE:
         sender.position = max(carried_by(batch.knot_us, batch.knot_bytes, sender, sender.now_us), sender.position)
-    sender.link = CARRIES
+    sender.link, sender.began_us = CARRIES, sender.now_us
     sender.position += next_size_bytes(batch, i)
     sender.finish_us = finish_of(batch.knot_us, batch.knot_bytes, sender, sender.position)
 
@@ -78,6 +103,7 @@ def finish_transmission(batch: Batch, i: int, at_us: int) -> None:
     """The last byte of the message in transmission crosses the link; without acks to wait for, its place is free."""
     sender = batch.senders[i]
     at(batch.log, i, at(batch.order, i, sender.transmitted)).transmitted_us = at_us
+    sender.carried_us += at_us - sender.began_us
     sender.now_us, sender.finish_us, sender.link = at_us, FOREVER, FREED
     sender.transmitted += 1
     sender.busy -= 1

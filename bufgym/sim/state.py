@@ -39,6 +39,7 @@ SENDER = np.dtype(
         ("ask_when_full", np.int64),  # 1: only an arrival that finds no room asks for a decision
         ("screens", np.int64),  # 1: an arrival may ask for no decision, or for several: ask_when_full, or a limit B
         ("ask_at_dequeue", np.int64),  # 1: the policy may drop the head before the socket dequeues it
+        ("measures", np.int64),  # 1: the link's rate is measured at each arrival; 0: nobody reads it
         ("ask_at_send", np.int64),  # 1: a scheduler chooses which message the socket dequeues
         ("topics", np.int64),  # 1: one queue, whatever the messages' topics; else each topic has rules of its own
         ("window", np.int64),  # n_T: messages sent and not yet acked, at most
@@ -79,10 +80,13 @@ SENDER = np.dtype(
         ("link", np.int64),  # IDLE, FREED or CARRIES
         ("position", np.int64),  # bytes of the trace used up when the message in transmission has been transmitted
         ("finish_us", np.int64),  # when that is; FOREVER while the link is idle
+        ("began_us", np.int64),  # when the link began with the message in transmission
+        ("carried_us", np.int64),  # time that the link took for all messages before it
         ("segment_now", np.int64),  # where on the trace the clock and the socket were last looked up
         ("segment_finish", np.int64),
         # counts
         ("dequeued", np.int64),  # messages the socket dequeued
+        ("dequeued_bytes", np.int64),
         ("transmitted", np.int64),  # messages whose last byte has crossed the link
         ("credited", np.int64),  # messages that reached the server
         ("rejected", np.int64),
@@ -96,6 +100,15 @@ SENDER = np.dtype(
         ("departures", np.int64),  # messages dequeued since the previous arrival
         ("period_us", np.float64),  # running mean of the time between arrivals
         ("service_ratio", np.float64),  # running mean of departures per arrival
+        ("period_square", np.float64),  # running mean of the squared time between arrivals, us^2
+        ("left_bytes", np.int64),  # in the socket when the arrival at hand came
+        ("sent_bytes", np.int64),  # that had left the socket by then
+        ("sending_us", np.int64),  # time that the link had carried this sender's bytes by then
+        ("drained_bytes", np.int64),  # of both the part since the previous arrival
+        ("drained_us", np.int64),
+        ("short_rate", np.float64),  # running means of the link's rate while it carries, bytes/us
+        ("medium_rate", np.float64),
+        ("long_rate", np.float64),
         # information
         ("delivered_gain", np.float64),  # sum of V over what reached the server
         ("retained_gain", np.float64),  # sum of V over what is kept or sent

@@ -43,6 +43,7 @@ def _beginning() -> NDArray[Any]:
     sender = records(1, SENDER)
     sender["first"] = 1
     sender["finish_us"] = FOREVER
+    sender["measures"] = 1
     return sender
 
 

@@ -6,24 +6,8 @@ from typing import Any
 
 from bufgym.kernel import at, kernel, stretch
 from bufgym.model.buffer import Buffer
-from bufgym.model.link import carried_by
-from bufgym.sim.socket import next_size_bytes
+from bufgym.sim.socket import held_bytes, left_of
 from bufgym.sim.state import ARRIVAL_WAITS, Batch
-
-
-@kernel
-def left_of_all(batch: Batch, i: int) -> tuple[int, int]:
-    """(bytes not yet transmitted, all bytes) of the messages in a busy socket."""
-    sender = batch.senders[i]
-    total_bytes = at(batch.slots, i, sender.first - 1).size_bytes
-    if sender.busy == 1 and sender.last_dequeue_us == sender.now_us:
-        return total_bytes, total_bytes
-    for k in range(sender.transmitted, sender.dequeued - 1):
-        total_bytes += at(batch.arrivals, i, at(batch.order, i, k)).size_bytes
-    waiting_bytes = total_bytes - next_size_bytes(batch, i)
-    carried_bytes = carried_by(batch.knot_us, batch.knot_bytes, sender, sender.now_us)
-    left_bytes = sender.position - carried_bytes + waiting_bytes
-    return min(total_bytes, max(0, left_bytes)), total_bytes
 
 
 @kernel
@@ -56,7 +40,11 @@ def view(batch: Batch, i: int) -> Buffer:
             dequeued_arrival_us, dequeued_x = at(batch.slots, i, k).arrival_us, at(batch.slots, i, k).x
     left_bytes, left_fraction = 0, 0.0
     if sender.busy > 0:
-        left_bytes, total_bytes = left_of_all(batch, i)
+        total_bytes = held_bytes(batch, i)
+        if sender.measures == 1 and sender.waiting == ARRIVAL_WAITS:
+            left_bytes = sender.left_bytes
+        else:
+            left_bytes = left_of(batch, i, total_bytes)
         left_fraction = left_bytes / total_bytes
     return Buffer(
         stretch(batch.slots, i, first, occupancy),
@@ -76,6 +64,12 @@ def view(batch: Batch, i: int) -> Buffer:
         sender.period_us,
         sender.departures,
         sender.service_ratio,
+        sender.period_square,
+        sender.drained_bytes,
+        sender.drained_us,
+        1e6 * sender.short_rate,
+        1e6 * sender.medium_rate,
+        1e6 * sender.long_rate,
         batch.v[sender.v_start :],
         stretch(batch.topics, i, 0, sender.topics),
         sender.window,

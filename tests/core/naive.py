@@ -91,8 +91,10 @@ class Sender:
         self.position = 0  # bytes of the link used up when it has
         self.last_dequeued = None
         self.previous = None  # the arrival before this one, kept or not
+        self.measured = []  # at each arrival, what the robot's own socket tells of its link
         self.periods = []  # running mean of the time between arrivals, us, of which the newest weighs 1/8
         self.dequeued, self.transmitted, self.dropped, self.order = {}, {}, {}, []
+        self.sizes = {}  # of those dequeued
         self.rejected = self.evicted = self.invalid = 0
         self.evictions = 0  # of those, for the arrival at hand
 
@@ -104,6 +106,7 @@ class Sender:
                 period = message["us"] - self.previous["us"]
                 mean = self.periods[-1] if self.periods else float(period)
                 self.periods.append(mean + (period - mean) / 8)
+            self.measured.append(self.measure(message["us"]))
             # (2) the policy decides
             fits = self.fits(self.queue, message)
             asked = first_decision <= message["seq"] <= last_decision
@@ -137,6 +140,7 @@ class Sender:
         self.position = position + self.sending["bytes"]
         self.finish = self.link.first_time(self.position)
         self.dequeued[self.sending["seq"]] = now
+        self.sizes[self.sending["seq"]] = self.sending["bytes"]
         self.policy.departed(self.queue)
 
     def left_bytes(self, now):
@@ -147,6 +151,26 @@ class Sender:
         if self.dequeued[self.sending["seq"]] == now:
             return size
         return min(size, max(0, self.position - math.floor(self.link.bytes_by(now))))
+
+    def measure(self, now):
+        """What left the socket and in how much time, in all and since the last arrival, and means of their ratio.
+
+        The newest of a mean over w weighs what it took / (what it took + w); at first w is all that came before.
+        """
+        if self.previous is None:
+            return {"sent": 0, "us": 0, "drained": 0, "drained_us": 0} | dict.fromkeys(("short", "medium", "long"), 0.0)
+        last = self.measured[-1]
+        begun = [m for m in self.dequeued if m in self.transmitted or m == self.sending["seq"]]
+        sent = sum(self.sizes[m] for m in begun) - self.left_bytes(now)
+        us = sum(self.transmitted.get(m, now) - self.dequeued[m] for m in begun)
+        made = {"sent": sent, "us": us, "drained": sent - last["sent"], "drained_us": us - last["us"]}
+        for name, w in (("short", 100_000), ("medium", 500_000), ("long", 2_000_000)):
+            mean = last[name]
+            if made["drained_us"] > 0:
+                weight = made["drained_us"] + min(w, last["us"])
+                mean += (made["drained"] - mean * made["drained_us"]) / weight
+            made[name] = mean
+        return made
 
     def fits(self, queue, message):
         enough_bytes = sum(m["bytes"] for m in queue) + message["bytes"] <= self.max_bytes

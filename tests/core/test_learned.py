@@ -25,7 +25,15 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS, observe_context, observe_slots
+from bufgym.observe import (
+    CONTEXT_FIELDS,
+    FIELDS,
+    ON_BOARD_FIELDS,
+    SLOT_FIELDS,
+    observe_context,
+    observe_on_board,
+    observe_slots,
+)
 from bufgym.policies import learned
 from bufgym.policies import weights as weights_file
 from bufgym.policies.learned import NAMES, Network, Weights
@@ -36,7 +44,7 @@ from bufgym.sim.metrics import outcome
 
 V = qoi.exponential(0.618)
 SLOT_NAMES = [field.name for field in SLOT_FIELDS]
-CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS]
+CONTEXT_NAMES = [field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS)]
 
 
 @st.composite
@@ -74,7 +82,8 @@ def twin(whole):
         s, L = len(buffer.slots), buffer.capacity
         slots, context = np.zeros((len(SLOT_NAMES), L + 1)), np.zeros(len(CONTEXT_NAMES))
         observe_slots(buffer, arrival, slots)
-        observe_context(buffer, arrival, context)
+        observe_context(buffer, arrival, context[: len(CONTEXT_FIELDS)])
+        observe_on_board(buffer, arrival, context[len(CONTEXT_FIELDS) :])
 
         def features(k):
             seen = dict(zip(SLOT_NAMES, slots[:, k], strict=True)) | dict(zip(CONTEXT_NAMES, context, strict=True))
@@ -253,7 +262,7 @@ def test_export_takes_over_what_the_run_noted(tmp_path):
     weights, metadata = weights_file.read(tmp_path / "one.safetensors")
     assert {key: metadata[key] for key in noted} == noted
     assert weights.widths == (8, 8)
-    assert set(weights.fields) == set(NAMES)
+    assert set(weights.fields) == {field.name for field in FIELDS}
 
     (tmp_path / "notes.json").write_text("{", encoding="utf-8")
     with pytest.raises(BufgymError, match=r"notes\.json: cannot be read"):

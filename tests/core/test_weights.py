@@ -202,3 +202,16 @@ def test_shipped_agents_are_read_when_they_are_asked_for(path, monkeypatch):
             policies.register(name)
     registry.register_later("afr", lambda: small)
     assert policies.get("afr").name == "afr"
+
+
+def test_fields_beside_the_tables_are_read_by_name(path):
+    # What weights were trained on before these fields came is still what it was.
+    assert weights.observation_hash(names=("rank",)) == weights.observation_hash()
+    fields = ("rank", "rate_short", "bend_large", "room")
+    weights.save(path, random_weights(QUEUE, fields), ABOUT)
+    read, metadata = weights.read(path)
+    assert read.context == fields[1:]
+    assert metadata["observation"] == weights.observation_hash(names=fields) != weights.observation_hash()
+    assert policies.load(path).measures
+    weights.save(path, random_weights(QUEUE, ["rank"]), ABOUT)
+    assert not policies.load(path).measures

@@ -1,0 +1,145 @@
+"""Fields that come with bufgym besides those of the tables: computed where an environment's ``fields``, or a learned
+policy, names one. The link's rate as its own socket shows it, how arrivals come, V's shape, the room under B.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.kernel import kernel
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
+from bufgym.model.qoi import merging_loss, value
+from bufgym.observe.own import OWN_FIELDS, Function, OwnField
+from bufgym.observe.queue import TINY, squash
+
+ON_BOARD_FIELDS: list[OwnField] = []
+"""In the order in which ``observe_on_board`` writes them."""
+
+
+def _context_field(group: str, unit: str) -> Callable[[Function], Function]:
+    """Register the decorated function as a field of its own name; kernels may call what comes back."""
+
+    def add(function: Function) -> Function:
+        name, meaning = function.__name__, (function.__doc__ or "").split("\n")[0]
+        OWN_FIELDS[name] = OwnField(name, "context", group, unit, meaning, function=function, compile=True)
+        ON_BOARD_FIELDS.append(OWN_FIELDS[name])
+        return kernel(function)
+
+    return add
+
+
+# --- the link --------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def mean_bytes(buffer: Buffer, arrival: Any) -> float:
+    """Of the queued messages and the newcomer."""
+    return float((buffer.backlog_bytes + arrival.size_bytes) / (len(buffer.slots) + 1))
+
+
+@kernel
+def demand(buffer: Buffer, arrival: Any) -> float:
+    """What the robot would like to send: a message of mean size at each arrival, bytes/s."""
+    return 1e6 * mean_bytes(buffer, arrival) / max(buffer.period_us, 1.0)
+
+
+@_context_field("link", "g/(g+r), r = demand")
+def rate_last(buffer: Buffer, arrival: Any) -> float:
+    "the link's rate since the previous arrival, as far as there was something to send; else rate_short"
+    rate = buffer.short_rate_bytes_per_s
+    if buffer.drained_us > 0:
+        rate = 1e6 * buffer.drained_bytes / buffer.drained_us
+    return squash(rate, demand(buffer, arrival))
+
+
+@_context_field("link", "g/(g+r), r = demand")
+def rate_short(buffer: Buffer, arrival: Any) -> float:
+    "the link's rate, a running mean over about 0.1 s; demand: a message of mean size at each arrival"
+    return squash(buffer.short_rate_bytes_per_s, demand(buffer, arrival))
+
+
+@_context_field("link", "g/(g+r), r = demand")
+def rate_medium(buffer: Buffer, arrival: Any) -> float:
+    "the same over about 0.5 s"
+    return squash(buffer.medium_rate_bytes_per_s, demand(buffer, arrival))
+
+
+@_context_field("link", "g/(g+r), r = demand")
+def rate_long(buffer: Buffer, arrival: Any) -> float:
+    "the same over about 2 s"
+    return squash(buffer.long_rate_bytes_per_s, demand(buffer, arrival))
+
+
+@_context_field("link", "g/(g+r), r = rate over 2 s")
+def rate_trend(buffer: Buffer, arrival: Any) -> float:
+    "the link's rate over 0.1 s beside that over 2 s: 0.5 = steady, more = it rises"
+    return squash(buffer.short_rate_bytes_per_s, buffer.long_rate_bytes_per_s)
+
+
+@_context_field("link", "g/(g+r), r = arrival period")
+def time_to_free(buffer: Buffer, arrival: Any) -> float:
+    "time until the message in transmission has left, at the rate over 0.1 s; 1 where that is 0"
+    if buffer.left_bytes == 0:
+        return 0.0
+    at_rate = 1e6 * buffer.left_bytes
+    return at_rate / (at_rate + buffer.short_rate_bytes_per_s * max(buffer.period_us, 1.0))
+
+
+# --- arrivals, V and B -----------------------------------------------------------------------------------------------
+
+
+@_context_field("time", "g/(g+r), r = 1")
+def burstiness(buffer: Buffer, arrival: Any) -> float:
+    "squared coefficient of variation of the times between arrivals: 0 = regular, 0.5 = as of a Poisson process"
+    square = buffer.period_us * buffer.period_us
+    return squash(max(buffer.period_square - square, 0.0), square)
+
+
+@kernel
+def bend_at(buffer: Buffer, arrival: Any, evens: float) -> float:
+    """(2 V(d) - V(2 d)) / V(d) at d = so many even motion spacings; with several topics of the newcomer's."""
+    v, gap = buffer.v, arrival.x - buffer.dequeued_x
+    if len(buffer.topics) > 1:
+        v = v[buffer.topics[arrival.topic].v_start :]
+    d = max(evens * gap / (buffer.capacity + 1), 0.0)
+    gain = value(v, d)
+    return float(min(max(merging_loss(v, d, gain, d, gain) / max(gain, TINY), 0.0), 1.0))
+
+
+@_context_field("value", "fraction")
+def bend_small(buffer: Buffer, arrival: Any) -> float:
+    "the bend of V at a quarter of the even motion spacing"
+    return bend_at(buffer, arrival, 0.25)
+
+
+@_context_field("value", "fraction")
+def bend_large(buffer: Buffer, arrival: Any) -> float:
+    "the bend of V at four times the even motion spacing"
+    return bend_at(buffer, arrival, 4.0)
+
+
+@_context_field("queue", "g/(g+r), r = L + 1 messages of mean size")
+def room(buffer: Buffer, arrival: Any) -> float:
+    "bytes free under B; 1 where there is no byte limit"
+    if buffer.max_bytes >= UNLIMITED_BYTES:
+        return 1.0
+    return squash(max(buffer.max_bytes - buffer.backlog_bytes, 0), (buffer.capacity + 1) * mean_bytes(buffer, arrival))
+
+
+@kernel
+def observe_on_board(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
+    """Write every value of ``ON_BOARD_FIELDS`` into ``context`` (float[fields])."""
+    context[0] = rate_last(buffer, arrival)
+    context[1] = rate_short(buffer, arrival)
+    context[2] = rate_medium(buffer, arrival)
+    context[3] = rate_long(buffer, arrival)
+    context[4] = rate_trend(buffer, arrival)
+    context[5] = time_to_free(buffer, arrival)
+    context[6] = burstiness(buffer, arrival)
+    context[7] = bend_small(buffer, arrival)
+    context[8] = bend_large(buffer, arrival)
+    context[9] = room(buffer, arrival)

@@ -1,0 +1,114 @@
+"""The planner: at each decision the queue's programme, solved in futures of the link that the past alone suggests.
+
+    rate of the link, its means over 0.1 s, 2 s and 20 s <- what left the socket
+    for each future f of the link (``futures``):
+        for each message j, queued or new: H_f(j) <- the most that can be reached without j (``hindsight``)
+    drop the j with the largest mean of H_f(j), less a little for its merged motion gap
+
+Where there is room the newcomer is accepted: whatever it would displace can still go later. Each future is solved as if
+it were known, which flatters plans that wait for news; while a link stands still that is all there is to decide, and
+``min-motion-gap`` does it.
+
+It is not yet what it could be: over lte-v1's validation links it is about level with `learned-motion`, which takes a
+hundredth of its time, and even futures that are known for 3 s leave it more than half of AFR's regret there: what the
+end of its horizon leaves open decides too much.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps
+from bufgym.policies.futures import FUTURES, MEAN_S, Grid, Link, sample
+from bufgym.policies.gaps import min_motion_gap
+from bufgym.policies.hindsight import collect, divide, prepare, room, sweep
+from bufgym.policies.registry import Arrival, Memory, register
+
+POINTS, POINTS_EACH = 24, 3
+"""Points of the grid of arrivals to come: so many, and so many more for each of L + 1 candidates."""
+PER_MESSAGE = 3.0
+"""Points of the grid to each message that the link is expected to carry."""
+WORK_PER_US = 300.0
+"""Steps of the programme that count as a microsecond: a budget is one of work, so that every machine decides alike."""
+STEP_WEIGHT = 1 / 16
+"""Of the newest motion step in the mean that is expected to go on."""
+GAP_WEIGHT, AGE_WEIGHT = 0.001, 0.35
+"""Many plans are worth the same: among them the smallest merged motion gap goes, in even gaps, the older the sooner."""
+STEP, MEAN, SEEN_US, REMEMBERED = 0, 1, 2, 3
+_min_motion_gap = kernel(min_motion_gap)
+
+
+@kernel
+def remember(buffer: Buffer, arrival: Arrival, memory: Memory) -> None:
+    """Renew the mean motion step and m, the link's rate over ``MEAN_S`` of sending time (bytes/us)."""
+    step = arrival.x - buffer.previous_x
+    memory[STEP] += (STEP_WEIGHT if memory[STEP] > 0 else 1.0) * (step - memory[STEP])
+    us = buffer.drained_us
+    if us > 0:
+        weight = us + min(MEAN_S * 1e6, memory[SEEN_US])
+        memory[MEAN] += (buffer.drained_bytes - memory[MEAN] * us) / weight
+        memory[SEEN_US] += us
+
+
+@kernel
+def grid_for(buffer: Buffer, rate: float, size_bytes: float) -> Grid:
+    """So fine that ``PER_MESSAGE`` points come between two messages sent at this rate (bytes/us)."""
+    periods = max(1.0, math.floor(size_bytes / (rate * buffer.period_us * PER_MESSAGE)))
+    return Grid(POINTS + POINTS_EACH * (buffer.capacity + 1), min(periods, 64.0) * buffer.period_us)
+
+
+@register(
+    "planner",
+    parameters={"budget_us": 200, "standstill_s": 1.0},
+    memory={"step": 0.0, "mean": 0.0, "seen_us": 0.0},
+    work=room(POINTS_EACH, POINTS),
+    source="hindsight planning over sampled futures (own)",
+    reads_rate=True,
+    named_only=True,
+    compile=True,
+)
+def planner(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A full queue drops what can be spared best in futures of the link that its rate until now suggests."""
+    if buffer.evictions == 0:
+        remember(buffer, arrival, memory)
+    if has_space(buffer, arrival):
+        return ACCEPT
+    s, budget = len(buffer.slots), buffer.parameters[0] * WORK_PER_US
+    size_bytes, rate = (buffer.backlog_bytes + arrival.size_bytes) / (s + 1), buffer.medium_rate_bytes_per_s / 1e6
+    slow = rate < 0.1 * memory[MEAN] or rate * (s + 1) * buffer.period_us < size_bytes
+    still = slow and buffer.stalled_us > buffer.parameters[1] * 1e6
+    if len(buffer.topics) > 1 or still or memory[MEAN] <= 0 or buffer.period_us <= 0 or memory[STEP] <= 0:
+        return _min_motion_gap(buffer, arrival, memory)
+    mean = memory[MEAN]
+    long_rate = max(buffer.long_rate_bytes_per_s / 1e6, 0.02 * mean)
+    short_rate = max(buffer.short_rate_bytes_per_s / 1e6, 0.02 * mean)
+    link = Link(
+        mean,
+        math.log(long_rate / mean),
+        math.log(short_rate / long_rate),
+        float(buffer.left_bytes),
+        size_bytes,
+        s,
+        buffer.period_us,
+    )
+    grid = grid_for(buffer, math.sqrt(mean * long_rate), size_bytes)
+    tables = divide(memory[REMEMBERED:], grid.points, buffer.capacity)
+    prepare(buffer, arrival, memory[STEP] * grid.step_us / buffer.period_us, grid, tables)
+    work, number = 0, 0
+    while number < FUTURES and (number == 0 or work + work / number <= budget):
+        taken = sample(link, grid, number, tables.dequeue_us)
+        work += 2 * grid.points + sweep(s + 1, grid, taken, tables)
+        collect(s + 1, tables)
+        number += 1
+    victim, best = 0, -np.inf
+    even = max((arrival.x - buffer.dequeued_x) / (s + 1), 1e-30)
+    for k in range(s + 1):
+        before, after = motion_gaps(buffer, arrival, k)
+        kept_longer = 1 - AGE_WEIGHT * (1 - k / (s + 1))
+        worth = tables.total[k + 1] / number - GAP_WEIGHT * kept_longer * (before + after) / even
+        if worth > best:
+            victim, best = k, worth
+    return victim if victim < s else REJECT

@@ -1,0 +1,102 @@
+"""The link's rate as a robot's own socket shows it: by hand, then against the twin; and the fields made of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import naive
+import numpy as np
+import pytest
+from cases import cases, newcomer, queue_of
+from hypothesis import given
+from test_sender import MS, V, line
+
+from bufgym import policies
+from bufgym.model import qoi
+from bufgym.model.buffer import ACCEPT
+from bufgym.observe import ON_BOARD_FIELDS, observe_on_board
+
+
+def recorder(seen):
+    """A policy of one's own that accepts what fits, and notes what it sees."""
+
+    def on_arrival(buffer, arrival, memory):
+        rates = buffer.short_rate_bytes_per_s, buffer.medium_rate_bytes_per_s, buffer.long_rate_bytes_per_s
+        seen.append((buffer.drained_bytes, buffer.drained_us, *rates))
+        return ACCEPT
+
+    return policies.Policy("recorder", on_arrival)
+
+
+def test_the_links_rate_by_hand():
+    # 1 MB/s, messages of 50 kB at 0, 20, 60 and 200 ms. By 20 ms the link carried 20 kB in 20 ms; by 60 ms 40 kB more;
+    # at 100 ms it had sent both, and stood idle from then on: in the last 140 ms it carried 40 kB in 40 ms.
+    seen = []
+    line([0, 20, 60, 200], sizes=[50_000, 50_000, 1, 50_000], capacity=4).run(recorder(seen))
+    assert [(b, us) for b, us, *_ in seen] == [(0, 0), (20_000, 20 * MS), (40_000, 40 * MS), (40_001, 40 * MS + 1)]
+    assert seen[0][2:] == (0, 0, 0)
+    np.testing.assert_allclose(seen[3][2:], 1e6)
+
+
+def test_the_links_rate_follows_a_change():
+    # 1 MB/s for 0.2 s, then nothing: arrivals each 100 ms. Of 100 ms that carried nothing the mean over 0.1 s takes
+    # 100 / (100 + 100), that over 0.5 s 100 / (100 + 200): before, no more than 0.2 s were seen.
+    seen = []
+    senders = line([0, 100, 200, 300, 400], sizes=900_000, knots=((0, 0), (200 * MS, 200_000), (900 * MS, 200_000)))
+    senders.run(recorder(seen))
+    short, medium, long = np.array(seen).T[2:]
+    np.testing.assert_allclose(short, [0, 1e6, 1e6, 5e5, 2.5e5])
+    np.testing.assert_allclose(medium, [0, 1e6, 1e6, 2e6 / 3, 5e5])
+    np.testing.assert_allclose(long, medium)
+
+
+@given(cases())
+def test_the_links_rate_as_the_twin_measures_it(case):
+    case = replace(case, decide_at="arrival", episode=replace(case.episode, first_decision=0, last_decision=2**31))
+    case = replace(case, max_bytes=None)
+    seen = []
+    case.run(recorder(seen), V)
+    measured = case.run_twin(naive.policy("drop-newest", V)).measured
+    twin = [(m["drained"], m["drained_us"], *(1e6 * m[n] for n in ("short", "medium", "long"))) for m in measured]
+    assert seen == twin
+
+
+# --- fields ----------------------------------------------------------------------------------------------------------
+
+
+def seen(**known):
+    """The fields of an empty queue of L = 3 that a newcomer of 1000 bytes, 4 gaps on, meets each 10 ms."""
+    arrival = newcomer()
+    arrival["size_bytes"], arrival["x"] = 1_000, 4.0
+    settings = {"period_us": 1e4, "period_square": 1e8, "v": qoi.saturating(1.5).array}
+    buffer = queue_of(0, 3)._replace(**(settings | known))
+    numbers = {field.name: field.function(buffer, arrival) for field in ON_BOARD_FIELDS}
+    table = np.zeros(len(ON_BOARD_FIELDS))
+    observe_on_board(buffer, arrival, table)
+    assert dict(zip(numbers, table, strict=True)) == numbers
+    return numbers
+
+
+def test_fields_by_hand():
+    # A message of 1000 bytes each 10 ms is a demand of 100 kB/s.
+    rates = {"short_rate_bytes_per_s": 3e5, "medium_rate_bytes_per_s": 1e5, "long_rate_bytes_per_s": 1e5}
+    on_link = seen(**rates, drained_bytes=100, drained_us=3_000, left_bytes=9_000)
+    assert [on_link[f"rate_{n}"] for n in ("last", "short", "medium", "long")] == pytest.approx([0.25, 0.75, 0.5, 0.5])
+    assert on_link["rate_trend"] == 0.75
+    # 9000 bytes take 30 ms, three periods; at no rate for ever.
+    assert on_link["time_to_free"] == 0.75
+    assert seen(left_bytes=9_000)["time_to_free"] == 1
+    assert seen()["time_to_free"] == 0
+    # Nothing to send since the last arrival tells nothing new.
+    assert seen(**rates)["rate_last"] == 0.75
+    # The square's mean is twice the mean's square: a Poisson process.
+    assert (seen()["burstiness"], seen(period_square=2e8)["burstiness"]) == (0, 0.5)
+    # V rises to 1 at 1.5: straight at a quarter of the even gap of 1, flat at four of them.
+    assert (seen()["bend_small"], seen()["bend_large"]) == (0, 1)
+    # 12 kB are free: three times the room that four messages take.
+    assert (seen()["room"], seen(max_bytes=12_000)["room"]) == (1, 0.75)
+
+
+def test_only_those_who_read_the_rate_have_it_measured():
+    assert not policies.get("afr").measures
+    assert policies.Policy("own", lambda buffer, arrival, memory: ACCEPT).measures
