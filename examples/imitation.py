@@ -7,8 +7,8 @@ It trains on six of the eight shipped links and is tested on the other two, on t
 
     bufgym bench --trace lte-synthetic-6 lte-synthetic-7 --seeds 40 --policies afr,min-motion-gap,drop-oldest
 
-DAgger (Ross, Gordon and Bagnell 2011): the network plays a batch of episodes, the clairvoyant labels every state that it
-comes to, and the network learns from all states so far. What is particular here:
+DAgger (Ross, Gordon and Bagnell 2011): the network plays a batch of episodes, the clairvoyant labels every state that
+it comes to, and the network learns from all states so far. What is particular here:
 
 - **A label is a number for each action** (``bufgym.expert``): the H that it gives away for good. Most decisions are
   close, so the network is taught probabilities, softmax(-regret / temperature). A close second costs it little.

@@ -92,3 +92,19 @@ def test_imitation_learns_from_the_clairvoyant(capsys: pytest.CaptureFixture[str
     assert reached["imitation"] > reached["afr"] > reached["drop-oldest"] == 0
     shown = capsys.readouterr().out
     assert "round 3: 8,640 states" in shown and "score of imitation: 0." in shown
+
+
+def test_offline_learns_from_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A clone of AFR is far above a network that learned nothing; CQL runs, and its values keep to the masks."""
+    for package in ("d3rlpy", "minari", "sb3_contrib"):
+        pytest.importorskip(package, reason="the extra [offline] is not installed")
+    offline = example("offline.py")
+    small = {"episodes": 8, "updates": 60, "minibatch": 256, "test_seeds": 2, "duration_s": 4.0}
+    settings = offline["Settings"](kinds=["medium"], data=str(tmp_path), **small, test_duration_s=4.0)
+    reached = offline["main"](settings)
+    assert reached["cloning-medium"] > -0.5 and "cql-medium" in reached and reached["drop-oldest"] == 0
+    assert "cql of 960 medium steps" in capsys.readouterr().out
+    seen = torch.zeros(1, offline["FORM"].numbers)
+    seen[0, [0, 1, offline["L"]]] = 1.0  # slots 0 and 1, and the newcomer
+    valid = offline["scored"](offline["new_network"](settings), seen)[0] > -1e5
+    assert valid.tolist() == [True, True, *[False] * 6, True, True]
