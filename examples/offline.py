@@ -1,7 +1,7 @@
 """Offline: a policy from a data set alone, by behaviour cloning and by conservative Q-learning (CQL) of d3rlpy.
 
     pip install "bufgym[offline]"
-    python examples/offline.py --kinds expert mixed
+    python examples/offline.py --kinds medium mixed
 
 Reads data sets as ``bufgym dataset make`` writes them, and makes those that are not in ``--data`` yet. Both learners
 train the same slot network on six of the eight shipped links and never touch an environment; they are tested on the
@@ -50,7 +50,7 @@ FORM = ObservationForm("dict", SLOT_FIELDS, CONTEXT_FIELDS, L)
 class Settings:
     """What ``main`` takes; the options of the command line."""
 
-    kinds: list[str] = field(default_factory=lambda: ["expert", "medium", "mixed"])
+    kinds: list[str] = field(default_factory=lambda: ["medium", "mixed"])
     """Who played in the data sets."""
     data: str = "offline-data"
     """Folder of the data sets."""

@@ -27,8 +27,8 @@ print(judge.regrets()[0].round(3))  # evict slot 0..7, reject, accept
 # %% [markdown]
 # ## A pupil
 #
-# `SlotPolicy` scores each message with the same small network. Elsewhere MaskablePPO trains it by reward; here it learns
-# from examples.
+# `SlotPolicy` scores each message with the same small network. Elsewhere MaskablePPO trains it by reward; here it
+# learns from examples.
 
 # %%
 import torch
