@@ -93,7 +93,7 @@ print(table.plain(run.run(chosen, held_out, capacities=[8], seeds=10)))
 # %% [markdown]
 # The pupil is above AFR, and far below 1, the clairvoyant's score. Where the link decides only later which message was
 # worth keeping, equal states have different labels, and the pupil learns their mean. `examples/imitation.py` trains
-# longer; the [guide](../guide.md#experts) has more about experts.
+# longer; the [guide](../guide/experts.md#experts) has more about experts.
 #
 # ## The picture
 
