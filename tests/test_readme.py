@@ -99,9 +99,7 @@ def test_the_table_is_what_its_command_prints(capsys: pytest.CaptureFixture[str]
 def test_the_guides_index_has_every_page_and_keeps_its_old_anchors() -> None:
     index = (REPO / "docs" / "guide.md").read_text(encoding="utf-8")
     assert {f"docs/{page}" for page in re.findall(r"\]\((guide/[\w-]+\.md)", index)} == set(GUIDE)
-    assert all(
-        f"- {page.removeprefix('docs/')}\n" in (REPO / "mkdocs.yml").read_text(encoding="utf-8") for page in GUIDE
-    )
+    assert {page.removeprefix("docs/") for page in GUIDE} <= set(SITE)
     old = ("Recordings", "Benchmark suites", "Training", "Environments", "Experts", "Data sets", "Pictures")
     assert all(f"\n## {title}\n" in index for title in old)
 
@@ -118,10 +116,6 @@ def test_links_lead_somewhere(page: str) -> None:
         path, _, anchor = target.partition("#")
         if not target.startswith("http"):
             # Pages that the site makes from the code are in its menu; tests/test_site.py builds it.
-            there = (REPO / page).parent / path
-            made = (
-                there.resolve().is_relative_to(REPO / "docs")
-                and str(there.resolve().relative_to(REPO / "docs")) in SITE
-            )
-            assert not path or made or there.exists(), target
+            there = ((REPO / page).parent / path).resolve()
+            assert not path or there.exists() or there in [REPO / "docs" / name for name in SITE], target
             assert not anchor or anchor in anchors, target
