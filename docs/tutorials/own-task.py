@@ -86,7 +86,7 @@ import bufgym
 
 task = {"scenario": "between-halls", "capacity": 8}
 task["fields"] = ["occupied", "rank", "loss", "staleness", "occupancy", "busy", "left", "service_ratio"]
-env = gym.make("bufgym/Uplink-v0", reward={"retained": 1.0, "waited": 1.0}, **task)
+env = gym.make("bufgym/Uplink-v0", reward={"retained": 1.0, "waited": 5.0}, **task)
 env.reset(seed=0)
 _, reward, _, _, info = env.step(env.action_space.n - 1)  # accept
 print(reward, info["reward_terms"])
@@ -108,7 +108,7 @@ def train(weight):
     return MaskablePPO(SlotPolicy, envs, seed=0, **settings).learn(81_920)
 
 
-agents = {"complete": train(0.0), "soon": train(1.0)}
+agents = {"complete": train(0.0), "soon": train(5.0)}
 
 # %% [markdown]
 # ## The picture
