@@ -141,8 +141,9 @@ for name in (*agents, "min-gap", "afr", "drop-oldest"):
     delay_s, h = waited_s / info["delivered"].sum(), info["qoi"].mean()
     print(f"{name:12} H = {h:.1f}, {delay_s:.2f} s")
     axes.plot(delay_s, h, "o", markersize=9, color="tab:red" if name in agents else "tab:gray")
-    axes.annotate(name, (delay_s, h), xytext=(8, -3), textcoords="offset points")
-axes.margins(0.15)
+    side = 9 if name in agents else -17  # points; agents are named above, the others below
+    axes.annotate(name, (delay_s, h), xytext=(0, side), textcoords="offset points", ha="center")
+axes.margins(0.15, 0.25)
 axes.set_xlabel("mean time from arrival to server (s)")
 axes.set_ylabel("QoI (H)")
 figure.savefig("own-task.png")
