@@ -61,7 +61,7 @@ gallery: $(READY)
 tutorials: $(READY)
 	for page in docs/tutorials/*.py; do \
 	  (cd docs/tutorials && ../../$(BIN)/python $$(basename $$page)) || exit 1; done
-	rm -f docs/tutorials/*.csv
+	rm -rf docs/tutorials/*.csv docs/tutorials/mine
 
 dist: $(READY)
 	rm -rf dist

@@ -12,7 +12,8 @@ from bufgym import cli, policies, reproduce
 from bufgym.cli import main
 
 REPO = Path(__file__).resolve().parent.parent
-PAGES = ("README.md", "CONTRIBUTING.md", "docs/index.md", "docs/concepts.md", "docs/guide.md")
+GUIDE = [f"docs/guide/{path.name}" for path in sorted((REPO / "docs" / "guide").glob("*.md"))]
+PAGES = ("README.md", "CONTRIBUTING.md", "docs/index.md", "docs/concepts.md", "docs/guide.md", *GUIDE)
 README = "\n".join((REPO / name).read_text(encoding="utf-8") for name in PAGES)
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 SITE = re.findall(r"[\w/-]+\.md", (REPO / "mkdocs.yml").read_text(encoding="utf-8"))
@@ -95,7 +96,17 @@ def test_the_table_is_what_its_command_prints(capsys: pytest.CaptureFixture[str]
     assert capsys.readouterr().out.strip() == table.strip()
 
 
-@pytest.mark.parametrize("page", ["README.md", *(f"docs/{path.name}" for path in sorted((REPO / "docs").glob("*.md")))])
+def test_the_guides_index_has_every_page_and_keeps_its_old_anchors() -> None:
+    index = (REPO / "docs" / "guide.md").read_text(encoding="utf-8")
+    assert {f"docs/{page}" for page in re.findall(r"\]\((guide/[\w-]+\.md)", index)} == set(GUIDE)
+    assert {page.removeprefix("docs/") for page in GUIDE} <= set(SITE)
+    old = ("Recordings", "Benchmark suites", "Training", "Environments", "Experts", "Data sets", "Pictures")
+    assert all(f"\n## {title}\n" in index for title in old)
+
+
+@pytest.mark.parametrize(
+    "page", ["README.md", *(f"docs/{path.name}" for path in sorted((REPO / "docs").glob("*.md"))), *GUIDE]
+)
 def test_links_lead_somewhere(page: str) -> None:
     text = (REPO / page).read_text(encoding="utf-8")
     anchors = {
@@ -105,5 +116,6 @@ def test_links_lead_somewhere(page: str) -> None:
         path, _, anchor = target.partition("#")
         if not target.startswith("http"):
             # Pages that the site makes from the code are in its menu; tests/test_site.py builds it.
-            assert not path or path in SITE or ((REPO / page).parent / path).exists(), target
+            there = ((REPO / page).parent / path).resolve()
+            assert not path or there.exists() or there in [REPO / "docs" / name for name in SITE], target
             assert not anchor or anchor in anchors, target

@@ -55,7 +55,7 @@ def page() -> str:
     lines = [
         "# Agent cards",
         "These agents come with bufgym. Use them as any other policy: `bufgym bench --policies learned-motion,afr`."
-        " The [guide](guide.md#training) says how to train your own.",
+        " The [guide](guide/training.md) says how to train your own.",
     ]
     for name, card in CARDS.items():
         facts = [

@@ -42,9 +42,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Links to files beside docs/ lead to their copies on the site."""
-    for name, page in FROM_ROOT.items():
-        markdown = markdown.replace(f"](../{name}", f"]({page}")
-    return markdown.replace("](../examples/", "](examples/")
+    for up in ("", "../"):  # from a page in docs/, from one in a folder of docs/
+        for name, page in FROM_ROOT.items():
+            markdown = markdown.replace(f"]({up}../{name}", f"]({up}{page}")
+        markdown = markdown.replace(f"]({up}../examples/", f"]({up}examples/")
+    return markdown
 
 
 def _of_root(text: str) -> str:

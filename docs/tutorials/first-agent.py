@@ -57,7 +57,7 @@ rows = run.run(chosen, scenario, capacities=[8], seeds=20)
 print(table.plain(rows))
 
 # %% [markdown]
-# The agent is trained for seconds only. `make train` trains longer, and the [guide](../guide.md#training) says how the
+# The agent is trained for seconds only. `make train` trains longer, and the [guide](../guide/training.md) says how the
 # shipped agents were made.
 #
 # ## What did the server see?

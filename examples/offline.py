@@ -1,0 +1,220 @@
+"""Offline: a policy from a data set alone, by behaviour cloning and by conservative Q-learning (CQL) of d3rlpy.
+
+    pip install "bufgym[offline]"
+    python examples/offline.py --kinds medium mixed
+
+Reads data sets as ``bufgym dataset make`` writes them, and makes those that are not in ``--data`` yet. Both learners
+train the same slot network on six of the eight shipped links and never touch an environment; they are tested on the
+other two links, on the episodes of
+
+    bufgym bench --trace lte-synthetic-6 lte-synthetic-7 --seeds 40 --policies afr,min-motion-gap,drop-oldest
+
+CQL (Kumar et al. 2020) is Q-learning on recorded steps that also pushes down the values of actions that nobody took.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import d3rlpy
+import minari
+import numpy as np
+import torch
+from d3rlpy.dataset import TransitionMiniBatch
+from d3rlpy.models.q_functions import QFunctionFactory
+from d3rlpy.models.torch.q_functions import DiscreteMeanQFunctionForwarder, DiscreteQFunction, QFunctionOutput
+from gymnasium import spaces
+from torch import Tensor
+
+from bufgym import policies, scenario
+from bufgym.benchmark.run import run
+from bufgym.envs.observation import ObservationForm
+from bufgym.expert import dataset
+from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
+from bufgym.oracle.measure import normalised_score
+from bufgym.sb3 import SlotPolicy, as_policy
+
+TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
+TEST = ["lte-synthetic-6", "lte-synthetic-7"]
+RIVALS = ("min-motion-gap", "afr", "drop-oldest")
+L = 8
+FORM = ObservationForm("dict", SLOT_FIELDS, CONTEXT_FIELDS, L)
+"""What the numbers of a flat observation mean."""
+
+
+@dataclass
+class Settings:
+    """What ``main`` takes; the options of the command line."""
+
+    kinds: list[str] = field(default_factory=lambda: ["medium", "mixed"])
+    """Who played in the data sets."""
+    data: str = "offline-data"
+    """Folder of the data sets."""
+    episodes: int = 300
+    """Of each data set."""
+    duration_s: float = 10.0
+    test_duration_s: float = 30.0
+    test_seeds: int = 40
+    """Test episodes on each held-out link."""
+    updates: int = 1_000
+    """Gradient steps of each learner."""
+    minibatch: int = 1_024
+    learning_rate: float = 2e-3
+    gamma: float = 0.9
+    """The reward pays at once what a decision costs, so a short sight keeps noise out."""
+    alpha: float = 1.0
+    """CQL's weight of what pushes unseen actions down."""
+    reward_scale: float = 10.0
+    """Rewards are hundredths of QoI; Q-learning likes them larger."""
+    seed: int = 0
+
+
+@dataclass
+class Steps:
+    """A data set as arrays, a row for each step."""
+
+    seen: np.ndarray
+    action: np.ndarray
+    reward: np.ndarray
+    seen_next: np.ndarray
+    ended: np.ndarray
+
+
+def read(kind: str, settings: Settings) -> Steps:
+    """The data set of that kind; made first where there is none."""
+    name, folder = f"bufgym/uplink/{kind}-v0", Path(settings.data)
+    if not (folder / name).exists():
+        options = {"capacity": L, "duration_s": settings.duration_s, "traces": TRAIN, "observation": "flat"}
+        dataset.make("Uplink-v0", kind, settings.episodes, out=folder, seed=settings.seed, regret=False, **options)
+    os.environ["MINARI_DATASETS_PATH"] = str(folder.absolute())
+    parts = [
+        (e.observations[:-1], e.actions, e.rewards, e.observations[1:], e.terminations)
+        for e in minari.load_dataset(name)
+    ]
+    return Steps(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def new_network(settings: Settings) -> SlotPolicy:
+    """An untrained slot network."""
+    return SlotPolicy(FORM.space, spaces.Discrete(L + 2), lambda _: settings.learning_rate)
+
+
+def scored(network: SlotPolicy, seen: Tensor) -> Tensor:
+    """[n, L + 2]: the network's number for each action, very low where the action is invalid."""
+    observation = FORM.of(seen)
+    features = network.extract_features(observation)
+    full = observation["occupied"][:, :L].min(dim=1, keepdim=True).values
+    valid = torch.cat([observation["occupied"][:, :L], torch.ones_like(full), 1 - full], dim=1)
+    return network.mlp_extractor.forward_actor(features).masked_fill(valid == 0, -1e6)
+
+
+def batches(steps: Steps, settings: Settings) -> list[np.ndarray]:
+    """So many random minibatches, as indices."""
+    rng = np.random.default_rng(settings.seed)
+    return [rng.integers(len(steps.action), size=settings.minibatch) for _ in range(settings.updates)]
+
+
+def clone(steps: Steps, settings: Settings) -> SlotPolicy:
+    """Behaviour cloning: the recorded actions become likely."""
+    network = new_network(settings)
+    for k, batch in enumerate(batches(steps, settings)):
+        network.optimizer.param_groups[0]["lr"] = settings.learning_rate * (1 - k / settings.updates)
+        logits, taken = scored(network, torch.from_numpy(steps.seen[batch])), torch.from_numpy(steps.action[batch])
+        loss = torch.nn.functional.cross_entropy(logits, taken)
+        network.optimizer.zero_grad()
+        loss.backward()
+        network.optimizer.step()
+    return network
+
+
+class SlotQ(DiscreteQFunction):
+    """Q of each action from a slot network; invalid ones are never the best."""
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__()
+        self.network = new_network(settings)
+
+    def forward(self, x: Tensor) -> QFunctionOutput:
+        return QFunctionOutput(q_value=scored(self.network, x), quantiles=None, taus=None)
+
+    @property
+    def encoder(self) -> SlotPolicy:
+        return self.network
+
+
+@dataclass
+class SlotQFactory(QFunctionFactory):
+    """Makes ``SlotQ`` for d3rlpy."""
+
+    settings: Settings = field(default_factory=Settings)
+
+    def create_discrete(
+        self, encoder: object, hidden_size: int, action_size: int
+    ) -> tuple[SlotQ, DiscreteMeanQFunctionForwarder]:
+        q = SlotQ(self.settings)
+        return q, DiscreteMeanQFunctionForwarder(q, action_size)
+
+    @staticmethod
+    def get_type() -> str:
+        return "slots"
+
+
+def conservative(steps: Steps, settings: Settings) -> SlotPolicy:
+    """Discrete CQL: the network's numbers become values, pushed down where the data set has nothing."""
+    cql = d3rlpy.algos.DiscreteCQLConfig(
+        batch_size=settings.minibatch,
+        gamma=settings.gamma,
+        learning_rate=settings.learning_rate,
+        q_func_factory=SlotQFactory(settings=settings),
+        target_update_interval=50,
+        alpha=settings.alpha,
+        reward_scaler=d3rlpy.preprocessing.MultiplyRewardScaler(settings.reward_scale),
+    ).create(device="cpu:0")
+    cql.create_impl((FORM.numbers,), L + 2)
+    for batch in batches(steps, settings):
+        column = {name: part[batch, None].astype(np.float32) for name, part in vars(steps).items() if part.ndim == 1}
+        drawn = TransitionMiniBatch(
+            observations=steps.seen[batch],
+            actions=column["action"],
+            rewards=column["reward"],
+            next_observations=steps.seen_next[batch],
+            next_actions=np.zeros_like(column["action"]),  # no part in Q-learning
+            terminals=column["ended"],
+            intervals=np.ones_like(column["ended"]),
+            transitions=[],
+        )
+        cql.update(drawn)
+    assert cql.impl is not None
+    return cql.impl.q_function[0].encoder
+
+
+def main(settings: Settings) -> dict[str, float]:
+    """Learn from each data set and test; the scores by learner and data set, and those of fixed policies."""
+    torch.set_num_threads(1)
+    players = [policies.get(name) for name in RIVALS]
+    for kind in settings.kinds:
+        steps = read(kind, settings)
+        for name, learn in (("cloning", clone), ("cql", conservative)):
+            d3rlpy.seed(settings.seed)
+            began = time.process_time()
+            players.append(as_policy(learn(steps, settings), f"{name}-{kind}"))
+            print(f"{name} of {len(steps.action):,} {kind} steps: {time.process_time() - began:.0f} CPU seconds")
+    rows = run(players, scenario.get("lte", traces=TEST, duration_s=settings.test_duration_s), [L], settings.test_seeds)
+    h = {player.name: sum(row["qoi"] for row in rows if row["policy"] == player.name) for player in players}
+    best = sum(row["clairvoyant"] for row in rows if row["policy"] == "drop-oldest")
+    reached = {name: float(normalised_score(total, h["drop-oldest"], best)) for name, total in h.items()}
+    for name, score in sorted(reached.items(), key=lambda pair: -pair[1]):
+        print(f"score of {name}: {score:.3f}")
+    return reached
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    for name, default in vars(Settings()).items():
+        kind = {"nargs": "+", "type": str} if isinstance(default, list) else {"type": type(default)}
+        parser.add_argument(f"--{name.replace('_', '-')}", default=default, help="(%(default)s)", **kind)
+    main(Settings(**vars(parser.parse_args())))
