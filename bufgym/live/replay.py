@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bufgym.errors import BufgymError
+from bufgym.kernel import records as zeroed
 from bufgym.live.log import Record, of, read_log
 from bufgym.model.buffer import MESSAGE
 from bufgym.model.link import Link
@@ -78,7 +79,7 @@ def _value(v: Record) -> Value:
 def _arrivals(records: Sequence[Record]) -> np.ndarray[Any, Any]:
     """MESSAGE[n] of the log."""
     puts = list(of(records, "put"))
-    arrivals = np.zeros(len(puts), MESSAGE)
+    arrivals = zeroed(len(puts), MESSAGE)
     for name, column in (("seq", "seq"), ("arrival_us", "us"), ("size_bytes", "size_bytes"), ("topic", "topic")):
         arrivals[name] = [put[column] for put in puts]
     arrivals["x"], arrivals["uniform"] = [put["x"] for put in puts], [put["uniform"] for put in puts]
