@@ -13,8 +13,9 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from bufgym.envs.fleet_rows import FleetRows
 from bufgym.envs.observation import Observation
-from bufgym.envs.rows import FleetRows, check_render_mode
+from bufgym.envs.rows import check_render_mode
 from bufgym.errors import BufgymError
 from bufgym.scenario import FleetScenario, Uplink
 

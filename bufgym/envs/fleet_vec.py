@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bufgym.envs.rows import FleetRows, Rows
+from bufgym.envs.fleet_rows import FleetRows
+from bufgym.envs.rows import Rows
 from bufgym.envs.vector import SenderVectorEnv
 from bufgym.model.checks import whole
 from bufgym.scenario import FleetScenario, Uplink

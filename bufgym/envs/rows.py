@@ -1,6 +1,6 @@
 """The rows that every environment is made of: n senders, what they hand out, and one compiled step over all of them.
 
-``Rows`` has a link for each sender; in ``FleetRows`` the robots of a cell share one.
+``Rows`` has a link for each sender; in ``fleet_rows`` the robots of a cell share one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bufgym import scenario as scenarios
 from bufgym.envs.bound import BOUND, check_one_queue, measured
 from bufgym.envs.observation import Observation, ObservationForm
 from bufgym.envs.own import OwnFields, OwnTerms
-from bufgym.envs.step import StepOutput, step_cells, step_rows
+from bufgym.envs.step import StepOutput, step_rows
 from bufgym.envs.threads import Threads
 from bufgym.errors import BufgymError
 from bufgym.model.checks import is_number
@@ -33,10 +33,9 @@ from bufgym.observe import (
     own_term,
     terms_for,
 )
-from bufgym.scenario import FleetScenario, Scenario, Streams
+from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import numbered
 from bufgym.sim import Senders
-from bufgym.sim.cell import Fleet
 
 INFOS = ("full", "steady", "mask", "none")
 """How much ``info`` has: all of it; all of it and the summary so far, so that every step has the same entries; the
@@ -285,71 +284,3 @@ class Rows:
             self.seed(i, seeding.np_random()[0])
         streams = cast(Streams, self.streams[i])
         return self._draw(streams), streams.policy
-
-
-class FleetRows(Rows):
-    """``cells`` cells with N = ``scenario.robots`` robots each: robot r of cell c is row c N + r.
-
-    The robots of a cell begin an episode together; it is drawn from the streams of the cell's first row.
-    """
-
-    def __init__(
-        self,
-        cells: int,
-        scenario: FleetScenario,
-        capacity: int,
-        *,
-        reward: str = "team",
-        term: str | Mapping[str, float] = "retained",
-        **options: Any,
-    ) -> None:
-        """``reward``: "team" or "own"; ``term``: what ``Rows`` calls reward; the rest as of ``Rows``."""
-        if reward not in ("team", "own"):
-            raise BufgymError(
-                f"reward = {reward!r}: must be 'team' (the mean over the robots) or 'own'; its term is `term`"
-            )
-        n = cells * scenario.robots
-        super().__init__(n, scenario.uplink, capacity, reward=term, **options)
-        self.reward = reward
-        self._draw = scenario.draw
-        self.robots = scenario.robots
-        self.fleet = Fleet(self.senders, scenario.robots)
-        self._threads = Threads(np.arange(cells), options.get("num_threads", 1))
-
-    def seed(self, i: int, rng: np.random.Generator) -> None:
-        """Give row ``i`` streams of its own if it is the first of its cell; the others need none."""
-        if i % self.robots == 0:
-            super().seed(i, rng)
-
-    def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
-        """Begin a new episode in each cell of ``rows``: ``episodes[c]``, or where that is None the next one drawn."""
-        cells = np.unique(rows // self.robots)
-        if len(cells) * self.robots != len(rows):
-            raise BufgymError("reset_mask: the robots of one cell begin together; give all of them or none")
-        if episodes is not None and len(episodes) != len(self.fleet):
-            raise BufgymError(f"episodes: {len(episodes)} given for {len(self.fleet)} cells; None where one is drawn")
-        for c in cells.tolist():
-            episode = episodes[c] if episodes is not None else None
-            if episode is None:
-                self.fleet.load(c, *self._next_episode(c * self.robots))
-                continue
-            if not episode.ticks_together:
-                raise BufgymError("episode: in an environment the messages of all robots arrive at the same times")
-            self.fleet.load(c, episode)
-        step_cells(self.senders.batch, self.fleet.shares, cells, NO_ACTIONS, self.rewarded, self.output)
-        if self._has_own:
-            self._begin_own(rows)
-
-    def step(self, actions: NDArray[np.int64]) -> None:
-        """One decision of every robot; the result is in ``self.output``."""
-        batch, shares, rewarded, output = self.senders.batch, self.fleet.shares, self.rewarded, self.output
-        self._threads.each(lambda cells: step_cells(batch, shares, cells, actions, rewarded, output))
-        if self._has_own:
-            self._step_own()
-
-    def rewards(self) -> NDArray[np.float64]:
-        """float64[rows]: each robot's own weighted sum, or for a "team" the mean of those in its cell."""
-        own = super().rewards()
-        if self.reward == "own":
-            return own
-        return np.repeat(own.reshape(len(self.fleet), self.robots).mean(axis=1), self.robots)

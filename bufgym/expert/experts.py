@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies
-from bufgym.envs.rows import FleetRows, Rows
+from bufgym.envs.fleet_rows import FleetRows
+from bufgym.envs.rows import Rows
 from bufgym.errors import BufgymError
 from bufgym.expert.player import Player
 from bufgym.oracle import law, online_optimum

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import FleetRows
+from bufgym.envs.fleet_rows import FleetRows
 from bufgym.errors import BufgymError
 from bufgym.expert.experts import rows_of
-from bufgym.oracle.ahead import NO_ROOM, Ahead, find_steps, find_values, new_work
+from bufgym.oracle.ahead import NO_ROOM, Ahead, find_steps
+from bufgym.oracle.from_queue import find_values, new_work
 from bufgym.oracle.programme import find_idle
 from bufgym.sim import ARRIVAL_WAITS
 

@@ -1,28 +1,21 @@
 """What can still be gained, from any moment of an episode: the clairvoyant for states that policies come to.
 
-As in ``labels``, sizes are equal (b bytes) and C(t) counts the bytes that the link can carry. Two parts:
-
-*Ahead.* ``F(i, e)`` is the most that can be gained after message i, if that is sent, ends at byte e and nothing else of
-what arrived before it is kept. As a function of e it is a falling staircase, and the staircase of message i follows
-from those of all later ones: one backward sweep over the episode (``find_steps``) finds all of them exactly.
-
-*From a queue.* A plan first sends some of the s messages that are queued after the action, and then only later
-arrivals, from where F knows the rest. But a queue of s messages is s transmissions without a pause, whatever is
-decided: decisions exchange messages, one an arrival, and never make the queue shorter. So the t-th of these, which
-begins at byte u_t, can send message m only if m was there before byte u_t, and s - t later ones were, too. A plan
-without this condition is a bound; nearly always it meets the condition anyway. If not, ``forced`` finds the best.
+As in ``labels``, sizes are equal (b bytes) and C(t) counts the bytes that the link can carry. ``F(i, e)`` is the most
+that can be gained after message i, if that is sent, ends at byte e and nothing else of what arrived before it is kept.
+As a function of e it is a falling staircase, and the staircase of message i follows from those of all later ones: one
+backward sweep over the episode (``find_steps``) finds all of them exactly. ``from_queue`` adds what is queued.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.kernel import at, kernel
 from bufgym.model.qoi import value
-from bufgym.sim.state import ARRIVAL_WAITS, CARRIES, Batch
+from bufgym.sim.state import Batch
 
 ALWAYS = 2**62
 """A byte that no message ends after."""
@@ -30,7 +23,7 @@ ALWAYS = 2**62
 NO_ROOM, NO_WORK_SPACE = -1, -2
 """What ``find_steps`` returns where it ran out of something."""
 
-_TIE = 1e-12
+TIE = 1e-12
 """A gain must be better by so much to replace another."""
 
 
@@ -56,55 +49,6 @@ class Ahead(NamedTuple):
     latest: NDArray[np.int64]
     gain: NDArray[np.float64]
     follow: NDArray[np.int32]
-
-
-class Work(NamedTuple):
-    """Work space of ``find_values`` for queues of up to L messages.
-
-    Fields:
-        x: float64[L + 1], of the queued messages and the newcomer, its last.
-        first: float64[L + 1], what each adds if it is sent next.
-        pair: float64[L + 1, L + 1], what the second adds if it is sent after the first.
-        own: float64[L + 2, L + 1], the most of so many of the queue's own messages, of which this is the last.
-        jump: float64[L + 2, L + 1], the most after these, if only later arrivals follow.
-        target: int64[L + 2, L + 1], the first of those; -1 for none.
-        slots: int64[L + 1], what is queued after the action.
-        arrived: int64[L + 2], arrivals after the newcomer by the time of the t-th transmission.
-        future: float64[messages], of each later arrival.
-        forced: float64[2, L + 1 + messages], of each candidate.
-    """
-
-    x: NDArray[np.float64]
-    first: NDArray[np.float64]
-    pair: NDArray[np.float64]
-    own: NDArray[np.float64]
-    jump: NDArray[np.float64]
-    target: NDArray[np.int64]
-    slots: NDArray[np.int64]
-    arrived: NDArray[np.int64]
-    future: NDArray[np.float64]
-    forced: NDArray[np.float64]
-
-
-def new_work(capacity: int, messages: int) -> Work:
-    """Work space for L = ``capacity`` and episodes of so many ``messages``."""
-    L = capacity
-    table = (L + 2, L + 1)
-    return Work(
-        np.zeros(L + 1),
-        np.zeros(L + 1),
-        np.zeros((L + 1, L + 1)),
-        np.zeros(table),
-        np.zeros(table),
-        np.zeros(table, np.int64),
-        np.zeros(L + 1, np.int64),
-        np.zeros(L + 2, np.int64),
-        np.zeros(messages),
-        np.zeros((2, L + 1 + messages)),
-    )
-
-
-# --- staircases ------------------------------------------------------------------------------------------------------
 
 
 @kernel
@@ -177,7 +121,7 @@ def find_steps(
                 else:
                     e, g, f = late, added + ahead.gain[k], np.int32(j)
                     k += 1
-                if g > best + _TIE:
+                if g > best + TIE:
                     if kept > 0 and latest[then, kept - 1] == e:
                         kept -= 1
                     latest[then, kept], gain[then, kept], follow[then, kept] = e, g, f
@@ -220,160 +164,3 @@ def sends(ahead: Ahead, i: int, m: int, e: int) -> float:
     if u - c > ahead.link[i, 1] * b:
         return -1.0
     return float(ahead.gain[step_of(ahead, i, m, u + b)])
-
-
-# --- from a queue ----------------------------------------------------------------------------------------------------
-
-
-@kernel
-def find_values(batch: Batch, ahead: Ahead, work: Work, action_mask: NDArray[np.int8], values: NDArray[Any]) -> None:
-    """``values``, float64[n, L + 2]: the best H attainable with each action now, in hindsight; NaN if it is invalid."""
-    for i in range(len(batch.senders)):
-        sender = batch.senders[i]
-        values[i, :] = np.nan
-        if sender.waiting != ARRIVAL_WAITS:
-            continue
-        h, e = so_far(batch, i, ahead.link[i, 2])
-        own = sender.occupancy + 1
-        if e <= ahead.link[i, 2]:
-            e = max(e, at(ahead.c, i, sender.next)) if sender.busy == 0 else e
-            look(batch, ahead, work, i, e)
-        for action in range(sender.capacity + 2):
-            if action_mask[i, action] == 0:
-                continue
-            values[i, action] = h
-            if e > ahead.link[i, 2]:
-                continue  # nothing is delivered any more
-            count = 0
-            for k in range(own):
-                gone = k == action if action < sender.capacity else action == sender.capacity and k == own - 1
-                if not gone:
-                    work.slots[count] = k
-                    count += 1
-            values[i, action] += best_from(batch, ahead, work, i, e, count)
-
-
-@kernel
-def so_far(batch: Batch, i: int, ends: int) -> tuple[float, int]:
-    """(H of all that the socket has taken, byte at which the last of it ends); without what is never delivered."""
-    sender = batch.senders[i]
-    gain, counted = sender.delivered_gain, sender.dequeued
-    e = sender.position
-    if sender.busy > 0 and sender.link != CARRIES:
-        e = ends + 1
-    if e > ends:
-        counted -= sender.busy
-    for k in range(sender.credited, counted):
-        gain += at(batch.log, i, at(batch.order, i, k)).gain
-    return (1.0 + gain if counted > 0 else 0.0), e
-
-
-@kernel
-def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
-    """Fill ``x``, ``first``, ``pair``, ``jump``, ``target`` and ``arrived`` for the decision of sender ``i``."""
-    sender = batch.senders[i]
-    own, n, b = sender.occupancy + 1, sender.next, ahead.link[i, 0]
-    v = batch.v[sender.v_start :]
-    last_x = at(batch.slots, i, sender.first - 1).x
-    sent = sender.dequeued > 0
-    for k in range(own):
-        x = at(batch.arrivals, i, n).x if k == own - 1 else at(batch.slots, i, sender.first + k).x
-        work.x[k] = x
-        work.first[k] = value(v, x - last_x) if sent else 1.0  # the very first is the 1 in H
-        for j in range(k):
-            work.pair[j, k] = value(v, x - work.x[j])
-    count = 0
-    for t in range(1, own + 2):
-        if t <= own:
-            while n + 1 + count < sender.arrivals and at(ahead.c, i, n + 1 + count) < e + (t - 1) * b:
-                count += 1
-            work.arrived[t] = count
-        u = e + (t - 1) * b  # t - 1 of the queue are sent, then a later arrival
-        known, chosen = n, n + 1
-        for k in range(max(0, t - 2), own if t > 1 else 1):
-            # Of a later message the best to follow is no earlier: V is concave.
-            most, target, m = 0.0, -1, chosen
-            while m < sender.arrivals:
-                if at(ahead.between, i, m) > n and at(ahead.idle, i, m) >= u:
-                    break  # something could be sent in the meantime
-                if m > known:
-                    work.future[m] = sends(ahead, i, m, u)
-                    known = m
-                after = work.future[m]
-                if after < -1 or (after >= 0 and after + 1 <= most):
-                    break  # with a later message there is not more to follow
-                if after >= 0:
-                    x = at(batch.arrivals, i, m).x
-                    added = value(v, x - (last_x if t == 1 else work.x[k])) if sent or t > 1 else 1.0
-                    if added + after > most + _TIE or target < 0:
-                        most, target = added + after, m
-                m += 1
-            work.jump[t - 1, k], work.target[t - 1, k] = most, target
-            chosen = target if target >= 0 else chosen
-
-
-@kernel
-def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int) -> float:
-    """The most that is still gained with the first ``count`` of ``work.slots`` queued and the socket free at ``e``."""
-    b, ends = ahead.link[i, 0], ahead.link[i, 2]
-    until = min(count, (ends - e) // b)  # transmissions of this queue that are delivered
-    most, sent, target = work.jump[0, 0], 0, work.target[0, 0]
-    for t in range(1, until + 1):
-        for p in range(t - 1, min(count, t + work.arrived[t])):
-            k = work.slots[p]
-            gain = work.first[k]
-            if t > 1:
-                gain = -1.0
-                for before in range(t - 2, min(p, t - 1 + work.arrived[t - 1])):
-                    j = work.slots[before]
-                    gain = max(gain, work.own[t - 1, j] + work.pair[j, k])
-            work.own[t, k] = gain
-            # Of equals those that send more: they are less often impossible.
-            if gain + work.jump[t, k] >= most - _TIE:
-                most, sent, target = gain + work.jump[t, k], t, work.target[t, k]
-    if possible(ahead, work, i, batch.senders[i].next, e, count, until, sent, target):
-        return float(most)
-    return forced(batch, ahead, work, i, e, count, until)
-
-
-@kernel
-def possible(ahead: Ahead, work: Work, i: int, n: int, e: int, count: int, until: int, sent: int, target: int) -> bool:
-    """Whether a plan that sends so many of the queue and then ``target`` keeps the socket as busy as it has to be."""
-    b, m = ahead.link[i, 0], target
-    for t in range(sent + 1, until + 1):
-        if m < 0 or m - n > work.arrived[t] - (count - t):
-            return False
-        m = ahead.follow[step_of(ahead, i, m, e + t * b)]
-    return True
-
-
-@kernel
-def forced(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int, until: int) -> float:
-    """``best_from``, with the condition kept by each of the first ``until`` transmissions.
-
-    Candidates are numbered: what is queued from 0 on, later arrivals from ``count`` on.
-    """
-    b, n = ahead.link[i, 0], batch.senders[i].next
-    v = batch.v[batch.senders[i].v_start :]
-    last_x = at(batch.slots, i, batch.senders[i].first - 1).x
-    most = 0.0
-    for t in range(1, until + 1):
-        arrived, before = work.arrived[t], work.arrived[t - 1]
-        for m in range(t - 1, t + arrived):
-            queued = m < count
-            x = work.x[work.slots[m]] if queued else at(batch.arrivals, i, n + 1 + m - count).x
-            gain = -1.0
-            if t == 1:
-                gain = work.first[work.slots[m]] if queued else value(v, x - last_x)
-            else:
-                for j in range(t - 2, min(m, before + t - 1)):
-                    x_j = work.x[work.slots[j]] if j < count else at(batch.arrivals, i, n + 1 + j - count).x
-                    gain = max(gain, work.forced[(t - 1) % 2, j] + value(v, x - x_j))
-            work.forced[t % 2, m] = gain
-            if t == until:
-                if queued:
-                    gain += work.jump[t, work.slots[m]]
-                else:
-                    gain += ahead.gain[step_of(ahead, i, n + 1 + m - count, e + t * b)]
-                most = max(most, gain)
-    return most
