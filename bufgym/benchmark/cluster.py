@@ -60,11 +60,21 @@ def spread(
         for _ in range(0, count, at_once):
             some = itertools.islice(wrapped, at_once)
             try:
-                yield from joblib.Parallel(n_jobs=jobs, return_as="list" if ray else "generator_unordered")(some)
+                yield from joblib.Parallel(
+                    n_jobs=jobs, return_as="list" if ray else "generator_unordered", **_own(backend)
+                )(some)
             except BrokenProcessPool:
                 raise WorkerDiedError(
                     "a worker process ended before its work did (killed, or out of memory?)"
                 ) from None
+
+
+def _own(backend: str) -> dict[str, Any]:
+    """What joblib's own worker processes are told: to end with this one, also before they have work, and not by
+    themselves, as loky loses work that comes to one at that moment."""
+    if backend != "loky":
+        return {}
+    return {"initializer": end_with, "initargs": (os.getpid(),), "idle_worker_timeout": 10**6}
 
 
 @contextmanager

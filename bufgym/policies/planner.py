@@ -9,9 +9,8 @@ Where there is room the newcomer is accepted: whatever it would displace can sti
 it were known, which flatters plans that wait for news; while a link stands still that is all there is to decide, and
 ``min-motion-gap`` does it.
 
-It is not yet what it could be: over lte-v1's validation links it is about level with `learned-motion`, which takes a
-hundredth of its time, and even futures that are known for 3 s leave it more than half of AFR's regret there: what the
-end of its horizon leaves open decides too much.
+It is not yet what it could be: over lte-v1's validation links it is about level with `learned-motion`, at a hundred
+times its cost. Many plans tie, and what the end of the horizon leaves open decides between them.
 """
 
 from __future__ import annotations
