@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bufgym import policies
+from bufgym.kernel import JIT
 from bufgym.live import replay
 from bufgym.live.channels import TRANSPORTS
 from bufgym.live.log import Record
@@ -19,6 +20,8 @@ from bufgym.scenario import Episode, Uplink, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
+
+pytestmark = pytest.mark.skipif(not JIT, reason="uncompiled, decisions take as long as messages do")
 
 V = qoi.exponential(0.618)
 PERIOD_US, SIZE_BYTES = 33_333, 200_000
