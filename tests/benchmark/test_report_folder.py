@@ -61,7 +61,10 @@ def test_a_folder_must_hold_a_run(tmp_path: Path) -> None:
         (json.dumps({**MANIFEST, "suite": 3}), "manifest.json: suite = 3: must be text"),
         (json.dumps({**MANIFEST, "scenarios": {"a": 1}}), "manifest.json: scenarios.a must be an object"),
         (json.dumps({**MANIFEST, "scenarios": {"a": {"outage_s": "x"}}}), "scenarios.a.outage_s = x: must be a number"),
-        (json.dumps({**MANIFEST, "task": "chess"}), "manifest.json: task = chess: must be one of queue, topics, fleet"),
+        (
+            json.dumps({**MANIFEST, "task": "chess"}),
+            "manifest.json: task = chess: must be one of queue, stress, topics, fleet",
+        ),
         (json.dumps({k: v for k, v in MANIFEST.items() if k != "command"}), "manifest.json: no command"),
     ],
 )
