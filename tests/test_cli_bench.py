@@ -65,6 +65,7 @@ def test_bench_takes_shipped_traces_and_all_policies_by_default(capsys: pytest.C
         assert bool(told) != policies.get(name).for_topics
 
 
+@pytest.mark.skipif(not JIT, reason="it plays whole benchmarks, which takes compiled code")
 def test_bench_meets_the_episodes_of_the_environment_by_default(tmp_path: Path) -> None:
     """Row (trace, seed) is what ``reset`` of bufgym/Uplink-v0 plays by these numbers; neither side has an argument."""
     assert main(["bench", "--seeds", "1", "--policies", "drop-oldest", "--format", "csv", "--out", str(tmp_path)]) == 0
@@ -78,6 +79,7 @@ def test_bench_meets_the_episodes_of_the_environment_by_default(tmp_path: Path) 
     assert info["qoi"] == row["qoi"] and info["regret"] == pytest.approx(row["regret"]) and info["score"] == 0
 
 
+@pytest.mark.skipif(not JIT, reason="it plays whole benchmarks, which takes compiled code")
 def test_the_default_task_is_worth_learning(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Drop Oldest loses at least 8 %, AFR at least 3 %, and on fewer than 3 % of the episodes nothing can be gained."""
     chosen = ["drop-oldest", "drop-newest", "afr", "min-motion-gap"]
