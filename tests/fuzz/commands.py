@@ -69,6 +69,9 @@ WORK = (
     ("bufgym.gallery", "page"),
     ("bufgym.gallery", "write_film"),
     ("bufgym.cli.play", "_play"),
+    ("bufgym.cli.live", "_run"),
+    ("bufgym.live.validate", "validate"),
+    ("bufgym.expert.dataset", "make"),
 )
 """What takes long, downloads, or needs a terminal."""
 
