@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, install
 
 
 @contextmanager
@@ -16,4 +16,4 @@ def needs(library: str) -> Iterator[None]:
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] != library:
             raise
-        raise BufgymError(f'bufgym.live needs {error.name}: pip install "bufgym[live]"') from None
+        raise BufgymError(f"bufgym.live needs {error.name}: {install('live')}") from None
