@@ -86,6 +86,11 @@ def line_of(error: Exception, *files: str | None) -> str | None:
     return next(filter(None, places), None)
 
 
+def first_line(documented: Any) -> str:
+    """The first line of its docstring; empty if there is none."""
+    return (inspect.getdoc(documented) or "").split("\n")[0]
+
+
 def needs(function: Any) -> int:
     """Arguments without a default; -1 where they cannot be told."""
     try:

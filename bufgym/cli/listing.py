@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 from bufgym.cli.options import Commands, columns, command, load_policies, policy_file
+from bufgym.modules import first_line
 
 
 def add(commands: Commands) -> None:
@@ -80,16 +80,12 @@ def _list_values() -> str:
 
     return columns(
         [
-            ("exponential:BASE", _first_line(qoi.exponential)),
-            ("saturating:DISTANCE", _first_line(qoi.saturating)),
-            ("tabulated:D=V,...", _first_line(qoi.tabulated)),
-            ("module:function", _first_line(qoi.of_function)),
+            ("exponential:BASE", first_line(qoi.exponential)),
+            ("saturating:DISTANCE", first_line(qoi.saturating)),
+            ("tabulated:D=V,...", first_line(qoi.tabulated)),
+            ("module:function", first_line(qoi.of_function)),
         ]
     )
-
-
-def _first_line(function: Any) -> str:
-    return (function.__doc__ or "").strip().split("\n")[0]
 
 
 def _list_rewards() -> str:

@@ -21,7 +21,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -125,6 +125,7 @@ class PolicyQueue:
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
         self._waiting: set[tuple[asyncio.AbstractEventLoop, asyncio.Future[None]]] = set()
+        self._number = 0  # messages dequeued so far that were handed on
         self._closed = False
         self.dropped = 0
         """Messages dropped so far."""
@@ -186,7 +187,6 @@ class PolicyQueue:
                 with self._deciding():
                     self._row.close()
                 self._settle(self._stamp(None), None)
-                self._wake()
 
     # --- out ----------------------------------------------------------------------------------------------------------
 
@@ -301,7 +301,7 @@ class PolicyQueue:
         number = self._number
         while number < dequeued:
             item = self._held.pop(self._row.dequeued_seq(number))
-            self._ready.append(Item(item.message, item.seq, number, item.at_us, item.size_bytes, item.x, item.topic))
+            self._ready.append(replace(item, number=number))
             self._tell({"event": "dequeued", "us": now_us, "seq": item.seq})
             number += 1
         changed, self._number = number > self._number, number
@@ -313,9 +313,6 @@ class PolicyQueue:
                 self._tell({"event": "dropped", "us": now_us, "seq": seq, "why": self._why(seq, newcomer)})
         if changed or self._drained:
             self._wake()
-
-    _number = 0
-    """Messages dequeued so far that were handed on."""
 
     def _why(self, seq: int, newcomer: int | None) -> str:
         if self._row.limited(seq):

@@ -9,7 +9,7 @@ import json
 import socket
 import time
 from collections import OrderedDict, deque
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
@@ -17,6 +17,7 @@ from bufgym.errors import BufgymError
 from bufgym.live.channels import Channel, TcpChannel, WebSocketChannel
 from bufgym.live.extra import needs
 from bufgym.live.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError
+from bufgym.live.tasks import Tasks
 
 MAX_STREAMS: Final = 64
 """Senders that are remembered, the latest."""
@@ -68,7 +69,7 @@ class Receiver:
         self._on_message = on_message
         self._max_body_bytes = max_body_bytes
         self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = Tasks()
         self._listener: socket.socket | None = None
         self._server: Any = None
 
@@ -76,7 +77,7 @@ class Receiver:
         """Begin to listen; the port (0: any that is free)."""
         if transport == "tcp":
             self._listener = await listener(host, port)
-            self._keep(self._accept(self._listener))
+            self._tasks.begin(self._accept(self._listener))
             return int(self._listener.getsockname()[1])
         if transport != "websocket":
             raise BufgymError(f"transport {transport!r}: must be 'tcp' or 'websocket'")
@@ -95,26 +96,19 @@ class Receiver:
 
     async def close(self) -> None:
         """Hang up, and listen no more."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.end()
         if self._listener is not None:
             self._listener.close()
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
 
-    def _keep(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
     async def _accept(self, listening: socket.socket) -> None:
         while True:
             connection, _ = await asyncio.get_running_loop().sock_accept(listening)
             connection.setblocking(False)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._keep(self._serve(TcpChannel(connection, self._max_body_bytes)))
+            self._tasks.begin(self._serve(TcpChannel(connection, self._max_body_bytes)))
 
     async def _serve(self, channel: Channel) -> None:
         """One connection, to its end."""

@@ -9,10 +9,11 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections.abc import Callable, Coroutine
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Final
 
 from bufgym.live.receiver import listener
+from bufgym.live.tasks import Tasks
 from bufgym.model.link import FOREVER, Link
 
 RECEIVE_BUFFER_BYTES: Final = 16_384
@@ -44,7 +45,7 @@ class ShapedLink:
         self._open = asyncio.Event()
         self._open.set()
         self._sockets: set[socket.socket] = set()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = Tasks()
         self._turn = asyncio.Lock()
         self.carried_bytes = 0
         """Towards the receiver, so far."""
@@ -53,7 +54,7 @@ class ShapedLink:
         """Begin to listen; the port (0: any that is free)."""
         listening = await listener(host, port, RECEIVE_BUFFER_BYTES)
         self._sockets.add(listening)
-        self._keep(self._accept(listening))
+        self._tasks.begin(self._accept(listening))
         return int(listening.getsockname()[1])
 
     def begin(self) -> None:
@@ -64,9 +65,7 @@ class ShapedLink:
     def cut(self) -> None:
         """Break all connections, and take no new ones until ``mend``."""
         self._open.clear()
-        for task in self._tasks:
-            if task.get_name() == "connection":
-                task.cancel()
+        self._tasks.cancel("connection")
 
     def mend(self) -> None:
         """Take connections again."""
@@ -74,25 +73,18 @@ class ShapedLink:
 
     async def close(self) -> None:
         """Break all connections, and listen no more."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.end()
         for one in self._sockets:
             one.close()
 
     # --- connections --------------------------------------------------------------------------------------------------
-
-    def _keep(self, work: Coroutine[Any, Any, None], name: str = "") -> None:
-        task = asyncio.create_task(work, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
 
     async def _accept(self, listening: socket.socket) -> None:
         while True:
             near, _ = await asyncio.get_running_loop().sock_accept(listening)
             near.setblocking(False)
             if self._open.is_set():
-                self._keep(self._forward(near), "connection")
+                self._tasks.begin(self._forward(near), "connection")
             else:
                 near.close()
 

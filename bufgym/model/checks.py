@@ -46,6 +46,12 @@ def whole(name: str, number: Any, least: int = 0, most: int | None = None, *, sy
     return int(number)
 
 
+def check_name(what: str, name: Any) -> None:
+    """``name`` can stand in lists of names with settings, as in ``"decimate:every=2,afr"``; ``what`` has it."""
+    if not isinstance(name, str) or not name or any(c in ":,= \t\n" for c in name):
+        raise BufgymError(f"{what} {name!r}: a name must be non-empty, without spaces, ':', ',' or '='")
+
+
 def named_settings(what: str, spec: str) -> tuple[str, dict[str, float]]:
     """``"decimate:every=2"`` -> its name and its settings; ``what`` it is, for the message."""
     name, _, settings = spec.partition(":")

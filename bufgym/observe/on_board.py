@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bufgym.kernel import kernel
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
 from bufgym.model.qoi import merging_loss, value
+from bufgym.modules import first_line
 from bufgym.observe.own import OWN_FIELDS, Function, OwnField
 from bufgym.observe.queue import TINY, squash
 
@@ -24,7 +25,7 @@ def _context_field(group: str, unit: str) -> Callable[[Function], Function]:
     """Register the decorated function as a field of its own name; kernels may call what comes back."""
 
     def add(function: Function) -> Function:
-        name, meaning = function.__name__, (function.__doc__ or "").split("\n")[0]
+        name, meaning = function.__name__, first_line(function)
         OWN_FIELDS[name] = OwnField(name, "context", group, unit, meaning, function=function, compile=True)
         ON_BOARD_FIELDS.append(OWN_FIELDS[name])
         return kernel(function)

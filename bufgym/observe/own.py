@@ -22,7 +22,6 @@ They take part where they are named; in text that has to stand alone, ``module:f
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
@@ -34,7 +33,7 @@ from numpy.typing import NDArray
 
 from bufgym import modules
 from bufgym.errors import BufgymError
-from bufgym.model.checks import changed, is_number, named_settings
+from bufgym.model.checks import changed, check_name, is_number, named_settings
 from bufgym.observe.fields import (
     FIELDS,
     REWARD_TERMS,
@@ -126,7 +125,7 @@ def field(
 
     def add(function: Function) -> Function:
         _check_function("field", name, function, 3 if per == "slot" else 2)
-        text = meaning or _first_line(function)
+        text = meaning or modules.first_line(function)
         OWN_FIELDS[name] = OwnField(name, per, "own", unit, text, low, high, function=function, compile=compile)
         return function
 
@@ -157,7 +156,7 @@ def reward_term(
     def add(function: Function) -> Function:
         _check_function("reward term", name, function, 2)
         settings = {"parameters": dict(parameters or {}), "memory": dict(memory or {})}
-        text = meaning or _first_line(function)
+        text = meaning or modules.first_line(function)
         OWN_TERMS[name] = OwnTerm(name, unit, text, function=function, one_queue=one_queue, compile=compile, **settings)
         return function
 
@@ -196,8 +195,7 @@ def _found(text: str, entries: Mapping[str, Entry], what: str) -> Entry | None:
 
 
 def _check_name(what: str, name: str, built_in: Any, entries: Mapping[str, Any]) -> None:
-    if not isinstance(name, str) or not name or any(c in ":,= \t\n" for c in name):
-        raise BufgymError(f"{what} {name!r}: a name must be non-empty, without spaces, ':', ',' or '='")
+    check_name(what, name)
     taken = entries.get(name)
     if name in built_in or (taken is not None and taken.function.__module__.startswith("bufgym.")):
         raise BufgymError(f"{what} {name!r}: a built-in {what} has this name")
@@ -207,7 +205,3 @@ def _check_function(what: str, name: str, function: Any, arguments: int) -> None
     if not callable(function) or modules.needs(function) != arguments:
         shape = {2: "(buffer, arrival)", 3: "(buffer, arrival, k)"}[arguments] if what == "field" else "(step, memory)"
         raise BufgymError(f"{what} {name!r}: {function!r} must be a function {shape}")
-
-
-def _first_line(function: Function) -> str:
-    return (inspect.getdoc(function) or "").split("\n")[0]

@@ -40,7 +40,8 @@ from numpy.typing import NDArray
 from bufgym.errors import BufgymError
 from bufgym.kernel import compile_for
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
-from bufgym.model.checks import changed, named_settings
+from bufgym.model.checks import changed, check_name, named_settings
+from bufgym.modules import first_line
 
 Arrival = Any
 """A MESSAGE record."""
@@ -165,7 +166,7 @@ class Policy:
     @property
     def summary(self) -> str:
         """What it does: ``about``, or the first line of the function's docstring."""
-        return self.about or (inspect.getdoc(self.on_arrival) or "").split("\n")[0]
+        return self.about or first_line(self.on_arrival)
 
     @property
     def parameter_array(self) -> NDArray[np.float64]:
@@ -258,8 +259,7 @@ def _registration(
         entry = _REGISTRY.get(name)
         if entry and (isinstance(entry, Later) or entry.on_arrival.__module__.startswith("bufgym.")):
             raise BufgymError(f"policy {name!r}: a built-in policy has this name")
-        if not name or any(c in ":,= \t\n" for c in name):
-            raise BufgymError(f"policy {name!r}: a name must be non-empty, without spaces, ':', ',' or '='")
+        check_name("policy", name)
 
         def add(on_arrival: OnArrival) -> OnArrival:
             if not callable(on_arrival):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
@@ -55,7 +54,7 @@ def register(name: str, about: str = "") -> Callable[[Maker], Maker]:
     def add(make: Maker) -> Maker:
         if not callable(make):
             raise BufgymError(f"scenario {name!r}: {make!r} is neither a class nor a function")
-        SCENARIOS[name] = make, about or (inspect.getdoc(make) or "").split("\n")[0]
+        SCENARIOS[name] = make, about or modules.first_line(make)
         _named.cache_clear()
         return make
 
