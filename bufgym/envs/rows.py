@@ -35,6 +35,7 @@ from bufgym.observe import (
 )
 from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import numbered
+from bufgym.scenario.pool import Pool
 from bufgym.sim import Senders
 
 INFOS = ("full", "steady", "mask", "none")
@@ -111,6 +112,7 @@ class Rows:
         info: str = "full",
         bound: bool = False,
         num_threads: int = 1,
+        pool: int | None = None,
         **parameters: Any,
     ) -> None:
         if info not in INFOS:
@@ -143,7 +145,8 @@ class Rows:
         self.observation_space = self.form.space
         self.action_space = spaces.Discrete(self.capacity + 2)
         self.streams: list[Streams | None] = [None] * n
-        self._draw: Callable[[Streams], Any] = self.scenario.draw
+        self._pool_size = pool
+        self._draw = self.from_pool(self.scenario.draw)
         self.rewarded = np.zeros((n, len(self.terms)))
         self._own_fields = OwnFields(self.form)
         self._own_terms = OwnTerms(own_terms, len(self.terms) - len(own_terms), n)
@@ -165,6 +168,10 @@ class Rows:
             np.zeros(n, np.bool_),
         )
 
+    def from_pool(self, draw: Callable[[Streams], Any]) -> Callable[[Streams], Any]:
+        """``draw``, or where a pool was asked for what takes its episodes from there."""
+        return draw if self._pool_size is None else Pool(draw, self._pool_size)
+
     def seed(self, i: int, rng: np.random.Generator) -> None:
         """Give row ``i`` streams of its own, derived from the generator that Gymnasium seeded."""
         self.streams[i] = Streams.seeded(int(rng.integers(2**63)))
@@ -178,13 +185,15 @@ class Rows:
             raise BufgymError(
                 f"episodes = {episodes!r}: must be a list of {len(self)}, one a row; None where one is drawn"
             )
-        load = self.senders.load
+        begun = []
         for i in rows.tolist():
             given = None if episodes is None else episodes[i]
             if given is None:
-                load(i, *self._next_episode(i))
+                begun.append((i, *self._next_episode(i)))
             else:
-                load(i, numbered(self.scenario, **_checked(given)) if isinstance(given, Mapping) else given)
+                episode = numbered(self.scenario, **_checked(given)) if isinstance(given, Mapping) else given
+                begun.append((i, episode, None))
+        self.senders.load_all(begun)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
         step_rows(self.senders.batch, rows, NO_ACTIONS, self.rewarded, self.output)
@@ -203,7 +212,8 @@ class Rows:
         total = np.zeros(len(self))
         # Term by term, as the single environment adds them: a matrix product may round differently.
         for k, weight in enumerate(self.weights.tolist()):
-            total += weight * self.output.reward_terms[:, k]
+            if weight:
+                total += weight * self.output.reward_terms[:, k]
         return total
 
     def summary(self, i: Any) -> dict[str, Any]:

@@ -178,8 +178,11 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         """The infos of rows that have ended; with SAME_STEP autoreset these rows begin anew at once."""
         rows = self.rows
         last: dict[str, Any] = {}
-        for name, column in rows.summary(slice(None)).items():
-            last |= {name: np.where(done, column, 0), f"_{name}": done}
+        at = np.flatnonzero(done)
+        for name, of_ended in rows.summary(at).items():
+            column = np.zeros(self.num_envs, of_ended.dtype)
+            column[at] = of_ended
+            last |= {name: column, f"_{name}": done}
         ended = done & rows.output.terminated
         if rows.bound and ended.any():
             for name, column in rows.bounds(ended, rows.output.qoi).items():
