@@ -37,6 +37,7 @@ from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import numbered
 from bufgym.scenario.pool import Pool
 from bufgym.sim import Senders
+from bufgym.sim.senders import Begun
 
 INFOS = ("full", "steady", "mask", "none")
 """How much ``info`` has: all of it; all of it and the summary so far, so that every step has the same entries; the
@@ -185,7 +186,7 @@ class Rows:
             raise BufgymError(
                 f"episodes = {episodes!r}: must be a list of {len(self)}, one a row; None where one is drawn"
             )
-        begun = []
+        begun: list[Begun] = []
         for i in rows.tolist():
             given = None if episodes is None else episodes[i]
             if given is None:

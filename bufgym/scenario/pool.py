@@ -18,8 +18,8 @@ _SEED = 704_251
 class Pool:
     """So many episodes of what ``draw`` draws, the same for everyone who makes a pool of it.
 
-    Called with a row's streams, as ``draw`` is, it hands out one of them, each as likely. An episode is drawn when it is
-    first taken; then it stays in memory (56 bytes a message).
+    Called with a row's streams, as ``draw`` is, it hands out one of them, each as likely. An episode is drawn when it
+    is first taken; then it stays in memory (56 bytes a message).
     """
 
     def __init__(self, draw: Callable[[Streams], Any], episodes: int) -> None:

@@ -23,6 +23,9 @@ from bufgym.sim.shared_link import Shares
 from bufgym.sim.state import LOAD, new_batch
 from bufgym.sim.transition import load_rows
 
+Begun = tuple[int, Episode, np.random.Generator | None]
+"""Which sender begins which episode, and what its uniform draws come from: the arguments of ``Senders.load``."""
+
 
 class Senders:
     """A batch of n senders that share L, B and V, each with an episode of its own.
@@ -75,8 +78,8 @@ class Senders:
         """
         self.load_all([(i, episode, uniforms)])
 
-    def load_all(self, begun: Sequence[tuple[int, Episode, np.random.Generator | None]]) -> None:
-        """``load`` for each of ``begun``, (i, episode, uniforms), at once."""
+    def load_all(self, begun: Sequence[Begun]) -> None:
+        """``load`` for each of ``begun`` at once."""
         loads = records(len(begun), LOAD)
         for r, (i, episode, uniforms) in enumerate(begun):
             loads[r] = self._loaded(i, episode)

@@ -72,5 +72,5 @@ def test_fleets_have_one_too() -> None:
 
 @pytest.mark.parametrize("pool", [0, -1, 1.5, "many", True])
 def test_a_pool_is_a_whole_number(pool: Any) -> None:
-    with pytest.raises(BufgymError, match="pool = .*: must be a whole number from 1 to 1000000"):
+    with pytest.raises(BufgymError, match=r"pool = .*: must be a whole number from 1 to 1000000"):
         SenderEnv(UPLINK, L, pool=pool)
