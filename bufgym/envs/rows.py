@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bufgym import scenario as scenarios
 from bufgym.envs.bound import BOUND, check_one_queue, measured
-from bufgym.envs.observation import Observation, ObservationForm
+from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.step import StepOutput, step_rows
 from bufgym.envs.threads import Threads
@@ -143,6 +143,7 @@ class Rows:
         self.slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
         self.context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
         self.form = ObservationForm(observation, self.slot_fields, self.context_fields, self.capacity, fields)
+        self._handed = Handed(self.form)
         self.observation_space = self.form.space
         self.action_space = spaces.Discrete(self.capacity + 2)
         self.streams: list[Streams | None] = [None] * n
@@ -218,14 +219,14 @@ class Rows:
         return total
 
     def summary(self, i: Any) -> dict[str, Any]:
-        """QoI and message counts so far of the episode(s) of row(s) ``i`` (an index or a slice)."""
-        sender = self.senders.batch.senders[i]
+        """QoI and message counts so far of the episode(s) of row(s) ``i`` (an index, or several)."""
+        senders = self.senders.batch.senders  # a whole record of each row would be copied
         return {
             "qoi": self.output.qoi[i],
-            "arrived": sender["next"],
-            "delivered": sender["transmitted"],
-            "dropped": sender["rejected"] + sender["evicted"],
-            "invalid": sender["invalid"],
+            "arrived": senders["next"][i],
+            "delivered": senders["transmitted"][i],
+            "dropped": senders["rejected"][i] + senders["evicted"][i],
+            "invalid": senders["invalid"][i],
         }
 
     def info(self, i: int, terms: Sequence[float], ended: bool) -> dict[str, Any]:
@@ -250,7 +251,7 @@ class Rows:
 
     def observation(self, i: int | None = None) -> Observation:
         """What the rows observe now, as views of ``output``; of row ``i`` alone, a copy."""
-        return self.form.of(self.output.flat if i is None else self.output.flat[i].copy())
+        return self.form.of(self.output.flat) if i is None else self._handed.of(self.output.flat[i])
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int, or an error that calls it ``name``."""

@@ -241,7 +241,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
                 break
         else:
             rows.output = rows.new_output()
-            self._pool.append(rows.output)
+            self._pool = [*self._pool[1 - _POOLED :], rows.output]  # who collects outputs holds them all
         if keep and rows.output is not before:
             for new, old in zip(cast(Any, rows.output), before, strict=True):
                 new[...] = old
@@ -267,3 +267,5 @@ def _count_own() -> int:
 
 
 _OWN_REFERENCES = _count_own()
+_POOLED = 4
+"""As many outputs are kept at most, to be written again."""
