@@ -31,6 +31,7 @@ from bufgym.sim import Senders
 
 ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
 TOPICS = "bufgym/Topics-v0"
+_BATCH_GOALS = {"bufgym/Uplink-v0": 10e6, "bufgym/Interruption-v0": 8e6, TOPICS: 5e6}
 POLICIES = ("afr", "drop-oldest", "random", "min-gap")
 SEED = 1
 
@@ -132,7 +133,7 @@ def _batches(sizes: Sizes) -> Iterable[Figure]:
         native = _batch_rate(id, "vector_entry_point", sizes.steps, sizes, sizes.capacity)
         sync = _batch_rate(id, "sync", sizes.sync_steps, sizes, sizes.capacity)
         definition = f"decisions a second of {call}'vector_entry_point'), {batch}"
-        yield Figure(f"native batch, {id}", native, "steps/s", 3e6, definition)
+        yield Figure(f"native batch, {id}", native, "steps/s", _BATCH_GOALS[id], definition)
         yield Figure(f"SyncVectorEnv, {id}", sync, "steps/s", None, f"decisions a second of {call}'sync'), {batch}")
         yield Figure(f"native / SyncVectorEnv, {id}", native / sync, "times", 50.0, "the ratio of these two")
     topics = len(scenarios.get("topics").topics)
@@ -140,7 +141,7 @@ def _batches(sizes: Sizes) -> Iterable[Figure]:
         f"native batch of {topics} topics, {TOPICS}",
         _batch_rate(TOPICS, "vector_entry_point", sizes.steps, sizes, sizes.topic_slots),
         "steps/s",
-        1e6,
+        _BATCH_GOALS[TOPICS],
         f"decisions and choices of what to send a second of {call}'vector_entry_point'), "
         f"n = {sizes.batch}, L = {sizes.topic_slots}, {rest}",
     )
@@ -172,7 +173,7 @@ def _singles(sizes: Sizes) -> Iterable[Figure]:
         "resets in the time"
     )
     for id in ENVIRONMENTS:
-        yield Figure(f"single environment, {id}", _single_rate(id, sizes), "steps/s", 1e5, definition)
+        yield Figure(f"single environment, {id}", _single_rate(id, sizes), "steps/s", 3e5, definition)
 
 
 def _rollouts(sizes: Sizes) -> Iterable[Figure]:
@@ -194,7 +195,7 @@ def _rollouts(sizes: Sizes) -> Iterable[Figure]:
         load()
         run()  # compiled, or loaded from disk, before the clock starts
         rate = arrivals / best_s(sizes.repeats, load, run)
-        yield Figure(f"rollout, {name}", rate, "arrivals/s", 2e7, definition)
+        yield Figure(f"rollout, {name}", rate, "arrivals/s", 4e7, definition)
 
 
 def human(number: float) -> str:

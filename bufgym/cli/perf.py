@@ -13,6 +13,9 @@ def add(commands: Commands) -> None:
     perf = command(commands, "perf", _perf, "measure bufgym's own speed on this machine")
     perf.add_argument("--json", metavar="FILE", help="also write the figures to FILE")
     perf.add_argument("--repeats", type=count, default=3, help="best of so many (%(default)s)")
+    perf.add_argument(
+        "--profile", action="store_true", help="what the time of a step goes into, in place of the figures"
+    )
     perf.add_argument("--quick", action="store_true", help="tiny sizes: does it run at all?")
 
 
@@ -24,6 +27,11 @@ def _perf(options: argparse.Namespace) -> None:
         sizes = perf.Sizes(4, 4, 20, 5, 20, 1, options.repeats)
     elif sys.stderr.isatty():
         print("measuring; this takes about half a minute ...", file=sys.stderr)
+    if options.profile:
+        from bufgym.benchmark import perf_profile
+
+        print(perf_profile.report(perf_profile.profile(sizes)))
+        return
     figures = perf.measure(sizes)
     print(perf.report(figures, sizes.repeats))
     if options.json is not None:

@@ -40,7 +40,7 @@ class FleetRows(Rows):
         n = cells * scenario.robots
         super().__init__(n, scenario.uplink, capacity, reward=term, **options)
         self.reward = reward
-        self._draw = scenario.draw
+        self._draw = self.from_pool(scenario.draw)
         self.robots = scenario.robots
         self.fleet = Fleet(self.senders, scenario.robots)
         self._threads = Threads(np.arange(cells), options.get("num_threads", 1))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bufgym import scenario as scenarios
 from bufgym.envs.bound import BOUND, check_one_queue, measured
-from bufgym.envs.observation import Observation, ObservationForm
+from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.step import StepOutput, step_rows
 from bufgym.envs.threads import Threads
@@ -35,7 +35,9 @@ from bufgym.observe import (
 )
 from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import numbered
+from bufgym.scenario.pool import Pool
 from bufgym.sim import Senders
+from bufgym.sim.senders import Begun
 
 INFOS = ("full", "steady", "mask", "none")
 """How much ``info`` has: all of it; all of it and the summary so far, so that every step has the same entries; the
@@ -111,6 +113,7 @@ class Rows:
         info: str = "full",
         bound: bool = False,
         num_threads: int = 1,
+        pool: int | None = None,
         **parameters: Any,
     ) -> None:
         if info not in INFOS:
@@ -140,10 +143,12 @@ class Rows:
         self.slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
         self.context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
         self.form = ObservationForm(observation, self.slot_fields, self.context_fields, self.capacity, fields)
+        self._handed = Handed(self.form)
         self.observation_space = self.form.space
         self.action_space = spaces.Discrete(self.capacity + 2)
         self.streams: list[Streams | None] = [None] * n
-        self._draw: Callable[[Streams], Any] = self.scenario.draw
+        self._pool_size = pool
+        self._draw = self.from_pool(self.scenario.draw)
         self.rewarded = np.zeros((n, len(self.terms)))
         self._own_fields = OwnFields(self.form)
         self._own_terms = OwnTerms(own_terms, len(self.terms) - len(own_terms), n)
@@ -165,6 +170,10 @@ class Rows:
             np.zeros(n, np.bool_),
         )
 
+    def from_pool(self, draw: Callable[[Streams], Any]) -> Callable[[Streams], Any]:
+        """``draw``, or where a pool was asked for what takes its episodes from there."""
+        return draw if self._pool_size is None else Pool(draw, self._pool_size)
+
     def seed(self, i: int, rng: np.random.Generator) -> None:
         """Give row ``i`` streams of its own, derived from the generator that Gymnasium seeded."""
         self.streams[i] = Streams.seeded(int(rng.integers(2**63)))
@@ -178,13 +187,15 @@ class Rows:
             raise BufgymError(
                 f"episodes = {episodes!r}: must be a list of {len(self)}, one a row; None where one is drawn"
             )
-        load = self.senders.load
+        begun: list[Begun] = []
         for i in rows.tolist():
             given = None if episodes is None else episodes[i]
             if given is None:
-                load(i, *self._next_episode(i))
+                begun.append((i, *self._next_episode(i)))
             else:
-                load(i, numbered(self.scenario, **_checked(given)) if isinstance(given, Mapping) else given)
+                episode = numbered(self.scenario, **_checked(given)) if isinstance(given, Mapping) else given
+                begun.append((i, episode, None))
+        self.senders.load_all(begun)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
         step_rows(self.senders.batch, rows, NO_ACTIONS, self.rewarded, self.output)
@@ -203,18 +214,19 @@ class Rows:
         total = np.zeros(len(self))
         # Term by term, as the single environment adds them: a matrix product may round differently.
         for k, weight in enumerate(self.weights.tolist()):
-            total += weight * self.output.reward_terms[:, k]
+            if weight:
+                total += weight * self.output.reward_terms[:, k]
         return total
 
     def summary(self, i: Any) -> dict[str, Any]:
-        """QoI and message counts so far of the episode(s) of row(s) ``i`` (an index or a slice)."""
-        sender = self.senders.batch.senders[i]
+        """QoI and message counts so far of the episode(s) of row(s) ``i`` (an index, or several)."""
+        senders = self.senders.batch.senders  # a whole record of each row would be copied
         return {
             "qoi": self.output.qoi[i],
-            "arrived": sender["next"],
-            "delivered": sender["transmitted"],
-            "dropped": sender["rejected"] + sender["evicted"],
-            "invalid": sender["invalid"],
+            "arrived": senders["next"][i],
+            "delivered": senders["transmitted"][i],
+            "dropped": senders["rejected"][i] + senders["evicted"][i],
+            "invalid": senders["invalid"][i],
         }
 
     def info(self, i: int, terms: Sequence[float], ended: bool) -> dict[str, Any]:
@@ -239,7 +251,7 @@ class Rows:
 
     def observation(self, i: int | None = None) -> Observation:
         """What the rows observe now, as views of ``output``; of row ``i`` alone, a copy."""
-        return self.form.of(self.output.flat if i is None else self.output.flat[i].copy())
+        return self.form.of(self.output.flat) if i is None else self._handed.of(self.output.flat[i])
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int, or an error that calls it ``name``."""

@@ -64,6 +64,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``bound``: whether the last ``info`` also has ``clairvoyant`` (the best H, or an upper bound of it), ``regret``
       and ``score`` (0 for Drop Oldest, 1 for the clairvoyant, NaN where they are equal). One queue only; found when an
       episode ends, in a tenth of a second where it is long.
+    - ``pool``: take every episode from a fixed set of so many (``bufgym.scenario.pool.Pool``, the same for every seed),
+      each drawn once, in place of a new one at each reset; None for no pool.
     - any further argument replaces a parameter of the scenario (``t_max=100``), as an object or as
       the text that the command line takes (``value="saturating:0.5"``, ``traces="lte-synthetic-0"``).
 
@@ -90,6 +92,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         observation: str = "dict",
         info: str = "full",
         bound: bool = False,
+        pool: int | None = None,
         render_mode: str | None = None,
         **parameters: Any,
     ) -> None:
@@ -105,6 +108,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             observation=observation,
             info=info,
             bound=bound,
+            pool=pool,
             **parameters,
         )
         self.observation_space = self.rows.observation_space

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import kernel, prefetch, stretch, table
+from bufgym.kernel import direct, kernel, prefetch, stretch, table
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.link import FOREVER
 from bufgym.observe import (
@@ -213,6 +213,7 @@ def advance(batch: Batch, i: int) -> None:
     settle_gains(batch, i, event == END)
 
 
+@direct
 @kernel
 def step_rows(
     batch: Batch,
@@ -279,6 +280,7 @@ def decisions_due(batch: Batch, shares: Shares, c: int) -> bool:
     return due
 
 
+@direct
 @kernel
 def step_cells(
     batch: Batch,

@@ -178,8 +178,11 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         """The infos of rows that have ended; with SAME_STEP autoreset these rows begin anew at once."""
         rows = self.rows
         last: dict[str, Any] = {}
-        for name, column in rows.summary(slice(None)).items():
-            last |= {name: np.where(done, column, 0), f"_{name}": done}
+        at = np.flatnonzero(done)
+        for name, of_ended in rows.summary(at).items():
+            column = np.zeros(self.num_envs, of_ended.dtype)
+            column[at] = of_ended
+            last |= {name: column, f"_{name}": done}
         ended = done & rows.output.terminated
         if rows.bound and ended.any():
             for name, column in rows.bounds(ended, rows.output.qoi).items():
@@ -238,7 +241,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
                 break
         else:
             rows.output = rows.new_output()
-            self._pool.append(rows.output)
+            self._pool = [*self._pool[1 - _POOLED :], rows.output]  # who collects outputs holds them all
         if keep and rows.output is not before:
             for new, old in zip(cast(Any, rows.output), before, strict=True):
                 new[...] = old
@@ -264,3 +267,5 @@ def _count_own() -> int:
 
 
 _OWN_REFERENCES = _count_own()
+_POOLED = 4
+"""As many outputs are kept at most, to be written again."""

@@ -8,7 +8,7 @@ check the compiled code against its own text.
 from bufgym.kernel.announce import compile_silently
 from bufgym.kernel.arrays import at, item, prefetch, records, stretch, table
 from bufgym.kernel.cache import FOLDER, JIT
-from bufgym.kernel.compile import compile_for, interruptible, kernel, located
+from bufgym.kernel.compile import compile_for, direct, interruptible, kernel, located
 
 __all__ = [
     "FOLDER",
@@ -16,6 +16,7 @@ __all__ = [
     "at",
     "compile_for",
     "compile_silently",
+    "direct",
     "interruptible",
     "item",
     "kernel",

@@ -70,6 +70,31 @@ def compile_for(signature: Any, function: Function) -> Function:
     return cast(Function, compiled)
 
 
+class _Direct:
+    """A kernel whose calls all have arguments of the types of the first."""
+
+    def __init__(self, compiled: Any) -> None:
+        self.__doc__, self.py_func = compiled.__doc__, compiled.py_func
+        self._compiled = compiled
+        self._entry: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._entry is None:
+            signature = tuple(cast(Any, numba).typeof(argument) for argument in arguments)
+            self._compiled.compile(signature)
+            self._entry = self._compiled.overloads[signature].entry_point
+        return self._entry(*arguments)
+
+
+def direct(compiled: Function) -> Function:
+    """A ``kernel`` that Python calls for every step, always with arguments of the same types.
+
+    To find the code for their types Numba looks at every array of every tuple, at each call: 3 us that a step of a
+    single environment need not take. Arrays of other types than those of the first call are not noticed.
+    """
+    return cast(Function, _Direct(compiled)) if JIT else compiled
+
+
 class _Located(types.WrapperAddressProtocol):
     """A compiled function together with where its machine code lies."""
 

@@ -41,8 +41,7 @@ class Fleet:
             raise BufgymError(f"episode: {episode!r} is not a bufgym.scenario FleetEpisode")
         if episode.robots != self.robots:
             raise BufgymError(f"episode of {episode.robots} robots: the cell has {self.robots}")
-        for robot, i in enumerate(self.rows(c)):
-            self.senders.load(i, episode.episode(robot), uniforms)
+        self.senders.load_all([(i, episode.episode(robot), uniforms) for robot, i in enumerate(self.rows(c))])
         load_cell(self.senders.batch, self.shares, c)
 
     def run(self, policy: Policy, memory: NDArray[np.float64] | None = None) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
+from bufgym.kernel import records
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.link import Knots
 from bufgym.model.qoi import Value
@@ -19,8 +20,11 @@ from bufgym.scenario import Episode
 from bufgym.sim.audit import check_untouched
 from bufgym.sim.rollout import roll_out
 from bufgym.sim.shared_link import Shares
-from bufgym.sim.state import new_batch
-from bufgym.sim.transition import load_row
+from bufgym.sim.state import LOAD, new_batch
+from bufgym.sim.transition import load_rows
+
+Begun = tuple[int, Episode, np.random.Generator | None]
+"""Which sender begins which episode, and what its uniform draws come from: the arguments of ``Senders.load``."""
 
 
 class Senders:
@@ -61,6 +65,8 @@ class Senders:
         self._uniforms: list[np.random.Generator | None] = [None] * n
         self._knots = Knots()
         self.batch = new_batch(n, self.capacity, max_messages, len(self._topic_table), values)
+        # Field by field, as NumPy copies records, loading would take five times as long.
+        self._words = self.batch.arrivals.view(np.int64)
 
     def __len__(self) -> int:
         return len(self.episodes)
@@ -70,32 +76,38 @@ class Senders:
 
         ``uniforms``: what ``draw_uniforms`` draws from; None for an episode that has its uniform draws.
         """
+        self.load_all([(i, episode, uniforms)])
+
+    def load_all(self, begun: Sequence[Begun]) -> None:
+        """``load`` for each of ``begun`` at once."""
+        loads = records(len(begun), LOAD)
+        for r, (i, episode, uniforms) in enumerate(begun):
+            loads[r] = self._loaded(i, episode)
+            self.episodes[i], self._uniforms[i] = episode, uniforms
+            self.begun[i] += 1
+        if self._knots.us is not self.batch.knot_us:
+            self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
+        ask_when_full = int(self.decide_at == "overflow")
+        load_rows(self.batch, loads, self._topic_table, self.capacity, self.max_bytes, ask_when_full)
+
+    def _loaded(self, i: int, episode: Episode) -> tuple[int, ...]:
+        """LOAD of sender ``i``, which gets the episode's arrivals; an error if it can't play it."""
         if not isinstance(episode, Episode):
             raise BufgymError(f"episode: {episode!r} is not a bufgym.scenario Episode")
-        link = episode.link
-        if len(episode.arrivals) > self.batch.arrivals.shape[1]:
+        link, n = episode.link, len(episode.arrivals)
+        if n > self.batch.arrivals.shape[1]:
             most = self.batch.arrivals.shape[1]
-            raise BufgymError(f"episode of {len(episode.arrivals)} messages: these senders have room for {most}")
+            raise BufgymError(f"episode of {n} messages: these senders have room for {most}")
         if self.topics and (unknown := episode.arrivals["topic"].max()) >= len(self.topics):
             raise BufgymError(f"episode: unknown topic {unknown}; the senders know {len(self.topics)}, from 0 on")
         if not self.topics:
             episode.check_one_queue()
-        first_knot, last_knot, after = self._knots.place(link.trace, i)
-        if self._knots.us is not self.batch.knot_us:
-            self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
-        self.episodes[i], self._uniforms[i] = episode, uniforms
-        self.begun[i] += 1
-        load_row(
-            self.batch,
-            i,
-            episode.arrivals,
-            self._topic_table,
-            (self.capacity, self.max_bytes, int(self.decide_at == "overflow")),
-            (episode.first_decision, episode.last_decision),
-            (first_knot, last_knot, after, link.offset_us, link.propagation_us),
-            (episode.window, episode.ack_delay_us),
-            0 if episode.value is None else self._v_start(episode.value),
-        )
+        v_start = 0 if episode.value is None else self._v_start(episode.value)
+        words = episode.arrivals.view(np.int64)
+        self._words[i, : len(words)] = words
+        decisions = (episode.first_decision, episode.last_decision)
+        delays = (link.offset_us, link.propagation_us, episode.window, episode.ack_delay_us)
+        return (i, n, *decisions, *self._knots.place(link.trace, i), *delays, v_start)
 
     def value_of(self, i: int) -> Value:
         """The V that the QoI of sender ``i``'s episode is measured with; without topics."""

@@ -128,6 +128,24 @@ LOG_ENTRY = np.dtype(
     ],
     align=True,
 )
+LOAD = np.dtype(
+    [
+        ("row", np.int64),  # which sender begins the episode; the rest goes into its record
+        ("arrivals", np.int64),
+        ("first_decision", np.int64),
+        ("last_decision", np.int64),
+        ("first_knot", np.int64),
+        ("last_knot", np.int64),
+        ("after", np.int64),
+        ("offset_us", np.int64),
+        ("propagation_us", np.int64),
+        ("window", np.int64),
+        ("ack_delay_us", np.int64),
+        ("v_start", np.int64),
+    ],
+    align=True,
+)
+
 NEVER = -1
 """A time in LOG_ENTRY: it has not happened."""
 

@@ -51,39 +51,29 @@ _BEGINNING = _beginning()
 
 
 @kernel
-def load_row(
-    batch: Batch,
-    i: int,
-    arrivals: NDArray[Any],
-    topics: NDArray[Any],
-    buffer: tuple[int, int, int],
-    decisions: tuple[int, int],
-    link: tuple[int, int, int, int, int],
-    window: tuple[int, int],
-    v_start: int,
+def load_rows(
+    batch: Batch, loads: NDArray[Any], topics: NDArray[Any], capacity: int, max_bytes: int, ask_when_full: int
 ) -> None:
-    """Put sender ``i`` at the beginning of an episode: empty buffer, idle socket, nothing arrived.
-
-    ``topics``: TOPIC[topics], their settings; ``buffer``: capacity, max_bytes, ask_when_full;
-    ``decisions``: first and last arrival that asks for one; ``link``: first and last knot, what follows the end,
-    offset_us, propagation_us; ``window``: n_T and the time from the end of a message's transmission to its ack, us;
-    ``v_start``: where V begins in the array of all V.
-    """
-    for k in range(len(arrivals)):
-        batch.arrivals[i, k] = arrivals[k]
-        entry = at(batch.log, i, k)
-        entry.dequeued_us, entry.transmitted_us, entry.dropped_us, entry.limited = NEVER, NEVER, NEVER, 0
-    for k in range(len(topics)):
-        batch.topics[i, k] = topics[k]
-    batch.senders[i] = _BEGINNING[0]
-    sender = batch.senders[i]
-    sender.capacity, sender.max_bytes, sender.ask_when_full = buffer
-    sender.screens = 1 if sender.ask_when_full == 1 or sender.max_bytes < UNLIMITED_BYTES else 0
-    sender.first_decision, sender.last_decision = decisions
-    sender.first_knot, sender.last_knot, sender.after, sender.offset_us, sender.propagation_us = link
-    sender.segment_now, sender.segment_finish = sender.first_knot, sender.first_knot
-    sender.window, sender.ack_delay_us = window
-    sender.arrivals, sender.topics, sender.v_start = len(arrivals), len(topics), v_start
+    """Put each sender that ``loads`` (LOAD[rows]) names at the beginning of an episode, whose arrivals it has already:
+    empty buffer, idle socket, nothing arrived. ``topics``: TOPIC[topics], their settings."""
+    for r in range(len(loads)):
+        load = loads[r]
+        i = load.row
+        for k in range(load.arrivals):
+            entry = at(batch.log, i, k)
+            entry.dequeued_us, entry.transmitted_us, entry.dropped_us, entry.limited = NEVER, NEVER, NEVER, 0
+        for k in range(len(topics)):
+            batch.topics[i, k] = topics[k]
+        batch.senders[i] = _BEGINNING[0]
+        sender = batch.senders[i]
+        sender.capacity, sender.max_bytes, sender.ask_when_full = capacity, max_bytes, ask_when_full
+        sender.screens = 1 if ask_when_full == 1 or max_bytes < UNLIMITED_BYTES else 0
+        sender.first_decision, sender.last_decision = load.first_decision, load.last_decision
+        sender.first_knot, sender.last_knot, sender.after = load.first_knot, load.last_knot, load.after
+        sender.offset_us, sender.propagation_us = load.offset_us, load.propagation_us
+        sender.segment_now, sender.segment_finish = load.first_knot, load.first_knot
+        sender.window, sender.ack_delay_us = load.window, load.ack_delay_us
+        sender.arrivals, sender.topics, sender.v_start = load.arrivals, len(topics), load.v_start
 
 
 @kernel

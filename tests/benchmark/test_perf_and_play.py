@@ -15,7 +15,7 @@ import pytest
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark import perf
+from bufgym.benchmark import perf, perf_profile
 from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
 from bufgym.expert import Player
@@ -37,13 +37,23 @@ def test_every_figure_is_a_number_with_its_definition(tmp_path: Path) -> None:
     assert all(math.isfinite(figure.value) and figure.value > 0 and figure.definition for figure in figures)
     assert sum(figure.target is not None for figure in figures) == len(figures) - 2
     (topics,) = [figure for figure in figures if figure.name == "native batch of 8 topics, bufgym/Topics-v0"]
-    assert (topics.target, topics.unit) == (1e6, "steps/s") and "n = 2, L = 32" in topics.definition
+    assert (topics.target, topics.unit) == (5e6, "steps/s") and "n = 2, L = 32" in topics.definition
     text = perf.report(figures, TINY.repeats)
     for figure in figures:
         assert figure.name in text and figure.definition in text
     perf.write_json(figures, TINY, tmp_path / "perf.json")
     read = json.loads((tmp_path / "perf.json").read_text())
     assert [figure["name"] for figure in read["figures"]] == [figure.name for figure in figures]
+
+
+def test_the_parts_of_a_step_add_up_to_it() -> None:
+    parts = perf_profile.profile(TINY)
+    by_environment: dict[str, float] = {}
+    for part in parts:
+        by_environment[part.of] = by_environment.get(part.of, 0.0) + part.share
+    assert len(by_environment) == 4 and list(by_environment.values()) == pytest.approx([1.0] * 4, abs=1e-6)
+    text = perf_profile.report(parts)
+    assert all(part.of in text and part.name in text for part in parts)
 
 
 def test_recorded_actions_are_possible_when_played_again() -> None:

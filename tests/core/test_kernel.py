@@ -6,10 +6,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from bufgym.kernel import announce, cache
+from bufgym.kernel import announce, cache, direct, kernel
 from tests.conftest import COMPILED
 
 TALE = """
@@ -101,3 +103,18 @@ def test_a_full_disk_keeps_no_code(tmp_path: Path) -> None:
     full = "import numba.core.caching as c\ndef full(*_): raise OSError(28, 'no space left')\n"
     run(tmp_path, before=full + "c.IndexDataCacheFile._save_data = full", NUMBA_CACHE_DIR=str(tmp_path / "code"))
     assert not list((tmp_path / "code").rglob("*.nbc"))
+
+
+@pytest.mark.skipif(not COMPILED, reason="only compiled kernels have types")
+def test_a_direct_call_is_the_call() -> None:
+    """Rows are stepped without a look at the types of their arrays: by the code that Numba would have found."""
+
+    @kernel
+    def double(numbers: Any, factor: Any) -> None:
+        for k in range(len(numbers)):
+            numbers[k] *= 2 * factor
+
+    doubled, directly = np.arange(4.0), direct(double)
+    for _ in range(3):
+        directly(doubled, 1.0)
+    assert doubled.tolist() == [0, 8, 16, 24] and len(double.overloads) == 1  # type: ignore[attr-defined]

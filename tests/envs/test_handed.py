@@ -1,0 +1,73 @@
+"""Observations that are handed out again once nobody holds them, and never before."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bufgym.envs import SenderEnv
+from bufgym.envs.observation import Handed, ObservationForm
+from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
+
+FORM = ObservationForm("dict", SLOT_FIELDS, CONTEXT_FIELDS, 3)
+NUMBERS = FORM.numbers
+
+
+def row(number: float) -> Any:
+    return np.full(NUMBERS, number, np.float32)
+
+
+def address(observation: dict[str, Any]) -> int:
+    return int(observation["loss"].ctypes.data)
+
+
+def test_what_nobody_holds_is_filled_again() -> None:
+    handed = Handed(FORM)
+    first = address(handed.of(row(1)))
+    again = handed.of(row(2))
+    assert address(again) == first and again["busy"][0] == 2
+
+
+def test_what_someone_holds_stays_as_it_is() -> None:
+    """The dict, one of its arrays, a part of one, or what shares an array's memory."""
+    handed = Handed(FORM)
+    dict_held = handed.of(row(1))
+    array_held = handed.of(row(2))["rank"]
+    part_held = handed.of(row(3))["loss"][1:]
+    shared = memoryview(handed.of(row(4))["size"])
+    for number in range(5, 12):
+        assert handed.of(row(number))["busy"][0] == number
+    assert all((array == 1).all() for array in dict_held.values())
+    assert (array_held == 2).all() and (part_held == 3).all() and list(shared) == [4] * 4
+
+
+def test_a_collector_gets_an_observation_of_its_own_each_time() -> None:
+    handed = Handed(FORM)
+    collected = [handed.of(row(number)) for number in range(20)]
+    assert [observation["busy"][0] for observation in collected] == list(range(20))
+    assert len(handed._made) < 20
+
+
+def test_a_dict_that_its_owner_changes_changes_no_other() -> None:
+    handed = Handed(FORM)
+    observation = handed.of(row(1))
+    observation.clear()
+    assert list(handed.of(row(2))) == list(FORM.space)
+
+
+def test_an_environment_hands_out_what_it_did_before() -> None:
+    """Collected or dropped at once, the observations of an episode are the same."""
+    env = SenderEnv("interruption", 3)
+    env.reset(seed=3)
+    kept, sums = [], []
+    for _ in range(30):
+        observation, _, ended, *_ = env.step(4)
+        kept.append(observation)
+        if ended:
+            break
+    env.reset(seed=3)
+    for _ in kept:
+        observation, *_ = env.step(4)
+        sums.append([float(array.sum()) for array in observation.values()])
+    assert sums == [[float(array.sum()) for array in observation.values()] for observation in kept]

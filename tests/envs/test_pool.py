@@ -1,0 +1,76 @@
+"""A pool: episodes that are drawn once and come again, the same in every environment that has one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
+from bufgym.errors import BufgymError
+from bufgym.scenario import Streams, Uplink
+from bufgym.scenario.pool import Pool
+from bufgym.traces import Trace
+
+UPLINK = Uplink(traces=(Trace.steps([(0.4, 9e6), (0.5, 0), (0.6, 2e6)]),), jitter=0.8, duration_s=0.4)
+L = 3
+
+
+def test_each_is_drawn_once_and_every_one_comes() -> None:
+    drawn: list[Any] = []
+
+    def draw(streams: Streams) -> Any:
+        drawn.append(UPLINK.draw(streams))
+        return drawn[-1]
+
+    pool, streams = Pool(draw, 5), Streams.seeded(1)
+    taken = Counter(id(pool(streams)) for _ in range(500))
+    assert len(pool) == len(drawn) == len(taken) == 5
+    # Each is taken 100 times of 500 on average; the standard deviation is 9.
+    assert min(taken.values()) > 50
+
+
+def test_the_set_is_the_same_for_every_row_and_seed() -> None:
+    """A single environment, and the rows of a batch, play no other episodes than those of the pool."""
+    arrivals = set()
+    for seed in range(4):
+        batch, single = SenderVectorEnv(3, UPLINK, L, pool=2), SenderEnv(UPLINK, L, pool=2)
+        batch.reset(seed=seed)
+        single.reset(seed=seed)
+        played = [*batch.rows.senders.episodes, *single.rows.senders.episodes]
+        arrivals |= {episode.arrivals["arrival_us"].tobytes() for episode in played if episode is not None}
+    assert len(arrivals) == 2
+
+
+def test_row_i_of_a_batch_is_the_single_environment() -> None:
+    batch = SenderVectorEnv(3, UPLINK, L, pool=4)
+    singles = [SenderEnv(UPLINK, L, pool=4) for _ in range(3)]
+    batch.reset(seed=7)
+    for i, env in enumerate(singles):
+        env.reset(seed=7 + i)
+    ended = np.zeros(3, np.bool_)
+    for _ in range(60):  # several episodes of 12 messages each
+        _, rewards, terminated, *_ = batch.step(np.full(3, L + 1))
+        for i, env in enumerate(singles):
+            if ended[i]:
+                env.reset()
+                continue
+            _, reward, ends, *_ = env.step(L + 1)
+            assert (reward, ends) == (rewards[i], terminated[i])
+        ended = terminated
+    assert batch.rows.senders.begun.min() > 3
+
+
+def test_fleets_have_one_too() -> None:
+    envs = FleetVecEnv(4, 2, UPLINK, L, pool=1)
+    envs.reset(seed=1)
+    links = {(episode.link.trace.name, episode.link.offset_us) for episode in envs.rows.senders.episodes if episode}
+    assert len(links) == 1
+
+
+@pytest.mark.parametrize("pool", [0, -1, 1.5, "many", True])
+def test_a_pool_is_a_whole_number(pool: Any) -> None:
+    with pytest.raises(BufgymError, match=r"pool = .*: must be a whole number from 1 to 1000000"):
+        SenderEnv(UPLINK, L, pool=pool)
