@@ -39,6 +39,7 @@ def add(commands: Commands) -> None:
     link.add_argument("--port", type=natural, default=PORT + 1, help="where it begins (%(default)s)")
     link.add_argument("--scale", type=positive, default=1.0, metavar="X", help="the trace's capacity times X")
     link.add_argument("--delay-ms", type=least_0, default=0.0, metavar="MS", help="each way (%(default)g)")
+    link.add_argument("--back", action="store_true", help="the messages come back from there (a publisher of ROS 1)")
 
     validate = command(parts, "validate", _validate, "the same episodes on real sockets and in the simulator")
     validate.add_argument("--trace", required=True, nargs="+", metavar="FILE", help="bandwidth traces, as in link")
@@ -101,7 +102,7 @@ def _link(options: argparse.Namespace) -> None:
     trace, target = traces.load(options.trace).scaled(options.scale), _address(options.to)
 
     async def forward() -> None:
-        link = ShapedLink(Link(trace, propagation_us=round(options.delay_ms * 1000)), target)
+        link = ShapedLink(Link(trace, propagation_us=round(options.delay_ms * 1000)), target, back=options.back)
         port = await link.listen(options.port)
         link.begin()
         print(f"127.0.0.1:{port} -> {options.to} over {trace.name}; Ctrl-C ends it", flush=True)

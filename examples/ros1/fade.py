@@ -1,0 +1,145 @@
+"""What arrives of a rospy camera over a link that fades: with rospy's own queue, and under policies.
+
+24 Mbit/s, and 2 Mbit/s for a quarter of the time, in the middle; frames of 230 kB at 30 Hz, queue_size 15. The node is
+``camera.py``, as it is; the subscriber is rospy's, and connects through ``bufgym.live.shaped``. Beside it the same
+policies in the simulator. Run it with a Python that has rospy, rosmaster and bufgym:
+
+    python3 examples/ros1/fade.py --policies rospy,drop-oldest,afr
+"""
+
+import argparse
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bufgym import policies
+from bufgym.live.shaped import ShapedLink
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.scenario import Episode, messages
+from bufgym.sim import run
+from bufgym.sim.metrics import outcome
+from bufgym.traces import Trace
+
+RATE_HZ, SIZE_BYTES, QUEUE_SIZE = 30.0, 230_000, 15
+FAST, SLOW = 3_000_000, 250_000
+"""Bytes a second."""
+V = qoi.exponential(0.618)
+CAMERA = Path(__file__).with_name("camera.py")
+
+
+def fade(seconds: float) -> Trace:
+    """The link: slow from 3/8 to 5/8 of the time."""
+    times = seconds * np.array([0, 3, 5, 8]) / 8
+    carried = np.append(0, np.cumsum(np.diff(times) * [FAST, SLOW, FAST]))
+    return Trace("fade", np.rint(times * 1e6).astype(np.int64), np.rint(carried).astype(np.int64), "hold")
+
+
+def arrived(frames: list[int]) -> dict[str, Any]:
+    """What a run is measured by."""
+    gaps = np.diff(frames)
+    return {"delivered": len(frames), "qoi": round(V.information(frames), 2), "longest_gap": int(gaps.max(initial=0))}
+
+
+class Fade:
+    """Subscribes to the camera through the link, and notes which frames come; one rospy process, so one run."""
+
+    def __init__(self, seconds: float) -> None:
+        import rospy
+        from rospy.impl import tcpros_pubsub
+        from sensor_msgs.msg import CompressedImage
+
+        self.frames: list[int] = []
+        self.latest_s = time.monotonic()
+        loop = asyncio.new_event_loop()
+        threading.Thread(target=loop.run_forever, daemon=True).start()
+        create = tcpros_pubsub.TCPROSHandler.create_transport
+
+        async def shape(target: tuple[str, int]) -> int:
+            link = ShapedLink(Link(fade(seconds)), target, back=True)
+            port = await link.listen()
+            link.begin()
+            return port
+
+        def through_the_link(handler: Any, name: str, uri: str, protocol: list[Any]) -> Any:
+            port = asyncio.run_coroutine_threadsafe(shape((protocol[1], protocol[2])), loop).result()
+            return create(handler, name, uri, [protocol[0], "127.0.0.1", port])
+
+        tcpros_pubsub.TCPROSHandler.create_transport = through_the_link
+        rospy.init_node("viewer", anonymous=True, disable_signals=True, disable_rosout=True)
+        rospy.Subscriber("/camera", CompressedImage, self._take)
+
+    def _take(self, frame: Any) -> None:
+        self.frames.append(int(frame.format))
+        self.latest_s = time.monotonic()
+
+
+def play(policy: str, seconds: float, python: str) -> dict[str, Any]:
+    """One run: a master, the camera as its own process, and a subscriber in a process of its own."""
+    command = [python, __file__, "--one", policy, "--seconds", str(seconds)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds + 150)
+    if done.returncode != 0:
+        raise SystemExit(f"{policy}: {done.stderr[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def one(policy: str, seconds: float) -> dict[str, Any]:
+    """The run itself."""
+    from rosmaster.master import Master
+
+    master = Master(0)
+    master.start()
+    port = master.master_node.server.socket.getsockname()[1]
+    os.environ.update(ROS_MASTER_URI=f"http://127.0.0.1:{port}", ROS_IP="127.0.0.1", PYTHONWARNINGS="ignore")
+    run_by = [] if policy == "rospy" else ["-m", "bufgym.ros1", "--policy", policy]
+    frames = round(seconds * RATE_HZ)
+    camera = subprocess.Popen([sys.executable, *run_by, str(CAMERA), "--frames", str(frames)], stdout=sys.stderr)
+    try:
+        seen = Fade(seconds)
+        began_s = time.monotonic()
+        while not seen.frames and camera.poll() is None and time.monotonic() - began_s < 120:
+            time.sleep(0.05)
+        began_s = time.monotonic()
+        while time.monotonic() < max(began_s + seconds + 1, seen.latest_s + 2):
+            time.sleep(0.05)
+    finally:
+        camera.terminate()
+        camera.wait(10)
+    return arrived(sorted(seen.frames))
+
+
+def simulated(policy: str, seconds: float) -> dict[str, Any]:
+    """The same in the simulator."""
+    times = np.arange(round(seconds * RATE_HZ)) * round(1e6 / RATE_HZ)
+    stats = outcome(run(policies.get(policy), [Episode(messages(times, SIZE_BYTES), Link(fade(seconds)))], QUEUE_SIZE, V), 0)
+    return {"delivered": stats.delivered, "qoi": round(stats.qoi, 2), "longest_gap": int(stats.longest_gap)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--policies", default="rospy,drop-oldest,afr,min-motion-gap")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--one", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.one:
+        print(json.dumps(one(options.one, options.seconds)), flush=True)
+        os._exit(0)  # rospy's threads have nothing left to say
+    print("| queue | delivered | QoI | longest gap | in the simulator: delivered | QoI | longest gap |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
+    for policy in options.policies.split(","):
+        rows = [play(policy, options.seconds, sys.executable)]
+        rows += [simulated("drop-oldest" if policy == "rospy" else policy, options.seconds)]
+        cells = [f"{row[key]:g}" for row in rows for key in ("delivered", "qoi", "longest_gap")]
+        print(f"| {policy} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
