@@ -34,6 +34,7 @@ ROOMS = [
     "expert",
     "sb3",
     "benchmark",
+    "ros1",
     "reproduce",
     "gallery",
     "cli",

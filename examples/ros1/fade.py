@@ -119,7 +119,9 @@ def one(policy: str, seconds: float) -> dict[str, Any]:
 def simulated(policy: str, seconds: float) -> dict[str, Any]:
     """The same in the simulator."""
     times = np.arange(round(seconds * RATE_HZ)) * round(1e6 / RATE_HZ)
-    stats = outcome(run(policies.get(policy), [Episode(messages(times, SIZE_BYTES), Link(fade(seconds)))], QUEUE_SIZE, V), 0)
+    stats = outcome(
+        run(policies.get(policy), [Episode(messages(times, SIZE_BYTES), Link(fade(seconds)))], QUEUE_SIZE, V), 0
+    )
     return {"delivered": stats.delivered, "qoi": round(stats.qoi, 2), "longest_gap": int(stats.longest_gap)}
 
 
