@@ -35,6 +35,7 @@ ROOMS = [
     "sb3",
     "benchmark",
     "ros1",
+    "ros2",
     "reproduce",
     "gallery",
     "cli",

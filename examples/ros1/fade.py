@@ -1,6 +1,6 @@
 """What arrives of a rospy camera over a link that fades: with rospy's own queue, and under policies.
 
-24 Mbit/s, and 2 Mbit/s for a quarter of the time, in the middle; frames of 230 kB at 30 Hz, queue_size 15. The node is
+Link and stream are those of ``examples/fade.py``. The node is
 ``camera.py``, as it is; the subscriber is rospy's, and connects through ``bufgym.live.shaped``. Beside it the same
 policies in the simulator. Run it with a Python that has rospy, rosmaster and bufgym:
 
@@ -18,35 +18,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from fade import HEADINGS, RATE_HZ, arrived, fade, line, simulated
 
-from bufgym import policies
 from bufgym.live.shaped import ShapedLink
-from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.scenario import Episode, messages
-from bufgym.sim import run
-from bufgym.sim.metrics import outcome
-from bufgym.traces import Trace
 
-RATE_HZ, SIZE_BYTES, QUEUE_SIZE = 30.0, 230_000, 15
-FAST, SLOW = 3_000_000, 250_000
-"""Bytes a second."""
-V = qoi.exponential(0.618)
 CAMERA = Path(__file__).with_name("camera.py")
-
-
-def fade(seconds: float) -> Trace:
-    """The link: slow from 3/8 to 5/8 of the time."""
-    times = seconds * np.array([0, 3, 5, 8]) / 8
-    carried = np.append(0, np.cumsum(np.diff(times) * [FAST, SLOW, FAST]))
-    return Trace("fade", np.rint(times * 1e6).astype(np.int64), np.rint(carried).astype(np.int64), "hold")
-
-
-def arrived(frames: list[int]) -> dict[str, Any]:
-    """What a run is measured by."""
-    gaps = np.diff(frames)
-    return {"delivered": len(frames), "qoi": round(V.information(frames), 2), "longest_gap": int(gaps.max(initial=0))}
 
 
 class Fade:
@@ -113,16 +91,7 @@ def one(policy: str, seconds: float) -> dict[str, Any]:
     finally:
         camera.terminate()
         camera.wait(10)
-    return arrived(sorted(seen.frames))
-
-
-def simulated(policy: str, seconds: float) -> dict[str, Any]:
-    """The same in the simulator."""
-    times = np.arange(round(seconds * RATE_HZ)) * round(1e6 / RATE_HZ)
-    stats = outcome(
-        run(policies.get(policy), [Episode(messages(times, SIZE_BYTES), Link(fade(seconds)))], QUEUE_SIZE, V), 0
-    )
-    return {"delivered": stats.delivered, "qoi": round(stats.qoi, 2), "longest_gap": int(stats.longest_gap)}
+    return arrived(seen.frames)
 
 
 def main() -> None:
@@ -134,13 +103,11 @@ def main() -> None:
     if options.one:
         print(json.dumps(one(options.one, options.seconds)), flush=True)
         os._exit(0)  # rospy's threads have nothing left to say
-    print("| queue | delivered | QoI | longest gap | in the simulator: delivered | QoI | longest gap |")
-    print("|---|---:|---:|---:|---:|---:|---:|")
+    print(HEADINGS)
     for policy in options.policies.split(","):
-        rows = [play(policy, options.seconds, sys.executable)]
-        rows += [simulated("drop-oldest" if policy == "rospy" else policy, options.seconds)]
-        cells = [f"{row[key]:g}" for row in rows for key in ("delivered", "qoi", "longest_gap")]
-        print(f"| {policy} | {' | '.join(cells)} |", flush=True)
+        same = "drop-oldest" if policy == "rospy" else policy
+        print(line(policy, play(policy, options.seconds, sys.executable), simulated(same, options.seconds)), flush=True)
+
 
 
 if __name__ == "__main__":
