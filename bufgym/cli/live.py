@@ -187,7 +187,9 @@ def _send(options: argparse.Namespace) -> None:
 
     with contextlib.ExitStack() as stack:
         log = None if options.log is None else stack.enter_context(LogFile(options.log))
-        run_async(stream(PolicyQueue(policies.get(name), options.capacity, value=qoi.exponential(math.exp(-1)), log=log)))
+        run_async(
+            stream(PolicyQueue(policies.get(name), options.capacity, value=qoi.exponential(math.exp(-1)), log=log))
+        )
 
 
 def _receive(options: argparse.Namespace) -> None:

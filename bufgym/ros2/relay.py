@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 from bufgym.errors import BufgymError
@@ -37,7 +37,7 @@ def _resolved(name: str) -> str:
 
 
 @contextmanager
-def _node(name: str) -> Any:
+def _node(name: str) -> Iterator[Any]:
     """A node of its own context."""
     with needs_rclpy():
         import rclpy
@@ -98,24 +98,22 @@ class Robot:
             executor.add_node(node)
 
             def spin() -> None:
-                try:
+                with suppress(ExternalShutdownException):
                     executor.spin()
-                except ExternalShutdownException:
-                    pass
 
-            tasks: list[Awaitable[None]] = [
-                asyncio.ensure_future(self.sender.run()),
-                asyncio.ensure_future(self._look(node)),
-                asyncio.get_running_loop().run_in_executor(None, spin),
+            tasks = [
+                asyncio.create_task(self.sender.run()),
+                asyncio.create_task(self._look(node)),
+                asyncio.create_task(asyncio.to_thread(spin)),
             ]
             try:
-                for task in asyncio.as_completed(tasks):
-                    await task
-                    break
+                done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()
             finally:
                 executor.shutdown(timeout_sec=2.0)
-                for one in tasks[:2]:
-                    one.cancel()  # type: ignore[attr-defined]
+                for task in tasks:
+                    task.cancel()
                 await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _look(self, node: Any) -> None:

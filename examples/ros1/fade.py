@@ -109,6 +109,5 @@ def main() -> None:
         print(line(policy, play(policy, options.seconds, sys.executable), simulated(same, options.seconds)), flush=True)
 
 
-
 if __name__ == "__main__":
     main()

@@ -1,6 +1,6 @@
 """An ordinary rclpy node, which knows nothing of bufgym: a camera of 230 kB frames at 30 Hz.
 
-    python3 camera.py --frames 600
+python3 camera.py --frames 600
 """
 
 import argparse
@@ -17,19 +17,13 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=230_000, help="bytes")
     parser.add_argument("--best-effort", action="store_true")
     parser.add_argument("--depth", type=int, default=15)
-    parser.add_argument("--policy", help="use bufgym.ros2.Publisher instead of rclpy's")
     options = parser.parse_args()
 
     rclpy.init()
     node = rclpy.create_node("camera")
-    if options.policy:
-        from bufgym.ros2 import Publisher
-
-        publisher = Publisher(node, CompressedImage, "/camera", policy=options.policy, queue_size=options.depth)
-    else:
-        reliability = ReliabilityPolicy.BEST_EFFORT if options.best_effort else ReliabilityPolicy.RELIABLE
-        quality = QoSProfile(depth=options.depth, reliability=reliability)
-        publisher = node.create_publisher(CompressedImage, "/camera", quality)
+    reliability = ReliabilityPolicy.BEST_EFFORT if options.best_effort else ReliabilityPolicy.RELIABLE
+    quality = QoSProfile(depth=options.depth, reliability=reliability)
+    publisher = node.create_publisher(CompressedImage, "/camera", quality)
     while publisher.get_subscription_count() == 0:
         rclpy.spin_once(node, timeout_sec=0.01)
     sent = 0

@@ -2,9 +2,9 @@
 
 The link is that of ``examples/fade.py``. The relay's uplink goes through ``bufgym.live.shaped``; robot and viewer are
 in two domains of DDS. ``best-effort`` and ``reliable`` are DDS itself, between two network namespaces with `tc tbf`
-and 200 kB of queue, for which it takes root on Linux; ``publisher:afr`` is ``bufgym.ros2.Publisher`` on that link.
+and 200 kB of queue, which takes root on Linux.
 
-    python3 examples/ros2/fade.py --queues best-effort,reliable,publisher:afr,drop-oldest,afr
+    python3 examples/ros2/fade.py --queues best-effort,reliable,drop-oldest,afr
 """
 
 import argparse
@@ -26,6 +26,8 @@ from fade import FAST, HEADINGS, QUEUE_SIZE, RATE_HZ, SIZE_BYTES, SLOW, arrived,
 from bufgym.live.shaped import ShapedLink
 from bufgym.model.link import Link
 
+DOMAIN = 20 + os.getpid() % 40 * 2
+"""Of DDS, and the next one: others for each run, as two may run at a time."""
 HERE = Path(__file__).resolve().parent
 CONFIG = f"""\
 [[topic]]
@@ -83,7 +85,7 @@ def relayed(policy: str, seconds: float) -> dict[str, Any]:
     """Through ``bufgym ros2 send`` and ``bufgym ros2 receive``, camera and viewer as they are."""
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, daemon=True).start()
-    robot, base = environment(71), environment(72)
+    robot, base = environment(DOMAIN), environment(DOMAIN + 1)
     robot["ROS_AUTOMATIC_DISCOVERY_RANGE"] = base["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     bufgym = [sys.executable, "-u", "-m", "bufgym", "ros2"]
     receive = subprocess.Popen([*bufgym, "receive", "--port", "0"], env=base, stdout=subprocess.PIPE, text=True)
@@ -137,14 +139,14 @@ def shaped(bytes_per_s: int, verb: str = "change") -> None:
     shell(f"{inside} {verb} dev robot root tbf rate {kbit}kbit burst 5000 limit 200000")
 
 
-def direct(camera_options: list[str], viewer_options: list[str], seconds: float) -> dict[str, Any]:
+def direct(options: list[str], seconds: float) -> dict[str, Any]:
     """Camera and viewer as they are, in two network namespaces."""
     with namespaces():
         shaped(FAST, "add")
-        place = environment(73)
-        viewer = Viewer(["ip", "netns", "exec", "bufgym-base", *python("viewer.py", *viewer_options)], place)
+        place = environment(DOMAIN)
+        viewer = Viewer(["ip", "netns", "exec", "bufgym-base", *python("viewer.py", *options)], place)
         frames = ["--frames", str(round(seconds * RATE_HZ))]
-        command = ["ip", "netns", "exec", "bufgym-robot", *python("camera.py", *frames, *camera_options)]
+        command = ["ip", "netns", "exec", "bufgym-robot", *python("camera.py", *frames, *options)]
         camera = subprocess.Popen(command, env=place)
         with ended(camera, viewer.process):
             deadline_s = time.monotonic() + 60
@@ -157,18 +159,14 @@ def direct(camera_options: list[str], viewer_options: list[str], seconds: float)
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--queues", default="best-effort,reliable,publisher:afr,drop-oldest,afr,min-motion-gap")
+    parser.add_argument("--queues", default="best-effort,reliable,drop-oldest,afr,min-motion-gap")
     parser.add_argument("--seconds", type=float, default=20.0)
     options = parser.parse_args()
     print(HEADINGS)
     for queue in options.queues.split(","):
         if queue in ("best-effort", "reliable"):
             wishes = ["--best-effort"] if queue == "best-effort" else []
-            print(line(f"DDS, {queue}", direct(wishes, wishes, options.seconds), None), flush=True)
-        elif queue.startswith("publisher:"):
-            policy = queue.partition(":")[2]
-            row = direct(["--policy", policy], [], options.seconds)
-            print(line(f"`Publisher`, {policy}", row, simulated(policy, options.seconds)), flush=True)
+            print(line(f"DDS, {queue}", direct(wishes, options.seconds), None), flush=True)
         else:
             row = relayed(queue, options.seconds)
             print(line(f"relay, {queue}", row, simulated(queue, options.seconds)), flush=True)

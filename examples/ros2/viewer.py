@@ -1,6 +1,6 @@
 """An ordinary rclpy node: prints the number of each frame of ``camera.py`` as it comes.
 
-    python3 viewer.py
+python3 viewer.py
 """
 
 import argparse
