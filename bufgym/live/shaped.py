@@ -117,9 +117,11 @@ class ShapedLink:
         finally:
             for task in tasks:
                 task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-            near.close()
-            far.close()
+            try:
+                await asyncio.gather(*tasks, return_exceptions=True)
+            finally:  # also when the link is closed meanwhile
+                near.close()
+                far.close()
 
     async def _up(self, sender: socket.socket, receiver: socket.socket) -> None:
         """Towards the receiver, piece by piece when it has crossed; connections take turns."""

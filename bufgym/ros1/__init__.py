@@ -2,7 +2,7 @@
 
     import bufgym.ros1
 
-    bufgym.ros1.install("afr")  # before the first subscriber comes; the node stays as it is
+    bufgym.ros1.install(policy="afr")  # before the first subscriber comes; the node stays as it is
     publisher = rospy.Publisher("/camera", Image, queue_size=15)
 
 or, for a node that is not touched at all,
