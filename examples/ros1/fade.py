@@ -19,11 +19,29 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from fade import HEADINGS, RATE_HZ, arrived, fade, line, simulated
+from fade import (
+    ADDRESSES,
+    BASE,
+    FAST,
+    HEADINGS,
+    RATE_HZ,
+    ROBOT,
+    Viewer,
+    arrived,
+    ended,
+    fade,
+    fade_away,
+    line,
+    namespaces,
+    shaped,
+    simulated,
+)
 
 from bufgym.live.shaped import ShapedLink
 from bufgym.model.link import Link
 
+PORT = 11399
+"""Of the master in a namespace of its own."""
 CAMERA = Path(__file__).with_name("camera.py")
 
 
@@ -60,9 +78,9 @@ class Fade:
         self.latest_s = time.monotonic()
 
 
-def play(policy: str, seconds: float, python: str) -> dict[str, Any]:
+def play(policy: str, seconds: float) -> dict[str, Any]:
     """One run: a master, the camera as its own process, and a subscriber in a process of its own."""
-    command = [python, __file__, "--one", policy, "--seconds", str(seconds)]
+    command = [sys.executable, __file__, "--one", policy, "--seconds", str(seconds)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds + 150)
     if done.returncode != 0:
         raise SystemExit(f"{policy}: {done.stderr[-2000:]}")
@@ -94,10 +112,29 @@ def one(policy: str, seconds: float) -> dict[str, Any]:
     return arrived(seen.frames)
 
 
+def through_the_kernel(policy: str, seconds: float) -> dict[str, Any]:
+    """The same with two network namespaces, `tc tbf` and 200 kB of queue as the link. Takes root on Linux."""
+    master = f"from rosmaster.master import Master; import time; Master({PORT}).start(); time.sleep({seconds + 100})"
+    run_by = [] if policy == "rospy" else ["-m", "bufgym.ros1", "--policy", policy]
+    camera = [*run_by, str(CAMERA), "--frames", str(round(seconds * RATE_HZ))]
+    place = {**os.environ, "ROS_MASTER_URI": f"http://{ADDRESSES[0]}:{PORT}", "PYTHONWARNINGS": "ignore"}
+    robot, base = {**place, "ROS_IP": ADDRESSES[0]}, {**place, "ROS_IP": ADDRESSES[1]}
+    with namespaces():
+        shaped(FAST, "add")
+        serving = subprocess.Popen([*ROBOT, sys.executable, "-c", master], env=robot)
+        time.sleep(1)
+        viewer = Viewer([*BASE, sys.executable, str(CAMERA.with_name("viewer.py"))], base)
+        publishing = subprocess.Popen([*ROBOT, sys.executable, *camera], env=robot)
+        with ended(publishing, viewer.process, serving):
+            fade_away(viewer, seconds)
+            return viewer.wait(seconds)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--policies", default="rospy,drop-oldest,afr,min-motion-gap")
     parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--tbf", action="store_true", help="over a link of the kernel's (root)")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -106,7 +143,8 @@ def main() -> None:
     print(HEADINGS)
     for policy in options.policies.split(","):
         same = "drop-oldest" if policy == "rospy" else policy
-        print(line(policy, play(policy, options.seconds, sys.executable), simulated(same, options.seconds)), flush=True)
+        run = through_the_kernel if options.tbf else play
+        print(line(policy, run(policy, options.seconds), simulated(same, options.seconds)), flush=True)
 
 
 if __name__ == "__main__":

@@ -9,19 +9,32 @@ and 200 kB of queue, which takes root on Linux.
 
 import argparse
 import asyncio
-import contextlib
 import os
 import subprocess
 import sys
 import tempfile
 import threading
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from fade import FAST, HEADINGS, QUEUE_SIZE, RATE_HZ, SIZE_BYTES, SLOW, arrived, fade, line, simulated
+from fade import (
+    BASE,
+    FAST,
+    HEADINGS,
+    QUEUE_SIZE,
+    RATE_HZ,
+    ROBOT,
+    SIZE_BYTES,
+    Viewer,
+    ended,
+    fade,
+    fade_away,
+    line,
+    namespaces,
+    shaped,
+    simulated,
+)
 
 from bufgym.live.shaped import ShapedLink
 from bufgym.model.link import Link
@@ -38,40 +51,8 @@ value = "exponential:0.618"
 """
 
 
-class Viewer:
-    """``viewer.py`` as a process, and the frames that it has seen."""
-
-    def __init__(self, command: list[str], environment: dict[str, str]) -> None:
-        self.frames: list[int] = []
-        self.latest_s = time.monotonic()
-        self.process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self) -> None:
-        for text in self.process.stdout or ():
-            self.frames.append(int(text))
-            self.latest_s = time.monotonic()
-
-    def wait(self, seconds: float) -> dict[str, Any]:
-        """What came until the stream had ended and nothing more came for 2 s."""
-        began_s = time.monotonic()
-        while time.monotonic() < max(began_s + seconds + 1, self.latest_s + 2):
-            time.sleep(0.05)
-        return arrived(self.frames)
-
-
 def environment(domain: int) -> dict[str, str]:
     return {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONWARNINGS": "ignore"}
-
-
-@contextlib.contextmanager
-def ended(*processes: subprocess.Popen[str]) -> Iterator[None]:
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()  # a node that is stopped otherwise tells of its executor's end at length
-            process.wait()
 
 
 def python(script: str, *options: str) -> list[str]:
@@ -109,51 +90,17 @@ def relayed(policy: str, seconds: float) -> dict[str, Any]:
 # --- DDS itself ------------------------------------------------------------------------------------------------------
 
 
-def shell(command: str) -> None:
-    subprocess.run(command.split(), check=True, capture_output=True)
-
-
-@contextlib.contextmanager
-def namespaces() -> Iterator[None]:
-    """Two network namespaces with a pair of devices between them, the camera's shaped."""
-    shell("ip netns add bufgym-robot")
-    shell("ip netns add bufgym-base")
-    try:
-        shell("ip link add robot netns bufgym-robot type veth peer name base netns bufgym-base")
-        for k, end in enumerate(("robot", "base")):
-            inside = f"ip netns exec bufgym-{end} ip"
-            shell(f"{inside} addr add 10.99.0.{k + 1}/24 dev {end}")
-            shell(f"{inside} link set {end} up")
-            shell(f"{inside} link set lo up")
-            shell(f"{inside} route add 224.0.0.0/4 dev {end}")
-        yield
-    finally:
-        shell("ip netns delete bufgym-robot")
-        shell("ip netns delete bufgym-base")
-
-
-def shaped(bytes_per_s: int, verb: str = "change") -> None:
-    # tbf counts the headers of Ethernet, IP and TCP too.
-    kbit = round(bytes_per_s * 8 / 1000 * 1514 / 1448)
-    inside = "ip netns exec bufgym-robot tc qdisc"
-    shell(f"{inside} {verb} dev robot root tbf rate {kbit}kbit burst 5000 limit 200000")
-
-
 def direct(options: list[str], seconds: float) -> dict[str, Any]:
     """Camera and viewer as they are, in two network namespaces."""
     with namespaces():
         shaped(FAST, "add")
         place = environment(DOMAIN)
-        viewer = Viewer(["ip", "netns", "exec", "bufgym-base", *python("viewer.py", *options)], place)
+        viewer = Viewer([*BASE, *python("viewer.py", *options)], place)
         frames = ["--frames", str(round(seconds * RATE_HZ))]
-        command = ["ip", "netns", "exec", "bufgym-robot", *python("camera.py", *frames, *options)]
+        command = [*ROBOT, *python("camera.py", *frames, *options)]
         camera = subprocess.Popen(command, env=place)
         with ended(camera, viewer.process):
-            deadline_s = time.monotonic() + 60
-            while not viewer.frames and time.monotonic() < deadline_s:
-                time.sleep(0.01)
-            for at, rate in ((3 / 8, SLOW), (5 / 8, FAST)):
-                threading.Timer(at * seconds, shaped, (rate,)).start()
+            fade_away(viewer, seconds)
             return viewer.wait(seconds)
 
 
