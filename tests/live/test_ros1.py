@@ -7,11 +7,11 @@ import os
 import socket
 import subprocess
 import sys
-import sysconfig
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from bufgym.kernel import JIT
 from bufgym.live import PolicyQueue, replay
 from bufgym.live.log import of, read_log
 from bufgym.live.odometry import Odometry
+from bufgym.ros1.__main__ import main as command
 from bufgym.ros1.connection import PolicyConnection
 from bufgym.traces import MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses, unit
@@ -36,7 +37,14 @@ SYSTEM = Path("/usr/lib/python3/dist-packages")
 
 
 def environment(folder: Path) -> dict[str, str]:
-    places = [REPO, sysconfig.get_paths()["purelib"], SYSTEM]
+    """ROS 1's own packages stand before this interpreter's: ROS 2 calls its messages by the same names."""
+    own = folder / "own"
+    own.mkdir()
+    for pattern in ("ros*", "gen*", "*_msgs", "*_srvs"):
+        for package in SYSTEM.glob(pattern):
+            if package.is_dir() and not (own / package.name).exists():
+                (own / package.name).symlink_to(package)
+    places = [REPO, own, *(place for place in sys.path if place.endswith("site-packages")), SYSTEM]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, places)), "ROS_LOG_DIR": str(folder)}
 
 
@@ -106,24 +114,60 @@ def test_each_subscriber_has_its_queue_and_each_topic_its_policy(ros: dict[str, 
     assert 0.8 < max(moved) <= 1.0
 
 
-def test_the_command_names_what_is_wrong(ros: dict[str, str], tmp_path: Path) -> None:
-    node = tmp_path / "node.py"
-    node.write_text("raise SystemExit(7)")
-    for options, code, words in (
-        ([tmp_path / "none.py"], 2, "none.py: no such file"),
-        (["--policy", "nonsense", node], 2, "nonsense"),
-        (["--policy", "/camera=oracle", node], 2, "oracle"),
-        (["--policy", "/camera=decimate:every=2", "--policy", "rospy", node], 7, ""),
-    ):
-        command = [sys.executable, "-m", "bufgym.ros1", *map(str, options)]
-        done = subprocess.run(command, env=ros, capture_output=True, text=True, check=False)
-        assert done.returncode == code and words in done.stderr and done.stderr.count("\n") == bool(words), done.stderr
-
-
 def test_without_ros_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rospy", None)
     with pytest.raises(BufgymError, match=r"bufgym\.ros1 needs rospy"):
         ros1.install("afr")
+
+
+@pytest.fixture
+def topics(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """rospy's modules as far as the command needs them; its ``topics``."""
+    for name in ("rospy", "rospy.topics", "rospy.impl", "rospy.impl.tcpros_pubsub"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    sys.modules["rospy.impl.tcpros_pubsub"].QueuedConnection = list  # type: ignore[attr-defined]
+    sys.modules["rospy"].topics = sys.modules["rospy.topics"]  # type: ignore[attr-defined]
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return sys.modules["rospy.topics"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["none.py"], "none.py: no such file"),
+        (["--policy", "nonsense", __file__], "unknown policy 'nonsense'"),
+        (["--policy", "/camera=oracle", __file__], "unknown policy 'oracle'"),
+        (["--value", "round:1", __file__], "round"),
+    ],
+)
+def test_the_command_names_what_is_wrong(
+    options: list[str], words: str, topics: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(options) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("bufgym.ros1: error: ") and words in told and told.count("\n") == 1
+
+
+def test_the_node_finds_itself_as_if_run_alone(topics: Any, tmp_path: Path) -> None:
+    node = tmp_path / "node.py"
+    node.write_text("import sys, beside\nraise SystemExit([__name__, sys.argv[1:]])")
+    (tmp_path / "beside.py").touch()
+    policies = ["--policy", "/camera=decimate:every=2", "--policy", "rospy", "--policy", "/rosout=afr"]
+    with pytest.raises(SystemExit) as ended:
+        command([*policies, str(node), "--policy", "its own", "__name:=camera"])
+    assert ended.value.code == ["__main__", ["--policy", "its own", "__name:=camera"]]
+    transport = Transport()
+    transport.name = "/other"
+    assert topics.QueuedConnection.__name__ == "queued"
+    with pytest.raises(TypeError):  # rospy's own, which is a list here
+        topics.QueuedConnection(transport, 3)
+    transport.name = "/camera"
+    connection = topics.QueuedConnection(transport, 3)
+    assert connection._queue.policy.name.startswith("decimate") and connection._queue._row.senders.capacity == 3
+    transport.close()
+    transport.peer.close()
+    assert ended_thread(connection)
 
 
 # --- the connection, without ROS -------------------------------------------------------------------------------------
@@ -166,7 +210,7 @@ def transport() -> Iterator[Transport]:
     one.peer.close()
 
 
-def ended(connection: PolicyConnection) -> bool:
+def ended_thread(connection: PolicyConnection) -> bool:
     connection._thread.join(5)
     return not connection._thread.is_alive()
 
@@ -188,7 +232,7 @@ def test_a_message_at_a_time(transport: Transport) -> None:
     while connection.stat_num_msg < len(kept):
         time.sleep(0.001)
     transport.close()
-    assert ended(connection) and connection.write_data(b"late")
+    assert ended_thread(connection) and connection.write_data(b"late")
 
 
 def test_closing_wakes_a_sender_that_waits_for_its_peer(transport: Transport) -> None:
@@ -196,7 +240,7 @@ def test_closing_wakes_a_sender_that_waits_for_its_peer(transport: Transport) ->
     for _ in range(10):
         connection.write_data(bytes(5 * 10**6))
     threading.Timer(0.1, transport.close).start()
-    assert ended(connection)
+    assert ended_thread(connection)
 
 
 def test_what_sending_raised_is_told_at_the_next_message(transport: Transport) -> None:
@@ -207,7 +251,7 @@ def test_what_sending_raised_is_told_at_the_next_message(transport: Transport) -
     with pytest.raises(ConnectionResetError, match="gone"):
         connection.write_data(b"b")
     transport.close()
-    assert ended(connection)
+    assert ended_thread(connection)
 
 
 # --- x ---------------------------------------------------------------------------------------------------------------
