@@ -34,6 +34,8 @@ ROOMS = [
     "expert",
     "sb3",
     "benchmark",
+    "ros1",
+    "ros2",
     "reproduce",
     "gallery",
     "cli",

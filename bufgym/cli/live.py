@@ -39,6 +39,7 @@ def add(commands: Commands) -> None:
     link.add_argument("--port", type=natural, default=PORT + 1, help="where it begins (%(default)s)")
     link.add_argument("--scale", type=positive, default=1.0, metavar="X", help="the trace's capacity times X")
     link.add_argument("--delay-ms", type=least_0, default=0.0, metavar="MS", help="each way (%(default)g)")
+    link.add_argument("--back", action="store_true", help="the messages come back from there (a publisher of ROS 1)")
 
     validate = command(parts, "validate", _validate, "the same episodes on real sockets and in the simulator")
     validate.add_argument("--trace", required=True, nargs="+", metavar="FILE", help="bandwidth traces, as in link")
@@ -78,14 +79,16 @@ def _add_ends(parts: Commands) -> None:
     receive.add_argument("--messages", type=count, help="stop after so many")
 
 
-def _address(text: str) -> tuple[str, int]:
+def address(text: str) -> tuple[str, int]:
+    """Of ``HOST:PORT``."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_535:
         raise BufgymError(f"{text}: must be HOST:PORT")
     return host, int(port)
 
 
-def _run(work: Coroutine[Any, Any, None]) -> None:
+def run_async(work: Coroutine[Any, Any, None]) -> None:
+    """Run it to its end, or to Ctrl-C."""
     import asyncio
 
     asyncio.run(work)
@@ -98,16 +101,16 @@ def _link(options: argparse.Namespace) -> None:
     from bufgym.live.shaped import ShapedLink
     from bufgym.model.link import Link
 
-    trace, target = traces.load(options.trace).scaled(options.scale), _address(options.to)
+    trace, target = traces.load(options.trace).scaled(options.scale), address(options.to)
 
     async def forward() -> None:
-        link = ShapedLink(Link(trace, propagation_us=round(options.delay_ms * 1000)), target)
+        link = ShapedLink(Link(trace, propagation_us=round(options.delay_ms * 1000)), target, back=options.back)
         port = await link.listen(options.port)
         link.begin()
         print(f"127.0.0.1:{port} -> {options.to} over {trace.name}; Ctrl-C ends it", flush=True)
         await asyncio.Event().wait()
 
-    _run(forward())
+    run_async(forward())
 
 
 def _validate(options: argparse.Namespace) -> None:
@@ -162,7 +165,7 @@ def _send(options: argparse.Namespace) -> None:
 
     load_policies(options.policy_file)
     (name,) = loaded([options.policies])[0]
-    host, port = _address(options.to)
+    host, port = address(options.to)
     motion = None if options.motion == "none" else traces.load_motion(options.motion)
 
     async def stream(queue: PolicyQueue) -> None:
@@ -184,7 +187,9 @@ def _send(options: argparse.Namespace) -> None:
 
     with contextlib.ExitStack() as stack:
         log = None if options.log is None else stack.enter_context(LogFile(options.log))
-        _run(stream(PolicyQueue(policies.get(name), options.capacity, value=qoi.exponential(math.exp(-1)), log=log)))
+        run_async(
+            stream(PolicyQueue(policies.get(name), options.capacity, value=qoi.exponential(math.exp(-1)), log=log))
+        )
 
 
 def _receive(options: argparse.Namespace) -> None:
@@ -217,4 +222,4 @@ def _receive(options: argparse.Namespace) -> None:
             print(f"{taken} received; {len(receiver.faults)} broken connections {list(receiver.faults)[-1:]}")
 
     with contextlib.ExitStack() as stack:
-        _run(take(stack.enter_context(Recording(options.out)) if options.out else lambda message: None))
+        run_async(take(stack.enter_context(Recording(options.out)) if options.out else lambda message: None))

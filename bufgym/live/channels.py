@@ -23,7 +23,7 @@ UNSENT_BYTES: Final = 16_384
 """TCP_NOTSENT_LOWAT: so much may wait in the kernel beyond what is on its way."""
 DEAD_AFTER_S: Final = 20.0
 """A connection on which nothing was acked for so long is given up, where the system can tell."""
-_PIECE_BYTES: Final = 16_384
+PIECE_BYTES: Final = 16_384
 """Written at a time, so that ``left_bytes`` is known while a large message is under way."""
 
 
@@ -59,9 +59,13 @@ def unacked_bytes(connection: socket.socket) -> int | None:
 def small_buffers(connection: socket.socket) -> None:
     """Set a sender's socket so that little waits in the system."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-    for option, number in (("TCP_NOTSENT_LOWAT", UNSENT_BYTES), ("TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))):
-        if hasattr(socket, option):
-            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), number)
+    _set(connection, "TCP_NOTSENT_LOWAT", UNSENT_BYTES)
+
+
+def _set(connection: socket.socket, option: str, number: int) -> None:
+    """Set an option of TCP, where the system has it."""
+    if hasattr(socket, option):
+        connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), number)
 
 
 async def _connected(host: str, port: int, small: bool = True) -> socket.socket:
@@ -74,6 +78,7 @@ async def _connected(host: str, port: int, small: bool = True) -> socket.socket:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if small:
             small_buffers(connection)
+            _set(connection, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
         await loop.sock_connect(connection, address)
     except BaseException:
         connection.close()
@@ -99,8 +104,8 @@ class TcpChannel:
         head, body = header(frame), memoryview(frame.body)
         self._unwritten_bytes = len(body)
         await loop.sock_sendall(self._socket, head)
-        for start in range(0, len(body), _PIECE_BYTES):
-            piece = body[start : start + _PIECE_BYTES]
+        for start in range(0, len(body), PIECE_BYTES):
+            piece = body[start : start + PIECE_BYTES]
             await loop.sock_sendall(self._socket, piece)
             self._unwritten_bytes -= len(piece)
 

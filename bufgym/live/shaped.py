@@ -1,7 +1,8 @@
 """A link of a trace's capacity between real sockets: a TCP proxy in user space, without root.
 
 Towards the receiver it forwards as the simulator's link carries, byte position by byte position; what comes back is
-only delayed. Its own buffers are small, so that it hides no queue.
+only delayed. Its own buffers are small, so that it hides no queue. The receiver is whom the sender calls, or (``back``)
+who calls the sender, as a subscriber of ROS 1 does.
 """
 
 from __future__ import annotations
@@ -26,18 +27,23 @@ the next message take their turns in programs, which is not the link's doing."""
 
 
 class ShapedLink:
-    """Forwards connections to ``target`` (host, port) at the pace of ``link``; ``speed``: how much faster time runs."""
+    """Forwards connections to ``target`` (host, port) at the pace of ``link``; ``speed``: how much faster time runs.
+
+    ``back``: the pace of what comes back from the target.
+    """
 
     def __init__(
         self,
         link: Link,
         target: tuple[str, int],
         *,
+        back: bool = False,
         speed: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._link = link
         self._target = target
+        self._back = back
         self._speed = speed
         self._clock = clock
         self._began_s = clock()
@@ -97,25 +103,33 @@ class ShapedLink:
             far.setblocking(False)
             for one in (near, far):
                 one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if self._back:
+                far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
             await loop.sock_connect(far, self._target)
-            tasks = [asyncio.create_task(self._up(near, far)), asyncio.create_task(self._down(far, near))]
+            sender, receiver = (far, near) if self._back else (near, far)
+            tasks = [
+                asyncio.create_task(self._up(sender, receiver)),
+                asyncio.create_task(self._down(receiver, sender)),
+            ]
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         except OSError:
             pass  # who listens no more: the sender connects again
         finally:
             for task in tasks:
                 task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-            near.close()
-            far.close()
+            try:
+                await asyncio.gather(*tasks, return_exceptions=True)
+            finally:  # also when the link is closed meanwhile
+                near.close()
+                far.close()
 
-    async def _up(self, near: socket.socket, far: socket.socket) -> None:
+    async def _up(self, sender: socket.socket, receiver: socket.socket) -> None:
         """Towards the receiver, piece by piece when it has crossed; connections take turns."""
         crossed: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_MOST_PIECES)
-        delivery = asyncio.create_task(self._deliver(crossed, far))
+        delivery = asyncio.create_task(self._deliver(crossed, receiver))
         try:
             while True:
-                waited, piece = await _piece(near)
+                waited, piece = await _piece(sender)
                 if not piece:
                     break
                 async with self._turn:
@@ -127,20 +141,20 @@ class ShapedLink:
         finally:
             delivery.cancel()
 
-    async def _deliver(self, crossed: asyncio.Queue[tuple[float, bytes]], far: socket.socket) -> None:
+    async def _deliver(self, crossed: asyncio.Queue[tuple[float, bytes]], receiver: socket.socket) -> None:
         """What has crossed arrives a propagation delay later."""
         while True:
             arrives_s, piece = await crossed.get()
             await self._until(arrives_s)
-            await asyncio.get_running_loop().sock_sendall(far, piece)
+            await asyncio.get_running_loop().sock_sendall(receiver, piece)
             crossed.task_done()
 
-    async def _down(self, far: socket.socket, near: socket.socket) -> None:
+    async def _down(self, receiver: socket.socket, sender: socket.socket) -> None:
         """Back to the sender."""
         loop = asyncio.get_running_loop()
-        while piece := await loop.sock_recv(far, 65_536):
+        while piece := await loop.sock_recv(receiver, 65_536):
             await asyncio.sleep(self._link.propagation_us / 1e6 / self._speed)
-            await loop.sock_sendall(near, piece)
+            await loop.sock_sendall(sender, piece)
 
     # --- time and bytes -----------------------------------------------------------------------------------------------
 

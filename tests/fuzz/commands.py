@@ -69,7 +69,8 @@ WORK = (
     ("bufgym.gallery", "page"),
     ("bufgym.gallery", "write_film"),
     ("bufgym.cli.play", "_play"),
-    ("bufgym.cli.live", "_run"),
+    ("bufgym.cli.live", "run_async"),
+    ("bufgym.cli.ros2", "run_async"),
     ("bufgym.live.validate", "validate"),
     ("bufgym.expert.dataset", "make"),
 )

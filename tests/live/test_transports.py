@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from bufgym.kernel import JIT
 from bufgym.live import replay
 from bufgym.live.channels import TRANSPORTS
 from bufgym.live.log import Record
+from bufgym.live.shaped import ShapedLink
 from bufgym.live.validate import Run, play, table, validate
 from bufgym.model import qoi
 from bufgym.model.link import Link
@@ -72,6 +74,37 @@ def test_what_the_systems_buffers_hide_is_lost() -> None:
     small, hidden = in_time(leaves="sent"), in_time(small=False, leaves="written")
     print("QoI in time, small and default buffers:", small, hidden)
     assert hidden < 0.9 * small
+
+
+@pytest.mark.parametrize(("back", "carried_bytes"), [(True, 10**6), (False, 4)])
+def test_a_link_whose_messages_come_back(back: bool, carried_bytes: int) -> None:
+    """4 bytes go to who is called, 1 MB comes back. The link, of 2 MB/s, carries the one or the other."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(bytes(250_000) * len(await reader.readexactly(4)))
+        await writer.drain()
+        writer.close()
+
+    async def fetch() -> tuple[float, int]:
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        trace = Trace("even", np.array([0, 10**6]), np.array([0, 2 * 10**6]), "loop")
+        link = ShapedLink(Link(trace), server.sockets[0].getsockname(), back=back)
+        reader, writer = await asyncio.open_connection("127.0.0.1", await link.listen())
+        began_s = time.monotonic()
+        writer.write(b"send")
+        await reader.readexactly(10**6)
+        taken_s = time.monotonic() - began_s
+        carried = link.carried_bytes
+        writer.close()
+        await writer.wait_closed()
+        await link.close()
+        server.close()
+        await server.wait_closed()
+        return taken_s, carried
+
+    taken_s, carried = asyncio.run(fetch())
+    assert carried == carried_bytes
+    assert taken_s >= 0.45 * back
 
 
 def test_a_window_of_several_messages() -> None:

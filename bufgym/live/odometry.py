@@ -1,0 +1,59 @@
+"""x on board: how far the scene has moved on, summed from a robot's odometry as it comes.
+
+The same sum over the same poses as ``bufgym.traces.motion_from_poses`` makes of a recording.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from bufgym.traces import MotionSettings
+from bufgym.traces.poses import angles
+
+_NORM = 0.9, 1.1
+"""Of a quaternion that is one: some drivers send zeros until they know better."""
+
+
+class Odometry:
+    """Call it with each pose; ``x`` is the sum so far."""
+
+    def __init__(self, settings: MotionSettings | None = None) -> None:
+        self.settings = settings or MotionSettings()
+        self.x = 0.0
+        """Units of the view, from 0; it never falls."""
+        self._last: tuple[float, Any, Any] | None = None
+
+    def __call__(self, time_s: float, position_m: Sequence[float], quaternion: Sequence[float]) -> None:
+        """A pose. One that comes sooner than the settings' rate allows, or that is no pose, counts for nothing.
+
+        Args:
+            time_s: its time; if it falls (a restarted simulation), the sum goes on from this pose.
+            position_m: three numbers.
+            quaternion: four, in any order that stays the same.
+        """
+        position, turn = np.asarray(position_m, np.float64), np.asarray([quaternion], np.float64)
+        norm = float(np.linalg.norm(turn))
+        if not (_NORM[0] < norm < _NORM[1] and np.isfinite(position).all() and math.isfinite(time_s)):
+            return
+        turn /= norm
+        if self._last is not None and time_s >= self._last[0]:
+            # Odometry at just this rate jitters by some percent.
+            if time_s - self._last[0] < 0.9 / self.settings.rate_hz:
+                return
+            turned_rad = float(angles(self._last[2], turn)[0])
+            moved_m = float(np.linalg.norm(position - self._last[1]))
+            self.x += turned_rad / math.radians(self.settings.fov_deg) + moved_m / self.settings.scene_scale_m
+        self._last = time_s, position, turn
+
+    def take(self, message: Any) -> None:
+        """A ROS message with a header and a pose: Odometry, PoseStamped, PoseWithCovarianceStamped; of ROS 1 or 2."""
+        stamp, pose = message.header.stamp, message.pose
+        while hasattr(pose, "pose"):
+            pose = pose.pose
+        time_s = stamp.to_sec() if hasattr(stamp, "to_sec") else stamp.sec + stamp.nanosec / 1e9
+        place, turn = pose.position, pose.orientation
+        self(time_s, (place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))

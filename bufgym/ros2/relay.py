@@ -1,0 +1,185 @@
+"""The relay: on the robot it subscribes and sends over one uplink, at the other end it receives and republishes.
+
+    robot's nodes -> subscription (serialized) -> PolicyQueue -> Sender ==uplink==> Receiver -> publisher -> nodes
+
+Both ends are one asyncio program each; the robot's subscriptions run in a thread of rclpy's executor. Commands go the
+other way through a second pair, whose topics are ``no_drop``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, Final
+
+from bufgym.errors import BufgymError
+from bufgym.live import LogFile, PolicyQueue
+from bufgym.live.channels import TRANSPORTS
+from bufgym.live.odometry import Odometry
+from bufgym.live.receiver import Received, Receiver
+from bufgym.live.sender import Sender
+from bufgym.policies.registry import Policy
+from bufgym.ros2.names import Published, needs_rclpy, parse, published
+from bufgym.scenario import Client
+
+SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
+"""Names of the nodes. What a receiver publishes is never sent on: a pair each way makes no circle."""
+_LOOK_S: Final = 0.2
+"""Between two looks at who publishes."""
+_MATCH_S: Final = 1.0
+"""A new publisher's first message waits so long for a subscriber at most."""
+
+
+def _resolved(name: str) -> str:
+    return name if name.startswith("/") else f"/{name}"
+
+
+@contextmanager
+def _node(name: str) -> Iterator[Any]:
+    """A node of its own context."""
+    with needs_rclpy():
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node(name, context=context, enable_rosout=False, start_parameter_services=False)
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+class Robot:
+    """The sending end: the topics of ``client`` over one uplink to (``host``, ``port``)."""
+
+    def __init__(
+        self,
+        client: Client,
+        host: str,
+        port: int,
+        *,
+        policy: str | Policy = "learned-scheduler",
+        capacity: int = 32,
+        odometry: str | None = None,
+        transport: str = "tcp",
+        log: LogFile | None = None,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """
+        Args:
+            client: its topics, with the rules for each, and n_T; ``bufgym.scenario.read_client`` reads one.
+            policy: a drop rule for one topic, a scheduler for several.
+            capacity: L, messages of all topics together.
+            odometry: a topic with poses, which gives x to the topics that move; x of the others is time.
+            say: takes a line for each topic that is found.
+        """
+        moving = [stream.topic.name for stream in client.streams if stream.moves]
+        if moving and odometry is None:
+            raise BufgymError(f"topic {moving[0]!r}: moves, which needs a topic with odometry")
+        self.queue = PolicyQueue(
+            policy, capacity, value=client.value, topics=client.topics, window=client.window, log=log
+        )
+        self.sender = Sender(self.queue, lambda: TRANSPORTS[transport](host, port))
+        self._streams = client.streams
+        self._odometry_topic = odometry
+        self._odometry = Odometry()
+        self._began_s = time.monotonic()
+        self._say = say
+
+    async def run(self) -> None:
+        """Relay until cancelled."""
+        with _node(SENDER) as node:
+            from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+            executor = SingleThreadedExecutor(context=node.context)
+            executor.add_node(node)
+
+            def spin() -> None:
+                with suppress(ExternalShutdownException):
+                    executor.spin()
+
+            tasks = [
+                asyncio.create_task(self.sender.run()),
+                asyncio.create_task(self._look(node)),
+                asyncio.create_task(asyncio.to_thread(spin)),
+            ]
+            try:
+                done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()
+            finally:
+                executor.shutdown(timeout_sec=2.0)
+                for task in tasks:
+                    task.cancel()
+                await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _look(self, node: Any) -> None:
+        """Subscribe to each topic once somebody publishes it."""
+        wanted = {_resolved(stream.topic.name): number for number, stream in enumerate(self._streams)}
+        if self._odometry_topic is not None:
+            wanted[_resolved(self._odometry_topic)] = wanted.get(_resolved(self._odometry_topic), -1)
+        while wanted:
+            for name in list(wanted):
+                topic = published(node, name, RECEIVER)
+                if topic is not None:
+                    self._subscribe(node, topic, wanted.pop(name))
+                    self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}")
+            await asyncio.sleep(_LOOK_S)
+        await asyncio.Event().wait()
+
+    def _subscribe(self, node: Any, topic: Published, number: int) -> None:
+        if number >= 0:
+            stream, head = self._streams[number], topic.head()
+
+            def put(message: bytes) -> None:
+                x = self._odometry.x if stream.moves else (time.monotonic() - self._began_s) * stream.unit_hz
+                self.queue.put(head + message, len(head) + len(message), x, number)
+
+            node.create_subscription(topic.message_class, topic.name, put, topic.qos, raw=True)
+        if self._odometry_topic is not None and topic.name == _resolved(self._odometry_topic):
+            node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos)
+
+
+async def receive(
+    port: int,
+    host: str = "127.0.0.1",
+    transport: str = "tcp",
+    say: Callable[[str], None] = lambda text: None,
+) -> None:
+    """The other end: republish what comes, with its publishers' quality of service, until cancelled.
+
+    Messages of a type that is not installed here are told of once, and dropped.
+    """
+    with _node(RECEIVER) as node:
+        publishers: dict[Published, Any] = {}
+
+        async def republish(message: Received) -> None:
+            topic, body = parse(message.body)
+            if topic not in publishers:
+                try:
+                    publishers[topic] = node.create_publisher(topic.message_class, topic.name, topic.qos)
+                    say(f"{topic.name}: {topic.type}")
+                except BufgymError as error:
+                    publishers[topic] = None
+                    say(f"{topic.name}: dropped: {error}")
+                else:
+                    await _matched(publishers[topic])
+            if publishers[topic] is not None:
+                publishers[topic].publish(body)
+
+        receiver = Receiver(republish)
+        say(f"listening on {host}:{await receiver.listen(port, host, transport)}")
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await receiver.close()
+
+
+async def _matched(publisher: Any) -> None:
+    """Subscribers that are there already find a new publisher within some 100 ms; until then they would miss it."""
+    deadline_s = time.monotonic() + _MATCH_S
+    while publisher.get_subscription_count() == 0 and time.monotonic() < deadline_s:
+        await asyncio.sleep(0.01)

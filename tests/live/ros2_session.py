@@ -1,0 +1,146 @@
+"""Nodes in two domains with the relay between them, for test_ros2.py: prints what came, as JSON. Needs rclpy.
+
+robot (domain 71): camera, odometry, status (transient local)  -> send ... receive -> base (domain 72): viewers
+base: commands, no_drop                                        -> send ... receive -> robot: driver
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+
+from bufgym.ros2 import Publisher
+
+ROBOT = 20 + os.getpid() % 40 * 2
+BASE = ROBOT + 1
+"""Domains of DDS, others for each run: two may run at a time."""
+CONFIG = """
+[[topic]]
+name = "camera"
+rate_hz = 50
+size_bytes = 1000
+moves = true
+[[topic]]
+name = "/status"
+rate_hz = 1
+size_bytes = 100
+[[topic]]
+name = "ghost"
+rate_hz = 1
+size_bytes = 100
+"""
+COMMANDS = """
+[[topic]]
+name = "commands"
+rate_hz = 10
+size_bytes = 100
+no_drop = true
+"""
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class Side:
+    """A node in a domain of its own, and what it has heard."""
+
+    def __init__(self, domain: int, name: str) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context, domain_id=domain)
+        self.node = rclpy.create_node(name, context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.came: dict[str, list[str]] = {}
+
+    def hear(self, topic: str, qos: Any) -> None:
+        heard = self.came.setdefault(topic, [])
+        self.node.create_subscription(String, topic, lambda text: heard.append(text.data), qos)
+
+    def spin(self) -> None:
+        self.executor.spin_once(timeout_sec=0.0)
+
+
+def main(folder: str) -> None:
+    processes: list[subprocess.Popen[str]] = []
+
+    def start(domain: int, *words: str) -> str:
+        """A command of the relay in its domain; its first line."""
+        place = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        command = [sys.executable, "-u", "-m", "bufgym", "ros2", *words]
+        processes.append(subprocess.Popen(command, env=place, stdout=subprocess.PIPE, text=True))
+        stdout = processes[-1].stdout
+        assert stdout is not None
+        return stdout.readline().strip()
+
+    robot, base = Side(ROBOT, "robot"), Side(BASE, "base")
+    for name, text in (("client", CONFIG), ("commands", COMMANDS)):
+        Path(folder, f"{name}.toml").write_text(text)
+    base.hear("camera", BEST_EFFORT)
+    base.hear("status", LATCHED)
+    base.hear("own/echo", 10)
+    robot.hear("commands", 10)
+    camera = robot.node.create_publisher(String, "camera", BEST_EFFORT)
+    odometry = robot.node.create_publisher(PoseStamped, "odom", 10)
+    robot.node.create_publisher(String, "status", LATCHED).publish(String(data="up"))
+    commands = base.node.create_publisher(String, "commands", 10)
+    try:
+        there = start(BASE, "receive", "--port", "0").rpartition(" ")[2]
+        back = start(ROBOT, "receive", "--port", "0").rpartition(" ")[2]
+        log = ["--log", str(Path(folder, "log.mcap"))]
+        told = start(ROBOT, "send", "--config", f"{folder}/client.toml", "--to", there, "--odom", "odom", *log)
+        told_back = start(BASE, "send", "--config", f"{folder}/commands.toml", "--to", back)
+        own = Publisher(robot.node, String, "own/echo", to=("127.0.0.1", int(there.rpartition(":")[2])))
+        deadline_s = time.monotonic() + 20
+        while camera.get_subscription_count() + odometry.get_subscription_count() < 2:
+            assert time.monotonic() < deadline_s, "nobody subscribes"
+            robot.spin()
+        for k in range(100):
+            pose = PoseStamped()
+            pose.header.stamp.sec, pose.header.stamp.nanosec = 100, k * 9_000_000
+            pose.pose.position.x, pose.pose.orientation.w = 0.02 * k, 1.0
+            odometry.publish(pose)
+            camera.publish(String(data=str(k)))
+            own.publish(String(data=str(k)))
+            if k % 10 == 0:
+                commands.publish(String(data=str(k)))
+            end_s = time.monotonic() + 0.02
+            while time.monotonic() < end_s:
+                robot.spin()
+                base.spin()
+        end_s = time.monotonic() + 1.5
+        while time.monotonic() < end_s:
+            robot.spin()
+            base.spin()
+        own.destroy(1.0)
+        quality = base.node.get_publishers_info_by_topic("/camera")[0]
+        print(
+            json.dumps(
+                {
+                    "came": base.came | robot.came,
+                    "told": [told, told_back],
+                    "best_effort": quality.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT,
+                    "by": quality.node_name,
+                    "faults": list(own.sender.faults),
+                }
+            ),
+            flush=True,
+        )
+        for process in processes:
+            process.terminate()
+            process.wait(20)
+    finally:
+        for process in processes:
+            process.kill()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
