@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.step import action_of
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for
+from bufgym.kernel import compile_for, entry, located
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.policies import Policy
 from bufgym.policies.registry import runs_compiled, signatures
@@ -46,6 +46,7 @@ class Player:
             raise BufgymError(f"policy {policy.name} {reason}: it can be benchmarked, but not play in an environment")
         self.policy = policy
         self._parameters = policy.parameter_array
+        self._functions = tuple(map(located, signatures(), policy.compiled)) if runs_compiled(policy) else None
         self._memory = np.zeros((n, 1))
         self._begun = np.zeros(n, np.int64)
         self._heard = np.zeros(n, np.int64)
@@ -78,12 +79,12 @@ class Player:
         rows = np.arange(len(senders)) if rows is None else rows
         rows = rows[waiting[rows] != NOTHING_WAITS]
         actions = np.full(len(senders), senders.capacity)
-        if not runs_compiled(self.policy):
+        if self._functions is None:
             actions[rows] = [self.action(senders, i) for i in rows.tolist()]
             return actions
         self._begin(senders, rows)
-        batch, compiled = senders.batch._replace(parameters=self._parameters), self.policy.compiled
-        on_arrival, on_departure, _, on_send = compiled
+        batch = senders.batch._replace(parameters=self._parameters)
+        on_arrival, on_departure, _, on_send = self._functions
         hears, answers = self.policy.hears_departures, actions.copy()
         compiled_ask()(batch, self._memory, self._heard, rows, on_arrival, on_departure, on_send, hears, answers)
         dropped = rows[waiting[rows] == ARRIVAL_WAITS]
@@ -151,9 +152,9 @@ def ask(
 
 @functools.cache
 def compiled_ask() -> Any:
-    """``ask`` compiled once for every policy, as the rollout is."""
+    """``ask`` compiled once for every policy, as the rollout is: its code."""
     on_arrival, on_departure, _, on_send = map(numba.types.FunctionType, signatures())
     types = numba.types
     numbers, memory = types.Array(types.int64, 1, "C"), types.Array(types.float64, 2, "C")
     kinds = batch_type(), memory, numbers, numbers, on_arrival, on_departure, on_send, types.boolean, numbers
-    return compile_for(types.void(*kinds), ask)
+    return entry(compile_for(types.void(*kinds), ask))

@@ -8,7 +8,7 @@ check the compiled code against its own text.
 from bufgym.kernel.announce import compile_silently
 from bufgym.kernel.arrays import at, item, prefetch, records, stretch, table
 from bufgym.kernel.cache import FOLDER, JIT
-from bufgym.kernel.compile import compile_for, direct, interruptible, kernel, located
+from bufgym.kernel.compile import compile_for, direct, entry, interruptible, kernel, located
 
 __all__ = [
     "FOLDER",
@@ -17,6 +17,7 @@ __all__ = [
     "compile_for",
     "compile_silently",
     "direct",
+    "entry",
     "interruptible",
     "item",
     "kernel",

@@ -70,6 +70,18 @@ def compile_for(signature: Any, function: Function) -> Function:
     return cast(Function, compiled)
 
 
+def entry(compiled: Any) -> Any:
+    """The code itself of what ``compile_for`` returned, for callers in Python that hand it the types of its signature.
+
+    To find the code for their types Numba looks at every array of every tuple, at each call: 3 us, and ten times that
+    where there are functions among them. Here nobody looks: other types go unnoticed.
+    """
+    if not JIT:
+        return compiled
+    (overload,) = compiled.overloads.values()
+    return overload.entry_point
+
+
 class _Direct:
     """A kernel whose calls all have arguments of the types of the first."""
 
@@ -82,16 +94,12 @@ class _Direct:
         if self._entry is None:
             signature = tuple(cast(Any, numba).typeof(argument) for argument in arguments)
             self._compiled.compile(signature)
-            self._entry = self._compiled.overloads[signature].entry_point
+            self._entry = entry(self._compiled)
         return self._entry(*arguments)
 
 
 def direct(compiled: Function) -> Function:
-    """A ``kernel`` that Python calls for every step, always with arguments of the same types.
-
-    To find the code for their types Numba looks at every array of every tuple, at each call: 3 us that a step of a
-    single environment need not take. Arrays of other types than those of the first call are not noticed.
-    """
+    """A ``kernel`` that Python calls for every step by its ``entry``, always with the types of the first call."""
     return cast(Function, _Direct(compiled)) if JIT else compiled
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import located
+from bufgym.kernel import entry, located
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
@@ -64,7 +64,7 @@ class Row:
         self.memory = policy.new_memory(1, self.senders.capacity)
         self._use(self.senders.batch, room)
         self._functions = tuple(map(located, signatures(), policy.compiled)) if runs_compiled(policy) else None
-        self._rollout: Any = compiled_rollout(False) if self._functions else None
+        self._rollout: Any = entry(compiled_rollout(False)) if self._functions else None
 
     def _use(self, batch: Batch, room: int) -> None:
         """Go on with these arrays, of which the messages that have not come yet are free."""
