@@ -31,7 +31,7 @@ POINTS, POINTS_EACH = 24, 3
 """Points of the grid of arrivals to come: so many, and so many more for each of L + 1 candidates."""
 PER_MESSAGE = 3.0
 """Points of the grid to each message that the link is expected to carry."""
-WORK_PER_US = 300.0
+WORK_PER_US = 120.0
 """Steps of the programme that count as a microsecond: a budget is one of work, so that every machine decides alike."""
 STEP_WEIGHT = 1 / 16
 """Of the newest motion step in the mean that is expected to go on."""
