@@ -2,7 +2,7 @@
 
 A ``Figure`` is a figure, table or theorem of a paper. Its dataclass fields are its options. ``simulate`` returns the
 numbers, ``claims`` what they say about the paper's sentences, ``draw`` makes the picture. The sentences themselves are
-in ``afr.toml`` and ``robofleet.toml``, one section a figure, with what is said around them.
+in ``afr.toml`` and ``robofleet.toml``, ours in ``own.toml``, one section a figure, with what is said around them.
 """
 
 from __future__ import annotations
@@ -117,8 +117,8 @@ class Figure(ABC):
 def statements() -> dict[str, dict[str, Any]]:
     """Name of a figure -> its texts: title, setup, notes, and under claims the paper's sentences."""
     texts: dict[str, dict[str, Any]] = {}
-    for paper in ("afr", "robofleet"):
-        with (Path(__file__).parent / f"{paper}.toml").open("rb") as file:
+    for part in ("afr", "robofleet", "own"):
+        with (Path(__file__).parent / f"{part}.toml").open("rb") as file:
             texts |= tomllib.load(file)
     return texts
 

@@ -16,8 +16,9 @@ from bufgym.reproduce.figure import facts_of, source, statements
 PAPERS = {
     "afr": "AFR [wang2022afr]",
     "robofleet": "Robofleet [sikand2021robofleet]",
+    "small": "Beside the papers: a link small enough to be solved",
 }
-"""Start of a section's name -> the paper, with its key in references.bib."""
+"""Start of a section's name -> the paper, with its key in references.bib, or what is ours."""
 
 VERDICTS = {True: "holds", False: "**differs**", None: "not checked"}
 

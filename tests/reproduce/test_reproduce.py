@@ -37,6 +37,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "afr-vs-random": {"max_capacity": 8, "last_T": 20},
     "afr-theorems": {"max_capacity": 4, "last_T": 40},
     "afr-fig9": {"decisions": 1000, "calls": 100},
+    "small-link": {"capacities": (2, 3), "runs": 3, "arrivals": 12, "depth": 3},
     "robofleet-table1": {"points": 50},
     "robofleet-fig3": {"rates_hz": (5, 100), "duration_s": 0.5, "runs": 1},
     "robofleet-fig4": {"dropouts_s": (1,), "links_mbit_per_s": (100,), "kinds": ("CompressedImage",), "runs": 2},
