@@ -76,7 +76,8 @@ class Player:
         One compiled call where the policy is compiled.
         """
         waiting = senders.batch.senders["waiting"]
-        rows = np.arange(len(senders)) if rows is None else rows
+        # Whole numbers of another size would be read as these.
+        rows = np.arange(len(senders)) if rows is None else np.ascontiguousarray(rows, np.int64)
         rows = rows[waiting[rows] != NOTHING_WAITS]
         actions = np.full(len(senders), senders.capacity)
         if self._functions is None:
