@@ -33,7 +33,6 @@ RUN = {
     r"bufgym bench --policies learned-motion,afr|bufgym bench --policy-file mine\.py --policies every-other.*": (
         "--seconds 2 --seeds 1"
     ),
-    r"bufgym bench --workload drive\.mcap .*": "--seeds 1 --policies afr --capacity 1",
     r"bufgym bench (--scenario-file|--workload (frames|nav2)|--policies ppo\.zip).*": "--seeds 1",
     r"bufgym dataset make --kind mixed .*": "--episodes 3 --option duration_s=2.0",
     r"bufgym dataset make --suite lte-v1 .*": "--episodes 2 --out data",
@@ -59,7 +58,8 @@ PARSED = {
     r"bufgym reproduce afr-fig9": "tests/reproduce/test_reproduce.py",
     r"bufgym trace fit .*": "needs recordings; tests/traces/test_fit.py",
     r"bufgym (perf|warmup)": "tests/benchmark/test_perf_and_play.py, test_warmup.py",
-    r"bufgym (topics --policy-file|play|bench --policies (clairvoyant|learned-motion).*seeds) .*": "tests/test_readme.py",
+    r"bufgym (topics --policy-file|play|bench --policies .*seeds) .*": "tests/test_readme.py",
+    r"bufgym bench --workload drive\.mcap .*": "tests/test_cli_workload.py",
     r"bufgym bench .*(my-agent.zip|every-second|drive\.csv).*": "the tutorial before it makes its files; test_site.py",
     r"python train\.py .*": "minutes to hours; tests/test_train.py",
     r"python -m agents\..*": "needs a run's folder; tests/test_agents.py, test_scheduling.py, test_ablation.py",
