@@ -140,6 +140,20 @@ def test_a_block_without_a_language_holds_commands() -> None:
             assert all(line.split(" ")[0] in page_cases.PROGRAMS for line in lines), (block.page, block.text)
 
 
+def test_every_picture_stands_beside_the_command_that_makes_it() -> None:
+    """Named in the paragraph behind it, or before the page's first section where one command makes all of them."""
+    pictures = 0
+    for page, text in page_cases.texts().items():
+        for found in re.finditer(r"!\[[^\]]*\]\([^)]+\)", text):
+            caption = " ".join(text[found.end() :].strip(") \n").split("\n\n")[:2])
+            said = re.findall(r"`([^`]+)`", caption) + re.findall(r"Made by `([^`]+)`", text.partition("\n## ")[0])
+            # Those of the tutorials: website/tutorials.py says so of all.
+            made = any(" ".join(command.split()) in commands() for command in said)
+            assert made or page.startswith("docs/tutorials/"), (page, found[0])
+            pictures += 1
+    assert pictures > 30
+
+
 # -------------------- commands: run
 
 
