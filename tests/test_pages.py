@@ -57,7 +57,7 @@ PARSED = {
     r"bufgym live .*": "sockets; tests/live/test_command.py",
     r"bufgym reproduce afr-fig9": "tests/reproduce/test_reproduce.py",
     r"bufgym trace fit .*": "needs recordings; tests/traces/test_fit.py",
-    r"bufgym (perf|warmup)": "tests/benchmark/test_perf_and_play.py, test_warmup.py",
+    r"bufgym (perf( --peers)?|warmup)": "tests/benchmark/test_perf_and_play.py, test_warmup.py",
     r"bufgym (topics --policy-file|play|bench --policies .*seeds) .*": "tests/test_readme.py",
     r"bufgym bench --workload drive\.mcap .*": "tests/test_cli_workload.py",
     r"bufgym bench .*(my-agent.zip|every-second|drive\.csv).*": "the tutorial before it makes its files; test_site.py",

@@ -13,6 +13,7 @@ def add(commands: Commands) -> None:
     perf = command(commands, "perf", _perf, "measure bufgym's own speed on this machine")
     perf.add_argument("--json", metavar="FILE", help="also write the figures to FILE")
     perf.add_argument("--repeats", type=count, default=3, help="best of so many (%(default)s)")
+    perf.add_argument("--peers", action="store_true", help="beside CartPole of gymnasium, envpool, pufferlib, if here")
     perf.add_argument("--quick", action="store_true", help="tiny sizes: does it run at all?")
 
 
@@ -24,7 +25,14 @@ def _perf(options: argparse.Namespace) -> None:
         sizes = perf.Sizes(4, 4, 20, 5, 20, 1, options.repeats)
     elif sys.stderr.isatty():
         print("measuring; this takes about half a minute ...", file=sys.stderr)
-    figures = perf.measure(sizes)
+    figures, absent = perf.measure(sizes), list[str]()
+    if options.peers:
+        from bufgym.benchmark import perf_peers
+
+        peers, absent = perf_peers.measure(sizes, figures)
+        figures += peers
     print(perf.report(figures, sizes.repeats))
+    if absent:
+        print(f"Not here, so left out: {', '.join(absent)}")
     if options.json is not None:
         perf.write_json(figures, sizes, Path(options.json))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import pytest
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark import perf
+from bufgym.benchmark import perf, perf_peers
 from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
 from bufgym.expert import Player
@@ -44,6 +46,17 @@ def test_every_figure_is_a_number_with_its_definition(tmp_path: Path) -> None:
     perf.write_json(figures, TINY, tmp_path / "perf.json")
     read = json.loads((tmp_path / "perf.json").read_text())
     assert [figure["name"] for figure in read["figures"]] == [figure.name for figure in figures]
+
+
+def test_a_peer_stands_beside_the_native_batch_of_the_same_run() -> None:
+    ours = [perf.Figure(f"native batch, {id}", 1e6, "steps/s", None, "as measured") for id in perf.ENVIRONMENTS]
+    nobody = perf_peers.Peer("no_such_package", "nobody's", lambda n: None)
+    broken = perf_peers.Peer("numpy", "half of it", lambda n: importlib.import_module("no_such_part"))
+    found, absent = perf_peers.measure(TINY, ours, (perf_peers.PEERS[0], nobody, broken))
+    speed, *ratios = found
+    assert speed.name == "CartPole, gymnasium" and f"gymnasium {version('gymnasium')}, n = 2" in speed.definition
+    assert [figure.value for figure in ratios] == [1e6 / speed.value] * len(ours)
+    assert absent == ["no_such_package", "numpy (No module named 'no_such_part')"]
 
 
 def test_recorded_actions_are_possible_when_played_again() -> None:
