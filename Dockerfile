@@ -3,6 +3,7 @@
 #   docker run --rm -v "$PWD/runs:/bufgym/runs" bufgym              make train
 #   docker run --rm bufgym make test
 FROM python:3.12-slim
+# hadolint ignore=DL3008
 RUN apt-get update \
  && apt-get install -y --no-install-recommends chromium git make \
  && rm -rf /var/lib/apt/lists/*

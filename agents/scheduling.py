@@ -38,7 +38,7 @@ information at the server, of the topics of priority 20 ("first") and of the oth
 
 ## By setting
 
-```
+```text
 {text}
 ```
 """

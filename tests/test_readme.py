@@ -91,7 +91,7 @@ def test_a_new_user_can_follow_start_here(
 @pytest.mark.slow
 def test_the_table_is_what_its_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
     text = (REPO / "README.md").read_text(encoding="utf-8")
-    command, table = re.findall(r"```\n(bufgym bench --policies [^\n]*)\n```\n\n```\n(.*?)```", text, re.DOTALL)[0]
+    command, table = re.findall(r"```\n(bufgym bench --policies [^\n]*)\n```\n\n```text\n(.*?)```", text, re.DOTALL)[0]
     assert main(command.split()[1:]) == 0
     assert capsys.readouterr().out.strip() == table.strip()
 

@@ -57,6 +57,15 @@ def test_a_picture_of_a_policy_shows_what_it_keeps() -> None:
     assert "H = 5.06" in svg
 
 
+def test_columns_of_numbers_stand_to_the_right() -> None:
+    rows = [("afr", "0.30 [0.28, 0.33]", "5, 10"), ("min|gap", "0.52", "none")]
+    assert markdown.table(("policy", "score", "L"), rows).splitlines()[1:] == [
+        "| --- | ---: | --- |",
+        "| afr | 0.30 [0.28, 0.33] | 5, 10 |",
+        "| min\\|gap | 0.52 | none |",
+    ]
+
+
 def test_suites_and_commands_are_all_there() -> None:
     assert all(f"| `{name}` |" in suites.page() for name in SUITES)
     page = commands.page()

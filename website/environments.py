@@ -68,7 +68,9 @@ def index() -> str:
     """The list of all environments with their films."""
     rows = [(f"[`{title(id)}`]({slug(id)}.md)", about(id)) for id in HISTORY]
     films = "\n\n".join(
-        f"[![{about(id)}](../gallery/{slug(id)}.webp)]({slug(id)}.md)\n\n`{title(id)}`: {about(id)}." for id in HISTORY
+        f"[![{about(id)}](../gallery/{slug(id)}.webp)]({slug(id)}.md)\n\n"
+        f"*`{title(id)}`: {about(id)}. {_made_by(slug(id))}*"
+        for id in HISTORY
     )
     return "\n\n".join(
         [
@@ -136,11 +138,14 @@ def _make(id: str) -> str:
     return f'```python\nimport bufgym\nimport gymnasium as gym\n\nenv = gym.make("{id}")\n```'
 
 
+def _made_by(film: str) -> str:
+    return f"Made by `bufgym gallery {film} --out docs/gallery`"
+
+
 def _films(id: str) -> list[str]:
     """Its films, each with the command that makes it."""
     return [
-        f"![{film.about}](../gallery/{name}.webp)\n\n*{film.about[0].upper()}{film.about[1:]}. Made by*"
-        f" `bufgym gallery {name} --out docs/gallery`"
+        f"![{film.about}](../gallery/{name}.webp)\n\n*{film.about[0].upper()}{film.about[1:]}. {_made_by(name)}*"
         for name, film in FILMS.items()
         if film.environment == id and name == slug(id)
     ]

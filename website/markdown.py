@@ -12,8 +12,12 @@ from typing import Any
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; bars and line breaks in cells are made harmless."""
-    lines = [head, ["---"] * len(head), *([_cell(cell) for cell in row] for row in rows)]
+    """A table, columns of numbers to the right; bars and line breaks in cells are made harmless."""
+    cells = [[_cell(cell) for cell in row] for row in rows]
+    numbers = [
+        all(re.fullmatch(r"[-\d.,%]+( \[.*\])?", cell) for cell in column) for column in zip(*cells, strict=True)
+    ]
+    lines = [head, ["---:" if right else "---" for right in numbers], *cells]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 

@@ -18,7 +18,7 @@ PARTS = {
     "For one queue": (
         "Each picture is the same interruption of 60 messages with L = 8. A line is a message that the server received,"
         " H the Quantity of Information of all of them (V = `exponential:0.618`). The best possible H is shown at"
-        " `clairvoyant`."
+        " `clairvoyant`. `make docs` draws them."
     ),
     "Only where they are named": "`bufgym bench` leaves these out unless you name them.",
     "For many topics": "These choose what to drop and what to send next. `bufgym topics` compares them.",

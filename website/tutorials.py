@@ -20,7 +20,8 @@ def made() -> dict[str, bytes]:
     for source in sources():
         notebook = jupytext.read(source)
         page = [cell.source if cell.cell_type == "markdown" else _block(cell.source) for cell in notebook.cells]
-        page += [f"[The same as a notebook]({source.stem}.ipynb)"]
+        page += ["*This page drew the picture; `make tutorials` draws it again.*"]
+        page += [f"[The page as a notebook]({source.stem}.ipynb)"]
         found[f"tutorials/{source.stem}.md"] = "\n\n".join(page).encode()
         found[f"tutorials/{source.stem}.ipynb"] = jupytext.writes(notebook, fmt="ipynb").encode()
     return found

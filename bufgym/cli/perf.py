@@ -16,6 +16,7 @@ def add(commands: Commands) -> None:
     perf.add_argument(
         "--profile", action="store_true", help="what the time of a step goes into, in place of the figures"
     )
+    perf.add_argument("--peers", action="store_true", help="beside CartPole of gymnasium, envpool, pufferlib, if here")
     perf.add_argument("--quick", action="store_true", help="tiny sizes: does it run at all?")
 
 
@@ -32,7 +33,14 @@ def _perf(options: argparse.Namespace) -> None:
 
         print(perf_profile.report(perf_profile.profile(sizes)))
         return
-    figures = perf.measure(sizes)
+    figures, absent = perf.measure(sizes), list[str]()
+    if options.peers:
+        from bufgym.benchmark import perf_peers
+
+        peers, absent = perf_peers.measure(sizes, figures)
+        figures += peers
     print(perf.report(figures, sizes.repeats))
+    if absent:
+        print(f"Not here, so left out: {', '.join(absent)}")
     if options.json is not None:
         perf.write_json(figures, sizes, Path(options.json))

@@ -86,7 +86,8 @@ def make(
                 infos=infos,
             )
 
-    root = Path(out or os.environ.get(VARIABLE) or Path.home() / ".minari" / "datasets")
+    # Minari writes Arrow files beside its own folder where that is relative.
+    root = Path(out or os.environ.get(VARIABLE) or Path.home() / ".minari" / "datasets").absolute()
     if (root / name).exists():
         raise BufgymError(f"{root / name}: exists already; remove it or give another --name")
     root.mkdir(parents=True, exist_ok=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,9 @@ import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark import perf, perf_profile
+
+
+from bufgym.benchmark import perf, perf_peers
 from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
 from bufgym.expert import Player
@@ -54,6 +59,17 @@ def test_the_parts_of_a_step_add_up_to_it() -> None:
     assert len(by_environment) == 4 and list(by_environment.values()) == pytest.approx([1.0] * 4, abs=1e-6)
     text = perf_profile.report(parts)
     assert all(part.of in text and part.name in text for part in parts)
+
+
+def test_a_peer_stands_beside_the_native_batch_of_the_same_run() -> None:
+    ours = [perf.Figure(f"native batch, {id}", 1e6, "steps/s", None, "as measured") for id in perf.ENVIRONMENTS]
+    nobody = perf_peers.Peer("no_such_package", "nobody's", lambda n: None)
+    broken = perf_peers.Peer("numpy", "half of it", lambda n: importlib.import_module("no_such_part"))
+    found, absent = perf_peers.measure(TINY, ours, (perf_peers.PEERS[0], nobody, broken))
+    speed, *ratios = found
+    assert speed.name == "CartPole, gymnasium" and f"gymnasium {version('gymnasium')}, n = 2" in speed.definition
+    assert [figure.value for figure in ratios] == [1e6 / speed.value] * len(ours)
+    assert absent == ["no_such_package", "numpy (No module named 'no_such_part')"]
 
 
 def test_recorded_actions_are_possible_when_played_again() -> None:
