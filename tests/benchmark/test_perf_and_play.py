@@ -17,10 +17,7 @@ import pytest
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark import perf, perf_profile
-
-
-from bufgym.benchmark import perf, perf_peers
+from bufgym.benchmark import perf, perf_peers, perf_profile
 from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
 from bufgym.expert import Player
