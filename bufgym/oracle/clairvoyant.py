@@ -71,6 +71,8 @@ def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> P
         room = min(capacity, most_bytes // int(size[0]))
         limit = np.full(n, room * size[0] if room else NEVER)
         sent, gain = labels.best(c, size, limit, x, v.array, ends)
+    elif _fits(c, size, capacity, most_bytes, ends, np.empty(n, np.int64)):
+        sent, gain = np.arange(n), v.information(x) - 1.0  # as V is concave, no plan is better than to send all
     else:
         limit = np.empty(n, np.int64)
         _relaxed_limits(c, size, capacity, most_bytes, np.empty(n, np.int64), np.empty(capacity, np.int64), limit)
@@ -81,7 +83,7 @@ def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> P
     kept[sent] = True
     qoi = 1.0 + gain if len(sent) else 0.0
     reached = v.information(x[sent]) >= qoi - 1e-9
-    fits = bool(_fits(c[sent], size[sent], capacity, most_bytes, np.empty(len(sent), np.int64)))
+    fits = bool(_fits(c[sent], size[sent], capacity, most_bytes, ends, np.empty(len(sent), np.int64)))
     # Arrivals without a decision are accepted where there is room.
     undecided = ~kept
     undecided[episode.first_decision : episode.last_decision + 1] = False
@@ -131,9 +133,9 @@ def _relaxed_limits(
 
 @kernel
 def _fits(
-    c: NDArray[np.int64], size: NDArray[np.int64], capacity: int, max_bytes: int, leaves: NDArray[np.int64]
+    c: NDArray[np.int64], size: NDArray[np.int64], capacity: int, max_bytes: int, ends: int, leaves: NDArray[np.int64]
 ) -> bool:
-    """Whether a sender has room for each of these messages, if nothing else arrives.
+    """Whether a sender has room for each of these messages, if nothing else arrives, and the link carries them all.
 
     ``leaves[k]``: message k is queued until the link has carried so many bytes.
     """
@@ -147,7 +149,7 @@ def _fits(
         backlog += size[k]
         leaves[k] = e
         e = max(c[k], e) + size[k]
-    return True
+    return bool(e <= ends)
 
 
 # --- as a policy -----------------------------------------------------------------------------------------------------

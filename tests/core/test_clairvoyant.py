@@ -156,6 +156,18 @@ def test_is_an_upper_bound_where_sizes_differ(case, v):
         assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
 
 
+def test_where_nothing_need_be_dropped_all_is_sent_at_once():
+    """A few small messages on a link of gigabytes: no grid over its bytes is laid out."""
+    fast = ((0, 0), (300_000_000, 3_000_000_000))
+    episode = line(np.arange(10) * 30_000_000, sizes=np.arange(10) + 1, x=np.arange(10) ** 2.0, knots=fast)
+    plan = clairvoyant(episode, 3, V)
+    assert plan.kept.all() and plan.certified
+    assert plan.qoi == pytest.approx(1 + sum(V(2 * k + 1) for k in range(9)))
+    # A link that ends after two and a half of them carries two.
+    stopped = line([0, 0, 0], sizes=[10, 20, 30], x=[0.0, 1.0, 2.0], knots=((0, 0), (1_000, 45)), after="stop")
+    assert clairvoyant(stopped, 3, V).kept.sum() == 2
+
+
 def test_unequal_sizes_by_hand():
     """L = 1, messages of 10, 30 and 10 us at 0, 5 and 6: of the two that wait only one has room, and the small one
     lets the fourth, at 25, find an idle link."""
