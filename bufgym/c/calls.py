@@ -10,6 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.errors import BufgymError
 from bufgym.kernel import at, compile_for, kernel, records
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
@@ -98,6 +99,8 @@ def recorded(
 
     No message may be larger than B: such a one is dropped unasked, and no call would say so.
     """
+    if policy.drops_at_dequeue or policy.schedules:
+        raise BufgymError(f"policy {policy.name}: is asked when the socket is free: must decide at arrivals alone")
     longest = max(len(episode.arrivals) for episode in episodes)
     senders = Senders(len(episodes), capacity, value, max_messages=longest, max_bytes=max_bytes)
     for i, episode in enumerate(episodes):

@@ -53,6 +53,10 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         BufgymError: a policy that has no C, or a limit that is none.
     """
     check_limits(capacity, max_bytes)
+    learns = policy.on_arrival is learned.on_arrival
+    body = _part("features.h") + _part("scorer.h") if learns else _rule(policy)
+    if "bufgym_departure(" not in body:
+        body += "\n" + _part("no_departure.h")
     unlimited = max_bytes is None
     numbers = {
         "ABOUT": _comment(policy.summary),
@@ -69,19 +73,14 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "VALUE": _comment(value.name),
         "VALUE_PART": _array("double", "bufgym_v", value.array) + _part(f"value_{_VALUES[int(value.array[0])]}.h"),
         "SCRATCH": "",
+        "POLICY": body,
         "TINY": repr(TINY),
         "ROUNDING": repr(ROUNDING),
         "STILL": repr(learned.STILL),
         "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
     }
-    if policy.on_arrival is learned.on_arrival:
+    if learns:
         numbers |= _scorers(policy)
-        body = _part("features.h") + _part("scorer.h")
-    else:
-        body = _rule(policy)
-    if "bufgym_departure(" not in body:
-        body += "\n" + _part("no_departure.h")
-    numbers["POLICY"] = body
     return _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from bufgym.cli.options import Commands, command, count, load_policies, loaded, policy_file, refuse
+from bufgym.cli.options import Commands, command, count, refuse
 from bufgym.errors import BufgymError
 
-_FOR_C = ("capacity", "max_bytes", "value", "policy_file")
+_FOR_C = ("capacity", "max_bytes", "value")
 _FOR_WEIGHTS = ("name", "about")
 
 
@@ -31,7 +31,6 @@ def add(commands: Commands) -> None:
     c.add_argument("--capacity", type=count, metavar="L", help="L, messages (16)")
     c.add_argument("--max-bytes", type=count, metavar="B", help="B, bytes queued at most (no limit)")
     c.add_argument("--value", metavar="V", help="V as in saturating:4 (exponential:0.618)")
-    policy_file(c)
 
 
 def _export(options: argparse.Namespace) -> None:
@@ -55,9 +54,7 @@ def _as_c(options: argparse.Namespace, out: str) -> object:
     from bufgym.model import qoi
 
     refuse(options, _FOR_WEIGHTS, "belongs to --to safetensors")
-    load_policies(options.policy_file)
-    names, _ = loaded([options.model])
-    if len(names) != 1:
-        raise BufgymError(f"{options.model}: must be one policy")
+    is_file = options.model.endswith(".safetensors")
+    policy = policies.load(options.model) if is_file else policies.get(options.model)
     value = qoi.load(options.value or "exponential:0.618")
-    return c.write(policies.get(names[0]), out, options.capacity or 16, value, options.max_bytes)
+    return c.write(policy, out, options.capacity or 16, value, options.max_bytes)
