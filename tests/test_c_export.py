@@ -123,7 +123,7 @@ def check(folder, policy, decisions):
     for k, (L, value, B) in enumerate(SETTINGS if JIT else SETTINGS[3:]):
         rng = np.random.default_rng(k)
         n = 1_000 if JIT else 40
-        episodes = [random_episode(rng, n, B) for _ in range(max(2, decisions // n))]
+        episodes = [random_episode(rng, n, B) for _ in range(decisions // n if JIT else 2)]
         calls = recorded(policy, episodes, L, value, B)
         assert calls.dtype == CALL
         calls.tofile(folder / "calls")
