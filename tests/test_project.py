@@ -30,6 +30,7 @@ ROOMS = [
     "sim",
     "oracle",
     "live",
+    "c",
     "envs",
     "expert",
     "sb3",

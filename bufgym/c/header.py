@@ -1,0 +1,178 @@
+"""Puts a policy's header together: its parts in C, and the policy's numbers as constants."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import __version__, policies
+from bufgym.c.calls import random_episode, recorded
+from bufgym.errors import BufgymError, printable
+from bufgym.files import replaced
+from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
+from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
+from bufgym.observe import CONTEXT_FIELDS, ON_BOARD_FIELDS, SLOT_FIELDS
+from bufgym.observe.queue import ROUNDING, TINY
+from bufgym.policies import Policy, learned
+from bufgym.policies.scoring import end_of, unpack
+
+_PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
+SUPPORTED = tuple(sorted(path.stem for path in _RULES.glob("*.h")))
+"""Names of the rules that can be exported; learned agents for one queue can be as well."""
+_HELPERS = {"bufgym_gaps_of(": "gaps.h", "bufgym_smallest_time_gap(": "time_gap.h", "bufgym_thin(": "thin.h"}
+"""Parts that rules share, each before those that call it."""
+_VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
+_SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
+"""Of the calls in the header."""
+
+
+def write(policy: Policy, out: str | Path, capacity: int, value: Value, max_bytes: int | None = None) -> Path:
+    """``header`` into the file ``out``, whole or not at all.
+
+    Raises:
+        BufgymError: as ``header``, or the file cannot be written.
+    """
+    target, text = Path(out), header(policy, capacity, value, max_bytes)
+    try:
+        with replaced(target) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise BufgymError(f"{target}: cannot be written: {error.strerror}") from None
+    return target
+
+
+def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = None) -> str:
+    """The policy as one C99 header, for L = ``capacity`` and B = ``max_bytes``, with V = ``value``.
+
+    Raises:
+        BufgymError: a policy that has no C, or a limit that is none.
+    """
+    check_limits(capacity, max_bytes)
+    learns = policy.on_arrival is learned.on_arrival
+    body = _part("features.h") + _part("scorer.h") if learns else _rule(policy)
+    if "bufgym_departure(" not in body:
+        body += "\n" + _part("no_departure.h")
+    unlimited = max_bytes is None
+    numbers = {
+        "ABOUT": _comment(policy.summary),
+        "SOURCE": _comment(policy.source),
+        "NAME": _comment(policy.name),
+        "VERSION": __version__,
+        "CAPACITY": capacity,
+        "UNLIMITED": UNLIMITED_BYTES,
+        "MAX_BYTES": "BUFGYM_UNLIMITED" if unlimited else f"INT64_C({max_bytes})",
+        "LIMIT": "no limit" if unlimited else max_bytes,
+        "MEMORY": ", ".join(map(repr, map(float, policy.memory.values()))) or "0.0",
+        "MEMORY_SIZE": max(1, len(policy.memory)),
+        "PARAMETERS": _array("double", "bufgym_parameters", policy.parameters.values()) if policy.parameters else "",
+        "VALUE": _comment(value.name),
+        "VALUE_PART": _array("double", "bufgym_v", value.array) + _part(f"value_{_VALUES[int(value.array[0])]}.h"),
+        "SCRATCH": "",
+        "POLICY": body,
+        "TINY": repr(TINY),
+        "ROUNDING": repr(ROUNDING),
+        "STILL": repr(learned.STILL),
+        "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
+    }
+    if learns:
+        numbers |= _scorers(policy)
+    return _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
+
+
+def _rule(policy: Policy) -> str:
+    """The C of a rule, after what it shares with others."""
+    name = policy.name.partition(":")[0]
+    if name not in SUPPORTED or policies.get(name).on_arrival is not policy.on_arrival:
+        known = ", ".join(SUPPORTED)
+        raise BufgymError(f"policy {policy.name}: has no C; known: {known}, and learned agents for one queue")
+    rule = (_RULES / f"{name}.h").read_text(encoding="utf-8")
+    helpers = ""
+    for call, part in reversed(_HELPERS.items()):  # a helper may call the one before it
+        if call in helpers + rule:
+            helpers = _part(part) + helpers
+    return helpers + rule
+
+
+def _scorers(policy: Policy) -> dict[str, Any]:
+    """What a learned policy's C is filled with: its scorers, their scratch and the fields."""
+    parameters, begin, networks = np.array(policy.weights), 0, len(learned.Weights.NETWORKS)
+    entries: list[str] = []
+    text, inputs, units = "", 1, 1
+    while begin < len(parameters):
+        scorer = getattr(unpack, "py_func", unpack)(parameters, begin, networks)
+        k, n = len(entries), len(scorer.fields)
+        text += _array("int", f"bufgym_fields_{k}", scorer.fields.astype(int))
+        text += _array("double", f"bufgym_networks_{k}", scorer.networks)
+        if len(scorer.mix):
+            text += _array("double", f"bufgym_mix_{k}", scorer.mix)
+        sizes = n, scorer.context, scorer.first, scorer.second, scorer.size, len(scorer.mix)
+        arrays = f"bufgym_fields_{k}, bufgym_networks_{k}, {f'bufgym_mix_{k}' if len(scorer.mix) else '0'}"
+        entries.append(f"    {{{', '.join(map(str, sizes))}, {arrays}}},\n")
+        inputs, units = max(inputs, n), max(units, 2 * scorer.first + scorer.second)
+        begin = end_of(parameters, begin, networks)
+    text += "/* The second one decides while the link stands still. */\n" if len(entries) > 1 else ""
+    text += f"#define BUFGYM_SCORERS {len(entries)}\n"
+    text += f"static const struct bufgym_scorer bufgym_scorers[] = {{\n{''.join(entries)}}};\n"
+    context = (*CONTEXT_FIELDS, *ON_BOARD_FIELDS)
+    scratch = (
+        "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"
+        f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{len(context)}];\n"
+        f"    double rows[{len(SLOT_FIELDS)}][BUFGYM_CAPACITY + 1];\n"
+    )
+    return {
+        "WEIGHTS": text,
+        "SCRATCH": scratch,
+        "SLOT_FIELDS": _enum(field.name for field in SLOT_FIELDS),
+        "CONTEXT_FIELDS": _enum(field.name for field in context),
+    }
+
+
+def _calls(policy: Policy, capacity: int, value: Value, max_bytes: int | None) -> NDArray[Any]:
+    """The calls in the header, whose messages all fit into B."""
+    rng = np.random.default_rng(_SEED)
+    episodes = [random_episode(rng, _MESSAGES, max_bytes) for _ in range(_EPISODES)]
+    return recorded(policy, episodes, capacity, value, max_bytes)
+
+
+# --- C text ----------------------------------------------------------------------------------------------------------
+
+
+def _part(name: str) -> str:
+    return (_PARTS / name).read_text(encoding="utf-8")
+
+
+def _filled(text: str, numbers: dict[str, Any]) -> str:
+    """The text with each @NAME@ replaced, those in what is filled in as well."""
+    while re.search("@[A-Z_]+@", text):
+        text = re.sub("@([A-Z_]+)@", lambda found: str(numbers[found[1]]), text)
+    return text
+
+
+def _comment(text: str) -> str:
+    """As it may stand in a comment, or in a line that is filled."""
+    return printable(text).replace("*/", "* /").replace("@", "(at)")
+
+
+def _array(kind: str, name: str, numbers: Iterable[Any]) -> str:
+    """``static const kind name[] = {...};``, numbers to the last bit."""
+    words = _lines(repr(int(number) if kind == "int" else float(number)) for number in numbers)
+    return f"static const {kind} {name}[] = {{\n    {words}\n}};\n"
+
+
+def _lines(words: Iterable[str]) -> str:
+    """The words with commas between them, five in a line."""
+    found = list(words)
+    return ",\n    ".join(", ".join(found[k : k + 5]) for k in range(0, len(found), 5))
+
+
+def _enum(names: Iterable[str]) -> str:
+    return f"enum {{\n    {_lines(f'BUFGYM_{name.upper()}' for name in names)}\n}};"
+
+
+def _call(call: Any) -> str:
+    return "    {" + ", ".join(repr(call[name].item()) for name in call.dtype.names) + "},\n"

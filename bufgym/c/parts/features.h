@@ -1,0 +1,134 @@
+/* What the policy reads: of each candidate (the newcomer last), and of the context. */
+@SLOT_FIELDS@
+@CONTEXT_FIELDS@
+
+/* g / (g + reference), in [0, 1]; 0 where both are 0. */
+static inline double bufgym_squash(double g, double reference)
+{
+    return g / (g + (reference > @TINY@ ? reference : @TINY@));
+}
+
+/* The same for a field of every candidate; the reference in single precision. */
+static inline void bufgym_squash_row(double *row, double reference)
+{
+    const double r = (double)(float)(reference > @TINY@ ? reference : @TINY@);
+    int k;
+    for (k = 0; k <= BUFGYM_CAPACITY; k++)
+        row[k] = row[k] / (row[k] + r);
+}
+
+/* V of the even motion spacing, and the QoI lost where two such gaps become one. */
+static inline double bufgym_even_gap(const struct bufgym_queue *q, const struct bufgym_message *arrival, double *loss)
+{
+    const double even = (arrival->x - q->dequeued_x) / (BUFGYM_CAPACITY + 1);
+    const double gain = bufgym_value(even);
+    *loss = bufgym_merging_loss(even, gain, even, gain);
+    return gain;
+}
+
+/* (2 V(d) - V(2 d)) / V(d) at d = so many even motion spacings. */
+static inline double bufgym_bend_at(const struct bufgym_queue *q, const struct bufgym_message *arrival, double evens)
+{
+    const double spacing = evens * (arrival->x - q->dequeued_x) / (BUFGYM_CAPACITY + 1);
+    const double d = spacing > 0.0 ? spacing : 0.0, gain = bufgym_value(d);
+    const double bend = bufgym_merging_loss(d, gain, d, gain) / (gain > @TINY@ ? gain : @TINY@);
+    return bend < 0.0 ? 0.0 : bend > 1.0 ? 1.0 : bend;
+}
+
+/* The fields of the context. */
+static inline void bufgym_observe_context(struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    double *context = q->context;
+    const int L = BUFGYM_CAPACITY, spread = L + 1;
+    const double time_gap = (double)(arrival->arrival_us - q->previous_us), motion_gap = arrival->x - q->previous_x;
+    const double time = (double)(arrival->arrival_us - q->dequeued_arrival_us), motion = arrival->x - q->dequeued_x;
+    const double mean_bytes = (double)(q->backlog_bytes + arrival->size_bytes) / (q->occupancy + 1);
+    const double period_us = q->period_us > 1.0 ? q->period_us : 1.0;
+    const double demand = 1e6 * mean_bytes / period_us;
+    const double square = q->period_us * q->period_us, spare = q->period_square - square;
+    const double short_rate = 1e6 * q->short_rate, long_rate = 1e6 * q->long_rate, left = 1e6 * (double)q->left_bytes;
+    const double last_rate = q->drained_us > 0 ? 1e6 * (double)q->drained_bytes / (double)q->drained_us : short_rate;
+    const int64_t room = BUFGYM_MAX_BYTES - q->backlog_bytes;
+    double even_loss;
+
+    context[BUFGYM_OCCUPANCY] = (double)q->occupancy / L;
+    context[BUFGYM_BACKLOG] =
+        BUFGYM_MAX_BYTES < BUFGYM_UNLIMITED ? (double)q->backlog_bytes / (double)BUFGYM_MAX_BYTES : 0.0;
+    context[BUFGYM_ARRIVAL_TIME_GAP] = bufgym_squash(time_gap, time / spread);
+    context[BUFGYM_ARRIVAL_MOTION_GAP] = bufgym_squash(motion_gap, motion / spread);
+    context[BUFGYM_BUSY] = q->busy > 0;
+    context[BUFGYM_LEFT] = q->busy > 0 ? (double)q->left_bytes / (double)q->held_bytes : 0.0;
+    context[BUFGYM_STALLED] = bufgym_squash((double)(q->now_us - q->last_dequeue_us), spread * q->period_us);
+    context[BUFGYM_DEPARTURES] = bufgym_squash((double)q->departures, 1.0);
+    context[BUFGYM_SERVICE_RATIO] = bufgym_squash(q->service_ratio, 1.0);
+    context[BUFGYM_EVEN_VALUE] = bufgym_even_gap(q, arrival, &even_loss);
+    context[BUFGYM_BEND] = even_loss / (context[BUFGYM_EVEN_VALUE] > @TINY@ ? context[BUFGYM_EVEN_VALUE] : @TINY@);
+
+    context[BUFGYM_RATE_LAST] = bufgym_squash(last_rate, demand);
+    context[BUFGYM_RATE_SHORT] = bufgym_squash(short_rate, demand);
+    context[BUFGYM_RATE_MEDIUM] = bufgym_squash(1e6 * q->medium_rate, demand);
+    context[BUFGYM_RATE_LONG] = bufgym_squash(long_rate, demand);
+    context[BUFGYM_RATE_TREND] = bufgym_squash(short_rate, long_rate);
+    context[BUFGYM_TIME_TO_FREE] = q->busy > 0 && q->left_bytes > 0 ? left / (left + short_rate * period_us) : 0.0;
+    context[BUFGYM_BURSTINESS] = bufgym_squash(spare > 0.0 ? spare : 0.0, square);
+    context[BUFGYM_BEND_SMALL] = bufgym_bend_at(q, arrival, 0.25);
+    context[BUFGYM_BEND_LARGE] = bufgym_bend_at(q, arrival, 4.0);
+    context[BUFGYM_ROOM] = 1.0;
+    if (BUFGYM_MAX_BYTES < BUFGYM_UNLIMITED)
+        context[BUFGYM_ROOM] = bufgym_squash(room > 0 ? (double)room : 0.0, spread * mean_bytes);
+}
+
+/* The fields of each candidate: empty slots are 0, the newcomer is the last. */
+static inline void bufgym_observe_slots(struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    double (*rows)[BUFGYM_CAPACITY + 1] = q->rows;
+    const int s = q->occupancy, last = BUFGYM_CAPACITY;
+    const double per_rank = 1.0 / (s + 1), even = 1.0 / (BUFGYM_CAPACITY + 1);
+    const double even_us = even * (double)(arrival->arrival_us - q->dequeued_arrival_us);
+    const double even_x = even * (arrival->x - q->dequeued_x);
+    const double step_us = (double)(arrival->arrival_us - q->previous_us), step_x = arrival->x - q->previous_x;
+    int64_t before_us = q->dequeued_arrival_us;
+    double before_x = q->dequeued_x, newcomer_gain = 0.0, loss, even_loss;
+    int k;
+
+    if (s > 0)
+        newcomer_gain = bufgym_value(arrival->x - q->slots[s - 1].x);
+    else if (q->dequeued > 0)
+        newcomer_gain = bufgym_value(arrival->x - q->dequeued_x);
+    memset(rows, 0, sizeof q->rows);
+    for (k = 0; k < s; k++) {
+        const struct bufgym_message *slot = &q->slots[k], *after = k + 1 < s ? slot + 1 : arrival;
+        const double after_gain = k + 1 < s ? after->gain : newcomer_gain;
+        loss = bufgym_merging_loss(slot->x - before_x, slot->gain, after->x - slot->x, after_gain);
+        rows[BUFGYM_OCCUPIED][k] = 1.0;
+        rows[BUFGYM_RANK][k] = (k + 1) * per_rank;
+        rows[BUFGYM_TIME_BEFORE][k] = (double)(slot->arrival_us - before_us);
+        rows[BUFGYM_TIME_MERGED][k] = (double)(after->arrival_us - before_us);
+        rows[BUFGYM_MOTION_BEFORE][k] = slot->x - before_x;
+        rows[BUFGYM_MOTION_MERGED][k] = after->x - before_x;
+        rows[BUFGYM_LOSS][k] = loss;
+        rows[BUFGYM_RELATIVE_LOSS][k] = loss > 0.0 ? loss : 0.0;
+        rows[BUFGYM_SIZE][k] = (double)slot->size_bytes;
+        before_us = slot->arrival_us;
+        before_x = slot->x;
+    }
+    loss = bufgym_merging_loss(arrival->x - before_x, newcomer_gain, step_x, bufgym_value(step_x));
+    rows[BUFGYM_OCCUPIED][last] = 1.0;
+    rows[BUFGYM_RANK][last] = 1.0;
+    rows[BUFGYM_TIME_BEFORE][last] = (double)(arrival->arrival_us - before_us);
+    rows[BUFGYM_TIME_MERGED][last] = (double)(arrival->arrival_us - before_us) + step_us;
+    rows[BUFGYM_MOTION_BEFORE][last] = arrival->x - before_x;
+    rows[BUFGYM_MOTION_MERGED][last] = arrival->x - before_x + step_x;
+    rows[BUFGYM_LOSS][last] = loss > 0.0 ? loss : 0.0; /* nothing is lost with a first message */
+    rows[BUFGYM_RELATIVE_LOSS][last] = rows[BUFGYM_LOSS][last];
+    rows[BUFGYM_SIZE][last] = (double)arrival->size_bytes;
+
+    bufgym_even_gap(q, arrival, &even_loss);
+    bufgym_squash_row(rows[BUFGYM_TIME_BEFORE], even_us);
+    bufgym_squash_row(rows[BUFGYM_TIME_MERGED], 2 * even_us);
+    bufgym_squash_row(rows[BUFGYM_MOTION_BEFORE], even_x);
+    bufgym_squash_row(rows[BUFGYM_MOTION_MERGED], 2 * even_x);
+    bufgym_squash_row(rows[BUFGYM_RELATIVE_LOSS], even_loss > @ROUNDING@ ? even_loss : @ROUNDING@);
+    bufgym_squash_row(rows[BUFGYM_SIZE], (double)(q->backlog_bytes + arrival->size_bytes) * per_rank);
+}
+

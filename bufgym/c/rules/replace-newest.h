@@ -1,0 +1,4 @@
+static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    return bufgym_has_space(q, arrival) ? BUFGYM_ACCEPT : q->occupancy - 1;
+}

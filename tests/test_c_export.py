@@ -1,0 +1,304 @@
+"""The header in C: compiled with gcc, it decides as Python does, on a million decisions; a robot in C++ uses it."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bufgym import policies
+from bufgym.c import CALL, SUPPORTED, header, random_episode, recorded
+from bufgym.cli import export as command
+from bufgym.cli.options import Parser
+from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.policies import Policy, learned
+from bufgym.policies.learned import NAMES, Network, Weights
+from bufgym.scenario import Episode, messages
+from bufgym.sim import run
+from bufgym.sim.metrics import received
+from bufgym.traces import Trace
+
+REPO = Path(__file__).resolve().parent.parent
+EXPONENTIAL = qoi.exponential()
+SETTINGS = [
+    (8, EXPONENTIAL, None),
+    (15, qoi.saturating(4.0), None),
+    (5, qoi.tabulated([0, 1, 3, 10], [0, 0.5, 0.8, 1]), None),
+    (12, EXPONENTIAL, 400_000),
+]
+"""L, V, B"""
+FLAGS = ["-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
+
+DRIVER = """
+#define BUFGYM_PARITY
+#include "policy.h"
+#include <stdio.h>
+
+/* Plays the calls in a file; prints bufgym_parity(), how many decisions there were, and how many differ. */
+int main(int words, char **files)
+{
+    static struct bufgym_call calls[4096];
+    static struct bufgym_queue q;
+    FILE *file = words > 1 ? fopen(files[1], "rb") : 0;
+    size_t k, n;
+    int decisions = 0, differ = 0;
+    while (file && (n = fread(calls, sizeof calls[0], 4096, file)) > 0)
+        for (k = 0; k < n; k++) {
+            differ += bufgym_play(&q, &calls[k]) != calls[k].decision;
+            decisions += calls[k].kind == BUFGYM_ARRIVAL;
+        }
+    printf("%d %d %d", bufgym_parity(), decisions, differ);
+    return 0;
+}
+"""
+
+
+def compiled(folder, compiler, standard, source, text):
+    """The program of this source and this header; skips where there is no compiler."""
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not installed")
+    (folder / "policy.h").write_text(text, encoding="utf-8")
+    program = folder / "program"
+    words = [compiler, f"-std={standard}", *FLAGS, "-I", folder, source, "-o", program, "-lm"]
+    done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def assert_equal(text, expected):
+    """Without pytest's own search for what differs, which takes minutes."""
+    lines = zip(text.splitlines(), expected.splitlines(), strict=True)
+    assert [pair for pair in lines if pair[0] != pair[1]] == []
+
+
+def output(program, *words, text=""):
+    return subprocess.run([program, *words], input=text, capture_output=True, text=True, check=True).stdout
+
+
+def driver(folder, text):
+    """``DRIVER`` with this header."""
+    (folder / "driver.c").write_text(DRIVER, encoding="utf-8")
+    return compiled(folder, "gcc", "c99", folder / "driver.c", text)
+
+
+def every_field() -> Policy:
+    """A random agent of two layers that reads every field there is, mixes them, and has a second scorer."""
+    rng = np.random.default_rng(3)
+
+    def some(*shape):
+        return rng.normal(size=shape).astype(np.float32)
+
+    def network(*widths):
+        inputs, layers = len(NAMES), []
+        for width in widths:
+            layers.append((some(inputs, width), some(width)))
+            inputs = width
+        return Network(some(len(NAMES)), some(1), tuple(layers), some(inputs if widths else 0))
+
+    slots = len(Weights.SLOT_NAMES)
+    mix = some(len(NAMES) - slots, slots)
+    still = Weights(NAMES, network(), network())
+    return learned.policy("every-field", Weights(NAMES, network(7, 5), network(7, 5), mix=mix, still=still))
+
+
+AGENTS = {
+    **{name: policies.get(name) for name in ("learned-motion", "learned-time")},
+    "every-field": every_field(),
+}
+
+
+# --- the same decisions ----------------------------------------------------------------------------------------------
+
+
+def check(folder, policy, decisions):
+    """Play so many decisions of each of SETTINGS in C."""
+    total = 0
+    for k, (L, value, B) in enumerate(SETTINGS if JIT else SETTINGS[3:]):
+        rng = np.random.default_rng(k)
+        n = 1_000 if JIT else 40
+        episodes = [random_episode(rng, n, B) for _ in range(decisions // n if JIT else 2)]
+        calls = recorded(policy, episodes, L, value, B)
+        assert calls.dtype == CALL
+        calls.tofile(folder / "calls")
+        played = output(driver(folder, header(policy, L, value, B)), folder / "calls")
+        parity, made, differ = map(int, played.split())
+        assert (parity, differ) == (0, 0), (L, value.name, B, made)
+        assert made >= n * len(episodes)
+        total += made
+    return total
+
+
+@pytest.mark.parametrize("name", SUPPORTED)
+def test_a_rule_in_c_decides_as_in_python(name, tmp_path):
+    total = check(tmp_path, policies.get(name), 20_000)
+    assert total >= 80_000 or not JIT  # more than a million of all rules
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_an_agent_in_c_decides_as_in_python_a_million_times(name, tmp_path):
+    total = check(tmp_path, AGENTS[name], 250_000)
+    assert total >= 1_000_000 or not JIT
+
+
+def test_with_a_window_several_messages_are_in_the_socket(tmp_path):
+    """Three in flight, acks 50 ms late: the socket holds more than one message, and the header knows of all."""
+    rng = np.random.default_rng(5)
+    drawn = [random_episode(rng, 40) for _ in range(30 if JIT else 2)]
+    episodes = [Episode(e.arrivals, e.link, window=3, ack_delay_us=50_000) for e in drawn]
+    policy = AGENTS["every-field"]
+    calls = recorded(policy, episodes, 6, EXPONENTIAL)
+    calls.tofile(tmp_path / "calls")
+    played = output(driver(tmp_path, header(policy, 6, EXPONENTIAL)), tmp_path / "calls")
+    assert played.split() == ["0", str(40 * len(episodes)), "0"]
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "other"),
+    [
+        ("afr", "<= 2.0 / 3.0", "<= 0.2"),
+        ("learned-motion", "bufgym_v[] = {\n    0.0, -0.48", "bufgym_v[] = {\n    0.0, -0.08"),
+        ("min-motion-gap", "gaps.before_x + gaps.after_x < smallest", "gaps.before_x < smallest"),
+    ],
+)
+def test_parity_finds_another_number(name, number, other, tmp_path):
+    text = header(policies.get(name), 8, EXPONENTIAL)
+    assert text.count(number) == 1
+    assert output(driver(tmp_path, text)).startswith("0 ")
+    assert not output(driver(tmp_path, text.replace(number, other))).startswith("0 ")
+
+
+def test_parity_is_said_of_its_own_capacity_alone(tmp_path):
+    text = "#define BUFGYM_CAPACITY 9\n" + header(policies.get("afr"), 8, EXPONENTIAL)
+    assert output(driver(tmp_path, text)).startswith("-1 ")
+
+
+def test_a_byte_limit_may_take_several_evictions(tmp_path):
+    """B = 100: 40 + 40 are queued when 90 come, so both go, one a call; 101 fit never. The data are the caller's."""
+    (tmp_path / "bytes.c").write_text(
+        """
+#include "policy.h"
+#include <stdio.h>
+
+int main(void)
+{
+    static struct bufgym_queue q;
+    const int sizes[] = {40, 40, 90, 101};
+    int k;
+    bufgym_init(&q, 1000);
+    for (k = 0; k < 4; k++) {
+        struct bufgym_message message = {1000 + 10 * k, sizes[k], k, 0.0, (void *)&sizes[k]};
+        do {
+            int decision = bufgym_arrival(&q, message, 0);
+            printf("%d:%d ", decision, decision == BUFGYM_ACCEPT ? 0 : *(const int *)q.dropped.data);
+        } while (q.evictions > 0);
+    }
+    printf("%d %d", q.occupancy, (int)q.backlog_bytes);
+    return 0;
+}
+""",
+        encoding="utf-8",
+    )
+    text = header(policies.get("drop-oldest"), 4, EXPONENTIAL, 100)
+    program = compiled(tmp_path, "gcc", "c99", tmp_path / "bytes.c", text)
+    assert output(program) == "-2:0 -2:0 0:40 0:40 -1:101 1 90"
+
+
+# --- the robot -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["afr", "learned-motion"])
+def test_the_robot_delivers_what_the_simulator_says(name, tmp_path):
+    """8 MB/s but for a standstill from second 4 to 8; 230 kB frames at 30 Hz."""
+    policy = policies.get(name)
+    text = header(policy, 8, EXPONENTIAL)
+    robot = compiled(tmp_path, "g++", "c++17", REPO / "examples" / "robot.cpp", text)
+    frames = 360 if JIT else 150
+    at_us = 33_333 * np.arange(frames)
+    arrivals = "".join(f"{us} 230000 {k}\n" for k, us in enumerate(at_us))
+    link = Link(Trace.steps([(4, 8e6), (4, 0), (12, 8e6)], after="stop"))
+    senders = run(policy, [Episode(messages(at_us, 230_000), link)], 8, EXPONENTIAL)
+    came = received(senders, 0)
+    lines = output(robot, "-", text=arrivals).splitlines()
+    assert len(lines) == frames + 1
+    x = senders.episodes[0].arrivals["x"][came["seq"]] if came.dtype.names else senders.episodes[0].arrivals["x"][came]
+    assert lines[-1] == f"delivered {len(came)}, H = {EXPONENTIAL.information(x):.3f}"
+    if frames == 360:
+        assert output(robot) == "\n".join(lines) + "\n"  # what it makes up by itself
+    assert (REPO / "examples" / "robot.cpp").read_text(encoding="utf-8").count("\n") <= 75
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+def exported(*words):
+    """``bufgym export`` with these words."""
+    parser = Parser(prog="bufgym")
+    command.add(parser.add_subparsers(required=True))
+    options: argparse.Namespace = parser.parse_args(["export", *map(str, words)])
+    options.command(options)
+
+
+def test_the_command_writes_the_header(tmp_path, capsys):
+    out = tmp_path / "policy.h"
+    exported("even-reject:beta=1.25", "--to", "c", "--out", out, "--capacity", 6, "--value", "saturating:4")
+    assert capsys.readouterr().out == f"wrote {out}\n"
+    text = out.read_text(encoding="utf-8")
+    assert_equal(text, header(policies.get("even-reject:beta=1.25"), 6, qoi.saturating(4)))
+    assert "#define BUFGYM_CAPACITY 6 " in text
+    assert "bufgym_parameters[] = {\n    1.25\n}" in text
+    assert "@" not in text
+
+
+def test_an_agent_in_a_file_is_exported(tmp_path):
+    shipped = REPO / "agents" / "pretrained" / "learned-time.safetensors"
+    exported(shipped, tmp_path / "policy.h", "--to", "c")
+    text = (tmp_path / "policy.h").read_text(encoding="utf-8")
+    assert_equal(text, header(policies.get("learned-time"), 16, EXPONENTIAL))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["codel", "--to", "c", "--out", "{}"], "policy codel: has no C; known: afr, afr-paper, decimate, "),
+        (["learned-scheduler", "{}", "--to", "c"], "has no C; known: .*, and learned agents for one queue"),
+        (["agent", "{}", "--to", "c"], "unknown policy 'agent'; known: afr"),
+        (["afr", "--to", "c"], "must be given once: OUT or --out OUT"),
+        (["afr", "{}", "--out", "{}", "--to", "c"], "must be given once"),
+        (["afr", "{}", "--to", "c", "--name", "mine"], "--name belongs to --to safetensors"),
+        (["model.zip", "{}", "--capacity", "4", "--name", "a"], "--capacity belongs to --to c"),
+        (["model.zip", "{}"], "--name must be given"),
+        (["afr", "{}/nowhere/policy.h", "--to", "c"], "policy.h: cannot be written: No"),
+        (["afr", "{}", "--to", "c", "--value", "flat"], "unknown kind 'flat'"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(words, message, tmp_path):
+    with pytest.raises(BufgymError, match=message) as error:
+        exported(*(word.format(tmp_path / "policy.h") for word in words))
+    assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_asked_at_the_socket_is_not_recorded():
+    with pytest.raises(BufgymError, match="policy codel: is asked when the socket is free"):
+        recorded(policies.get("codel"), [random_episode(np.random.default_rng(0), 5)], 4, EXPONENTIAL)
+
+
+def test_a_policy_of_ones_own_has_no_c_even_under_a_known_name():
+    own = Policy("afr", lambda buffer, arrival, memory: -1)
+    with pytest.raises(BufgymError, match="policy afr: has no C"):
+        header(own, 8, EXPONENTIAL)
+
+
+@pytest.mark.parametrize("name", SUPPORTED)
+def test_what_has_c_is_a_drop_rule_of_the_registry(name):
+    policy = policies.get(name)
+    assert policy.compile
+    assert policy.ranked
+    assert not (policy.schedules or policy.drops_at_dequeue or policy.work != (0, 0))
