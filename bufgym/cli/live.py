@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Coroutine
+from pathlib import Path
 from typing import Any
 
 from bufgym.cli.options import (
@@ -50,8 +52,9 @@ def add(commands: Commands) -> None:
     validate.add_argument("--duration", type=positive, default=30.0, metavar="S", help="of each (%(default)g s)")
     validate.add_argument("--size", type=count, default=230_000, metavar="BYTES", help="of a message (%(default)s)")
     validate.add_argument("--scale", type=positive, default=1.0, metavar="X", help="the traces' capacity times X")
-    validate.add_argument("--transport", choices=TRANSPORTS, default="tcp", help="(%(default)s)")
+    validate.add_argument("--transport", choices=TRANSPORTS, nargs="+", default=["tcp"], help="one or more (tcp)")
     validate.add_argument("--speed", type=positive, default=1.0, metavar="X", help="time runs X times as fast")
+    validate.add_argument("--out", metavar="DIR", help="write there a page with pictures, and every run (JSON)")
 
     replay = command(parts, "replay", _replay, "a queue's log through the simulator: the same decisions?")
     replay.add_argument("log", metavar="LOG.mcap", help="what send --log wrote")
@@ -115,7 +118,8 @@ def _link(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from bufgym import policies, traces
-    from bufgym.live.validate import table, validate
+    from bufgym.live.runs import save, table
+    from bufgym.live.validate import validate
     from bufgym.scenario import Uplink
 
     load_policies(options.policy_file)
@@ -128,12 +132,34 @@ def _validate(options: argparse.Namespace) -> None:
         scale=(options.scale,),
         propagation_us=0,
     )
-    print(
+    about = (
         f"{options.duration:g} s, {options.size} bytes at 30 Hz, L = {options.capacity}, V = {scenario.value.name}, "
-        f"over {options.transport} (a window of one ack) and in the simulator\n"
+        f"over {', '.join(options.transport)} (a window of one ack) and in the simulator"
     )
-    wishes = given(options, ("seeds", "transport", "speed"))
-    print(table(validate(chosen, scenario, options.capacity, **wishes)))
+    print(f"{about}\n")
+    runs = validate(
+        chosen,
+        scenario,
+        options.capacity,
+        seeds=options.seeds,
+        transports=options.transport,
+        speed=options.speed,
+    )
+    print(table(runs))
+    if options.out is not None:
+        from bufgym.benchmark.report import live
+
+        print(f"\nwrote {live.write(save(runs, about, _command(options), Path(options.out)))}")
+
+
+def _command(options: argparse.Namespace) -> str:
+    """The command that validates this again."""
+    names = ("trace", "policies", "policy_file", "capacity", "seeds", "duration", "size", "scale", "transport", "speed")
+    words = ["bufgym live validate"]
+    for name, value in given(options, names).items():
+        words.append(f"--{name.replace('_', '-')}")
+        words += [shlex.quote(str(one)) for one in (value if isinstance(value, list) else [value])]
+    return " ".join(words)
 
 
 def _replay(options: argparse.Namespace) -> None:

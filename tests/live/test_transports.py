@@ -14,8 +14,9 @@ from bufgym.kernel import JIT
 from bufgym.live import replay
 from bufgym.live.channels import TRANSPORTS
 from bufgym.live.log import Record
+from bufgym.live.runs import Run, orders, table
 from bufgym.live.shaped import ShapedLink
-from bufgym.live.validate import Run, play, table, validate
+from bufgym.live.validate import play, validate
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, Uplink, messages
@@ -127,7 +128,20 @@ def test_validation_holds_both_side_by_side() -> None:
 
 
 def test_the_table_by_hand() -> None:
-    runs = [Run("afr", "a", 0, 9, 10, 4.0, 5.0, 5.0), Run("afr", "b", 0, 10, 10, 5.0, 5.0, 5.0)]
+    runs = [
+        Run("afr", "a", 0, 9, 10, 4.0, 5.0, 5.0, "tcp", (0.1, 0.2, 0.6), (0.1, 0.2)),
+        Run("afr", "b", 0, 10, 10, 5.0, 5.0, 5.0, "tcp", (0.2, 0.4), (0.15,)),
+    ]
     text = table(runs)
-    assert "| afr | 9.5 | 10.0 | 4.500 | 5.000 | 10.00% | 0.00% |" in text
+    assert "| afr | 9.5 | 10.0 | 4.500 | 5.000 | 10.00% | 0.00% | 0.250 | 0.150 |" in text
     assert "10.00% apart (median), 20.00% at most; delivered 0.5 and 1." in text
+
+
+def test_orders_by_hand() -> None:
+    """On link a the three differ by more than 1 % but for the last two, of which live one swaps with the first."""
+
+    def one(policy: str, simulated: float, live: float, link: str = "a") -> Run:
+        return Run(policy, link, 0, 1, 1, live, simulated, 9.0)
+
+    runs = [one("afr", 5.0, 4.9), one("random", 4.0, 3.9), one("drop-oldest", 4.03, 4.95), one("afr", 1.0, 1.0, "b")]
+    assert orders(runs) == (1, 2)
