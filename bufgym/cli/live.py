@@ -25,7 +25,7 @@ from bufgym.errors import BufgymError
 
 PORT = 7410
 """Of a receiver, where none is named."""
-TRANSPORTS = ("tcp", "websocket")
+TRANSPORTS = ("tcp", "websocket", "zenoh", "mqtt", "dds")
 DEFAULT_POLICIES = ("drop-oldest", "afr", "min-motion-gap", "learned-motion")
 
 
@@ -52,7 +52,7 @@ def add(commands: Commands) -> None:
     validate.add_argument("--duration", type=positive, default=30.0, metavar="S", help="of each (%(default)g s)")
     validate.add_argument("--size", type=count, default=230_000, metavar="BYTES", help="of a message (%(default)s)")
     validate.add_argument("--scale", type=positive, default=1.0, metavar="X", help="the traces' capacity times X")
-    validate.add_argument("--transport", choices=TRANSPORTS, nargs="+", default=["tcp"], help="one or more (tcp)")
+    validate.add_argument("--transport", choices=TRANSPORTS[:3], nargs="+", default=["tcp"], help="one or more (tcp)")
     validate.add_argument("--speed", type=positive, default=1.0, metavar="X", help="time runs X times as fast")
     validate.add_argument("--out", metavar="DIR", help="write there a page with pictures, and every run (JSON)")
 

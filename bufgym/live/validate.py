@@ -37,18 +37,20 @@ async def play(
     speed: float = 1.0,
     seed: int = 0,
     log: list[Record] | None = None,
+    port: int = 0,
 ) -> list[Received]:
     """What arrives at the other end of real sockets, when ``policy`` sends the messages of ``episode`` over its link.
 
     ``received_ns`` counts from the episode's beginning, as ``at_us`` does, but as this system's time runs.
 
     Args:
-        transport: "tcp" or "websocket".
+        transport: one of ``TRANSPORTS`` over TCP.
         leaves: when a message has left, see ``Sender``.
         small: small buffers in the system; else its default ones.
         speed: how much faster time runs for queue and link alike; bytes are as they are.
         seed: of the draws of randomised policies.
         log: takes the queue's records.
+        port: the receiver's (0: any); over MQTT the broker's.
     """
     if transport not in TRANSPORTS:
         raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
@@ -59,7 +61,7 @@ async def play(
         came.append(message._replace(body=b"", received_ns=time.monotonic_ns() - round(began_s * 1e9)))
 
     receiver = Receiver(take)
-    link = ShapedLink(episode.link, ("127.0.0.1", await receiver.listen(transport=transport)), speed=speed)
+    link = ShapedLink(episode.link, ("127.0.0.1", await receiver.listen(port, transport=transport)), speed=speed)
     port = await link.listen()
     messages = episode.arrivals
     bodies = memoryview(bytes(int(messages["size_bytes"].max())))

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from live_cases import OVER_TCP, meeting_port
 
 from bufgym import policies
 from bufgym.kernel import JIT
 from bufgym.live import replay
-from bufgym.live.channels import TRANSPORTS
 from bufgym.live.log import Record
 from bufgym.live.runs import Run, orders, table
 from bufgym.live.shaped import ShapedLink
@@ -43,11 +43,11 @@ def live(episode: Episode, policy: str = "afr", capacity: int = 8, **settings: A
     )
 
 
-@pytest.mark.parametrize("transport", TRANSPORTS)
-def test_on_sockets_as_in_the_simulator(transport: str) -> None:
+@pytest.mark.parametrize("transport", OVER_TCP)
+def test_on_sockets_as_in_the_simulator(transport: str, request: pytest.FixtureRequest) -> None:
     """Wide margins: on a quiet machine counts agree within 1 and QoI within 0.5 %."""
     records: list[Record] = []
-    came = live(fade(), transport=transport, log=records)
+    came = live(fade(), transport=transport, port=meeting_port(transport, request), log=records)
     simulated = outcome(run(policies.get("afr"), [fade()], 8, V), 0)
     assert [message.number for message in came] == list(range(len(came)))
     assert [message.seq for message in came] == sorted({message.seq for message in came})

@@ -148,7 +148,7 @@ def _chosen(runs: Sequence[Run], draw: Any) -> tuple[dict[tuple[str, ...], list[
     """A figure for each link and transport, and what can be chosen."""
     links = list(dict.fromkeys(one.link for one in runs))
     transports = list(dict.fromkeys(one.transport for one in runs))
-    panels = {}
+    panels: dict[tuple[str, ...], list[Figure]] = {}
     for link, transport in product(links, transports):
         chosen = [one for one in runs if (one.link, one.transport) == (link, transport)]
         panels[link, transport] = [draw(chosen)] if chosen else []
