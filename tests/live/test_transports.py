@@ -12,7 +12,7 @@ from live_cases import OVER_TCP, meeting_port
 
 from bufgym import policies
 from bufgym.kernel import JIT
-from bufgym.live import replay
+from bufgym.live import PolicyQueue, replay
 from bufgym.live.log import Record
 from bufgym.live.runs import Run, orders, table
 from bufgym.live.shaped import ShapedLink
@@ -106,6 +106,23 @@ def test_a_link_whose_messages_come_back(back: bool, carried_bytes: int) -> None
     taken_s, carried = asyncio.run(fetch())
     assert carried == carried_bytes
     assert taken_s >= 0.45 * back
+
+
+def test_nothing_is_compiled_while_the_episodes_time_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first decision of a process takes a second here: 2 s of the episode, which it must not cost."""
+
+    class Compiling(PolicyQueue):
+        compiled = False
+
+        def put(self, *arguments: Any, **settings: Any) -> int:
+            if not Compiling.compiled:
+                time.sleep(1)
+                Compiling.compiled = True
+            return super().put(*arguments, **settings)
+
+    monkeypatch.setattr("bufgym.live.validate.PolicyQueue", Compiling)
+    came = live(fade(5))
+    assert Compiling.compiled and came[0].at_us < 10**6
 
 
 def test_a_window_of_several_messages() -> None:
