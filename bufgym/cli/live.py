@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
 from collections.abc import Coroutine
+from pathlib import Path
 from typing import Any
 
 from bufgym.cli.options import (
@@ -23,7 +26,7 @@ from bufgym.errors import BufgymError
 
 PORT = 7410
 """Of a receiver, where none is named."""
-TRANSPORTS = ("tcp", "websocket")
+TRANSPORTS = ("tcp", "websocket", "zenoh", "mqtt", "dds")
 DEFAULT_POLICIES = ("drop-oldest", "afr", "min-motion-gap", "learned-motion")
 
 
@@ -50,8 +53,13 @@ def add(commands: Commands) -> None:
     validate.add_argument("--duration", type=positive, default=30.0, metavar="S", help="of each (%(default)g s)")
     validate.add_argument("--size", type=count, default=230_000, metavar="BYTES", help="of a message (%(default)s)")
     validate.add_argument("--scale", type=positive, default=1.0, metavar="X", help="the traces' capacity times X")
-    validate.add_argument("--transport", choices=TRANSPORTS, default="tcp", help="(%(default)s)")
+    validate.add_argument("--transport", choices=TRANSPORTS[:3], nargs="+", default=["tcp"], help="one or more (tcp)")
     validate.add_argument("--speed", type=positive, default=1.0, metavar="X", help="time runs X times as fast")
+    validate.add_argument("--out", metavar="DIR", help="write there a page with pictures, and every run (JSON)")
+
+    view = command(parts, "view", _view, "what a queue does, from its log: queue, drops, rates, QoI")
+    view.add_argument("log", metavar="LOG.mcap", help="what send --log writes, also while it writes")
+    view.add_argument("--follow", action="store_true", help="show it again as the log grows; Ctrl-C ends it")
 
     replay = command(parts, "replay", _replay, "a queue's log through the simulator: the same decisions?")
     replay.add_argument("log", metavar="LOG.mcap", help="what send --log wrote")
@@ -70,6 +78,7 @@ def _add_ends(parts: Commands) -> None:
     send.add_argument("--motion", default="drive-0", metavar="FILE", help="gives x (%(default)s); or 'none'")
     send.add_argument("--transport", choices=TRANSPORTS, default="tcp", help="(%(default)s)")
     send.add_argument("--log", metavar="LOG.mcap", help="log every decision there, for replay")
+    send.add_argument("--view", action="store_true", help="show queue, drops, rates and QoI as it happens")
 
     receive = command(parts, "receive", _receive, "receive, ack and count what is sent here; Ctrl-C ends it")
     receive.add_argument("--port", type=natural, default=PORT, help="(%(default)s)")
@@ -115,7 +124,8 @@ def _link(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from bufgym import policies, traces
-    from bufgym.live.validate import table, validate
+    from bufgym.live.runs import save, table
+    from bufgym.live.validate import validate
     from bufgym.scenario import Uplink
 
     load_policies(options.policy_file)
@@ -128,12 +138,34 @@ def _validate(options: argparse.Namespace) -> None:
         scale=(options.scale,),
         propagation_us=0,
     )
-    print(
+    about = (
         f"{options.duration:g} s, {options.size} bytes at 30 Hz, L = {options.capacity}, V = {scenario.value.name}, "
-        f"over {options.transport} (a window of one ack) and in the simulator\n"
+        f"over {', '.join(options.transport)} (a window of one ack) and in the simulator"
     )
-    wishes = given(options, ("seeds", "transport", "speed"))
-    print(table(validate(chosen, scenario, options.capacity, **wishes)))
+    print(f"{about}\n")
+    runs = validate(
+        chosen,
+        scenario,
+        options.capacity,
+        seeds=options.seeds,
+        transports=options.transport,
+        speed=options.speed,
+    )
+    print(table(runs))
+    if options.out is not None:
+        from bufgym.benchmark.report import live
+
+        print(f"\nwrote {live.write(save(runs, about, _command(options), Path(options.out)))}")
+
+
+def _command(options: argparse.Namespace) -> str:
+    """The command that validates this again."""
+    names = ("trace", "policies", "policy_file", "capacity", "seeds", "duration", "size", "scale", "transport", "speed")
+    words = ["bufgym live validate"]
+    for name, value in given(options, names).items():
+        words.append(f"--{name.replace('_', '-')}")
+        words += [shlex.quote(str(one)) for one in (value if isinstance(value, list) else [value])]
+    return " ".join(words)
 
 
 def _replay(options: argparse.Namespace) -> None:
@@ -152,6 +184,30 @@ def _replay(options: argparse.Namespace) -> None:
     print("The simulator makes the same decisions.")
 
 
+REDRAW_S = 0.25
+"""A view is drawn again so often."""
+
+
+def _redraw(text: str) -> None:
+    """Over what stood there, on a terminal; below it in a file."""
+    print(f"\x1b[H\x1b[J{text}" if sys.stdout.isatty() else f"{text}\n", flush=True)
+
+
+def _view(options: argparse.Namespace) -> None:
+    import time
+
+    from bufgym.live import read_log
+    from bufgym.live.view import View
+
+    size_bytes = -1
+    while options.follow or size_bytes < 0:
+        seen_bytes, size_bytes = size_bytes, Path(options.log).stat().st_size if Path(options.log).exists() else 0
+        if size_bytes != seen_bytes:
+            _redraw(View(read_log(options.log)).text())
+        if options.follow:
+            time.sleep(REDRAW_S)
+
+
 def _send(options: argparse.Namespace) -> None:
     import asyncio
     import contextlib
@@ -160,7 +216,9 @@ def _send(options: argparse.Namespace) -> None:
     from bufgym import policies, traces
     from bufgym.live import LogFile, PolicyQueue
     from bufgym.live.channels import TRANSPORTS as CONNECT
+    from bufgym.live.log import Record
     from bufgym.live.sender import Sender
+    from bufgym.live.view import View
     from bufgym.model import qoi
 
     load_policies(options.policy_file)
@@ -177,18 +235,30 @@ def _send(options: argparse.Namespace) -> None:
                 break
             x = None if motion is None else float(motion.at(round(k / options.rate * 1e6)))
             queue.put(body, len(body), x)
-            if k % round(max(1.0, options.rate)) == 0:
+            if view is not None:
+                if k % max(1, round(options.rate * REDRAW_S)) == 0:
+                    _redraw(view.text())
+            elif k % round(max(1.0, options.rate)) == 0:
                 print(
                     f"{k / options.rate:4.0f} s: {k + 1} put, {queue.dropped} dropped, {len(queue)} queued", flush=True
                 )
         queue.close()
         await sending
+        if view is not None:
+            _redraw(view.text())
         print(f"all put, {queue.dropped} dropped, {len(sender.faults)} broken connections {list(sender.faults)[-1:]}")
 
     with contextlib.ExitStack() as stack:
         log = None if options.log is None else stack.enter_context(LogFile(options.log))
+        view = View() if options.view else None
+        takers = [taker for taker in (log, view) if taker is not None]
+
+        def record(one: Record) -> None:
+            for taker in takers:
+                taker(one)
+
         run_async(
-            stream(PolicyQueue(policies.get(name), options.capacity, value=qoi.exponential(math.exp(-1)), log=log))
+            stream(PolicyQueue(policies.get(name), options.capacity, value=qoi.exponential(math.exp(-1)), log=record))
         )
 
 

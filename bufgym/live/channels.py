@@ -1,28 +1,20 @@
-"""Connections that hide no queue: TCP as it is, and WebSocket.
-
-A connection with the system's default buffers takes megabytes at once, and what lies there no policy can drop. So the
-sender's socket gets a small send buffer, the kernel keeps little beyond what is on its way (TCP_NOTSENT_LOWAT), and
-``left_bytes`` says how much the peer's kernel has not acked yet (SIOCOUTQ).
-"""
+"""Connections that hide no queue: TCP as it is, WebSocket, and the table of all transports."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import socket
-import struct
-import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final, Protocol
 
+from bufgym.live.bus_channel import BusChannel
+from bufgym.live.buses import BUSES
 from bufgym.live.extra import needs
-from bufgym.live.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, header, parse
+from bufgym.live.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, header, parse, whole
+from bufgym.live.sockets import connected, unacked_bytes
 
-SEND_BUFFER_BYTES: Final = 32_768
-UNSENT_BYTES: Final = 16_384
-"""TCP_NOTSENT_LOWAT: so much may wait in the kernel beyond what is on its way."""
-DEAD_AFTER_S: Final = 20.0
-"""A connection on which nothing was acked for so long is given up, where the system can tell."""
 PIECE_BYTES: Final = 16_384
 """Written at a time, so that ``left_bytes`` is known while a large message is under way."""
 
@@ -43,49 +35,6 @@ class Channel(Protocol):
         """At once."""
 
 
-def unacked_bytes(connection: socket.socket) -> int | None:
-    """Bytes in the kernel's send queue, on their way or not (SIOCOUTQ); None where the system has no such call."""
-    if not sys.platform.startswith("linux"):
-        return None
-    import fcntl
-    import termios
-
-    try:
-        return int(struct.unpack("i", fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, b"\0\0\0\0"))[0])
-    except (OSError, ValueError):  # it is closed
-        return None
-
-
-def small_buffers(connection: socket.socket) -> None:
-    """Set a sender's socket so that little waits in the system."""
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-    _set(connection, "TCP_NOTSENT_LOWAT", UNSENT_BYTES)
-
-
-def _set(connection: socket.socket, option: str, number: int) -> None:
-    """Set an option of TCP, where the system has it."""
-    if hasattr(socket, option):
-        connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), number)
-
-
-async def _connected(host: str, port: int, small: bool = True) -> socket.socket:
-    """A connected TCP socket of a sender."""
-    loop = asyncio.get_running_loop()
-    family, kind, protocol, _, address = (await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM))[0]
-    connection = socket.socket(family, kind, protocol)
-    try:
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if small:
-            small_buffers(connection)
-            _set(connection, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
-        await loop.sock_connect(connection, address)
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
 class TcpChannel:
     """Frames on a TCP socket, one after the other."""
 
@@ -97,7 +46,7 @@ class TcpChannel:
     @classmethod
     async def connect(cls, host: str, port: int, *, small: bool = True) -> TcpChannel:
         """A sender's connection; ``small=False`` leaves the system's buffers as they are."""
-        return cls(await _connected(host, port, small))
+        return cls(await connected(host, port, small))
 
     async def send(self, frame: Frame) -> None:
         loop = asyncio.get_running_loop()
@@ -147,7 +96,7 @@ class WebSocketChannel:
         try:
             connection = await connect(
                 f"ws://{host}:{port}",
-                sock=await _connected(host, port, small),
+                sock=await connected(host, port, small),
                 compression=None,
                 ping_interval=None,  # a slow link answers late; TCP_USER_TIMEOUT finds a dead one
                 proxy=None,
@@ -166,10 +115,7 @@ class WebSocketChannel:
             data = await self._connection.recv()
         if not isinstance(data, bytes):
             raise FrameError("a text message: must be binary")
-        frame, body_bytes = parse(data, self._max_body_bytes)
-        if len(data) != HEADER_BYTES + body_bytes:
-            raise FrameError(f"message of {len(data)} bytes: must be {HEADER_BYTES + body_bytes}, as its header says")
-        return frame._replace(body=memoryview(data)[HEADER_BYTES:])
+        return whole(data, self._max_body_bytes)
 
     def left_bytes(self) -> int | None:
         transport = self._connection.transport
@@ -191,5 +137,9 @@ def _as_connection_errors() -> Any:
         raise ConnectionResetError(f"{type(error).__name__}: {error}") from None
 
 
-TRANSPORTS: Final[dict[str, Callable[..., Any]]] = {"tcp": TcpChannel.connect, "websocket": WebSocketChannel.connect}
+TRANSPORTS: Final[dict[str, Callable[..., Any]]] = {
+    "tcp": TcpChannel.connect,
+    "websocket": WebSocketChannel.connect,
+    **{name: partial(BusChannel.connect, opening) for name, opening in BUSES.items()},
+}
 """How a sender connects: (host, port, small=True) -> a ``Channel``."""

@@ -1,4 +1,4 @@
-"""What the extra ``live`` brings, imported where it is used."""
+"""What the extras ``live``, ``zenoh`` and ``dds`` bring, imported where it is used."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from bufgym.errors import BufgymError, install
 
 
 @contextmanager
-def needs(library: str) -> Iterator[None]:
-    """An error that names the extra if ``library`` is missing, which the block imports."""
+def needs(library: str, extra: str = "live") -> Iterator[None]:
+    """An error that names ``extra`` if ``library`` is missing, which the block imports."""
     try:
         yield
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] != library:
             raise
-        raise BufgymError(f"bufgym.live needs {error.name}: {install('live')}") from None
+        raise BufgymError(f"bufgym.live needs {error.name}: {install(extra)}") from None

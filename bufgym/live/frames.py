@@ -63,3 +63,11 @@ def parse(data: bytes | bytearray | memoryview, max_body_bytes: int) -> tuple[Fr
     if body_bytes > most_bytes:
         raise FrameError(f"body of {body_bytes} bytes: must be at most {most_bytes}")
     return Frame(kind, number, seq, at_us, x, topic), body_bytes
+
+
+def whole(data: bytes, max_body_bytes: int) -> Frame:
+    """The frame that is all of ``data``; errors as for ``parse``."""
+    frame, body_bytes = parse(data, max_body_bytes)
+    if len(data) != HEADER_BYTES + body_bytes:
+        raise FrameError(f"message of {len(data)} bytes: must be {HEADER_BYTES + body_bytes}, as its header says")
+    return frame._replace(body=memoryview(data)[HEADER_BYTES:])

@@ -20,6 +20,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, cast
 
+import numpy as np
+
 from bufgym.errors import BufgymError
 from bufgym.live.extra import needs
 from bufgym.model.qoi import Value
@@ -62,6 +64,11 @@ def settings(
 
 def _numbers(value: Value) -> Record:
     return {"name": value.name, "numbers": value.array.tolist()}
+
+
+def value_of(v: Record) -> Value:
+    """V, of what ``settings`` wrote of it."""
+    return Value(v["name"], np.array(v["numbers"], np.float64))
 
 
 class LogFile:

@@ -14,9 +14,12 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
 from bufgym.errors import BufgymError
-from bufgym.live.channels import Channel, TcpChannel, WebSocketChannel
+from bufgym.live.bus_channel import BusServer
+from bufgym.live.buses import BUSES, MQTT_PORT
+from bufgym.live.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel
 from bufgym.live.extra import needs
 from bufgym.live.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError
+from bufgym.live.sockets import free_port
 from bufgym.live.tasks import Tasks
 
 MAX_STREAMS: Final = 64
@@ -72,15 +75,21 @@ class Receiver:
         self._tasks = Tasks()
         self._listener: socket.socket | None = None
         self._server: Any = None
+        self._bus: BusServer | None = None
 
     async def listen(self, port: int = 0, host: str = "127.0.0.1", transport: str = "tcp") -> int:
-        """Begin to listen; the port (0: any that is free)."""
+        """Begin to listen; the port (0: any that is free). Over MQTT these are the broker's (0: the standard's)."""
         if transport == "tcp":
             self._listener = await listener(host, port)
             self._tasks.begin(self._accept(self._listener))
             return int(self._listener.getsockname()[1])
+        if transport in BUSES:
+            port = port or (MQTT_PORT if transport == "mqtt" else free_port(host))
+            self._bus = BusServer(self._serve, self._tasks.begin, self._max_body_bytes)
+            await self._bus.listen(BUSES[transport], host, port)
+            return port
         if transport != "websocket":
-            raise BufgymError(f"transport {transport!r}: must be 'tcp' or 'websocket'")
+            raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
         with needs("websockets"):
             from websockets.asyncio.server import serve
         self._server = await serve(
@@ -96,6 +105,8 @@ class Receiver:
 
     async def close(self) -> None:
         """Hang up, and listen no more."""
+        if self._bus is not None:
+            await self._bus.close()
         await self._tasks.end()
         if self._listener is not None:
             self._listener.close()

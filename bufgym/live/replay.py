@@ -11,10 +11,9 @@ import numpy as np
 
 from bufgym.errors import BufgymError
 from bufgym.kernel import records as zeroed
-from bufgym.live.log import Record, of, read_log
+from bufgym.live.log import Record, of, read_log, value_of
 from bufgym.model.buffer import MESSAGE
 from bufgym.model.link import Link
-from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
 from bufgym.scenario import Episode
@@ -58,22 +57,18 @@ def _replayed(records: Sequence[Record], policy: Policy | None) -> Replay:
     made = records[0]
     if policy is None:
         policy = replace(get(made["policy"]), parameters=made["parameters"])
-    topics = [Topic(**{**topic, "value": topic["value"] and _value(topic["value"])}) for topic in made["topics"]]
+    topics = [Topic(**{**topic, "value": topic["value"] and value_of(topic["value"])}) for topic in made["topics"]]
     episode = Episode(_arrivals(records), Link(_trace(records)), window=made["window"])
     senders = run(
         policy,
         [replace(episode, window=made["window"])],
         made["capacity"],
-        _value(made["v"]),
+        value_of(made["v"]),
         max_bytes=made["max_bytes"],
         decide_at=made["decide_at"],
         topics=topics,
     )
     return Replay(senders, episode, tuple(_differences(records, senders)))
-
-
-def _value(v: Record) -> Value:
-    return Value(v["name"], np.array(v["numbers"], np.float64))
 
 
 def _arrivals(records: Sequence[Record]) -> np.ndarray[Any, Any]:

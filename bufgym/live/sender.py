@@ -46,6 +46,7 @@ class Sender:
         self._unacked: deque[Item] = deque()
         self._acked = asyncio.Event()
         self._max_body_bytes = 0
+        self._next = 0  # the number of the message that the queue hands out next
         self._left = 0  # messages of which the queue knows that they have left
 
     async def run(self) -> None:
@@ -79,7 +80,7 @@ class Sender:
 
     async def _greet(self, channel: Channel) -> None:
         """Say which stream this is; what the receiver has already got needs no second sending."""
-        first = self._unacked[0].number if self._unacked else 0
+        first = self._unacked[0].number if self._unacked else self._next
         await channel.send(Frame(GREETING, first, body=self._stream))
         answer = await asyncio.wait_for(channel.receive(), PATIENCE_S)
         if answer.kind != GREETING:
@@ -105,6 +106,7 @@ class Sender:
             await self._send(channel, unacked)
         while (item := await self.queue.aget()) is not None:
             self._unacked.append(item)
+            self._next = item.number + 1
             await self._send(channel, item)
             while len(self._unacked) >= _MOST_UNACKED:
                 await self._an_ack()

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,42 +15,14 @@ from bufgym.live.channels import TRANSPORTS
 from bufgym.live.log import Record
 from bufgym.live.queue import PolicyQueue
 from bufgym.live.receiver import Received, Receiver
+from bufgym.live.runs import Run
 from bufgym.live.sender import Leaves, Sender
 from bufgym.live.shaped import ShapedLink
 from bufgym.model.qoi import Value
-from bufgym.oracle.measure import regret
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode, Streams, Uplink
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome, received
-
-
-@dataclass(frozen=True)
-class Run:
-    """One policy on one episode, live and simulated."""
-
-    policy: str
-    link: str
-    seed: int
-    live_delivered: int
-    simulated_delivered: int
-    live_qoi: float
-    simulated_qoi: float
-    best_qoi: float
-    """The clairvoyant's H."""
-
-    @property
-    def live_regret(self) -> float:
-        return regret(self.live_qoi, self.best_qoi)
-
-    @property
-    def simulated_regret(self) -> float:
-        return regret(self.simulated_qoi, self.best_qoi)
-
-    @property
-    def qoi_difference(self) -> float:
-        """Live over simulated H, less 1."""
-        return self.live_qoi / self.simulated_qoi - 1 if self.simulated_qoi else 0.0
 
 
 async def play(
@@ -67,26 +37,31 @@ async def play(
     speed: float = 1.0,
     seed: int = 0,
     log: list[Record] | None = None,
+    port: int = 0,
 ) -> list[Received]:
     """What arrives at the other end of real sockets, when ``policy`` sends the messages of ``episode`` over its link.
 
+    ``received_ns`` counts from the episode's beginning, as ``at_us`` does, but as this system's time runs.
+
     Args:
-        transport: "tcp" or "websocket".
+        transport: one of ``TRANSPORTS`` over TCP.
         leaves: when a message has left, see ``Sender``.
         small: small buffers in the system; else its default ones.
         speed: how much faster time runs for queue and link alike; bytes are as they are.
         seed: of the draws of randomised policies.
         log: takes the queue's records.
+        port: the receiver's (0: any); over MQTT the broker's.
     """
     if transport not in TRANSPORTS:
         raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
+    _warm(PolicyQueue(policy, capacity, value=value, window=episode.window))
     came: list[Received] = []
 
     def take(message: Received) -> None:
-        came.append(message._replace(body=b""))
+        came.append(message._replace(body=b"", received_ns=time.monotonic_ns() - round(began_s * 1e9)))
 
     receiver = Receiver(take)
-    link = ShapedLink(episode.link, ("127.0.0.1", await receiver.listen(transport=transport)), speed=speed)
+    link = ShapedLink(episode.link, ("127.0.0.1", await receiver.listen(port, transport=transport)), speed=speed)
     port = await link.listen()
     messages = episode.arrivals
     bodies = memoryview(bytes(int(messages["size_bytes"].max())))
@@ -121,13 +96,21 @@ async def play(
     return came
 
 
+def _warm(queue: PolicyQueue) -> None:
+    """One message through the queue, so that nothing is compiled while the episode's time runs."""
+    queue.put(b"", 1)
+    queue.get()
+    queue.gone()
+    queue.close()
+
+
 def validate(
     policies: Sequence[Policy],
     scenario: Uplink,
     capacity: int,
     *,
     seeds: int = 1,
-    transport: str = "tcp",
+    transports: Sequence[str] = ("tcp",),
     speed: float = 1.0,
 ) -> list[Run]:
     """Every policy on ``seeds`` episodes of every trace, on sockets one after the other, and in the simulator."""
@@ -139,51 +122,26 @@ def validate(
             for policy in policies:
                 drawn = episode.with_uniforms(np.random.default_rng(seed))
                 simulated = run(policy, [drawn], capacity, scenario.value)
-                came = asyncio.run(
-                    play(policy, episode, capacity, scenario.value, transport=transport, speed=speed, seed=seed)
-                )
-                runs.append(
-                    Run(
-                        policy.name,
-                        trace.name,
-                        seed,
-                        len(came),
-                        len(received(simulated, 0)),
-                        scenario.value.information([message.x for message in came]),
-                        outcome(simulated, 0).qoi,
-                        best,
+                messages = received(simulated, 0)
+                transmitted_us = simulated.batch.log["transmitted_us"][0, messages["seq"]]
+                delivery_us = transmitted_us + episode.link.propagation_us - messages["arrival_us"]
+                for transport in transports:
+                    came = asyncio.run(
+                        play(policy, episode, capacity, scenario.value, transport=transport, speed=speed, seed=seed)
                     )
-                )
+                    runs.append(
+                        Run(
+                            policy.name,
+                            trace.name,
+                            seed,
+                            len(came),
+                            len(messages),
+                            scenario.value.information([message.x for message in came]),
+                            outcome(simulated, 0).qoi,
+                            best,
+                            transport,
+                            tuple(message.received_ns / 1e9 * speed - message.at_us / 1e6 for message in came),
+                            tuple((delivery_us / 1e6).tolist()),
+                        )
+                    )
     return runs
-
-
-def table(runs: Sequence[Run]) -> str:
-    """The runs in Markdown: means by policy, then how far apart live and simulated are."""
-    lines = [
-        "| policy | delivered, live | simulated | QoI, live | simulated | regret, live | simulated |",
-        "|---|---:|---:|---:|---:|---:|---:|",
-    ]
-    by_policy: dict[str, list[Run]] = {}
-    for one in runs:
-        by_policy.setdefault(one.policy, []).append(one)
-
-    def mean(name: str, chosen: list[Run]) -> Any:
-        return statistics.fmean(getattr(one, name) for one in chosen)
-
-    for name, chosen in sorted(by_policy.items(), key=lambda entry: -mean("simulated_qoi", entry[1])):
-        cells = [
-            f"{mean('live_delivered', chosen):.1f}",
-            f"{mean('simulated_delivered', chosen):.1f}",
-            f"{mean('live_qoi', chosen):.3f}",
-            f"{mean('simulated_qoi', chosen):.3f}",
-            f"{mean('live_regret', chosen):.2%}",
-            f"{mean('simulated_regret', chosen):.2%}",
-        ]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    apart = [abs(one.qoi_difference) for one in runs]
-    counts = [abs(one.live_delivered - one.simulated_delivered) for one in runs]
-    lines.append(
-        f"\n{len(runs)} runs: QoI live and simulated {statistics.median(apart):.2%} apart (median), "
-        f"{max(apart):.2%} at most; delivered {statistics.median(counts):g} and {max(counts)}."
-    )
-    return "\n".join(lines)

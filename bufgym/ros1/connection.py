@@ -15,7 +15,8 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from bufgym.live import LogFile, PolicyQueue
-from bufgym.live.channels import PIECE_BYTES, UNSENT_BYTES, small_buffers, unacked_bytes
+from bufgym.live.channels import PIECE_BYTES
+from bufgym.live.sockets import UNSENT_BYTES, small_buffers, unacked_bytes
 
 _POLL_S: Final = 0.001
 

@@ -1,11 +1,25 @@
-"""A queue on a link of a test's own: every time is an argument."""
+"""A queue on a link of a test's own, where every time is an argument; and which transports there are here."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from bufgym.live import PolicyQueue
+from bufgym.live.channels import TRANSPORTS
 from bufgym.live.log import Record
+
+LIBRARIES = {"websocket": "websockets", "zenoh": "zenoh", "mqtt": "paho.mqtt", "dds": "cyclonedds"}
+OVER_TCP = [transport for transport in TRANSPORTS if transport != "dds"]
+"""What goes through a shaped link."""
+
+
+def meeting_port(transport: str, request: pytest.FixtureRequest) -> int:
+    """Where a receiver listens: any port, or over MQTT the broker's; skips what is not installed."""
+    if transport in LIBRARIES:
+        pytest.importorskip(LIBRARIES[transport], reason=f"no {LIBRARIES[transport]} here")
+    return int(request.getfixturevalue("broker_port")) if transport == "mqtt" else 0
 
 
 class Bench:

@@ -34,7 +34,7 @@ def test_send_receive_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert main(["bench", "--workload", str(came), "--topics", "/topic_0", "--trace", "lte-synthetic-0"]) == 0
 
 
-def test_validate_prints_both_side_by_side(capsys: pytest.CaptureFixture[str]) -> None:
+def test_validate_prints_both_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [
         "--trace",
         "lte-synthetic-0",
@@ -46,10 +46,17 @@ def test_validate_prints_both_side_by_side(capsys: pytest.CaptureFixture[str]) -
         "50000",
         "--speed",
         "2",
+        "--transport",
+        "tcp",
+        "websocket",
+        "--out",
+        str(tmp_path),
     ]
     assert main(["live", "validate", *arguments]) == 0
     out = capsys.readouterr().out
-    assert "| afr |" in out and "1 runs" in out
+    assert "| afr |" in out and "2 runs" in out
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "bufgym live validate --trace lte-synthetic-0 --policies afr" in page and "--transport tcp websocket" in page
 
 
 @pytest.mark.parametrize(

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from live_cases import OVER_TCP, meeting_port
 
 from bufgym import policies
 from bufgym.kernel import JIT
-from bufgym.live import replay
-from bufgym.live.channels import TRANSPORTS
+from bufgym.live import PolicyQueue, replay
 from bufgym.live.log import Record
+from bufgym.live.runs import Run, orders, table
 from bufgym.live.shaped import ShapedLink
-from bufgym.live.validate import Run, play, table, validate
+from bufgym.live.validate import play, validate
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, Uplink, messages
@@ -42,11 +43,11 @@ def live(episode: Episode, policy: str = "afr", capacity: int = 8, **settings: A
     )
 
 
-@pytest.mark.parametrize("transport", TRANSPORTS)
-def test_on_sockets_as_in_the_simulator(transport: str) -> None:
+@pytest.mark.parametrize("transport", OVER_TCP)
+def test_on_sockets_as_in_the_simulator(transport: str, request: pytest.FixtureRequest) -> None:
     """Wide margins: on a quiet machine counts agree within 1 and QoI within 0.5 %."""
     records: list[Record] = []
-    came = live(fade(), transport=transport, log=records)
+    came = live(fade(), transport=transport, port=meeting_port(transport, request), log=records)
     simulated = outcome(run(policies.get("afr"), [fade()], 8, V), 0)
     assert [message.number for message in came] == list(range(len(came)))
     assert [message.seq for message in came] == sorted({message.seq for message in came})
@@ -107,6 +108,23 @@ def test_a_link_whose_messages_come_back(back: bool, carried_bytes: int) -> None
     assert taken_s >= 0.45 * back
 
 
+def test_nothing_is_compiled_while_the_episodes_time_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first decision of a process takes a second here: 2 s of the episode, which it must not cost."""
+
+    class Compiling(PolicyQueue):
+        compiled = False
+
+        def put(self, *arguments: Any, **settings: Any) -> int:
+            if not Compiling.compiled:
+                time.sleep(1)
+                Compiling.compiled = True
+            return super().put(*arguments, **settings)
+
+    monkeypatch.setattr("bufgym.live.validate.PolicyQueue", Compiling)
+    came = live(fade(5))
+    assert Compiling.compiled and came[0].at_us < 10**6
+
+
 def test_a_window_of_several_messages() -> None:
     episode = fade(60)
     several = Episode(episode.arrivals, episode.link, window=3)
@@ -127,7 +145,20 @@ def test_validation_holds_both_side_by_side() -> None:
 
 
 def test_the_table_by_hand() -> None:
-    runs = [Run("afr", "a", 0, 9, 10, 4.0, 5.0, 5.0), Run("afr", "b", 0, 10, 10, 5.0, 5.0, 5.0)]
+    runs = [
+        Run("afr", "a", 0, 9, 10, 4.0, 5.0, 5.0, "tcp", (0.1, 0.2, 0.6), (0.1, 0.2)),
+        Run("afr", "b", 0, 10, 10, 5.0, 5.0, 5.0, "tcp", (0.2, 0.4), (0.15,)),
+    ]
     text = table(runs)
-    assert "| afr | 9.5 | 10.0 | 4.500 | 5.000 | 10.00% | 0.00% |" in text
+    assert "| afr | 9.5 | 10.0 | 4.500 | 5.000 | 10.00% | 0.00% | 0.250 | 0.150 |" in text
     assert "10.00% apart (median), 20.00% at most; delivered 0.5 and 1." in text
+
+
+def test_orders_by_hand() -> None:
+    """On link a the three differ by more than 1 % but for the last two, of which live one swaps with the first."""
+
+    def one(policy: str, simulated: float, live: float, link: str = "a") -> Run:
+        return Run(policy, link, 0, 1, 1, live, simulated, 9.0)
+
+    runs = [one("afr", 5.0, 4.9), one("random", 4.0, 3.9), one("drop-oldest", 4.03, 4.95), one("afr", 1.0, 1.0, "b")]
+    assert orders(runs) == (1, 2)

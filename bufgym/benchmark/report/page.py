@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -22,6 +23,36 @@ CHARTS = (charts.ranking, charts.capacities, charts.outages, costs.delays, timel
 
 def html(run: Run, summary: Summary) -> str:
     """The whole page, in one file that asks for no other."""
+    context = Context.of(run, summary)
+    cells = list(dict.fromkeys((row["scenario"], row["capacity"]) for row in run.rows))
+    return rendered(
+        "summary" if summary.scores is None else "scores",
+        [chart for chart in (draw(context) for draw in CHARTS) if chart is not None],
+        manifest=run.manifest,
+        summary=summary,
+        intro=[run.manifest["about"], *tables.intro(run)[1:]],
+        rows=len(run.rows),
+        episodes=len({(row["scenario"], row["trace"], row["seed"]) for row in run.rows}),
+        scenarios=len({scenario for scenario, _ in cells}),
+        sizes=sorted({capacity for _, capacity in cells}),
+        confidence=f"{summary.confidence:.0%}".replace("%", " %"),
+        threshold=f"{DISCRIMINATIVE:.0%}".replace("%", " %"),
+        places=tables.ranking(run, summary),
+        cells=[
+            (title(cell, run.abouts), tables.ranking(run, summary, standings))
+            for cell, standings in summary.cells.items()
+        ],
+        best=next((s for s in summary.overall[:1] if s.ranked and not math.isnan(s[summary.rank_by].value)), None),
+        reference=None if summary.scores is None else summary.standings.get(summary.scores.reference),
+        heat=None if summary.scores is None else tables.heat_map(summary.scores),
+        shade=_shade,
+        colour=context.colour,
+        episode=run.timeline,
+    )
+
+
+def rendered(template: str, drawn: Sequence[Chart], **words: Any) -> str:
+    """A page with charts, from one of the templates here and what it asks for."""
     jinja2, graphs, plotly_js = _libraries()
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(_asset),
@@ -32,37 +63,15 @@ def html(run: Run, summary: Summary) -> str:
     )
     environment.filters |= {"score": table.score, "percent": table.percent}
     markup = jinja2.utils.markupsafe.Markup
-    context = Context.of(run, summary)
-    drawn = {chart.id: chart for chart in (draw(context) for draw in CHARTS) if chart is not None}
-    cells = list(dict.fromkeys((row["scenario"], row["capacity"]) for row in run.rows))
-    template = "summary" if summary.scores is None else "scores"
+    charts = {chart.id: chart for chart in drawn}
     return str(
         environment.get_template(f"{template}.html.jinja").render(
-            manifest=run.manifest,
-            summary=summary,
-            intro=[run.manifest["about"], *tables.intro(run)[1:]],
-            rows=len(run.rows),
-            episodes=len({(row["scenario"], row["trace"], row["seed"]) for row in run.rows}),
-            scenarios=len({scenario for scenario, _ in cells}),
-            sizes=sorted({capacity for _, capacity in cells}),
-            confidence=f"{summary.confidence:.0%}".replace("%", " %"),
-            threshold=f"{DISCRIMINATIVE:.0%}".replace("%", " %"),
-            places=tables.ranking(run, summary),
-            cells=[
-                (title(cell, run.abouts), tables.ranking(run, summary, standings))
-                for cell, standings in summary.cells.items()
-            ],
-            best=next((s for s in summary.overall[:1] if s.ranked and not math.isnan(s[summary.rank_by].value)), None),
-            reference=None if summary.scores is None else summary.standings.get(summary.scores.reference),
-            heat=None if summary.scores is None else tables.heat_map(summary.scores),
-            shade=_shade,
-            colour=context.colour,
-            charts=drawn,
-            episode=run.timeline,
+            charts=charts,
             css=markup(_asset("page.css")),
             js=markup(_asset("page.js")),
             plotly=markup(plotly_js),
-            figures=markup(_figures(drawn, graphs)),
+            figures=markup(_figures(charts, graphs)),
+            **words,
         )
     )
 
