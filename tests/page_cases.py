@@ -20,7 +20,7 @@ WRITTEN = [
 ]
 """Pages that are files. (The changelog names commands of its day.)"""
 
-PROGRAMS = ("bufgym", "python", "make", "pip", "pre-commit", "docker", "source")
+PROGRAMS = ("bufgym", "python", "python3", "make", "pip", "pre-commit", "docker", "source")
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import ast
 import functools
 import glob
 import gzip
-import importlib
+import importlib.util
 import re
 import shutil
 import textwrap
@@ -55,18 +55,21 @@ PARSED = {
     r"bufgym report results/lte": "tests/benchmark/test_report_folder.py",
     r"bufgym gallery .*": "tests/test_gallery.py; the first one by test_readme.py",
     r"bufgym live .*": "sockets; tests/live/test_command.py",
-    r"bufgym reproduce afr-fig9": "tests/reproduce/test_reproduce.py",
+    r"bufgym ros2 .*": "needs ROS 2; tests/live/test_ros2.py",
+    r"bufgym export .* --to c .*": "compiles for 40 s; tests/test_c_export.py",
+    r"bufgym reproduce (afr-fig9|small-link)": "tests/reproduce/test_reproduce.py",
     r"bufgym trace fit .*": "needs recordings; tests/traces/test_fit.py",
     r"bufgym (perf( --peers)?|warmup)": "tests/benchmark/test_perf_and_play.py, test_warmup.py",
     r"bufgym (topics --policy-file|play|bench --policies .*seeds) .*": "tests/test_readme.py",
     r"bufgym bench --workload drive\.mcap .*": "tests/test_cli_workload.py",
     r"bufgym bench .*(my-agent.zip|every-second|drive\.csv).*": "the tutorial before it makes its files; test_site.py",
+    r"python3? (-m bufgym\.ros1|examples/ros[12]/fade\.py).*": "needs ROS; tests/live/test_ros1.py, test_ros2.py",
     r"python train\.py .*": "minutes to hours; tests/test_train.py",
     r"python -m agents\..*": "needs a run's folder; tests/test_agents.py, test_scheduling.py, test_ablation.py",
     r"python examples/view_missed\.py": "tests/test_training_examples.py",
     r"python -m pytest .*": "a test",
     r"make .*": "a rule of the Makefile",
-    r"pip install .*|pre-commit install|source \.venv/bin/activate": "set-up; .ci/install-matrix",
+    r"pip install .*|python3 -m venv .*|pre-commit install|source \.venv/bin/activate": "set-up; .ci/install-matrix",
 }
 """Pattern of a whole command -> why it does not run here, and what tests it."""
 
@@ -113,6 +116,8 @@ def test_python_is_given_what_it_takes() -> None:
             page = importlib.import_module(settings.pop(0)).main
             # The same settings for a function that does nothing.
             assert not settings or tyro.cli(functools.wraps(page)(lambda *given, **named: "taken"), args=settings)
+        elif program == "-m" and settings[0] != "pytest":
+            assert importlib.util.find_spec(settings[0]) is not None
         elif program == "train.py" and settings != ["--help"]:
             assert tyro.cli(Settings, args=settings).algo
         else:
@@ -256,6 +261,7 @@ AFTER = {"docs/guide/truth.md": "assert round(best.value, 5) == 0.98311", "docs/
 """What a page says of its program."""
 
 ELSEWHERE = {
+    "docs/guide/on-a-robot.md": "tests/live/test_ros1.py, test_ros2.py",
     "docs/guide/own-policy.md": "tests/test_readme.py and above, by a command",
     "docs/guide/yours-to-change.md": "tests/test_examples.py",
     "docs/index.md": "tests/test_readme.py",
