@@ -137,7 +137,7 @@ def topics(monkeypatch: pytest.MonkeyPatch) -> Any:
     [
         (["none.py"], "none.py: no such file"),
         (["--policy", "nonsense", __file__], "unknown policy 'nonsense'"),
-        (["--policy", "/camera=oracle", __file__], "unknown policy 'oracle'"),
+        (["--policy", "/camera=nobody", __file__], "unknown policy 'nobody'"),
         (["--value", "round:1", __file__], "round"),
     ],
 )
