@@ -59,7 +59,7 @@ PARSED = {
     r"bufgym export .* --to c .*": "compiles for 40 s; tests/test_c_export.py",
     r"bufgym reproduce (afr-fig9|small-link)": "tests/reproduce/test_reproduce.py",
     r"bufgym trace fit .*": "needs recordings; tests/traces/test_fit.py",
-    r"bufgym (perf( --peers)?|warmup)": "tests/benchmark/test_perf_and_play.py, test_warmup.py",
+    r"bufgym (perf( --peers| --profile)?|warmup)": "tests/benchmark/test_perf_and_play.py, test_warmup.py",
     r"bufgym (topics --policy-file|play|bench --policies .*seeds) .*": "tests/test_readme.py",
     r"bufgym bench --workload drive\.mcap .*": "tests/test_cli_workload.py",
     r"bufgym bench .*(my-agent.zip|every-second|drive\.csv).*": "the tutorial before it makes its files; test_site.py",
