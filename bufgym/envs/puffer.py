@@ -83,13 +83,7 @@ class PufferSenders(pufferlib.PufferEnv):  # type: ignore[misc]
         rows = self.rows
         if rows.senders.episodes[0] is None:
             raise gym.error.ResetNeeded("call reset() before step()")
-        chosen = np.ascontiguousarray(actions, np.int64)
-        if chosen.shape != (self.num_agents,):
-            raise BufgymError(f"actions have shape {chosen.shape}: must be ({self.num_agents},)")
-        if chosen.min() < 0 or chosen.max() >= rows.capacity + 2:
-            wrong = int(np.argmax((chosen < 0) | (chosen >= rows.capacity + 2)))
-            raise rows.bad_action(f"actions[{wrong}]", chosen[wrong])
-        rows.step(chosen)
+        rows.step(rows.actions(actions))
         self.rewards[:], self.terminals[:] = rows.rewards(), rows.output.terminated
         ended = np.flatnonzero(rows.output.terminated)
         infos: list[dict[str, float]] = []
@@ -102,7 +96,7 @@ class PufferSenders(pufferlib.PufferEnv):  # type: ignore[misc]
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[n, L + 2]: the actions that are valid now in each row."""
-        return self.rows.output.action_mask.astype(np.bool_)
+        return self.rows.action_masks()
 
     def close(self) -> None:
         """Nothing is held open."""

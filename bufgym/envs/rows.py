@@ -265,6 +265,23 @@ class Rows:
             raise self.bad_action(name, number)
         return number
 
+    def actions(self, actions: Any) -> NDArray[np.int64]:
+        """One action for each row as the kernels read them, or an error that says which does not fit."""
+        numbers = np.asarray(actions)
+        if numbers.dtype.kind not in "iu":
+            raise BufgymError(f"actions are {numbers.dtype}: must be whole numbers (int64)")
+        numbers = np.ascontiguousarray(numbers, np.int64)
+        if numbers.shape != (len(self),):
+            raise BufgymError(f"actions have shape {numbers.shape}: must be ({len(self)},)")
+        if numbers.min() < 0 or numbers.max() >= self.capacity + 2:
+            wrong = int(np.argmax((numbers < 0) | (numbers >= self.capacity + 2)))
+            raise self.bad_action(f"actions[{wrong}]", numbers[wrong])
+        return numbers
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """bool[n, L + 2]: the actions that are valid now in each row."""
+        return self.output.action_mask.astype(np.bool_)
+
     def bounds(self, ended: NDArray[np.bool_], qoi: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """By name float64[n]: what ``measured`` finds of the rows that have ``ended`` with this H; 0 elsewhere."""
         columns = {name: np.zeros(len(self)) for name in BOUND}

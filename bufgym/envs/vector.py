@@ -131,15 +131,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self, actions: NDArray[np.int64]
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         rows = self.rows
-        actions = np.asarray(actions)
-        if actions.dtype.kind not in "iu":
-            raise BufgymError(f"actions are {actions.dtype}: must be whole numbers (int64)")
-        actions = np.ascontiguousarray(actions, np.int64)
-        if actions.shape != (self.num_envs,):
-            raise BufgymError(f"actions have shape {actions.shape}: must be ({self.num_envs},)")
-        if actions.min() < 0 or actions.max() >= rows.capacity + 2:
-            wrong = int(np.argmax((actions < 0) | (actions >= rows.capacity + 2)))
-            raise rows.bad_action(f"actions[{wrong}]", actions[wrong])
+        actions = rows.actions(actions)
         if rows.senders.episodes[-1] is None:
             raise gym.error.ResetNeeded("call reset() before step()")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._done.any():
@@ -163,7 +155,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[n, L + 2]: the actions that are valid now in each row."""
-        return self.rows.output.action_mask.astype(np.bool_)
+        return self.rows.action_masks()
 
     def render(self) -> Any:
         """Each row as the single environment renders it."""
