@@ -187,8 +187,7 @@ def _rollouts(sizes: Sizes) -> Iterable[Figure]:
     )
 
     def load() -> None:
-        for i, episode in enumerate(episodes):
-            senders.load(i, episode)
+        senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
 
     for name in POLICIES:
         run = functools.partial(senders.run, policies.get(name))

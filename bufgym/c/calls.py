@@ -103,8 +103,7 @@ def recorded(
         raise BufgymError(f"policy {policy.name}: is asked when the socket is free: must decide at arrivals alone")
     longest = max(len(episode.arrivals) for episode in episodes)
     senders = Senders(len(episodes), capacity, value, max_messages=longest, max_bytes=max_bytes)
-    for i, episode in enumerate(episodes):
-        senders.load(i, episode)
+    senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
     senders.follow(policy)
     # An arrival may have to wait for as many evictions as the queue holds, but each message is evicted only once.
     most = sum(1 + 4 * len(episode.arrivals) for episode in episodes)

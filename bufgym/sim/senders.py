@@ -81,8 +81,9 @@ class Senders:
     def load_all(self, begun: Sequence[Begun]) -> None:
         """``load`` for each of ``begun`` at once."""
         loads = records(len(begun), LOAD)
+        v_starts = [self._checked(episode) for _, episode, _ in begun]  # before any of them is touched
         for r, (i, episode, uniforms) in enumerate(begun):
-            loads[r] = self._loaded(i, episode)
+            loads[r] = self._loaded(i, episode, v_starts[r])
             self.episodes[i], self._uniforms[i] = episode, uniforms
             self.begun[i] += 1
         if self._knots.us is not self.batch.knot_us:
@@ -90,11 +91,11 @@ class Senders:
         ask_when_full = int(self.decide_at == "overflow")
         load_rows(self.batch, loads, self._topic_table, self.capacity, self.max_bytes, ask_when_full)
 
-    def _loaded(self, i: int, episode: Episode) -> tuple[int, ...]:
-        """LOAD of sender ``i``, which gets the episode's arrivals; an error if it can't play it."""
+    def _checked(self, episode: Episode) -> int:
+        """Where the V of the episode begins in the array of all V; an error if these senders can't play it."""
         if not isinstance(episode, Episode):
             raise BufgymError(f"episode: {episode!r} is not a bufgym.scenario Episode")
-        link, n = episode.link, len(episode.arrivals)
+        n = len(episode.arrivals)
         if n > self.batch.arrivals.shape[1]:
             most = self.batch.arrivals.shape[1]
             raise BufgymError(f"episode of {n} messages: these senders have room for {most}")
@@ -102,12 +103,15 @@ class Senders:
             raise BufgymError(f"episode: unknown topic {unknown}; the senders know {len(self.topics)}, from 0 on")
         if not self.topics:
             episode.check_one_queue()
-        v_start = 0 if episode.value is None else self._v_start(episode.value)
-        words = episode.arrivals.view(np.int64)
+        return 0 if episode.value is None else self._v_start(episode.value)
+
+    def _loaded(self, i: int, episode: Episode, v_start: int) -> tuple[int, ...]:
+        """LOAD of sender ``i``, which gets the episode's arrivals."""
+        link, words = episode.link, episode.arrivals.view(np.int64)
         self._words[i, : len(words)] = words
         decisions = (episode.first_decision, episode.last_decision)
         delays = (link.offset_us, link.propagation_us, episode.window, episode.ack_delay_us)
-        return (i, n, *decisions, *self._knots.place(link.trace, i), *delays, v_start)
+        return (i, len(episode.arrivals), *decisions, *self._knots.place(link.trace, i), *delays, v_start)
 
     def value_of(self, i: int) -> Value:
         """The V that the QoI of sender ``i``'s episode is measured with; without topics."""
@@ -208,8 +212,7 @@ def run(
     senders = Senders(
         len(episodes), capacity, v, max_messages=longest, max_bytes=max_bytes, decide_at=decide_at, topics=topics
     )
-    for i, episode in enumerate(episodes):
-        senders.load(i, episode)
+    senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
     senders.run(policy, memory)
     senders.check_untouched(policy)
     return senders

@@ -74,3 +74,14 @@ def test_fleets_have_one_too() -> None:
 def test_a_pool_is_a_whole_number(pool: Any) -> None:
     with pytest.raises(BufgymError, match=r"pool = .*: must be a whole number from 1 to 1000000"):
         SenderEnv(UPLINK, L, pool=pool)
+
+
+def test_a_reset_that_is_refused_touches_no_row() -> None:
+    """Of three episodes given the last is too long: the rows before it go on with what they have."""
+    batch = SenderVectorEnv(3, UPLINK, L)
+    batch.reset(seed=1)
+    before = batch.rows.senders.batch.arrivals.copy()
+    long = Uplink(traces=UPLINK.traces, duration_s=2.0).draw(Streams.seeded(3))
+    with pytest.raises(BufgymError, match="these senders have room for"):
+        batch.reset(options={"episodes": [UPLINK.draw(Streams.seeded(2)), None, long]})
+    assert (batch.rows.senders.batch.arrivals == before).all() and batch.rows.senders.begun.tolist() == [1, 1, 1]
