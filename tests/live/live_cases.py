@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from bufgym.live import PolicyQueue
 from bufgym.live.channels import TRANSPORTS
 from bufgym.live.log import Record
+from bufgym.live.receiver import Received
 
 LIBRARIES = {"websocket": "websockets", "zenoh": "zenoh", "mqtt": "paho.mqtt", "dds": "cyclonedds"}
 OVER_TCP = [transport for transport in TRANSPORTS if transport != "dds"]
@@ -20,6 +23,16 @@ def meeting_port(transport: str, request: pytest.FixtureRequest) -> int:
     if transport in LIBRARIES:
         pytest.importorskip(LIBRARIES[transport], reason=f"no {LIBRARIES[transport]} here")
     return int(request.getfixturevalue("broker_port")) if transport == "mqtt" else 0
+
+
+def slowly(came: list[Received]) -> Callable[[Received], Awaitable[None]]:
+    """What a receiver that takes 50 ms for each message hands it to; they end in ``came``."""
+
+    async def take(message: Received) -> None:
+        came.append(message)
+        await asyncio.sleep(0.05)
+
+    return take
 
 
 class Bench:

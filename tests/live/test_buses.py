@@ -7,7 +7,7 @@ from collections.abc import Coroutine
 from typing import Any
 
 import pytest
-from live_cases import meeting_port
+from live_cases import meeting_port, slowly
 
 from bufgym.cli import live as command
 from bufgym.live import PolicyQueue
@@ -50,12 +50,7 @@ def test_a_slow_receiver_and_what_the_policy_drops(transport: str, request: pyte
 
     async def story() -> None:
         came: list[Received] = []
-
-        async def slowly(message: Received) -> None:
-            came.append(message)
-            await asyncio.sleep(0.05)
-
-        receiver = Receiver(slowly)
+        receiver = Receiver(slowly(came))
         port = await receiver.listen(meeting, transport=transport)
         queue = PolicyQueue("drop-oldest", 4)
         sender = Sender(queue, lambda: TRANSPORTS[transport]("127.0.0.1", port))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live_cases import OVER_TCP, meeting_port
+from live_cases import OVER_TCP, meeting_port, slowly
 
 from bufgym.errors import BufgymError
 from bufgym.live import LogFile, PolicyQueue, read_log, replay
@@ -195,12 +195,7 @@ def test_a_message_larger_than_the_receiver_takes_is_an_error() -> None:
 def test_a_slow_receiver_slows_the_sender_not_the_robot() -> None:
     async def story() -> None:
         came: list[Received] = []
-
-        async def slowly(message: Received) -> None:
-            came.append(message)
-            await asyncio.sleep(0.05)
-
-        receiver = Receiver(slowly)
+        receiver = Receiver(slowly(came))
         port = await receiver.listen()
         queue = PolicyQueue("drop-oldest", 4)
         task = asyncio.create_task(Sender(queue, lambda: TcpChannel.connect("127.0.0.1", port)).run())
