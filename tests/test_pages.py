@@ -162,9 +162,15 @@ def test_every_picture_stands_beside_the_command_that_makes_it() -> None:
 # -------------------- commands: run
 
 
+@pytest.fixture
+def folder(given: Path, tmp_path: Path) -> Path:
+    """What the pages' commands read; each has its own."""
+    return shutil.copytree(given, tmp_path / "pages")
+
+
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the pages' commands read, stand-ins for recordings included."""
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What they read, stand-ins for recordings included."""
     there = tmp_path_factory.mktemp("pages")
     for name in ("examples", "traces"):
         shutil.copytree(REPO / name, there / name)
@@ -216,7 +222,7 @@ def _untrained(there: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("line", [line for line in commands() if entry(RUN, line) is not None])
 def test_the_command_runs(
-    line: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    line: str, given: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
@@ -230,6 +236,7 @@ def test_the_command_runs(
         _untrained(folder)
     said = words(line)[1:]
     said = [name for word in said for name in (sorted(glob.glob(word)) if "*" in word else [word])]
+    assert {path.name for path in given.iterdir()} <= {path.name for path in Path.cwd().iterdir()}
     try:
         assert main([*said, *words(entry(RUN, line) or "")]) == 0
     except SystemExit as end:  # --help

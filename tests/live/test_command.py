@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -24,11 +25,16 @@ def test_send_receive_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[s
         target=main, args=(["live", "receive", "--port", port, "--messages", "30", "--out", str(came)],), daemon=True
     )
     receiving.start()
-    sent = main(["live", "send", f"127.0.0.1:{port}", "--size", "1000", "--duration", "1", "--log", str(log)])
+    out, patience = "", time.monotonic() + 60
+    while "listening" not in out and time.monotonic() < patience:
+        time.sleep(0.05)
+        out += capsys.readouterr().out
+    room = ["--capacity", "64"]  # however slow the machine is: nothing is dropped
+    sent = main(["live", "send", f"127.0.0.1:{port}", "--size", "1000", "--duration", "1", *room, "--log", str(log)])
     receiving.join(30)
     assert sent == 0 and not receiving.is_alive()
     assert main(["live", "replay", str(log)]) == 0
-    out = capsys.readouterr().out
+    out += capsys.readouterr().out
     assert "30 received; 0 broken connections" in out
     assert "30 put, 30 delivered, 0 dropped" in out and "makes the same decisions" in out
     assert main(["bench", "--workload", str(came), "--topics", "/topic_0", "--trace", "lte-synthetic-0"]) == 0
