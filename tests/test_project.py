@@ -30,6 +30,7 @@ ROOMS = [
     "sim",
     "oracle",
     "live",
+    "perception",
     "c",
     "envs",
     "expert",
