@@ -178,7 +178,7 @@ class Tracker:
             self._seen,
         )
         icp.orient(self._seen, np.ascontiguousarray(pose[:3, 3]), SAME_SURFACE, self._seen_normals)
-        to_model_camera = np.linalg.inv(pose)
+        to_model_camera = np.asarray(np.linalg.inv(pose), np.float64)
         for stride, most_steps in LEVELS:
             for _ in range(most_steps):
                 step = self._step(stride, pose, to_model_camera)

@@ -148,8 +148,8 @@ def raycast(
     """The surface as seen from ``to_world``: float32[height, width, 3] in the world, NaN where none is seen.
 
     ``hint`` float32[height, width] is a depth that was fused from there, 0 where none: what lies in front of it by more
-    than the truncation was found free, so the ray begins there. It goes on by what the function says is free, at least a voxel and at most the truncation; where it passes from
-    positive to negative, both sides known, lies the surface.
+    than the truncation was found free, so the ray begins there. It goes on by what the function says is free, at least
+    a voxel and at most the truncation; where it passes from positive to negative, both sides known, lies the surface.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     m = to_world
@@ -180,7 +180,7 @@ def raycast(
                 else:
                     value = tsdf[i, j, k]
                     if value < 0.0:
-                        if before > 0.0:
+                        if before >= 0.0:
                             back = z - step
                             near = _trilinear(tsdf, weight, ox + gx * back, oy + gy * back, oz + gz * back)
                             far = _trilinear(tsdf, weight, ox + gx * z, oy + gy * z, oz + gz * z)
