@@ -200,7 +200,7 @@ def furnished(rng: np.random.Generator, size_m: Float64Array, way: Float64Array)
 def _box(rng: np.random.Generator, size_m: Float64Array, n: int) -> Float64Array:
     """Of four things one stands at a wall, one on the floor, and two hang at a wall."""
     half = np.array([0.15 + 0.4 * rng.random(), 0.12 + 0.2 * rng.random(), 0.2 + 0.75 * rng.random()])
-    turn = 0.5 * np.pi * rng.integers(4)
+    turn = 0.5 * np.pi * int(rng.integers(4))
     if n % 4 == 1:
         half[2] *= 0.45
         turn = 2 * np.pi * rng.random()
