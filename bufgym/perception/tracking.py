@@ -23,7 +23,7 @@ from bufgym.traces.trace import Float64Array
 
 LEVELS: Final = ((4, 10), (2, 5), (1, 4))
 """(stride, steps) from coarse to fine, as KinectFusion has them."""
-SMALL_STEP: Final = 1e-4
+SMALL_STEP: Final = 3e-4
 """A level ends early at a smaller step, rad and m."""
 SAME_SURFACE: Final = 0.05
 """Neighbouring pixels are of one surface if their distances differ by at most this share."""
