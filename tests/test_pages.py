@@ -293,7 +293,12 @@ def test_pages_whose_programs_run_elsewhere_have_some() -> None:
 @pytest.mark.parametrize("block", PROGRAMS, ids=[f"{block.page}-{k}" for k, block in enumerate(PROGRAMS)])
 def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for package in ("sb3_contrib", "cma", "pettingzoo", "mcap", "cv2"):
-        needs = {"cma": "agents.objectives", "pettingzoo": "parallel_env", "mcap": ".mcap", "cv2": "bufgym.perception"}.get(package, package)
+        needs = {
+            "cma": "agents.objectives",
+            "pettingzoo": "parallel_env",
+            "mcap": ".mcap",
+            "cv2": "bufgym.perception",
+        }.get(package, package)
         if needs in block.text:
             pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
