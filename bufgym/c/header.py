@@ -16,7 +16,6 @@ from bufgym.errors import BufgymError, printable
 from bufgym.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
-from bufgym.observe import CONTEXT_FIELDS, ON_BOARD_FIELDS, SLOT_FIELDS
 from bufgym.observe.queue import ROUNDING, TINY
 from bufgym.policies import Policy, learned
 from bufgym.policies.scoring import end_of, unpack
@@ -118,17 +117,16 @@ def _scorers(policy: Policy) -> dict[str, Any]:
     text += "/* The second one decides while the link stands still. */\n" if len(entries) > 1 else ""
     text += f"#define BUFGYM_SCORERS {len(entries)}\n"
     text += f"static const struct bufgym_scorer bufgym_scorers[] = {{\n{''.join(entries)}}};\n"
-    context = (*CONTEXT_FIELDS, *ON_BOARD_FIELDS)
     scratch = (
         "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"
-        f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{len(context)}];\n"
-        f"    double rows[{len(SLOT_FIELDS)}][BUFGYM_CAPACITY + 1];\n"
+        f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{learned.CONTEXT}];\n"
+        f"    double rows[{learned.SLOTS}][BUFGYM_CAPACITY + 1];\n"
     )
     return {
         "WEIGHTS": text,
         "SCRATCH": scratch,
-        "SLOT_FIELDS": _enum(field.name for field in SLOT_FIELDS),
-        "CONTEXT_FIELDS": _enum(field.name for field in context),
+        "SLOT_FIELDS": _enum(learned.SLOT_NAMES),
+        "CONTEXT_FIELDS": _enum(learned.CONTEXT_NAMES),
     }
 
 

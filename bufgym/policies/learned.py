@@ -27,11 +27,12 @@ from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
 from bufgym.observe import (
     CONTEXT_FIELDS,
-    FIELDS,
     ON_BOARD_FIELDS,
+    ON_BOARD_SLOT_FIELDS,
     SLOT_FIELDS,
     observe_context,
     observe_on_board,
+    observe_on_board_slots,
     observe_slots,
 )
 from bufgym.policies.registry import Arrival, Memory, Policy
@@ -50,10 +51,12 @@ from bufgym.policies.scoring import (
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 
-SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
-CONTEXT = TABLE + len(ON_BOARD_FIELDS)
-ON_BOARD = tuple(field.name for field in ON_BOARD_FIELDS)
-NAMES = tuple(field.name for field in FIELDS) + ON_BOARD
+SLOT_NAMES = tuple(field.name for field in (*SLOT_FIELDS, *ON_BOARD_SLOT_FIELDS))
+CONTEXT_NAMES = tuple(field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS))
+NAMES = SLOT_NAMES + CONTEXT_NAMES
+SLOTS, CONTEXT = len(SLOT_NAMES), len(CONTEXT_NAMES)
+# Those that come after are observed only where they are read.
+TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
 
 STILL = 0.07
 """The link stands still while its service ratio (running mean of departures per arrival) is below this: from the first
@@ -72,7 +75,11 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         if scorer.fields[i] >= TABLE:
             observe_on_board(buffer, arrival, scratch.context[TABLE:])
             break
-    observe_slots(buffer, arrival, scratch.rows)
+    observe_slots(buffer, arrival, scratch.rows[:TABLE_SLOTS])
+    for i in range(scorer.context, len(scorer.fields)):
+        if scorer.fields[i] >= TABLE_SLOTS:
+            observe_on_board_slots(buffer, arrival, scratch.rows[TABLE_SLOTS:])
+            break
     read_context(scorer, scratch)
     common = begin(scorer, DROP, scratch)
     best, decision = -np.inf, REJECT
@@ -99,8 +106,8 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 class Weights(ScorerWeights):
     """A slot scorer for one queue."""
 
-    SLOT_NAMES = NAMES[:SLOTS]
-    CONTEXT_NAMES = NAMES[SLOTS:]
+    SLOT_NAMES = SLOT_NAMES
+    CONTEXT_NAMES = CONTEXT_NAMES
     NETWORKS = ("drop", "accept")
     LAYERS = 2
 
@@ -126,7 +133,7 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
         work=(scratch, SLOTS),
         source=source,
         about=summary,
-        reads_rate=not set(ON_BOARD).isdisjoint(weights.fields),
+        reads_rate=not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields),
         compile=True,
     )
 

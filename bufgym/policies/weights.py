@@ -9,7 +9,7 @@ hidden layer ``drop.0.weight`` [inputs, outputs] and ``drop.0.bias`` [outputs], 
     name          the policy's
     about         a sentence: what it does (may be absent)
     fields        the observation's fields that it reads, in the order of the networks' inputs
-    observation   hash of what defines them (``bufgym.observe.FIELDS``, and those of ``ON_BOARD_FIELDS`` among them)
+    observation   hash of what defines them (``bufgym.observe.FIELDS``, and those on board among them)
     bufgym        version that wrote the file
     sha256        of fields and tensors
 
@@ -34,7 +34,7 @@ from safetensors.numpy import save as serialized
 from bufgym import __version__
 from bufgym.errors import BufgymError, where
 from bufgym.files import read_whole, replaced
-from bufgym.observe import FIELDS, ON_BOARD_FIELDS, TOPIC_FIELDS
+from bufgym.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, TOPIC_FIELDS
 from bufgym.policies import learned, learned_topics
 from bufgym.policies.learned import Weights
 from bufgym.policies.learned_topics import TopicWeights
@@ -65,7 +65,8 @@ def observation_hash(topics: bool = False, names: Sequence[str] = ()) -> str:
 
     ``topics``: with the fields that only several topics have; those beside the tables count where ``names`` has them.
     """
-    fields = [*FIELDS, *(TOPIC_FIELDS if topics else ()), *(field for field in ON_BOARD_FIELDS if field.name in names)]
+    beside = [field for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.name in names]
+    fields = [*FIELDS, *(TOPIC_FIELDS if topics else ()), *beside]
     table = [(field.name, field.per, field.unit, field.meaning) for field in fields]
     return hashlib.sha256(json.dumps(table).encode()).hexdigest()
 

@@ -29,9 +29,11 @@ from bufgym.observe import (
     CONTEXT_FIELDS,
     FIELDS,
     ON_BOARD_FIELDS,
+    ON_BOARD_SLOT_FIELDS,
     SLOT_FIELDS,
     observe_context,
     observe_on_board,
+    observe_on_board_slots,
     observe_slots,
 )
 from bufgym.policies import learned
@@ -43,7 +45,7 @@ from bufgym.sim import named, python_view, run
 from bufgym.sim.metrics import outcome
 
 V = qoi.exponential(0.618)
-SLOT_NAMES = [field.name for field in SLOT_FIELDS]
+SLOT_NAMES = [field.name for field in (*SLOT_FIELDS, *ON_BOARD_SLOT_FIELDS)]
 CONTEXT_NAMES = [field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS)]
 
 
@@ -81,7 +83,8 @@ def twin(whole):
         made = whole.still if whole.still is not None and buffer.service_ratio < 0.07 else whole
         s, L = len(buffer.slots), buffer.capacity
         slots, context = np.zeros((len(SLOT_NAMES), L + 1)), np.zeros(len(CONTEXT_NAMES))
-        observe_slots(buffer, arrival, slots)
+        observe_slots(buffer, arrival, slots[: len(SLOT_FIELDS)])
+        observe_on_board_slots(buffer, arrival, slots[len(SLOT_FIELDS) :])
         observe_context(buffer, arrival, context[: len(CONTEXT_FIELDS)])
         observe_on_board(buffer, arrival, context[len(CONTEXT_FIELDS) :])
 
