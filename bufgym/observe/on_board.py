@@ -170,7 +170,7 @@ def index_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
 @kernel
 def even_index_gap(buffer: Buffer, arrival: Any) -> float:
     """Arrivals since the message dequeued last, divided by L + 1."""
-    return max(arrival.seq - buffer.dequeued_seq, 0) / (buffer.capacity + 1)
+    return float(max(arrival.seq - buffer.dequeued_seq, 0) / (buffer.capacity + 1))
 
 
 @_field("slot", "queue", "g/(g+r), r = even spacing in messages")
