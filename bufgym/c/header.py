@@ -15,7 +15,7 @@ from bufgym.c.calls import random_episode, recorded
 from bufgym.errors import BufgymError, printable
 from bufgym.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
-from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
+from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value, straight
 from bufgym.observe.queue import ROUNDING, TINY
 from bufgym.policies import Policy, learned
 from bufgym.policies.scoring import end_of, unpack
@@ -53,7 +53,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     """
     check_limits(capacity, max_bytes)
     learns = policy.on_arrival is learned.on_arrival
-    body = _part("features.h") + _part("scorer.h") if learns else _rule(policy)
+    body = _part("features.h") + _part("greedy.h") + _part("scorer.h") if learns else _rule(policy)
     if "bufgym_departure(" not in body:
         body += "\n" + _part("no_departure.h")
     unlimited = max_bytes is None
@@ -76,6 +76,9 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "TINY": repr(TINY),
         "ROUNDING": repr(ROUNDING),
         "STILL": repr(learned.STILL),
+        "FLOWS": repr(learned.FLOWS),
+        "STEADY": repr(learned.STEADY),
+        "STRAIGHT": int(straight(value.array)),
         "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
     }
     if learns:
@@ -99,7 +102,7 @@ def _rule(policy: Policy) -> str:
 
 def _scorers(policy: Policy) -> dict[str, Any]:
     """What a learned policy's C is filled with: its scorers, their scratch and the fields."""
-    parameters, begin, networks = np.array(policy.weights), 0, len(learned.Weights.NETWORKS)
+    parameters, begin, networks = np.array(policy.weights), 1, len(learned.Weights.NETWORKS)
     entries: list[str] = []
     text, inputs, units = "", 1, 1
     while begin < len(parameters):
@@ -116,6 +119,7 @@ def _scorers(policy: Policy) -> dict[str, Any]:
         begin = end_of(parameters, begin, networks)
     text += "/* The second one decides while the link stands still. */\n" if len(entries) > 1 else ""
     text += f"#define BUFGYM_SCORERS {len(entries)}\n"
+    text += f"#define BUFGYM_LEAVES_TO_GREEDY {int(parameters[0])}\n"
     text += f"static const struct bufgym_scorer bufgym_scorers[] = {{\n{''.join(entries)}}};\n"
     scratch = (
         "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"

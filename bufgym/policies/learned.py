@@ -12,6 +12,10 @@ A second scorer over the same fields, with hidden layers of its own, may decide 
 (``STILL``): thinning a queue that nothing leaves, for an unknown time, is a different task from keeping up with a slow
 link.
 
+An agent may leave to ``greedy-qoi`` what that does better (``greedy``), as can be told on board. Where V is straight
+and then flat, gaps of the length where it bends lose nothing: no plan is better, however long an interruption is. On a
+steady link the queue is sent as it stands, so that there is no trap: what is worth most now stays so.
+
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
 
@@ -25,6 +29,7 @@ from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
+from bufgym.model.qoi import straight
 from bufgym.observe import (
     CONTEXT_FIELDS,
     ON_BOARD_FIELDS,
@@ -35,6 +40,7 @@ from bufgym.observe import (
     observe_on_board_slots,
     observe_slots,
 )
+from bufgym.policies.gaps import greedy_qoi
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.scoring import (
     DROP,
@@ -61,14 +67,29 @@ TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
 STILL = 0.07
 """The link stands still while its service ratio (running mean of departures per arrival) is below this: from the first
 arrival of an interruption on (1/16), or 41 arrivals after a link that kept up has stopped."""
+FLOWS, STEADY = 0.18, 0.01
+"""The link is steady while at least so many messages leave per arrival, and its rates over 0.1 s and 0.5 s differ from
+that over 2 s by no more than twice this share, and this share, of it."""
+_greedy_qoi = kernel(greedy_qoi)
+
+
+@kernel
+def steady(buffer: Buffer) -> bool:
+    """Whether the link carries messages at one and the same rate."""
+    mean = buffer.long_rate_bytes_per_s
+    near = abs(buffer.medium_rate_bytes_per_s - mean) <= STEADY * mean
+    level = near and abs(buffer.short_rate_bytes_per_s - mean) <= 2 * STEADY * mean
+    return bool(level and mean > 0 and buffer.drained_us > 0 and buffer.service_ratio >= FLOWS)
 
 
 @kernel
 def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The decision that scores highest."""
     s, L = len(buffer.slots), buffer.capacity
-    at = end_of(buffer.parameters, 0, 2) if buffer.service_ratio < STILL else 0
-    scorer = unpack(buffer.parameters, at if at < len(buffer.parameters) else 0, 2)
+    if buffer.parameters[0] > 0 and (straight(buffer.v) or steady(buffer)):
+        return _greedy_qoi(buffer, arrival, memory)
+    at = end_of(buffer.parameters, 1, 2) if buffer.service_ratio < STILL else 1
+    scorer = unpack(buffer.parameters, at if at < len(buffer.parameters) else 1, 2)
     scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
     observe_context(buffer, arrival, scratch.context[:TABLE])
     for i in range(scorer.context):
@@ -115,11 +136,13 @@ class Weights(ScorerWeights):
     """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
     still: Weights | None = None
     """Decides while the link stands still, from the same fields; None: these weights do."""
+    greedy: bool = False
+    """Whether ``greedy-qoi`` decides where V is straight and then flat, and while the link is steady."""
 
     def parameters(self) -> NDArray[np.float64]:
-        """As the policy reads them: this scorer, then the one for a link that stands still."""
+        """As the policy reads them: whether it is greedy, this scorer, then the one for a link that stands still."""
         scorers = [self] if self.still is None else [self, self.still]
-        return np.concatenate([scorer.pack(scorer.mix) for scorer in scorers])
+        return np.concatenate([[float(self.greedy)], *(scorer.pack(scorer.mix) for scorer in scorers)])
 
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
@@ -133,7 +156,7 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
         work=(scratch, SLOTS),
         source=source,
         about=summary,
-        reads_rate=not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields),
+        reads_rate=weights.greedy or not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields),
         compile=True,
     )
 
