@@ -8,7 +8,7 @@ from bufgym.cli.options import Commands, command, count, refuse
 from bufgym.errors import BufgymError
 
 _FOR_C = ("capacity", "max_bytes", "value")
-_FOR_WEIGHTS = ("name", "about", "greedy")
+_FOR_WEIGHTS = ("name", "about", "shortcuts")
 
 
 def add(commands: Commands) -> None:
@@ -25,10 +25,10 @@ def add(commands: Commands) -> None:
     weights.add_argument("--name", metavar="N", help="the policy's name; must be given")
     weights.add_argument("--about", metavar="TEXT", help="a sentence: what it was trained for")
     weights.add_argument(
-        "--greedy",
+        "--shortcuts",
         action="store_true",
         default=None,
-        help="leave to greedy-qoi where V is straight and then flat, and a steady link",
+        help="leave to greedy-qoi and exact plans what they do better",
     )
     c = parser.add_argument_group(
         "C (--to c)",
@@ -52,7 +52,7 @@ def _as_weights(options: argparse.Namespace, out: str) -> object:
     refuse(options, _FOR_C, "belongs to --to c")
     if options.name is None:
         raise BufgymError("--name must be given: the policy's name")
-    return export(options.model, out, name=options.name, about=options.about or "", greedy=bool(options.greedy))
+    return export(options.model, out, name=options.name, about=options.about or "", shortcuts=bool(options.shortcuts))
 
 
 def _as_c(options: argparse.Namespace, out: str) -> object:

@@ -12,9 +12,10 @@ A second scorer over the same fields, with hidden layers of its own, may decide 
 (``STILL``): thinning a queue that nothing leaves, for an unknown time, is a different task from keeping up with a slow
 link.
 
-An agent may leave to ``greedy-qoi`` what that does better (``greedy``), as can be told on board. Where V is straight
-and then flat, gaps of the length where it bends lose nothing: no plan is better, however long an interruption is. On a
-steady link the queue is sent as it stands, so that there is no trap: what is worth most now stays so.
+An agent may leave to others what they do better, as can be told on board (``shortcuts``). Where V is straight and then
+flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and no plan is better, however long an
+interruption is. It does so on a steady link too: the queue is sent as it stands, there is no trap. And while the link
+stands still a queue of four messages at most follows the exact plan (``small_queue``) where there is one.
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
@@ -54,6 +55,7 @@ from bufgym.policies.scoring import (
     score,
     unpack,
 )
+from bufgym.policies.small_queue import NONE, NUMBERS, packed, planned
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 
@@ -86,10 +88,17 @@ def steady(buffer: Buffer) -> bool:
 def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The decision that scores highest."""
     s, L = len(buffer.slots), buffer.capacity
-    if buffer.parameters[0] > 0 and (straight(buffer.v) or steady(buffer)):
-        return _greedy_qoi(buffer, arrival, memory)
-    at = end_of(buffer.parameters, 1, 2) if buffer.service_ratio < STILL else 1
-    scorer = unpack(buffer.parameters, at if at < len(buffer.parameters) else 1, 2)
+    still, end = buffer.service_ratio < STILL, len(buffer.parameters)
+    if buffer.parameters[0] > 0:
+        end -= NUMBERS
+        if straight(buffer.v) or steady(buffer):
+            return _greedy_qoi(buffer, arrival, memory)
+        if still:
+            plan = planned(buffer, arrival, buffer.parameters[end:])
+            if plan != NONE:
+                return plan
+    at = end_of(buffer.parameters, 1, 2) if still else 1
+    scorer = unpack(buffer.parameters, at if at < end else 1, 2)
     scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
     observe_context(buffer, arrival, scratch.context[:TABLE])
     for i in range(scorer.context):
@@ -136,13 +145,15 @@ class Weights(ScorerWeights):
     """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
     still: Weights | None = None
     """Decides while the link stands still, from the same fields; None: these weights do."""
-    greedy: bool = False
-    """Whether ``greedy-qoi`` decides where V is straight and then flat, and while the link is steady."""
+    shortcuts: bool = False
+    """Whether ``greedy-qoi`` and exact plans decide where they do better."""
 
     def parameters(self) -> NDArray[np.float64]:
-        """As the policy reads them: whether it is greedy, this scorer, then the one for a link that stands still."""
+        """As the policy reads them: whether there are shortcuts, this scorer, the one for a link that stands still,
+        the shortcuts' plans."""
         scorers = [self] if self.still is None else [self, self.still]
-        return np.concatenate([[float(self.greedy)], *(scorer.pack(scorer.mix) for scorer in scorers)])
+        plans = [packed()] if self.shortcuts else []
+        return np.concatenate([[float(self.shortcuts)], *(scorer.pack(scorer.mix) for scorer in scorers), *plans])
 
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
@@ -156,7 +167,7 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
         work=(scratch, SLOTS),
         source=source,
         about=summary,
-        reads_rate=weights.greedy or not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields),
+        reads_rate=weights.shortcuts or not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields),
         compile=True,
     )
 

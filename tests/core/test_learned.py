@@ -62,7 +62,7 @@ def weights(draw):
     )
     mix = rng.normal(0, 1, (len(made.context), len(made.slot))).astype(np.float32)
     made, other = (replace(each, mix=draw(st.sampled_from([None, mix]))) for each in (made, other))
-    return replace(made, still=draw(st.sampled_from([None, other])), greedy=draw(st.booleans()))
+    return replace(made, still=draw(st.sampled_from([None, other])), shortcuts=draw(st.booleans()))
 
 
 # --- the twin --------------------------------------------------------------------------------------------------------
@@ -87,7 +87,7 @@ def twin(whole):
         flows = buffer.drained_us > 0 and buffer.service_ratio >= 0.18
         v = buffer.v
         bends_once = v[0] == qoi.SATURATING or (v[0] == qoi.TABULATED and v[int(v[1]) + 3] == v[-1])
-        if whole.greedy and (bends_once or (level and flows)):
+        if whole.shortcuts and (bends_once or (level and flows)):
             return policies.get("greedy-qoi").on_arrival(buffer, arrival, memory)
         made = whole.still if whole.still is not None and buffer.service_ratio < 0.07 else whole
         s, L = len(buffer.slots), buffer.capacity
@@ -174,7 +174,7 @@ def test_where_greed_is_no_trap_it_loses_nothing():
         sum(
             outcome(one, i).qoi for one in [run(learned.policy("own", w), episodes, L, world.value)] for i in range(200)
         )
-        for w in (made, replace(made, greedy=False))
+        for w in (made, replace(made, shortcuts=False))
     )
     assert greedy == pytest.approx(best, rel=1e-12)
     assert alone < 0.9999 * best

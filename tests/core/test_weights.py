@@ -54,11 +54,11 @@ def test_what_is_written_comes_back_bit_for_bit(path, kind, widths):
 
 
 def test_what_is_left_to_greedy_qoi_comes_back(path):
-    weights.save(path, replace(made(3), greedy=True), ABOUT)
+    weights.save(path, replace(made(3), shortcuts=True), ABOUT)
     again, metadata = weights.read(path)
-    assert again.greedy and metadata["greedy"] is True
+    assert again.shortcuts and metadata["shortcuts"] is True
     weights.save(path, made(3), ABOUT)
-    assert not weights.read(path)[0].greedy and "greedy" not in weights.read(path)[1]
+    assert not weights.read(path)[0].shortcuts and "shortcuts" not in weights.read(path)[1]
 
 
 def test_the_format_is_what_the_text_says(path):

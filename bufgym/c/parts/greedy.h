@@ -10,8 +10,8 @@ static inline int bufgym_greedy(const struct bufgym_queue *q, const struct bufgy
     if (s > 0 || q->dequeued > 0)
         gain = bufgym_value(arrival->x - (s > 0 ? q->slots[s - 1].x : q->dequeued_x));
     for (k = 0; k < s; k++) {
-        const double before = q->slots[k].x - (k > 0 ? q->slots[k - 1].x : q->dequeued_x);
-        const double after = (k + 1 < s ? q->slots[k + 1].x : arrival->x) - q->slots[k].x;
+        const struct bufgym_message *slot = &q->slots[k], *next = k + 1 < s ? slot + 1 : arrival;
+        const double before = slot->x - (k > 0 ? (slot - 1)->x : q->dequeued_x), after = next->x - slot->x;
         const double added = gain - bufgym_merging_loss(before, bufgym_value(before), after, bufgym_value(after));
         if (added > most) {
             most = added;

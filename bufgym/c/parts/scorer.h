@@ -86,8 +86,13 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
     const int s = q->occupancy, L = BUFGYM_CAPACITY;
     double common, best = -HUGE_VAL;
     int i, k, decision = BUFGYM_REJECT;
-    if (BUFGYM_LEAVES_TO_GREEDY && (@STRAIGHT@ || bufgym_steady(q)))
-        return bufgym_greedy(q, arrival);
+    if (BUFGYM_SHORTCUTS) {
+        const int plan = q->service_ratio < @STILL@ ? bufgym_planned(q, arrival) : BUFGYM_NO_PLAN;
+        if (@STRAIGHT@ || bufgym_steady(q))
+            return bufgym_greedy(q, arrival);
+        if (plan != BUFGYM_NO_PLAN)
+            return plan;
+    }
     bufgym_observe_context(q, arrival);
     bufgym_observe_slots(q, arrival);
     for (i = 0; i < scorer->context; i++)
