@@ -151,7 +151,8 @@ def test_an_agent_in_c_decides_as_in_python_a_million_times(name, tmp_path):
 @pytest.mark.parametrize("L", [1, 2, 3, 4])
 def test_a_small_queue_follows_its_plan_in_c_too(L, tmp_path):
     policy = policies.get("learned-motion")
-    episodes = [draw(Interruption(t_max=400), seed) for seed in range(40 if JIT else 2)]
+    drawn = [draw(Interruption(t_max=400), seed) for seed in range(40 if JIT else 2)]
+    episodes = [Episode(e.arrivals, e.link) for e in drawn]
     calls = recorded(policy, episodes, L, EXPONENTIAL)
     calls.tofile(tmp_path / "calls")
     text = header(policy, L, EXPONENTIAL)

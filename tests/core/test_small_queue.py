@@ -21,8 +21,6 @@ from bufgym.scenario import Interruption
 
 TEXT = Path(small_queue.__file__).with_suffix(".txt").read_text(encoding="utf-8")
 LINES = [line.split() for line in TEXT.splitlines()]
-    line.split() for line in Path(small_queue.__file__).with_suffix(".txt").read_text(encoding="utf-8").splitlines()
-]
 AGENT = policies.load(files.shipped("agents", "agents/pretrained", "*.safetensors")["learned-motion"])
 
 
