@@ -69,6 +69,7 @@ TRAINING = [
     "agents.goals",
     "agents.scheduling",
     "agents.ablation",
+    "agents.small_queue",
     "train",
 ]
 """The modules that drive training, top to bottom. Each imports only bufgym and modules above it."""
