@@ -37,6 +37,7 @@ ROOMS = [
     "benchmark",
     "ros1",
     "ros2",
+    "relay",
     "reproduce",
     "gallery",
     "cli",
