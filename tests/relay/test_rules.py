@@ -117,7 +117,8 @@ def test_nothing_is_delivered_that_no_rule_allows(seed: int) -> None:
 
     async def story() -> None:
         async with (
-            relay(settings(rules=tuple(configuration))) as server, client(server.port, local=addresses[0]) as a,
+            relay(settings(rules=tuple(configuration))) as server,
+            client(server.port, local=addresses[0]) as a,
             client(server.port, local=addresses[1]) as b,
             client(server.port, local=addresses[2]) as c,
         ):
