@@ -74,7 +74,8 @@ async def busy(robots: int, viewers: int, seconds: float, slow: bool) -> None:
         latency_us: list[list[int]] = [[] for _ in range(viewers)]
 
         async def view(k: int) -> None:
-            async with client(relay.port, name=f"viewer-{k}") as one:
+            buffer_bytes = 65_536 if slow and k == 0 else None
+            async with client(relay.port, receive_buffer_bytes=buffer_bytes, name=f"viewer-{k}") as one:
                 await one.subscribe("^/robots/")
                 while True:
                     message = await one.next(1e6)
