@@ -48,7 +48,7 @@ class Client:
     async def command(self, seq: int, topic: str = COMMAND) -> None:
         await self.put(topic, str(seq).encode(), encoding="json", seq=seq, no_drop=True)
 
-    async def next(self, timeout_s: float = 5.0) -> Any:
+    async def next(self, timeout_s: float = 20.0) -> Any:
         """What comes next: a ``Message``, or the object of a text frame."""
         data = await asyncio.wait_for(self.socket.recv(), timeout_s)
         return wire.decode(data) if isinstance(data, bytes) else wire.heard(data)
@@ -79,18 +79,14 @@ async def client(
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
     own.bind((local, 0))
     own.setblocking(False)
-    await asyncio.get_running_loop().sock_connect(own, ("127.0.0.1", port))
-    async with connect(
-        f"{'wss' if tls else 'ws'}://127.0.0.1:{port}{wire.PATH}",
-        sock=own,
-        ssl=tls,
-        subprotocols=[Subprotocol(wire.SUBPROTOCOL)],
-        compression=None,
-        proxy=None,
-        close_timeout=0.2,
-        max_queue=1,
-    ) as connection:
-        one = Client(connection)
+    stack = contextlib.AsyncExitStack()
+    stack.callback(own.close)
+    async with stack:
+        await asyncio.get_running_loop().sock_connect(own, ("127.0.0.1", port))
+        options = {"compression": None, "proxy": None, "close_timeout": 0.2, "max_queue": 1}
+        url = f"{'wss' if tls else 'ws'}://127.0.0.1:{port}{wire.PATH}"
+        connecting = connect(url, sock=own, ssl=tls, subprotocols=[Subprotocol(wire.SUBPROTOCOL)], **options)
+        one = Client(await stack.enter_async_context(connecting))
         await one.say("hello", **{"version": 1, **hello})
         one.welcome = await one.next()
         yield one
