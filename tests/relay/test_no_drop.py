@@ -20,7 +20,7 @@ from bufgym.relay.config import Rule, Store
 from bufgym.relay.wire import Message
 
 HERE = Path(__file__).parent
-KILLS = int(os.environ.get("BUFGYM_KILLS", "3"))
+KILLS = int(os.environ.get("BUFGYM_KILLS", "2"))
 
 
 async def came(one: Client, seq: int, payload: bytes) -> None:
@@ -288,6 +288,7 @@ def test_exactly_once_though_the_relay_is_killed(tmp_path: Path) -> None:
         finally:
             for task in tasks:
                 task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
             process.kill()
             await process.wait()
         for k in range(1, max(receiver.took) + 1):
