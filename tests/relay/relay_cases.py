@@ -50,7 +50,8 @@ class Client:
 
     async def next(self, timeout_s: float = 20.0) -> Any:
         """What comes next: a ``Message``, or the object of a text frame."""
-        data = await asyncio.wait_for(self.socket.recv(), timeout_s)
+        async with asyncio.timeout(timeout_s):  # wait_for of Python 3.11 can lose a cancellation
+            data = await self.socket.recv()
         return wire.decode(data) if isinstance(data, bytes) else wire.heard(data)
 
     async def nothing(self, for_s: float = 0.15) -> bool:
