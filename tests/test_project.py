@@ -38,6 +38,7 @@ ROOMS = [
     "benchmark",
     "ros1",
     "ros2",
+    "relay",
     "reproduce",
     "gallery",
     "cli",

@@ -9,11 +9,11 @@ from bufgym.errors import BufgymError, install
 
 
 @contextmanager
-def needs(library: str, extra: str = "live") -> Iterator[None]:
-    """An error that names ``extra`` if ``library`` is missing, which the block imports."""
+def needs(library: str, extra: str = "live", room: str = "bufgym.live") -> Iterator[None]:
+    """An error that names ``room`` and ``extra`` if ``library`` is missing, which the block imports."""
     try:
         yield
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] != library:
             raise
-        raise BufgymError(f"bufgym.live needs {error.name}: {install(extra)}") from None
+        raise BufgymError(f"{room} needs {error.name}: {install(extra)}") from None

@@ -71,7 +71,7 @@ def read_client(path: str | Path, **parameters: Any) -> Client:
     Raises BufgymError, one line that names the file, for a file that can't be read or breaks a rule.
     """
     try:
-        settings = _settings(path)
+        settings = read_toml(path)
         tables = settings.pop("topic", [])
         check_keys(settings, _CLIENT_KEYS, "topic, ")
         if not isinstance(tables, list) or not tables:
@@ -82,7 +82,7 @@ def read_client(path: str | Path, **parameters: Any) -> Client:
         raise error if str(error).startswith(f"{path}") else BufgymError(f"{path}: {error}") from None
 
 
-def _settings(path: str | Path) -> dict[str, Any]:
+def read_toml(path: str | Path) -> dict[str, Any]:
     """What the TOML file holds."""
     text = read_utf8(path, MAX_TOML_BYTES)
     for number, line in enumerate(text.split("\n"), 1):

@@ -1,0 +1,256 @@
+"""A relay's configuration: who may do what, and how much of it. ``examples/relay.toml`` has every table.
+
+Everything is denied that no rule allows: a configuration without rules serves nobody.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Final
+
+from bufgym.errors import BufgymError
+from bufgym.model.checks import above_0, whole
+from bufgym.model.topics import check_window
+from bufgym.relay.patterns import pattern
+from bufgym.scenario.configuration import check_keys, read_toml
+
+PORT: Final = 7420
+NO_DROP: Final = ("/robots/[^/]+/command",)
+POLICIES: Final = ("robofleet", "skip-pending", "drop-oldest", "drop-newest", "afr", "min-motion-gap", "ros-native")
+"""What a viewer may choose; each is compiled when it is first asked for."""
+DEFAULT_CAPACITY: Final = 32
+ALGORITHMS: Final = ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512", "EdDSA")
+"""Signatures by a private key alone: with a shared secret every verifier could sign."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Robofleet's rule: an identity, send or receive, a pattern of whole topics. What no rule allows is denied."""
+
+    address: str = ""
+    """An IP address, or a range as ``10.0.0.0/8``."""
+    email: str = ""
+    """That of a token or a client's certificate."""
+    recorder: bool = False
+    """The relay's own recorder."""
+    send: bool = False
+    receive: bool = False
+    topic: str = ".*"
+
+    def __post_init__(self) -> None:
+        if (self.address != "") + (self.email != "") + (self.recorder is True) != 1:
+            raise BufgymError("rule: needs one identity: an address, an email, or recorder = true")
+        for name in ("send", "receive", "recorder"):
+            if not isinstance(getattr(self, name), bool):
+                raise BufgymError(f"rule: {name} = {getattr(self, name)!r}: must be true or false")
+        if not (self.send or self.receive):
+            raise BufgymError("rule: must allow send or receive")
+        if self.address:
+            try:
+                ipaddress.ip_network(self.address)
+            except ValueError as error:
+                raise BufgymError(f"rule: address = {self.address!r}: {error}") from None
+        elif self.email and (not isinstance(self.email, str) or not self.email.isprintable()):
+            raise BufgymError(f"rule: email = {self.email!r}: must be a text")
+        pattern(self.topic)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Of one identity, over all its connections, where not said otherwise."""
+
+    message_bytes: int = 2**23
+    """Of a frame."""
+    topics: int = 256
+    """It publishes on."""
+    subscriptions: int = 64
+    sessions: int = 64
+    """The relay keeps, with what is held for them."""
+    connections: int = 32
+    messages_per_s: int = 2_000
+    bytes_per_s: int = 10**8
+    all_connections: int = 4_096
+    """Of everybody."""
+    hello_s: float = 5.0
+    """From the connection to its hello."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            if each.type == "int":
+                whole(f"limits: {each.name}", getattr(self, each.name), 1, 2**40)
+        above_0("limits: hello_s", self.hello_s)
+
+
+@dataclass(frozen=True)
+class Store:
+    """Where no_drop messages are held until their receivers have acked them."""
+
+    messages: int = 1_000
+    """For one session; what comes then is refused to its sender."""
+    bytes: int = 2**26
+    """In all."""
+    keep_s: float = 86_400.0
+    """A session that has been away for so long is forgotten, with what is held for it."""
+    window: int = 5
+    """n_T, no_drop messages on their way to or from a client and not acked, at most."""
+
+    def __post_init__(self) -> None:
+        whole("store: messages", self.messages, 1, 2**31)
+        whole("store: bytes", self.bytes, 1, 2**40)
+        above_0("store: keep_s", self.keep_s)
+        check_window(self.window)
+
+
+@dataclass(frozen=True)
+class Tls:
+    """Certificates, PEM files."""
+
+    certificate: str
+    key: str
+    clients: str = ""
+    """The authority that signs clients' certificates; without it they are not asked for."""
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """JSON web tokens, as an OpenID provider issues them."""
+
+    issuer: str
+    audience: str
+    keys: str
+    """Its key set (JWKS): https://..., or a file, which is read again when a token names a key that is not in it."""
+    algorithms: tuple[str, ...] = ("RS256", "ES256", "EdDSA")
+    leeway_s: float = 10.0
+    """Clocks may differ by so much."""
+
+    def __post_init__(self) -> None:
+        for name in ("issuer", "audience", "keys"):
+            if not isinstance(getattr(self, name), str) or not getattr(self, name):
+                raise BufgymError(f"tokens: {name} = {getattr(self, name)!r}: must be a text")
+        unknown = sorted(set(self.algorithms) - set(ALGORITHMS))
+        if unknown or not self.algorithms:
+            raise BufgymError(f"tokens: algorithms = {list(self.algorithms)}: must be of {', '.join(ALGORITHMS)}")
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """Files of a log: when one is full the next begins, and the oldest goes."""
+
+    bytes: int = 2**26
+    files: int = 16
+
+    def __post_init__(self) -> None:
+        whole("bytes", self.bytes, 1_000, 2**40)
+        whole("files", self.files, 1, 10**6)
+
+
+@dataclass(frozen=True)
+class Config:
+    """All of it."""
+
+    host: str = "127.0.0.1"
+    port: int = PORT
+    """0 for any that is free."""
+    rules: tuple[Rule, ...] = ()
+    no_drop: tuple[str, ...] = NO_DROP
+    """Patterns of the topics of which nothing may be lost, each for a whole topic."""
+    policies: tuple[str, ...] = POLICIES
+    """Of subscribers' queues; the first is the default."""
+    origins: tuple[str, ...] = ()
+    """Web pages of other servers that may connect, as ``https://example.org``."""
+    robofleet: bool = False
+    """Whether clients that Robofleet released may connect, on any path but ours. The same rules hold for them."""
+    folder: Path | None = None
+    """For what is held, the audit log and recordings; without it nothing of them outlives the relay."""
+    small_buffers: bool = True
+    """Whether the system keeps little of what goes to a client: what lies there no policy can drop."""
+    limits: Limits = Limits()
+    store: Store = Store()
+    audit: Rotation = Rotation()
+    recording: Rotation = field(default_factory=lambda: Rotation(bytes=2**30))
+    """Of MCAP files with all that a rule for the recorder allows."""
+    tls: Tls | None = None
+    tokens: Tokens | None = None
+
+    def __post_init__(self) -> None:
+        whole("port", self.port, 0, 65_535)
+        for name in ("robofleet", "small_buffers"):
+            if not isinstance(getattr(self, name), bool):
+                raise BufgymError(f"{name} = {getattr(self, name)!r}: must be true or false")
+        for name in ("no_drop", "policies", "origins"):
+            texts = getattr(self, name)
+            if not isinstance(texts, tuple) or not all(isinstance(text, str) for text in texts):
+                raise BufgymError(f"{name} = {texts!r}: must be a list of texts")
+        for text in self.no_drop:
+            pattern(text)
+        if not self.policies:
+            raise BufgymError("policies: needs at least one, the default")
+
+
+_TABLES: Final[Mapping[str, Any]] = {
+    "limits": Limits,
+    "store": Store,
+    "audit": Rotation,
+    "recording": Rotation,
+    "tls": Tls,
+    "tokens": Tokens,
+}
+
+
+def load(path: str | Path) -> Config:
+    """The configuration of a TOML file; files that it names lie beside it.
+
+    Raises BufgymError, one line that names the file, for one that can't be read or breaks a rule.
+    """
+    beside = Path(path).parent
+    try:
+        tables = read_toml(path)
+        settings: dict[str, Any] = {}
+        for key, value in tables.items():
+            if key == "rules":
+                settings[key] = tuple(_made(Rule, "rules", one) for one in _listed(key, value))
+            elif key in _TABLES:
+                settings[key] = _made(_TABLES[key], key, value)
+            else:
+                settings[key] = tuple(value) if isinstance(value, list) else value
+        if "folder" in settings:
+            settings["folder"] = beside / _text("folder", settings["folder"])
+        config: Config = _made(Config, "", settings)
+        if config.tls is not None:
+            paths = {each.name: getattr(config.tls, each.name) for each in fields(Tls)}
+            tls = Tls(**{name: str(beside / _text(name, value)) if value else "" for name, value in paths.items()})
+            config = replace(config, tls=tls)
+        if config.tokens is not None and "://" not in config.tokens.keys:
+            config = replace(config, tokens=replace(config.tokens, keys=str(beside / config.tokens.keys)))
+        return config
+    except BufgymError as error:
+        raise error if str(error).startswith(f"{path}") else BufgymError(f"{path}: {error}") from None
+
+
+def _made(kind: Any, name: str, table: Any) -> Any:
+    """A table as its dataclass."""
+    if not isinstance(table, Mapping):
+        raise BufgymError(f"{name} = {table!r}: must be a table")
+    where = name and f"{name}: "
+    try:
+        check_keys(table, {each.name for each in fields(kind)})
+        return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in table.items()})
+    except TypeError as error:
+        raise BufgymError(f"{where}{str(error).partition('__() ')[2] or error}") from None
+    except BufgymError as error:
+        raise BufgymError(str(error) if str(error).startswith(name.rstrip("s")) else f"{where}{error}") from None
+
+
+def _listed(name: str, value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise BufgymError(f"{name}: must be [[{name}]] tables")
+    return value
+
+
+def _text(name: str, value: Any) -> str:
+    if not isinstance(value, str):
+        raise BufgymError(f"{name} = {value!r}: must be a text")
+    return value

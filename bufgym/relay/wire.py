@@ -1,0 +1,265 @@
+"""What goes over a relay's WebSockets: binary frames are a message each, text frames are JSON objects with an ``op``.
+
+A binary message, big endian (``docs/guide/relay.md`` has the table): a header of 32 bytes, then topic, type, encoding
+and sender in UTF-8, then the payload. In JSON the same message is an object whose ``data`` is the value itself
+where the encoding is ``json``, and base64 of the payload where it is not.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple, NoReturn
+
+from bufgym.errors import BufgymError
+
+PATH: Final = "/relay"
+SUBPROTOCOL: Final = "bufgym.relay.v1"
+VERSION: Final = 1
+MESSAGE: Final = 1
+"""The one kind of binary frame."""
+NO_DROP: Final = 1
+"""A flag."""
+MAX_NAME_BYTES: Final = 255
+"""Of a topic, a type, an encoding, a sender."""
+MAX_SEQ: Final = 2**53
+"""Numbers are exact in JavaScript up to this."""
+MAX_STAMP_US: Final = 2**53
+
+_HEADER: Final = struct.Struct("!2s7B3sIQq")
+"""Magic; version, kind, flags, bytes of topic, type, encoding and sender; zeros; bytes of the payload; seq; stamp."""
+HEADER_BYTES: Final = _HEADER.size
+_MAGIC: Final = b"bR"
+
+
+class WireError(BufgymError):
+    """What came is no frame of this protocol."""
+
+
+class Message(NamedTuple):
+    """One message of a topic."""
+
+    topic: str
+    payload: bytes | memoryview
+    encoding: str = "json"
+    """How to read the payload: json, cdr, ros1, jpeg, png, or a name that sender and receivers know."""
+    type: str = ""
+    """As in ROS, ``sensor_msgs/msg/LaserScan``; empty if unknown."""
+    sender: str = ""
+    """The relay fills it in."""
+    seq: int = 0
+    """A no_drop message's number on its way; any other's is its sender's own business."""
+    stamp_us: int = 0
+    """When it was put, us since 1970, by its sender's clock."""
+    no_drop: bool = False
+
+
+def encode(message: Message) -> bytes:
+    """The binary frame; the names are checked, as those of ``decode`` are."""
+    _check(message)
+    names = [name.encode() for name in (message.topic, message.type, message.encoding, message.sender)]
+    return b"".join(
+        (
+            _HEADER.pack(
+                _MAGIC,
+                VERSION,
+                MESSAGE,
+                NO_DROP if message.no_drop else 0,
+                *map(len, names),
+                b"\0\0\0",
+                len(message.payload),
+                message.seq,
+                message.stamp_us,
+            ),
+            *names,
+            message.payload,
+        )
+    )
+
+
+def decode(data: bytes, max_bytes: int = 2**26) -> Message:
+    """The message of a binary frame of at most ``max_bytes``.
+
+    Raises WireError: it is none.
+    """
+    if not HEADER_BYTES <= len(data) <= max_bytes:
+        raise WireError(f"frame of {len(data)} bytes: must be from {HEADER_BYTES} to {max_bytes}")
+    magic, version, kind, flags, *lengths, zeros, payload_bytes, seq, stamp_us = _HEADER.unpack_from(data)
+    if (magic, version, kind, zeros) != (_MAGIC, VERSION, MESSAGE, b"\0\0\0") or flags > NO_DROP:
+        raise WireError(f"header {data[:12]!r}: must be {_MAGIC!r}, version {VERSION}, kind {MESSAGE}, a known flag")
+    names, at = [], HEADER_BYTES
+    for length in lengths:
+        try:
+            names.append(data[at : at + length].decode())
+        except UnicodeDecodeError:
+            raise WireError(f"name {data[at : at + length]!r}: must be UTF-8") from None
+        at += length
+    if len(data) != at + payload_bytes:
+        raise WireError(f"frame of {len(data)} bytes: must be {at + payload_bytes}, as its header says")
+    topic, kind_name, encoding, sender = names
+    message = Message(
+        topic, memoryview(data)[at:], encoding, kind_name, sender, seq, stamp_us, no_drop=bool(flags & NO_DROP)
+    )
+    _check(message)
+    return message
+
+
+def _check(message: Message) -> None:
+    check_topic(message.topic)
+    for what in ("encoding", "type", "sender"):
+        check_name(what, getattr(message, what))
+    if not message.encoding:
+        raise WireError("encoding: must not be empty")
+    if not 0 <= message.seq <= MAX_SEQ:
+        raise WireError(f"seq = {message.seq}: must be from 0 to {MAX_SEQ}")
+    if abs(message.stamp_us) > MAX_STAMP_US:
+        raise WireError(f"stamp_us = {message.stamp_us}: must be at most {MAX_STAMP_US}")
+
+
+def check_topic(topic: str) -> None:
+    """A topic's name begins with ``/``."""
+    check_name("topic", topic)
+    if not topic.startswith("/"):
+        raise WireError(f"topic {topic!r}: must begin with '/'")
+
+
+def check_name(what: str, name: str) -> None:
+    """A name is short, and prints as it stands."""
+    if not name.isprintable() or (not name.isascii() and _utf8_bytes(what, name) > MAX_NAME_BYTES):
+        raise WireError(f"{what} {name!r}: must be printable, at most {MAX_NAME_BYTES} bytes")
+    if len(name) > MAX_NAME_BYTES:
+        raise WireError(f"{what} {name!r}: must be at most {MAX_NAME_BYTES} bytes")
+
+
+def _utf8_bytes(what: str, name: str) -> int:
+    try:
+        return len(name.encode())
+    except UnicodeEncodeError:
+        raise WireError(f"{what} {name!r}: must be UTF-8") from None
+
+
+# --- JSON ------------------------------------------------------------------------------------------------------------
+
+_ANY: Final = object
+_MESSAGE: Final = {
+    "topic": (str, True),
+    "data": (_ANY, True),
+    "encoding": (str, False),
+    "type": (str, False),
+    "seq": (int, False),
+    "stamp_us": (int, False),
+    "no_drop": (bool, False),
+}
+FIELDS: Final[Mapping[str, Mapping[str, tuple[Any, bool]]]] = {
+    "hello": {
+        "version": (int, True),
+        "name": (str, False),
+        "session": (str, False),
+        "token": (str, False),
+        "form": (str, False),
+        "received": (int, False),
+        "acked": (int, False),
+    },
+    "welcome": {"version": (int, True), "received": (int, True), "window": (int, True), "rules": (list, True)},
+    "subscribe": {
+        "id": (str, True),
+        "topic": (str, True),
+        "policy": (str, False),
+        "capacity": (int, False),
+        "priority": (float, False),
+        "durable": (bool, False),
+    },
+    "subscribed": {"id": (str, True)},
+    "unsubscribe": {"id": (str, True)},
+    "publish": _MESSAGE,
+    "message": {**_MESSAGE, "sender": (str, True)},
+    "ack": {"seq": (int, True)},
+    "delivered": {"seq": (int, True), "receivers": (int, True), "lost": (int, True)},
+    "refused": {"what": (str, True), "code": (str, True), "why": (str, True)},
+}
+"""op -> field -> (its kind, whether it must be there). Other fields are let pass: a later version may have more."""
+FORMS: Final = ("binary", "json")
+
+
+def say(op: str, **fields: Any) -> str:
+    """The text frame of an ``op``."""
+    return json.dumps({"op": op, **fields}, separators=(",", ":"), allow_nan=False)
+
+
+def heard(text: str) -> dict[str, Any]:
+    """The object of a text frame: its ``op`` is known, its fields are of their kinds.
+
+    Raises WireError: it is none of this protocol.
+    """
+    try:
+        said = json.loads(text, parse_constant=no_constant)
+    except (ValueError, RecursionError) as error:
+        raise WireError(f"text {text[:60]!r}: must be JSON: {error}") from None
+    if not isinstance(said, dict) or not isinstance(said.get("op"), str) or said["op"] not in FIELDS:
+        raise WireError(f"text {text[:60]!r}: must be an object whose op is one of {', '.join(FIELDS)}")
+    for field, (kind, needed) in FIELDS[said["op"]].items():
+        if field not in said:
+            if needed:
+                raise WireError(f"{said['op']}: {field} is missing")
+        elif not _is(said[field], kind):
+            raise WireError(f"{said['op']}: {field} = {said[field]!r}: must be a {_KINDS[kind]}")
+    return said
+
+
+_KINDS: Final = {int: "whole number >= 0", str: "text", bool: "true or false", float: "number", list: "list"}
+
+
+def _is(value: Any, kind: Any) -> bool:
+    if kind is int:
+        return type(value) is int and 0 <= value <= MAX_SEQ
+    if kind is float:
+        return type(value) in (int, float) and abs(value) <= MAX_SEQ
+    return isinstance(value, kind)
+
+
+def no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON")
+
+
+def to_json(message: Message, op: str = "message") -> str:
+    """The message as a text frame: ``message`` from the relay, ``publish`` to it."""
+    data: Any
+    if message.encoding == "json":
+        try:
+            data = json.loads(bytes(message.payload), parse_constant=no_constant)
+        except (ValueError, RecursionError) as error:
+            raise WireError(f"topic {message.topic}: payload must be JSON, as its encoding says: {error}") from None
+    else:
+        data = base64.b64encode(message.payload).decode()
+    fields = message._asdict()
+    del fields["payload"]
+    return say(op, **fields, data=data)
+
+
+def from_json(said: Mapping[str, Any]) -> Message:
+    """The message of a ``publish`` or ``message`` that was heard."""
+    encoding = said.get("encoding", "json")
+    if encoding == "json":
+        payload = json.dumps(said["data"], separators=(",", ":")).encode()
+    elif isinstance(said["data"], str):
+        try:
+            payload = base64.b64decode(said["data"], validate=True)
+        except (binascii.Error, ValueError) as error:
+            raise WireError(f"data: must be base64: {error}") from None
+    else:
+        raise WireError(f"data: must be base64 text for encoding {encoding!r}")
+    message = Message(
+        said["topic"],
+        payload,
+        encoding,
+        said.get("type", ""),
+        said.get("sender", ""),
+        said.get("seq", 0),
+        said.get("stamp_us", 0),
+        no_drop=said.get("no_drop", False),
+    )
+    _check(message)
+    return message
