@@ -59,7 +59,7 @@ class Client(Session):
         value: Value | None = None,
         token: str | None = None,
         tls: ssl.SSLContext | None = None,
-        log: Callable[[Record], None] | None = None,
+        log: Callable[[int, Record], None] | None = None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """
@@ -69,7 +69,7 @@ class Client(Session):
             capacity: L, messages of all topics together.
             window: n_T, messages handed to the system and not yet acked by the relay's, at most.
             value: V of topics that have none of their own.
-            log: takes a record of all that happens in the queue.
+            log: takes the number of the queue, which ``change`` counts, and a record of all that happens there.
             url, name, token, tls, say: as a ``Session`` has them.
         """
         super().__init__(url, name, token=token, tls=tls, say=say)
@@ -78,6 +78,7 @@ class Client(Session):
         self._capacity, self._window, self._value, self._log = capacity, window, value, log
         self._queues: deque[PolicyQueue] = deque()
         """The last is put into; those before it hand out what they still hold, under the policy they were made with."""
+        self._changes = 0
         self._away: deque[_Away] = deque()
         self._moved = asyncio.Event()
         self._seqs: Counter[str] = Counter()
@@ -88,9 +89,16 @@ class Client(Session):
 
     def change(self, policy: str | Policy) -> None:
         """Another policy rules the queue from now on; what is queued goes first, by the one before."""
+        log, number = self._log, self._changes
         queue = PolicyQueue(
-            policy, self._capacity, topics=self._topics, window=self._window, value=self._value, log=self._log
+            policy,
+            self._capacity,
+            topics=self._topics,
+            window=self._window,
+            value=self._value,
+            log=None if log is None else lambda record: log(number, record),
         )
+        self._changes += 1
         queue.left_bytes = self._left_bytes
         before = self._queues[-1] if self._queues else None
         self._queues.append(queue)
@@ -159,7 +167,7 @@ class Client(Session):
         if away.answered is None:
             message = away.item.message
             if any(pattern.fullmatch(message.topic) for pattern in self._no_drop):
-                away.answered = self._outbox.put(message._replace(no_drop=True))
+                away.answered = self._unanswered.put(message._replace(no_drop=True))
                 self._wanted.set()
             else:
                 await self._connection.send(wire.encode(message))

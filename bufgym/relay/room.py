@@ -85,28 +85,37 @@ def _cross(one: Any, other: Any) -> Any:
     return one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
 
 
+_FOCAL: Final = PICTURE[0] / 2 / math.tan(FIELD_OF_VIEW / 2)
+_ANGLES: Final = np.arctan((PICTURE[0] / 2 - 0.5 - np.arange(PICTURE[0])) / _FOCAL)
+_BELOW: Final = ((np.arange(PICTURE[1]) + 0.5 - PICTURE[1] / 2) / _FOCAL).astype(np.float32)[:, None]
+"""Of a row's point 1 m ahead, m under the eye."""
+_HALF: Final = PICTURE[1] // 2
+_REACH: Final = EYE_M / _BELOW[_HALF:]
+"""How far ahead the floor is in each row of the lower half, m."""
+_CEILING: Final = (236 - 60 * np.exp(_BELOW[:_HALF] * 4)).astype(np.uint8)[..., None]
+_TILES: Final = (np.array([96, 122]) / (1 + 0.06 * _REACH))[..., None] * np.array([1.05, 1.0, 0.92])
+"""Colours of the floor's dark and light tiles in each row."""
+
+
 def picture(pose: Pose) -> NDArray[np.uint8]:
     """What the camera sees, [height, width, 3]."""
-    width, height = PICTURE
-    focal = width / 2 / math.tan(FIELD_OF_VIEW / 2)
-    angles = np.arctan((width / 2 - 0.5 - np.arange(width)) / focal)
-    distance, wall, along = cast(pose, angles)
-    depth = distance * np.cos(angles)
-    below = (np.arange(height) + 0.5 - height / 2)[:, None] / focal  # of a point 1 m ahead, m under the eye
+    distance, wall, along = cast(pose, _ANGLES)
+    depth = (distance * np.cos(_ANGLES)).astype(np.float32)
     # Panels of half a metre, darker with distance.
     panel = 1 - 0.12 * (np.floor(along * 2) % 2) - 0.25 * (np.abs(along * 2 % 1 - 0.5) > 0.47)
-    seen = _COLOURS[wall] * (panel / (1 + 0.11 * depth))[:, None]
-    frame = np.broadcast_to(seen, (height, width, 3)).copy()
-    frame[(below * depth > EYE_M - 0.12) & (below * depth <= EYE_M)] *= 0.55  # skirting
-    ceiling = below * depth < EYE_M - WALL_M
-    frame[ceiling] = np.broadcast_to((236 - 60 * np.exp(below * 4))[..., None], frame.shape)[ceiling]
-    rows, columns = np.nonzero(below * depth > EYE_M)
-    reach = EYE_M / below[rows, 0]
-    ray = reach / np.cos(angles[columns])
-    turn = angles[columns] + pose.yaw
-    tile = np.floor(pose.x + ray * np.cos(turn)) + np.floor(pose.y + ray * np.sin(turn))
-    frame[rows, columns] = ((96 + 26 * (tile % 2)) / (1 + 0.06 * reach))[:, None] * (1.05, 1.0, 0.92)
-    return frame.clip(0, 255).astype(np.uint8)
+    shade = (_COLOURS[wall] * (panel / (1 + 0.11 * depth))[:, None]).astype(np.uint8)
+    frame = np.empty((PICTURE[1], PICTURE[0], 3), np.uint8)
+    frame[:] = shade
+    down = _BELOW * depth
+    upper, lower = frame[:_HALF], frame[_HALF:]
+    np.copyto(upper, _CEILING, where=(down[:_HALF] < EYE_M - WALL_M)[..., None])
+    np.copyto(lower, (shade * 0.55).astype(np.uint8), where=(down[_HALF:] > EYE_M - 0.12)[..., None])  # skirting
+    turn = _ANGLES + pose.yaw
+    aside, ahead = ((f(turn) / np.cos(_ANGLES)).astype(np.float32) for f in (np.sin, np.cos))
+    tile = np.floor(pose.x + _REACH * ahead).astype(np.int32) + np.floor(pose.y + _REACH * aside).astype(np.int32)
+    floor = _TILES.astype(np.uint8)[np.arange(_HALF)[:, None], tile & 1]
+    np.copyto(lower, floor, where=(down[_HALF:] > EYE_M)[..., None])
+    return frame
 
 
 def jpeg(frame: NDArray[np.uint8], quality: int = 70) -> bytes:

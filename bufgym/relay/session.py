@@ -21,11 +21,11 @@ from urllib.parse import urlsplit
 
 from bufgym.errors import BufgymError
 from bufgym.files import read_utf8
-from bufgym.relay.extra import needs
 from bufgym.live.sockets import connected, unacked_bytes
 from bufgym.live.tasks import Tasks
 from bufgym.relay import wire
-from bufgym.relay.outbox import Outbox
+from bufgym.relay.extra import needs
+from bufgym.relay.unanswered import Unanswered
 
 TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
 RETRY_S: Final = 0.5
@@ -55,6 +55,19 @@ def token(path: str | Path | None = None) -> str | None:
     if path is not None:
         return read_utf8(path, _MAX_TOKEN_BYTES).strip()
     return os.environ.get(TOKEN_VARIABLE) or None
+
+
+def security(authority: str | None = None, certificate: str | None = None) -> ssl.SSLContext | None:
+    """For ``wss``: who signs the relay's certificate, and the client's own with its key, PEM files; None for neither."""
+    if authority is None and certificate is None:
+        return None
+    try:
+        context = ssl.create_default_context(cafile=authority)
+        if certificate is not None:
+            context.load_cert_chain(certificate)
+    except (OSError, ssl.SSLError) as error:
+        raise BufgymError(f"{certificate or authority}: no certificate: {error}") from None
+    return context
 
 
 class Session:
@@ -92,7 +105,7 @@ class Session:
         self._token, self._tls, self._report = token, tls, say
         self._session = f"{re.sub('[^A-Za-z0-9._-]', '-', name)[:40]}-{os.urandom(8).hex()}"
         self._no_drop: tuple[re.Pattern[str], ...] = ()
-        self._outbox = Outbox()
+        self._unanswered = Unanswered()
         self._wanted = asyncio.Event()
         self._received = 0
         self._subscriptions: dict[str, Subscription] = {}
@@ -107,7 +120,7 @@ class Session:
         """
         payload = json.dumps(data, separators=(",", ":"), allow_nan=False).encode()
         message = wire.Message(topic, payload, stamp_us=time.time_ns() // 1000, no_drop=True)
-        answered = self._outbox.put(message)
+        answered = self._unanswered.put(message)
         self._wanted.set()
         await answered
 
@@ -161,7 +174,7 @@ class Session:
                         self._connection = None
                 await asyncio.sleep(RETRY_S)
         finally:
-            self._outbox.give_up(f"{self.name}: the client has ended")
+            self._unanswered.give_up(f"{self.name}: the client has ended")
             await self._tasks.end()
 
     def _note(self, fault: str) -> None:
@@ -195,7 +208,7 @@ class Session:
         hello: dict[str, Any] = {"version": wire.VERSION, "name": self.name, "session": self._session, "form": "binary"}
         if self._token is not None:
             hello["token"] = self._token
-        await self._say_it("hello", **hello, received=self._received, acked=self._outbox.acked)
+        await self._say_it("hello", **hello, received=self._received, acked=self._unanswered.acked)
         said = wire.heard(await self._connection.recv())
         if said["op"] == "refused":
             raise RefusedError(f"{self.address.geturl()}: refused: {said['code']}: {said['why']}")
@@ -203,7 +216,7 @@ class Session:
             raise wire.WireError(f"op {said['op']!r}: must be welcome")
         self.welcome = said
         self._no_drop = tuple(re.compile(pattern) for pattern in said.get("no_drop", ()))
-        self._outbox.resume(said["received"], max(1, said["window"]))
+        self._unanswered.resume(said["received"], max(1, said["window"]))
         for subscription in self._subscriptions.values():
             await self._say_it("subscribe", **subscription.fields)
         self.connected.set()
@@ -234,7 +247,7 @@ class Session:
 
     async def _send_no_drop(self) -> None:
         while True:
-            while (message := self._outbox.next()) is not None:
+            while (message := self._unanswered.next()) is not None:
                 await self._connection.send(wire.encode(message))
             self._wanted.clear()
             await self._wanted.wait()
@@ -268,10 +281,10 @@ class Session:
 
     def _answer(self, said: dict[str, Any]) -> None:
         if said["op"] == "ack":
-            self._outbox.ack(said["seq"])
+            self._unanswered.ack(said["seq"])
         elif said["op"] == "refused":
-            if said["what"] == "publish" and self._outbox.expects(said.get("topic", ""), said.get("seq")):
-                self._outbox.refuse(said["code"], said["why"])
+            if said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
+                self._unanswered.refuse(said["code"], said["why"])
             else:
                 self._note(f"{said['what']} refused: {said['code']}: {said['why']}")
         self._wanted.set()

@@ -26,7 +26,7 @@ class Pending:
     """Done when the relay holds it; a BufgymError when it was refused."""
 
 
-class Outbox:
+class Unanswered:
     """The messages of one session, in order."""
 
     def __init__(self) -> None:

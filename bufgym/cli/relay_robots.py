@@ -1,0 +1,109 @@
+"""``bufgym relay robot`` and ``bufgym relay demo``: robots for a relay, real, recorded and made up."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from bufgym.cli.options import Commands, command, count, load_policies, loaded, natural, policy_file
+from bufgym.errors import BufgymError
+
+CAPACITY = 32
+
+
+def add(parts: Commands) -> None:
+    robot = command(parts, "robot", _robot, "a robot: recorded, of ROS, or made up; Ctrl-C ends it")
+    robot.add_argument("--to", default="ws://127.0.0.1:7420", metavar="URL", help="the relay (%(default)s)")
+    robot.add_argument("--name", default="robot-1", help="(%(default)s)")
+    robot.add_argument("--config", metavar="FILE.toml", help="its topics, as in examples/client.toml")
+    kinds = robot.add_mutually_exclusive_group()
+    kinds.add_argument("--bag", metavar="FILE", help="a recording as a robot, again and again")
+    kinds.add_argument("--ros", choices=("1", "2"), help="the topics of this version of ROS, as in --config")
+    robot.add_argument("--odom", metavar="TOPIC", help="with --ros: poses, which give x to the topics that move")
+    robot.add_argument(
+        "--receive", nargs="+", default=[], metavar="TOPIC", help="with --ros: published here if it comes"
+    )
+    robot.add_argument("--number", type=natural, default=0, metavar="N", help="which made-up robot (%(default)s)")
+    robot.add_argument("--policies", metavar="NAME", help="the policy, as in bench (learned-scheduler)")
+    policy_file(robot)
+    robot.add_argument("--capacity", type=count, default=CAPACITY, metavar="L", help="L, messages (%(default)s)")
+    robot.add_argument("--token-file", metavar="FILE", help="who it is (default: $BUFGYM_RELAY_TOKEN)")
+    robot.add_argument("--ca", metavar="FILE.pem", help="with wss: who signs the relay's certificate")
+    robot.add_argument("--certificate", metavar="FILE.pem", help="with wss: the robot's own, with its key")
+
+    demo = command(parts, "demo", _demo, "a relay, made-up robots over fading links, and the page; Ctrl-C ends it")
+    demo.add_argument("--robots", type=count, default=3, metavar="N", help="(%(default)s)")
+    demo.add_argument("--port", type=natural, default=7420, help="of the relay (%(default)s)")
+    demo.add_argument("--folder", metavar="DIR", help="record there")
+    demo.add_argument("--foxglove", type=natural, metavar="PORT", help="show them in Foxglove and Lichtblick too")
+    demo.add_argument("--no-browser", action="store_true", help="do not open the page")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _robot(options: argparse.Namespace) -> None:
+    import asyncio
+
+    from bufgym.relay.robot import Robot
+    from bufgym.relay.session import security, token
+    from bufgym.scenario import read_client
+
+    load_policies(options.policy_file)
+    (policy,) = loaded([options.policies or "learned-scheduler"])[0]
+    client = None if options.config is None else read_client(options.config)
+    settings: dict[str, Any] = {} if client is None else {"window": client.window, "value": client.value}
+
+    async def run() -> None:
+        robot = Robot(
+            options.to,
+            options.name,
+            _source(options, None if client is None else client.streams),
+            policy=policy,
+            capacity=options.capacity,
+            token=token(options.token_file),
+            tls=security(options.ca, options.certificate),
+            say=_say,
+            **settings,
+        )
+        print(f"{options.name} -> {options.to}; Ctrl-C ends it", flush=True)
+        await robot.run()
+
+    asyncio.run(run())
+
+
+def _source(options: argparse.Namespace, streams: Any) -> Any:
+    if options.bag is not None:
+        from bufgym.relay.bag import Recorded
+
+        return Recorded(options.bag, streams)
+    if options.ros is not None:
+        if streams is None:
+            raise BufgymError("--ros needs --config: which topics, and the rules for each")
+        from bufgym.relay import ros
+
+        return ros.SOURCES[options.ros](streams, options.odom, options.receive)
+    from bufgym.relay.madeup import MadeUp
+
+    return MadeUp(options.number, streams)
+
+
+def _demo(options: argparse.Namespace) -> None:
+    import asyncio
+    import webbrowser
+
+    from bufgym.relay import demo
+
+    async def show() -> None:
+        folder = None if options.folder is None else Path(options.folder)
+        async with demo.running(options.robots, options.port, folder=folder, say=_say) as port:
+            page = f"http://127.0.0.1:{port}/"
+            print(f"{page}: {options.robots} robots; Ctrl-C ends it", flush=True)
+            if not options.no_browser:
+                webbrowser.open(page)
+            await asyncio.Event().wait()
+
+    asyncio.run(show())

@@ -1,0 +1,100 @@
+"""Messages of ROS 2 in CDR, made and read without ROS (the library ``rosbags``)."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.errors import BufgymError
+from bufgym.relay.extra import needs
+from bufgym.relay.room import Pose
+
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+SCAN: Final = "sensor_msgs/msg/LaserScan"
+POSES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+"""Types that say where a robot is."""
+
+
+@functools.cache
+def store() -> Any:
+    """The types of ROS 2."""
+    with needs("rosbags"):
+        from rosbags.typesys import Stores, get_typestore
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@functools.cache
+def _store_1() -> Any:
+    """Those of ROS 1."""
+    with needs("rosbags"):
+        from rosbags.typesys import Stores, get_typestore
+    return get_typestore(Stores.ROS1_NOETIC)
+
+
+def _header(time_us: int, frame: str) -> Any:
+    kinds = store().types
+    stamp = kinds["builtin_interfaces/msg/Time"](time_us // 10**6, time_us % 10**6 * 1000)
+    return kinds["std_msgs/msg/Header"](stamp, frame)
+
+
+def odometry(time_us: int, pose: Pose, speed_m_s: float) -> bytes:
+    """A ``nav_msgs/msg/Odometry``."""
+    kinds, zeros = store().types, np.zeros(36)
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(pose.yaw / 2), math.cos(pose.yaw / 2))
+    place = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](pose.x, pose.y, 0.0), turn)
+    motion = kinds["geometry_msgs/msg/Twist"](vector(speed_m_s, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+    message = kinds[ODOMETRY](
+        _header(time_us, "map"),
+        "base",
+        kinds["geometry_msgs/msg/PoseWithCovariance"](place, zeros),
+        kinds["geometry_msgs/msg/TwistWithCovariance"](motion, zeros),
+    )
+    return bytes(store().serialize_cdr(message, ODOMETRY))
+
+
+def scan(time_us: int, angles: NDArray[np.float64], ranges_m: NDArray[np.float64]) -> bytes:
+    """A ``sensor_msgs/msg/LaserScan`` of these equally spaced angles."""
+    step = float(angles[1] - angles[0])
+    ends = float(angles[0]), float(angles[-1])
+    ranges, intensities = ranges_m.astype(np.float32), np.zeros(0, np.float32)
+    message = store().types[SCAN](_header(time_us, "base"), *ends, step, 0.0, 0.1, 0.05, 30.0, ranges, intensities)
+    return bytes(store().serialize_cdr(message, SCAN))
+
+
+def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:
+    """The message; a BufgymError if it is none of this type."""
+    try:
+        if encoding == "ros1":
+            return _store_1().deserialize_ros1(payload, type)
+        return store().deserialize_cdr(payload, type)
+    except BufgymError:
+        raise
+    except Exception as error:  # what does not fit fails in many ways
+        raise BufgymError(f"message of {len(payload)} bytes: no {type} in {encoding}: {error}") from None
+
+
+def planar(pose: Any) -> dict[str, float]:
+    """A ``geometry_msgs/msg/Pose`` seen from above."""
+    place, turn = pose.position, pose.orientation
+    yaw = math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
+    return {"x": round(place.x, 3), "y": round(place.y, 3), "yaw": round(yaw, 4)}
+
+
+def as_cdr(payload: bytes, type: str) -> bytes:
+    """A message of ROS 1 in ROS 2's encoding; the two have most types in common."""
+    try:
+        return bytes(_store_1().ros1_to_cdr(payload, type))
+    except Exception as error:
+        raise BufgymError(f"message of {len(payload)} bytes: no {type} of ROS 1: {error}") from None
+
+
+def definition(type: str) -> str | None:
+    """The type's definition with all that it uses, as recordings carry it; None for a type that is not known here."""
+    if type not in store().types:
+        return None
+    return str(store().generate_msgdef(type, ros_version=2)[0])
