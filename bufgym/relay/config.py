@@ -163,8 +163,8 @@ class Config:
     """Web pages of other servers that may connect, as ``https://example.org``."""
     folder: Path | None = None
     """For what is held, the audit log and recordings; without it nothing of them outlives the relay."""
-    send_buffer_bytes: int = 32_768
-    """Of a connection in the system, where no policy can drop; 0 leaves the system's own."""
+    small_buffers: bool = True
+    """Whether the system keeps little of what goes to a client: what lies there no policy can drop."""
     limits: Limits = Limits()
     store: Store = Store()
     audit: Rotation = Rotation()
@@ -175,7 +175,8 @@ class Config:
 
     def __post_init__(self) -> None:
         whole("port", self.port, 0, 65_535)
-        whole("send_buffer_bytes", self.send_buffer_bytes, 0, 2**30)
+        if not isinstance(self.small_buffers, bool):
+            raise BufgymError(f"small_buffers = {self.small_buffers!r}: must be true or false")
         for name in ("no_drop", "policies", "origins"):
             texts = getattr(self, name)
             if not isinstance(texts, tuple) or not all(isinstance(text, str) for text in texts):

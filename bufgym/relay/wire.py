@@ -25,8 +25,9 @@ NO_DROP: Final = 1
 """A flag."""
 MAX_NAME_BYTES: Final = 255
 """Of a topic, a type, an encoding, a sender."""
-MAX_SEQ: Final = 2**63 - 1
-MAX_STAMP_US: Final = 2**62
+MAX_SEQ: Final = 2**53
+"""Numbers are exact in JavaScript up to this."""
+MAX_STAMP_US: Final = 2**53
 
 _HEADER: Final = struct.Struct("!2s7B3sIQq")
 """Magic; version, kind, flags, bytes of topic, type, encoding and sender; zeros; bytes of the payload; seq; stamp."""
@@ -194,7 +195,7 @@ def heard(text: str) -> dict[str, Any]:
     Raises WireError: it is none of this protocol.
     """
     try:
-        said = json.loads(text, parse_constant=_no_constant)
+        said = json.loads(text, parse_constant=no_constant)
     except (ValueError, RecursionError) as error:
         raise WireError(f"text {text[:60]!r}: must be JSON: {error}") from None
     if not isinstance(said, dict) or not isinstance(said.get("op"), str) or said["op"] not in FIELDS:
@@ -219,7 +220,7 @@ def _is(value: Any, kind: Any) -> bool:
     return isinstance(value, kind)
 
 
-def _no_constant(name: str) -> NoReturn:
+def no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no JSON")
 
 
@@ -228,7 +229,7 @@ def to_json(message: Message, op: str = "message") -> str:
     data: Any
     if message.encoding == "json":
         try:
-            data = json.loads(bytes(message.payload), parse_constant=_no_constant)
+            data = json.loads(bytes(message.payload), parse_constant=no_constant)
         except (ValueError, RecursionError) as error:
             raise WireError(f"topic {message.topic}: payload must be JSON, as its encoding says: {error}") from None
     else:

@@ -71,6 +71,7 @@ WORK = (
     ("bufgym.cli.play", "_play"),
     ("bufgym.cli.live", "run_async"),
     ("bufgym.cli.ros2", "run_async"),
+    ("bufgym.cli.relay", "run_async"),
     ("bufgym.live.validate", "validate"),
     ("bufgym.expert.dataset", "make"),
 )

@@ -1,0 +1,91 @@
+"""Who came, what was refused: JSON lines in files that take turns.
+
+A client that is refused the same thing a thousand times a second makes one line a second, with how often.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter, deque
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
+from typing import Any, Final
+
+from bufgym.errors import printable
+from bufgym.relay.config import Rotation
+
+FILE: Final = "audit.jsonl"
+_MOST_CHARACTERS: Final = 300
+"""Of a text of a stranger's."""
+_RECENT: Final = 1_000
+
+
+class _Lines(RotatingFileHandler):
+    """Rotated files without the ceremony of log records."""
+
+    def write(self, line: str) -> None:
+        if self.stream is None:
+            self.stream = self._open()
+        if self.stream.tell() + len(line) + 1 > self.maxBytes:
+            self.doRollover()
+        self.stream.write(f"{line}\n")
+        self.stream.flush()
+
+
+class Audit:
+    """The log; in memory alone without a folder."""
+
+    def __init__(self, folder: Path | None, rotation: Rotation) -> None:
+        self.recent: deque[dict[str, Any]] = deque(maxlen=_RECENT)
+        """The last entries."""
+        self.refused = 0
+        self._repeated: Counter[tuple[str, ...]] = Counter()
+        self._lines = None
+        if folder is not None:
+            path = folder / FILE
+            self._lines = _Lines(path, maxBytes=rotation.bytes, backupCount=rotation.files, encoding="utf-8")
+
+    def __call__(self, event: str, **fields: Any) -> None:
+        """One entry."""
+        entry = {"at": round(time.time(), 6), "event": event}
+        entry |= {name: _short(value) for name, value in fields.items()}
+        self.recent.append(entry)
+        if event == "refused":
+            self.refused += fields.get("times", 1)
+        if self._lines is not None:
+            self._lines.write(json.dumps(entry, separators=(",", ":")))
+
+    def repeated(self, **fields: str) -> bool:
+        """A refusal that may come often: the first is written at once, and how many followed with ``flush``.
+
+        Whether it is the first.
+        """
+        key = tuple(item for pair in sorted(fields.items()) for item in pair)
+        first = key not in self._repeated
+        if first and len(self._repeated) < 10 * _RECENT:
+            self._repeated[key] = 0
+            self("refused", **fields)
+        else:
+            self._repeated[key if not first else ("what", "others")] += 1
+        return first
+
+    def flush(self) -> None:
+        """Write how often each refusal was repeated since the last time."""
+        repeated, self._repeated = self._repeated, Counter()
+        for key, times in repeated.items():
+            if times:
+                self("refused", **dict(zip(key[::2], key[1::2], strict=True)), times=times)
+
+    def close(self) -> None:
+        """Finish the file."""
+        self.flush()
+        if self._lines is not None:
+            self._lines.close()
+
+
+def _short(value: Any) -> Any:
+    if isinstance(value, str):
+        text = printable(value)
+        return text if len(text) <= _MOST_CHARACTERS else f"{text[:_MOST_CHARACTERS]}..."
+    return value

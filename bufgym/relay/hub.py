@@ -1,0 +1,234 @@
+"""Who is connected, and what goes to whom: the relay without its sockets."""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Final, Protocol
+
+from bufgym.relay import wire
+from bufgym.relay.audit import Audit
+from bufgym.relay.config import Config
+from bufgym.relay.patterns import pattern
+from bufgym.relay.quota import Quotas, RefusedError
+from bufgym.relay.recorder import Recorder
+from bufgym.relay.rules import Permissions
+from bufgym.relay.store import Session, Settled, Store
+from bufgym.relay.subscriber import Subscription
+
+OWN: Final = "relay"
+"""The relay's name as a sender, and the beginning of its topics."""
+STATUS: Final = f"/{OWN}/status"
+MAX_ROUTES: Final = 10_000
+MAX_JSON_BYTES: Final = 2**20
+"""Of a text frame, and of a payload that says that it is JSON: to read it takes time."""
+
+
+class Frame:
+    """A message as it goes out, in each form made once however many receive it."""
+
+    def __init__(self, message: wire.Message) -> None:
+        self.message = message
+
+    @functools.cached_property
+    def binary(self) -> bytes:
+        return wire.encode(self.message)
+
+    @functools.cached_property
+    def json(self) -> str:
+        return wire.to_json(self.message)
+
+    @property
+    def size_bytes(self) -> int:
+        return wire.HEADER_BYTES + len(self.message.payload)
+
+
+class Member(Protocol):
+    """A connection that has said who it is."""
+
+    session: Session
+    permissions: Permissions
+    subscriptions: dict[str, Subscription]
+
+    @property
+    def sent(self) -> int:
+        """Messages that have gone to it."""
+
+    def offer(self, subscription: Subscription, frame: Frame) -> None:
+        """A message that its queues decide on."""
+
+    def wake(self) -> None:
+        """The store has something for it."""
+
+    def tell(self, op: str, **fields: Any) -> None:
+        """Say this to its client, before any message."""
+
+    def end(self, why: str) -> None:
+        """Close it."""
+
+
+class Hub:
+    """All that the connections share."""
+
+    def __init__(self, config: Config, clock: Callable[[], float] = time.monotonic) -> None:
+        self.config = config
+        self.clock = clock
+        if config.folder is not None:
+            config.folder.mkdir(parents=True, exist_ok=True)
+        self.audit = Audit(config.folder, config.audit)
+        self.quotas = Quotas(config.limits, clock)
+        self.store = Store(config.folder, config.store, config.limits.sessions)
+        self.recorder = Recorder.of(config)
+        self.members: dict[Session, Member] = {}
+        self.received = 0
+        self._sent = 0
+        self._dropped = 0
+        self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
+
+    # --- who is here --------------------------------------------------------------------------------------------------
+
+    def join(self, member: Member) -> None:
+        """It has said who it is; another connection of its session ends."""
+        other = self.members.get(member.session)
+        if other is not None:
+            self._detach(other)
+            other.end("taken over by another connection")
+        self.members[member.session] = member
+
+    def leave(self, member: Member) -> None:
+        """Its connection has ended."""
+        if self.members.get(member.session) is member:
+            self._detach(member)
+            self.settled(self.store.left(member.session))
+
+    def _detach(self, member: Member) -> None:
+        del self.members[member.session]
+        self._sent += member.sent
+        self._dropped += sum(each.dropped for each in member.subscriptions.values())
+        self._routes.clear()
+
+    def subscribe(self, member: Member, subscription: Subscription) -> None:
+        """It wants what matches; a subscription of the same id goes."""
+        old = member.subscriptions.pop(subscription.id, None)
+        self._dropped += old.dropped if old else 0
+        member.subscriptions[subscription.id] = subscription
+        self._routes.clear()
+        wanted = subscription.pattern.text if subscription.durable else None
+        self.store.want(member.session, subscription.id, wanted)
+
+    def unsubscribe(self, member: Member, id: str) -> bool:
+        """It wants this no longer; whether it had it."""
+        self.store.want(member.session, id, None)
+        old = member.subscriptions.pop(id, None)
+        self._dropped += old.dropped if old else 0
+        self._routes.clear()
+        return old is not None
+
+    # --- messages -----------------------------------------------------------------------------------------------------
+
+    def is_no_drop(self, topic: str) -> bool:
+        """Whether nothing of the topic may be lost."""
+        return _any_whole(self.config.no_drop, topic)
+
+    def publish(self, sender: Member | None, message: wire.Message) -> None:
+        """To each subscriber's queue but its sender's."""
+        self.received += 1
+        if self.recorder is not None:
+            self.recorder(message)
+        frame = Frame(message)
+        for member, subscription in self._route(message.topic):
+            if member is not sender:
+                member.offer(subscription, frame)
+
+    def _route(self, topic: str) -> list[tuple[Member, Subscription]]:
+        """Who gets it: each member once, by the first of its subscriptions that matches."""
+        route = self._routes.get(topic)
+        if route is None:
+            if len(self._routes) >= MAX_ROUTES:
+                self._routes.clear()
+            route = self._routes[topic] = [
+                (member, wanted)
+                for member in self.members.values()
+                if (wanted := matching(member, topic)) is not None and member.permissions.allow("receive", topic)
+            ]
+        return route
+
+    def hold(self, sender: Member, message: wire.Message) -> None:
+        """Keep a no_drop message until its receivers have acked it.
+
+        Raises RefusedError: nobody is to get it, or there is no room.
+        """
+        receivers = self._holders(sender, message.topic)
+        if not receivers:
+            raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it")
+        frame = wire.encode(message)
+        self.store.hold(sender.session, message.seq, message.topic, frame, receivers)
+        self.received += 1
+        if self.recorder is not None:
+            self.recorder(message)
+        for session in receivers:
+            if session in self.members:
+                self.members[session].wake()
+
+    def _holders(self, sender: Member, topic: str) -> list[Session]:
+        """The sessions that are to get a no_drop message, here or away."""
+        here = [member.session for member, _ in self._route(topic) if member is not sender]
+        away = [
+            session
+            for session in self.store.sessions.values()
+            if session.durable
+            and session not in self.members
+            and any(pattern(text).part(topic) for text in session.durable.values())
+            and Permissions(self.config.rules, session.identity).allow("receive", topic)
+        ]
+        return here + away
+
+    def settled(self, messages: Sequence[Settled]) -> None:
+        """Tell the senders of these what became of them."""
+        for sender, seq, receivers, lost in messages:
+            if sender in self.members:
+                self.members[sender].tell("delivered", seq=seq, receivers=receivers, lost=lost)
+
+    # --- once a second ------------------------------------------------------------------------------------------------
+
+    def status(self) -> dict[str, int]:
+        """The relay's counts."""
+        members = list(self.members.values())
+        subscriptions = [each for member in members for each in member.subscriptions.values()]
+        return {
+            "connections": len(members),
+            "received": self.received,
+            "sent": self._sent + sum(member.sent for member in members),
+            "dropped": self._dropped + sum(each.dropped for each in subscriptions),
+            "refused": self.audit.refused,
+            "held": sum(session.held for session in self.store.sessions.values()),
+        }
+
+    def tick(self) -> None:
+        """Once a second: tell how it is, and forget what is over."""
+        payload = json.dumps(self.status()).encode()
+        self.publish(None, wire.Message(STATUS, payload, sender=OWN, stamp_us=time.time_ns() // 1000))
+        self.audit.flush()
+        self.quotas.tidy()
+        for session in self.store.expired(list(self.members)):
+            self.audit("forgotten", session=session.name, held=session.held, **session.identity.as_json())
+            self.settled(self.store.forget(session))
+
+    def close(self) -> None:
+        """Finish the files."""
+        if self.recorder is not None:
+            self.recorder.close()
+        self.audit.close()
+        self.store.close()
+
+
+@functools.lru_cache(MAX_ROUTES)
+def _any_whole(patterns: tuple[str, ...], topic: str) -> bool:
+    return any(pattern(text).whole(topic) for text in patterns)
+
+
+def matching(member: Member, topic: str) -> Subscription | None:
+    """The first of its subscriptions that wants this topic."""
+    return next((each for each in member.subscriptions.values() if each.pattern.part(topic)), None)

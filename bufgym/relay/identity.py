@@ -1,0 +1,140 @@
+"""Who is at the other end: JSON web tokens against an issuer's keys, clients' certificates."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import json
+import ssl
+import time
+import urllib.request
+from collections.abc import Mapping
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from bufgym.errors import BufgymError
+from bufgym.files import read_utf8
+from bufgym.relay.config import Tls, Tokens
+from bufgym.relay.extra import needs
+from bufgym.relay.quota import RefusedError
+
+MAX_KEYS_BYTES: Final = 2**20
+MAX_TOKEN_CHARACTERS: Final = 2**14
+KEYS_AGE_S: Final = 300.0
+"""A key that the issuer withdrew is trusted for so long at most."""
+AGAIN_S: Final = 1.0
+"""Tokens that name unknown keys make the relay ask the issuer no more often than this."""
+_FETCH_S: Final = 5.0
+
+
+def _unauthorized(why: str) -> RefusedError:
+    return RefusedError("unauthorized", why)
+
+
+class Verifier:
+    """Checks tokens of one issuer; its keys may change at any time."""
+
+    def __init__(self, tokens: Tokens) -> None:
+        with needs("jwt"):
+            import jwt
+        self._jwt: Any = jwt
+        self._tokens = tokens
+        self._keys: Mapping[str | None, Any] = {}
+        self._fetched_s = -1e9
+        self._fetching = asyncio.Lock()
+        if "://" in tokens.keys:
+            url = urlsplit(tokens.keys)
+            if url.scheme != "https" and not (url.scheme == "http" and _is_loopback(url.hostname)):
+                raise BufgymError(f"tokens: keys = {tokens.keys!r}: must be an https address")
+
+    async def email(self, token: str) -> tuple[str, float]:
+        """(the e-mail that the token proves, until when, s since 1970).
+
+        Raises RefusedError: it proves none.
+        """
+        if len(token) > MAX_TOKEN_CHARACTERS:
+            raise _unauthorized(f"token of {len(token)} characters: must be at most {MAX_TOKEN_CHARACTERS}")
+        try:
+            kid = self._jwt.get_unverified_header(token).get("kid")
+            key = await self._key(kid)
+            claims = self._jwt.decode(
+                token,
+                key,
+                algorithms=list(self._tokens.algorithms),
+                audience=self._tokens.audience,
+                issuer=self._tokens.issuer,
+                leeway=self._tokens.leeway_s,
+                options={"require": ["exp", "iss", "aud"]},
+            )
+        except (self._jwt.PyJWTError, ValueError, TypeError, OverflowError, RecursionError) as error:
+            raise error if isinstance(error, RefusedError) else _unauthorized(f"token: {error}") from None
+        email = claims.get("email")
+        if not isinstance(email, str) or not email or not email.isprintable() or claims.get("email_verified") is False:
+            raise _unauthorized("token: names no verified email")
+        return email, float(claims["exp"])
+
+    async def _key(self, kid: str | None) -> Any:
+        async with self._fetching:
+            age_s = time.monotonic() - self._fetched_s
+            if age_s > KEYS_AGE_S or (kid not in self._keys and age_s > AGAIN_S):
+                self._fetched_s = time.monotonic()
+                try:
+                    self._keys = self._parsed(await asyncio.to_thread(self._text))
+                except (OSError, BufgymError, ValueError, RecursionError) as error:
+                    if age_s > KEYS_AGE_S:
+                        self._keys = {}
+                    raise _unauthorized(f"the issuer's keys cannot be read: {error}") from None
+        if kid is None and len(self._keys) == 1:
+            return next(iter(self._keys.values()))
+        if kid not in self._keys:
+            raise _unauthorized(f"token: unknown key {str(kid)[:60]!r}")
+        return self._keys[kid]
+
+    def _text(self) -> str:
+        keys = self._tokens.keys
+        if "://" not in keys:
+            return read_utf8(keys, MAX_KEYS_BYTES)
+        with urllib.request.urlopen(keys, timeout=_FETCH_S) as answer:
+            return str(answer.read(MAX_KEYS_BYTES).decode())
+
+    def _parsed(self, text: str) -> dict[str | None, Any]:
+        try:
+            found = self._jwt.PyJWKSet.from_dict(json.loads(text)).keys
+        except (self._jwt.PyJWTError, AttributeError, TypeError) as error:
+            raise BufgymError(str(error)) from None
+        return {key.key_id: key for key in found}
+
+
+def _is_loopback(host: str | None) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host or "").is_loopback
+    except ValueError:
+        return False
+
+
+# --- certificates ----------------------------------------------------------------------------------------------------
+
+
+def server_context(tls: Tls) -> ssl.SSLContext:
+    """TLS for the relay's side; certificates of clients are asked for if an authority for them is given."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(tls.certificate, tls.key)
+        if tls.clients:
+            context.load_verify_locations(tls.clients)
+            context.verify_mode = ssl.CERT_OPTIONAL  # one without a certificate may have a token, or an address
+    except (OSError, ssl.SSLError) as error:
+        raise BufgymError(f"tls: {tls.certificate}, {tls.key}, {tls.clients}: {error}") from None
+    return context
+
+
+def certificate_email(certificate: Mapping[str, Any] | None) -> str:
+    """The e-mail in a client's verified certificate (subject alternative name, or subject); empty if there is none."""
+    for kind, value in (certificate or {}).get("subjectAltName", ()):
+        if kind == "email" and isinstance(value, str) and value.isprintable():
+            return value
+    for names in (certificate or {}).get("subject", ()):
+        for kind, value in names:
+            if kind == "emailAddress" and value.isprintable():
+                return str(value)
+    return ""

@@ -1,0 +1,114 @@
+"""What goes to one client, the most urgent first.
+
+First what the relay answers, then no_drop messages while fewer than n_T are not acked, then what the queues hand out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from typing import Any, Final
+
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import WebSocketException
+
+from bufgym.relay import wire
+from bufgym.relay.hub import Frame, Hub, Member
+from bufgym.relay.subscriber import next_lane
+from bufgym.relay.wire import WireError
+
+MAX_ANSWERS: Final = 4_096
+"""Not yet sent: a client that asks and asks and reads nothing is closed."""
+
+
+class Outbox:
+    """The one task that writes to a connection, and what it writes."""
+
+    def __init__(self, hub: Hub, socket: ServerConnection) -> None:
+        self._hub = hub
+        self._socket = socket
+        self._answers: deque[str] = deque()
+        self._awake = asyncio.Event()
+        self._member: Member | None = None
+        self._form = "binary"
+        self._sent_number = 0
+        self._in_flight: deque[int] = deque()
+        self.sent = 0
+        """Messages so far."""
+
+    def begin(self, member: Member, form: str, received: int) -> None:
+        """Its client has said hello, and has had no_drop messages to this number."""
+        self._member, self._form = member, form
+        self._sent_number = received
+
+    def tell(self, op: str, **fields: Any) -> bool:
+        """Say this, before any message; whether there is room for more."""
+        self._answers.append(wire.say(op, **fields))
+        self._awake.set()
+        return len(self._answers) <= MAX_ANSWERS
+
+    def wake(self) -> None:
+        """There may be something to send."""
+        self._awake.set()
+
+    def acked(self, number: int) -> None:
+        """The client has processed all no_drop messages to this number."""
+        if number > self._sent_number:
+            raise WireError(f"ack of {number}: must be at most {self._sent_number}, the last sent")
+        while self._in_flight and self._in_flight[0] <= number:
+            self._in_flight.popleft()
+        self._awake.set()
+
+    async def run(self) -> None:
+        """Send what is to be sent, one after the other."""
+        try:
+            while True:
+                await self._awake.wait()
+                self._awake.clear()
+                while await self.one():
+                    pass
+        except WebSocketException:
+            pass  # the reader sees it too
+        except Exception:
+            self._socket.transport.abort()
+            raise
+
+    async def answers(self) -> None:
+        """Send all that the relay has said."""
+        while self._answers:
+            await self._socket.send(self._answers.popleft())
+
+    async def one(self) -> bool:
+        """Send what goes next; whether there was something."""
+        await self.answers()
+        member = self._member
+        if member is None:
+            return False
+        if self._sent_number < member.session.numbered and await self._no_drop(member):
+            return True
+        now_s = self._hub.clock()
+        lane = next_lane(list(member.subscriptions.values()), now_s)
+        item = None if lane is None else lane.take(now_s)
+        if lane is None or item is None:
+            return False
+        await self._send(item.message)
+        lane.gone()
+        return True
+
+    async def _no_drop(self, member: Member) -> bool:
+        """Send the next no_drop message, if the window has room and there is one."""
+        if len(self._in_flight) >= self._hub.config.store.window:
+            return False
+        waiting = self._hub.store.waiting(member.session, self._sent_number, 1)
+        for number, topic, frame in waiting:
+            self._sent_number = number
+            if member.permissions.allow("receive", topic):
+                self._in_flight.append(number)
+                await self._send(Frame(wire.decode(frame, len(frame))._replace(seq=number)))
+            else:
+                self._hub.settled(self._hub.store.denied(member.session, number))
+        return bool(waiting)
+
+    async def _send(self, frame: Frame) -> None:
+        await self._socket.send(frame.binary if self._form == "binary" else frame.json)
+        self.sent += 1

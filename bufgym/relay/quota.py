@@ -1,0 +1,115 @@
+"""How much one identity may do, over all its connections."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from bufgym.errors import BufgymError
+from bufgym.relay.config import Limits
+
+
+class RefusedError(BufgymError):
+    """What a client asked for is not done; ``code`` says why in a word."""
+
+    def __init__(self, code: str, why: str) -> None:
+        super().__init__(why)
+        self.code = code
+
+
+class Bucket:
+    """A token bucket: ``rate`` a second, and a second's worth at once."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._left = rate
+        self._at_s: float | None = None
+
+    def take(self, amount: float, now_s: float) -> bool:
+        """Whether so much was left. More than a second's worth may go where a whole second's worth is left."""
+        if self._at_s is not None:
+            self._left = min(self._rate, self._left + (now_s - self._at_s) * self._rate)
+        self._at_s = now_s
+        if self._left < min(amount, self._rate):
+            return False
+        self._left -= amount
+        return True
+
+
+@dataclass
+class Quota:
+    """What one identity has taken of its limits."""
+
+    limits: Limits
+    messages: Bucket = field(init=False)
+    bytes: Bucket = field(init=False)
+    connections: int = 0
+    subscriptions: int = 0
+    topics: set[str] = field(default_factory=set)
+    idle_since_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.messages, self.bytes = Bucket(self.limits.messages_per_s), Bucket(self.limits.bytes_per_s)
+
+    def message(self, size_bytes: int, now_s: float) -> None:
+        """It publishes a message.
+
+        Raises RefusedError: beyond a limit, as all of these functions.
+        """
+        limits = self.limits
+        if not (self.messages.take(1, now_s) and self.bytes.take(size_bytes, now_s)):
+            rule = f"must be at most {limits.messages_per_s} messages and {limits.bytes_per_s} bytes a second"
+            raise RefusedError("too_fast", rule)
+
+    def topic(self, topic: str) -> None:
+        """It publishes on this topic."""
+        if topic not in self.topics:
+            if len(self.topics) >= self.limits.topics:
+                raise RefusedError("too_many", f"topic {topic}: must be at most {self.limits.topics} topics")
+            self.topics.add(topic)
+
+    def connect(self) -> None:
+        """One more connection."""
+        if self.connections >= self.limits.connections:
+            raise RefusedError("too_many", f"must be at most {self.limits.connections} connections")
+        self.connections += 1
+
+    def subscribe(self) -> None:
+        """One more subscription."""
+        if self.subscriptions >= self.limits.subscriptions:
+            raise RefusedError("too_many", f"must be at most {self.limits.subscriptions} subscriptions")
+        self.subscriptions += 1
+
+
+KEPT_S = 60.0
+"""A quota whose last connection has gone is remembered for so long: who comes back meets the same limits."""
+MAX_QUOTAS = 100_000
+
+
+class Quotas:
+    """Those of all identities."""
+
+    def __init__(self, limits: Limits, clock: Callable[[], float]) -> None:
+        self._limits = limits
+        self._clock = clock
+        self._quotas: dict[str, Quota] = {}
+
+    def of(self, key: str) -> Quota:
+        """That of an identity."""
+        if key not in self._quotas:
+            if len(self._quotas) >= MAX_QUOTAS:
+                self.tidy(kept_s=0.0)
+            self._quotas[key] = Quota(self._limits, idle_since_s=self._clock())
+        return self._quotas[key]
+
+    def left(self, quota: Quota) -> None:
+        """A connection of it has ended."""
+        quota.connections -= 1
+        quota.idle_since_s = self._clock()
+
+    def tidy(self, kept_s: float = KEPT_S) -> None:
+        """Forget those that were long not used."""
+        now_s = self._clock()
+        for key, quota in list(self._quotas.items()):
+            if quota.connections == 0 and now_s - quota.idle_since_s >= kept_s:
+                del self._quotas[key]

@@ -1,0 +1,242 @@
+"""The relay's server: WebSockets and the page on one port, over the library ``websockets``."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections import Counter
+from functools import partial
+from http import HTTPStatus
+from typing import Any, Final, cast
+from urllib.parse import urlsplit
+
+from websockets.asyncio.server import Server as WebSocketServer
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from bufgym.errors import BufgymError
+from bufgym.live.sockets import DEAD_AFTER_S, set_option, small_buffers
+from bufgym.relay import pages, policies, wire
+from bufgym.relay.config import Config
+from bufgym.relay.connection import HELLO_BYTES, Connection
+from bufgym.relay.hub import Hub
+from bufgym.relay.identity import Verifier, server_context
+from bufgym.relay.quota import RefusedError
+from bufgym.relay.rules import Identity, Permissions, plain_address
+
+_PING_S: Final = 20.0
+_PONG_S: Final = 60.0
+"""A pong waits behind the message that is under way, which on a slow link takes long."""
+_QUIET: Final = logging.getLogger("bufgym.relay.websockets")
+"""What strangers do wrong is in the audit log, not in tracebacks."""
+_QUIET.setLevel(logging.CRITICAL + 1)
+
+
+class Door:
+    """Who may come as far as the handshake."""
+
+    def __init__(self, hub: Hub) -> None:
+        self.hub = hub
+        self.waiting: Counter[str] = Counter()
+        """Connections of an address that have not said hello."""
+        self.open = 0
+
+    def enter(self, address: str) -> None:
+        """One more connection.
+
+        Raises RefusedError: too many.
+        """
+        limits = self.hub.config.limits
+        if self.open >= limits.all_connections:
+            raise RefusedError("too_many", f"must be at most {limits.all_connections} connections in all")
+        if self.waiting[address] >= limits.connections:
+            raise RefusedError("too_many", f"must be at most {limits.connections} connections that have not said hello")
+        self.open += 1
+        self.waiting[address] += 1
+
+    def greeted(self, address: str) -> None:
+        """It has said hello, or has gone without."""
+        self.waiting[address] -= 1
+        if self.waiting[address] <= 0:
+            del self.waiting[address]
+
+    def refusal(self, address: str, request: Request) -> RefusedError | None:
+        """Why this request is denied; None if it may go on."""
+        config = self.hub.config
+        by_address = Permissions(config.rules, Identity(address)).rules
+        proves_more = config.tokens is not None or (config.tls is not None and config.tls.clients != "")
+        if not by_address and not (proves_more and any(rule.email for rule in config.rules)):
+            return RefusedError("unauthorized", "no rule allows anything to this address")
+        origins = request.headers.get_all("Origin")
+        if request.path.partition("?")[0] == wire.PATH and any(not self._is_own(each, request) for each in origins):
+            return RefusedError("unauthorized", f"origin {origins[0]!r}: a page of another server")
+        return None
+
+    def _is_own(self, origin: str, request: Request) -> bool:
+        """Whether the page that connects is ours, or one that the configuration names.
+
+        A page of any server that somebody looks at could otherwise use the address of the browser's machine. Its name
+        can be made to mean our address; so without being named only an address or localhost is our own.
+        """
+        if origin in self.hub.config.origins:
+            return True
+        try:
+            parts = urlsplit(origin)
+            host = parts.hostname or ""
+            if host != "localhost":
+                plain_address(host)
+        except ValueError:
+            return False
+        return parts.netloc in request.headers.get_all("Host")
+
+
+class Accepted(ServerConnection):
+    """A TCP connection, from its first byte on."""
+
+    def __init__(self, door: Door, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self._door = door
+        self._address = ""
+        self._inside = False
+        self._waits = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        try:
+            self._address = plain_address(transport.get_extra_info("peername")[0])
+            self._door.enter(self._address)
+        except (TypeError, IndexError):  # it has gone already
+            self.transport.abort()
+            return
+        except RefusedError as refused:
+            self._refused(refused.code, str(refused))
+            self.transport.abort()
+            return
+        self._inside = self._waits = True
+        connection = transport.get_extra_info("socket")
+        with contextlib.suppress(OSError):
+            set_option(connection, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
+            if self._door.hub.config.small_buffers:
+                small_buffers(connection)
+
+    def greeted(self) -> None:
+        """It has said hello, or it has gone."""
+        if self._waits:
+            self._waits = False
+            self._door.greeted(self._address)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._inside:
+            self._inside = False
+            self._door.open -= 1
+            if self.response is None:
+                why = self.protocol.handshake_exc or "no whole request in time"
+                self._refused("wrong", f"{type(why).__name__}: {why}" if isinstance(why, Exception) else why)
+            self.greeted()
+        super().connection_lost(exc)
+
+    def _refused(self, code: str, why: str) -> None:
+        self._door.hub.audit.repeated(what="connection", code=code, address=self._address, why=why)
+
+
+class Server:
+    """A relay.
+
+    server = Server(config)
+    port = await server.start()
+    await server.close()
+    """
+
+    def __init__(self, config: Config) -> None:
+        for name in config.policies:
+            policies.policy(name)
+        self.config = config
+        self.hub = Hub(config)
+        self._door = Door(self.hub)
+        self._verifier = None if config.tokens is None else Verifier(config.tokens)
+        self._tls = None if config.tls is None else server_context(config.tls)
+        self._server: WebSocketServer | None = None
+        self._ticking: asyncio.Task[None] | None = None
+
+    async def start(self) -> int:
+        """Listen; the port. The default policy is compiled before."""
+        await asyncio.to_thread(policies.warm, self.config.policies[0])
+        limits = self.config.limits
+        try:
+            self._server = await serve(
+                self._serve,
+                self.config.host,
+                self.config.port,
+                subprotocols=[Subprotocol(wire.SUBPROTOCOL)],
+                process_request=self._request,
+                create_connection=cast(type[Accepted], partial(Accepted, self._door)),  # it is called, no more
+                compression=None,  # pictures are compressed; and a small message may unpack to a large one
+                max_size=HELLO_BYTES,
+                max_queue=2,
+                write_limit=(1, 0),  # a message has left when the system has all of it
+                open_timeout=limits.hello_s,
+                close_timeout=1.0,
+                ping_interval=_PING_S,
+                ping_timeout=_PONG_S,
+                logger=_QUIET,
+                server_header=None,
+                ssl=self._tls,
+                backlog=1_024,
+            )
+        except OSError as error:
+            raise BufgymError(f"{self.config.host}:{self.config.port}: {error.strerror or error}") from None
+        self._ticking = asyncio.create_task(self._tick())
+        self.hub.audit("started", host=self.config.host, port=self.port)
+        return self.port
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        assert self._server is not None
+        return int(next(iter(self._server.sockets)).getsockname()[1])
+
+    async def close(self) -> None:
+        """Close all connections; what is held stays on disk."""
+        if self._ticking is not None:
+            self._ticking.cancel()
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+        self.hub.close()
+
+    async def _serve(self, socket: ServerConnection) -> None:
+        assert isinstance(socket, Accepted)
+        await Connection(self.hub, socket, self._verifier).serve(socket.greeted)
+
+    def _request(self, socket: ServerConnection, request: Request) -> Response | None:
+        """Deny it, answer it with a page, or let it go on to be a WebSocket."""
+        try:
+            address = plain_address(socket.remote_address[0])
+        except (TypeError, IndexError):
+            return pages.response(HTTPStatus.BAD_REQUEST, "gone\n")
+        refused = self._door.refusal(address, request)
+        if refused is not None:
+            self.hub.audit.repeated(what="connection", code=refused.code, address=address, why=str(refused))
+            return pages.response(HTTPStatus.FORBIDDEN, f"{refused}\n")
+        if request.path.partition("?")[0] == wire.PATH:
+            return None
+        return pages.answer(request.path)
+
+    async def _tick(self) -> None:
+        while True:
+            await asyncio.sleep(1.0)
+            self.hub.tick()
+
+
+async def serve_forever(config: Config, say: Any = print) -> None:
+    """Run a relay until cancelled."""
+    server = Server(config)
+    port = await server.start()
+    scheme = "http" if config.tls is None else "https"
+    say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
+    try:
+        await asyncio.Event().wait()
+    finally:
+        await server.close()

@@ -1,0 +1,288 @@
+"""What may not be lost: no_drop messages on disk until each of their receivers has acked them.
+
+A session outlives its connections. The relay numbers what it sends to a session, and knows the highest number that came
+from it; both are committed with the message itself, before anything is acked. So a message is taken once however often
+it is sent again, and a relay that is killed goes on where it was. Bounded: what has no room is refused to its sender.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from bufgym.errors import BufgymError
+from bufgym.relay import config
+from bufgym.relay.quota import RefusedError
+from bufgym.relay.rules import Identity
+
+FILE: Final = "held.sqlite"
+_SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS session (
+    id INTEGER PRIMARY KEY, name TEXT, address TEXT, email TEXT, temporary INTEGER,
+    received INTEGER, numbered INTEGER, seen_s REAL);
+CREATE TABLE IF NOT EXISTS durable (session INTEGER, id TEXT, pattern TEXT, PRIMARY KEY (session, id)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS message (
+    id INTEGER PRIMARY KEY, sender INTEGER, seq INTEGER, topic TEXT, frame BLOB, receivers INTEGER,
+    waiting INTEGER, lost INTEGER);
+CREATE TABLE IF NOT EXISTS delivery (
+    session INTEGER, number INTEGER, message INTEGER, PRIMARY KEY (session, number)) WITHOUT ROWID;
+"""
+
+
+@dataclass(eq=False)
+class Session:
+    """One client over all its connections."""
+
+    name: str
+    identity: Identity
+    temporary: bool
+    """Ends with its connection."""
+    received: int = 0
+    """Highest number of a no_drop message of its own that was taken."""
+    numbered: int = 0
+    """Highest number of a no_drop message to it."""
+    held: int = 0
+    """Messages to it that are not acked."""
+    durable: dict[str, str] = field(default_factory=dict)
+    """id -> pattern: what is held for it while it is away."""
+    seen_s: float = 0.0
+    """When it was last connected, s since 1970."""
+    id: int | None = None
+    """In the store; None while there is nothing to remember."""
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """A name belongs to who uses it: another identity's session of this name is another session."""
+        return self.identity.key, self.name
+
+
+class Settled(NamedTuple):
+    """A message that nobody waits for any more."""
+
+    sender: Session
+    seq: int
+    receivers: int
+    lost: int
+    """Receivers whose sessions were forgotten before they acked it."""
+
+
+class Store:
+    """Sessions, and what is held for them; in memory alone without a folder."""
+
+    def __init__(self, folder: Path | None, limits: config.Store, sessions: int = 64) -> None:
+        self.limits = limits
+        self._most_sessions = sessions
+        path = ":memory:" if folder is None else str(folder / FILE)
+        try:
+            self._db = sqlite3.connect(path, timeout=0.5, isolation_level=None)
+            # A kill of the process loses nothing; a power failure may lose the last moments.
+            for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL", "synchronous = NORMAL"):
+                self._db.execute(f"PRAGMA {pragma}")
+            self._db.executescript(_SCHEMA)
+        except sqlite3.Error as error:
+            raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
+        self.sessions: dict[tuple[str, str], Session] = {}
+        self._by_id: dict[int, Session] = {}
+        self._load()
+
+    def _load(self) -> None:
+        columns = "id, name, address, email, temporary, received, numbered, seen_s"
+        for id, name, address, email, temporary, received, numbered, seen_s in self._db.execute(
+            f"SELECT {columns} FROM session"
+        ).fetchall():
+            session = Session(name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s)
+            session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
+            (session.held,) = self._db.execute("SELECT count(*) FROM delivery WHERE session = ?", (id,)).fetchone()
+            self.sessions[session.key] = self._by_id[id] = session
+        (self.bytes,) = self._db.execute("SELECT coalesce(sum(length(frame)), 0) FROM message").fetchone()
+        for session in list(self.sessions.values()):
+            if session.temporary:  # of a relay that was killed
+                self.forget(session)
+
+    # --- sessions -----------------------------------------------------------------------------------------------------
+
+    def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> Session:
+        """The session of this name; a new one goes on from what the client knows.
+
+        Raises RefusedError: the identity has too many.
+        """
+        session = self.sessions.get((identity.key, name))
+        if session is None:
+            if sum(key == identity.key for key, _ in self.sessions) >= self._most_sessions:
+                raise RefusedError("too_many", f"must be at most {self._most_sessions} sessions")
+            session = Session(name, identity, temporary, acked, received)
+            self.sessions[session.key] = session
+        session.identity, session.seen_s = identity, time.time()
+        session.received, session.numbered = max(session.received, acked), max(session.numbered, received)
+        if session.id is not None:
+            with self._transaction():
+                self._save(session)
+        return session
+
+    def left(self, session: Session) -> list[Settled]:
+        """Its connection has ended; what nobody will ever ask for is forgotten."""
+        session.seen_s = time.time()
+        if session.temporary or session.id is None:
+            return self.forget(session)
+        with self._transaction():
+            self._save(session)
+        return []
+
+    def forget(self, session: Session) -> list[Settled]:
+        """It is no more; what was held for it is lost."""
+        self.sessions.pop(session.key, None)
+        if session.id is None:
+            return []
+        with self._transaction():
+            settled = self._settle(session, 0, 2**62, lost=1)
+            for table, column in (("session", "id"), ("durable", "session")):
+                self._db.execute(f"DELETE FROM {table} WHERE {column} = ?", (session.id,))
+        self._by_id.pop(session.id, None)
+        return settled
+
+    def want(self, session: Session, id: str, pattern: str | None) -> None:
+        """Hold for it what matches while it is away; None: no longer."""
+        if pattern is None and session.durable.pop(id, None) is None:
+            return
+        self._remember(session)
+        with self._transaction():
+            if pattern is None:
+                self._db.execute("DELETE FROM durable WHERE session = ? AND id = ?", (session.id, id))
+            else:
+                session.durable[id] = pattern
+                self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
+
+    # --- messages -----------------------------------------------------------------------------------------------------
+
+    def hold(self, sender: Session, seq: int, topic: str, frame: bytes, receivers: Sequence[Session]) -> None:
+        """Take the sender's message number ``seq`` for these receivers; it is on disk when this returns.
+
+        Raises RefusedError: no room; then its number is not used.
+        """
+        full = next((each for each in receivers if each.held >= self.limits.messages), None)
+        if full is not None:
+            raise RefusedError("store_full", f"session {full.name} has not acked {self.limits.messages} messages")
+        if self.bytes + len(frame) > self.limits.bytes:
+            raise RefusedError("store_full", f"no room for {len(frame)} bytes beside {self.bytes}")
+        try:
+            for session in (sender, *receivers):
+                self._remember(session)
+            with self._transaction():
+                cursor = self._db.execute(
+                    "INSERT INTO message (sender, seq, topic, frame, receivers, waiting, lost) "
+                    "VALUES (?, ?, ?, ?, ?, ?, 0)",
+                    (sender.id, seq, topic, frame, len(receivers), len(receivers)),
+                )
+                for receiver in receivers:
+                    number = receiver.numbered + 1
+                    self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, cursor.lastrowid))
+                    self._db.execute("UPDATE session SET numbered = ? WHERE id = ?", (number, receiver.id))
+                self._db.execute("UPDATE session SET received = ? WHERE id = ?", (seq, sender.id))
+        except sqlite3.Error as error:
+            raise RefusedError("store_full", f"the store cannot be written: {error}") from None
+        sender.received = seq
+        self.bytes += len(frame)
+        for receiver in receivers:
+            receiver.numbered += 1
+            receiver.held += 1
+
+    def waiting(self, session: Session, after: int, most: int) -> list[tuple[int, str, bytes]]:
+        """(number, topic, frame) of the next messages to it."""
+        if session.id is None:
+            return []
+        query = (
+            "SELECT number, topic, frame FROM delivery JOIN message ON message.id = delivery.message "
+            "WHERE session = ? AND number > ? ORDER BY number LIMIT ?"
+        )
+        return self._db.execute(query, (session.id, after, most)).fetchall()
+
+    def acked(self, session: Session, number: int) -> list[Settled]:
+        """It has processed all to this number; the messages that nobody waits for any more."""
+        if session.id is None or session.held == 0:
+            return []
+        with self._transaction():
+            return self._settle(session, 0, number, lost=0)
+
+    def denied(self, session: Session, number: int) -> list[Settled]:
+        """No rule lets it have this message any more."""
+        with self._transaction():
+            return self._settle(session, number, number, lost=1)
+
+    def expired(self, connected: Sequence[Session]) -> list[Session]:
+        """The sessions that have been away for too long."""
+        before_s = time.time() - self.limits.keep_s
+        here = set(map(id, connected))
+        return [each for each in self.sessions.values() if id(each) not in here and each.seen_s < before_s]
+
+    def close(self) -> None:
+        """Everything is on disk anyway."""
+        self._db.close()
+
+    # --- on disk ------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self._db.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            self._db.execute("ROLLBACK")
+            raise
+        self._db.execute("COMMIT")
+
+    def _settle(self, session: Session, first: int, last: int, lost: int) -> list[Settled]:
+        settled = []
+        chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
+        rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
+        self._db.execute(f"DELETE {chosen}", (session.id, first, last))
+        session.held -= len(rows)
+        for (message,) in rows:
+            (sender, seq, receivers, waiting, gone, size_bytes) = self._db.execute(
+                "UPDATE message SET waiting = waiting - 1, lost = lost + ? WHERE id = ? "
+                "RETURNING sender, seq, receivers, waiting, lost, length(frame)",
+                (lost, message),
+            ).fetchone()
+            if waiting == 0:
+                self._db.execute("DELETE FROM message WHERE id = ?", (message,))
+                self.bytes -= size_bytes
+                if sender in self._by_id:
+                    settled.append(Settled(self._by_id[sender], seq, receivers, gone))
+        return settled
+
+    def _remember(self, session: Session) -> None:
+        """Give it a place in the store, in a transaction of its own: its id is not taken back."""
+        if session.id is None:
+            cursor = self._db.execute(
+                "INSERT INTO session (name, address, email, temporary, received, numbered, seen_s) "
+                "VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (
+                    session.name,
+                    session.identity.address,
+                    session.identity.email,
+                    session.temporary,
+                    session.received,
+                    session.numbered,
+                    session.seen_s,
+                ),
+            )
+            assert cursor.lastrowid is not None
+            session.id = cursor.lastrowid
+            self._by_id[session.id] = session
+
+    def _save(self, session: Session) -> None:
+        self._db.execute(
+            "UPDATE session SET address = ?, email = ?, received = ?, numbered = ?, seen_s = ? WHERE id = ?",
+            (
+                session.identity.address,
+                session.identity.email,
+                session.received,
+                session.numbered,
+                session.seen_s,
+                session.id,
+            ),
+        )

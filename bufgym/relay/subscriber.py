@@ -1,0 +1,106 @@
+"""What waits for one subscriber: queues under its policy, made when the first message comes.
+
+A policy that knows topics (``robofleet``, the default, keeps the newest message of each) has one queue for some thirty
+of them; any other has a queue for each topic. Between queues the one goes next whose priority x wait is largest,
+Robofleet's own rule.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final
+
+from bufgym.live import PolicyQueue
+from bufgym.live.queue import Item
+from bufgym.policies.registry import Policy
+from bufgym.relay.patterns import Pattern
+from bufgym.relay.policies import PLACES, new_queue
+
+MAX_QUEUES: Final = 64
+"""Of a subscription: topics beyond them share queues."""
+
+
+class Lane:
+    """A queue, and whether the connection is carrying a message of it."""
+
+    def __init__(self, queue: PolicyQueue, left_bytes: Callable[[], int]) -> None:
+        self.queue = queue
+        self.served_s = 0.0
+        self.carried = False
+        queue.left_bytes = lambda: left_bytes() if self.carried else 0
+
+    @property
+    def ready(self) -> bool:
+        """Whether a message can go."""
+        return not self.carried and self.queue.in_flight > 0
+
+    def take(self, now_s: float) -> Item | None:
+        """The message that goes next."""
+        self.carried, self.served_s = True, now_s
+        return self.queue.get(0)
+
+    def gone(self) -> None:
+        """It has left."""
+        self.queue.gone()
+        self.carried = False
+
+
+class Subscription:
+    """What one subscriber asked for under one id."""
+
+    def __init__(
+        self,
+        id: str,
+        pattern: Pattern,
+        policy: Policy,
+        capacity: int,
+        *,
+        priority: float = 1.0,
+        durable: bool = False,
+        left_bytes: Callable[[], int] = lambda: 0,
+    ) -> None:
+        self.id = id
+        self.pattern = pattern
+        self.policy = policy
+        self.capacity = capacity
+        self.priority = priority
+        self.durable = durable
+        self._left_bytes = left_bytes
+        self.lanes: list[Lane] = []
+        self._topics: dict[str, int] = {}
+
+    def offer(self, topic: str, frame: Any, size_bytes: int) -> None:
+        """A message comes; the policy decides."""
+        number = self._topics.get(topic)
+        if number is None:
+            places = MAX_QUEUES * (PLACES if self.policy.for_topics else 1)
+            number = len(self._topics) if len(self._topics) < places else zlib.crc32(topic.encode()) % places
+            if len(self._topics) < places:
+                self._topics[topic] = number
+        lane, place = divmod(number, PLACES) if self.policy.for_topics else (number, 0)
+        while lane >= len(self.lanes):
+            self.lanes.append(Lane(new_queue(self.policy, self.capacity), self._left_bytes))
+        self.lanes[lane].queue.put(frame, size_bytes, topic=place)
+
+    @property
+    def dropped(self) -> int:
+        """Messages so far."""
+        return sum(lane.queue.dropped for lane in self.lanes)
+
+    def __len__(self) -> int:
+        """Messages queued."""
+        return sum(len(lane.queue) for lane in self.lanes)
+
+
+def next_lane(subscriptions: Sequence[Subscription], now_s: float) -> Lane | None:
+    """The lane that goes next; None if nothing waits."""
+    ready = list(_ready(subscriptions, now_s))
+    return max(ready, key=lambda each: each[0])[1] if ready else None
+
+
+def _ready(subscriptions: Sequence[Subscription], now_s: float) -> Iterator[tuple[float, Lane]]:
+    for subscription in subscriptions:
+        for lane in subscription.lanes:
+            if lane.ready:
+                yield subscription.priority * (now_s - lane.served_s), lane

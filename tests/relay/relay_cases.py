@@ -1,0 +1,92 @@
+"""A relay in the test's own loop, and clients that say exactly what they are told to."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+for library in ("websockets", "re2", "jwt"):
+    pytest.importorskip(library, reason=f"no {library} here: the extra relay")
+
+from websockets.asyncio.client import ClientConnection, connect
+
+from bufgym.relay import wire
+from bufgym.relay.config import Config, Rule
+from bufgym.relay.server import Server
+from bufgym.relay.wire import Message
+
+ALL = Rule(address="127.0.0.1", send=True, receive=True)
+COMMAND = "/robots/a/command"
+
+
+def settings(**changed: Any) -> Config:
+    """All is allowed to this machine."""
+    return Config(**{"port": 0, "rules": (ALL,), "policies": ("drop-oldest", "skip-pending", "robofleet"), **changed})
+
+
+class Client:
+    """Says hello, and then what it is told to."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self.socket = socket
+        self.welcome: dict[str, Any] = {}
+
+    async def say(self, op: str, **fields: Any) -> None:
+        await self.socket.send(wire.say(op, **fields))
+
+    async def put(self, topic: str, payload: bytes = b"1", **fields: Any) -> None:
+        await self.socket.send(wire.encode(Message(topic, payload, **{"encoding": "raw", **fields})))
+
+    async def command(self, seq: int, topic: str = COMMAND) -> None:
+        await self.put(topic, str(seq).encode(), encoding="json", seq=seq, no_drop=True)
+
+    async def next(self, timeout_s: float = 5.0) -> Any:
+        """What comes next: a ``Message``, or the object of a text frame."""
+        data = await asyncio.wait_for(self.socket.recv(), timeout_s)
+        return wire.decode(data) if isinstance(data, bytes) else wire.heard(data)
+
+    async def nothing(self, for_s: float = 0.15) -> bool:
+        try:
+            return await self.next(for_s) is None
+        except TimeoutError:
+            return True
+
+    async def subscribe(self, topic: str, id: str = "a", **fields: Any) -> dict[str, Any]:
+        await self.say("subscribe", id=id, topic=topic, **fields)
+        said: dict[str, Any] = await self.next()
+        return said
+
+
+@contextlib.asynccontextmanager
+async def client(port: int, **hello: Any) -> AsyncIterator[Client]:
+    """Connected and welcomed, or with the refusal in ``welcome``."""
+    url = f"ws://127.0.0.1:{port}{wire.PATH}"
+    options = {"subprotocols": [wire.SUBPROTOCOL], "compression": None, "proxy": None, "close_timeout": 0.2}
+    async with connect(url, **options) as socket:
+        one = Client(socket)
+        await one.say("hello", **{"version": 1, **hello})
+        one.welcome = await one.next()
+        yield one
+
+
+@contextlib.asynccontextmanager
+async def relay(config: Config | None = None) -> AsyncIterator[Server]:
+    server = Server(config or settings())
+    await server.start()
+    try:
+        yield server
+    finally:
+        await server.close()
+
+
+def run(story: Callable[[], Awaitable[None]], most_s: float = 60.0) -> None:
+    asyncio.run(asyncio.wait_for(story(), most_s))  # type: ignore[arg-type]
+
+
+def in_folder(folder: Path, **changed: Any) -> Config:
+    return settings(folder=folder, **changed)
