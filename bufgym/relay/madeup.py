@@ -48,12 +48,12 @@ class MadeUp:
         now_s, now_us = self._now()
         pose, later = pose_at(self.number, now_s), pose_at(self.number, now_s + 0.1)
         speed_m_s = math.hypot(later.x - pose.x, later.y - pose.y) / 0.1
-        robot.publish("odom", ros_messages.odometry(now_us, pose, speed_m_s), "cdr", ros_messages.ODOMETRY)
+        robot.publish("odom", ros_messages.odometry(now_us, robot.name, pose, speed_m_s), "cdr", ros_messages.ODOMETRY)
 
     def _scan(self, robot: Robot) -> None:
         now_s, now_us = self._now()
         ranges_m = cast(pose_at(self.number, now_s), BEAMS)[0]
-        robot.publish("scan", ros_messages.scan(now_us, BEAMS, ranges_m), "cdr", ros_messages.SCAN)
+        robot.publish("scan", ros_messages.scan(now_us, robot.name, BEAMS, ranges_m), "cdr", ros_messages.SCAN)
 
     def _camera(self, robot: Robot) -> None:
         robot.publish("camera", jpeg(picture(pose_at(self.number, self._now()[0]))), "jpeg")

@@ -41,7 +41,7 @@ def _header(time_us: int, frame: str) -> Any:
     return kinds["std_msgs/msg/Header"](stamp, frame)
 
 
-def odometry(time_us: int, pose: Pose, speed_m_s: float) -> bytes:
+def odometry(time_us: int, robot: str, pose: Pose, speed_m_s: float) -> bytes:
     """A ``nav_msgs/msg/Odometry``."""
     kinds, zeros = store().types, np.zeros(36)
     vector = kinds["geometry_msgs/msg/Vector3"]
@@ -50,19 +50,19 @@ def odometry(time_us: int, pose: Pose, speed_m_s: float) -> bytes:
     motion = kinds["geometry_msgs/msg/Twist"](vector(speed_m_s, 0.0, 0.0), vector(0.0, 0.0, 0.0))
     message = kinds[ODOMETRY](
         _header(time_us, "map"),
-        "base",
+        f"{robot}/base",
         kinds["geometry_msgs/msg/PoseWithCovariance"](place, zeros),
         kinds["geometry_msgs/msg/TwistWithCovariance"](motion, zeros),
     )
     return bytes(store().serialize_cdr(message, ODOMETRY))
 
 
-def scan(time_us: int, angles: NDArray[np.float64], ranges_m: NDArray[np.float64]) -> bytes:
+def scan(time_us: int, robot: str, angles: NDArray[np.float64], ranges_m: NDArray[np.float64]) -> bytes:
     """A ``sensor_msgs/msg/LaserScan`` of these equally spaced angles."""
     step = float(angles[1] - angles[0])
     ends = float(angles[0]), float(angles[-1])
     ranges, intensities = ranges_m.astype(np.float32), np.zeros(0, np.float32)
-    message = store().types[SCAN](_header(time_us, "base"), *ends, step, 0.0, 0.1, 0.05, 30.0, ranges, intensities)
+    message = store().types[SCAN](_header(time_us, f"{robot}/base"), *ends, step, 0.0, 0.1, 0.05, 30.0, ranges, intensities)
     return bytes(store().serialize_cdr(message, SCAN))
 
 
