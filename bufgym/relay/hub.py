@@ -173,13 +173,14 @@ class Hub:
                 self.members[session].wake()
 
     def _holders(self, sender: Member, topic: str) -> list[Session]:
-        """The sessions that are to get a no_drop message, here or away."""
+        """The sessions that are to get a no_drop message: here, away, or back and about to subscribe again."""
         here = [member.session for member, _ in self._route(topic) if member is not sender]
         away = [
             session
             for session in self.store.sessions.values()
             if session.durable
-            and session not in self.members
+            and session is not sender.session
+            and session not in here
             and any(pattern(text).part(topic) for text in session.durable.values())
             and Permissions(self.config.rules, session.identity).allow("receive", topic)
         ]

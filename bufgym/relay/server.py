@@ -161,8 +161,7 @@ class Server:
         self._ticking: asyncio.Task[None] | None = None
 
     async def start(self) -> int:
-        """Listen; the port. The default policy is compiled before."""
-        await asyncio.to_thread(policies.warm, self.config.policies[0])
+        """Listen; the port. The default policy is compiled while robots connect again."""
         limits = self.config.limits
         try:
             self._server = await serve(
@@ -187,6 +186,7 @@ class Server:
             )
         except OSError as error:
             raise BufgymError(f"{self.config.host}:{self.config.port}: {error.strerror or error}") from None
+        self._warming = asyncio.create_task(asyncio.to_thread(policies.warm, self.config.policies[0]))
         self._ticking = asyncio.create_task(self._tick())
         self.hub.audit("started", host=self.config.host, port=self.port)
         return self.port
@@ -204,6 +204,7 @@ class Server:
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
+            await self._warming
         self.hub.close()
 
     async def _serve(self, socket: ServerConnection) -> None:

@@ -13,12 +13,12 @@ import pytest
 for library in ("websockets", "re2", "jwt"):
     pytest.importorskip(library, reason=f"no {library} here: the extra relay")
 
-from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.client import ClientConnection, connect  # noqa: E402
 
-from bufgym.relay import wire
-from bufgym.relay.config import Config, Rule
-from bufgym.relay.server import Server
-from bufgym.relay.wire import Message
+from bufgym.relay import wire  # noqa: E402
+from bufgym.relay.config import Config, Rule  # noqa: E402
+from bufgym.relay.server import Server  # noqa: E402
+from bufgym.relay.wire import Message  # noqa: E402
 
 ALL = Rule(address="127.0.0.1", send=True, receive=True)
 COMMAND = "/robots/a/command"

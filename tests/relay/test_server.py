@@ -79,8 +79,8 @@ def test_each_refusal_says_why() -> None:
             assert await code("/shut") == "unauthorized"
             assert await code("/relay/status") == "unauthorized"
             assert await code("/open/a", no_drop=True) == "wrong"
-            await one.put("/open/a", b"{", encoding="json")
-            assert (await one.next())["why"].startswith("topic /open/a: payload must be JSON")
+            await one.put("/open/b", b"{", encoding="json")
+            assert (await one.next())["why"].startswith("topic /open/b: payload must be JSON")
             await one.say("publish", topic="/open/b", data=1)
             assert await code("/open/c") == "too_many"
             for subscription, expected in (
