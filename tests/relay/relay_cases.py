@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -63,11 +64,13 @@ class Client:
 
 
 @contextlib.asynccontextmanager
-async def client(port: int, **hello: Any) -> AsyncIterator[Client]:
+async def client(
+    port: int, local: str = "127.0.0.1", tls: ssl.SSLContext | None = None, **hello: Any
+) -> AsyncIterator[Client]:
     """Connected and welcomed, or with the refusal in ``welcome``."""
-    url = f"ws://127.0.0.1:{port}{wire.PATH}"
-    options = {"subprotocols": [wire.SUBPROTOCOL], "compression": None, "proxy": None, "close_timeout": 0.2}
-    async with connect(url, **options) as socket:
+    url = f"{'wss' if tls else 'ws'}://127.0.0.1:{port}{wire.PATH}"
+    options = {"subprotocols": [wire.SUBPROTOCOL], "compression": None, "proxy": None, "close_timeout": 0.2, "ssl": tls}
+    async with connect(url, local_addr=(local, 0), **options) as socket:
         one = Client(socket)
         await one.say("hello", **{"version": 1, **hello})
         one.welcome = await one.next()

@@ -1,0 +1,113 @@
+"""Frames byte by byte, and what is none."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import relay_cases  # noqa: F401  (skips where the extra is missing)
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bufgym.relay import wire
+from bufgym.relay.wire import Message, WireError
+
+names = st.text(st.characters(exclude_categories=("C", "Z")), max_size=60)
+whole = st.integers(0, 2**53)
+messages = st.builds(
+    Message, names.map("/{}".format), st.binary(max_size=50), st.just("raw"), names, names, whole, whole, st.booleans()
+)
+
+
+def test_byte_by_byte() -> None:
+    message = Message("/a/b", b"\x01\x02", "jpeg", "T", "me", seq=258, stamp_us=-1, no_drop=True)
+    assert wire.encode(message) == (
+        b"bR\x01\x01\x01\x04\x01\x04\x02\0\0\0"
+        b"\0\0\0\x02"
+        b"\0\0\0\0\0\0\x01\x02"
+        b"\xff\xff\xff\xff\xff\xff\xff\xff"
+        b"/a/bTjpegme\x01\x02"
+    )
+
+
+@given(messages)
+def test_what_is_written_is_read(message: Message) -> None:
+    assert wire.decode(wire.encode(message)) == message
+    assert wire.from_json(wire.heard(wire.to_json(message))) == message
+
+
+def test_json_payloads_are_values() -> None:
+    message = Message("/a", b'{"x": [1, null, "\\u00e4"]}')
+    assert json.loads(wire.to_json(message))["data"] == {"x": [1, None, "ä"]}
+    assert json.loads(bytes(wire.from_json(wire.heard(wire.to_json(message))).payload)) == {"x": [1, None, "ä"]}
+
+
+GOOD = wire.encode(Message("/a", b"12"))
+
+
+@pytest.mark.parametrize(
+    ("data", "error"),
+    [
+        (b"", "frame of 0 bytes"),
+        (GOOD[:-1], "frame of 39 bytes: must be 40"),
+        (GOOD + b"1", "frame of 41 bytes: must be 40"),
+        (b"bX" + GOOD[2:], "header"),
+        (GOOD[:2] + b"\x02" + GOOD[3:], "version 1"),
+        (GOOD[:3] + b"\x02" + GOOD[4:], "kind 1"),
+        (GOOD[:4] + b"\x02" + GOOD[5:], "a known flag"),
+        (GOOD[:9] + b"\x01" + GOOD[10:], "header"),
+        (GOOD[:16] + b"\xff" * 8 + GOOD[24:], "seq"),
+        (GOOD[:24] + b"\x7f" + GOOD[25:], "stamp_us"),
+        (GOOD.replace(b"/a", b"aa"), "must begin with '/'"),
+        (GOOD.replace(b"/a", b"/\n"), "must be printable"),
+        (GOOD.replace(b"/a", b"/\xff"), "must be UTF-8"),
+    ],
+)
+def test_what_is_no_message(data: bytes, error: str) -> None:
+    with pytest.raises(WireError, match=error):
+        wire.decode(data)
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("", "must be JSON"),
+        ("[" * 10_000, "must be JSON"),
+        ("9" * 5_000, "must be JSON"),
+        ("3", "must be an object"),
+        ('{"op": "dance"}', "must be an object whose op"),
+        ('{"op": ["hello"]}', "must be an object whose op"),
+        ('{"op": "hello"}', "version is missing"),
+        ('{"op": "hello", "version": true}', "must be a whole number"),
+        ('{"op": "hello", "version": -1}', "must be a whole number"),
+        ('{"op": "hello", "version": 1e99}', "must be a whole number"),
+        ('{"op": "publish", "topic": "/a", "data": NaN}', "NaN is no JSON"),
+        ('{"op": "subscribe", "id": "a", "topic": 3}', "topic = 3: must be a text"),
+        ('{"op": "subscribe", "id": "a", "topic": "a", "priority": "1"}', "must be a number"),
+    ],
+)
+def test_what_is_no_text_frame(text: str, error: str) -> None:
+    with pytest.raises(WireError, match=error):
+        wire.heard(text)
+
+
+@pytest.mark.parametrize(
+    ("fields", "error"),
+    [
+        ({"topic": "a"}, "must begin with '/'"),
+        ({"topic": "/\ud800"}, "must be"),
+        ({"topic": "/" + "a" * 255}, "at most 255 bytes"),
+        ({"topic": "/" + "ä" * 128}, "at most 255 bytes"),
+        ({"encoding": "jpeg", "data": "*"}, "must be base64"),
+        ({"encoding": "jpeg", "data": 3}, "must be base64"),
+        ({"encoding": "", "data": ""}, "must not be empty"),
+    ],
+)
+def test_what_is_no_message_in_json(fields: dict[str, object], error: str) -> None:
+    with pytest.raises(WireError, match=error):
+        wire.from_json({"topic": "/a", "data": 1, **fields})
+
+
+def test_a_payload_that_is_not_what_its_encoding_says() -> None:
+    with pytest.raises(WireError, match="payload must be JSON"):
+        wire.to_json(Message("/a", b"{"))
