@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from bufgym.cli.live import run_async
 from bufgym.cli.options import Commands, command, count, load_policies, loaded, natural, policy_file
 from bufgym.errors import BufgymError
 
@@ -15,7 +16,7 @@ CAPACITY = 32
 
 def add(parts: Commands) -> None:
     robot = command(parts, "robot", _robot, "a robot: recorded, of ROS, or made up; Ctrl-C ends it")
-    robot.add_argument("--to", default="ws://127.0.0.1:7420", metavar="URL", help="the relay (%(default)s)")
+    _add_session(robot)
     robot.add_argument("--name", default="robot-1", help="(%(default)s)")
     robot.add_argument("--config", metavar="FILE.toml", help="its topics, as in examples/client.toml")
     kinds = robot.add_mutually_exclusive_group()
@@ -29,16 +30,27 @@ def add(parts: Commands) -> None:
     robot.add_argument("--policies", metavar="NAME", help="the policy, as in bench (learned-scheduler)")
     policy_file(robot)
     robot.add_argument("--capacity", type=count, default=CAPACITY, metavar="L", help="L, messages (%(default)s)")
-    robot.add_argument("--token-file", metavar="FILE", help="who it is (default: $BUFGYM_RELAY_TOKEN)")
-    robot.add_argument("--ca", metavar="FILE.pem", help="with wss: who signs the relay's certificate")
-    robot.add_argument("--certificate", metavar="FILE.pem", help="with wss: the robot's own, with its key")
 
     demo = command(parts, "demo", _demo, "a relay, made-up robots over fading links, and the page; Ctrl-C ends it")
     demo.add_argument("--robots", type=count, default=3, metavar="N", help="(%(default)s)")
     demo.add_argument("--port", type=natural, default=7420, help="of the relay (%(default)s)")
+    demo.add_argument("--policies", metavar="NAME", help="of the robots, as in bench (learned-scheduler)")
     demo.add_argument("--folder", metavar="DIR", help="record there")
     demo.add_argument("--foxglove", type=natural, metavar="PORT", help="show them in Foxglove and Lichtblick too")
     demo.add_argument("--no-browser", action="store_true", help="do not open the page")
+
+    foxglove = command(parts, "foxglove", _foxglove, "a viewer that Foxglove and Lichtblick connect to; Ctrl-C ends it")
+    _add_session(foxglove)
+    foxglove.add_argument("--name", default="foxglove", help="(%(default)s)")
+    foxglove.add_argument("--port", type=natural, default=8765, help="where they connect to (%(default)s)")
+    foxglove.add_argument("--topics", default="^/", metavar="REGEX", help="what is shown (%(default)s)")
+
+
+def _add_session(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--to", default="ws://127.0.0.1:7420", metavar="URL", help="the relay (%(default)s)")
+    parser.add_argument("--token-file", metavar="FILE", help="who this is (default: $BUFGYM_RELAY_TOKEN)")
+    parser.add_argument("--ca", metavar="FILE.pem", help="with wss: who signs the relay's certificate")
+    parser.add_argument("--certificate", metavar="FILE.pem", help="with wss: this one's own, with its key")
 
 
 def _say(text: str) -> None:
@@ -46,8 +58,6 @@ def _say(text: str) -> None:
 
 
 def _robot(options: argparse.Namespace) -> None:
-    import asyncio
-
     from bufgym.relay.robot import Robot
     from bufgym.relay.session import security, token
     from bufgym.scenario import read_client
@@ -72,7 +82,7 @@ def _robot(options: argparse.Namespace) -> None:
         print(f"{options.name} -> {options.to}; Ctrl-C ends it", flush=True)
         await robot.run()
 
-    asyncio.run(run())
+    run_async(run())
 
 
 def _source(options: argparse.Namespace, streams: Any) -> Any:
@@ -97,13 +107,39 @@ def _demo(options: argparse.Namespace) -> None:
 
     from bufgym.relay import demo
 
+    (policy,) = loaded([options.policies or "learned-scheduler"])[0]
+
     async def show() -> None:
         folder = None if options.folder is None else Path(options.folder)
-        async with demo.running(options.robots, options.port, folder=folder, say=_say) as port:
+        async with (
+            demo.running(options.robots, options.port, policy=policy, folder=folder, say=_say) as port,
+            asyncio.TaskGroup() as tasks,
+        ):
             page = f"http://127.0.0.1:{port}/"
             print(f"{page}: {options.robots} robots; Ctrl-C ends it", flush=True)
+            if options.foxglove is not None:
+                tasks.create_task(_bridge(f"ws://127.0.0.1:{port}", "foxglove", options.foxglove).run())
             if not options.no_browser:
                 webbrowser.open(page)
             await asyncio.Event().wait()
 
-    asyncio.run(show())
+    run_async(show())
+
+
+def _foxglove(options: argparse.Namespace) -> None:
+    async def show() -> None:
+        from bufgym.relay.session import security, token
+
+        settings = {"token": token(options.token_file), "tls": security(options.ca, options.certificate)}
+        await _bridge(options.to, options.name, options.port, options.topics, **settings).run()
+
+    run_async(show())
+
+
+def _bridge(url: str, name: str, port: int, topics: str = "^/", **session: Any) -> Any:
+    from bufgym.relay.foxglove import Bridge
+    from bufgym.relay.session import Session
+
+    bridge = Bridge(Session(url, name, say=_say, **session), port, pattern=topics)
+    print(f"ws://127.0.0.1:{bridge.port}: Foxglove, Lichtblick -> {url}; Ctrl-C ends it", flush=True)
+    return bridge

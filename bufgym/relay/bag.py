@@ -60,9 +60,7 @@ class Recorded:
             if offset_s is None or loop.time() - logged_ns / 1e9 - offset_s > _LATE_S:
                 offset_s = loop.time() - logged_ns / 1e9
             await asyncio.sleep(offset_s + logged_ns / 1e9 - loop.time())
-            encoding = channel.encoding or "json"
-            if encoding == "ros1":
-                encoding, payload = "cdr", ros_messages.as_cdr(payload, channel.type)
+            encoding, payload = ros_messages.modern(payload, channel.type, channel.encoding or "json")
             robot.publish(name, payload, encoding, channel.type)
 
     def status(self) -> dict[str, Any]:

@@ -19,9 +19,9 @@ from bufgym.relay.server import Server
 from bufgym.scenario import read_client
 from bufgym.traces import Trace
 
-CLEAR_BPS: Final = 1_200_000
-FADED_BPS: Final = 130_000
-"""A robot wants 700 kbit/s."""
+CLEAR_BPS: Final = 1_000_000
+FADED_BPS: Final = 100_000
+"""A robot wants 550 kbit/s."""
 FADES_S: Final = 24.0
 DELAY_US: Final = 20_000
 

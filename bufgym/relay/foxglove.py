@@ -55,10 +55,9 @@ class Bridge:
         if message.encoding in _PICTURES:
             from foxglove.messages import CompressedImage
 
-            payload_of_picture = CompressedImage(
-                timestamp=_timestamp(time_ns), frame_id=_frame(message.topic), data=payload, format=message.encoding
-            )
-            self._channels[key].log(payload_of_picture, log_time=time_ns)
+            frame, form = _frame(message.topic), message.encoding
+            picture = CompressedImage(timestamp=_timestamp(time_ns), frame_id=frame, data=payload, format=form)
+            self._channels[key].log(picture, log_time=time_ns)
             return
         self._channels[key].log(payload, log_time=time_ns)
         if message.encoding == "cdr" and message.type in ros_messages.POSES:

@@ -1,7 +1,7 @@
 """A relay's recordings for its page, piece by piece, as JSON: only topics that the viewer may receive.
 
-A recorder's file is a plain row of MCAP records, which may still grow. It is walked once; where its messages lie in time
-is remembered, so that a piece from its middle is read from there.
+A recorder's file is a plain row of MCAP records, which may still grow. It is walked once, and where its messages lie in
+time is remembered, so that a piece from its middle is read from there.
 """
 
 from __future__ import annotations
@@ -34,9 +34,7 @@ def recordings(folder: Path | None) -> list[dict[str, Any]]:
     """The files of a relay's recordings, the latest first."""
     paths = [] if folder is None or not folder.is_dir() else folder.glob("*.mcap")
     stats = [(path.name, path.stat()) for path in paths]
-    files = [
-        {"name": name, "bytes": stat.st_size, "modified_us": stat.st_mtime_ns // 1000} for name, stat in stats
-    ]
+    files = [{"name": name, "bytes": stat.st_size, "modified_us": stat.st_mtime_ns // 1000} for name, stat in stats]
     return sorted(files, key=lambda file: (file["modified_us"], file["name"]), reverse=True)
 
 

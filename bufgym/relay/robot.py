@@ -106,11 +106,13 @@ class Robot:
         stream = self._streams[topic]
         self._kinds[topic] = {"type": type, "encoding": encoding}
         if type in ros_messages.POSES and encoding in ("cdr", "ros1"):
-            self._locate(ros_messages.read(payload, type, encoding))
+            self.locate(payload, type, encoding)
         x = self._odometry.x if stream.moves else (time.monotonic() - self._began_s) * stream.unit_hz
         self.client.publish(self.topic(topic), payload, encoding, type, x, stamp_us)
 
-    def _locate(self, message: Any) -> None:
+    def locate(self, payload: bytes, type: str, encoding: str = "cdr") -> None:
+        """Take a pose, which says where the robot is and gives x to the topics that move."""
+        message = ros_messages.read(payload, type, encoding)
         self._odometry.take(message)
         pose = message.pose
         while hasattr(pose, "pose"):

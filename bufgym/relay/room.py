@@ -21,7 +21,7 @@ HALF_M: Final = (6.0, 4.0)
 WALL_M: Final = 2.4
 EYE_M: Final = 0.9
 """Height of the walls, and of the camera."""
-PICTURE: Final = (320, 240)
+PICTURE: Final = (256, 192)
 FIELD_OF_VIEW: Final = math.radians(75)
 _BOXES: Final = (  # x, y, width, depth, colour
     (0.0, 0.0, 12.0, 8.0, (214, 206, 190)),  # the room itself

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from typing import Any, Final
@@ -62,7 +63,9 @@ def scan(time_us: int, robot: str, angles: NDArray[np.float64], ranges_m: NDArra
     step = float(angles[1] - angles[0])
     ends = float(angles[0]), float(angles[-1])
     ranges, intensities = ranges_m.astype(np.float32), np.zeros(0, np.float32)
-    message = store().types[SCAN](_header(time_us, f"{robot}/base"), *ends, step, 0.0, 0.1, 0.05, 30.0, ranges, intensities)
+    message = store().types[SCAN](
+        _header(time_us, f"{robot}/base"), *ends, step, 0.0, 0.1, 0.05, 30.0, ranges, intensities
+    )
     return bytes(store().serialize_cdr(message, SCAN))
 
 
@@ -85,12 +88,20 @@ def planar(pose: Any) -> dict[str, float]:
     return {"x": round(place.x, 3), "y": round(place.y, 3), "yaw": round(yaw, 4)}
 
 
-def as_cdr(payload: bytes, type: str) -> bytes:
-    """A message of ROS 1 in ROS 2's encoding; the two have most types in common."""
+def modern(payload: bytes, type: str, encoding: str) -> tuple[str, bytes]:
+    """(encoding, payload) in CDR where it was ROS 1's and the type is common to both; else as it is."""
+    if encoding == "ros1" and type in store().types:
+        with contextlib.suppress(Exception):  # a type of this name, but not this form
+            return "cdr", bytes(_store_1().ros1_to_cdr(payload, type))
+    return encoding, payload
+
+
+def as_ros1(payload: bytes, type: str) -> bytes:
+    """A message in CDR as ROS 1 has it."""
     try:
-        return bytes(_store_1().ros1_to_cdr(payload, type))
-    except Exception as error:
-        raise BufgymError(f"message of {len(payload)} bytes: no {type} of ROS 1: {error}") from None
+        return bytes(_store_1().cdr_to_ros1(payload, type))
+    except Exception as error:  # what does not fit fails in many ways
+        raise BufgymError(f"message of {len(payload)} bytes: no {type}: {error}") from None
 
 
 def definition(type: str) -> str | None:

@@ -58,7 +58,7 @@ def token(path: str | Path | None = None) -> str | None:
 
 
 def security(authority: str | None = None, certificate: str | None = None) -> ssl.SSLContext | None:
-    """For ``wss``: who signs the relay's certificate, and the client's own with its key, PEM files; None for neither."""
+    """For ``wss``: who signs the relay's certificate, the client's own with its key, PEM files; None for neither."""
     if authority is None and certificate is None:
         return None
     try:

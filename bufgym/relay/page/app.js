@@ -8,6 +8,7 @@ import {Relay} from "./relay.js";
 import {Replay} from "./replay.js";
 
 const HISTORY_MS = 60_000, TRAIL_GAP_MS = 100, AWAY_MS = 5000, TEXT_MS = 250;
+const POSES = 100, NEAR_MS = 20, GAP_MS = 400;
 const ROBOT = /^\/robots\/([^/]+)\/(.+)$/;
 
 const $ = id => document.getElementById(id);
@@ -43,7 +44,7 @@ const nowMs = () => replay ? replay.nowMs : Date.now();
 
 function robotOf(name) {
   if (!robots.has(name)) {
-    const robot = {name, number: robots.size, trail: [], history: [], topics: {}, kinds: {}, skewMs: Infinity, heardMs: 0, frames: []};
+    const robot = {name, number: robots.size, trail: [], poses: [], history: [], kinds: {}, skewMs: Infinity, heardMs: 0, frames: []};
     robot.tint = hue(robot.number);
     robots.set(name, robot);
     addCard(robot);
@@ -68,7 +69,8 @@ function take(message) {
     robot.scan = scan(message);
     robot.scanMs = message.stampMs + robot.skewMs;
     robot.scanChanged = true;
-    if (robot.pose) map.addScan(robot.pose, robot.scan);
+    const then = poseAt(robot, robot.scanMs);
+    if (then) map.addScan(then, robot.scan);
   } else if (robot.kinds[topic] === "picture" && name === chosen) {
     robot.coming = message;                         // only the latest is decoded
     robot.frames.push(nowMs());
@@ -88,8 +90,12 @@ function takeQueue(robot, queue, ms, own = true) {
   robot.queue = queue;
   robot.saidMs = ms;
   if (own) robot.queueMs = ms;
-  robot.history.push({ms, queued: queue.queued, capacity: queue.capacity, rate: queue.rate_bps ?? 0, dropped: queue.dropped});
-  if (robot.history.length > 1 && ms < robot.history.at(-2).ms) robot.history.sort((one, other) => one.ms - other.ms);
+  robot.history.push({ms, queued: queue.queued, capacity: queue.capacity, rate: queue.rate_bps ?? 0, dropped: queue.dropped, drops: 0});
+  robot.history.sort((one, other) => one.ms - other.ms);
+  for (let k = 1; k < robot.history.length; k++) {
+    const [before, entry] = [robot.history[k - 1], robot.history[k]];
+    entry.drops = Math.max(0, entry.dropped - before.dropped) / Math.max(0.1, (entry.ms - before.ms) / 1000);
+  }
   robot.queueChanged = true;
 }
 
@@ -97,8 +103,19 @@ function takePose(robot, at, ms) {
   if (robot.poseMs > ms) return;
   robot.pose = at;
   robot.poseMs = ms;
+  robot.poses.push({...at, ms});
+  if (robot.poses.length > POSES) robot.poses.shift();
   if (!robot.trail.length || ms - robot.trail.at(-1).ms >= TRAIL_GAP_MS) robot.trail.push({x: at.x, y: at.y, ms});
   map.changed = true;
+}
+
+// Where a robot was: between two poses, or right at one.
+function poseAt(robot, ms) {
+  const k = robot.poses.findIndex(at => at.ms >= ms), after = robot.poses[k], before = robot.poses[k - 1];
+  const near = [before, after, robot.poses.at(-1)].find(at => at && Math.abs(at.ms - ms) < NEAR_MS);
+  if (!before || !after || after.ms - before.ms > GAP_MS) return near;
+  const part = (ms - before.ms) / Math.max(1, after.ms - before.ms), turn = Math.atan2(Math.sin(after.yaw - before.yaw), Math.cos(after.yaw - before.yaw));
+  return {x: before.x + part * (after.x - before.x), y: before.y + part * (after.y - before.y), yaw: before.yaw + part * turn};
 }
 
 // Of all robots where they are, of the chosen one all that is drawn.
@@ -245,7 +262,7 @@ function play(file) {
   forget();
   for (const id of ["status", "poses", "chosen"]) relay.unsubscribe(id);
   replay = new Replay(relay, file, take, () => {
-    for (const robot of robots.values()) Object.assign(robot, {trail: [], history: [], skewMs: Infinity, poseMs: 0, queueMs: 0});
+    for (const robot of robots.values()) Object.assign(robot, {trail: [], poses: [], history: [], skewMs: Infinity, poseMs: 0, queueMs: 0});
     map.forget();
   });
   $("player").hidden = false;
@@ -318,8 +335,10 @@ function redraw() {
     robot.tint = hue(robot.number);
     robot.card.style.setProperty("--robot", robot.tint);
     robot.scanChanged = robot.queueChanged = robot.pictureChanged = true;
+    if (robot.name === chosen) $("robot").style.setProperty("--robot", robot.tint);
   }
-  map.belowMs = -Infinity;
+  for (const row of $("topics").rows) row.dataset.name = "";
+  textMs = map.belowMs = -Infinity;
 }
 whenColoursChange(redraw);
 addEventListener("resize", redraw);

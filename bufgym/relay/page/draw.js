@@ -96,26 +96,32 @@ export function drawSlots(canvas, queue) {
   }
 }
 
-// The last minute: the queue's length above, the link's rate below, a red line for every drop.
+// The last minute: the queue's length, what it dropped, and the link's rate.
 export function drawHistory(canvas, entries, nowMs) {
   const [drawing, width, height] = context(canvas);
   const x = ms => width - (nowMs - ms) / HISTORY_MS * width;
-  const capacity = Math.max(1, ...entries.map(entry => entry.capacity));
-  const fastest = Math.max(1000, ...entries.map(entry => entry.rate));
+  const most = (key, least) => Math.max(least, ...entries.map(entry => entry[key]));
+  const capacity = most("capacity", 1), drops = most("drops", 5), rate = most("rate", 1000);
+  const unit = (height - 3 * 16) / 5;
   const lanes = [
-    {top: 15, bottom: height / 2 - 3, most: capacity, key: "queued", tint: colour("accent"), says: `queue, of ${capacity}`},
-    {top: height / 2 + 18, bottom: height - 1, most: fastest, key: "rate", tint: colour("link"), says: `link, up to ${bits(fastest)}`},
+    {units: 2, most: capacity, key: "queued", tint: colour("accent"), says: `queue, of ${capacity}`},
+    {units: 1, most: drops, key: "drops", tint: colour("lost"), says: `dropped, up to ${Math.round(drops)} a second`},
+    {units: 2, most: rate, key: "rate", tint: colour("link"), says: `link, up to ${bits(rate)}`},
   ];
   drawing.font = "11px system-ui, sans-serif";
+  let top = 0;
   for (const lane of lanes) {
-    const y = value => lane.bottom - value / lane.most * (lane.bottom - lane.top);
+    drawing.fillStyle = colour("soft");
+    drawing.fillText(lane.says, 0, top + 12);
+    top += 16;
+    const bottom = top + lane.units * unit, y = value => bottom - value / lane.most * (bottom - top - 1);
     drawing.fillStyle = colour("lane");
-    drawing.fillRect(0, lane.top, width, lane.bottom - lane.top);
+    drawing.fillRect(0, top, width, bottom - top);
     if (entries.length > 1) {
       drawing.beginPath();
-      drawing.moveTo(x(entries[0].ms), lane.bottom);
+      drawing.moveTo(x(entries[0].ms), bottom);
       for (const entry of entries) drawing.lineTo(x(entry.ms), y(entry[lane.key]));
-      drawing.lineTo(x(entries.at(-1).ms), lane.bottom);
+      drawing.lineTo(x(entries.at(-1).ms), bottom);
       drawing.globalAlpha = 0.3;
       drawing.fillStyle = lane.tint;
       drawing.fill();
@@ -126,18 +132,11 @@ export function drawHistory(canvas, entries, nowMs) {
       drawing.lineWidth = 1.5;
       drawing.stroke();
     }
-    drawing.fillStyle = colour("soft");
-    drawing.fillText(lane.says, 0, lane.top - 4);
+    top = bottom;
   }
-  drawing.fillStyle = colour("lost");
-  entries.forEach((entry, k) => {
-    const drops = k ? entry.dropped - entries[k - 1].dropped : 0;
-    if (drops > 0) drawing.fillRect(x(entry.ms) - 1, lanes[0].top, 1.5, Math.min(1, drops / 4) * (lanes[0].bottom - lanes[0].top));
-  });
-  drawing.textAlign = "right";
-  drawing.fillText("dropped", width, lanes[0].top - 4);
   drawing.fillStyle = colour("soft");
-  drawing.fillText("last minute", width, lanes[1].top - 4);
+  drawing.textAlign = "right";
+  drawing.fillText("last minute", width, 12);
   drawing.textAlign = "left";
 }
 

@@ -22,6 +22,7 @@ export class Map2D {
   forget() {
     this.walls.getContext("2d").clearRect(0, 0, CELLS, CELLS);
     this.origin = null;
+    this.seen = [];                                 // two corners of what lasers have seen
     this.belowMs = -Infinity;
     this.changed = true;
   }
@@ -100,23 +101,25 @@ export class Map2D {
     scan.ranges.forEach((range, k) => {
       if (!Number.isFinite(range)) return;
       const angle = pose.yaw + scan.angle_min + k * scan.angle_increment;
-      const x = (pose.x + range * Math.cos(angle) - this.origin.x + half) / CELL_M;
-      const y = (this.origin.y - pose.y - range * Math.sin(angle) + half) / CELL_M;
-      drawing.fillRect(Math.floor(x), Math.floor(y), 1, 1);
+      const x = pose.x + range * Math.cos(angle), y = pose.y + range * Math.sin(angle);
+      const [low, high] = this.seen;
+      this.seen = low ? [{x: Math.min(low.x, x), y: Math.min(low.y, y)}, {x: Math.max(high.x, x), y: Math.max(high.y, y)}] : [{x, y}, {x, y}];
+      drawing.fillRect(Math.floor((x - this.origin.x + half) / CELL_M), Math.floor((this.origin.y - y + half) / CELL_M), 1, 1);
     });
   }
 
   fit(robots) {
     const points = robots.flatMap(robot => robot.trail.length ? robot.trail : robot.pose ? [robot.pose] : []);
     if (!points.length) return;
+    points.push(...this.seen);
     let [left, right, low, high] = [Infinity, -Infinity, Infinity, -Infinity];
     for (const {x, y} of points) {
       [left, right] = [Math.min(left, x), Math.max(right, x)];
       [low, high] = [Math.min(low, y), Math.max(high, y)];
     }
-    const margin = 2.2, scale = Math.min(this.canvas.clientWidth / (right - left + 2 * margin), this.canvas.clientHeight / (high - low + 2 * margin));
+    const margin = 0.8, scale = Math.min(this.canvas.clientWidth / (right - left + 2 * margin), this.canvas.clientHeight / (high - low + 2 * margin));
     const wanted = {x: (left + right) / 2, y: (low + high) / 2, scale: Math.min(120, scale)};
-    const ease = this.fitted ? 0.15 : 1;
+    const ease = this.fitted ? 0.3 : 1;
     for (const key of ["x", "y", "scale"]) this.view[key] += (wanted[key] - this.view[key]) * ease;
     this.fitted = true;
   }
