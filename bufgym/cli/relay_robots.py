@@ -27,14 +27,14 @@ def add(parts: Commands) -> None:
         "--receive", nargs="+", default=[], metavar="TOPIC", help="with --ros: published here if it comes"
     )
     robot.add_argument("--number", type=natural, default=0, metavar="N", help="which made-up robot (%(default)s)")
-    robot.add_argument("--policies", metavar="NAME", help="the policy, as in bench (learned-scheduler)")
+    robot.add_argument("--policies", metavar="NAME", help="the policy, as in bench (robofleet)")
     policy_file(robot)
     robot.add_argument("--capacity", type=count, default=CAPACITY, metavar="L", help="L, messages (%(default)s)")
 
     demo = command(parts, "demo", _demo, "a relay, made-up robots over fading links, and the page; Ctrl-C ends it")
     demo.add_argument("--robots", type=count, default=3, metavar="N", help="(%(default)s)")
     demo.add_argument("--port", type=natural, default=7420, help="of the relay (%(default)s)")
-    demo.add_argument("--policies", metavar="NAME", help="of the robots, as in bench (learned-scheduler)")
+    demo.add_argument("--policies", metavar="NAME", help="of the robots, as in bench (robofleet)")
     demo.add_argument("--folder", metavar="DIR", help="record there")
     demo.add_argument("--foxglove", type=natural, metavar="PORT", help="show them in Foxglove and Lichtblick too")
     demo.add_argument("--no-browser", action="store_true", help="do not open the page")
@@ -63,7 +63,7 @@ def _robot(options: argparse.Namespace) -> None:
     from bufgym.scenario import read_client
 
     load_policies(options.policy_file)
-    (policy,) = loaded([options.policies or "learned-scheduler"])[0]
+    (policy,) = loaded([options.policies or "robofleet"])[0]
     client = None if options.config is None else read_client(options.config)
     settings: dict[str, Any] = {} if client is None else {"window": client.window, "value": client.value}
 
@@ -107,7 +107,7 @@ def _demo(options: argparse.Namespace) -> None:
 
     from bufgym.relay import demo
 
-    (policy,) = loaded([options.policies or "learned-scheduler"])[0]
+    (policy,) = loaded([options.policies or "robofleet"])[0]
 
     async def show() -> None:
         folder = None if options.folder is None else Path(options.folder)

@@ -53,7 +53,7 @@ class Client(Session):
         name: str,
         *,
         topics: Sequence[Topic] = (),
-        policy: str | Policy = "learned-scheduler",
+        policy: str | Policy = "robofleet",
         capacity: int = 32,
         window: int = 1,
         value: Value | None = None,

@@ -39,7 +39,7 @@ async def running(
     robots: int = 3,
     port: int = 0,
     *,
-    policy: str | Policy = "learned-scheduler",
+    policy: str | Policy = "robofleet",
     capacity: int = 16,
     folder: Path | None = None,
     fades: bool = True,

@@ -27,7 +27,7 @@ from bufgym.scenario import Stream
 
 STATUS_S: Final = 1.0
 QUEUE_S: Final = 0.2
-POLICIES: Final = ("learned-scheduler", "robofleet", "afr", "min-motion-gap", "drop-oldest", "drop-newest", "fifo")
+POLICIES: Final = ("robofleet", "afr", "min-motion-gap", "drop-oldest", "drop-newest", "fifo", "learned-scheduler")
 """What a viewer may choose of, where the robot says nothing else."""
 _OWN: Final = tuple(
     Stream(Topic(name, priority=20.0, weight=0.0), rate_hz, 1000) for name, rate_hz in (("status", 1.0), ("queue", 5.0))
@@ -59,7 +59,7 @@ class Robot:
         name: str,
         source: Source,
         *,
-        policy: str | Policy = "learned-scheduler",
+        policy: str | Policy = "robofleet",
         capacity: int = 32,
         window: int = 1,
         value: Value | None = None,

@@ -96,6 +96,8 @@ class Session:
         self.name = name
         self.connected = asyncio.Event()
         """Set while the relay has said welcome."""
+        self.ready = asyncio.Event()
+        """Set while the relay has taken all subscriptions too."""
         self.welcome: dict[str, Any] = {}
         """What it said, the last time."""
         self.faults: deque[str] = deque(maxlen=100)
@@ -109,6 +111,7 @@ class Session:
         self._wanted = asyncio.Event()
         self._received = 0
         self._subscriptions: dict[str, Subscription] = {}
+        self._confirmed: set[str] = set()
         self._connection: Any = None
         self._tasks = Tasks()
 
@@ -145,6 +148,7 @@ class Session:
             self._subscriptions[id] = Subscription(re.compile(pattern), on_message, fields)
         except re.error as error:
             raise BufgymError(f"subscription {pattern!r}: no regular expression: {error}") from None
+        self.ready.clear()
         if self.connected.is_set():
             self._tasks.begin(self._say_it("subscribe", **fields))
 
@@ -169,6 +173,8 @@ class Session:
                     self._note(f"{type(error).__name__}: {error}")
                 finally:
                     self.connected.clear()
+                    self.ready.clear()
+                    self._confirmed.clear()
                     if self._connection is not None:
                         self._connection.transport.abort()
                         self._connection = None
@@ -220,6 +226,11 @@ class Session:
         for subscription in self._subscriptions.values():
             await self._say_it("subscribe", **subscription.fields)
         self.connected.set()
+        self._confirm()
+
+    def _confirm(self) -> None:
+        if self._confirmed.issuperset(self._subscriptions):
+            self.ready.set()
 
     def _works(self) -> list[Coroutine[Any, Any, None]]:
         """What goes on while there is a connection."""
@@ -282,6 +293,9 @@ class Session:
     def _answer(self, said: dict[str, Any]) -> None:
         if said["op"] == "ack":
             self._unanswered.ack(said["seq"])
+        elif said["op"] == "subscribed":
+            self._confirmed.add(said["id"])
+            self._confirm()
         elif said["op"] == "refused":
             if said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
                 self._unanswered.refuse(said["code"], said["why"])

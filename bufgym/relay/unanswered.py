@@ -108,3 +108,4 @@ def _settle(pending: Pending, error: BufgymError | None = None) -> None:
         pending.answered.set_result(None)
     else:
         pending.answered.set_exception(error)
+        pending.answered.exception()  # it may be that nobody asks, which is no fault of theirs
