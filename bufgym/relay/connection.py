@@ -70,11 +70,11 @@ class Connection:
         expiry = asyncio.get_running_loop().call_later(
             min(self.identity.until_s - time.time(), 2**20), lambda: self.end("the token has expired")
         )
+        fault = None
         try:
             await self._read()
         except WireError as error:
-            writer.cancel()
-            await self._refuse_and_close("frame", error)
+            fault = error
         except WebSocketException:
             pass
         finally:
@@ -84,6 +84,8 @@ class Connection:
             self._quota.subscriptions -= len(self.subscriptions)
             self._hub.quotas.left(self._quota)
             self._hub.audit("left", session=self.session.name, **self.identity.as_json())
+        if fault is not None:
+            await self._refuse_and_close("frame", fault)
 
     async def _hello(self) -> None:
         data = await self._socket.recv()
@@ -151,8 +153,8 @@ class Connection:
         )
 
     async def _read(self) -> None:
-        """What the client says, until it ends."""
-        while True:
+        """What the client says, until one of both ends it."""
+        while self._ending is None:
             data = await self._socket.recv()
             if isinstance(data, bytes):
                 self._answer({"op": "publish"}, wire.decode(data, self._hub.config.limits.message_bytes))
@@ -213,6 +215,7 @@ class Connection:
 
     async def _subscribe(self, said: Mapping[str, Any]) -> None:
         try:
+            self._quota.message(0, self._hub.clock())
             if said["id"] not in self.subscriptions:
                 self._quota.subscribe()
             try:

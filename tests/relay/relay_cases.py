@@ -78,6 +78,20 @@ async def client(
 
 
 @contextlib.asynccontextmanager
+async def stranger(
+    port: int, local: str = "127.0.0.1"
+) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    """A bare TCP connection."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(local, 0))
+    try:
+        yield reader, writer
+    finally:
+        writer.close()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
+
+
+@contextlib.asynccontextmanager
 async def relay(config: Config | None = None) -> AsyncIterator[Server]:
     server = Server(config or settings())
     await server.start()

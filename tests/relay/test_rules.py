@@ -116,33 +116,33 @@ def test_nothing_is_delivered_that_no_rule_allows(seed: int) -> None:
         configuration.append(Rule(address=place, send=send, receive=not send, topic=topic))
 
     async def story() -> None:
-        async with relay(settings(rules=tuple(configuration))) as server:
-            async with (
-                client(server.port, local=addresses[0]) as a,
-                client(server.port, local=addresses[1]) as b,
-                client(server.port, local=addresses[2]) as c,
-            ):
-                clients = dict(zip(addresses, (a, b, c), strict=True))
-                for one in clients.values():
-                    assert (await one.subscribe(".*", capacity=100))["op"] == "subscribed"
-                for sender, topic in ((sender, topic) for sender in addresses for topic in TOPICS):
-                    await clients[sender].put(topic, sender.encode())
-                for receiver in addresses:
-                    came = set()
-                    while True:
-                        try:
-                            said = await clients[receiver].next(0.1)
-                        except TimeoutError:
-                            break
-                        if isinstance(said, tuple):
-                            came.add((bytes(said.payload).decode(), said.topic))
-                    assert came == {
-                        (sender, topic)
-                        for sender in addresses
-                        for topic in TOPICS
-                        if sender != receiver
-                        and reference(configuration, sender, "", "send", topic)
-                        and reference(configuration, receiver, "", "receive", topic)
-                    }
+        async with (
+            relay(settings(rules=tuple(configuration))) as server,
+            client(server.port, local=addresses[0]) as a,
+            client(server.port, local=addresses[1]) as b,
+            client(server.port, local=addresses[2]) as c,
+        ):
+            clients = dict(zip(addresses, (a, b, c), strict=True))
+            for one in clients.values():
+                assert (await one.subscribe(".*", capacity=100))["op"] == "subscribed"
+            for sender, topic in ((sender, topic) for sender in addresses for topic in TOPICS):
+                await clients[sender].put(topic, sender.encode())
+            for receiver in addresses:
+                came = set()
+                while True:
+                    try:
+                        said = await clients[receiver].next(0.1)
+                    except TimeoutError:
+                        break
+                    if isinstance(said, tuple):
+                        came.add((bytes(said.payload).decode(), said.topic))
+                assert came == {
+                    (sender, topic)
+                    for sender in addresses
+                    for topic in TOPICS
+                    if sender != receiver
+                    and reference(configuration, sender, "", "send", topic)
+                    and reference(configuration, receiver, "", "receive", topic)
+                }
 
     run(story)

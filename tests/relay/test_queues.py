@@ -1,0 +1,171 @@
+"""What waits for a subscriber, and that a slow one slows nobody."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+
+import pytest
+from relay_cases import client, relay, run, settings
+from websockets.exceptions import WebSocketException
+
+from bufgym.errors import BufgymError
+from bufgym.relay import policies
+from bufgym.relay.config import POLICIES, Config
+from bufgym.relay.patterns import MAX_CHARACTERS, pattern
+from bufgym.relay.quota import Bucket, Quotas
+from bufgym.relay.server import Server
+from bufgym.relay.subscriber import Subscription, next_lane
+
+
+def subscription(policy: str, capacity: int = 8, priority: float = 1.0) -> Subscription:
+    return Subscription("a", pattern(".*"), policies.policy(policy), capacity, priority=priority)
+
+
+def sent(*subscriptions: Subscription, now_s: float = 0.0) -> list[object]:
+    """All that goes, one after the other, a second for each."""
+    went = []
+    while (lane := next_lane(subscriptions, now_s)) is not None:
+        item = lane.take(now_s)
+        assert item is not None
+        went.append(item.message)
+        lane.gone()
+        now_s += 1
+    return went
+
+
+@pytest.mark.parametrize(
+    ("policy", "capacity", "went"),
+    [
+        # The first is on its way at once; then the queue has room for two.
+        ("drop-oldest", 2, ["a0", "a3", "a4"]),
+        ("drop-newest", 2, ["a0", "a1", "a2"]),
+        ("robofleet", 2, ["a0", "a4"]),
+        ("skip-pending", 2, ["a0"]),
+    ],
+)
+def test_the_policy_decides(policy: str, capacity: int, went: list[str]) -> None:
+    one = subscription(policy, capacity)
+    for k in range(5):
+        one.offer("/a", f"a{k}", 10)
+    assert len(one) == len(went) - 1 and one.dropped == 5 - len(went)
+    assert sent(one) == went
+    one.offer("/a", "a5", 10)
+    assert sent(one) == ["a5"]
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_each_policy_of_the_default_serves_several_topics(policy: str) -> None:
+    one = subscription(policy)
+    for k in range(3):
+        for topic in "ab":
+            one.offer(f"/{topic}", f"{topic}{k}", 10)
+    went = sent(one)
+    assert {str(message)[0] for message in went} >= ({"a"} if policy == "skip-pending" else {"a", "b"})
+    assert len(went) + one.dropped == 6
+
+
+def test_topics_of_a_policy_that_knows_none_do_not_push_each_other_out() -> None:
+    one = subscription("drop-oldest", 1)
+    one.offer("/rare", "rare", 10)
+    one.offer("/rare", "rare 2", 10)
+    for k in range(100):
+        one.offer("/often", k, 10)
+    assert sorted(map(str, sent(one))) == ["0", "99", "rare", "rare 2"]
+
+
+def test_priority_times_wait() -> None:
+    """At second 0 both wait equally long: the first goes. Then 10 x 1 s is more than 1 x 2 s, and so on."""
+    low, high = subscription("drop-oldest"), subscription("drop-oldest", priority=10)
+    for k in range(3):
+        low.offer("/low", f"low {k}", 10)
+        high.offer("/high", f"high {k}", 10)
+    went = sent(low, high, now_s=100)
+    assert went == ["high 0", "low 0", "high 1", "high 2", "low 1", "low 2"]
+
+
+def test_queues_and_topics_are_bounded() -> None:
+    one = subscription("skip-pending")
+    for k in range(200):
+        one.offer(f"/{k}", k, 10)
+    assert len(one.lanes) == 64 and len(one._topics) == 64
+
+
+def test_a_subscriber_that_reads_nothing_slows_nobody() -> None:
+    async def story() -> None:
+        async with (
+            relay(settings(policies=("robofleet",))) as server,
+            client(server.port, name="robot") as robot,
+            client(server.port) as fast,
+            client(server.port) as stuck,
+        ):
+            for one in (fast, stuck):
+                await one.subscribe("/camera$")
+            stuck.socket.transport.pause_reading()
+            body = bytes(200_000)
+            for k in range(60):
+                await robot.put("/camera", body, seq=k)
+                assert (await fast.next()).seq == k
+            status = server.hub.status()
+            assert status["dropped"] > 20
+            stuck.socket.transport.resume_reading()
+            numbers = []
+            with contextlib.suppress(TimeoutError, WebSocketException):
+                while True:
+                    numbers.append((await stuck.next(0.5)).seq)
+            # What the system had taken, and then the newest alone.
+            assert numbers == sorted(set(numbers)) and numbers[-1] == 59 and len(numbers) == 60 - status["dropped"]
+
+    run(story)
+
+
+def test_patterns_of_strangers_take_linear_time() -> None:
+    evil = pattern("(a+)+$")
+    assert evil.part("/" + "a" * 200) and not evil.part("/" + "a" * 200 + "b")
+    assert pattern("^/a$").part("/a") and not pattern("^/a$").part("/ab")
+    assert pattern("/a").part("x/ab") and not pattern("/a").whole("x/ab")
+    for text in ("(", "a" * (MAX_CHARACTERS + 1), r"(a)\1", r"\pL{500}", "\ud800"):
+        with pytest.raises(BufgymError, match="pattern"):
+            pattern(text)
+
+
+def test_a_bucket_of_ten_a_second() -> None:
+    bucket = Bucket(10)
+    assert [bucket.take(4, 0.0) for _ in range(3)] == [True, True, False]
+    assert not bucket.take(4, 0.1) and bucket.take(4, 0.2)  # 2 left, 3, 4
+    # More than a second's worth waits for a full bucket, and is paid for.
+    assert bucket.take(25, 5.0) and not bucket.take(1, 6.5) and bucket.take(1, 6.7)
+
+
+def test_quotas_are_remembered_for_a_while() -> None:
+    now = [0.0]
+    quotas = Quotas(Config().limits, lambda: now[0])
+    quota = quotas.of("a")
+    quota.connect()
+    quotas.tidy()
+    now[0] = 100.0
+    quotas.tidy()
+    assert quotas.of("a") is quota
+    quotas.left(quota)
+    quotas.tidy()
+    assert quotas.of("a") is quota
+    now[0] = 161.0
+    quotas.tidy()
+    assert quotas.of("a") is not quota
+
+
+def test_a_policy_that_there_is_not() -> None:
+    with pytest.raises(BufgymError, match="unknown policy 'newest'"):
+        Server(settings(policies=("newest",)))
+
+
+def test_a_port_that_is_taken() -> None:
+    async def story() -> None:
+        async with relay() as server:
+            other = Server(settings(port=server.port))
+            with pytest.raises(BufgymError, match=r"127\.0\.0\.1"):
+                await other.start()
+            other.hub.close()
+            await asyncio.sleep(0)
+
+    run(story)
