@@ -1,7 +1,7 @@
 """A robot's own ROS as a source: topics of ROS 1 or ROS 2 go to the relay, and what the relay sends comes back.
 
-What others publish on ``/robots/NAME/to/TOPIC``, in CDR and with its type, is published on ``/TOPIC`` here if that is one of
-the topics that the robot was told to receive.
+What others publish on ``/robots/NAME/to/TOPIC``, in CDR and with its type, is published on ``/TOPIC`` here, if that is
+one of the topics that the robot was told to receive.
 """
 
 from __future__ import annotations

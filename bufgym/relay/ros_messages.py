@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
+from dataclasses import fields, is_dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -92,14 +93,26 @@ def modern(payload: bytes, type: str, encoding: str) -> tuple[str, bytes]:
     """(encoding, payload) in CDR where it was ROS 1's and the type is common to both; else as it is."""
     if encoding == "ros1" and type in store().types:
         with contextlib.suppress(Exception):  # a type of this name, but not this form
-            return "cdr", bytes(_store_1().ros1_to_cdr(payload, type))
+            message = _moulded(_store_1().deserialize_ros1(payload, type), store())
+            return "cdr", bytes(store().serialize_cdr(message, type))
     return encoding, payload
+
+
+def _moulded(value: Any, types: Any) -> Any:
+    """The message as the other version of ROS has it: the same fields, but for a header's number."""
+    if isinstance(value, list):
+        return [_moulded(one, types) for one in value]
+    if not is_dataclass(value):
+        return value
+    kind = types.types[value.__msgtype__]  # type: ignore[attr-defined]
+    return kind(**{one.name: _moulded(getattr(value, one.name, 0), types) for one in fields(kind)})
 
 
 def as_ros1(payload: bytes, type: str) -> bytes:
     """A message in CDR as ROS 1 has it."""
     try:
-        return bytes(_store_1().cdr_to_ros1(payload, type))
+        message = _moulded(store().deserialize_cdr(payload, type), _store_1())
+        return bytes(_store_1().serialize_ros1(message, type))
     except Exception as error:  # what does not fit fails in many ways
         raise BufgymError(f"message of {len(payload)} bytes: no {type}: {error}") from None
 

@@ -170,7 +170,9 @@ class Session:
                         await self._greet()
                     await self._converse()
                 except (OSError, TimeoutError, wire.WireError, WebSocketException) as error:
-                    self._note(f"{type(error).__name__}: {error}")
+                    # A relay that does not even talk to this address says why in its page.
+                    page = getattr(getattr(error, "response", None), "body", None) or b""
+                    self._note(f"{type(error).__name__}: {error} {page.decode(errors='replace')}".strip())
                 finally:
                     self.connected.clear()
                     self.ready.clear()

@@ -13,14 +13,14 @@ from test_client import compiled, until
 
 pytest.importorskip("foxglove", reason="no foxglove here: the extra foxglove")
 
-from websockets.asyncio.client import connect  # noqa: E402
-from websockets.typing import Subprotocol  # noqa: E402
+from websockets.asyncio.client import connect
+from websockets.typing import Subprotocol
 
-from bufgym.relay import ros_messages  # noqa: E402
-from bufgym.relay.foxglove import Bridge  # noqa: E402
-from bufgym.relay.madeup import MadeUp  # noqa: E402
-from bufgym.relay.robot import Robot  # noqa: E402
-from bufgym.relay.session import Session  # noqa: E402
+from bufgym.relay import ros_messages
+from bufgym.relay.foxglove import Bridge
+from bufgym.relay.madeup import MadeUp
+from bufgym.relay.robot import Robot
+from bufgym.relay.session import Session
 
 TOPICS = {"/robots/r/camera", "/robots/r/odom", "/robots/r/queue", "/robots/r/scan", "/robots/r/status", "/tf"}
 

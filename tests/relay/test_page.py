@@ -23,7 +23,8 @@ pytestmark = [compiled, pytest.mark.skipif(CHROMIUM is None, reason="no chromium
 
 SEES = """canvas => {
   const {data} = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height), seen = new Set();
-  for (let k = 0; k < data.length; k += 4) if (data[k + 3]) seen.add(data[k] >> 4 << 8 | data[k + 1] >> 4 << 4 | data[k + 2] >> 4);
+  for (let k = 0; k < data.length; k += 4)
+    if (data[k + 3]) seen.add(data[k] >> 4 << 8 | data[k + 1] >> 4 << 4 | data[k + 2] >> 4);
   return seen.size;
 }"""
 """How many colours a canvas has."""
@@ -103,7 +104,9 @@ def test_a_viewer_chooses_the_policy(browser: Any, port: int) -> None:
     shown = Page(browser, port)
     shown.until("document.querySelector('#policy').value === 'drop-oldest'")
     shown.page.select_option("#policy", "drop-newest")
-    shown.until("document.querySelector('#told').textContent === '' && document.querySelector('#policy').value === 'drop-newest'")
+    shown.until(
+        "document.querySelector('#told').textContent === '' && document.querySelector('#policy').value === 'drop-newest'"
+    )
     assert shown.faults == []
 
 
@@ -112,11 +115,15 @@ def test_a_recording_is_played(browser: Any, port: int) -> None:
     shown.until("document.querySelectorAll('.card').length === 2")
     shown.page.click("#recordings")
     shown.page.click("#files li button")
-    shown.until("document.querySelectorAll('.card').length === 2 && document.querySelector('#clock').textContent !== ''")
+    shown.until(
+        "document.querySelectorAll('.card').length === 2 && document.querySelector('#clock').textContent !== ''"
+    )
     shown.until("document.querySelector('#camera-says').textContent.startsWith('camera')")
     assert shown.page.text_content("#state") == "replay" and shown.page.is_disabled("#policy")
     shown.page.click("#play")
     assert shown.page.text_content("#play") == "Play"
     shown.page.click("#live")
-    shown.until("document.querySelector('#state').textContent === 'live' && document.querySelectorAll('.card').length === 2")
+    shown.until(
+        "document.querySelector('#state').textContent === 'live' && document.querySelectorAll('.card').length === 2"
+    )
     assert shown.faults == []

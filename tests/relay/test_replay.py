@@ -63,5 +63,5 @@ def test_only_recordings_are_read(tmp_path: Path) -> None:
     for name in ("../own.mcap", "/etc/passwd", "", "none.mcap"):
         with pytest.raises(BufgymError, match="there is none of this name"):
             piece(tmp_path, name, 0, 1, lambda topic: True)
-    with pytest.raises(BufgymError, match="recording 'own.mcap'|recording own.mcap: must be an MCAP file"):
+    with pytest.raises(BufgymError, match=r"recording own\.mcap: must be an MCAP file"):
         piece(tmp_path, "own.mcap", 0, 1, lambda topic: True)
