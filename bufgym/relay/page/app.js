@@ -7,11 +7,13 @@ import {json, kindOf, picture, pose, scan} from "./messages.js";
 import {Relay} from "./relay.js";
 import {Replay} from "./replay.js";
 
-const HISTORY_MS = 60_000, TRAIL_GAP_MS = 100, AWAY_MS = 5000, TEXT_MS = 250;
+const HISTORY_MS = 60_000, TRAIL_GAP_MS = 300, AWAY_MS = 5000, TEXT_MS = 250;
+const USUAL_POSES = ["odom", "odometry", "localization"];   // asked for before a robot's status, which comes once a second, names its own
 const POSES = 100, NEAR_MS = 20, GAP_MS = 400;
 const ROBOT = /^\/robots\/([^/]+)\/(.+)$/;
 
 const $ = id => document.getElementById(id);
+const say = (element, text) => { if (element.textContent !== String(text)) element.textContent = text; };
 const escaped = text => text.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
 
 const robots = new Map();
@@ -35,8 +37,12 @@ const relay = new Relay({
     $("ask").showModal();
   },
 });
-relay.subscribe("status", "^/robots/[^/]+/status$");
-relay.subscribe("relay", "^/relay/status$");
+function begin() {
+  relay.subscribe("status", "^/robots/[^/]+/status$");
+  relay.subscribe("relay", "^/relay/status$");
+  subscribe();
+}
+begin();
 
 const nowMs = () => replay ? replay.nowMs : Date.now();
 
@@ -121,9 +127,9 @@ function poseAt(robot, ms) {
 // Of all robots where they are, of the chosen one all that is drawn.
 function subscribe() {
   if (replay) return;                               // what is drawn now comes from the file
-  const poses = new Set();
+  const poses = new Set(USUAL_POSES);
   for (const robot of robots.values()) for (const [topic, kind] of Object.entries(robot.kinds)) if (kind === "pose") poses.add(topic);
-  if (poses.size) relay.subscribe("poses", `^/robots/[^/]+/(${[...poses].sort().map(escaped).join("|")})$`);
+  relay.subscribe("poses", `^/robots/[^/]+/(${[...poses].sort().map(escaped).join("|")})$`);
   const robot = robots.get(chosen);
   if (!robot) return;
   const first = kind => Object.keys(robot.kinds).find(topic => robot.kinds[topic] === kind);
@@ -197,8 +203,8 @@ function sayRobots() {
     const silentMs = nowMs() - robot.heardMs, {battery} = robot.status ?? {};
     robot.away = silentMs > AWAY_MS;
     robot.card.classList.toggle("away", robot.away);
-    robot.card.querySelector(".says").textContent = robot.away ? `silent for ${seconds(silentMs / 1000)}` : bits(robot.queue?.rate_bps ?? 0);
-    robot.card.querySelector(".charge").textContent = battery == null ? "" : percent(battery);
+    say(robot.card.querySelector(".says"), robot.away ? `silent for ${seconds(silentMs / 1000)}` : bits(robot.queue?.rate_bps ?? 0));
+    say(robot.card.querySelector(".charge"), battery == null ? "" : percent(battery));
     const bar = robot.card.querySelector(".bar");
     bar.hidden = battery == null;
     bar.classList.toggle("low", battery < 0.25);
@@ -209,16 +215,16 @@ function sayRobots() {
 function sayChosen(robot) {
   const {queue, status} = robot, agoS = Math.max(0, nowMs() - (robot.saidMs ?? nowMs())) / 1000;
   const {x, y} = robot.pose ?? {}, rtt = status?.network?.rtt_ms;
-  $("facts").textContent = [x === undefined ? "" : `at ${x.toFixed(1)}, ${y.toFixed(1)} m`, rtt == null ? "" : `answers in ${Math.round(rtt)} ms`,
-    status?.battery == null ? "" : `battery ${percent(status.battery)}`, status?.recording ?? ""].filter(Boolean).join(" · ");
-  $("scan-says").textContent = robot.scan ? `laser, ${seconds((nowMs() - robot.scanMs) / 1000)} old` : "no laser";
+  say($("facts"), [x === undefined ? "" : `at ${x.toFixed(1)}, ${y.toFixed(1)} m`, rtt == null ? "" : `answers in ${Math.round(rtt)} ms`,
+    status?.battery == null ? "" : `battery ${percent(status.battery)}`, status?.recording ?? ""].filter(Boolean).join(" · "));
+  say($("scan-says"), robot.scan ? `laser, ${seconds((nowMs() - robot.scanMs) / 1000)} old` : "no laser");
   while (robot.frames.length && robot.frames[0] < nowMs() - 2000) robot.frames.shift();
-  $("camera-says").textContent = robot.bitmap ? `camera, ${(robot.frames.length / 2).toFixed(1)} a second, ${seconds((nowMs() - robot.pictureMs) / 1000)} old` : "no picture";
+  say($("camera-says"), robot.bitmap ? `camera, ${(robot.frames.length / 2).toFixed(1)} a second, ${seconds((nowMs() - robot.pictureMs) / 1000)} old` : "no picture");
   if (!queue) return;
-  $("rate").textContent = bits(queue.rate_bps ?? 0);
-  $("qoi").textContent = percent(queue.qoi);
-  $("queued").textContent = `${queue.queued} of ${queue.capacity}`;
-  $("dropped").textContent = queue.put ? `${queue.dropped} (${percent(queue.dropped / queue.put)})` : "0";
+  say($("rate"), bits(queue.rate_bps ?? 0));
+  say($("qoi"), percent(queue.qoi));
+  say($("queued"), `${queue.queued} of ${queue.capacity}`);
+  say($("dropped"), queue.put ? `${queue.dropped} (${percent(queue.dropped / queue.put)})` : "0");
   const names = Object.keys(queue.topics ?? {});
   while ($("topics").rows.length > names.length) $("topics").deleteRow(-1);
   names.forEach((name, k) => {
@@ -231,7 +237,7 @@ function sayChosen(robot) {
       row.cells[0].lastChild.textContent = row.cells[0].title = name;
     }
     const texts = [topic.age_s == null ? "–" : seconds(topic.age_s + agoS), topic.left, topic.dropped, percent(topic.qoi)];
-    texts.forEach((text, c) => { row.cells[c + 1].textContent = text ?? ""; });
+    texts.forEach((text, c) => { say(row.cells[c + 1], text ?? ""); });
   });
 }
 
@@ -274,7 +280,7 @@ $("live").onclick = () => {
   replay = null;
   $("player").hidden = true;
   forget();
-  relay.subscribe("status", "^/robots/[^/]+/status$");
+  begin();
   relay.on.state(relay.welcome ? "live" : "not connected", relay.welcome !== null);
 };
 $("play").onclick = () => {

@@ -4,7 +4,7 @@ import {arrow, colour, context} from "./draw.js";
 
 const CELL_M = 0.05, CELLS = 1024;
 const TRAIL_MS = 60_000;
-const REDRAW_MS = 200;
+const REDRAW_MS = 500, FRAME_MS = 30;               // what lies below is drawn twice a second, robots 30 times at most
 
 export class Map2D {
   constructor(canvas, onPick) {
@@ -23,7 +23,7 @@ export class Map2D {
     this.walls.getContext("2d").clearRect(0, 0, CELLS, CELLS);
     this.origin = null;
     this.seen = [];                                 // two corners of what lasers have seen
-    this.belowMs = -Infinity;
+    this.belowMs = this.drawnMs = -Infinity;
     this.changed = true;
   }
 
@@ -119,7 +119,7 @@ export class Map2D {
     }
     const margin = 0.8, scale = Math.min(this.canvas.clientWidth / (right - left + 2 * margin), this.canvas.clientHeight / (high - low + 2 * margin));
     const wanted = {x: (left + right) / 2, y: (low + high) / 2, scale: Math.min(120, scale)};
-    const ease = this.fitted ? 0.3 : 1;
+    const ease = this.fitted ? 0.5 : 1;
     for (const key of ["x", "y", "scale"]) this.view[key] += (wanted[key] - this.view[key]) * ease;
     this.fitted = true;
   }
@@ -131,8 +131,9 @@ export class Map2D {
       if (this.follow) this.fit(robots);
       this.drawBelow(robots, chosen, nowMs);
       this.belowMs = clock;
-    } else if (!this.changed) return;
+    } else if (!this.changed || clock - this.drawnMs < FRAME_MS) return;
     this.changed = false;
+    this.drawnMs = clock;
     const [drawing, width, height] = context(this.canvas);
     drawing.drawImage(this.below, 0, 0, width, height);
     drawing.font = "600 12px system-ui, sans-serif";
@@ -151,7 +152,6 @@ export class Map2D {
   }
 
   drawBelow(robots, chosen, nowMs) {
-    this.below.style.width = this.canvas.clientWidth + "px";
     const ratio = devicePixelRatio || 1, width = this.canvas.clientWidth, height = this.canvas.clientHeight, {scale} = this.view;
     this.below.width = Math.round(width * ratio);
     this.below.height = Math.round(height * ratio);
@@ -169,12 +169,15 @@ export class Map2D {
       drawing.lineTo(width, Math.round(this.at(0, y)[1]) + 0.5);
     }
     drawing.stroke();
-    if (this.origin) {
-      const half = CELLS * CELL_M / 2, [x, y] = this.at(this.origin.x - half, this.origin.y + half);
+    if (this.seen.length) {                         // only the part of the walls' canvas in which there are any
+      const half = CELLS * CELL_M / 2, [low, high] = this.seen;
+      const column = Math.floor((low.x - this.origin.x + half) / CELL_M), row = Math.floor((this.origin.y - high.y + half) / CELL_M);
+      const columns = Math.ceil((high.x - low.x) / CELL_M) + 1, rows = Math.ceil((high.y - low.y) / CELL_M) + 1;
+      const [x, y] = this.at(this.origin.x - half + column * CELL_M, this.origin.y + half - row * CELL_M), size = CELL_M * scale;
       drawing.imageSmoothingEnabled = false;
-      drawing.drawImage(this.walls, x, y, 2 * half * scale, 2 * half * scale);
+      drawing.drawImage(this.walls, column, row, columns, rows, x, y, columns * size, rows * size);
     }
-    drawing.lineJoin = "round";
+    drawing.lineJoin = "bevel";
     for (const robot of robots) {
       while (robot.trail.length && robot.trail[0].ms < nowMs - TRAIL_MS) robot.trail.shift();
       drawing.strokeStyle = robot.tint;
