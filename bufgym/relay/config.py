@@ -161,6 +161,8 @@ class Config:
     """Of subscribers' queues; the first is the default."""
     origins: tuple[str, ...] = ()
     """Web pages of other servers that may connect, as ``https://example.org``."""
+    robofleet: bool = False
+    """Whether clients that Robofleet released may connect, on any path but ours. The same rules hold for them."""
     folder: Path | None = None
     """For what is held, the audit log and recordings; without it nothing of them outlives the relay."""
     small_buffers: bool = True
@@ -175,8 +177,9 @@ class Config:
 
     def __post_init__(self) -> None:
         whole("port", self.port, 0, 65_535)
-        if not isinstance(self.small_buffers, bool):
-            raise BufgymError(f"small_buffers = {self.small_buffers!r}: must be true or false")
+        for name in ("robofleet", "small_buffers"):
+            if not isinstance(getattr(self, name), bool):
+                raise BufgymError(f"{name} = {getattr(self, name)!r}: must be true or false")
         for name in ("no_drop", "policies", "origins"):
             texts = getattr(self, name)
             if not isinstance(texts, tuple) or not all(isinstance(text, str) for text in texts):

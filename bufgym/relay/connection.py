@@ -45,6 +45,7 @@ class Connection:
     permissions: Permissions
     name: str
     """What others see as the sender."""
+    acks = True
 
     def __init__(self, hub: Hub, socket: ServerConnection, verifier: Verifier | None) -> None:
         self._hub = hub
@@ -97,6 +98,11 @@ class Connection:
         if said["version"] != wire.VERSION or said.get("form", "binary") not in wire.FORMS:
             raise WireError(f"hello: must be of version {wire.VERSION}, of form {' or '.join(wire.FORMS)}")
         self.identity = await self._identified(said.get("token"))
+        self._admit(said, said.get("form", "binary"))
+        self._welcome()
+
+    def _admit(self, said: Mapping[str, Any], form: str) -> None:
+        """Let it in, in a session of its own."""
         self.permissions = Permissions(self._hub.config.rules, self.identity)
         if not self.permissions.rules:
             raise RefusedError("unauthorized", "no rule allows anything to this identity")
@@ -117,12 +123,11 @@ class Connection:
             self._hub.quotas.left(quota)
             raise
         self._quota: Quota = quota
-        self._outbox.begin(self, said.get("form", "binary"), received)
+        self._outbox.begin(self, form, received)
         self._hub.settled(store.acked(self.session, received))
         self._hub.join(self)
         self._socket.protocol.max_message_size = self._hub.config.limits.message_bytes
         self._hub.audit("joined", name=self.name, session=name, **self.identity.as_json())
-        self._welcome()
 
     async def _identified(self, token: str | None) -> Identity:
         """Who it is: by token, certificate, or address alone."""
@@ -159,14 +164,14 @@ class Connection:
         while self._ending is None:
             data = await self._socket.recv()
             if isinstance(data, bytes):
-                self._answer({"op": "publish"}, wire.decode(data, self._hub.config.limits.message_bytes))
+                self._answer(wire.decode(data, self._hub.config.limits.message_bytes))
             elif len(data) > MAX_JSON_BYTES:
                 raise WireError(f"text of {len(data)} characters: must be at most {MAX_JSON_BYTES}")
             else:
                 said = wire.heard(data)
                 match said["op"]:
                     case "publish":
-                        self._answer(said, wire.from_json(said))
+                        self._answer(wire.from_json(said))
                     case "subscribe":
                         await self._subscribe(said)
                     case "unsubscribe":
@@ -198,7 +203,7 @@ class Connection:
         else:
             self.tell("replayed", id=said["id"], **part)
 
-    def _answer(self, said: Mapping[str, Any], message: wire.Message) -> None:
+    def _answer(self, message: wire.Message) -> None:
         """Publish it, or say why not: of a no_drop message every time, of others now and then."""
         try:
             self._publish(message)

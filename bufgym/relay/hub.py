@@ -21,6 +21,8 @@ from bufgym.relay.subscriber import Subscription
 OWN: Final = "relay"
 """The relay's name as a sender, and the beginning of its topics."""
 STATUS: Final = f"/{OWN}/status"
+ROBOFLEET: Final = "robofleet"
+"""The encoding of a flatbuffer of Robofleet's, and the form in which its clients get messages: that alone."""
 MAX_ROUTES: Final = 10_000
 MAX_JSON_BYTES: Final = 2**20
 """Of a text frame, and of a payload that says that it is JSON: to read it takes time."""
@@ -40,6 +42,12 @@ class Frame:
     def json(self) -> str:
         return wire.to_json(self.message)
 
+    def form(self, name: str) -> bytes | str:
+        """As a client of this form gets it."""
+        if name == ROBOFLEET:
+            return bytes(self.message.payload)
+        return self.json if name == "json" else self.binary
+
     @property
     def size_bytes(self) -> int:
         return wire.HEADER_BYTES + len(self.message.payload)
@@ -51,6 +59,8 @@ class Member(Protocol):
     session: Session
     permissions: Permissions
     subscriptions: dict[str, Subscription]
+    acks: bool
+    """Whether its client acks no_drop messages; if not, they go to it as all others."""
 
     @property
     def sent(self) -> int:
@@ -171,10 +181,13 @@ class Hub:
         for session in receivers:
             if session in self.members:
                 self.members[session].wake()
+        for member, subscription in self._route(message.topic):
+            if member is not sender and not member.acks:
+                member.offer(subscription, Frame(message))
 
     def _holders(self, sender: Member, topic: str) -> list[Session]:
         """The sessions that are to get a no_drop message: here, away, or back and about to subscribe again."""
-        here = [member.session for member, _ in self._route(topic) if member is not sender]
+        here = [member.session for member, _ in self._route(topic) if member is not sender and member.acks]
         away = [
             session
             for session in self.store.sessions.values()

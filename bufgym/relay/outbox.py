@@ -110,5 +110,5 @@ class Outbox:
         return bool(waiting)
 
     async def _send(self, frame: Frame) -> None:
-        await self._socket.send(frame.binary if self._form == "binary" else frame.json)
+        await self._socket.send(frame.form(self._form))
         self.sent += 1

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from http import HTTPStatus
 from typing import Any, Final, cast
@@ -13,6 +14,7 @@ from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server as WebSocketServer
 from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import NegotiationError
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
@@ -24,6 +26,7 @@ from bufgym.relay.connection import HELLO_BYTES, Connection
 from bufgym.relay.hub import Hub
 from bufgym.relay.identity import Verifier, server_context
 from bufgym.relay.quota import RefusedError
+from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
 
 _PING_S: Final = 20.0
@@ -32,6 +35,11 @@ _PONG_S: Final = 60.0
 _QUIET: Final = logging.getLogger("bufgym.relay.websockets")
 """What strangers do wrong is in the audit log, not in tracebacks."""
 _QUIET.setLevel(logging.CRITICAL + 1)
+
+
+def _is_ours(request: Request | None) -> bool:
+    """Whether the client speaks our protocol."""
+    return request is not None and request.path.partition("?")[0] == wire.PATH
 
 
 class Door:
@@ -70,7 +78,7 @@ class Door:
         if not by_address and not (proves_more and any(rule.email for rule in config.rules)):
             return RefusedError("unauthorized", "no rule allows anything to this address")
         origins = request.headers.get_all("Origin")
-        if request.path.partition("?")[0] == wire.PATH and any(not self._is_own(each, request) for each in origins):
+        if "Upgrade" in request.headers and any(not self._is_own(each, request) for each in origins):
             return RefusedError("unauthorized", f"origin {origins[0]!r}: a page of another server")
         return None
 
@@ -168,7 +176,7 @@ class Server:
                 self._serve,
                 self.config.host,
                 self.config.port,
-                subprotocols=[Subprotocol(wire.SUBPROTOCOL)],
+                select_subprotocol=self._subprotocol,
                 process_request=self._request,
                 create_connection=cast(type[Accepted], partial(Accepted, self._door)),  # it is called, no more
                 compression=None,  # pictures are compressed; and a small message may unpack to a large one
@@ -209,7 +217,15 @@ class Server:
 
     async def _serve(self, socket: ServerConnection) -> None:
         assert isinstance(socket, Accepted)
-        await Connection(self.hub, socket, self._verifier).serve(socket.greeted)
+        kind = Connection if _is_ours(socket.request) else RobofleetConnection
+        await kind(self.hub, socket, self._verifier).serve(socket.greeted)
+
+    def _subprotocol(self, socket: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+        if not _is_ours(socket.request):
+            return None
+        if wire.SUBPROTOCOL not in offered:
+            raise NegotiationError(f"must offer the subprotocol {wire.SUBPROTOCOL}")
+        return Subprotocol(wire.SUBPROTOCOL)
 
     def _request(self, socket: ServerConnection, request: Request) -> Response | None:
         """Deny it, answer it with a page, or let it go on to be a WebSocket."""
@@ -221,7 +237,7 @@ class Server:
         if refused is not None:
             self.hub.audit.repeated(what="connection", code=refused.code, address=address, why=str(refused))
             return pages.response(HTTPStatus.FORBIDDEN, f"{refused}\n")
-        if request.path.partition("?")[0] == wire.PATH:
+        if _is_ours(request) or (self.config.robofleet and "Upgrade" in request.headers):
             return None
         return pages.answer(request.path)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import socket
 import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ for library in ("websockets", "re2", "jwt"):
     pytest.importorskip(library, reason=f"no {library} here: the extra relay")
 
 from websockets.asyncio.client import ClientConnection, connect  # noqa: E402
+from websockets.typing import Subprotocol  # noqa: E402
 
 from bufgym.relay import wire  # noqa: E402
 from bufgym.relay.config import Config, Rule  # noqa: E402
@@ -46,7 +48,7 @@ class Client:
     async def command(self, seq: int, topic: str = COMMAND) -> None:
         await self.put(topic, str(seq).encode(), encoding="json", seq=seq, no_drop=True)
 
-    async def next(self, timeout_s: float = 5.0) -> Any:
+    async def next(self, timeout_s: float = 20.0) -> Any:
         """What comes next: a ``Message``, or the object of a text frame."""
         data = await asyncio.wait_for(self.socket.recv(), timeout_s)
         return wire.decode(data) if isinstance(data, bytes) else wire.heard(data)
@@ -65,13 +67,26 @@ class Client:
 
 @contextlib.asynccontextmanager
 async def client(
-    port: int, local: str = "127.0.0.1", tls: ssl.SSLContext | None = None, **hello: Any
+    port: int,
+    local: str = "127.0.0.1",
+    tls: ssl.SSLContext | None = None,
+    receive_buffer_bytes: int | None = None,
+    **hello: Any,
 ) -> AsyncIterator[Client]:
     """Connected and welcomed, or with the refusal in ``welcome``."""
-    url = f"{'wss' if tls else 'ws'}://127.0.0.1:{port}{wire.PATH}"
-    options = {"subprotocols": [wire.SUBPROTOCOL], "compression": None, "proxy": None, "close_timeout": 0.2, "ssl": tls}
-    async with connect(url, local_addr=(local, 0), **options) as socket:
-        one = Client(socket)
+    own = socket.socket()
+    if receive_buffer_bytes is not None:
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
+    own.bind((local, 0))
+    own.setblocking(False)
+    stack = contextlib.AsyncExitStack()
+    stack.callback(own.close)
+    async with stack:
+        await asyncio.get_running_loop().sock_connect(own, ("127.0.0.1", port))
+        options = {"compression": None, "proxy": None, "close_timeout": 0.2, "max_queue": 1}
+        url = f"{'wss' if tls else 'ws'}://127.0.0.1:{port}{wire.PATH}"
+        connecting = connect(url, sock=own, ssl=tls, subprotocols=[Subprotocol(wire.SUBPROTOCOL)], **options)
+        one = Client(await stack.enter_async_context(connecting))
         await one.say("hello", **{"version": 1, **hello})
         one.welcome = await one.next()
         yield one

@@ -16,7 +16,18 @@ REPO = Path(__file__).resolve().parents[2]
 
 def test_the_example_says_what_the_defaults_are() -> None:
     example, default = load(REPO / "examples/relay.toml"), Config()
-    for name in ("host", "port", "no_drop", "policies", "origins", "limits", "store", "audit", "recording"):
+    for name in (
+        "host",
+        "port",
+        "no_drop",
+        "policies",
+        "robofleet",
+        "origins",
+        "limits",
+        "store",
+        "audit",
+        "recording",
+    ):
         assert getattr(example, name) == getattr(default, name), name
     assert example.folder == REPO / "examples" / "relay"
     assert len(example.rules) == 5 and default.rules == ()

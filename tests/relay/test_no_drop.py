@@ -118,6 +118,26 @@ def test_the_same_session_takes_over() -> None:
     run(story)
 
 
+def test_the_name_of_a_session_belongs_to_who_uses_it() -> None:
+    """Another identity's session of the same name is another: it neither takes over, nor gets what is held."""
+    rules = (Rule(address="127.0.0.0/8", send=True, receive=True),)
+
+    async def story() -> None:
+        async with relay(settings(rules=rules)) as server, client(server.port) as operator:
+            async with client(server.port, session="a") as robot:
+                await robot.subscribe("command$", durable=True)
+                async with client(server.port, session="a", local="127.0.0.2") as thief:
+                    assert thief.welcome["op"] == "welcome" and await robot.nothing()
+            await operator.command(1)
+            assert (await operator.next())["op"] == "ack"
+            async with client(server.port, session="a", local="127.0.0.2") as thief:
+                assert await thief.nothing()
+            async with client(server.port, session="a") as robot:
+                await came(robot, 1, b"1")
+
+    run(story)
+
+
 def test_what_a_forgotten_session_had_to_get_is_told() -> None:
     async def story() -> None:
         async with relay(settings(store=Store(keep_s=0.5))) as server, client(server.port) as operator:

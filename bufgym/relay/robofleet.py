@@ -1,0 +1,148 @@
+"""Robofleet's own protocol, for its released clients (github ut-amrl/robofleet_client, robofleet_webviz).
+
+Each binary frame is one flatbuffer. Its schema (msg2fbs/schema.fbs in ut-amrl/robofleet) begins every message's table
+with ``__metadata``, a table of ``type`` and ``topic``; the rest is the message, which the relay passes on as it came.
+One of type ``amrl_msgs/RobofleetSubscription`` (``topic_regex``, ``action``: 1 to subscribe, 0 to unsubscribe) is an
+order to the relay. Text frames are JSON: ``{"id_token": ...}`` says who it is. There is no hello, and no ack.
+
+Here the same rules hold as for everybody; Robofleet's server lets all receive topics that end in ``/status``. What its
+clients get is what came from its clients: flatbuffers are not made from other encodings, nor they from them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+import time
+from typing import Any, Final, NamedTuple
+
+from bufgym.errors import BufgymError
+from bufgym.relay import policies, wire
+from bufgym.relay.config import DEFAULT_CAPACITY
+from bufgym.relay.connection import Connection
+from bufgym.relay.extra import needs
+from bufgym.relay.hub import ROBOFLEET, Frame
+from bufgym.relay.patterns import pattern
+from bufgym.relay.rules import Permissions
+from bufgym.relay.subscriber import Subscription
+from bufgym.relay.wire import WireError
+
+SUBSCRIPTION_TYPES: Final = ("amrl_msgs/RobofleetSubscription", "RobofleetSubscription")
+_FIRST: Final = 4
+"""Where field 0 of a table stands in its vtable; each further one 2 bytes on."""
+
+
+class Flat(NamedTuple):
+    """What the relay reads of a flatbuffer."""
+
+    type: str
+    topic: str
+    pattern: str = ""
+    """Of a subscription."""
+    subscribe: bool = False
+
+
+def read(data: bytes) -> Flat:
+    """The metadata of a message, and what a subscription asks for.
+
+    Raises WireError: none of Robofleet's.
+    """
+    with needs("flatbuffers"):
+        from flatbuffers.number_types import Uint8Flags, UOffsetTFlags
+        from flatbuffers.table import Table
+
+    def text(table: Any, field: int) -> str:
+        offset = table.Offset(_FIRST + 2 * field)
+        return str(table.String(offset + table.Pos).decode()) if offset else ""
+
+    try:
+        table = Table(data, int(UOffsetTFlags.packer_type.unpack_from(data)[0]))
+        offset = table.Offset(_FIRST)
+        if not offset:
+            raise WireError("flatbuffer: has no metadata")
+        metadata = Table(data, table.Indirect(offset + table.Pos))
+        flat = Flat(text(metadata, 0), text(metadata, 1))
+        if flat.type in SUBSCRIPTION_TYPES:
+            action = table.Offset(_FIRST + 4)
+            flat = flat._replace(
+                pattern=text(table, 1), subscribe=bool(action and table.Get(Uint8Flags, action + table.Pos) == 1)
+            )
+    except (struct.error, IndexError, TypeError, ValueError, OverflowError) as error:
+        raise error if isinstance(error, WireError) else WireError(f"flatbuffer: {error}") from None
+    topic = flat.topic if flat.topic.startswith("/") else f"/{flat.topic}"
+    wire.check_topic(topic)
+    wire.check_name("type", flat.type)
+    return flat._replace(topic=topic)
+
+
+class RobofleetConnection(Connection):
+    """A client that Robofleet released."""
+
+    acks = False
+
+    async def _hello(self) -> None:
+        """There is none: it is let in by its address or certificate, or once it has said its token."""
+        self.identity = await self._identified(None)
+        while not Permissions(self._hub.config.rules, self.identity).rules:
+            data = await self._socket.recv()
+            if isinstance(data, str):
+                await self._signed_in(data)
+        self._admit({}, ROBOFLEET)
+
+    async def _signed_in(self, text: str) -> bool:
+        """Take a token, if it is one that proves something."""
+        try:
+            said = json.loads(text)
+        except (ValueError, RecursionError):
+            raise WireError("text: must be JSON") from None
+        token = said.get("id_token") if isinstance(said, dict) else None
+        if not isinstance(token, str):
+            return False
+        self.identity = await self._identified(token)
+        asyncio.get_running_loop().call_later(
+            min(self.identity.until_s - time.time(), 2**20), lambda: self.end("the token has expired")
+        )
+        return True
+
+    async def _read(self) -> None:
+        while self._ending is None:
+            data = await self._socket.recv()
+            if isinstance(data, str):
+                before = self.identity
+                if await self._signed_in(data) and self.identity.key != before.key:
+                    raise WireError("id_token: must be said first; connect again to be somebody else")
+                continue
+            flat = read(data)
+            if flat.type in SUBSCRIPTION_TYPES:
+                await self._ordered(flat)
+                continue
+            message = wire.Message(flat.topic, data, ROBOFLEET, flat.type)
+            if self._hub.is_no_drop(flat.topic):
+                message = message._replace(no_drop=True, seq=self.session.received + 1)
+            self._answer(message)
+
+    async def _ordered(self, flat: Flat) -> None:
+        """Subscribe, or no longer; as in its server, a client with bytes pending is skipped."""
+        if not flat.subscribe:
+            if self._hub.unsubscribe(self, flat.pattern):
+                self._quota.subscriptions -= 1
+            return
+        try:
+            chosen = pattern(flat.pattern)
+            warmed = await asyncio.to_thread(policies.warm, policies.SKIP_PENDING.name)
+            if flat.pattern not in self.subscriptions:
+                self._quota.subscribe()
+        except BufgymError as error:
+            self._refuse("subscribe", error)
+            return
+        left_bytes = self._socket.transport.get_write_buffer_size
+        self._hub.subscribe(self, Subscription(flat.pattern, chosen, warmed, DEFAULT_CAPACITY, left_bytes=left_bytes))
+
+    def offer(self, subscription: Subscription, frame: Frame) -> None:
+        """It reads flatbuffers alone."""
+        if frame.message.encoding == ROBOFLEET:
+            super().offer(subscription, frame)
+
+    def tell(self, op: str, **fields: Any) -> None:
+        """Its client would not understand."""

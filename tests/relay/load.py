@@ -1,0 +1,128 @@
+"""How fast a relay is: robots that publish to viewers of all, or connections that do nothing.
+
+python tests/relay/load.py --robots 20 --viewers 5 --seconds 60 [--slow]
+python tests/relay/load.py --idle 1000
+
+The relay has a process of its own; robots and viewers share another, so give the machine cores enough.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from relay_cases import client, settings
+
+from bufgym.relay.config import Limits
+from bufgym.relay.server import serve_forever
+from bufgym.relay.wire import Message
+
+SIZE_BYTES, RATE_HZ = 50_000, 10
+
+
+class Relay:
+    """The process, and what it takes."""
+
+    def __init__(self, process: Any, port: int) -> None:
+        self.process, self.port = process, port
+
+    @classmethod
+    @contextlib.asynccontextmanager
+    async def started(cls) -> Any:
+        process = await asyncio.create_subprocess_exec(sys.executable, __file__, "--serve", stdout=-1)
+        assert process.stdout is not None
+        line = (await process.stdout.readline()).decode()
+        try:
+            yield cls(process, int(line.partition("/ is")[0].rpartition(":")[2]))
+        finally:
+            process.kill()
+            await process.wait()
+
+    @property
+    def cpu_s(self) -> float:
+        times = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(times[11]) + int(times[12])) / os.sysconf("SC_CLK_TCK")
+
+    @property
+    def megabytes(self) -> float:
+        return int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]) * 4096 / 1e6
+
+
+async def idle(count: int) -> None:
+    async with Relay.started() as relay, contextlib.AsyncExitStack() as stack:
+        times_s, before = [], relay.megabytes
+        for _ in range(count):
+            began_s = time.perf_counter()
+            one = await stack.enter_async_context(client(relay.port))
+            await one.subscribe("^/robots/")
+            times_s.append(time.perf_counter() - began_s)
+        median, late = np.percentile(times_s, [50, 99]) * 1e3
+        print(
+            f"{count} connections: {before:.0f} -> {relay.megabytes:.0f} MB; {median:.1f} ms a new one, p99 {late:.1f}"
+        )
+
+
+async def busy(robots: int, viewers: int, seconds: float, slow: bool) -> None:
+    async with Relay.started() as relay:
+        latency_us: list[list[int]] = [[] for _ in range(viewers)]
+
+        async def view(k: int) -> None:
+            buffer_bytes = 65_536 if slow and k == 0 else None
+            async with client(relay.port, receive_buffer_bytes=buffer_bytes, name=f"viewer-{k}") as one:
+                await one.subscribe("^/robots/")
+                while True:
+                    message = await one.next(1e6)
+                    if isinstance(message, Message):
+                        latency_us[k].append(time.time_ns() // 1000 - message.stamp_us)
+                        await asyncio.sleep(SIZE_BYTES / 1e5 if slow and k == 0 else 0)
+
+        async def publish(k: int) -> None:
+            async with client(relay.port, name=f"robot-{k}") as one:
+                await asyncio.sleep(k / robots / RATE_HZ)
+                began_s, body = time.monotonic(), os.urandom(SIZE_BYTES)
+                for i in range(round(seconds * RATE_HZ)):
+                    await asyncio.sleep(max(0.0, began_s + i / RATE_HZ - time.monotonic()))
+                    await one.put(f"/robots/{k}/camera", body, seq=i, stamp_us=time.time_ns() // 1000)
+
+        watching = [asyncio.create_task(view(k)) for k in range(viewers)]
+        await asyncio.sleep(5.0)  # until the policy is compiled
+        began_s, cpu_s, before = time.monotonic(), relay.cpu_s, relay.megabytes
+        await asyncio.gather(*(publish(k) for k in range(robots)))
+        cores = (relay.cpu_s - cpu_s) / (time.monotonic() - began_s)
+        await asyncio.sleep(1.0)
+        for task in watching:
+            task.cancel()
+        print(f"{robots} robots, {viewers} viewers: {cores:.2f} cores, {before:.0f} -> {relay.megabytes:.0f} MB")
+        for k, times_us in enumerate(latency_us):
+            median, late, longest = np.percentile(times_us, [50, 99, 100]) / 1e3
+            of = round(seconds * RATE_HZ) * robots
+            print(f"viewer {k}: {len(times_us)} of {of}, {median:.2f} ms, p99 {late:.2f}, longest {longest:.0f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--robots", type=int, default=4)
+    parser.add_argument("--viewers", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=6.0)
+    parser.add_argument("--slow", action="store_true", help="the first viewer reads 100 kB/s")
+    parser.add_argument("--idle", type=int, default=0)
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.serve:
+        many = Limits(connections=10_000, all_connections=10_000, sessions=10_000, subscriptions=10_000)
+        asyncio.run(serve_forever(settings(policies=("robofleet",), limits=many), lambda text: print(text, flush=True)))
+    elif options.idle:
+        asyncio.run(idle(options.idle))
+    else:
+        asyncio.run(busy(options.robots, options.viewers, options.seconds, options.slow))
+
+
+if __name__ == "__main__":
+    main()
