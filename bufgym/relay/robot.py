@@ -37,8 +37,9 @@ _OWN: Final = tuple(
 class Source(Protocol):
     """What a robot publishes: the made-up one, a recording, ROS, or any program."""
 
-    streams: Sequence[Stream]
-    """Its topics, with the rules for each."""
+    @property
+    def streams(self) -> Sequence[Stream]:
+        """Its topics, with the rules for each."""
 
     async def run(self, robot: Robot) -> None:
         """Publish with ``robot.publish``; returns when there is no more."""

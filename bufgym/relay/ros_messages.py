@@ -104,7 +104,7 @@ def _moulded(value: Any, types: Any) -> Any:
         return [_moulded(one, types) for one in value]
     if not is_dataclass(value):
         return value
-    kind = types.types[value.__msgtype__]  # type: ignore[attr-defined]
+    kind = types.types[getattr(value, "__msgtype__")]  # noqa: B009  (a field of the library's own)
     return kind(**{one.name: _moulded(getattr(value, one.name, 0), types) for one in fields(kind)})
 
 
