@@ -56,6 +56,7 @@ PARSED = {
     r"bufgym gallery .*": "tests/test_gallery.py; the first one by test_readme.py",
     r"bufgym live .*": "sockets; tests/live/test_command.py",
     r"bufgym ros2 .*": "needs ROS 2; tests/live/test_ros2.py",
+    r"bufgym relay .*": "a server, and who connects to it; tests/relay",
     r"bufgym export .* --to c .*": "compiles for 40 s; tests/test_c_export.py",
     r"bufgym reproduce (afr-fig9|small-link)": "tests/reproduce/test_reproduce.py",
     r"bufgym trace fit .*": "needs recordings; tests/traces/test_fit.py",

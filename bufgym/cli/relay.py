@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from bufgym.cli import relay_robots
 from bufgym.cli.live import run_async
 from bufgym.cli.options import Commands, command
 
@@ -13,6 +14,7 @@ def add(commands: Commands) -> None:
     relay = commands.add_parser("relay", help="a server for fleets: robots and viewers meet there")
     parts = relay.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_server(parts)
+    relay_robots.add(parts)
 
 
 # --- the server ------------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import re
 import secrets
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 from websockets.asyncio.server import ServerConnection
@@ -16,13 +17,14 @@ from websockets.exceptions import WebSocketException
 from bufgym.errors import BufgymError
 from bufgym.model.buffer import MAX_CAPACITY
 from bufgym.model.checks import whole
-from bufgym.relay import policies, wire
+from bufgym.relay import policies, replay, wire
 from bufgym.relay.config import DEFAULT_CAPACITY
 from bufgym.relay.hub import MAX_JSON_BYTES, OWN, Frame, Hub
 from bufgym.relay.identity import Verifier, certificate_email
 from bufgym.relay.outbox import Outbox
 from bufgym.relay.patterns import pattern
 from bufgym.relay.quota import Quota, RefusedError
+from bufgym.relay.recorder import FOLDER as RECORDINGS
 from bufgym.relay.rules import Identity, Permissions, plain_address
 from bufgym.relay.store import Session
 from bufgym.relay.subscriber import Subscription
@@ -33,7 +35,7 @@ HELLO_BYTES: Final = 2**16
 MAX_PRIORITY: Final = 1e6
 _SESSION: Final = re.compile(r"[\w.-]{1,64}", re.ASCII)
 _POLICY_VIOLATION: Final = 1008
-_ORDERS: Final = ("subscribe", "unsubscribe", "publish", "ack")
+_ORDERS: Final = ("subscribe", "unsubscribe", "publish", "ack", "recordings", "replay")
 
 
 class Connection:
@@ -177,8 +179,29 @@ class Connection:
                             self._quota.subscriptions -= 1
                     case "ack":
                         self._ack(said["seq"])
+                    case "recordings":
+                        self.tell("recordings", files=await asyncio.to_thread(replay.recordings, self._recordings))
+                    case "replay":
+                        await self._replay(said)
                     case op:
                         raise WireError(f"{op}: must be one of {', '.join(_ORDERS)}")
+
+    @property
+    def _recordings(self) -> Path | None:
+        folder = self._hub.config.folder
+        return None if folder is None else folder / RECORDINGS
+
+    async def _replay(self, said: Mapping[str, Any]) -> None:
+        def may(topic: str) -> bool:
+            return self.permissions.allow("receive", topic)
+
+        asked = said["file"], said["from_us"], said["most_bytes"]
+        try:
+            part = await asyncio.to_thread(replay.piece, self._recordings, *asked, may)
+        except BufgymError as error:
+            self._refuse("replay", error, id=said["id"])
+        else:
+            self.tell("replayed", id=said["id"], **part)
 
     def _answer(self, message: wire.Message) -> None:
         """Publish it, or say why not: of a no_drop message every time, of others now and then."""

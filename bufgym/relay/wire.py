@@ -177,6 +177,9 @@ FIELDS: Final[Mapping[str, Mapping[str, tuple[Any, bool]]]] = {
     "publish": _MESSAGE,
     "message": {**_MESSAGE, "sender": (str, True)},
     "ack": {"seq": (int, True)},
+    "recordings": {"files": (list, False)},
+    "replay": {"id": (str, True), "file": (str, True), "from_us": (int, True), "most_bytes": (int, True)},
+    "replayed": {"id": (str, True), "messages": (list, True)},
     "delivered": {"seq": (int, True), "receivers": (int, True), "lost": (int, True)},
     "refused": {"what": (str, True), "code": (str, True), "why": (str, True)},
 }

@@ -26,18 +26,18 @@ from bufgym.scenario import Client
 
 SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
 """Names of the nodes. What a receiver publishes is never sent on: a pair each way makes no circle."""
-_LOOK_S: Final = 0.2
+LOOK_S: Final = 0.2
 """Between two looks at who publishes."""
 _MATCH_S: Final = 1.0
 """A new publisher's first message waits so long for a subscriber at most."""
 
 
-def _resolved(name: str) -> str:
+def resolved(name: str) -> str:
     return name if name.startswith("/") else f"/{name}"
 
 
 @contextmanager
-def _node(name: str) -> Iterator[Any]:
+def own_node(name: str) -> Iterator[Any]:
     """A node of its own context."""
     with needs_rclpy():
         import rclpy
@@ -91,7 +91,7 @@ class Robot:
 
     async def run(self) -> None:
         """Relay until cancelled."""
-        with _node(SENDER) as node:
+        with own_node(SENDER) as node:
             from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
             executor = SingleThreadedExecutor(context=node.context)
@@ -118,16 +118,16 @@ class Robot:
 
     async def _look(self, node: Any) -> None:
         """Subscribe to each topic once somebody publishes it."""
-        wanted = {_resolved(stream.topic.name): number for number, stream in enumerate(self._streams)}
+        wanted = {resolved(stream.topic.name): number for number, stream in enumerate(self._streams)}
         if self._odometry_topic is not None:
-            wanted[_resolved(self._odometry_topic)] = wanted.get(_resolved(self._odometry_topic), -1)
+            wanted[resolved(self._odometry_topic)] = wanted.get(resolved(self._odometry_topic), -1)
         while wanted:
             for name in list(wanted):
                 topic = published(node, name, RECEIVER)
                 if topic is not None:
                     self._subscribe(node, topic, wanted.pop(name))
                     self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}")
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(LOOK_S)
         await asyncio.Event().wait()
 
     def _subscribe(self, node: Any, topic: Published, number: int) -> None:
@@ -139,7 +139,7 @@ class Robot:
                 self.queue.put(head + message, len(head) + len(message), x, number)
 
             node.create_subscription(topic.message_class, topic.name, put, topic.qos, raw=True)
-        if self._odometry_topic is not None and topic.name == _resolved(self._odometry_topic):
+        if self._odometry_topic is not None and topic.name == resolved(self._odometry_topic):
             node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos)
 
 
@@ -153,7 +153,7 @@ async def receive(
 
     Messages of a type that is not installed here are told of once, and dropped.
     """
-    with _node(RECEIVER) as node:
+    with own_node(RECEIVER) as node:
         publishers: dict[Published, Any] = {}
 
         async def republish(message: Received) -> None:

@@ -27,7 +27,7 @@ from typing import Final
 import numpy as np
 
 from bufgym.errors import BufgymError, install
-from bufgym.traces.formats.bag_files import MAX_TOPICS, SOURCES
+from bufgym.traces.formats.bag_files import MAX_TOPICS, SOURCES, Message
 from bufgym.traces.formats.bag_poses import PoseCollector
 from bufgym.traces.formats.faults import StrPath, fault, os_errors
 from bufgym.traces.poses import Poses
@@ -35,6 +35,7 @@ from bufgym.traces.trace import MAX_DURATION_S, Int64Array
 
 MAX_BAG_MESSAGES: Final = 10**7
 
+_RULE: Final = "must be an MCAP file, a ROS 1 bag, or a rosbag2 folder or .db3 file"
 _MAGICS: Final = {b"\x89MCAP0\r\n": "mcap", b"#ROSBAG V": "ros1", b"SQLite format 3\0": "rosbag2"}
 
 
@@ -93,8 +94,7 @@ def read_bag(path: StrPath, odom: str | None = None) -> Bag:
     """
     kind = _kind(Path(path))
     if not kind:
-        rule = "must be an MCAP file, a ROS 1 bag, or a rosbag2 folder or .db3 file"
-        raise fault(path, rule if Path(path).exists() else "no such file")
+        raise fault(path, _RULE if Path(path).exists() else "no such file")
     collector = None if odom is None else PoseCollector(path, odom)
     types: dict[str, str] = {}  # of every topic, also of those without messages
     numbers: dict[str, int] = {}
@@ -124,6 +124,18 @@ def read_bag(path: StrPath, odom: str | None = None) -> Bag:
         return bag
     from_ns, poses = collector.poses(topics)
     return replace(bag, poses=poses, poses_from_ns=from_ns)
+
+
+def messages(path: StrPath) -> Iterator[Message]:
+    """Every message of a recording, in the order of the file.
+
+    Raises: as ``read_bag``, where the file is damaged.
+    """
+    kind = _kind(Path(path))
+    if not kind:
+        raise fault(path, _RULE if Path(path).exists() else "no such file")
+    with _damage_errors(path):
+        yield from SOURCES[kind](Path(path), {})
 
 
 # --- the three kinds -------------------------------------------------------------------------------------------------

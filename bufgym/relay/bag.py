@@ -1,0 +1,70 @@
+"""A recording as a robot: its messages again, as far apart as they were recorded."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bufgym.errors import BufgymError
+from bufgym.model.topics import Topic
+from bufgym.relay import ros_messages
+from bufgym.relay.robot import Robot
+from bufgym.scenario import Stream
+from bufgym.traces.formats.bags import messages, read_bag
+
+_LATE_S = 1.0
+"""Who is behind by more does not catch up: time goes on from there."""
+
+
+class Recorded:
+    """The recording in ``path``, an MCAP file, a ROS 1 bag or a rosbag2; again from its beginning if it ``loops``.
+
+    ``streams``: which of its topics, with the rules for each; None: all of them, without rules.
+    """
+
+    def __init__(self, path: str | Path, streams: Sequence[Stream] | None = None, *, loops: bool = True) -> None:
+        bag = read_bag(path)
+        if not len(bag.time_ns):
+            raise BufgymError(f"{path}: has no messages")
+        counts = dict(zip(bag.topics, np.bincount(bag.topic, minlength=len(bag.topics)).tolist(), strict=True))
+        if streams is None:
+            seconds = max(1.0, float(bag.time_ns[-1] - bag.time_ns[0]) / 1e9)
+            streams = tuple(
+                Stream(Topic(name.lstrip("/")), count / seconds, 1000) for name, count in counts.items() if count
+            )
+        self.path = path
+        self.streams = streams
+        self._loops = loops
+        self._names = {f"/{stream.topic.name.lstrip('/')}": stream.topic.name for stream in streams}
+        for name in self._names:
+            if not counts.get(name):
+                raise BufgymError(f"{path}: no messages of topic {name!r}; it has: {', '.join(bag.topics)}")
+
+    async def run(self, robot: Robot) -> None:
+        while True:
+            await self._play(robot)
+            if not self._loops:
+                return
+
+    async def _play(self, robot: Robot) -> None:
+        loop = asyncio.get_running_loop()
+        offset_s: float | None = None
+        for channel, logged_ns, payload in messages(self.path):
+            name = self._names.get(channel.topic)
+            if name is None:
+                continue
+            if offset_s is None or loop.time() - logged_ns / 1e9 - offset_s > _LATE_S:
+                offset_s = loop.time() - logged_ns / 1e9
+            await asyncio.sleep(offset_s + logged_ns / 1e9 - loop.time())
+            encoding, payload = ros_messages.modern(payload, channel.type, channel.encoding or "json")
+            robot.publish(name, payload, encoding, channel.type)
+
+    def status(self) -> dict[str, Any]:
+        return {"recording": Path(self.path).name}
+
+    async def on_command(self, command: Any) -> None:
+        """A recording does what it did."""

@@ -1,0 +1,201 @@
+"""A relay's client, for robots and any Python program: connects out, publishes through a policy's queue, subscribes.
+
+    client = Client("ws://relay.example:7420", "robot-3", topics=(Topic("/robots/robot-3/camera"),), policy="afr")
+    client.subscribe("^/robots/robot-3/command$", on_command, durable=True)
+    running = asyncio.create_task(client.run())  # connects, and again whenever the connection breaks
+    client.publish("/robots/robot-3/camera", jpeg, encoding="jpeg")  # never blocks; the policy decides what goes
+    await client.command("/robots/robot-4/command", {"command": "stop"})  # returns once the relay holds it
+
+Little waits outside the queue: the system's buffers are small, and a message counts as on its way until the relay's
+system has acked its last byte. Those that a broken connection leaves so go again, with the numbers that they had.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from bufgym.errors import BufgymError
+from bufgym.live.log import Record
+from bufgym.live.queue import Item, PolicyQueue
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
+from bufgym.policies.registry import Policy
+from bufgym.relay import wire
+from bufgym.relay.session import Session
+
+_POLL_S: Final = (0.001, 0.016)
+"""Between two looks at what has left: at first, and when nothing moves."""
+
+
+@dataclass(eq=False)
+class _Away:
+    """A message that a queue has handed out."""
+
+    queue: PolicyQueue
+    item: Item
+    answered: asyncio.Future[None] | None = None
+    """On a no_drop topic: done when the relay holds it."""
+    written: bool = False
+
+
+class Client(Session):
+    """A session with a queue. See the module's text."""
+
+    def __init__(
+        self,
+        url: str,
+        name: str,
+        *,
+        topics: Sequence[Topic] = (),
+        policy: str | Policy = "robofleet",
+        capacity: int = 32,
+        window: int = 1,
+        value: Value | None = None,
+        token: str | None = None,
+        tls: ssl.SSLContext | None = None,
+        log: Callable[[int, Record], None] | None = None,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """
+        Args:
+            topics: what is published, and the rules for each; none: ordinary messages can't be published.
+            policy: a drop rule for one topic, a scheduler for several.
+            capacity: L, messages of all topics together.
+            window: n_T, messages handed to the system and not yet acked by the relay's, at most.
+            value: V of topics that have none of their own.
+            log: takes the number of the queue, which ``change`` counts, and a record of all that happens there.
+            url, name, token, tls, say: as a ``Session`` has them.
+        """
+        super().__init__(url, name, token=token, tls=tls, say=say)
+        self._topics = tuple(topics)
+        self._numbers = {topic.name: k for k, topic in enumerate(topics)}
+        self._capacity, self._window, self._value, self._log = capacity, window, value, log
+        self._queues: deque[PolicyQueue] = deque()
+        """The last is put into; those before it hand out what they still hold, under the policy they were made with."""
+        self._changes = 0
+        self._away: deque[_Away] = deque()
+        self._moved = asyncio.Event()
+        self._seqs: Counter[str] = Counter()
+        if topics:
+            self.change(policy)
+
+    # --- what it publishes --------------------------------------------------------------------------------------------
+
+    def change(self, policy: str | Policy) -> None:
+        """Another policy rules the queue from now on; what is queued goes first, by the one before."""
+        log, number = self._log, self._changes
+        queue = PolicyQueue(
+            policy,
+            self._capacity,
+            topics=self._topics,
+            window=self._window,
+            value=self._value,
+            log=None if log is None else lambda record: log(number, record),
+        )
+        self._changes += 1
+        queue.left_bytes = self._left_bytes
+        before = self._queues[-1] if self._queues else None
+        self._queues.append(queue)
+        if before is not None:
+            before.close()
+
+    @property
+    def queue(self) -> PolicyQueue:
+        """That which messages are put into."""
+        return self._queues[-1]
+
+    def publish(
+        self,
+        topic: str,
+        payload: bytes,
+        encoding: str = "json",
+        type: str = "",
+        x: float | None = None,
+        stamp_us: int | None = None,
+    ) -> None:
+        """Put a message into the queue, from any thread. Never blocks; the policy decides whether it goes.
+
+        Args:
+            topic: one of ``topics``.
+            payload: in that ``encoding`` (json, cdr, ros1, jpeg, png, or a name that the receivers know).
+            type: as in ROS, ``sensor_msgs/msg/LaserScan``.
+            x: how far the scene has moved on; None: 1 more than the last.
+            stamp_us: us since 1970; None: now.
+        """
+        if topic not in self._numbers:
+            raise BufgymError(f"topic {topic!r}: this client publishes {', '.join(self._numbers) or 'nothing'}")
+        self._seqs[topic] += 1
+        stamp_us = time.time_ns() // 1000 if stamp_us is None else stamp_us
+        message = wire.Message(topic, payload, encoding, type, "", self._seqs[topic], stamp_us)
+        size_bytes = len(wire.encode(message))
+        while True:
+            queue = self.queue
+            try:
+                queue.put(message, size_bytes, x, self._numbers[topic])
+                return
+            except BufgymError:
+                if queue is self.queue:  # else the policy was changed in that moment
+                    raise
+
+    def _works(self) -> list[Coroutine[Any, Any, None]]:
+        return [*super()._works(), self._send_all(), self._leave_all()]
+
+    # --- out ----------------------------------------------------------------------------------------------------------
+
+    async def _send_all(self) -> None:
+        """What the queues hand out, in order; first what the last connection left."""
+        for away in self._away:
+            away.written = False
+        for away in list(self._away):
+            await self._send(away)
+        while self._queues:
+            item = await self._queues[0].aget()
+            if item is None:  # it is closed: another policy follows
+                self._queues.popleft()
+                continue
+            away = _Away(self._queues[0], item)
+            self._away.append(away)
+            await self._send(away)
+
+    async def _send(self, away: _Away) -> None:
+        if away.answered is None:
+            message = away.item.message
+            if any(pattern.fullmatch(message.topic) for pattern in self._no_drop):
+                away.answered = self._unanswered.put(message._replace(no_drop=True))
+                self._wanted.set()
+            else:
+                await self._connection.send(wire.encode(message))
+        away.written = True
+        self._moved.set()
+
+    async def _leave_all(self) -> None:
+        """Tell each queue what has left: in order, as soon as no more bytes are left than belong to those behind it."""
+        while True:
+            await self._moved.wait()
+            self._moved.clear()
+            while self._away and self._away[0].written:
+                away = self._away[0]
+                if away.answered is not None:
+                    await asyncio.wait([away.answered])
+                    if (error := away.answered.exception()) is not None:
+                        self._note(str(error))
+                else:
+                    await self._left()
+                self._away.popleft()
+                away.queue.gone()
+
+    async def _left(self) -> None:
+        """Returns when the oldest message away has left."""
+        poll_s, most_s = _POLL_S
+        while (left_bytes := self._left_bytes()) is not None:
+            behind = sum(away.item.size_bytes for away in list(self._away)[1:] if away.written)
+            if left_bytes <= behind:
+                return
+            await asyncio.sleep(poll_s)
+            poll_s = min(2 * poll_s, most_s)

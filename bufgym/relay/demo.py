@@ -1,0 +1,80 @@
+"""A relay with made-up robots over fading links, all in one process: something to look at within seconds."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Final
+
+from bufgym.live.shaped import ShapedLink
+from bufgym.model.link import Link
+from bufgym.policies.registry import Policy
+from bufgym.relay.config import Config, Rule
+from bufgym.relay.madeup import CONFIG, MadeUp
+from bufgym.relay.robot import Robot
+from bufgym.relay.server import Server
+from bufgym.scenario import read_client
+from bufgym.traces import Trace
+
+CLEAR_BPS: Final = 1_000_000
+FADED_BPS: Final = 100_000
+"""A robot wants 550 kbit/s."""
+FADES_S: Final = 24.0
+DELAY_US: Final = 20_000
+
+
+def fading(number: int) -> Trace:
+    """A link that is nearly gone for some seconds of every 24, each robot's at another time."""
+    steps = 48
+    depth = [max(0.0, math.cos(2 * math.pi * (k / steps - 0.35 - 0.31 * number))) ** 4 for k in range(steps)]
+    rates = [CLEAR_BPS / 8 * (FADED_BPS / CLEAR_BPS) ** d for d in depth]
+    return Trace.steps([(FADES_S / steps, rate) for rate in rates], name=f"fade-{number}")
+
+
+@contextlib.asynccontextmanager
+async def running(
+    robots: int = 3,
+    port: int = 0,
+    *,
+    policy: str | Policy = "robofleet",
+    capacity: int = 16,
+    folder: Path | None = None,
+    fades: bool = True,
+    say: Callable[[str], None] = lambda text: None,
+) -> AsyncIterator[int]:
+    """The port of a relay that this machine may use, and that ``robots`` made-up ones are connected to.
+
+    ``folder``: it records there.
+    """
+    rules = (Rule(address="127.0.0.1", send=True, receive=True), Rule(recorder=True, receive=True))
+    server = Server(Config(port=port, rules=rules[: 1 if folder is None else 2], folder=folder))
+    client = read_client(CONFIG)
+    async with contextlib.AsyncExitStack() as stack:
+        port = await server.start()
+        stack.push_async_callback(server.close)
+        tasks = []
+        for number in range(robots):
+            to = port
+            if fades:
+                link = ShapedLink(Link(fading(number), propagation_us=DELAY_US), ("127.0.0.1", port))
+                to = await link.listen()
+                stack.push_async_callback(link.close)
+            robot = Robot(
+                f"ws://127.0.0.1:{to}",
+                f"robot-{number + 1}",
+                MadeUp(number, client.streams),
+                policy=policy,
+                capacity=capacity,
+                window=client.window,
+                say=say,
+            )
+            tasks.append(asyncio.create_task(robot.run()))
+        try:
+            yield port
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)

@@ -1,0 +1,116 @@
+"""What a viewer at a relay sees, in Foxglove's own WebSocket protocol (``foxglove-sdk``, extra ``foxglove``).
+
+Foxglove and Lichtblick connect to it as to any robot. Messages of ROS go through as they are, with their definitions;
+pictures become CompressedImage, and poses also transforms, so that the map shows every robot where it is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import Any, Final
+
+from bufgym.errors import BufgymError
+from bufgym.live.extra import needs
+from bufgym.relay import ros_messages, wire
+from bufgym.relay.session import Session
+
+PORT: Final = 8765
+_PICTURES: Final = ("jpeg", "png")
+_ROBOT: Final = re.compile(r"/robots/([^/]+)/")
+
+
+class Bridge:
+    """Shows what ``session`` receives on topics in which ``pattern`` is found."""
+
+    def __init__(self, session: Session, port: int = PORT, host: str = "127.0.0.1", pattern: str = "^/") -> None:
+        with needs("foxglove", "foxglove", "bufgym.relay"):
+            import foxglove
+        self._foxglove = foxglove
+        self._context = foxglove.Context()
+        try:
+            self._server = foxglove.start_server(name="bufgym relay", host=host, port=port, context=self._context)
+        except Exception as error:  # of its own kinds
+            raise BufgymError(f"{host}:{port}: Foxglove's server: {error}") from None
+        self.port: int = self._server.port
+        """Where it listens."""
+        self.session = session
+        self._channels: dict[tuple[str, str, str], Any] = {}
+        session.subscribe(pattern, self.show)
+
+    async def run(self) -> None:
+        """Until cancelled."""
+        try:
+            await self.session.run()
+        finally:
+            await asyncio.to_thread(self._server.stop)
+
+    def show(self, message: wire.Message) -> None:
+        """One message."""
+        key = message.topic, message.encoding, message.type
+        if key not in self._channels:
+            self._channels[key] = self._channel(message)
+        time_ns = max(0, message.stamp_us) * 1000
+        payload = bytes(message.payload)
+        if message.encoding in _PICTURES:
+            from foxglove.messages import CompressedImage
+
+            frame, form = _frame(message.topic), message.encoding
+            picture = CompressedImage(timestamp=_timestamp(time_ns), frame_id=frame, data=payload, format=form)
+            self._channels[key].log(picture, log_time=time_ns)
+            return
+        self._channels[key].log(payload, log_time=time_ns)
+        if message.encoding == "cdr" and message.type in ros_messages.POSES:
+            self._transform(ros_messages.read(payload, message.type), message.topic, time_ns)
+
+    def _channel(self, message: wire.Message) -> Any:
+        if message.encoding in _PICTURES:
+            from foxglove.channels import CompressedImageChannel
+
+            return CompressedImageChannel(message.topic, context=self._context)
+        schema = None
+        if message.encoding == "cdr":
+            definition = ros_messages.definition(message.type) or ""
+            schema = self._foxglove.Schema(name=message.type, encoding="ros2msg", data=definition.encode())
+        elif message.encoding == "json":
+            schema = self._foxglove.Schema(name=message.type or "object", encoding="jsonschema", data=_OBJECT)
+        return self._foxglove.Channel(
+            message.topic, schema=schema, message_encoding=message.encoding, context=self._context
+        )
+
+    def _transform(self, message: Any, topic: str, time_ns: int) -> None:
+        from foxglove.channels import FrameTransformChannel
+        from foxglove.messages import FrameTransform, Quaternion, Vector3
+
+        if _TRANSFORMS not in self._channels:
+            self._channels[_TRANSFORMS] = FrameTransformChannel("/tf", context=self._context)
+        pose = message.pose
+        while hasattr(pose, "pose"):
+            pose = pose.pose
+        place, turn = pose.position, pose.orientation
+        self._channels[_TRANSFORMS].log(
+            FrameTransform(
+                timestamp=_timestamp(time_ns),
+                parent_frame_id=message.header.frame_id or "map",
+                child_frame_id=getattr(message, "child_frame_id", "") or _frame(topic),
+                translation=Vector3(x=place.x, y=place.y, z=place.z),
+                rotation=Quaternion(x=turn.x, y=turn.y, z=turn.z, w=turn.w),
+            ),
+            log_time=time_ns,
+        )
+
+
+_TRANSFORMS: Final = ("/tf", "", "")
+_OBJECT: Final = b'{"type": "object"}'
+
+
+def _frame(topic: str) -> str:
+    """The frame of the robot whose topic this is."""
+    match = _ROBOT.match(topic)
+    return f"{match[1]}/base" if match else "base"
+
+
+def _timestamp(time_ns: int) -> Any:
+    from foxglove.messages import Timestamp
+
+    return Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)

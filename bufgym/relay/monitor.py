@@ -1,0 +1,144 @@
+"""How a robot's queue is, in numbers that fit into a message: made from its records as they happen."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from bufgym.live.log import Record
+from bufgym.model import qoi
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
+
+RATE_S: Final = 1.0
+"""Rates are over the time so long before now."""
+QOI_S: Final = 30.0
+"""QoI is that of the messages put in so long before now."""
+_MOST: Final = 10_000
+"""Messages of a topic that are remembered for its QoI."""
+
+
+class _Put:
+    """A message: when it was put, where the scene was, and what became of it."""
+
+    __slots__ = ("left", "put_s", "size_bytes", "topic", "x")
+
+    def __init__(self, put_s: float, x: float, topic: int, size_bytes: int) -> None:
+        self.put_s, self.x, self.topic, self.size_bytes = put_s, x, topic, size_bytes
+        self.left: bool | None = None
+
+
+class _Counts:
+    """Of one topic."""
+
+    def __init__(self) -> None:
+        self.put = self.left = self.dropped = 0
+        self.latest_s: float | None = None
+        """When the last one that has left was put."""
+        self.lately: deque[_Put] = deque(maxlen=_MOST)
+
+
+class Monitor:
+    """Of one robot's queues: call it with each record of each; the policy is that of the latest."""
+
+    def __init__(
+        self, topics: Sequence[Topic], value: Value | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._topics = tuple(topics)
+        self._value = value or qoi.exponential()
+        self._clock = clock
+        self._counts = [_Counts() for _ in topics]
+        self._left: deque[tuple[float, int]] = deque()
+        self._queued: dict[tuple[int, int], _Put] = {}
+        self._away: dict[tuple[int, int], _Put] = {}
+        self._policy, self._capacity = "", 0
+
+    def __call__(self, number: int, record: Record) -> None:
+        """Take a record of the ``number``-th queue."""
+        event, now_s = record["event"], self._clock()
+        if event == "settings":
+            self._policy, self._capacity = record["policy"], record["capacity"]
+            return
+        key = number, record["seq"]
+        if event == "put":
+            put = self._queued[key] = _Put(now_s, record["x"], record["topic"], record["size_bytes"])
+            self._counts[put.topic].put += 1
+            self._counts[put.topic].lately.append(put)
+        elif event == "dequeued":
+            self._away[key] = self._queued.pop(key)
+        elif event == "gone":
+            put = self._away.pop(key)
+            counts = self._counts[put.topic]
+            put.left, counts.latest_s = True, put.put_s
+            counts.left += 1
+            self._left.append((now_s, put.size_bytes))
+        else:
+            put = self._queued.pop(key)
+            put.left = False
+            self._counts[put.topic].dropped += 1
+
+    def state(self) -> dict[str, Any]:
+        """How it is now: see ``docs/guide/relay-robots.md``."""
+        now_s = self._clock()
+        while self._left and self._left[0][0] < now_s - RATE_S:
+            self._left.popleft()
+        qois = [self._qoi(k, now_s) for k in range(len(self._topics))]
+        weights = [topic.share for topic, part in zip(self._topics, qois, strict=True) if part is not None]
+        parts = [part for part in qois if part is not None]
+        names = [topic.name for topic in self._topics]
+        return {
+            "policy": self._policy,
+            "capacity": self._capacity,
+            "queued": len(self._queued),
+            "waiting": [put.topic for put in list(self._queued.values())],
+            "away": len(self._away),
+            "put": sum(counts.put for counts in self._counts),
+            "left": sum(counts.left for counts in self._counts),
+            "dropped": sum(counts.dropped for counts in self._counts),
+            "rate_bps": round(8 * sum(size for _, size in self._left) / RATE_S),
+            "qoi": _ratio(sum(w * p for w, p in zip(weights, parts, strict=True)), sum(weights)),
+            "topics": {
+                name: {
+                    "put": counts.put,
+                    "left": counts.left,
+                    "dropped": counts.dropped,
+                    "age_s": None if counts.latest_s is None else round(now_s - counts.latest_s, 3),
+                    "qoi": None if part is None else round(part, 3),
+                }
+                for name, counts, part in zip(names, self._counts, qois, strict=True)
+            },
+        }
+
+    def _qoi(self, topic: int, now_s: float) -> float | None:
+        """H of what has left, as a part of H of all that was put, of the last ``QOI_S``; None where nothing was."""
+        lately = self._counts[topic].lately
+        while lately and lately[0].put_s < now_s - QOI_S:
+            lately.popleft()
+        value = self._topics[topic].value or self._value
+        settled = [put for put in list(lately) if put.left is not None]
+        if not settled:
+            return None
+        # Another queue's x begins anew where its program lets it count: only the sum of ever growing x is a distance.
+        most, got = (value.information(_grown([put.x for put in some])) for some in (settled, _kept(settled)))
+        return min(1.0, got / most)
+
+
+def _kept(puts: list[_Put]) -> list[_Put]:
+    return [put for put in puts if put.left]
+
+
+def _grown(xs: list[float]) -> list[float]:
+    """From where x falls (a new queue that counts from 0) it goes on from where it was."""
+    grown, offset, before = [], 0.0, float("-inf")
+    for x in xs:
+        if x < before:
+            offset += before - x
+        grown.append(x + offset)
+        before = x
+    return grown
+
+
+def _ratio(part: float, whole: float) -> float | None:
+    return round(part / whole, 3) if whole else None

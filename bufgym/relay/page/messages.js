@@ -1,0 +1,123 @@
+// What goes over the wire, and what is in it: the relay's binary frames, and ROS 2 messages in CDR.
+
+const text = new TextDecoder();
+
+// A message of a binary frame: {topic, type, encoding, sender, seq, stampMs, noDrop, payload}.
+export function decode(buffer) {
+  const view = new DataView(buffer), names = [];
+  if (view.getUint16(0) !== 0x6252 || view.getUint8(2) !== 1 || view.getUint8(3) !== 1) throw new Error("no frame of this relay");
+  let at = 32;
+  for (let k = 0; k < 4; k++) {
+    const length = view.getUint8(5 + k);
+    names.push(text.decode(new Uint8Array(buffer, at, length)));
+    at += length;
+  }
+  return {
+    topic: names[0], type: names[1], encoding: names[2], sender: names[3],
+    seq: Number(view.getBigUint64(16)), stampMs: Number(view.getBigInt64(24)) / 1000,
+    noDrop: (view.getUint8(4) & 1) === 1, payload: new Uint8Array(buffer, at, view.getUint32(12)),
+  };
+}
+
+// The same of a JSON object: what a replay consists of.
+export function fromJson(said) {
+  const message = {...said, stampMs: said.stamp_us / 1000, noDrop: said.no_drop};
+  if (said.encoding === "json") message.value = said.data;
+  else message.payload = Uint8Array.from(atob(said.data), letter => letter.charCodeAt(0));
+  return message;
+}
+
+export function json(message) {
+  if (message.value === undefined) message.value = JSON.parse(text.decode(message.payload));
+  return message.value;
+}
+
+class Cdr {
+  constructor(payload) {
+    this.view = new DataView(payload.buffer, payload.byteOffset, payload.byteLength);
+    this.little = (this.view.getUint8(1) & 1) === 1;
+    this.at = 4;                                    // alignment counts from behind the four bytes that say how it is encoded
+  }
+  skipTo(bytes) { this.at += (bytes - (this.at - 4) % bytes) % bytes; }
+  number(kind, bytes) {
+    this.skipTo(bytes);
+    const value = this.view["get" + kind](this.at, this.little);
+    this.at += bytes;
+    return value;
+  }
+  uint() { return this.number("Uint32", 4); }
+  float() { return this.number("Float32", 4); }
+  double() { return this.number("Float64", 8); }
+  bytes(length) { return new Uint8Array(this.view.buffer, this.view.byteOffset + (this.at += length) - length, length); }
+  string() { const length = this.uint(); return text.decode(this.bytes(length).subarray(0, Math.max(0, length - 1))); }
+  header() { this.uint(); this.uint(); this.string(); }
+  pose() {
+    const [x, y] = [this.double(), this.double()];
+    this.double();
+    const [qx, qy, qz, qw] = [this.double(), this.double(), this.double(), this.double()];
+    return {x, y, yaw: Math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))};
+  }
+  scan() {
+    const [angle_min, , angle_increment] = [this.float(), this.float(), this.float()];
+    this.float(); this.float(); this.float(); this.float();
+    const ranges = new Float32Array(this.uint());
+    for (let k = 0; k < ranges.length; k++) ranges[k] = this.float();
+    return {angle_min, angle_increment, ranges};
+  }
+}
+
+const KINDS = {
+  "nav_msgs/msg/Odometry": "pose", "geometry_msgs/msg/PoseStamped": "pose", "geometry_msgs/msg/PoseWithCovarianceStamped": "pose",
+  "sensor_msgs/msg/LaserScan": "scan", "sensor_msgs/msg/CompressedImage": "picture", "sensor_msgs/msg/Image": "picture",
+};
+
+// What a topic shows: "pose", "scan", "picture", or nothing that the page can draw.
+export function kindOf(name, {type, encoding}) {
+  if (KINDS[type] && encoding === "cdr") return KINDS[type];
+  if (encoding === "jpeg" || encoding === "png") return "picture";
+  if (encoding === "json") return {odom: "pose", scan: "scan"}[name];
+}
+
+export function pose(message) {
+  if (message.encoding === "json") return json(message);
+  const cdr = new Cdr(message.payload);
+  cdr.header();
+  if (message.type === "nav_msgs/msg/Odometry") cdr.string();
+  return cdr.pose();
+}
+
+export function scan(message) {
+  if (message.encoding === "json") return json(message);
+  const cdr = new Cdr(message.payload);
+  cdr.header();
+  return cdr.scan();
+}
+
+// A promise of something that a canvas can draw.
+export function picture(message) {
+  let {payload, encoding} = message;
+  if (encoding === "cdr") {
+    const cdr = new Cdr(payload);
+    cdr.header();
+    if (message.type === "sensor_msgs/msg/Image") return createImageBitmap(plain(cdr));
+    encoding = cdr.string().includes("png") ? "png" : "jpeg";
+    payload = cdr.bytes(cdr.uint());
+  }
+  return createImageBitmap(new Blob([payload], {type: "image/" + encoding}));
+}
+
+function plain(cdr) {
+  const [height, width] = [cdr.uint(), cdr.uint()], order = cdr.string();
+  cdr.at++;                                         // whether it is big endian
+  const step = cdr.uint(), data = cdr.bytes(cdr.uint());
+  const [red, green, blue, bytes] = {rgb8: [0, 1, 2, 3], bgr8: [2, 1, 0, 3], rgba8: [0, 1, 2, 4], bgra8: [2, 1, 0, 4]}[order] ?? [0, 0, 0, 1];
+  const image = new ImageData(width, height);
+  for (let y = 0, to = 0; y < height; y++)
+    for (let x = 0, from = y * step; x < width; x++, from += bytes, to += 4) {
+      image.data[to] = data[from + red];
+      image.data[to + 1] = data[from + green];
+      image.data[to + 2] = data[from + blue];
+      image.data[to + 3] = 255;
+    }
+  return image;
+}

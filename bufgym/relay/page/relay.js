@@ -1,0 +1,125 @@
+// The connection to the relay: says hello, subscribes, sends commands, and connects again by itself.
+
+import {decode, fromJson} from "./messages.js";
+
+const RETRY_MS = 500;
+
+export class Relay {
+  // on: {state(text, isOn), welcome(), message(message), said(object), unauthorized(why)}
+  constructor(on) {
+    this.on = on;
+    this.welcome = null;
+    this.received = 0;                              // the highest no_drop message that came
+    this.acked = 0;                                 // and the highest of ours that the relay holds
+    this.subscriptions = new Map();
+    this.commands = [];                             // not answered yet; the first is on its way
+    this.name = "page-" + [...crypto.getRandomValues(new Uint8Array(8))].map(byte => byte.toString(16).padStart(2, "0")).join("");
+    this.token = new URLSearchParams(location.hash.slice(1)).get("token") ?? sessionStorage.getItem("token");
+    this.connect();
+  }
+
+  connect() {
+    const address = new URL("relay", location.href);
+    address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+    address.hash = address.search = "";
+    this.socket = new WebSocket(address, ["bufgym.relay.v1"]);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onopen = () => {
+      // Without a session: it ends with the connection. A command that it leaves goes again, and says the same twice.
+      this.received = 0;
+      this.say("hello", {version: 1, name: this.name, form: "binary", ...(this.token ? {token: this.token} : {})});
+    };
+    this.socket.onmessage = event => this.hear(event.data);
+    this.socket.onclose = () => {
+      this.welcome = null;
+      this.on.state("not connected", false);
+      if (!this.refused) setTimeout(() => this.connect(), RETRY_MS);
+    };
+  }
+
+  authorize(token) {
+    this.token = token;
+    sessionStorage.setItem("token", token);
+    this.refused = false;
+    this.connect();
+  }
+
+  say(op, fields) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({op, ...fields}));
+  }
+
+  subscribe(id, topic, fields = {}) {
+    if (this.subscriptions.get(id)?.topic === topic) return;
+    this.subscriptions.set(id, {id, topic, ...fields});
+    if (this.welcome) this.say("subscribe", this.subscriptions.get(id));
+  }
+
+  unsubscribe(id) {
+    if (this.subscriptions.delete(id) && this.welcome) this.say("unsubscribe", {id});
+  }
+
+  // Done when the relay holds it; an error says why it does not.
+  command(topic, data) {
+    return new Promise((done, failed) => {
+      this.commands.push({topic, data, done, failed});
+      if (this.commands.length === 1 && this.welcome) this.sendCommand();
+    });
+  }
+
+  sendCommand() {
+    const [command] = this.commands;
+    if (command) this.say("publish", {topic: command.topic, data: command.data, encoding: "json", no_drop: true, seq: this.acked + 1});
+  }
+
+  mayCommand(topic) {
+    return (this.welcome?.rules ?? []).some(rule => {
+      try {
+        return rule.send && new RegExp(`^(?:${rule.topic})$`).test(topic);
+      } catch {
+        return rule.send;                           // a pattern that only the relay's engine knows: the relay will say
+      }
+    });
+  }
+
+  hear(data) {
+    if (typeof data !== "string") return this.take(decode(data));
+    const said = JSON.parse(data);
+    if (said.op === "message") this.take(fromJson(said));
+    else if (said.op === "welcome") {
+      this.welcome = said;
+      this.acked = said.received;
+      for (const subscription of this.subscriptions.values()) this.say("subscribe", subscription);
+      this.sendCommand();
+      this.on.state("live", true);
+      this.on.welcome();
+    } else if (said.op === "ack") this.answered(said.seq);
+    else if (said.op === "refused") this.refuse(said);
+    else this.on.said(said);
+  }
+
+  answered(seq) {
+    if (seq <= this.acked) return;
+    this.acked = seq;
+    this.commands.shift()?.done();
+    this.sendCommand();
+  }
+
+  refuse(said) {
+    if (said.what === "hello") {
+      this.refused = true;
+      this.on.unauthorized(said.why);
+    } else if (said.what === "publish" && said.topic === this.commands[0]?.topic) {
+      this.commands.shift().failed(new Error(said.why));
+      this.sendCommand();
+    } else this.on.said(said);
+  }
+
+  take(message) {
+    if (message.noDrop) {
+      if (message.seq <= this.received) return;
+      this.received = message.seq;
+      this.say("ack", {seq: message.seq});
+    }
+    this.on.message(message);
+  }
+}

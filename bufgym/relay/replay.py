@@ -1,0 +1,151 @@
+"""A relay's recordings for its page, piece by piece, as JSON: only topics that the viewer may receive.
+
+A recorder's file is a plain row of MCAP records, which may still grow. It is walked once, and where its messages lie in
+time is remembered, so that a piece from its middle is read from there.
+"""
+
+from __future__ import annotations
+
+import base64
+import bisect
+import io
+import json
+import struct
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final
+
+from bufgym.errors import BufgymError
+from bufgym.relay.extra import needs
+
+MOST_BYTES: Final = 4 * 2**20
+"""Of a piece's payloads."""
+_MAGIC: Final = b"\x89MCAP0\r\n"
+_RECORD: Final = struct.Struct("<BQ")
+_MESSAGE: Final = struct.Struct("<HIQQ")
+"""Channel, sequence number, when it was logged and when it was published, ns."""
+_SCHEMA, _CHANNEL, _MESSAGES, _CHUNK = 3, 4, 5, 6
+_STEP_BYTES: Final = 2**18
+"""Between two places of a file that are remembered."""
+
+
+def recordings(folder: Path | None) -> list[dict[str, Any]]:
+    """The files of a relay's recordings, the latest first."""
+    paths = [] if folder is None or not folder.is_dir() else folder.glob("*.mcap")
+    stats = [(path.name, path.stat()) for path in paths]
+    files = [{"name": name, "bytes": stat.st_size, "modified_us": stat.st_mtime_ns // 1000} for name, stat in stats]
+    return sorted(files, key=lambda file: (file["modified_us"], file["name"]), reverse=True)
+
+
+def piece(
+    folder: Path | None, file: str, from_us: int, most_bytes: int, may_receive: Callable[[str], bool]
+) -> dict[str, Any]:
+    """Messages of the recording ``file`` from that time on, with payloads of ``most_bytes`` or one message more.
+
+    ``next_us`` is where the next piece begins, None at the end.
+    """
+    if folder is None or file not in {one["name"] for one in recordings(folder)}:
+        raise BufgymError(f"recording {file!r}: there is none of this name")
+    recording = _recording(folder / file)
+    recording.walk()
+    messages: list[dict[str, Any]] = []
+    left_bytes, last_us, next_us = min(most_bytes, MOST_BYTES), -1, None
+    for channel, seq, time_us, payload in recording.messages(from_us):
+        if left_bytes <= 0 and time_us > last_us:
+            next_us = time_us
+            break
+        topic, type, encoding = recording.channels[channel]
+        if not may_receive(topic):
+            continue
+        try:
+            data = json.loads(payload) if encoding == "json" else base64.b64encode(payload).decode()
+        except ValueError:
+            continue
+        left_bytes -= len(payload)
+        last_us = time_us
+        messages.append(
+            {
+                "topic": topic,
+                "type": type,
+                "encoding": encoding,
+                "sender": "",
+                "seq": seq,
+                "stamp_us": time_us,
+                "no_drop": False,
+                "data": data,
+            }
+        )
+    return {"messages": messages, "next_us": next_us, "first_us": recording.first_us, "last_us": recording.last_us}
+
+
+class _Recording:
+    """What is known of a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.channels: dict[int, tuple[str, str, str]] = {}
+        """Number -> topic, type, encoding."""
+        self.first_us = self.last_us = 0
+        self._schemas: dict[int, str] = {0: ""}
+        self._times: list[int] = []
+        self._offsets: list[int] = []
+        self._end = len(_MAGIC)
+
+    def walk(self) -> None:
+        """Look at what has been written since the last time."""
+        for kind, offset, content in self._records(self._end):
+            if kind in (_SCHEMA, _CHANNEL):
+                self._declare(kind, content)
+            elif kind == _CHUNK:
+                raise BufgymError(f"recording {self.path.name}: has chunks, which no relay writes")
+            elif kind == _MESSAGES:
+                self.last_us = _MESSAGE.unpack_from(content)[2] // 1000
+                if not self._times:
+                    self.first_us = self.last_us
+                if not self._offsets or offset - self._offsets[-1] >= _STEP_BYTES:
+                    self._times.append(self.last_us)
+                    self._offsets.append(offset)
+            self._end = offset + _RECORD.size + len(content)
+
+    def messages(self, from_us: int) -> Iterator[tuple[int, int, int, bytes]]:
+        """(channel, number, when it was recorded in us, payload) of each message from that time on."""
+        if not self._offsets:
+            return
+        place = max(0, bisect.bisect_left(self._times, from_us) - 1)
+        for kind, _, content in self._records(self._offsets[place]):
+            if kind == _MESSAGES:
+                channel, seq, logged_ns, _ = _MESSAGE.unpack_from(content)
+                if logged_ns // 1000 >= from_us:
+                    yield channel, seq, logged_ns // 1000, content[_MESSAGE.size :]
+
+    def _declare(self, kind: int, content: bytes) -> None:
+        with needs("mcap"):
+            from mcap import records
+            from mcap.data_stream import ReadDataStream
+        stream = ReadDataStream(io.BytesIO(content))
+        if kind == _SCHEMA:
+            schema = records.Schema.read(stream)
+            self._schemas[schema.id] = "" if schema.name == "object" else schema.name
+        else:
+            channel = records.Channel.read(stream)
+            self.channels[channel.id] = channel.topic, self._schemas[channel.schema_id], channel.message_encoding
+
+    def _records(self, offset: int) -> Iterator[tuple[int, int, bytes]]:
+        """(kind, where it begins, content) of each whole record from there on."""
+        size = self.path.stat().st_size
+        with self.path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise BufgymError(f"recording {self.path.name}: must be an MCAP file")
+            file.seek(offset)
+            while offset + _RECORD.size <= size:
+                kind, length = _RECORD.unpack(file.read(_RECORD.size))
+                if offset + _RECORD.size + length > size:
+                    return  # it is being written, or broke off
+                yield kind, offset, file.read(length)
+                offset += _RECORD.size + length
+
+
+@lru_cache(maxsize=16)
+def _recording(path: Path) -> _Recording:
+    return _Recording(path)

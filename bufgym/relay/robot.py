@@ -1,0 +1,185 @@
+"""A robot at a relay: what a source publishes, how its queue is, and the commands that come to it.
+
+A robot's topics lie under ``/robots/NAME/``. Besides its source's it publishes ``queue`` five times a second and
+``status`` once: battery, location, network, queue, and what it publishes. A command ``{"command": "policy", "policy":
+"afr"}`` on its topic ``command`` puts another policy over its queue.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
+from typing import Any, Final, Protocol
+
+from bufgym.errors import BufgymError
+from bufgym.live.odometry import Odometry
+from bufgym.live.tasks import Tasks
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
+from bufgym.policies.registry import Policy, get
+from bufgym.relay import ros_messages, wire
+from bufgym.relay.client import Client
+from bufgym.relay.monitor import Monitor
+from bufgym.scenario import Stream
+
+STATUS_S: Final = 1.0
+QUEUE_S: Final = 0.2
+POLICIES: Final = ("robofleet", "afr", "min-motion-gap", "drop-oldest", "drop-newest", "fifo", "learned-scheduler")
+"""What a viewer may choose of, where the robot says nothing else."""
+_OWN: Final = tuple(
+    Stream(Topic(name, priority=20.0, weight=0.0), rate_hz, 1000) for name, rate_hz in (("status", 1.0), ("queue", 5.0))
+)
+
+
+class Source(Protocol):
+    """What a robot publishes: the made-up one, a recording, ROS, or any program."""
+
+    @property
+    def streams(self) -> Sequence[Stream]:
+        """Its topics, with the rules for each."""
+
+    async def run(self, robot: Robot) -> None:
+        """Publish with ``robot.publish``; returns when there is no more."""
+
+    def status(self) -> dict[str, Any]:
+        """What it knows of ``battery`` (0 to 1), and of ``location``."""
+
+    async def on_command(self, command: Any) -> None:
+        """A command that is not the robot's own."""
+
+
+class Robot:
+    """One robot's connection. See the module's text."""
+
+    def __init__(
+        self,
+        url: str,
+        name: str,
+        source: Source,
+        *,
+        policy: str | Policy = "robofleet",
+        capacity: int = 32,
+        window: int = 1,
+        value: Value | None = None,
+        policies: Sequence[str] = POLICIES,
+        **session: Any,
+    ) -> None:
+        """As a ``Client``; ``policies``: what commands may choose of."""
+        if not name or "/" in name:
+            raise BufgymError(f"robot {name!r}: a name must be a text without '/'")
+        self.name = name
+        self.source = source
+        streams = [*source.streams]
+        streams += [own for own in _OWN if own.topic.name not in {stream.topic.name for stream in streams}]
+        self._streams = {stream.topic.name: stream for stream in streams}
+        topics = [replace(stream.topic, name=self.topic(stream.topic.name)) for stream in streams]
+        self.monitor = Monitor([stream.topic for stream in streams], value)
+        self._policies = tuple(dict.fromkeys([get(policy).name, *policies]))
+        self._kinds: dict[str, dict[str, str]] = {}
+        self._odometry = Odometry()
+        self._location: dict[str, float] | None = None
+        self._began_s = time.monotonic()
+        self._pings = Tasks()
+        self.client = Client(
+            url,
+            name,
+            topics=topics,
+            policy=policy,
+            capacity=capacity,
+            window=window,
+            value=value,
+            log=self.monitor,
+            **session,
+        )
+        self.client.subscribe(f"^{self.topic('command')}$", self._command)
+
+    def topic(self, name: str) -> str:
+        """With the robot's name before it."""
+        return f"/robots/{self.name}/{name.lstrip('/')}"
+
+    # --- what it says -------------------------------------------------------------------------------------------------
+
+    def publish(self, topic: str, payload: bytes, encoding: str, type: str = "", stamp_us: int | None = None) -> None:
+        """Put a message of the source's topic into the queue, from any thread."""
+        stream = self._streams[topic]
+        self._kinds[topic] = {"type": type, "encoding": encoding}
+        if type in ros_messages.POSES and encoding in ("cdr", "ros1"):
+            self.locate(payload, type, encoding)
+        x = self._odometry.x if stream.moves else (time.monotonic() - self._began_s) * stream.unit_hz
+        self.client.publish(self.topic(topic), payload, encoding, type, x, stamp_us)
+
+    def locate(self, payload: bytes, type: str, encoding: str = "cdr") -> None:
+        """Take a pose, which says where the robot is and gives x to the topics that move."""
+        message = ros_messages.read(payload, type, encoding)
+        self._odometry.take(message)
+        pose = message.pose
+        while hasattr(pose, "pose"):
+            pose = pose.pose
+        self._location = ros_messages.planar(pose)
+
+    def say(self, topic: str, data: Any) -> None:
+        """Publish ``data`` as JSON."""
+        self.publish(topic, json.dumps(data, separators=(",", ":"), allow_nan=False).encode(), "json")
+
+    def status(self) -> dict[str, Any]:
+        """How it is."""
+        queue = self.monitor.state()
+        round_trip_s = self.client.round_trip_s
+        return {
+            "battery": None,
+            "location": self._location,
+            "network": {
+                "rate_bps": queue["rate_bps"],
+                "rtt_ms": None if round_trip_s is None else round(1000 * round_trip_s, 1),
+            },
+            "queue": queue,
+            "publishes": self._kinds,
+            "policies": self._policies,
+            **self.source.status(),
+        }
+
+    # --- what it does -------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Until the source has no more, or cancelled."""
+        own = [self.client.run(), self._every(STATUS_S, self._say_status), self._every(QUEUE_S, self._say_queue)]
+        tasks = [asyncio.create_task(work) for work in (self.source.run(self), *own)]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            await self._pings.end()
+
+    async def _every(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
+        await self.client.connected.wait()
+        loop = asyncio.get_running_loop()
+        next_s = loop.time()
+        while True:
+            await work()
+            next_s = max(next_s + period_s, loop.time())
+            await asyncio.sleep(next_s - loop.time())
+
+    async def _say_status(self) -> None:
+        self.say("status", self.status())
+        self._pings.begin(self.client.ping())
+
+    async def _say_queue(self) -> None:
+        self.say("queue", self.monitor.state())
+
+    async def _command(self, message: wire.Message) -> None:
+        try:
+            command = json.loads(bytes(message.payload))
+        except ValueError:
+            return  # a sender's mistake is no reason for a robot to stop
+        if isinstance(command, dict) and command.get("command") == "policy":
+            if command.get("policy") in self._policies:
+                await asyncio.to_thread(self.client.change, command["policy"])
+        else:
+            await self.source.on_command(command)

@@ -1,0 +1,124 @@
+"""Messages of ROS 2 in CDR, made and read without ROS (the library ``rosbags``)."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+from dataclasses import fields, is_dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.errors import BufgymError
+from bufgym.relay.extra import needs
+from bufgym.relay.room import Pose
+
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+SCAN: Final = "sensor_msgs/msg/LaserScan"
+POSES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+"""Types that say where a robot is."""
+
+
+@functools.cache
+def store() -> Any:
+    """The types of ROS 2."""
+    with needs("rosbags"):
+        from rosbags.typesys import Stores, get_typestore
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@functools.cache
+def _store_1() -> Any:
+    """Those of ROS 1."""
+    with needs("rosbags"):
+        from rosbags.typesys import Stores, get_typestore
+    return get_typestore(Stores.ROS1_NOETIC)
+
+
+def _header(time_us: int, frame: str) -> Any:
+    kinds = store().types
+    stamp = kinds["builtin_interfaces/msg/Time"](time_us // 10**6, time_us % 10**6 * 1000)
+    return kinds["std_msgs/msg/Header"](stamp, frame)
+
+
+def odometry(time_us: int, robot: str, pose: Pose, speed_m_s: float) -> bytes:
+    """A ``nav_msgs/msg/Odometry``."""
+    kinds, zeros = store().types, np.zeros(36)
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(pose.yaw / 2), math.cos(pose.yaw / 2))
+    place = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](pose.x, pose.y, 0.0), turn)
+    motion = kinds["geometry_msgs/msg/Twist"](vector(speed_m_s, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+    message = kinds[ODOMETRY](
+        _header(time_us, "map"),
+        f"{robot}/base",
+        kinds["geometry_msgs/msg/PoseWithCovariance"](place, zeros),
+        kinds["geometry_msgs/msg/TwistWithCovariance"](motion, zeros),
+    )
+    return bytes(store().serialize_cdr(message, ODOMETRY))
+
+
+def scan(time_us: int, robot: str, angles: NDArray[np.float64], ranges_m: NDArray[np.float64]) -> bytes:
+    """A ``sensor_msgs/msg/LaserScan`` of these equally spaced angles."""
+    step = float(angles[1] - angles[0])
+    ends = float(angles[0]), float(angles[-1])
+    ranges, intensities = ranges_m.astype(np.float32), np.zeros(0, np.float32)
+    message = store().types[SCAN](
+        _header(time_us, f"{robot}/base"), *ends, step, 0.0, 0.1, 0.05, 30.0, ranges, intensities
+    )
+    return bytes(store().serialize_cdr(message, SCAN))
+
+
+def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:
+    """The message; a BufgymError if it is none of this type."""
+    try:
+        if encoding == "ros1":
+            return _store_1().deserialize_ros1(payload, type)
+        return store().deserialize_cdr(payload, type)
+    except BufgymError:
+        raise
+    except Exception as error:  # what does not fit fails in many ways
+        raise BufgymError(f"message of {len(payload)} bytes: no {type} in {encoding}: {error}") from None
+
+
+def planar(pose: Any) -> dict[str, float]:
+    """A ``geometry_msgs/msg/Pose`` seen from above."""
+    place, turn = pose.position, pose.orientation
+    yaw = math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
+    return {"x": round(place.x, 3), "y": round(place.y, 3), "yaw": round(yaw, 4)}
+
+
+def modern(payload: bytes, type: str, encoding: str) -> tuple[str, bytes]:
+    """(encoding, payload) in CDR where it was ROS 1's and the type is common to both; else as it is."""
+    if encoding == "ros1" and type in store().types:
+        with contextlib.suppress(Exception):  # a type of this name, but not this form
+            message = _moulded(_store_1().deserialize_ros1(payload, type), store())
+            return "cdr", bytes(store().serialize_cdr(message, type))
+    return encoding, payload
+
+
+def _moulded(value: Any, types: Any) -> Any:
+    """The message as the other version of ROS has it: the same fields, but for a header's number."""
+    if isinstance(value, list):
+        return [_moulded(one, types) for one in value]
+    if not is_dataclass(value):
+        return value
+    kind = types.types[getattr(value, "__msgtype__")]  # noqa: B009  (a field of the library's own)
+    return kind(**{one.name: _moulded(getattr(value, one.name, 0), types) for one in fields(kind)})
+
+
+def as_ros1(payload: bytes, type: str) -> bytes:
+    """A message in CDR as ROS 1 has it."""
+    try:
+        message = _moulded(store().deserialize_cdr(payload, type), _store_1())
+        return bytes(_store_1().serialize_ros1(message, type))
+    except Exception as error:  # what does not fit fails in many ways
+        raise BufgymError(f"message of {len(payload)} bytes: no {type}: {error}") from None
+
+
+def definition(type: str) -> str | None:
+    """The type's definition with all that it uses, as recordings carry it; None for a type that is not known here."""
+    if type not in store().types:
+        return None
+    return str(store().generate_msgdef(type, ros_version=2)[0])

@@ -1,0 +1,306 @@
+"""A session at a relay: connects out, again and again if need be; subscribes; sends commands that arrive exactly once.
+
+This is all that a viewer needs. ``client.Client`` adds a queue, for what a robot publishes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import json
+import os
+import re
+import ssl
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from bufgym.errors import BufgymError
+from bufgym.files import read_utf8
+from bufgym.live.sockets import connected, unacked_bytes
+from bufgym.live.tasks import Tasks
+from bufgym.relay import wire
+from bufgym.relay.extra import needs
+from bufgym.relay.unanswered import Unanswered
+
+TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
+RETRY_S: Final = 0.5
+PATIENCE_S: Final = 5.0
+"""For a connection, and for the relay's welcome."""
+_MAX_TOKEN_BYTES: Final = 2**16
+_MAX_FRAME_BYTES: Final = 2**26
+
+OnMessage = Callable[[wire.Message], Awaitable[None] | None]
+
+
+class RefusedError(BufgymError):
+    """The relay does not let this client in."""
+
+
+@dataclass(frozen=True)
+class Subscription:
+    """What is wanted of the relay."""
+
+    pattern: re.Pattern[str]
+    on_message: OnMessage
+    fields: dict[str, Any]
+
+
+def token(path: str | Path | None = None) -> str | None:
+    """The token in this file, or in the environment's ``BUFGYM_RELAY_TOKEN``; None without either."""
+    if path is not None:
+        return read_utf8(path, _MAX_TOKEN_BYTES).strip()
+    return os.environ.get(TOKEN_VARIABLE) or None
+
+
+def security(authority: str | None = None, certificate: str | None = None) -> ssl.SSLContext | None:
+    """For ``wss``: who signs the relay's certificate, the client's own with its key, PEM files; None for neither."""
+    if authority is None and certificate is None:
+        return None
+    try:
+        context = ssl.create_default_context(cafile=authority)
+        if certificate is not None:
+            context.load_cert_chain(certificate)
+    except (OSError, ssl.SSLError) as error:
+        raise BufgymError(f"{certificate or authority}: no certificate: {error}") from None
+    return context
+
+
+class Session:
+    """One name at a relay, over as many connections as it takes."""
+
+    def __init__(
+        self,
+        url: str,
+        name: str,
+        *,
+        token: str | None = None,
+        tls: ssl.SSLContext | None = None,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """
+        Args:
+            url: the relay's, ``ws://HOST:PORT`` or ``wss://HOST:PORT``.
+            name: what others see as the sender.
+            token: says who this is, where the relay wants one; ``token()`` finds it.
+            tls: for ``wss``, with a client's certificate if the relay knows it by that (default: the system's).
+            say: takes a line for what the relay refuses, and why connections ended.
+        """
+        self.address = urlsplit(url)
+        if self.address.scheme not in ("ws", "wss") or not self.address.hostname:
+            raise BufgymError(f"{url}: must be ws://HOST:PORT or wss://HOST:PORT")
+        self.name = name
+        self.connected = asyncio.Event()
+        """Set while the relay has said welcome."""
+        self.ready = asyncio.Event()
+        """Set while the relay has taken all subscriptions too."""
+        self.welcome: dict[str, Any] = {}
+        """What it said, the last time."""
+        self.faults: deque[str] = deque(maxlen=100)
+        """Why connections ended, and what was refused, the last 100."""
+        self.round_trip_s: float | None = None
+        """To the relay and back, behind what is on its way, as ``ping`` last measured it."""
+        self._token, self._tls, self._report = token, tls, say
+        self._session = f"{re.sub('[^A-Za-z0-9._-]', '-', name)[:40]}-{os.urandom(8).hex()}"
+        self._no_drop: tuple[re.Pattern[str], ...] = ()
+        self._unanswered = Unanswered()
+        self._wanted = asyncio.Event()
+        self._received = 0
+        self._subscriptions: dict[str, Subscription] = {}
+        self._confirmed: set[str] = set()
+        self._connection: Any = None
+        self._tasks = Tasks()
+
+    async def command(self, topic: str, data: Any) -> None:
+        """Send ``data`` (JSON) on a no_drop topic; returns once the relay holds it. It arrives exactly once.
+
+        Raises:
+            BufgymError: the relay refused it, and why.
+        """
+        payload = json.dumps(data, separators=(",", ":"), allow_nan=False).encode()
+        message = wire.Message(topic, payload, stamp_us=time.time_ns() // 1000, no_drop=True)
+        answered = self._unanswered.put(message)
+        self._wanted.set()
+        await answered
+
+    def subscribe(
+        self,
+        pattern: str,
+        on_message: OnMessage,
+        *,
+        policy: str | None = None,
+        capacity: int | None = None,
+        durable: bool = False,
+    ) -> None:
+        """``on_message`` gets what is published on topics in which ``pattern`` is found, as far as the rules allow.
+
+        ``policy`` and ``capacity``: of the relay's queue for it. ``durable``: no_drop messages are held while this
+        client is away.
+        """
+        id = str(len(self._subscriptions))
+        chosen = {"policy": policy, "capacity": capacity, "durable": durable or None}
+        fields = {"id": id, "topic": pattern, **{key: value for key, value in chosen.items() if value is not None}}
+        try:
+            self._subscriptions[id] = Subscription(re.compile(pattern), on_message, fields)
+        except re.error as error:
+            raise BufgymError(f"subscription {pattern!r}: no regular expression: {error}") from None
+        self.ready.clear()
+        if self.connected.is_set():
+            self._tasks.begin(self._say_it("subscribe", **fields))
+
+    # --- its connection -----------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Connect, and again whenever the connection ends, until cancelled.
+
+        Raises:
+            RefusedError: the relay does not let this client in.
+        """
+        with needs("websockets"):
+            from websockets.exceptions import WebSocketException
+        try:
+            while True:
+                try:
+                    async with asyncio.timeout(PATIENCE_S):
+                        self._connection = await self._connect()
+                        await self._greet()
+                    await self._converse()
+                except (OSError, TimeoutError, wire.WireError, WebSocketException) as error:
+                    # A relay that does not even talk to this address says why in its page.
+                    page = getattr(getattr(error, "response", None), "body", None) or b""
+                    self._note(f"{type(error).__name__}: {error} {page.decode(errors='replace')}".strip())
+                finally:
+                    self.connected.clear()
+                    self.ready.clear()
+                    self._confirmed.clear()
+                    if self._connection is not None:
+                        self._connection.transport.abort()
+                        self._connection = None
+                await asyncio.sleep(RETRY_S)
+        finally:
+            self._unanswered.give_up(f"{self.name}: the client has ended")
+            await self._tasks.end()
+
+    def _note(self, fault: str) -> None:
+        if not self.faults or self.faults[-1] != fault:
+            self._report(f"{self.name}: {fault}")
+        self.faults.append(fault)
+
+    async def _connect(self) -> Any:
+        from websockets.asyncio.client import connect
+        from websockets.typing import Subprotocol
+
+        secure = self.address.scheme == "wss"
+        host, port = self.address.hostname or "", self.address.port or (443 if secure else 80)
+        return await connect(
+            f"{self.address.scheme}://{self.address.netloc}{wire.PATH}",
+            sock=await connected(host, port),
+            subprotocols=[Subprotocol(wire.SUBPROTOCOL)],
+            ssl=(self._tls or ssl.create_default_context()) if secure else None,
+            server_hostname=host if secure else None,
+            compression=None,
+            ping_interval=None,  # a slow link answers late; TCP_USER_TIMEOUT finds a dead one
+            proxy=None,
+            max_size=_MAX_FRAME_BYTES,
+            write_limit=(1, 0),
+        )
+
+    async def _say_it(self, op: str, **fields: Any) -> None:
+        await self._connection.send(wire.say(op, **fields))
+
+    async def _greet(self) -> None:
+        hello: dict[str, Any] = {"version": wire.VERSION, "name": self.name, "session": self._session, "form": "binary"}
+        if self._token is not None:
+            hello["token"] = self._token
+        await self._say_it("hello", **hello, received=self._received, acked=self._unanswered.acked)
+        said = wire.heard(await self._connection.recv())
+        if said["op"] == "refused":
+            raise RefusedError(f"{self.address.geturl()}: refused: {said['code']}: {said['why']}")
+        if said["op"] != "welcome":
+            raise wire.WireError(f"op {said['op']!r}: must be welcome")
+        self.welcome = said
+        self._no_drop = tuple(re.compile(pattern) for pattern in said.get("no_drop", ()))
+        self._unanswered.resume(said["received"], max(1, said["window"]))
+        for subscription in self._subscriptions.values():
+            await self._say_it("subscribe", **subscription.fields)
+        self.connected.set()
+        self._confirm()
+
+    def _confirm(self) -> None:
+        if self._confirmed.issuperset(self._subscriptions):
+            self.ready.set()
+
+    def _works(self) -> list[Coroutine[Any, Any, None]]:
+        """What goes on while there is a connection."""
+        return [self._send_no_drop(), self._take_all()]
+
+    async def _converse(self) -> None:
+        """Send, and take what comes, until the connection ends."""
+        tasks = [asyncio.create_task(work) for work in self._works()]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            ended = await asyncio.gather(*tasks, return_exceptions=True)
+        for error in ended:
+            if isinstance(error, Exception):
+                raise error
+
+    def _left_bytes(self) -> int | None:
+        connection = self._connection
+        if connection is None:
+            return None
+        unacked = unacked_bytes(connection.transport.get_extra_info("socket"))
+        return None if unacked is None else connection.transport.get_write_buffer_size() + unacked
+
+    async def _send_no_drop(self) -> None:
+        while True:
+            while (message := self._unanswered.next()) is not None:
+                await self._connection.send(wire.encode(message))
+            self._wanted.clear()
+            await self._wanted.wait()
+
+    async def ping(self) -> None:
+        """Measure ``round_trip_s``; returns when the relay has answered."""
+        if self._connection is not None:
+            self.round_trip_s = await (await self._connection.ping())
+
+    # --- in -----------------------------------------------------------------------------------------------------------
+
+    async def _take_all(self) -> None:
+        async for frame in self._connection:
+            if isinstance(frame, bytes):
+                await self._take(wire.decode(frame, _MAX_FRAME_BYTES))
+            else:
+                self._answer(wire.heard(frame))
+        raise ConnectionResetError("the relay has closed the connection")
+
+    async def _take(self, message: wire.Message) -> None:
+        if message.no_drop and message.seq <= self._received:
+            return  # it came before the connection broke
+        for subscription in list(self._subscriptions.values()):
+            if subscription.pattern.search(message.topic):
+                done = subscription.on_message(message)
+                if inspect.isawaitable(done):
+                    await done
+        if message.no_drop:
+            self._received = message.seq
+            await self._say_it("ack", seq=message.seq)
+
+    def _answer(self, said: dict[str, Any]) -> None:
+        if said["op"] == "ack":
+            self._unanswered.ack(said["seq"])
+        elif said["op"] == "subscribed":
+            self._confirmed.add(said["id"])
+            self._confirm()
+        elif said["op"] == "refused":
+            if said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
+                self._unanswered.refuse(said["code"], said["why"])
+            else:
+                self._note(f"{said['what']} refused: {said['code']}: {said['why']}")
+        self._wanted.set()

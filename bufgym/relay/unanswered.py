@@ -1,0 +1,111 @@
+"""What a client has under way on no_drop topics: numbered, held until the relay answers, numbered anew if refused.
+
+The relay takes number k only after k - 1, and answers each once, in order. A refused number was not used: so once all
+that are under way are answered, those behind it go again, from that number on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from dataclasses import dataclass
+
+from bufgym.errors import BufgymError
+from bufgym.relay import wire
+
+AGAIN = "out_of_order"
+"""Why a message behind a refused one is refused itself: it goes again."""
+
+
+@dataclass
+class Pending:
+    """A message on its way."""
+
+    message: wire.Message
+    answered: asyncio.Future[None]
+    """Done when the relay holds it; a BufgymError when it was refused."""
+
+
+class Unanswered:
+    """The messages of one session, in order."""
+
+    def __init__(self) -> None:
+        self.acked = 0
+        """The highest number that the relay holds."""
+        self.window = 1
+        """n_T: so many may be unanswered."""
+        self._waiting: deque[Pending] = deque()
+        self._sent: deque[Pending] = deque()
+        self._again: list[Pending] = []
+        self._refused = 0
+        """Refusals since the last answer that was none, while there are more to come."""
+
+    def __len__(self) -> int:
+        """Messages that the relay has not answered."""
+        return len(self._waiting) + len(self._sent) + len(self._again)
+
+    def put(self, message: wire.Message) -> asyncio.Future[None]:
+        """A message; done once the relay holds it."""
+        pending = Pending(message, asyncio.get_running_loop().create_future())
+        self._waiting.append(pending)
+        return pending.answered
+
+    def next(self) -> wire.Message | None:
+        """The next to send, with its number; None where nothing waits, the window is full, or refusals are to come."""
+        if not self._waiting or self._refused or len(self._sent) >= self.window:
+            return None
+        self._sent.append(self._waiting.popleft())
+        return self._sent[-1].message._replace(seq=self.acked + len(self._sent))
+
+    def ack(self, seq: int) -> None:
+        """The relay holds this one and all before it."""
+        while self._sent and self.acked < seq and not self._refused:
+            self.acked += 1
+            _settle(self._sent.popleft())
+
+    def expects(self, topic: str, seq: int | None) -> bool:
+        """Whether the next answer is about this message."""
+        return bool(
+            self._sent and self._sent[0].message.topic == topic and seq in (None, self.acked + self._refused + 1)
+        )
+
+    def refuse(self, code: str, why: str) -> None:
+        """The relay has not taken the oldest that is unanswered."""
+        if not self._sent:
+            return
+        pending = self._sent.popleft()
+        if code == AGAIN:
+            self._again.append(pending)
+        else:
+            _settle(pending, BufgymError(f"topic {pending.message.topic}: refused: {code}: {why}"))
+        # Whatever is under way behind a refused one is refused as well: nothing new goes before all of it is back.
+        self._refused += 1
+        if not self._sent:
+            self._refused = 0
+            self._waiting.extendleft(reversed(self._again))
+            self._again.clear()
+
+    def resume(self, received: int, window: int) -> None:
+        """After a new connection: the relay holds all up to ``received``; the rest goes again."""
+        self.window = window
+        self.ack(received)
+        self._waiting.extendleft(reversed([*self._again, *self._sent]))
+        self._again.clear()
+        self._sent.clear()
+        self._refused = 0
+        self.acked = received
+
+    def give_up(self, why: str) -> None:
+        """Nothing will be answered any more."""
+        for pending in (*self._again, *self._sent, *self._waiting):
+            _settle(pending, BufgymError(why))
+
+
+def _settle(pending: Pending, error: BufgymError | None = None) -> None:
+    if pending.answered.done():  # who waited has given up
+        return
+    if error is None:
+        pending.answered.set_result(None)
+    else:
+        pending.answered.set_exception(error)
+        pending.answered.exception()  # it may be that nobody asks, which is no fault of theirs

@@ -1,0 +1,206 @@
+"""Robots: what a made-up one sees, how a queue is told, recordings, commands."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from relay_cases import relay, settings
+from test_client import compiled, until
+
+from bufgym.errors import BufgymError
+from bufgym.model import qoi
+from bufgym.model.topics import Topic
+from bufgym.relay import ros_messages, wire
+from bufgym.relay.bag import Recorded
+from bufgym.relay.madeup import MadeUp
+from bufgym.relay.monitor import Monitor
+from bufgym.relay.robot import Robot
+from bufgym.relay.room import HALF_M, PICTURE, Pose, cast, jpeg, picture, pose_at
+from bufgym.relay.session import Session
+
+pytest.importorskip("rosbags", reason="no rosbags here: the extra relay")
+pytest.importorskip("PIL", reason="no Pillow here: the extra relay")
+
+
+# --- the made-up room ------------------------------------------------------------------------------------------------
+
+
+def test_rays_by_hand() -> None:
+    """From (-3, 0), looking along x: the table in the middle begins at x = -1.4; behind is the room's wall at -6."""
+    pose = Pose(-3.0, 0.0, 0.0)
+    distance, _, along = cast(pose, np.radians([0.0, 90.0, 180.0, -90.0]))
+    assert distance == pytest.approx([3 - 1.4, HALF_M[1], 3.0, HALF_M[1]])
+    assert along[0] == pytest.approx(0.6)  # the middle of its short side, 1.2 m
+    assert cast(pose._replace(yaw=math.pi / 2), np.array([0.0]))[0] == pytest.approx([HALF_M[1]])
+
+
+def test_robots_stay_clear_of_all_walls() -> None:
+    everywhere = np.radians(np.arange(0, 360, 5.0))
+    for number in range(20):
+        for time_s in np.linspace(0, 40, 80):
+            assert cast(pose_at(number, float(time_s)), everywhere)[0].min() > 0.25, number
+
+
+def test_the_camera_sees_ceiling_wall_and_floor() -> None:
+    frame = picture(Pose(-3.0, 0.0, math.pi))  # 3 m before the room's wall
+    assert frame.shape == (PICTURE[1], PICTURE[0], 3)
+    top, middle, bottom = (frame[row, PICTURE[0] // 2].astype(int) for row in (0, PICTURE[1] // 2, -1))
+    assert top.min() > 150 and middle[0] > middle[2] + 8 and bottom.max() < 130  # light; warm; dark tiles
+    assert jpeg(frame)[:3] == b"\xff\xd8\xff"
+
+
+# --- how a queue is --------------------------------------------------------------------------------------------------
+
+
+def test_a_queue_told_by_hand() -> None:
+    """Five messages of 1,000 bytes half a second apart; 0, 1 and 4 leave, 2 and 3 are dropped: x = 0, 1, 4.
+
+    V halves with each step of x: H = 1 + 1/2 + 7/8 of all five's 1 + 4/2.
+    """
+    now_s = 0.0
+    monitor = Monitor([Topic("a"), Topic("b")], qoi.exponential(0.5), clock=lambda: now_s)
+    monitor(0, {"event": "settings", "policy": "afr", "capacity": 2})
+    for seq in range(5):
+        now_s = seq / 2
+        monitor(0, {"event": "put", "seq": seq, "x": float(seq), "topic": 0, "size_bytes": 1000})
+        if seq in (0, 1, 4):
+            monitor(0, {"event": "dequeued", "seq": seq})
+            monitor(0, {"event": "gone", "seq": seq})
+        else:
+            monitor(0, {"event": "dropped", "seq": seq, "why": "rejected"})
+    now_s = 2.25
+    monitor(0, {"event": "put", "seq": 5, "x": 5.0, "topic": 1, "size_bytes": 10})
+    state = monitor.state()
+    assert (state["policy"], state["capacity"], state["queued"], state["waiting"]) == ("afr", 2, 1, [1])
+    assert (state["put"], state["left"], state["dropped"]) == (6, 3, 2)
+    assert state["rate_bps"] == 8_000  # 1,000 bytes in the last second
+    h = 1 + 0.5 + 0.875
+    assert state["topics"]["a"] == {"put": 5, "left": 3, "dropped": 2, "age_s": 0.25, "qoi": round(h / 3, 3)}
+    assert state["topics"]["b"]["age_s"] is None and state["qoi"] == round(h / 3, 3)
+
+
+def test_a_new_queue_counts_on() -> None:
+    monitor = Monitor([Topic("a")], clock=lambda: 0.0)
+    for number, policy in enumerate(("afr", "drop-oldest")):
+        monitor(number, {"event": "settings", "policy": policy, "capacity": 2})
+        monitor(number, {"event": "put", "seq": 0, "x": 0.0, "topic": 0, "size_bytes": 1})
+        monitor(number, {"event": "dequeued", "seq": 0})
+        monitor(number, {"event": "gone", "seq": 0})
+    assert monitor.state()["policy"] == "drop-oldest" and monitor.state()["left"] == 2
+
+
+# --- messages of ROS -------------------------------------------------------------------------------------------------
+
+
+def test_messages_read_as_they_were_made() -> None:
+    made = ros_messages.odometry(1_500_000, "r", Pose(1.0, -2.0, 0.5), 0.25)
+    read = ros_messages.read(made, ros_messages.ODOMETRY)
+    assert (read.header.stamp.sec, read.header.stamp.nanosec, read.child_frame_id) == (1, 500_000_000, "r/base")
+    assert ros_messages.planar(read.pose.pose) == {"x": 1.0, "y": -2.0, "yaw": 0.5}
+    angles = np.radians([-90.0, 0.0, 90.0])
+    scan = ros_messages.read(ros_messages.scan(0, "r", angles, np.array([1.0, 2.0, 3.0])), ros_messages.SCAN)
+    assert scan.ranges.tolist() == [1, 2, 3] and scan.angle_increment == pytest.approx(math.pi / 2)
+    with pytest.raises(BufgymError, match="message of 3 bytes: no nav_msgs/msg/Odometry in cdr"):
+        ros_messages.read(b"abc", ros_messages.ODOMETRY)
+    old = ros_messages.as_ros1(made, ros_messages.ODOMETRY)
+    assert ros_messages.modern(old, ros_messages.ODOMETRY, "ros1") == ("cdr", made)
+    assert ros_messages.modern(b"?", "my_msgs/msg/Own", "ros1") == ("ros1", b"?")
+    assert "float32[] ranges" in (ros_messages.definition(ros_messages.SCAN) or "")
+
+
+# --- at a relay ------------------------------------------------------------------------------------------------------
+
+
+async def watched(source: Any, story: Any, **robot: Any) -> dict[str, list[wire.Message]]:
+    """What a viewer receives of a robot while ``story(viewer, came)`` goes on."""
+    came: dict[str, list[wire.Message]] = defaultdict(list)
+    async with relay(settings(policies=("drop-oldest",))) as server:
+        url = f"ws://127.0.0.1:{server.port}"
+        viewer = Session(url, "viewer")
+        viewer.subscribe("^/robots/", lambda message: came[message.topic].append(message))
+        tasks = [asyncio.create_task(viewer.run())]
+        await viewer.ready.wait()
+        tasks.append(asyncio.create_task(Robot(url, "r", source, capacity=16, **robot).run()))
+        try:
+            await asyncio.wait_for(story(viewer, came), 60)
+        finally:
+            for task in tasks:
+                task.cancel()
+            ended = await asyncio.gather(*tasks, return_exceptions=True)
+    for error in ended:
+        if isinstance(error, Exception):
+            raise error
+    return came
+
+
+@compiled
+def test_the_made_up_robot_and_a_command() -> None:
+    async def story(viewer: Session, came: dict[str, list[wire.Message]]) -> None:
+        topics = [f"/robots/r/{name}" for name in ("odom", "scan", "camera", "queue", "status")]
+        await until(lambda: all(len(came[topic]) >= 2 for topic in topics))
+        for wrong in ({"command": "policy", "policy": "oracle"}, "stop", 3):
+            await viewer.command("/robots/r/command", wrong)
+        await viewer.command("/robots/r/command", {"command": "policy", "policy": "drop-newest"})
+        await until(lambda: json.loads(bytes(came["/robots/r/queue"][-1].payload))["policy"] == "drop-newest")
+
+    came = asyncio.run(watched(MadeUp(), story, policy="drop-oldest", policies=("drop-newest",)))
+    status = json.loads(bytes(came["/robots/r/status"][-1].payload))
+    assert 0.9 < status["battery"] <= 1 and abs(status["location"]["x"]) < HALF_M[0]
+    assert status["policies"] == ["drop-oldest", "drop-newest"]
+    assert status["publishes"]["scan"] == {"type": ros_messages.SCAN, "encoding": "cdr"}
+    assert set(status["queue"]["topics"]) == {"status", "queue", "odom", "scan", "camera"}
+    assert all(message.sender == "r" for messages in came.values() for message in messages if not message.no_drop)
+    pose = ros_messages.read(bytes(came["/robots/r/odom"][0].payload), ros_messages.ODOMETRY)
+    assert abs(pose.pose.pose.position.y) < HALF_M[1]
+    assert bytes(came["/robots/r/camera"][0].payload[:2]) == b"\xff\xd8"
+
+
+def recording(path: Path) -> Path:
+    """Two topics over a second: 10 scans, and 5 messages of a type of one's own."""
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        scans = writer.register_channel("/scan", "cdr", writer.register_schema(ros_messages.SCAN, "ros2msg", b""))
+        notes = writer.register_channel("/notes", "json", writer.register_schema("own", "jsonschema", b"{}"))
+        for k in range(10):
+            payload = ros_messages.scan(k, "bag", np.radians([0.0, 1.0]), np.array([float(k), 1.0]))
+            writer.add_message(scans, log_time=k * 10**8, publish_time=k * 10**8, data=payload)
+            if k % 2 == 0:
+                writer.add_message(notes, log_time=k * 10**8 + 1, publish_time=0, data=b'{"k":%d}' % k)
+        writer.finish()
+    return path
+
+
+@compiled
+def test_a_recording_is_a_robot(tmp_path: Path) -> None:
+    async def story(viewer: Session, came: dict[str, list[wire.Message]]) -> None:
+        await until(lambda: len(came["/robots/r/scan"]) >= 12 and came["/robots/r/status"])
+
+    source = Recorded(recording(tmp_path / "drive.mcap"))
+    assert [(stream.topic.name, stream.rate_hz) for stream in source.streams] == [("notes", 5.0), ("scan", 10.0)]
+    came = asyncio.run(watched(source, story, policy="drop-oldest"))
+    ranges = [ros_messages.read(bytes(one.payload), one.type).ranges[0] for one in came["/robots/r/scan"]]
+    start = ranges.index(0.0)
+    assert ranges[start : start + 3] == [0, 1, 2] and len(ranges) > 10  # it begins anew
+    assert came["/robots/r/notes"][0].encoding == "json"
+    assert json.loads(bytes(came["/robots/r/status"][0].payload))["recording"] == "drive.mcap"
+
+
+def test_what_a_recording_lacks(tmp_path: Path) -> None:
+    path = recording(tmp_path / "drive.mcap")
+    camera = [stream for stream in MadeUp().streams if stream.topic.name == "camera"]
+    with pytest.raises(BufgymError, match=r"no messages of topic '/camera'; it has: /notes, /scan"):
+        Recorded(path, camera)
+    with pytest.raises(BufgymError, match="no such file"):
+        Recorded(tmp_path / "none.mcap")
+    with pytest.raises(BufgymError, match="robot 'a/b': a name must be a text without '/'"):
+        Robot("ws://a:1", "a/b", MadeUp())
