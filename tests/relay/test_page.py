@@ -22,7 +22,7 @@ CHROMIUM = shutil.which("chromium")
 pytestmark = [compiled, pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")]
 
 SEES = """canvas => {
-  const {data} = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height), seen = new Set();
+  const {data} = canvas.getContext("2d", {willReadFrequently: true}).getImageData(0, 0, canvas.width, canvas.height), seen = new Set();
   for (let k = 0; k < data.length; k += 4)
     if (data[k + 3]) seen.add(data[k] >> 4 << 8 | data[k + 1] >> 4 << 4 | data[k + 2] >> 4);
   return seen.size;
@@ -67,7 +67,7 @@ class Page:
         self.page = browser.new_page(**options)
         self.faults: list[str] = []
         self.asked: list[str] = []
-        self.page.on("console", lambda message: self.faults.append(message.text))
+        self.page.on("console", lambda message: self.faults.append(message.text) if message.type == "error" else None)
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(f"http://127.0.0.1:{port}/")
