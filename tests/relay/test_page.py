@@ -22,7 +22,8 @@ CHROMIUM = shutil.which("chromium")
 pytestmark = [compiled, pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")]
 
 SEES = """canvas => {
-  const {data} = canvas.getContext("2d", {willReadFrequently: true}).getImageData(0, 0, canvas.width, canvas.height), seen = new Set();
+  const seen = new Set();
+  const {data} = canvas.getContext("2d", {willReadFrequently: true}).getImageData(0, 0, canvas.width, canvas.height);
   for (let k = 0; k < data.length; k += 4)
     if (data[k + 3]) seen.add(data[k] >> 4 << 8 | data[k + 1] >> 4 << 4 | data[k + 2] >> 4);
   return seen.size;
