@@ -34,11 +34,10 @@ class Margin:
     """Live over simulated."""
 
     def __str__(self) -> str:
-        live, simulated = (_percent(interval) for interval in (self.live, self.simulated))
-        return (
-            f"{self.policy} against {self.reference}, {self.episodes} episodes: regret lower by {live} live, "
-            f"{simulated} simulated: {_percent(self.share)} of the simulator's margin is there live."
-        )
+        live, simulated, share = map(_percent, (self.live, self.simulated, self.share))
+        lower = f"{self.policy} against {self.reference}, {self.episodes} episodes: regret lower by"
+        there = f": {share} of the simulator's margin is there live" if self.simulated.value > 0 else ""
+        return f"{lower} {live} live, {simulated} simulated{there}."
 
 
 def _percent(interval: Interval) -> str:

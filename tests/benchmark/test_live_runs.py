@@ -39,6 +39,6 @@ def test_nothing_is_said_of_a_single_episode_or_without_the_reference() -> None:
     assert margins([one("random", 0, 4.1, 4.2), one("random", 1, 4.1, 4.2)]) == []
 
 
-def test_a_share_of_nothing_is_a_dash() -> None:
+def test_there_is_no_share_of_nothing() -> None:
     [margin] = margins([*AFR, one("random", 0, 4.1, 4.0), one("random", 1, 3.2, 3.0)])
-    assert "0.000 % [0.000, 0.000] simulated: –" in str(margin)
+    assert str(margin).endswith("[2.00, 4.00] live, 0.000 % [0.000, 0.000] simulated.")
