@@ -9,6 +9,8 @@ import asyncio
 import importlib
 import multiprocessing
 import os
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -88,12 +90,21 @@ class Program:
 
 
 def _run(work: Callable[[Connection], None], words: Connection, failures: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's, who ends us
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     os.environ["PYTHONWARNINGS"] = "ignore"
     try:
         work(words)
     except Exception as error:
         failures.send(str(error) if isinstance(error, BufgymError) else f"{type(error).__name__}: {error}")
     os._exit(0)  # the threads of ROS have nothing left to say
+
+
+def _end_with(parent: int) -> None:
+    """A program does not outlive a parent that was killed."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
 
 
 @contextmanager

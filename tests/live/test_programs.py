@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 import time
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,6 +55,31 @@ def test_a_program_is_spoken_to_and_may_be_silent() -> None:
         assert asyncio.run(echo.told()) == {"port": 3}
         with pytest.raises(BufgymError, match=r"echo: said nothing for 0\.1 s"):
             asyncio.run(echo.told(patience_s=0.1))
+
+
+PARENT = """
+import multiprocessing, os, signal, threading
+from bufgym.live.programs import programs
+with programs(idle=lambda parent: threading.Event().wait()):
+    print(multiprocessing.active_children()[0].pid, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_no_program_outlives_a_parent_that_was_killed() -> None:
+    told = subprocess.run([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True, check=False, timeout=60)
+    pid, patience_s = int(told.stdout), time.monotonic() + 20
+    while running(pid) and time.monotonic() < patience_s:
+        time.sleep(0.1)
+    assert not running(pid)
+
+
+def running(pid: int) -> bool:
+    """Whether there is such a process, but for one that has ended and that nobody has asked for."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def test_each_frame_comes_in_time_after_a_pose_that_says_its_x() -> None:
