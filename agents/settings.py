@@ -14,7 +14,7 @@ from bufgym.policies.weights import MAX_WIDTH
 from bufgym.scenario import Interruption, Uplink, suites
 from bufgym.scenario.uplink import RGBD_BYTES
 
-TIME = ("rank", "time_before", "time_merged", "occupancy", "stalled", "service_ratio")
+TIME = ("rank", "index_before", "index_merged", "occupancy", "stalled", "service_ratio")
 """Fields that a queue and a clock can tell, as AFR's."""
 
 MOTION = (

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from bufgym import policies
+from bufgym.benchmark.run import draw
 from bufgym.c import CALL, SUPPORTED, header, random_episode, recorded
 from bufgym.cli import export as command
 from bufgym.cli.options import Parser
@@ -20,7 +21,7 @@ from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.policies import Policy, learned
 from bufgym.policies.learned import NAMES, Network, Weights
-from bufgym.scenario import Episode, messages
+from bufgym.scenario import Episode, Interruption, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import received
 from bufgym.traces import Trace
@@ -145,6 +146,21 @@ def test_a_rule_in_c_decides_as_in_python(name, tmp_path):
 def test_an_agent_in_c_decides_as_in_python_a_million_times(name, tmp_path):
     total = check(tmp_path, AGENTS[name], 250_000)
     assert total >= 1_000_000 or not JIT
+
+
+@pytest.mark.parametrize("L", [1, 2, 3, 4])
+def test_a_small_queue_follows_its_plan_in_c_too(L, tmp_path):
+    policy = policies.get("learned-motion")
+    drawn = [draw(Interruption(t_max=400), seed) for seed in range(40 if JIT else 2)]
+    episodes = [Episode(e.arrivals, e.link) for e in drawn]
+    calls = recorded(policy, episodes, L, EXPONENTIAL)
+    calls.tofile(tmp_path / "calls")
+    text = header(policy, L, EXPONENTIAL)
+    made = sum(len(episode.arrivals) for episode in episodes)
+    assert output(driver(tmp_path, text), tmp_path / "calls").split() == ["0", str(made), "0"]
+    if JIT:  # and it is the plan that decides
+        other = text.replace("#define BUFGYM_SHORTCUTS 1", "#define BUFGYM_SHORTCUTS 0")
+        assert output(driver(tmp_path, other), tmp_path / "calls").split()[2] != "0"
 
 
 def test_with_a_window_several_messages_are_in_the_socket(tmp_path):

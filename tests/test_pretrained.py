@@ -24,7 +24,7 @@ def test_there_are_two_one_without_odometry() -> None:
 
 def groups(name: str) -> list[str]:
     """What it takes to know what the agent reads."""
-    known = {field.name: field.group for field in weights.FIELDS}
+    known = {field.name: field.group for field in (*weights.FIELDS, *weights.ON_BOARD_SLOT_FIELDS)}
     return [known[field] for field in weights.read(SHIPPED[name])[0].fields]
 
 

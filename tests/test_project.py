@@ -30,6 +30,7 @@ ROOMS = [
     "sim",
     "oracle",
     "live",
+    "perception",
     "c",
     "envs",
     "expert",
@@ -68,6 +69,7 @@ TRAINING = [
     "agents.goals",
     "agents.scheduling",
     "agents.ablation",
+    "agents.small_queue",
     "train",
 ]
 """The modules that drive training, top to bottom. Each imports only bufgym and modules above it."""
@@ -265,7 +267,7 @@ def test_one_version_everywhere() -> None:
 
 # -------------------- (d) light import
 
-HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "matplotlib", "scipy", "pandas", "pyarrow")
+HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "matplotlib", "scipy", "pandas", "pyarrow", "cv2", "rvl")
 
 
 def heavy_modules_after(statement: str) -> set[str]:

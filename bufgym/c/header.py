@@ -15,10 +15,9 @@ from bufgym.c.calls import random_episode, recorded
 from bufgym.errors import BufgymError, printable
 from bufgym.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
-from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
-from bufgym.observe import CONTEXT_FIELDS, ON_BOARD_FIELDS, SLOT_FIELDS
+from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value, straight
 from bufgym.observe.queue import ROUNDING, TINY
-from bufgym.policies import Policy, learned
+from bufgym.policies import Policy, learned, small_queue
 from bufgym.policies.scoring import end_of, unpack
 
 _PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
@@ -26,6 +25,8 @@ SUPPORTED = tuple(sorted(path.stem for path in _RULES.glob("*.h")))
 """Names of the rules that can be exported; learned agents for one queue can be as well."""
 _HELPERS = {"bufgym_gaps_of(": "gaps.h", "bufgym_smallest_time_gap(": "time_gap.h", "bufgym_thin(": "thin.h"}
 """Parts that rules share, each before those that call it."""
+_LEARNED = ("features.h", "greedy.h", "small_queue.h", "scorer.h")
+"""Parts of a learned agent."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
 """Of the calls in the header."""
@@ -54,7 +55,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     """
     check_limits(capacity, max_bytes)
     learns = policy.on_arrival is learned.on_arrival
-    body = _part("features.h") + _part("scorer.h") if learns else _rule(policy)
+    body = "".join(map(_part, _LEARNED)) if learns else _rule(policy)
     if "bufgym_departure(" not in body:
         body += "\n" + _part("no_departure.h")
     unlimited = max_bytes is None
@@ -77,10 +78,13 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "TINY": repr(TINY),
         "ROUNDING": repr(ROUNDING),
         "STILL": repr(learned.STILL),
+        "FLOWS": repr(learned.FLOWS),
+        "STEADY": repr(learned.STEADY),
+        "STRAIGHT": int(straight(value.array)),
         "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
     }
     if learns:
-        numbers |= _scorers(policy)
+        numbers |= _scorers(policy) | _plans(value)
     return _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
 
 
@@ -100,10 +104,12 @@ def _rule(policy: Policy) -> str:
 
 def _scorers(policy: Policy) -> dict[str, Any]:
     """What a learned policy's C is filled with: its scorers, their scratch and the fields."""
-    parameters, begin, networks = np.array(policy.weights), 0, len(learned.Weights.NETWORKS)
+    parameters, begin, networks = np.array(policy.weights), 1, len(learned.Weights.NETWORKS)
     entries: list[str] = []
+    shortcuts = bool(parameters[0])
+    end = len(parameters) - shortcuts * small_queue.NUMBERS
     text, inputs, units = "", 1, 1
-    while begin < len(parameters):
+    while begin < end:
         scorer = getattr(unpack, "py_func", unpack)(parameters, begin, networks)
         k, n = len(entries), len(scorer.fields)
         text += _array("int", f"bufgym_fields_{k}", scorer.fields.astype(int))
@@ -117,18 +123,34 @@ def _scorers(policy: Policy) -> dict[str, Any]:
         begin = end_of(parameters, begin, networks)
     text += "/* The second one decides while the link stands still. */\n" if len(entries) > 1 else ""
     text += f"#define BUFGYM_SCORERS {len(entries)}\n"
+    text += f"#define BUFGYM_SHORTCUTS {int(shortcuts)}\n"
     text += f"static const struct bufgym_scorer bufgym_scorers[] = {{\n{''.join(entries)}}};\n"
-    context = (*CONTEXT_FIELDS, *ON_BOARD_FIELDS)
     scratch = (
         "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"
-        f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{len(context)}];\n"
-        f"    double rows[{len(SLOT_FIELDS)}][BUFGYM_CAPACITY + 1];\n"
+        f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{learned.CONTEXT}];\n"
+        f"    double rows[{learned.SLOTS}][BUFGYM_CAPACITY + 1];\n"
     )
     return {
         "WEIGHTS": text,
         "SCRATCH": scratch,
-        "SLOT_FIELDS": _enum(field.name for field in SLOT_FIELDS),
-        "CONTEXT_FIELDS": _enum(field.name for field in context),
+        "SLOT_FIELDS": _enum(learned.SLOT_NAMES),
+        "CONTEXT_FIELDS": _enum(learned.CONTEXT_NAMES),
+        "PLANS": _array("int64_t", "bufgym_plans", small_queue.packed() if shortcuts else [0]),
+    }
+
+
+def _plans(value: Value) -> dict[str, Any]:
+    """What the plans for small queues are filled with, besides themselves."""
+    log_base = float(value.array[1]) if value.array[0] == EXPONENTIAL else 0.0
+    return {
+        "PLAN_LOG_BASE": repr(log_base),
+        "PLAN_FIRST": repr(small_queue.FIRST),
+        "PLAN_STEP": repr(small_queue.STEP),
+        "PLAN_SLACK": repr(small_queue.SLACK),
+        "PLAN_BASES": len(small_queue.BASES),
+        "PLAN_ALL": small_queue.EACH,
+        "PLAN_SIZE": small_queue.PLAN,
+        "PLAN_LONGEST": small_queue.LONGEST,
     }
 
 
@@ -160,7 +182,7 @@ def _comment(text: str) -> str:
 
 def _array(kind: str, name: str, numbers: Iterable[Any]) -> str:
     """``static const kind name[] = {...};``, numbers to the last bit."""
-    words = _lines(repr(int(number) if kind == "int" else float(number)) for number in numbers)
+    words = _lines(repr(float(number) if kind == "double" else int(number)) for number in numbers)
     return f"static const {kind} {name}[] = {{\n    {words}\n}};\n"
 
 

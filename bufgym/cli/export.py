@@ -8,7 +8,7 @@ from bufgym.cli.options import Commands, command, count, refuse
 from bufgym.errors import BufgymError
 
 _FOR_C = ("capacity", "max_bytes", "value")
-_FOR_WEIGHTS = ("name", "about")
+_FOR_WEIGHTS = ("name", "about", "shortcuts")
 
 
 def add(commands: Commands) -> None:
@@ -24,6 +24,12 @@ def add(commands: Commands) -> None:
     weights = parser.add_argument_group("weights (--to safetensors)")
     weights.add_argument("--name", metavar="N", help="the policy's name; must be given")
     weights.add_argument("--about", metavar="TEXT", help="a sentence: what it was trained for")
+    weights.add_argument(
+        "--shortcuts",
+        action="store_true",
+        default=None,
+        help="leave to greedy-qoi and exact plans what they do better",
+    )
     c = parser.add_argument_group(
         "C (--to c)",
         "One C99 header that decides as Python does. MODEL is a policy's name, as afr, or a .safetensors of weights.",
@@ -46,7 +52,7 @@ def _as_weights(options: argparse.Namespace, out: str) -> object:
     refuse(options, _FOR_C, "belongs to --to c")
     if options.name is None:
         raise BufgymError("--name must be given: the policy's name")
-    return export(options.model, out, name=options.name, about=options.about or "")
+    return export(options.model, out, name=options.name, about=options.about or "", shortcuts=bool(options.shortcuts))
 
 
 def _as_c(options: argparse.Namespace, out: str) -> object:

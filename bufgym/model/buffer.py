@@ -103,9 +103,12 @@ class Buffer(NamedTuple):
     """Messages dequeued so far (delivered, or in transmission)."""
     dequeued_arrival_us: int
     """Arrival time of the message dequeued last, us; before the first, that of the oldest queued message, else of the
-    previous arrival. With several topics this and the next three are those of the newcomer's topic."""
+    previous arrival. With several topics this, ``dequeued_x`` and the previous arrival's two are of the
+    newcomer's topic."""
     dequeued_x: float
     """Coordinate x of the message dequeued last."""
+    dequeued_seq: int
+    """Place (``seq``) among all arrivals of the message dequeued last, of whatever topic; before the first likewise."""
     previous_us: int
     """Time of the previous arrival, kept or not, us."""
     previous_x: float

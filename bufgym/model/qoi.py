@@ -58,6 +58,15 @@ def merging_loss(v: NDArray[np.float64], a: float, value_a: float, b: float, val
 
 
 @kernel
+def straight(v: NDArray[np.float64]) -> bool:
+    """Whether V rises straight and then is flat, as min(1, d / D): what is best then does not depend on the future."""
+    if v[0] == TABULATED:
+        points = int(v[1])
+        return bool(v[3 + points] == v[1 + 2 * points])
+    return bool(v[0] == SATURATING)
+
+
+@kernel
 def information(v: NDArray[np.float64], x: NDArray[np.float64]) -> float:
     """H of the received messages with coordinates ``x`` (shape [received], in order of receipt); 0 for none."""
     if len(x) == 0:

@@ -16,7 +16,12 @@ from bufgym.observe.fields import (
     Field,
     RewardTerm,
 )
-from bufgym.observe.on_board import ON_BOARD_FIELDS, observe_on_board
+from bufgym.observe.on_board import (
+    ON_BOARD_FIELDS,
+    ON_BOARD_SLOT_FIELDS,
+    observe_on_board,
+    observe_on_board_slots,
+)
 from bufgym.observe.own import (
     OWN_FIELDS,
     OWN_TERMS,
@@ -35,6 +40,7 @@ __all__ = [
     "CONTEXT_FIELDS",
     "FIELDS",
     "ON_BOARD_FIELDS",
+    "ON_BOARD_SLOT_FIELDS",
     "OWN_FIELDS",
     "OWN_TERMS",
     "REWARD_TERMS",
@@ -50,6 +56,7 @@ __all__ = [
     "field",
     "observe_context",
     "observe_on_board",
+    "observe_on_board_slots",
     "observe_slots",
     "observe_topic_context",
     "observe_topic_slots",

@@ -1,5 +1,6 @@
 """Fields that come with bufgym besides those of the tables: computed where an environment's ``fields``, or a learned
-policy, names one. The link's rate as its own socket shows it, how arrivals come, V's shape, the room under B.
+policy, names one. The link's rate as its own socket shows it, how arrivals come, V's shape, the room under B; and of a
+slot its gaps counted in messages.
 """
 
 from __future__ import annotations
@@ -18,16 +19,18 @@ from bufgym.observe.own import OWN_FIELDS, Function, OwnField
 from bufgym.observe.queue import TINY, squash
 
 ON_BOARD_FIELDS: list[OwnField] = []
-"""In the order in which ``observe_on_board`` writes them."""
+"""Those of the context, in the order in which ``observe_on_board`` writes them."""
+ON_BOARD_SLOT_FIELDS: list[OwnField] = []
+"""Those of slots, in the order in which ``observe_on_board_slots`` writes them."""
 
 
-def _context_field(group: str, unit: str) -> Callable[[Function], Function]:
+def _field(per: str, group: str, unit: str) -> Callable[[Function], Function]:
     """Register the decorated function as a field of its own name; kernels may call what comes back."""
 
     def add(function: Function) -> Function:
         name, meaning = function.__name__, first_line(function)
-        OWN_FIELDS[name] = OwnField(name, "context", group, unit, meaning, function=function, compile=True)
-        ON_BOARD_FIELDS.append(OWN_FIELDS[name])
+        OWN_FIELDS[name] = OwnField(name, per, group, unit, meaning, function=function, compile=True)
+        (ON_BOARD_FIELDS if per == "context" else ON_BOARD_SLOT_FIELDS).append(OWN_FIELDS[name])
         return kernel(function)
 
     return add
@@ -48,7 +51,7 @@ def demand(buffer: Buffer, arrival: Any) -> float:
     return 1e6 * mean_bytes(buffer, arrival) / max(buffer.period_us, 1.0)
 
 
-@_context_field("link", "g/(g+r), r = demand")
+@_field("context", "link", "g/(g+r), r = demand")
 def rate_last(buffer: Buffer, arrival: Any) -> float:
     "the link's rate since the previous arrival, as far as there was something to send; else rate_short"
     rate = buffer.short_rate_bytes_per_s
@@ -57,31 +60,31 @@ def rate_last(buffer: Buffer, arrival: Any) -> float:
     return squash(rate, demand(buffer, arrival))
 
 
-@_context_field("link", "g/(g+r), r = demand")
+@_field("context", "link", "g/(g+r), r = demand")
 def rate_short(buffer: Buffer, arrival: Any) -> float:
     "the link's rate, a running mean over about 0.1 s; demand: a message of mean size at each arrival"
     return squash(buffer.short_rate_bytes_per_s, demand(buffer, arrival))
 
 
-@_context_field("link", "g/(g+r), r = demand")
+@_field("context", "link", "g/(g+r), r = demand")
 def rate_medium(buffer: Buffer, arrival: Any) -> float:
     "the same over about 0.5 s"
     return squash(buffer.medium_rate_bytes_per_s, demand(buffer, arrival))
 
 
-@_context_field("link", "g/(g+r), r = demand")
+@_field("context", "link", "g/(g+r), r = demand")
 def rate_long(buffer: Buffer, arrival: Any) -> float:
     "the same over about 2 s"
     return squash(buffer.long_rate_bytes_per_s, demand(buffer, arrival))
 
 
-@_context_field("link", "g/(g+r), r = rate over 2 s")
+@_field("context", "link", "g/(g+r), r = rate over 2 s")
 def rate_trend(buffer: Buffer, arrival: Any) -> float:
     "the link's rate over 0.1 s beside that over 2 s: 0.5 = steady, more = it rises"
     return squash(buffer.short_rate_bytes_per_s, buffer.long_rate_bytes_per_s)
 
 
-@_context_field("link", "g/(g+r), r = arrival period")
+@_field("context", "link", "g/(g+r), r = arrival period")
 def time_to_free(buffer: Buffer, arrival: Any) -> float:
     "time until the message in transmission has left, at the rate over 0.1 s; 1 where that is 0"
     if buffer.left_bytes == 0:
@@ -93,7 +96,7 @@ def time_to_free(buffer: Buffer, arrival: Any) -> float:
 # --- arrivals, V and B -----------------------------------------------------------------------------------------------
 
 
-@_context_field("time", "g/(g+r), r = 1")
+@_field("context", "time", "g/(g+r), r = 1")
 def burstiness(buffer: Buffer, arrival: Any) -> float:
     "squared coefficient of variation of the times between arrivals: 0 = regular, 0.5 = as of a Poisson process"
     square = buffer.period_us * buffer.period_us
@@ -111,19 +114,19 @@ def bend_at(buffer: Buffer, arrival: Any, evens: float) -> float:
     return float(min(max(merging_loss(v, d, gain, d, gain) / max(gain, TINY), 0.0), 1.0))
 
 
-@_context_field("value", "fraction")
+@_field("context", "value", "fraction")
 def bend_small(buffer: Buffer, arrival: Any) -> float:
     "the bend of V at a quarter of the even motion spacing"
     return bend_at(buffer, arrival, 0.25)
 
 
-@_context_field("value", "fraction")
+@_field("context", "value", "fraction")
 def bend_large(buffer: Buffer, arrival: Any) -> float:
     "the bend of V at four times the even motion spacing"
     return bend_at(buffer, arrival, 4.0)
 
 
-@_context_field("queue", "g/(g+r), r = L + 1 messages of mean size")
+@_field("context", "queue", "g/(g+r), r = L + 1 messages of mean size")
 def room(buffer: Buffer, arrival: Any) -> float:
     "bytes free under B; 1 where there is no byte limit"
     if buffer.max_bytes >= UNLIMITED_BYTES:
@@ -144,3 +147,52 @@ def observe_on_board(buffer: Buffer, arrival: Any, context: NDArray[np.floating[
     context[7] = bend_small(buffer, arrival)
     context[8] = bend_large(buffer, arrival)
     context[9] = room(buffer, arrival)
+
+
+# --- gaps in messages ------------------------------------------------------------------------------------------------
+
+
+@kernel
+def index_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
+    """Arrivals since the message kept before slot ``k``, and the gap left if that is dropped; of any topic.
+
+    After the newcomer one more is expected, as the other gaps expect one more step.
+    """
+    s = len(buffer.slots)
+    before = buffer.slots[k - 1].seq if k > 0 else buffer.dequeued_seq
+    own = buffer.slots[k].seq if k < s else arrival.seq
+    after = arrival.seq + 1
+    if k < s:
+        after = buffer.slots[k + 1].seq if k + 1 < s else arrival.seq
+    return float(max(own - before, 0)), float(max(after - before, 0))
+
+
+@kernel
+def even_index_gap(buffer: Buffer, arrival: Any) -> float:
+    """Arrivals since the message dequeued last, divided by L + 1."""
+    return float(max(arrival.seq - buffer.dequeued_seq, 0) / (buffer.capacity + 1))
+
+
+@_field("slot", "queue", "g/(g+r), r = even spacing in messages")
+def index_before(buffer: Buffer, arrival: Any, k: int) -> float:
+    "messages that arrived since the message kept before it, itself included"
+    return squash(index_gaps(buffer, arrival, k)[0], even_index_gap(buffer, arrival))
+
+
+@_field("slot", "queue", "g/(g+r), r = 2 x even spacing in messages")
+def index_merged(buffer: Buffer, arrival: Any, k: int) -> float:
+    "gap in messages left if it is dropped"
+    return squash(index_gaps(buffer, arrival, k)[1], 2 * even_index_gap(buffer, arrival))
+
+
+@kernel
+def observe_on_board_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
+    """Write every value of ``ON_BOARD_SLOT_FIELDS`` into ``rows`` (float[fields, L + 1]); the newcomer is last."""
+    s, last = len(buffer.slots), buffer.capacity
+    even = even_index_gap(buffer, arrival)
+    for k in range(s + 1):
+        before, merged = index_gaps(buffer, arrival, k)
+        column = k if k < s else last
+        rows[0, column] = squash(before, even)
+        rows[1, column] = squash(merged, 2 * even)
+    rows[:, s:last] = 0.0

@@ -12,6 +12,11 @@ A second scorer over the same fields, with hidden layers of its own, may decide 
 (``STILL``): thinning a queue that nothing leaves, for an unknown time, is a different task from keeping up with a slow
 link.
 
+An agent may leave to others what they do better, as can be told on board (``shortcuts``). Where V is straight and then
+flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and no plan is better, however long an
+interruption is. It does so on a steady link too: the queue is sent as it stands, there is no trap. And while the link
+stands still a queue of four messages at most follows the exact plan (``small_queue``) where there is one.
+
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
 
@@ -25,15 +30,18 @@ from numpy.typing import NDArray
 
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
+from bufgym.model.qoi import straight
 from bufgym.observe import (
     CONTEXT_FIELDS,
-    FIELDS,
     ON_BOARD_FIELDS,
+    ON_BOARD_SLOT_FIELDS,
     SLOT_FIELDS,
     observe_context,
     observe_on_board,
+    observe_on_board_slots,
     observe_slots,
 )
+from bufgym.policies.gaps import greedy_qoi
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.scoring import (
     DROP,
@@ -47,32 +55,61 @@ from bufgym.policies.scoring import (
     score,
     unpack,
 )
+from bufgym.policies.small_queue import NONE, NUMBERS, packed, planned
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 
-SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
-CONTEXT = TABLE + len(ON_BOARD_FIELDS)
-ON_BOARD = tuple(field.name for field in ON_BOARD_FIELDS)
-NAMES = tuple(field.name for field in FIELDS) + ON_BOARD
+SLOT_NAMES = tuple(field.name for field in (*SLOT_FIELDS, *ON_BOARD_SLOT_FIELDS))
+CONTEXT_NAMES = tuple(field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS))
+NAMES = SLOT_NAMES + CONTEXT_NAMES
+SLOTS, CONTEXT = len(SLOT_NAMES), len(CONTEXT_NAMES)
+# Those that come after are observed only where they are read.
+TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
 
 STILL = 0.07
 """The link stands still while its service ratio (running mean of departures per arrival) is below this: from the first
 arrival of an interruption on (1/16), or 41 arrivals after a link that kept up has stopped."""
+FLOWS, STEADY = 0.18, 0.01
+"""The link is steady while at least so many messages leave per arrival, and its rates over 0.1 s and 0.5 s differ from
+that over 2 s by no more than twice this share, and this share, of it."""
+_greedy_qoi = kernel(greedy_qoi)
+
+
+@kernel
+def steady(buffer: Buffer) -> bool:
+    """Whether the link carries messages at one and the same rate."""
+    mean = buffer.long_rate_bytes_per_s
+    near = abs(buffer.medium_rate_bytes_per_s - mean) <= STEADY * mean
+    level = near and abs(buffer.short_rate_bytes_per_s - mean) <= 2 * STEADY * mean
+    return bool(level and mean > 0 and buffer.drained_us > 0 and buffer.service_ratio >= FLOWS)
 
 
 @kernel
 def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The decision that scores highest."""
     s, L = len(buffer.slots), buffer.capacity
-    at = end_of(buffer.parameters, 0, 2) if buffer.service_ratio < STILL else 0
-    scorer = unpack(buffer.parameters, at if at < len(buffer.parameters) else 0, 2)
+    still, end = buffer.service_ratio < STILL, len(buffer.parameters)
+    if buffer.parameters[0] > 0:
+        end -= NUMBERS
+        if straight(buffer.v) or steady(buffer):
+            return _greedy_qoi(buffer, arrival, memory)
+        if still:
+            plan = planned(buffer, arrival, buffer.parameters[end:])
+            if plan != NONE:
+                return plan
+    at = end_of(buffer.parameters, 1, 2) if still else 1
+    scorer = unpack(buffer.parameters, at if at < end else 1, 2)
     scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
     observe_context(buffer, arrival, scratch.context[:TABLE])
     for i in range(scorer.context):
         if scorer.fields[i] >= TABLE:
             observe_on_board(buffer, arrival, scratch.context[TABLE:])
             break
-    observe_slots(buffer, arrival, scratch.rows)
+    observe_slots(buffer, arrival, scratch.rows[:TABLE_SLOTS])
+    for i in range(scorer.context, len(scorer.fields)):
+        if scorer.fields[i] >= TABLE_SLOTS:
+            observe_on_board_slots(buffer, arrival, scratch.rows[TABLE_SLOTS:])
+            break
     read_context(scorer, scratch)
     common = begin(scorer, DROP, scratch)
     best, decision = -np.inf, REJECT
@@ -99,8 +136,8 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 class Weights(ScorerWeights):
     """A slot scorer for one queue."""
 
-    SLOT_NAMES = NAMES[:SLOTS]
-    CONTEXT_NAMES = NAMES[SLOTS:]
+    SLOT_NAMES = SLOT_NAMES
+    CONTEXT_NAMES = CONTEXT_NAMES
     NETWORKS = ("drop", "accept")
     LAYERS = 2
 
@@ -108,11 +145,15 @@ class Weights(ScorerWeights):
     """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
     still: Weights | None = None
     """Decides while the link stands still, from the same fields; None: these weights do."""
+    shortcuts: bool = False
+    """Whether ``greedy-qoi`` and exact plans decide where they do better."""
 
     def parameters(self) -> NDArray[np.float64]:
-        """As the policy reads them: this scorer, then the one for a link that stands still."""
+        """As the policy reads them: whether there are shortcuts, this scorer, the one for a link that stands still,
+        the shortcuts' plans."""
         scorers = [self] if self.still is None else [self, self.still]
-        return np.concatenate([scorer.pack(scorer.mix) for scorer in scorers])
+        plans = [packed()] if self.shortcuts else []
+        return np.concatenate([[float(self.shortcuts)], *(scorer.pack(scorer.mix) for scorer in scorers), *plans])
 
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
@@ -126,7 +167,7 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
         work=(scratch, SLOTS),
         source=source,
         about=summary,
-        reads_rate=not set(ON_BOARD).isdisjoint(weights.fields),
+        reads_rate=weights.shortcuts or not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields),
         compile=True,
     )
 

@@ -9,7 +9,7 @@ hidden layer ``drop.0.weight`` [inputs, outputs] and ``drop.0.bias`` [outputs], 
     name          the policy's
     about         a sentence: what it does (may be absent)
     fields        the observation's fields that it reads, in the order of the networks' inputs
-    observation   hash of what defines them (``bufgym.observe.FIELDS``, and those of ``ON_BOARD_FIELDS`` among them)
+    observation   hash of what defines them (``bufgym.observe.FIELDS``, and those on board among them)
     bufgym        version that wrote the file
     sha256        of fields and tensors
 
@@ -34,7 +34,7 @@ from safetensors.numpy import save as serialized
 from bufgym import __version__
 from bufgym.errors import BufgymError, where
 from bufgym.files import read_whole, replaced
-from bufgym.observe import FIELDS, ON_BOARD_FIELDS, TOPIC_FIELDS
+from bufgym.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, TOPIC_FIELDS
 from bufgym.policies import learned, learned_topics
 from bufgym.policies.learned import Weights
 from bufgym.policies.learned_topics import TopicWeights
@@ -52,7 +52,7 @@ MAX_WIDTH = 256
 """Units of a hidden layer at most."""
 KEY = "bufgym"
 """The entry of the header's metadata that holds the JSON text."""
-WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")
+WRITTEN = ("format", "fields", "observation", "bufgym", "sha256", "shortcuts")
 """Metadata that ``save`` itself writes."""
 MIX = "drop.mix"
 """A tensor that a file may lack."""
@@ -65,7 +65,8 @@ def observation_hash(topics: bool = False, names: Sequence[str] = ()) -> str:
 
     ``topics``: with the fields that only several topics have; those beside the tables count where ``names`` has them.
     """
-    fields = [*FIELDS, *(TOPIC_FIELDS if topics else ()), *(field for field in ON_BOARD_FIELDS if field.name in names)]
+    beside = [field for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.name in names]
+    fields = [*FIELDS, *(TOPIC_FIELDS if topics else ()), *beside]
     table = [(field.name, field.per, field.unit, field.meaning) for field in fields]
     return hashlib.sha256(json.dumps(table).encode()).hexdigest()
 
@@ -118,6 +119,8 @@ def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any
         "bufgym": __version__,
         "sha256": _sha256(weights.fields, tensors),
     }
+    if isinstance(weights, Weights) and weights.shortcuts:
+        metadata["shortcuts"] = True
     try:
         text = json.dumps(metadata, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -188,7 +191,8 @@ def _parsed(path: StrPath, data: bytes) -> tuple[Weights | TopicWeights, dict[st
     if _sha256(metadata["fields"], tensors) != metadata["sha256"]:
         rule = "fields and tensors have another one: the file was changed"
         raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
-    return _weights(kind, metadata["fields"], tensors), metadata
+    weights = _weights(kind, metadata["fields"], tensors)
+    return replace(weights, shortcuts=True) if metadata.get("shortcuts") else weights, metadata
 
 
 def _weights(kind: Any, fields: Sequence[str], tensors: Tensors) -> Any:
@@ -229,6 +233,10 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
     name, about, fields = metadata["name"], metadata.get("about", ""), metadata.get("fields")
     if not name or not name.isprintable() or any(c in ":,= " for c in name):
         refuse("name", "must be non-empty, without spaces, ':', ',' or '='")
+    if not isinstance(metadata.get("shortcuts", False), bool):
+        refuse("shortcuts", "must be true or false")
+    if metadata.get("shortcuts") and kind is TopicWeights:
+        refuse("shortcuts", "is for one queue, not for several topics")
     if not isinstance(about, str) or not about.isprintable():
         refuse("about", "must be one line of text")
     if metadata["observation"] != observation_hash(kind is TopicWeights, fields if isinstance(fields, list) else ()):

@@ -29,7 +29,7 @@ CHECKED = (4, 8, 16, 32)
 """L of the regrets that are noted in the file."""
 
 
-def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
+def export(model: StrPath, out: StrPath, *, name: str, about: str = "", shortcuts: bool = False) -> Path:
     """Write the agent in ``model`` to ``out``, with what its run's folder says of its training.
 
     Args:
@@ -39,15 +39,20 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
         out: the file to write, .safetensors.
         name: the policy's name.
         about: a sentence: what it was trained for.
+        shortcuts: leave to others what they do better (``bufgym.policies.learned``).
 
     Raises:
-        BufgymError: ``model`` is no agent that scores slots, or ``out`` cannot be written.
+        BufgymError: ``model`` is no agent that scores slots, ``out`` cannot be written, or ``shortcuts`` are asked for
+            with several topics.
     """
     path = Path(model)
     weights = files.read_any(path)[0] if path.suffix == ".safetensors" else weights_of(read_policy(path))
     notes = {"name": name, "about": about, **run_notes(path)}
+    if shortcuts and isinstance(weights, TopicWeights):
+        raise BufgymError(f"{path}: a scheduler for several topics: shortcuts are for one queue")
     if isinstance(weights, TopicWeights):
         return files.save(out, weights, {**notes, "weighted_qoi": topics_qoi(learned_topics.policy(name, weights))})
+    weights = replace(weights, shortcuts=shortcuts or weights.shortcuts)
     return files.save(out, weights, {**notes, "regret": regrets(learned.policy(name, weights))})
 
 

@@ -16,13 +16,15 @@ def view(batch: Batch, i: int) -> Buffer:
     sender = batch.senders[i]
     first, occupancy = sender.first, sender.occupancy
     last = at(batch.slots, i, first - 1)
-    dequeued_arrival_us, dequeued_x = last.arrival_us, last.x
+    dequeued_arrival_us, dequeued_x, dequeued_seq = last.arrival_us, last.x, last.seq
     previous_us, previous_x = sender.previous_us, sender.previous_x
     if sender.dequeued == 0:
         dequeued_arrival_us, dequeued_x = previous_us, previous_x
+        dequeued_seq = at(batch.arrivals, i, max(sender.next - 1, 0)).seq
         if occupancy > 0:
             # a scheduler holds the first of all back
-            dequeued_arrival_us, dequeued_x = at(batch.slots, i, first).arrival_us, at(batch.slots, i, first).x
+            oldest = at(batch.slots, i, first)
+            dequeued_arrival_us, dequeued_x, dequeued_seq = oldest.arrival_us, oldest.x, oldest.seq
     if sender.topics > 1 and sender.waiting == ARRIVAL_WAITS:
         # gaps are those of the newcomer's topic
         arrival = at(batch.arrivals, i, sender.next)
@@ -55,6 +57,7 @@ def view(batch: Batch, i: int) -> Buffer:
         sender.forgotten + sender.dequeued,
         dequeued_arrival_us,
         dequeued_x,
+        dequeued_seq,
         previous_us,
         previous_x,
         1 if sender.busy > 0 else 0,

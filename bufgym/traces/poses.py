@@ -103,6 +103,16 @@ def quaternions(rotation: Float64Array) -> Float64Array:
     return unit(rows[np.arange(len(r)), largest])
 
 
+def rotations(quaternion: Float64Array) -> Float64Array:
+    """Rotation matrices, float64[m, 3, 3], of unit quaternions (x, y, z, w), float64[m, 4]."""
+    vector, w = quaternion[:, :3], quaternion[:, 3]
+    cross = np.zeros((len(quaternion), 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        cross[:, i, j], cross[:, j, i] = -vector[:, k], vector[:, k]
+    # Rodrigues: 1 + 2 w [v] + 2 [v]^2.
+    return np.asarray(np.eye(3) + 2 * w[:, None, None] * cross + 2 * cross @ cross, np.float64)
+
+
 def _same_side(a: Float64Array, b: Float64Array) -> Float64Array:
     """b or -b, whichever is nearer to a: they are the same orientation."""
     return np.where(np.sum(a * b, axis=1, keepdims=True) < 0, -b, b)

@@ -88,6 +88,8 @@ def test_metadata_that_are_no_json_object_are_refused(path, parts, text, rule):
         (QUEUE, "name", "\ud800", "must be non-empty"),
         (QUEUE, "about", ["no", "text"], "must be one line of text"),
         (QUEUE, "bufgym", None, "must be text"),
+        (QUEUE, "shortcuts", 1, "shortcuts = 1: must be true or false"),
+        (TOPICS, "shortcuts", True, "shortcuts = True: is for one queue, not for several topics"),
         (QUEUE, "observation", "0" * 64, "trained on other observations than this bufgym's: train it again"),
         (QUEUE, "fields", "time_merged", "must be a list of at least one field"),
         (QUEUE, "fields", [], "must be a list of at least one field"),

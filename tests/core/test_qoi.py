@@ -126,3 +126,10 @@ def test_parse():
 def test_parse_errors(text, rule):
     with pytest.raises(BufgymError, match=rule):
         qoi.parse(text)
+
+
+def test_straight_and_then_flat():
+    assert [qoi.straight(v.array) for v in (qoi.exponential(0.5), qoi.saturating(3))] == [False, True]
+    assert qoi.straight(qoi.tabulated([0, 4], [0, 1]).array)
+    assert qoi.straight(qoi.tabulated([0, 4, 9], [0, 0.5, 0.5]).array)
+    assert not qoi.straight(qoi.tabulated([0, 4, 9], [0, 0.5, 0.6]).array)

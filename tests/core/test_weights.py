@@ -53,6 +53,14 @@ def test_what_is_written_comes_back_bit_for_bit(path, kind, widths):
     assert path.read_bytes() == first
 
 
+def test_what_is_left_to_greedy_qoi_comes_back(path):
+    weights.save(path, replace(made(3), shortcuts=True), ABOUT)
+    again, metadata = weights.read(path)
+    assert again.shortcuts and metadata["shortcuts"] is True
+    weights.save(path, made(3), ABOUT)
+    assert not weights.read(path)[0].shortcuts and "shortcuts" not in weights.read(path)[1]
+
+
 def test_the_format_is_what_the_text_says(path):
     weights.save(path, made(3), ABOUT)
     shapes = {name: list(tensor.shape) for name, tensor in parts_of(path)[0].items()}

@@ -88,6 +88,8 @@ static inline void bufgym_observe_slots(struct bufgym_queue *q, const struct buf
     const double even_x = even * (arrival->x - q->dequeued_x);
     const double step_us = (double)(arrival->arrival_us - q->previous_us), step_x = arrival->x - q->previous_x;
     int64_t before_us = q->dequeued_arrival_us;
+    const double even_seq = (double)(arrival->seq - q->dequeued_seq) / (BUFGYM_CAPACITY + 1);
+    int64_t before_seq = q->dequeued_seq;
     double before_x = q->dequeued_x, newcomer_gain = 0.0, loss, even_loss;
     int k;
 
@@ -109,6 +111,9 @@ static inline void bufgym_observe_slots(struct bufgym_queue *q, const struct buf
         rows[BUFGYM_LOSS][k] = loss;
         rows[BUFGYM_RELATIVE_LOSS][k] = loss > 0.0 ? loss : 0.0;
         rows[BUFGYM_SIZE][k] = (double)slot->size_bytes;
+        rows[BUFGYM_INDEX_BEFORE][k] = bufgym_squash((double)(slot->seq - before_seq), even_seq);
+        rows[BUFGYM_INDEX_MERGED][k] = bufgym_squash((double)(after->seq - before_seq), 2 * even_seq);
+        before_seq = slot->seq;
         before_us = slot->arrival_us;
         before_x = slot->x;
     }
@@ -122,6 +127,8 @@ static inline void bufgym_observe_slots(struct bufgym_queue *q, const struct buf
     rows[BUFGYM_LOSS][last] = loss > 0.0 ? loss : 0.0; /* nothing is lost with a first message */
     rows[BUFGYM_RELATIVE_LOSS][last] = rows[BUFGYM_LOSS][last];
     rows[BUFGYM_SIZE][last] = (double)arrival->size_bytes;
+    rows[BUFGYM_INDEX_BEFORE][last] = bufgym_squash((double)(arrival->seq - before_seq), even_seq);
+    rows[BUFGYM_INDEX_MERGED][last] = bufgym_squash((double)(arrival->seq - before_seq + 1), 2 * even_seq);
 
     bufgym_even_gap(q, arrival, &even_loss);
     bufgym_squash_row(rows[BUFGYM_TIME_BEFORE], even_us);

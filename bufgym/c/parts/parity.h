@@ -12,7 +12,7 @@ struct bufgym_call {
 /* Make this call; the decision, 0 where none is due. */
 static inline int bufgym_play(struct bufgym_queue *q, const struct bufgym_call *call)
 {
-    struct bufgym_message message = {call->at_us, call->size_bytes, call->x, 0.0, 0};
+    struct bufgym_message message = {call->at_us, call->size_bytes, call->x, 0.0, 0, 0};
     if (call->kind == BUFGYM_ARRIVAL)
         return bufgym_arrival(q, message, call->left_bytes);
     if (call->kind == BUFGYM_DEQUEUE)

@@ -23,6 +23,7 @@ struct bufgym_message {
     int64_t size_bytes;
     double x;    /* how far the scene has moved on: frame index, or motion of the camera; never falls */
     double gain; /* V(x - x of the message kept before it), filled in */
+    int64_t seq; /* how many came before it, filled in */
     void *data;  /* yours: never looked at */
 };
 
@@ -43,6 +44,7 @@ struct bufgym_queue {
     int64_t last_dequeue_us;
     int64_t dequeued_arrival_us; /* of the message dequeued last; before the first see bufgym_ask */
     double dequeued_x;
+    int64_t dequeued_seq;
     /* arrivals */
     int64_t arrived;
     int64_t previous_us; /* the arrival before, kept or not */
@@ -142,6 +144,7 @@ static inline int bufgym_ask(struct bufgym_queue *q, const struct bufgym_message
     if (q->dequeued == 0) {
         q->dequeued_arrival_us = q->occupancy > 0 ? q->slots[0].arrival_us : q->previous_us;
         q->dequeued_x = q->occupancy > 0 ? q->slots[0].x : q->previous_x;
+        q->dequeued_seq = q->occupancy > 0 ? q->slots[0].seq : arrival->seq - (arrival->seq > 0);
     }
     return bufgym_decide(q, arrival);
 }
@@ -162,6 +165,7 @@ static inline void bufgym_init(struct bufgym_queue *q, int64_t now_us)
 static inline int bufgym_arrival(struct bufgym_queue *q, struct bufgym_message arrival, int64_t left_bytes)
 {
     int decision = BUFGYM_REJECT;
+    arrival.seq = q->arrived;
     if (q->evictions == 0)
         bufgym_note(q, &arrival, left_bytes);
     if (arrival.size_bytes <= BUFGYM_MAX_BYTES)
@@ -210,6 +214,7 @@ static inline int bufgym_dequeue(struct bufgym_queue *q, int64_t now_us, struct 
     q->last_dequeue_us = now_us;
     q->dequeued_arrival_us = head->arrival_us;
     q->dequeued_x = head->x;
+    q->dequeued_seq = head->seq;
     q->departures += 1;
     bufgym_departure(q);
     return 1;

@@ -71,6 +71,14 @@ static inline double bufgym_score(
     return common + own;
 }
 
+/* Whether the link carries messages at one and the same rate. */
+static inline int bufgym_steady(const struct bufgym_queue *q)
+{
+    const double mean = 1e6 * q->long_rate, medium = 1e6 * q->medium_rate, short_mean = 1e6 * q->short_rate;
+    return fabs(medium - mean) <= @STEADY@ * mean && fabs(short_mean - mean) <= 2 * @STEADY@ * mean && mean > 0.0
+        && q->drained_us > 0 && q->service_ratio >= @FLOWS@;
+}
+
 /* The decision that scores highest; ties go to the oldest message. */
 static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
@@ -78,6 +86,13 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
     const int s = q->occupancy, L = BUFGYM_CAPACITY;
     double common, best = -HUGE_VAL;
     int i, k, decision = BUFGYM_REJECT;
+    if (BUFGYM_SHORTCUTS) {
+        const int plan = q->service_ratio < @STILL@ ? bufgym_planned(q, arrival) : BUFGYM_NO_PLAN;
+        if (@STRAIGHT@ || bufgym_steady(q))
+            return bufgym_greedy(q, arrival);
+        if (plan != BUFGYM_NO_PLAN)
+            return plan;
+    }
     bufgym_observe_context(q, arrival);
     bufgym_observe_slots(q, arrival);
     for (i = 0; i < scorer->context; i++)
