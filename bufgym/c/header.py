@@ -79,6 +79,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "ROUNDING": repr(ROUNDING),
         "STILL": repr(learned.STILL),
         "FLOWS": repr(learned.FLOWS),
+        "FEW": learned.FEW,
         "STEADY": repr(learned.STEADY),
         "STRAIGHT": int(straight(value.array)),
         "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),

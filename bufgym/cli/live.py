@@ -7,7 +7,7 @@ import shlex
 import sys
 from collections.abc import Coroutine
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bufgym.cli.options import (
     Commands,
@@ -24,9 +24,14 @@ from bufgym.cli.options import (
 )
 from bufgym.errors import BufgymError
 
+if TYPE_CHECKING:
+    from bufgym.live.validate import Play
+
 PORT = 7410
 """Of a receiver, where none is named."""
 TRANSPORTS = ("tcp", "websocket", "zenoh", "mqtt", "dds")
+VALIDATED = (*TRANSPORTS[:3], "ros1", "ros2")
+"""What goes through a shaped link."""
 DEFAULT_POLICIES = ("drop-oldest", "afr", "min-motion-gap", "learned-motion")
 
 
@@ -53,7 +58,7 @@ def add(commands: Commands) -> None:
     validate.add_argument("--duration", type=positive, default=30.0, metavar="S", help="of each (%(default)g s)")
     validate.add_argument("--size", type=count, default=230_000, metavar="BYTES", help="of a message (%(default)s)")
     validate.add_argument("--scale", type=positive, default=1.0, metavar="X", help="the traces' capacity times X")
-    validate.add_argument("--transport", choices=TRANSPORTS[:3], nargs="+", default=["tcp"], help="one or more (tcp)")
+    validate.add_argument("--transport", choices=VALIDATED, nargs="+", default=["tcp"], help="one or more (tcp)")
     validate.add_argument("--speed", type=positive, default=1.0, metavar="X", help="time runs X times as fast")
     validate.add_argument("--out", metavar="DIR", help="write there a page with pictures, and every run (JSON)")
 
@@ -124,6 +129,7 @@ def _link(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from bufgym import policies, traces
+    from bufgym.benchmark.live_runs import margins
     from bufgym.live.runs import save, table
     from bufgym.live.validate import validate
     from bufgym.scenario import Uplink
@@ -138,9 +144,10 @@ def _validate(options: argparse.Namespace) -> None:
         scale=(options.scale,),
         propagation_us=0,
     )
+    plays = {name: _play_over(name) for name in options.transport}
     about = (
         f"{options.duration:g} s, {options.size} bytes at 30 Hz, L = {options.capacity}, V = {scenario.value.name}, "
-        f"over {', '.join(options.transport)} (a window of one ack) and in the simulator"
+        f"over {', '.join(options.transport)} (one message at a time) and in the simulator"
     )
     print(f"{about}\n")
     runs = validate(
@@ -148,14 +155,29 @@ def _validate(options: argparse.Namespace) -> None:
         scenario,
         options.capacity,
         seeds=options.seeds,
-        transports=options.transport,
+        plays=plays,
         speed=options.speed,
     )
-    print(table(runs))
+    print("\n".join([table(runs), "", *map(str, margins(runs))]))
     if options.out is not None:
         from bufgym.benchmark.report import live
 
         print(f"\nwrote {live.write(save(runs, about, _command(options), Path(options.out)))}")
+
+
+def _play_over(transport: str) -> Play:
+    """How an episode is played there; an error where that is not installed."""
+    if transport == "ros1":
+        from bufgym.ros1 import episode as ros1
+
+        return ros1.player()
+    if transport == "ros2":
+        from bufgym.ros2 import episode as ros2
+
+        return ros2.player()
+    from bufgym.live.validate import over
+
+    return over(transport)
 
 
 def _command(options: argparse.Namespace) -> str:

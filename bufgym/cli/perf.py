@@ -17,6 +17,7 @@ def add(commands: Commands) -> None:
         "--profile", action="store_true", help="what the time of a step goes into, in place of the figures"
     )
     perf.add_argument("--peers", action="store_true", help="beside CartPole of gymnasium, envpool, pufferlib, if here")
+    perf.add_argument("--queue", action="store_true", help="what a live queue costs a robot, in place of the figures")
     perf.add_argument("--quick", action="store_true", help="tiny sizes: does it run at all?")
 
 
@@ -28,6 +29,11 @@ def _perf(options: argparse.Namespace) -> None:
         sizes = perf.Sizes(4, 4, 20, 5, 20, 1, options.repeats)
     elif sys.stderr.isatty():
         print("measuring; this takes about half a minute ...", file=sys.stderr)
+    if options.queue:
+        from bufgym.benchmark import perf_queue
+
+        print(perf_queue.report([perf_queue.measure(name, 1 if options.quick else 20) for name in perf_queue.POLICIES]))
+        return
     if options.profile:
         from bufgym.benchmark import perf_profile
 

@@ -11,6 +11,7 @@ import asyncio
 import socket
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 from bufgym.live.receiver import listener
@@ -22,8 +23,10 @@ _PIECE_BYTES: Final = 16_384
 _MOST_PIECES: Final = 4096
 """On their way to the receiver at a time, at most."""
 _SLACK_S: Final = 0.005
-"""Where bytes come no later than this after the last ones had crossed, the link counts as busy all the time: an ack and
-the next message take their turns in programs, which is not the link's doing."""
+"""A link that waits no longer than this for the next bytes counts as busy: an ack and the next message take their turns
+in programs, which is not the link's doing."""
+_STALL_S: Final = 0.1
+"""Nor is it that a busy machine stops this program: a busy link makes up for so much time at most."""
 
 
 class ShapedLink:
@@ -129,11 +132,11 @@ class ShapedLink:
         delivery = asyncio.create_task(self._deliver(crossed, receiver))
         try:
             while True:
-                waited, piece = await _piece(sender)
+                waited_s, piece = await _piece(sender)
                 if not piece:
                     break
                 async with self._turn:
-                    crossed_s = self._crossed_s(len(piece), waited)
+                    crossed_s = self._crossed_s(len(piece), waited_s)
                     await self._until(crossed_s)
                 self.carried_bytes += len(piece)
                 await crossed.put((crossed_s + self._link.propagation_us / 1e6, piece))
@@ -162,10 +165,11 @@ class ShapedLink:
         """The link's time."""
         return (self._clock() - self._began_s) * self._speed
 
-    def _crossed_s(self, size_bytes: int, waited: bool) -> float:
-        """When so many more bytes have crossed, in the link's time; ``waited``: it may have been idle before."""
-        if waited:
-            idle_us = max(0, int((self._now_s() - _SLACK_S * self._speed) * 1e6))
+    def _crossed_s(self, size_bytes: int, waited_s: float) -> float:
+        """When so many more bytes have crossed, in the link's time; ``waited_s``: so long it has waited for them."""
+        if waited_s > 0:
+            late_s = _SLACK_S if waited_s > _SLACK_S else _STALL_S
+            idle_us = max(0, int((self._now_s() - late_s * self._speed) * 1e6))
             self._position = max(self._position, self._link.carried_at(idle_us))
         self._position += size_bytes
         crossed_us = self._link.time_at(self._position)
@@ -177,9 +181,19 @@ class ShapedLink:
             await asyncio.sleep(min(rest_s, 1.0))
 
 
-async def _piece(connection: socket.socket) -> tuple[bool, bytes]:
-    """(whether it had to wait, the next bytes; none at the end)."""
+async def _piece(connection: socket.socket) -> tuple[float, bytes]:
+    """(how long it had to wait, the next bytes; none at the end). To wait for a processor is not to wait for bytes."""
     try:
-        return False, connection.recv(_PIECE_BYTES)
+        return 0.0, connection.recv(_PIECE_BYTES)
     except BlockingIOError:
-        return True, await asyncio.get_running_loop().sock_recv(connection, _PIECE_BYTES)
+        began_s, starved_s = time.monotonic(), _starved_s()
+        piece = await asyncio.get_running_loop().sock_recv(connection, _PIECE_BYTES)
+        return max(1e-6, time.monotonic() - began_s - (_starved_s() - starved_s)), piece
+
+
+def _starved_s() -> float:
+    """How long this thread has been ready and had no processor; 0 where the system does not tell."""
+    try:
+        return int(Path("/proc/thread-self/schedstat").read_text(encoding="ascii").split()[1]) / 1e9
+    except (OSError, ValueError, IndexError):
+        return 0.0

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -54,7 +55,7 @@ async def play(
     """
     if transport not in TRANSPORTS:
         raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
-    _warm(PolicyQueue(policy, capacity, value=value, window=episode.window))
+    warm(PolicyQueue(policy, capacity, value=value, window=episode.window))
     came: list[Received] = []
 
     def take(message: Received) -> None:
@@ -96,12 +97,31 @@ async def play(
     return came
 
 
-def _warm(queue: PolicyQueue) -> None:
+def warm(queue: PolicyQueue) -> None:
     """One message through the queue, so that nothing is compiled while the episode's time runs."""
     queue.put(b"", 1)
     queue.get()
     queue.gone()
     queue.close()
+
+
+class Play(Protocol):
+    """How an episode is played live; what comes, as ``play`` has it."""
+
+    def __call__(
+        self, policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
+    ) -> list[Received]: ...
+
+
+def over(transport: str) -> Play:
+    """``play`` over one of ``TRANSPORTS``."""
+
+    def played(
+        policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
+    ) -> list[Received]:
+        return asyncio.run(play(policy, episode, capacity, value, transport=transport, speed=speed, seed=seed))
+
+    return played
 
 
 def validate(
@@ -110,10 +130,11 @@ def validate(
     capacity: int,
     *,
     seeds: int = 1,
-    transports: Sequence[str] = ("tcp",),
+    plays: Mapping[str, Play] | None = None,
     speed: float = 1.0,
 ) -> list[Run]:
-    """Every policy on ``seeds`` episodes of every trace, on sockets one after the other, and in the simulator."""
+    """Every policy on ``seeds`` episodes of every trace: live by ``plays`` in turn (default: TCP), and simulated."""
+    plays = {"tcp": over("tcp")} if plays is None else plays
     runs = []
     for trace in scenario.traces:
         for seed in range(seeds):
@@ -125,10 +146,8 @@ def validate(
                 messages = received(simulated, 0)
                 transmitted_us = simulated.batch.log["transmitted_us"][0, messages["seq"]]
                 delivery_us = transmitted_us + episode.link.propagation_us - messages["arrival_us"]
-                for transport in transports:
-                    came = asyncio.run(
-                        play(policy, episode, capacity, scenario.value, transport=transport, speed=speed, seed=seed)
-                    )
+                for transport, played in plays.items():
+                    came = played(policy, episode, capacity, scenario.value, speed=speed, seed=seed)
                     runs.append(
                         Run(
                             policy.name,

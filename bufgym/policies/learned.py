@@ -69,9 +69,10 @@ TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
 STILL = 0.07
 """The link stands still while its service ratio (running mean of departures per arrival) is below this: from the first
 arrival of an interruption on (1/16), or 41 arrivals after a link that kept up has stopped."""
-FLOWS, STEADY = 0.18, 0.01
-"""The link is steady while at least so many messages leave per arrival, and its rates over 0.1 s and 0.5 s differ from
-that over 2 s by no more than twice this share, and this share, of it."""
+FLOWS, FEW, STEADY = 0.18, 1, 0.01
+"""The link is steady while at least so many messages leave per arrival (or L is so small that the queue is soon sent
+all the same), and its rates over 0.1 s and 0.5 s differ from that over 2 s by no more than twice this share, and this
+share, of it."""
 _greedy_qoi = kernel(greedy_qoi)
 
 
@@ -81,7 +82,8 @@ def steady(buffer: Buffer) -> bool:
     mean = buffer.long_rate_bytes_per_s
     near = abs(buffer.medium_rate_bytes_per_s - mean) <= STEADY * mean
     level = near and abs(buffer.short_rate_bytes_per_s - mean) <= 2 * STEADY * mean
-    return bool(level and mean > 0 and buffer.drained_us > 0 and buffer.service_ratio >= FLOWS)
+    flows = buffer.service_ratio >= FLOWS or buffer.capacity <= FEW
+    return bool(level and mean > 0 and buffer.drained_us > 0 and flows)
 
 
 @kernel

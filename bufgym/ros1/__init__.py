@@ -18,7 +18,8 @@ from __future__ import annotations
 import itertools
 import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,6 +37,18 @@ UNTOUCHED: Final = ("/rosout", "/tf", "/tf_static", "/clock")
 """Small, and read by all; a policy that is named for one of them rules it all the same."""
 _ROOM: Final = 4096
 """Of a queue's bookkeeping: half a MB for each subscriber."""
+
+
+@contextmanager
+def needs_rospy() -> Iterator[None]:
+    """An error that says how to get ROS 1 where the block cannot import it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = f"python3-{(error.name or 'rospy').split('.')[0].replace('_', '-')}"
+        raise BufgymError(
+            f"bufgym.ros1 needs {error.name}: ROS 1's own, or Debian's {package}, and a Python that sees it"
+        ) from None
 
 
 def install(
@@ -61,20 +74,19 @@ def install(
     Raises:
         BufgymError: rospy is not there, or no such policy, or one that no live queue can have.
     """
-    try:
+    with needs_rospy():
         from rospy import topics as rospy_topics
         from rospy.impl.tcpros_pubsub import QueuedConnection
-    except ModuleNotFoundError as error:
-        raise BufgymError(
-            f"bufgym.ros1 needs {error.name}: ROS 1's own, or Debian's python3-rospy, and a Python that sees it"
-        ) from None
     if value is None:
         value = qoi.exponential() if odometry is None else qoi.exponential(math.exp(-1))
     if log is not None:
         Path(log).mkdir(parents=True, exist_ok=True)
     chosen = {**dict.fromkeys(UNTOUCHED), **(topics or {})}
-    for one in {policy, *chosen.values()} - {None}:
-        _warm_up(one, value)
+    warmed: list[str | Policy] = []
+    for one in (policy, *chosen.values()):
+        if one is not None and one not in warmed:
+            _warm_up(one, value)
+            warmed.append(one)
     moved = None if odometry is None else _Subscribed(odometry, Odometry(motion))
     numbers = itertools.count()
 

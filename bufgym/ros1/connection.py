@@ -33,7 +33,7 @@ class PolicyConnection:
     ) -> None:
         """``connection``: a ``TCPROSTransport``; ``x``: the coordinate now; ``log``: closed with the connection."""
         self._connection = connection
-        self._queue = queue
+        self.queue = queue
         self._x = x
         self._log = log
         self._error: Exception | None = None
@@ -61,18 +61,18 @@ class PolicyConnection:
             error, self._error = self._error, None
             raise error
         if not self._connection.done:
-            self._queue.put(data, len(data), self._x())
+            self.queue.put(data, len(data), self._x())
         return True
 
     def _run(self) -> None:
         """Send what the queue hands out, until the connection is closed."""
         try:
-            while not self._connection.done and (item := self._queue.get()) is not None:
+            while not self._connection.done and (item := self.queue.get()) is not None:
                 try:
                     self._send(memoryview(item.message))
                 except Exception as error:
                     self._error = error
-                self._queue.gone()
+                self.queue.gone()
         finally:
             if self._log is not None:
                 self._log.close()

@@ -17,6 +17,7 @@ from typing import Any, Final
 from bufgym.errors import BufgymError
 from bufgym.live import LogFile, PolicyQueue
 from bufgym.live.channels import TRANSPORTS
+from bufgym.live.log import Record
 from bufgym.live.odometry import Odometry
 from bufgym.live.receiver import Received, Receiver
 from bufgym.live.sender import Sender
@@ -65,7 +66,7 @@ class Robot:
         capacity: int = 32,
         odometry: str | None = None,
         transport: str = "tcp",
-        log: LogFile | None = None,
+        log: LogFile | Callable[[Record], None] | None = None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """

@@ -17,7 +17,7 @@ import pytest
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark import perf, perf_peers, perf_profile
+from bufgym.benchmark import perf, perf_peers, perf_profile, perf_queue
 from bufgym.benchmark.run import draw, run
 from bufgym.errors import BufgymError
 from bufgym.expert import Player
@@ -56,6 +56,14 @@ def test_the_parts_of_a_step_add_up_to_it() -> None:
     assert len(by_environment) == 4 and list(by_environment.values()) == pytest.approx([1.0] * 4, abs=1e-6)
     text = perf_profile.report(parts)
     assert all(part.of in text and part.name in text for part in parts)
+
+
+def test_what_a_live_queue_costs() -> None:
+    cost = perf_queue.measure("drop-oldest", 1)
+    assert 0 < cost.median_us <= cost.p99_us and cost.warm_us > 0 and cost.core_percent > 0
+    assert 1 < cost.held <= perf_queue.CAPACITY + 1  # 30 put, 12 sent, and memory is bounded by L and the socket's one
+    text = perf_queue.report([perf_queue.Cost("afr", 41.4, 99.5, 30.0, 0.456, 17)])
+    assert "| afr | 41 us | 100 us | 30 us | 0.46 % | 17 |" in text
 
 
 def test_a_peer_stands_beside_the_native_batch_of_the_same_run() -> None:

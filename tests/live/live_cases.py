@@ -17,6 +17,18 @@ LIBRARIES = {"websocket": "websockets", "zenoh": "zenoh", "mqtt": "paho.mqtt", "
 OVER_TCP = [transport for transport in TRANSPORTS if transport != "dds"]
 """What goes through a shaped link."""
 
+VALIDATE = [
+    *("-mbufgym", "live", "validate", "--trace", "lte-synthetic-3", "--scale", "0.4"),
+    *("--duration", "4", "--policies", "min-motion-gap", "--transport"),
+]
+"""One short run in real time, over what stands behind it."""
+
+
+def as_simulated(seen: dict[str, Any]) -> bool:
+    """Whether a run over ROS is close to the simulator's; of a busy machine more is not asked."""
+    near = abs(seen["live_qoi"] / seen["simulated_qoi"] - 1) < 0.1
+    return near and abs(seen["live_delivered"] - seen["simulated_delivered"]) <= 0.15 * seen["simulated_delivered"]
+
 
 def meeting_port(transport: str, request: pytest.FixtureRequest) -> int:
     """Where a receiver listens: any port, or over MQTT the broker's; skips what is not installed."""

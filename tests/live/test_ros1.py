@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cli_cases import fails
+from live_cases import VALIDATE, as_simulated
 
 from bufgym import ros1
 from bufgym.errors import BufgymError
@@ -23,6 +25,7 @@ from bufgym.kernel import JIT
 from bufgym.live import PolicyQueue, replay
 from bufgym.live.log import of, read_log
 from bufgym.live.odometry import Odometry
+from bufgym.policies import get
 from bufgym.ros1.__main__ import main as command
 from bufgym.ros1.connection import PolicyConnection
 from bufgym.traces import MotionSettings, motion_from_poses
@@ -61,12 +64,16 @@ def ros(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return where
 
 
-def run(ros: dict[str, str], *command: Any) -> Any:
+def python(ros: dict[str, str], *command: Any) -> str:
     done = subprocess.run(
         [sys.executable, *map(str, command)], env=ros, capture_output=True, text=True, check=False, timeout=120
     )
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    return done.stdout
+
+
+def run(ros: dict[str, str], *command: Any) -> Any:
+    return json.loads(python(ros, *command).splitlines()[-1])
 
 
 # --- in ROS ----------------------------------------------------------------------------------------------------------
@@ -114,10 +121,20 @@ def test_each_subscriber_has_its_queue_and_each_topic_its_policy(ros: dict[str, 
     assert 0.8 < max(moved) <= 1.0
 
 
-def test_without_ros_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_episode_through_a_node_is_that_of_the_simulator(ros: dict[str, str], tmp_path: Path) -> None:
+    for _ in range(2):
+        python(ros, *VALIDATE, "ros1", "--out", tmp_path)
+        [seen] = json.loads((tmp_path / "runs.json").read_text())["runs"]
+        if as_simulated(seen):
+            break
+    assert as_simulated(seen), {**seen, "live_s": (), "simulated_s": ()}
+
+
+def test_without_ros_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(sys.modules, "rospy", None)
-    with pytest.raises(BufgymError, match=r"bufgym\.ros1 needs rospy"):
+    with pytest.raises(BufgymError, match=r"bufgym\.ros1 needs rospy: .* python3-rospy"):
         ros1.install("afr")
+    fails([*VALIDATE[1:], "ros1"], "bufgym.ros1 needs rospy", capsys)
 
 
 @pytest.fixture
@@ -153,6 +170,7 @@ def test_the_node_finds_itself_as_if_run_alone(topics: Any, tmp_path: Path) -> N
     node = tmp_path / "node.py"
     node.write_text("import sys, beside\nraise SystemExit([__name__, sys.argv[1:]])")
     (tmp_path / "beside.py").touch()
+    ros1.install(get("afr"), topics={"/scan": get("afr")})  # a policy itself may stand for its name
     policies = ["--policy", "/camera=decimate:every=2", "--policy", "rospy", "--policy", "/rosout=afr"]
     with pytest.raises(SystemExit) as ended:
         command([*policies, str(node), "--policy", "its own", "__name:=camera"])
@@ -164,7 +182,7 @@ def test_the_node_finds_itself_as_if_run_alone(topics: Any, tmp_path: Path) -> N
         topics.QueuedConnection(transport, 3)
     transport.name = "/camera"
     connection = topics.QueuedConnection(transport, 3)
-    assert connection._queue.policy.name.startswith("decimate") and connection._queue._row.senders.capacity == 3
+    assert connection.queue.policy.name.startswith("decimate") and connection.queue._row.senders.capacity == 3
     transport.close()
     transport.peer.close()
     assert ended_thread(connection)

@@ -14,6 +14,7 @@ import pytest
 from cli_cases import fails
 from hypothesis import given
 from hypothesis import strategies as st
+from live_cases import VALIDATE, as_simulated
 
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
@@ -31,9 +32,9 @@ in_ros = pytest.mark.skipif(
 )
 
 
-def run(program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     where = {**os.environ, "PYTHONPATH": str(REPO), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    command = [sys.executable, str(REPO / program), *map(str, arguments)]
+    command = [sys.executable, *map(str, arguments)]
     done = subprocess.run(command, env=where, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     return done
@@ -46,7 +47,9 @@ def run(program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
 def test_the_relay_over_a_fade_is_as_good_as_the_simulator() -> None:
     """6 s with a fade of 1.5 s. Over 20 s, quiet machine: 98 % of the simulator's QoI."""
     for _ in range(2):
-        cells = run("examples/ros2/fade.py", "--queues", "afr", "--seconds", 6).stdout.splitlines()[-1].split("|")
+        cells = (
+            run(REPO / "examples/ros2/fade.py", "--queues", "afr", "--seconds", 6).stdout.splitlines()[-1].split("|")
+        )
         relayed, simulated = float(cells[3]), float(cells[6])
         print(cells)
         if relayed > 0.85 * simulated:
@@ -59,7 +62,7 @@ def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None
     numbers = [str(k) for k in range(100)]
     expected = {"camera": numbers, "status": ["up"], "own/echo": numbers, "commands": numbers[::10]}
     for tries_left in (1, 0):
-        seen: dict[str, Any] = json.loads(run("tests/live/ros2_session.py", tmp_path).stdout.splitlines()[-1])
+        seen: dict[str, Any] = json.loads(run(REPO / "tests/live/ros2_session.py", tmp_path).stdout.splitlines()[-1])
         if seen["came"] == expected or not tries_left:
             break
     assert seen["came"] == expected
@@ -70,6 +73,16 @@ def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None
     # 2 m of motion at a scene scale of 2 m, compared 30 times a second at most.
     moved = [record["x"] for record in of(log, "put") if record["topic"] == 0]
     assert moved[0] < 0.1 and 0.85 < moved[-1] <= 1.0
+
+
+@in_ros
+def test_an_episode_through_the_relay_is_that_of_the_simulator(tmp_path: Path) -> None:
+    for _ in range(2):
+        run(*VALIDATE, "ros2", "--out", tmp_path)
+        [seen] = json.loads((tmp_path / "runs.json").read_text())["runs"]
+        if as_simulated(seen):
+            break
+    assert as_simulated(seen), {**seen, "live_s": (), "simulated_s": ()}
 
 
 # --- what the relay says of a topic ----------------------------------------------------------------------------------
@@ -117,3 +130,4 @@ def test_the_command_names_what_is_wrong(
     monkeypatch.setitem(sys.modules, "rclpy", None)
     for words in (["receive", "--port", "0"], ["send", "--config", str(config)]):
         fails(["ros2", *words], "bufgym.ros2 needs rclpy", capsys)
+    fails([*VALIDATE[1:], "ros2"], "bufgym.ros2 needs rclpy", capsys)

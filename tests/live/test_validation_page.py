@@ -42,6 +42,18 @@ def test_the_page_tells_all_runs(tmp_path: Path) -> None:
     assert (curves["afr, simulated"][0], curves["afr, simulated"][-1]) == (0.1, 0.3)
 
 
+def test_the_page_says_by_how_much_one_policy_beats_another(tmp_path: Path) -> None:
+    from bufgym.benchmark.report import live
+
+    runs = [
+        Run(policy, "a", seed, 1, 1, qoi, qoi, 5.0)
+        for seed in (0, 1)
+        for policy, qoi in (("afr", 4.0), ("random", 4.1))
+    ]
+    page = live.write(save(runs, "", "", tmp_path)).read_text()
+    assert "<p>random against afr, 2 episodes: regret lower by 2.00 % [2.00, 2.00] live" in page
+
+
 @pytest.mark.parametrize("text", ["", "[]", '{"runs": [{"policy": 3}]}', '{"runs": 1, "about": "", "command": ""}'])
 def test_a_file_without_runs_is_named(text: str, tmp_path: Path) -> None:
     from bufgym.benchmark.report import live

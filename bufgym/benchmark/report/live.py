@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from bufgym import __version__
+from bufgym.benchmark.live_runs import margins
 from bufgym.benchmark.report import style
 from bufgym.benchmark.report.charts import Chart
 from bufgym.benchmark.report.page import rendered
@@ -54,6 +55,7 @@ def html(runs: Sequence[Run], about: str, command: str) -> str:
         about=about,
         command=command,
         agreement=agreement(runs),
+        margins=list(map(str, margins(runs))),
         columns=[title for title, _, _ in COLUMNS],
         rows=cells(runs),
         colour=lambda policy: colours.get(policy, style.MUTED),

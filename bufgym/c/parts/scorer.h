@@ -76,7 +76,7 @@ static inline int bufgym_steady(const struct bufgym_queue *q)
 {
     const double mean = 1e6 * q->long_rate, medium = 1e6 * q->medium_rate, short_mean = 1e6 * q->short_rate;
     return fabs(medium - mean) <= @STEADY@ * mean && fabs(short_mean - mean) <= 2 * @STEADY@ * mean && mean > 0.0
-        && q->drained_us > 0 && q->service_ratio >= @FLOWS@;
+        && q->drained_us > 0 && (q->service_ratio >= @FLOWS@ || BUFGYM_CAPACITY <= @FEW@);
 }
 
 /* The decision that scores highest; ties go to the oldest message. */

@@ -9,18 +9,25 @@ static inline double bufgym_fill(const struct bufgym_queue *q)
     return bytes > messages ? bytes : messages;
 }
 
-/* r was halved or not: count, and evict at p when full. */
-static inline int bufgym_thin(struct bufgym_queue *q, const struct bufgym_message *arrival, double r, double c)
+/* The head is gone, so the same message is now one slot further to the front. */
+static inline void bufgym_move_on(struct bufgym_queue *q)
+{
+    q->memory[BUFGYM_P] = q->memory[BUFGYM_P] > 1 ? q->memory[BUFGYM_P] - 1 : 0.0;
+}
+
+/* r was halved or not: count, and evict at p when full. One arrival in `gap` is kept: r in AFR. */
+static inline int
+bufgym_thin(struct bufgym_queue *q, const struct bufgym_message *arrival, double r, double c, double gap)
 {
     const int s = q->occupancy;
     double p = q->memory[BUFGYM_P];
     int decision = BUFGYM_ACCEPT;
     if (q->evictions == 0) {
         c += 1;
-        if (c < r)
+        if (c < gap)
             decision = BUFGYM_REJECT; /* even when there is room: the rate has been lowered to one in r */
         else
-            c = fmod(c - r, 1.0);
+            c = fmod(c - gap, 1.0);
     }
     if (decision == BUFGYM_ACCEPT && !bufgym_has_space(q, arrival)) {
         if (p >= s) { /* only under B, where fewer messages are queued than when this pass began */

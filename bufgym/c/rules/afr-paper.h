@@ -6,5 +6,5 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
         r = r / 2;
         c = fmod(c, r);
     }
-    return bufgym_thin(q, arrival, r, c);
+    return bufgym_thin(q, arrival, r, c, r);
 }

@@ -6,11 +6,10 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
         r = r / 2;
         c = fmod(c, r);
     }
-    return bufgym_thin(q, arrival, r, c);
+    return bufgym_thin(q, arrival, r, c, r);
 }
 
-/* The head is gone, so the same message is now one slot further to the front. */
 static inline void bufgym_departure(struct bufgym_queue *q)
 {
-    q->memory[BUFGYM_P] = q->memory[BUFGYM_P] > 1 ? q->memory[BUFGYM_P] - 1 : 0.0;
+    bufgym_move_on(q);
 }

@@ -1,0 +1,115 @@
+"""The programs of an episode on ROS, without ROS."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bufgym import policies
+from bufgym.errors import BufgymError
+from bufgym.live.odometry import Odometry
+from bufgym.live.programs import LEAD_S, pose_stamp, programs, publish_in_time, received
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.ros1 import episode as ros1
+from bufgym.ros2 import episode as ros2
+from bufgym.scenario import Episode, messages
+from bufgym.traces import Trace
+
+EPISODE = Episode(
+    messages(np.array([0, 20_000, 60_000]), np.array([5, 6, 7]), np.array([0.0, 0.25, 1.5])),
+    Link(Trace.steps([(1.0, 1e6)])),
+)
+
+
+def echoes(parent: Connection) -> None:
+    while True:
+        parent.send(parent.recv())
+
+
+def fails(_: Connection) -> None:
+    raise BufgymError("no such thing")
+
+
+def ends(_: Connection) -> None:
+    pass
+
+
+@pytest.mark.parametrize(("work", "words"), [(fails, "other: no such thing"), (ends, "other: has ended")])
+def test_who_waits_for_one_program_hears_that_another_has_failed(work: Any, words: str) -> None:
+    with programs(echo=echoes, other=work) as (echo, _), pytest.raises(BufgymError, match=words):
+        asyncio.run(echo.told())
+
+
+def test_a_program_is_spoken_to_and_may_be_silent() -> None:
+    with programs(echo=echoes) as (echo,):
+        echo.tell({"port": 3})
+        assert asyncio.run(echo.told()) == {"port": 3}
+        with pytest.raises(BufgymError, match=r"echo: said nothing for 0\.1 s"):
+            asyncio.run(echo.told(patience_s=0.1))
+
+
+PARENT = """
+import multiprocessing, os, signal, threading
+from bufgym.live.programs import programs
+with programs(idle=lambda parent: threading.Event().wait()):
+    print(multiprocessing.active_children()[0].pid, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_no_program_outlives_a_parent_that_was_killed() -> None:
+    told = subprocess.run([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True, check=False, timeout=60)
+    pid, patience_s = int(told.stdout), time.monotonic() + 20
+    while running(pid) and time.monotonic() < patience_s:
+        time.sleep(0.1)
+    assert not running(pid)
+
+
+def running(pid: int) -> bool:
+    """Whether there is such a process, but for one that has ended and that nobody has asked for."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_each_frame_comes_in_time_after_a_pose_that_says_its_x() -> None:
+    odometry, seen = Odometry(), list[tuple[int, int, float]]()
+    began_s = time.monotonic() + 0.05
+    early_s: list[float] = []
+
+    def move(k: int, metres: float) -> None:
+        early_s.append(began_s + int(EPISODE.arrivals["arrival_us"][k]) / 1e6 - time.monotonic())
+        seconds, nanoseconds = pose_stamp(k)
+        odometry(seconds + nanoseconds / 1e9, (metres, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+    def show(k: int, size_bytes: int) -> None:
+        assert time.monotonic() > began_s + int(EPISODE.arrivals["arrival_us"][k]) / 1e6 - 1e-3
+        seen.append((k, size_bytes, odometry.x))
+
+    publish_in_time(EPISODE, began_s, move, show)
+    assert seen == [(0, 5, 0.0), (1, 6, pytest.approx(0.25)), (2, 7, pytest.approx(1.5))]
+    assert max(early_s) < LEAD_S + 1e-3
+
+
+def test_what_came_is_told_as_messages_of_the_episode() -> None:
+    came = received([(0, 2_030_000_000), (2, 2_090_000_000)], EPISODE, 2.0)
+    assert [(one.number, one.seq, one.at_us, one.x, one.received_ns) for one in came] == [
+        (0, 0, 0, 0.0, 30_000_000),
+        (1, 2, 60_000, 1.5, 90_000_000),
+    ]
+
+
+@pytest.mark.parametrize("play", [ros1.play, ros2.play])
+def test_ros_knows_one_speed(play: Any) -> None:
+    with pytest.raises(BufgymError, match="speed = 2: must be 1 with ROS"):
+        play(policies.get("afr"), EPISODE, 4, qoi.exponential(), speed=2.0)
