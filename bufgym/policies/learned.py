@@ -14,8 +14,8 @@ link.
 
 An agent may leave to others what they do better, as can be told on board (``shortcuts``). Where V is straight and then
 flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and no plan is better, however long an
-interruption is. It does so on a steady link too: the queue is sent as it stands, there is no trap. And while the link
-stands still a queue of four messages at most follows the exact plan (``small_queue``) where there is one.
+interruption is. It does so on a steady link too: the queue is sent as it stands, there is no trap. And while nothing
+leaves at all a queue of four messages at most follows the exact plan (``small_queue``) where there is one.
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
@@ -95,7 +95,7 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         end -= NUMBERS
         if straight(buffer.v) or steady(buffer):
             return _greedy_qoi(buffer, arrival, memory)
-        if still:
+        if still and buffer.drained_bytes == 0:
             plan = planned(buffer, arrival, buffer.parameters[end:])
             if plan != NONE:
                 return plan

@@ -87,7 +87,8 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
     double common, best = -HUGE_VAL;
     int i, k, decision = BUFGYM_REJECT;
     if (BUFGYM_SHORTCUTS) {
-        const int plan = q->service_ratio < @STILL@ ? bufgym_planned(q, arrival) : BUFGYM_NO_PLAN;
+        const int nothing_leaves = q->service_ratio < @STILL@ && q->drained_bytes == 0;
+        const int plan = nothing_leaves ? bufgym_planned(q, arrival) : BUFGYM_NO_PLAN;
         if (@STRAIGHT@ || bufgym_steady(q))
             return bufgym_greedy(q, arrival);
         if (plan != BUFGYM_NO_PLAN)
