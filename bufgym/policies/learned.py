@@ -14,8 +14,8 @@ link.
 
 An agent may leave to others what they do better, as can be told on board (``shortcuts``). Where V is straight and then
 flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and no plan is better, however long an
-interruption is. It does so on a steady link too: the queue is sent as it stands, there is no trap. And while nothing
-leaves at all a queue of four messages at most follows the exact plan (``small_queue``) where there is one.
+interruption is. It does so on a steady link too, where motion is uneven: the queue is sent as it stands, there is no
+trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``) where there is one.
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
@@ -70,15 +70,22 @@ STILL = 0.07
 """The link stands still while its service ratio (running mean of departures per arrival) is below this: from the first
 arrival of an interruption on (1/16), or 41 arrivals after a link that kept up has stopped."""
 FLOWS, FEW, STEADY = 0.18, 1, 0.01
-"""The link is steady while at least so many messages leave per arrival (or L is so small that the queue is soon sent
+"""A link is steady while at least so many messages leave per arrival (or L is so small that the queue is soon sent
 all the same), and its rates over 0.1 s and 0.5 s differ from that over 2 s by no more than twice this share, and this
 share, of it."""
 _greedy_qoi = kernel(greedy_qoi)
 
 
 @kernel
-def steady(buffer: Buffer) -> bool:
-    """Whether the link carries messages at one and the same rate."""
+def steady(buffer: Buffer, arrival: Arrival) -> bool:
+    """Whether the link carries messages at one and the same rate, while the scene does not move evenly.
+
+    Where it does, the even spacing is best, and the scorer is nearer to that.
+    """
+    moved = arrival.x - buffer.dequeued_x
+    step = arrival.x - buffer.previous_x
+    if abs(step * (arrival.seq - buffer.dequeued_seq) - moved) <= STEADY * moved:
+        return False
     mean = buffer.long_rate_bytes_per_s
     near = abs(buffer.medium_rate_bytes_per_s - mean) <= STEADY * mean
     level = near and abs(buffer.short_rate_bytes_per_s - mean) <= 2 * STEADY * mean
@@ -93,7 +100,7 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     still, end = buffer.service_ratio < STILL, len(buffer.parameters)
     if buffer.parameters[0] > 0:
         end -= NUMBERS
-        if straight(buffer.v) or steady(buffer):
+        if straight(buffer.v) or steady(buffer, arrival):
             return _greedy_qoi(buffer, arrival, memory)
         if still and buffer.drained_bytes == 0:
             plan = planned(buffer, arrival, buffer.parameters[end:])

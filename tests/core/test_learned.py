@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import VALUES, cases, log, queue_of, same
+from cases import VALUES, cases, log, newcomer, queue_of, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from weight_cases import network
@@ -85,6 +85,9 @@ def twin(whole):
         rates = [getattr(buffer, f"{span}_rate_bytes_per_s") for span in ("short", "medium", "long")]
         level = rates[2] > 0 and all(abs(r / rates[2] - 1) <= n / 100 for r, n in zip(rates, (2, 1), strict=False))
         flows = buffer.drained_us > 0 and (buffer.service_ratio >= 0.18 or buffer.capacity == 1)
+        steps = arrival.seq - buffer.dequeued_seq
+        moved = arrival.x - buffer.dequeued_x
+        flows = flows and abs((arrival.x - buffer.previous_x) * steps - moved) > moved / 100
         v = buffer.v
         bends_once = v[0] == qoi.SATURATING or (v[0] == qoi.TABULATED and v[int(v[1]) + 3] == v[-1])
         if whole.shortcuts and (bends_once or (level and flows)):
@@ -181,16 +184,19 @@ def test_where_greed_is_no_trap_it_loses_nothing():
 
 
 def test_a_link_is_steady_while_its_rates_agree():
-    buffer = queue_of(0, 8)._replace(service_ratio=0.25, drained_us=1000)
+    buffer = queue_of(0, 8)._replace(service_ratio=0.25, drained_us=1000, dequeued_x=0.0, previous_x=4.0)
+    uneven, even = newcomer(), newcomer()
+    uneven["seq"], uneven["x"] = 4, 4.5  # half a step after three of more
+    even["seq"], even["x"] = 4, 16 / 3
 
-    def steady(short, medium, long, **known):
+    def steady(short, medium, long, arrival=uneven, **known):
         rates = {"short_rate_bytes_per_s": short, "medium_rate_bytes_per_s": medium, "long_rate_bytes_per_s": long}
-        return learned.steady(buffer._replace(**rates, **known))
+        return learned.steady(buffer._replace(**rates, **known), arrival)
 
     assert steady(1e6, 1e6, 1e6) and steady(1.02e6, 0.99e6, 1e6)
     assert not steady(1.03e6, 1e6, 1e6) and not steady(1e6, 0.98e6, 1e6)
     assert not steady(1e6, 1e6, 1e6, service_ratio=0.1) and not steady(1e6, 1e6, 1e6, drained_us=0)
-    assert not steady(0.0, 0.0, 0.0)
+    assert not steady(0.0, 0.0, 0.0) and not steady(1e6, 1e6, 1e6, arrival=even)
     assert steady(1e6, 1e6, 1e6, service_ratio=0.1, capacity=1)  # one message is soon sent
 
 

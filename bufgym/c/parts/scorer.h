@@ -71,10 +71,13 @@ static inline double bufgym_score(
     return common + own;
 }
 
-/* Whether the link carries messages at one and the same rate. */
-static inline int bufgym_steady(const struct bufgym_queue *q)
+/* Whether the link carries messages at one and the same rate, while the scene does not move evenly. */
+static inline int bufgym_steady(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
+    const double moved = arrival->x - q->dequeued_x, step = arrival->x - q->previous_x;
     const double mean = 1e6 * q->long_rate, medium = 1e6 * q->medium_rate, short_mean = 1e6 * q->short_rate;
+    if (fabs(step * (double)(arrival->seq - q->dequeued_seq) - moved) <= @STEADY@ * moved)
+        return 0;
     return fabs(medium - mean) <= @STEADY@ * mean && fabs(short_mean - mean) <= 2 * @STEADY@ * mean && mean > 0.0
         && q->drained_us > 0 && (q->service_ratio >= @FLOWS@ || BUFGYM_CAPACITY <= @FEW@);
 }
@@ -89,7 +92,7 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
     if (BUFGYM_SHORTCUTS) {
         const int nothing_leaves = q->service_ratio < @STILL@ && q->drained_bytes == 0;
         const int plan = nothing_leaves ? bufgym_planned(q, arrival) : BUFGYM_NO_PLAN;
-        if (@STRAIGHT@ || bufgym_steady(q))
+        if (@STRAIGHT@ || bufgym_steady(q, arrival))
             return bufgym_greedy(q, arrival);
         if (plan != BUFGYM_NO_PLAN)
             return plan;
