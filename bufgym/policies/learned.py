@@ -15,7 +15,7 @@ link.
 An agent may leave to others what they do better, as can be told on board (``shortcuts``). Where V is straight and then
 flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and no plan is better, however long an
 interruption is. It does so on a steady link too, where motion is uneven: the queue is sent as it stands, there is no
-trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``) where there is one.
+trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``).
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
