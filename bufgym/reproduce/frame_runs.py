@@ -1,0 +1,342 @@
+"""What Fig. 7 and 8 of the AFR paper share when frames are really mapped and tracked: recordings, link, runs.
+
+The paper streams 794 RGB-D frames at 30 Hz over car_0002. Here the same number of frames comes from a recording of a
+Kinect (7-Scenes, with ``--data``) and from a made-up room, each as long as it really is when encoded. The link is that
+of the paper (with ``--data``; a made-up fade without) for as long as the stream lasts, and then again.
+
+Where the fade meets the camera's motion decides much. The paper shows one *alignment*: the link begins with the stream.
+Beside it stands a sweep that was fixed before anything had been run: the link begins k tenths of the stream later, so
+the fade comes earlier by as much, k = 0 .. ``offsets`` - 1; k = 0 is the paper's.
+
+Each run is one task: a recording, and the numbers of the frames that arrived. What a task gave is kept in a file by
+these alone. So figures share their runs, equal runs are run once, and what was killed goes on where it was.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import traces
+from bufgym.benchmark import cluster
+from bufgym.benchmark.run import bar
+from bufgym.errors import BufgymError
+from bufgym.perception import frames as depth_frames
+from bufgym.perception import mapping, orb, room, streams, tracking, views
+from bufgym.reproduce.afr_evaluation import LINK, PAPER_FRAMES, STYLES
+from bufgym.reproduce.figure import COLOURS, Figure, several, whole
+from bufgym.reproduce.rows import Row, Rows
+from bufgym.scenario import Episode
+from bufgym.scenario.suites import CAPACITIES, motion_value, time_value
+from bufgym.traces import Trace
+
+RECORDINGS = {"room": "a made-up room", "7-scenes": "7-Scenes, Kinect"}
+"""Name -> what it is; the second needs a folder of recordings."""
+SEVEN_SCENES = "rgbd_7scenes"
+WIDTH = 160
+"""Frames are mapped and tracked at 160 x 120."""
+OFFSETS = 10
+
+POLICIES = {
+    "drop-oldest": STYLES["drop-oldest"],
+    "random": STYLES["random"],
+    "orbbuf-images": ("ORBBuf, images", COLOURS["pink"], "D"),
+    "orbbuf": ("ORBBuf, motion", "#882255", "d"),
+    "afr": STYLES["afr"],
+    "min-motion-gap": ("min-motion-gap", COLOURS["orange"], "v"),
+    "learned-motion": ("learned-motion", COLOURS["sky"], "P"),
+    "clairvoyant": ("clairvoyant", COLOURS["oracle-ideal"], "*"),
+}
+"""Policy -> label, colour, marker. The clairvoyant plans for motion QoI."""
+
+Kind = Literal["map", "track"]
+
+
+def fade() -> Trace:
+    """In place of the paper's link: 2.2 MB/s, which is about its mean, and 0.4 from second 21 to second 24."""
+    return Trace.steps([(21, 2.2e6), (3, 0.4e6), (30, 2.2e6)], name="fade")
+
+
+# --- one recording ---------------------------------------------------------------------------------------------------
+
+
+class Stage:
+    """A recording at the size at which it is mapped and tracked, and what every run on it needs."""
+
+    def __init__(self, name: str, data: str | None, frames: int) -> None:
+        if name == "room":
+            whole_size = room.room(0, frames=frames)
+        elif data is None:
+            raise BufgymError(f"recording {name}: needs a folder of recordings (--data DIR) with {SEVEN_SCENES}")
+        else:
+            whole_size = depth_frames.open_sequence(Path(data) / SEVEN_SCENES)
+        self.whole = streams.first(whole_size, frames)
+        self.sequence = self.whole.reduced(self.whole.camera.width // WIDTH).loaded()
+
+    @cached_property
+    def grid(self) -> mapping.Grid:
+        """Of every map."""
+        return mapping.grid_of(self.sequence)
+
+    @cached_property
+    def reference(self) -> mapping.Map:
+        """The map of all frames."""
+        return mapping.fuse(self.sequence, range(len(self.sequence)), self.grid)
+
+    @cached_property
+    def similar(self) -> orb.OrbSimilarity:
+        """Of the images, as the sender has them."""
+        return orb.OrbSimilarity(self.whole.grey)
+
+    @cached_property
+    def seen(self) -> NDArray[np.float32]:
+        """See ``views.seen_shares``."""
+        return views.seen_shares(self.sequence)
+
+    @cached_property
+    def coverage(self) -> views.Coverage:
+        """Of its scene."""
+        return views.Coverage(self.sequence.reduced(2))
+
+    def mapped(self, kept: Sequence[int]) -> Row:
+        """Error of the map of these frames with their true poses."""
+        return errors(mapping.error(mapping.fuse(self.sequence, kept, self.grid), self.reference))
+
+    def tracked(self, kept: Sequence[int]) -> Row:
+        """Where tracking along these frames breaks, and the error of the map with the poses that it found till then."""
+        track = tracking.track(self.sequence, kept, self.grid)
+        known = ~np.isnan(track.poses[:, 0, 0])
+        posed = Posed(self.sequence, np.asarray(track.frames)[known], track.poses[known])
+        found = errors(mapping.error(mapping.fuse(posed, posed.frames, self.grid), self.reference))
+        row: Row = {"failed": bool(track.failed), "failed_at": None if track.where is None else int(track.where)}
+        row["pose_rmse_mm"] = 1e3 * float(np.sqrt(np.mean(np.square(track.error_m[known]))))
+        return row | {f"slam_{name}": number for name, number in found.items()}
+
+
+class Posed(streams.First):
+    """A recording in which some frames have other poses."""
+
+    def __init__(self, whole: depth_frames.Sequence, frames: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+        super().__init__(whole, len(whole))
+        self.frames = frames.tolist()
+        self.poses = whole.poses.copy()
+        self.poses[frames] = poses
+
+
+def errors(error: mapping.MapError) -> Row:
+    """A map's error in mm, and what of the scene it lacks."""
+    return {
+        "rmse_mm": 1e3 * error.rmse_m,
+        "to_reference_mm": 1e3 * error.to_reference_m,
+        "from_reference_mm": 1e3 * error.from_reference_m,
+        "uncovered": error.uncovered,
+    }
+
+
+@functools.lru_cache(maxsize=2)
+def stage(name: str, data: str | None, frames: int) -> Stage:
+    """One for each process: to open a recording takes seconds."""
+    return Stage(name, data, frames)
+
+
+# --- tasks -----------------------------------------------------------------------------------------------------------
+
+
+class Task(NamedTuple):
+    """What is to be found out of some frames of a recording."""
+
+    kind: Kind
+    recording: str
+    data: str | None
+    frames: int
+    kept: tuple[int, ...]
+
+    @property
+    def key(self) -> str:
+        """Tells it from all others, wherever the data lie."""
+        text = f"{self.kind} {self.recording} {self.frames} {self.kept}"
+        return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def carried_out(task: Task) -> tuple[str, Row]:
+    """The task's key and what it gave."""
+    on = stage(task.recording, task.data, task.frames)
+    return task.key, on.mapped(task.kept) if task.kind == "map" else on.tracked(task.kept)
+
+
+class Store:
+    """Results of tasks by their keys, in memory and, if ``path`` is given, a line each in a file."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._held: dict[str, Row] = {}
+        if path is not None and path.exists():
+            for line in path.read_text(encoding="utf-8").splitlines():
+                try:
+                    key, row = json.loads(line)
+                except ValueError:
+                    continue  # the line that a kill cut short
+                self._held[key] = row
+
+    def __contains__(self, task: Task) -> bool:
+        return task.key in self._held
+
+    def __getitem__(self, task: Task) -> Row:
+        return self._held[task.key]
+
+    def add(self, key: str, row: Row) -> None:
+        """Keep what a task gave."""
+        self._held[key] = row
+        if self._path is not None:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps([key, row]) + "\n")
+
+
+def carry_out(tasks: Iterable[Task], store: Store, jobs: int) -> None:
+    """Carry out what the store does not have yet; each task once."""
+    missing = list({task.key: task for task in tasks if task not in store}.values())
+    if not missing:
+        return
+    with bar(len(missing), show=True, unit="run") as advance:
+        for key, row in _spread(missing, jobs):
+            store.add(key, row)
+            advance(1)
+
+
+def _spread(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[str, Row]]:
+    if jobs == 1:
+        yield from map(carried_out, tasks)
+    else:
+        calls = ((carried_out, (task,)) for task in tasks)
+        yield from cluster.spread(calls, len(tasks), jobs, "loky", None)
+
+
+# --- the figures -----------------------------------------------------------------------------------------------------
+
+
+class Setting(NamedTuple):
+    """One run: which policy, with which queue, on which recording, with the fade where."""
+
+    recording: str
+    k: int
+    L: int
+    policy: str
+
+
+@dataclass(frozen=True)
+class FrameFigure(Figure):
+    """A figure of runs of every policy at each L, on each recording and with the fade at each offset."""
+
+    data: Path | None = None
+    """Folder of recordings; without one the made-up room and a made-up fade alone."""
+    frames: int = PAPER_FRAMES
+    capacities: Sequence[int] = CAPACITIES
+    policies: Sequence[str] = tuple(POLICIES)
+    offsets: int = OFFSETS
+    """Runs of the sweep; the fade comes a tenth of the stream earlier in each."""
+    jobs: int = -1
+    """Processes side by side; -1: one a core."""
+    store: Path | None = None
+    """File of the tasks that have been carried out; None keeps nothing."""
+
+    RULES = {"frames": whole(30), "capacities": several(whole()), "offsets": whole(1, OFFSETS)}
+
+    @property
+    def recordings(self) -> list[str]:
+        """Those that are there."""
+        real = self.data is not None and (self.data / SEVEN_SCENES).is_dir()
+        return ["room", *(["7-scenes"] if real else [])]
+
+    @cached_property
+    def link(self) -> Trace:
+        """The paper's where it is there."""
+        path = None if self.data is None else self.data / LINK
+        return fade() if path is None or not path.is_file() else traces.read_trace(path)
+
+    def stage(self, recording: str) -> Stage:
+        """The recording, opened once."""
+        return stage(recording, None if self.data is None else str(self.data), self.frames)
+
+    def settings(self) -> list[Setting]:
+        """Every run, in the order of the rows."""
+        return [
+            Setting(recording, k, L, policy)
+            for recording in self.recordings
+            for k in range(self.offsets)
+            for L in self.capacities
+            for policy in self.policies
+        ]
+
+    def task(self, kind: Kind, setting: Setting) -> Task:
+        """What is to be found out of this run."""
+        data = None if self.data is None else str(self.data)
+        return Task(kind, setting.recording, data, self.frames, self.kept(setting))
+
+    def kept(self, setting: Setting) -> tuple[int, ...]:
+        """The frames that arrive in this run."""
+        if setting not in self._kept:
+            one = self.episode(setting.recording, setting.k)
+            policy: Any = setting.policy
+            if policy == "orbbuf-images":
+                policy = orb.orbbuf_by(self.stage(setting.recording).similar, one)
+            self._kept[setting] = streams.received(policy, one, setting.L)
+        return self._kept[setting]
+
+    @cached_property
+    def _kept(self) -> dict[Setting, tuple[int, ...]]:
+        return {}
+
+    def episode(self, recording: str, k: int) -> Episode:
+        """The stream of a recording, the fade k tenths earlier than in the paper."""
+        sequence = self.stage(recording).whole
+        stream_us = int(sequence.time_us[-1])
+        link = streams.fading(stream_us, self.link, k * stream_us // OFFSETS)
+        return streams.episode(sequence, streams.sizes(sequence), link, seed=k)
+
+    def play(self, *kinds: Kind) -> Rows:
+        """A row for each run: its frames, its information by each V, and what the tasks of these kinds gave."""
+        settings, store = self.settings(), Store(self.store)
+        carry_out([self.task(kind, setting) for kind in kinds for setting in settings], store, self.jobs)
+        rows = Rows()
+        for setting in settings:
+            row: Row = setting._asdict() | {"received": len(self.kept(setting))} | self.information(setting)
+            for kind in kinds:
+                row |= store[self.task(kind, setting)]
+            rows.append(row)
+        return rows
+
+    def information(self, setting: Setting) -> Row:
+        """H of the run's frames by time, by motion and by measured overlap, and what of the scene they cover."""
+        kept, on = self.kept(setting), self.stage(setting.recording)
+        x = self.episode(setting.recording, 0).arrivals["x"][list(kept)]
+        return {
+            "H_time": time_value().information(np.array(kept, np.float64)),
+            "H_motion": motion_value().information(x),
+            "H_overlap": views.overlap_information(on.seen, kept),
+            "coverage": on.coverage.share(kept),
+        }
+
+    def about(self) -> str:
+        """What meets the policies, in sentences."""
+        parts = []
+        for recording in self.recordings:
+            whole = self.stage(recording).whole
+            size_kb = float(streams.sizes(whole).mean()) / 1e3
+            seconds = float(whole.time_us[-1]) / 1e6
+            carried = self.episode(recording, 0).link.carried_at(int(whole.time_us[-1]))
+            demand = float(streams.sizes(whole).sum())
+            parts.append(
+                f"{recording}: {RECORDINGS[recording]}, {len(whole)} frames of {size_kb:.0f} kB in {seconds:.1f} s, "
+                f"of which the link {self.link.name} carries {carried / demand:.0%}."
+            )
+        return "\n\n".join(parts)
