@@ -14,6 +14,7 @@ from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode
 from bufgym.scenario.arrivals import messages
 from bufgym.scenario.suites import motion_value
+from bufgym.sim import metrics
 from bufgym.traces import Trace
 
 SIZED_EVERY = 10
@@ -75,4 +76,4 @@ def episode(sequence: Sequence, size_bytes: NDArray[np.int64], link: Link, seed:
 def received(policy: str | Policy, one: Episode, capacity: int) -> tuple[int, ...]:
     """The frames that arrive, by their numbers, with a queue of ``capacity`` messages under ``policy``."""
     senders = sim.run(policies.get(policy), [one], capacity, motion_value())
-    return tuple(sim.metrics.received(senders, 0)["seq"].tolist())
+    return tuple(metrics.received(senders, 0)["seq"].tolist())

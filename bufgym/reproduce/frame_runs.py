@@ -46,10 +46,12 @@ WIDTH = 160
 """Frames are mapped and tracked at 160 x 120."""
 OFFSETS = 10
 
+IMAGES = "orbbuf-images"
+"""ORBBuf by the images themselves: a policy of each episode, not registered."""
 POLICIES = {
     "drop-oldest": STYLES["drop-oldest"],
     "random": STYLES["random"],
-    "orbbuf-images": ("ORBBuf, images", COLOURS["pink"], "D"),
+    IMAGES: ("ORBBuf, images", COLOURS["pink"], "D"),
     "orbbuf": ("ORBBuf, motion", "#882255", "d"),
     "afr": STYLES["afr"],
     "min-motion-gap": ("min-motion-gap", COLOURS["orange"], "v"),
@@ -58,7 +60,7 @@ POLICIES = {
 }
 """Policy -> label, colour, marker. The clairvoyant plans for motion QoI."""
 
-Kind = Literal["map", "track"]
+Kind = Literal["images", "map", "track"]
 
 
 def fade() -> Trace:
@@ -107,6 +109,12 @@ class Stage:
         """Of its scene."""
         return views.Coverage(self.sequence.reduced(2))
 
+    def episode(self, trace: Trace, k: int) -> Episode:
+        """The stream over this link, the fade k tenths of it earlier than in the paper."""
+        stream_us = int(self.whole.time_us[-1])
+        link = streams.fading(stream_us, trace, k * stream_us // OFFSETS)
+        return streams.episode(self.whole, streams.sizes(self.whole), link, seed=k)
+
     def mapped(self, kept: Sequence[int]) -> Row:
         """Error of the map of these frames with their true poses."""
         return errors(mapping.error(mapping.fuse(self.sequence, kept, self.grid), self.reference))
@@ -152,25 +160,33 @@ def stage(name: str, data: str | None, frames: int) -> Stage:
 
 
 class Task(NamedTuple):
-    """What is to be found out of some frames of a recording."""
+    """What is to be found out: the map or the track of some frames of a recording, or which ones ORBBuf keeps."""
 
     kind: Kind
     recording: str
     data: str | None
     frames: int
-    kept: tuple[int, ...]
+    about: tuple[int, ...]
+    """The frames; of ``images`` (k, L): the offset of the fade, and the queue."""
+    trace: Trace
+    """The link."""
 
     @property
     def key(self) -> str:
-        """Tells it from all others, wherever the data lie."""
-        text = f"{self.kind} {self.recording} {self.frames} {self.kept}"
+        """Tells it from all others, wherever the data lie; maps and tracks depend on nothing but their frames."""
+        link = self.trace.name if self.kind == "images" else ""
+        text = f"{self.kind} {self.recording} {self.frames} {self.about} {link}"
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
 def carried_out(task: Task) -> tuple[str, Row]:
     """The task's key and what it gave."""
     on = stage(task.recording, task.data, task.frames)
-    return task.key, on.mapped(task.kept) if task.kind == "map" else on.tracked(task.kept)
+    if task.kind == "images":
+        k, L = task.about
+        one = on.episode(task.trace, k)
+        return task.key, {"kept": streams.received(orb.orbbuf_by(on.similar, one), one, L)}
+    return task.key, on.mapped(task.about) if task.kind == "map" else on.tracked(task.about)
 
 
 class Store:
@@ -277,48 +293,49 @@ class FrameFigure(Figure):
             for policy in self.policies
         ]
 
+    @cached_property
+    def done(self) -> Store:
+        """What has been carried out."""
+        return Store(self.store)
+
     def task(self, kind: Kind, setting: Setting) -> Task:
         """What is to be found out of this run."""
         data = None if self.data is None else str(self.data)
-        return Task(kind, setting.recording, data, self.frames, self.kept(setting))
+        about = (setting.k, setting.L) if kind == "images" else self.kept(setting)
+        return Task(kind, setting.recording, data, self.frames, about, self.link)
 
     def kept(self, setting: Setting) -> tuple[int, ...]:
         """The frames that arrive in this run."""
+        if setting.policy == IMAGES:
+            task = self.task("images", setting)
+            carry_out([task], self.done, 1)
+            return tuple(self.done[task]["kept"])
         if setting not in self._kept:
-            one = self.episode(setting.recording, setting.k)
-            policy: Any = setting.policy
-            if policy == "orbbuf-images":
-                policy = orb.orbbuf_by(self.stage(setting.recording).similar, one)
-            self._kept[setting] = streams.received(policy, one, setting.L)
+            one = self.stage(setting.recording).episode(self.link, setting.k)
+            self._kept[setting] = streams.received(setting.policy, one, setting.L)
         return self._kept[setting]
 
     @cached_property
     def _kept(self) -> dict[Setting, tuple[int, ...]]:
         return {}
 
-    def episode(self, recording: str, k: int) -> Episode:
-        """The stream of a recording, the fade k tenths earlier than in the paper."""
-        sequence = self.stage(recording).whole
-        stream_us = int(sequence.time_us[-1])
-        link = streams.fading(stream_us, self.link, k * stream_us // OFFSETS)
-        return streams.episode(sequence, streams.sizes(sequence), link, seed=k)
-
     def play(self, *kinds: Kind) -> Rows:
         """A row for each run: its frames, its information by each V, and what the tasks of these kinds gave."""
-        settings, store = self.settings(), Store(self.store)
-        carry_out([self.task(kind, setting) for kind in kinds for setting in settings], store, self.jobs)
+        settings = self.settings()
+        carry_out([self.task("images", one) for one in settings if one.policy == IMAGES], self.done, self.jobs)
+        carry_out([self.task(kind, setting) for kind in kinds for setting in settings], self.done, self.jobs)
         rows = Rows()
         for setting in settings:
             row: Row = setting._asdict() | {"received": len(self.kept(setting))} | self.information(setting)
             for kind in kinds:
-                row |= store[self.task(kind, setting)]
+                row |= self.done[self.task(kind, setting)]
             rows.append(row)
         return rows
 
     def information(self, setting: Setting) -> Row:
         """H of the run's frames by time, by motion and by measured overlap, and what of the scene they cover."""
         kept, on = self.kept(setting), self.stage(setting.recording)
-        x = self.episode(setting.recording, 0).arrivals["x"][list(kept)]
+        x = on.episode(self.link, 0).arrivals["x"][list(kept)]
         return {
             "H_time": time_value().information(np.array(kept, np.float64)),
             "H_motion": motion_value().information(x),
@@ -333,7 +350,7 @@ class FrameFigure(Figure):
             whole = self.stage(recording).whole
             size_kb = float(streams.sizes(whole).mean()) / 1e3
             seconds = float(whole.time_us[-1]) / 1e6
-            carried = self.episode(recording, 0).link.carried_at(int(whole.time_us[-1]))
+            carried = self.stage(recording).episode(self.link, 0).link.carried_at(int(whole.time_us[-1]))
             demand = float(streams.sizes(whole).sum())
             parts.append(
                 f"{recording}: {RECORDINGS[recording]}, {len(whole)} frames of {size_kb:.0f} kB in {seconds:.1f} s, "
