@@ -1,0 +1,200 @@
+"""Where a camera is, from its frames alone: KinectFusion on the frames that arrived, and where it fails.
+
+The model begins with the first frame at its true pose. Each further frame is aligned with the model as seen from the
+frame before (coarse to fine) and then fused into it at the pose found. There is no model of motion and no relocation:
+a camera that moved on too far between two frames that arrived is lost, as it is for the robot's server.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from bufgym.errors import BufgymError
+from bufgym.perception import icp, tsdf
+from bufgym.perception.frames import Camera, Depth, Sequence
+from bufgym.perception.mapping import FAR_M, Grid, Map, grid_of, lens_of
+from bufgym.traces.poses import rotations
+from bufgym.traces.trace import Float64Array
+
+LEVELS: Final = ((4, 10), (2, 5), (1, 4))
+"""(stride, steps) from coarse to fine, as KinectFusion has them."""
+SAME_SURFACE: Final = 0.05
+"""Neighbouring pixels are of one surface if their distances differ by at most this share."""
+SMOOTH_RADIUS: Final = 2
+"""Depths are smoothed over 5x5 pixels, within one surface, before normals are taken."""
+MOST_WEIGHT: Final = 64.0
+"""The model forgets as KinectFusion's does, by a running mean of at most so many frames."""
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """When two points belong together, and when tracking has failed.
+
+    The papers do not say what a tracking failure is. Here a run fails at its first frame at which the alignment finds
+    too few pairs (the tracker knows that it is lost), or at which the pose found is too far from the truth (it is lost
+    and does not know).
+    """
+
+    apart_m: float = 0.1
+    """Pairs farther apart than this are none, m."""
+    apart_deg: float = 30.0
+    """Nor are pairs whose normals differ by more, degrees."""
+    least_pairs: float = 0.3
+    """Lost if fewer of the frame's points than this share have a pair."""
+    most_error_m: float = 0.2
+    """Lost if the position is farther from the truth, m."""
+    most_error_deg: float = 10.0
+    """Lost if the orientation is farther from the truth, degrees."""
+
+    def __post_init__(self) -> None:
+        for name in ("apart_m", "apart_deg", "most_error_m", "most_error_deg"):
+            if not getattr(self, name) > 0:
+                raise BufgymError(f"{name} = {getattr(self, name)}: must be above 0")
+        if not 0 <= self.least_pairs <= 1:
+            raise BufgymError(f"least_pairs = {self.least_pairs}: must be from 0 to 1")
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """How far tracking got."""
+
+    frames: npt.NDArray[np.int64]
+    """int64[m], those that arrived, indices of the sequence."""
+    poses: Float64Array
+    """float64[m, 4, 4], the poses found, camera to world; NaN from the failure on."""
+    error_m: Float64Array
+    """float64[m], distance from the true position, m; NaN after the failure, and at it if no pose was found."""
+    error_deg: Float64Array
+    """float64[m], the same of the orientation, degrees."""
+    where: int | None
+    """The frame (index of the sequence) at which tracking failed; None if it never did."""
+
+    @property
+    def failed(self) -> bool:
+        """Whether it failed at all."""
+        return self.where is not None
+
+
+def track(
+    sequence: Sequence, frames: Iterable[int], grid: Grid | None = None, settings: TrackingSettings | None = None
+) -> Track:
+    """Follow the camera through the frames that arrived, until that fails.
+
+    Args:
+        sequence: the recording; `Sequence.reduced` to about 160x120 is meant.
+        frames: the indices of those that arrived, in order.
+        grid: of the model; by default `grid_of` the whole recording.
+        settings: by default `TrackingSettings()`.
+
+    Raises:
+        BufgymError: no frame, or frames that are not in order.
+    """
+    settings = settings or TrackingSettings()
+    arrived = np.array(list(frames), np.int64)
+    if not len(arrived) or (np.diff(arrived) <= 0).any() or arrived[0] < 0 or arrived[-1] >= len(sequence):
+        raise BufgymError(f"frames: must be at least one index below {len(sequence)}, increasing")
+    poses = np.full((len(arrived), 4, 4), np.nan)
+    errors = np.full((2, len(arrived)), np.nan)
+    poses[0], errors[:, 0] = sequence.poses[arrived[0]], 0.0
+    tracker = Tracker(sequence.camera, grid or grid_of(sequence), settings)
+    tracker.begin(sequence.depth(int(arrived[0])), poses[0])
+    for n, k in enumerate(arrived.tolist()[1:], 1):
+        pose = tracker.follow(sequence.depth(k))
+        if pose is not None:
+            errors[:, n] = difference(pose, sequence.poses[k])
+        if pose is None or errors[0, n] > settings.most_error_m or errors[1, n] > settings.most_error_deg:
+            return Track(arrived, poses, errors[0], errors[1], k)
+        poses[n] = pose
+    return Track(arrived, poses, errors[0], errors[1], None)
+
+
+def difference(pose: Float64Array, truth: Float64Array) -> tuple[float, float]:
+    """How far two poses are apart, m and degrees."""
+    turn = pose[:3, :3].T @ truth[:3, :3]
+    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    angle = np.arctan2(sine, np.trace(turn) - 1)  # the arc cosine would lose small angles
+    return float(np.linalg.norm(pose[:3, 3] - truth[:3, 3])), float(np.degrees(angle))
+
+
+class Tracker:
+    """A model that grows and the pose of the camera in it."""
+
+    def __init__(self, camera: Camera, grid: Grid, settings: TrackingSettings | None = None) -> None:
+        self.settings = settings or TrackingSettings()
+        self.model = Map.empty(grid)
+        self.pose = np.eye(4)
+        self._camera, self._lens = camera, lens_of(camera)
+        shape = (camera.height, camera.width, 3)
+        self._smooth = np.zeros(shape[:2], np.float32)
+        self._points, self._normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self._seen, self._seen_normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self._sums = np.zeros((8, 8))
+
+    def begin(self, depth: Depth, pose: Float64Array) -> None:
+        """The first frame, at a known pose."""
+        self._fuse(depth, pose)
+
+    def follow(self, depth: Depth) -> Float64Array | None:
+        """The pose of the next frame, camera to world, which is then part of the model; None if it is lost."""
+        pose = self._aligned(depth)
+        if pose is not None:
+            self._fuse(depth, pose)
+        return pose
+
+    def _fuse(self, depth: Depth, pose: Float64Array) -> None:
+        self.pose = pose
+        self.model.add(depth, self._camera, pose, MOST_WEIGHT)
+
+    def _aligned(self, depth: Depth) -> Float64Array | None:
+        grid, lens, settings, eye = self.model.grid, self._lens, self.settings, np.zeros(3)
+        icp.smooth(depth, SMOOTH_RADIUS, SAME_SURFACE / 2, self._smooth)
+        icp.unproject(self._smooth, FAR_M, lens, self._points)
+        icp.orient(self._points, eye, SAME_SURFACE, self._normals)
+        origin_m, reach_m = np.array(grid.origin_m), grid.truncation_m
+        model = self.model
+        tsdf.raycast(
+            model.tsdf, model.weight, origin_m, grid.voxel_m, reach_m, FAR_M, lens, self.pose, self._seen
+        )
+        icp.orient(self._seen, np.ascontiguousarray(self.pose[:3, 3]), SAME_SURFACE, self._seen_normals)
+        to_model_camera = np.linalg.inv(self.pose)
+        cosine = float(np.cos(np.radians(settings.apart_deg)))
+        pose = self.pose.copy()
+        for stride, steps in LEVELS:
+            for _ in range(steps):
+                icp.normal_equations(
+                    self._points,
+                    self._normals,
+                    stride,
+                    pose,
+                    self._seen,
+                    self._seen_normals,
+                    to_model_camera,
+                    lens,
+                    settings.apart_m,
+                    cosine,
+                    self._sums,
+                )
+                pairs, points = self._sums[0, 7], self._sums[1, 7]
+                if pairs < max(6, settings.least_pairs * points):
+                    return None
+                try:
+                    step = np.linalg.solve(self._sums[:6, :6], -self._sums[:6, 6])
+                except np.linalg.LinAlgError:  # a view that leaves a direction open, such as a single wall
+                    return None
+                pose = _moved(pose, step)
+        return pose
+
+
+def _moved(pose: Float64Array, step: Float64Array) -> Float64Array:
+    """The pose after a small rotation about the world's origin (rad) and a translation (m)."""
+    angle = float(np.linalg.norm(step[:3]))
+    axis = step[:3] / angle if angle > 0 else step[:3]
+    quaternion = np.append(np.sin(angle / 2) * axis, np.cos(angle / 2))
+    change = np.eye(4)
+    change[:3, :3], change[:3, 3] = rotations(quaternion[None])[0], step[3:]
+    return np.asarray(change @ pose, np.float64)
