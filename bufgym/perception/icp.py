@@ -91,8 +91,9 @@ def normal_equations(
     lens: Any,
     apart_m: float,
     cosine: float,
+    jacobian: Any,
     sums: Any,
-) -> None:
+) -> int:
     """What least squares needs to move ``pose`` by a small rotation and translation (rx, ry, rz, tx, ty, tz).
 
     Args:
@@ -104,12 +105,15 @@ def normal_equations(
         lens: of both.
         apart_m: pairs farther apart are none, m.
         cosine: pairs whose normals differ by more than the angle of this cosine are none.
-        sums: float64[8, 8], written: sum of j j^T of the rows j = (6 derivatives, distance to the plane) in [:7, :7];
-            in the last column the number of pairs and the number of points with a normal; the last row is j itself.
+        jacobian: float64[8], scratch: of one pair the 6 derivatives of the distance to the plane, that distance, and 1.
+        sums: float64[8, 8], written: the sum of jacobian^T jacobian over all pairs; its last element is their number.
+
+    Returns the number of points with a normal, paired or not.
     """
     height, width = model.shape[0], model.shape[1]
     m, c = pose, to_model_camera
-    for a in range(7):
+    count = 0
+    for a in range(8):
         for b in range(8):
             sums[a, b] = 0.0
     for v in range(0, points.shape[0], stride):
@@ -117,7 +121,7 @@ def normal_equations(
             lx, ly, lz = point_normals[v, u, 0], point_normals[v, u, 1], point_normals[v, u, 2]
             if math.isnan(lx):
                 continue
-            sums[1, 7] += 1.0
+            count += 1
             px, py, pz = points[v, u, 0], points[v, u, 1], points[v, u, 2]
             x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]
             y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
@@ -138,13 +142,11 @@ def normal_equations(
             wz = m[2, 0] * lx + m[2, 1] * ly + m[2, 2] * lz
             if not wx * nx + wy * ny + wz * nz > cosine:
                 continue
-            j = sums[7]
-            j[0], j[1], j[2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
-            j[3], j[4], j[5], j[6] = nx, ny, nz, dx * nx + dy * ny + dz * nz
-            for a in range(7):
-                for b in range(a, 7):
-                    sums[a, b] += j[a] * j[b]
-            sums[0, 7] += 1.0
-    for a in range(7):
-        for b in range(a):
-            sums[a, b] = sums[b, a]
+            jacobian[0], jacobian[1], jacobian[2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+            jacobian[3], jacobian[4], jacobian[5], jacobian[6] = nx, ny, nz, dx * nx + dy * ny + dz * nz
+            jacobian[7] = 1.0
+            for a in range(8):
+                factor = jacobian[a]
+                for b in range(8):  # all eight, though the sums are symmetric: so it is vectorised
+                    sums[a, b] += factor * jacobian[b]
+    return count

@@ -23,6 +23,8 @@ from bufgym.traces.trace import Float64Array
 
 LEVELS: Final = ((4, 10), (2, 5), (1, 4))
 """(stride, steps) from coarse to fine, as KinectFusion has them."""
+SMALL_STEP: Final = 1e-4
+"""A level ends early at a smaller step, rad and m."""
 SAME_SURFACE: Final = 0.05
 """Neighbouring pixels are of one surface if their distances differ by at most this share."""
 SMOOTH_RADIUS: Final = 2
@@ -36,8 +38,8 @@ class TrackingSettings:
     """When two points belong together, and when tracking has failed.
 
     The papers do not say what a tracking failure is. Here a run fails at its first frame at which the alignment finds
-    too few pairs (the tracker knows that it is lost), or at which the pose found is too far from the truth (it is lost
-    and does not know).
+    too few pairs (the tracker knows that it is lost), or at which the step from the frame before is too far from the
+    true step (it is lost and does not know). Slow drift is no failure: it depends on the recording's camera model.
     """
 
     apart_m: float = 0.1
@@ -46,10 +48,10 @@ class TrackingSettings:
     """Nor are pairs whose normals differ by more, degrees."""
     least_pairs: float = 0.3
     """Lost if fewer of the frame's points than this share have a pair."""
-    most_error_m: float = 0.2
-    """Lost if the position is farther from the truth, m."""
-    most_error_deg: float = 10.0
-    """Lost if the orientation is farther from the truth, degrees."""
+    most_error_m: float = 0.1
+    """Lost if one step is off by more, m."""
+    most_error_deg: float = 5.0
+    """Lost if one step turns by so much more or less than it should, degrees."""
 
     def __post_init__(self) -> None:
         for name in ("apart_m", "apart_deg", "most_error_m", "most_error_deg"):
@@ -68,7 +70,7 @@ class Track:
     poses: Float64Array
     """float64[m, 4, 4], the poses found, camera to world; NaN from the failure on."""
     error_m: Float64Array
-    """float64[m], distance from the true position, m; NaN after the failure, and at it if no pose was found."""
+    """float64[m], distance from the true position, drift included, m; NaN from the failure on."""
     error_deg: Float64Array
     """float64[m], the same of the orientation, degrees."""
     where: int | None
@@ -100,17 +102,24 @@ def track(
         raise BufgymError(f"frames: must be at least one index below {len(sequence)}, increasing")
     poses = np.full((len(arrived), 4, 4), np.nan)
     errors = np.full((2, len(arrived)), np.nan)
-    poses[0], errors[:, 0] = sequence.poses[arrived[0]], 0.0
+    truth = sequence.poses[arrived]
+    poses[0], errors[:, 0] = truth[0], 0.0
     tracker = Tracker(sequence.camera, grid or grid_of(sequence), settings)
     tracker.begin(sequence.depth(int(arrived[0])), poses[0])
     for n, k in enumerate(arrived.tolist()[1:], 1):
         pose = tracker.follow(sequence.depth(k))
-        if pose is not None:
-            errors[:, n] = difference(pose, sequence.poses[k])
-        if pose is None or errors[0, n] > settings.most_error_m or errors[1, n] > settings.most_error_deg:
+        if pose is None or _jumped(poses[n - 1], pose, truth[n - 1], truth[n], settings):
             return Track(arrived, poses, errors[0], errors[1], k)
-        poses[n] = pose
+        poses[n], errors[:, n] = pose, difference(pose, truth[n])
     return Track(arrived, poses, errors[0], errors[1], None)
+
+
+def _jumped(
+    before: Float64Array, pose: Float64Array, true_before: Float64Array, truth: Float64Array, settings: TrackingSettings
+) -> bool:
+    """Whether the step between two poses is too far from the true step."""
+    off_m, off_deg = difference(np.linalg.inv(before) @ pose, np.linalg.inv(true_before) @ truth)
+    return off_m > settings.most_error_m or off_deg > settings.most_error_deg
 
 
 def difference(pose: Float64Array, truth: Float64Array) -> tuple[float, float]:
@@ -133,7 +142,8 @@ class Tracker:
         self._smooth = np.zeros(shape[:2], np.float32)
         self._points, self._normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self._seen, self._seen_normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        self._sums = np.zeros((8, 8))
+        self._jacobian, self._sums = np.zeros(8), np.zeros((8, 8))
+        self._hint: Depth = self._smooth
 
     def begin(self, depth: Depth, pose: Float64Array) -> None:
         """The first frame, at a known pose."""
@@ -147,47 +157,60 @@ class Tracker:
         return pose
 
     def _fuse(self, depth: Depth, pose: Float64Array) -> None:
-        self.pose = pose
+        self.pose, self._hint = pose, depth
         self.model.add(depth, self._camera, pose, MOST_WEIGHT)
 
     def _aligned(self, depth: Depth) -> Float64Array | None:
-        grid, lens, settings, eye = self.model.grid, self._lens, self.settings, np.zeros(3)
+        model, grid, lens, pose = self.model, self.model.grid, self._lens, self.pose
         icp.smooth(depth, SMOOTH_RADIUS, SAME_SURFACE / 2, self._smooth)
         icp.unproject(self._smooth, FAR_M, lens, self._points)
-        icp.orient(self._points, eye, SAME_SURFACE, self._normals)
-        origin_m, reach_m = np.array(grid.origin_m), grid.truncation_m
-        model = self.model
+        icp.orient(self._points, np.zeros(3), SAME_SURFACE, self._normals)
         tsdf.raycast(
-            model.tsdf, model.weight, origin_m, grid.voxel_m, reach_m, FAR_M, lens, self.pose, self._seen
+            model.tsdf,
+            model.weight,
+            np.array(grid.origin_m),
+            grid.voxel_m,
+            grid.truncation_m,
+            FAR_M,
+            lens,
+            pose,
+            self._hint,
+            self._seen,
         )
-        icp.orient(self._seen, np.ascontiguousarray(self.pose[:3, 3]), SAME_SURFACE, self._seen_normals)
-        to_model_camera = np.linalg.inv(self.pose)
-        cosine = float(np.cos(np.radians(settings.apart_deg)))
-        pose = self.pose.copy()
-        for stride, steps in LEVELS:
-            for _ in range(steps):
-                icp.normal_equations(
-                    self._points,
-                    self._normals,
-                    stride,
-                    pose,
-                    self._seen,
-                    self._seen_normals,
-                    to_model_camera,
-                    lens,
-                    settings.apart_m,
-                    cosine,
-                    self._sums,
-                )
-                pairs, points = self._sums[0, 7], self._sums[1, 7]
-                if pairs < max(6, settings.least_pairs * points):
-                    return None
-                try:
-                    step = np.linalg.solve(self._sums[:6, :6], -self._sums[:6, 6])
-                except np.linalg.LinAlgError:  # a view that leaves a direction open, such as a single wall
+        icp.orient(self._seen, np.ascontiguousarray(pose[:3, 3]), SAME_SURFACE, self._seen_normals)
+        to_model_camera = np.linalg.inv(pose)
+        for stride, most_steps in LEVELS:
+            for _ in range(most_steps):
+                step = self._step(stride, pose, to_model_camera)
+                if step is None:
                     return None
                 pose = _moved(pose, step)
+                if np.abs(step).max() < SMALL_STEP:
+                    break
         return pose
+
+    def _step(self, stride: int, pose: Float64Array, to_model_camera: Float64Array) -> Float64Array | None:
+        """The rotation and translation that bring the points into the model's planes; None if too few have a pair."""
+        points = icp.normal_equations(
+            self._points,
+            self._normals,
+            stride,
+            pose,
+            self._seen,
+            self._seen_normals,
+            to_model_camera,
+            self._lens,
+            self.settings.apart_m,
+            float(np.cos(np.radians(self.settings.apart_deg))),
+            self._jacobian,
+            self._sums,
+        )
+        if self._sums[7, 7] < max(6.0, self.settings.least_pairs * points):
+            return None
+        try:
+            return np.asarray(np.linalg.solve(self._sums[:6, :6], -self._sums[:6, 6]), np.float64)
+        except np.linalg.LinAlgError:  # a view that leaves a direction open, such as a single wall
+            return None
 
 
 def _moved(pose: Float64Array, step: Float64Array) -> Float64Array:

@@ -142,11 +142,13 @@ def raycast(
     far_m: float,
     lens: Any,
     to_world: Any,
+    hint: Any,
     vertices: Any,
 ) -> None:
     """The surface as seen from ``to_world``: float32[height, width, 3] in the world, NaN where none is seen.
 
-    A ray goes on by what the function says is free, at least a voxel and at most the truncation; where it passes from
+    ``hint`` float32[height, width] is a depth that was fused from there, 0 where none: what lies in front of it by more
+    than the truncation was found free, so the ray begins there. It goes on by what the function says is free, at least a voxel and at most the truncation; where it passes from
     positive to negative, both sides known, lies the surface.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -163,7 +165,7 @@ def raycast(
             ox = (m[0, 3] - origin_m[0]) / voxel_m
             oy = (m[1, 3] - origin_m[1]) / voxel_m
             oz = (m[2, 3] - origin_m[2]) / voxel_m
-            low, high = NEAR_M, far_m
+            low, high = max(NEAR_M, hint[v, u] - 2.0 * truncation_m), far_m
             low, high = _clipped(low, high, ox, gx)
             low, high = _clipped(low, high, tsdf.shape[0] - 1.0 - ox, -gx)
             low, high = _clipped(low, high, oy, gy)
