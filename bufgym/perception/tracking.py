@@ -75,6 +75,8 @@ class Track:
     """float64[m], the same of the orientation, degrees."""
     where: int | None
     """The frame (index of the sequence) at which tracking failed; None if it never did."""
+    model: Map
+    """What it made of the frames until then, at the poses found."""
 
     @property
     def failed(self) -> bool:
@@ -109,9 +111,9 @@ def track(
     for n, k in enumerate(arrived.tolist()[1:], 1):
         pose = tracker.follow(sequence.depth(k))
         if pose is None or _jumped(poses[n - 1], pose, truth[n - 1], truth[n], settings):
-            return Track(arrived, poses, errors[0], errors[1], k)
+            return Track(arrived, poses, errors[0], errors[1], k, tracker.model)
         poses[n], errors[:, n] = pose, difference(pose, truth[n])
-    return Track(arrived, poses, errors[0], errors[1], None)
+    return Track(arrived, poses, errors[0], errors[1], None, tracker.model)
 
 
 def _jumped(

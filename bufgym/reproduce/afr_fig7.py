@@ -76,7 +76,7 @@ class Reproduction(FrameFigure):
                 first = {name: change(some.where(k=0), "rmse_mm", "afr", other) for name, some in shown.items()}
                 slam = {name: change(some, "slam_rmse_mm", "afr", other) for name, some in shown.items()}
                 lack = {name: change(some, "slam_uncovered", "afr", other) for name, some in shown.items()}
-                facts[key] = found[main].low <= paper
+                facts[key] = found[main].high < 0 and found[main].low <= paper
                 facts[f"{key}_change"] = "; ".join(f"{name} {spelled(i)}" for name, i in found.items())
                 facts[f"{key}_paper"] = "; ".join(f"{name} {i.value:+.1%}" for name, i in first.items())
                 facts[f"{key}_slam"] = "; ".join(f"{name} {spelled(i)}" for name, i in slam.items())

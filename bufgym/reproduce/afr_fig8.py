@@ -89,7 +89,7 @@ class Reproduction(FrameFigure):
 
     def _broken(self, axes: Any, recording: str, shown: Rows) -> None:
         """The camera's way from above, and where tracking broke along it."""
-        places = self.stage(recording).sequence.poses[:, :3, 3]
+        places = self.stage(recording).whole.poses[:, :3, 3]
         across, along = np.argsort(np.ptp(places, axis=0))[:0:-1]
         axes.plot(places[:, across], places[:, along], color=".75", linewidth=1, zorder=1)
         axes.plot(*places[0, [across, along]], ">", color=".4", markersize=7, zorder=1)
