@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,20 +80,24 @@ def orbbuf_with_images(sequence: Sequence, episode: Episode) -> Policy:
     return orbbuf_by(OrbSimilarity(sequence.grey), episode)
 
 
-def decision_ms(sequence: Sequence, decisions: int = 50, features: int = FEATURES) -> Any:
+COMPARED: Final = 3
+"""Further images that the last of so many decisions compares."""
+
+
+def decision_ms(sequence: Sequence, decisions: int = 50, features: int = FEATURES) -> NDArray[np.float64]:
     """float64[decisions]: times of one decision as the paper has it, ms.
 
-    The newcomer's features are computed, and the similarities of the two neighbours whose pairs have changed: three
-    images are compared, of which only the newcomer is new.
+    A message went and one came: the features of the new image are computed, and the similarity of each neighbour of
+    the gap to the one now beside it. Reading the images takes no part.
     """
-    images = [sequence.grey(k) for k in range(decisions + 3)]
+    images = [sequence.grey(k) for k in range(decisions + COMPARED)]
     similar = OrbSimilarity(images.__getitem__, features)
-    for i in range(2):
-        similar(i, i + 1)
+    for k in range(COMPARED - 1):
+        similar(k, k + 1)
     times = np.zeros(decisions)
     for k in range(decisions):
         start_ns = time.perf_counter_ns()
         similar(k, k + 2)
-        similar(k + 1, k + 3)
+        similar(k + 1, k + COMPARED)
         times[k] = (time.perf_counter_ns() - start_ns) / 1e6
     return times

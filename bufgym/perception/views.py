@@ -114,6 +114,15 @@ def overlap_information(seen: NDArray[np.float32], frames: Iterable[int]) -> flo
     return 1.0 + float((1.0 - seen[kept[:-1], kept[1:]].astype(np.float64)).sum())
 
 
+def least_overlap(seen: NDArray[np.float32], frames: Iterable[int]) -> float:
+    """The least part of a frame that the one before it has seen, over these frames in order; 1 for fewer than two.
+
+    No information: what a tracker needs, which is lost by the worst step and not by the sum of all.
+    """
+    kept = np.fromiter(frames, np.int64)
+    return float(seen[kept[:-1], kept[1:]].min()) if len(kept) > 1 else 1.0
+
+
 class Coverage:
     """What part of the scene some frames have seen at all, in whatever order: a measure for robots that come back.
 

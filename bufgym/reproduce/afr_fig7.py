@@ -105,7 +105,8 @@ class Reproduction(FrameFigure):
         return [name for name in SHOWN if name in self.policies] or [self.policies[0]]
 
     def draw(self, rows: Rows, figure: Any) -> None:
-        above, *below = figure.subfigures(1 + len(self.recordings), 1, height_ratios=[3.4, *[3.0] * len(self.recordings)])
+        heights = [3.4, *[3.0] * len(self.recordings)]
+        above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
         panels = above.subplots(1, 2 * len(self.recordings), squeeze=False)[0]
         for n, recording in enumerate(self.recordings):
             for axes, title, some in (
@@ -116,7 +117,9 @@ class Reproduction(FrameFigure):
                     label, colour, marker = POLICIES[policy]
                     means = [some.mean("rmse_mm", recording=recording, policy=policy, L=L) for L in self.capacities]
                     axes.plot(self.capacities, means, marker=marker, color=colour, markersize=4, label=label)
-                finish(axes, f"{recording}: {title}", xlabel="queue size L", ylabel="RMSE of the map, mm" if n == 0 else "")
+                axes.set_xticks(self.capacities)
+                finish(axes, f"{recording}: {title}", xlabel="queue size L")
+        panels[0].set_ylabel("RMSE of the map, mm")
         legend_below(figure, 4, panels[0])
         for part, recording in zip(below, self.recordings, strict=True):
             self._maps(part, recording)
@@ -132,9 +135,8 @@ class Reproduction(FrameFigure):
             # From the reference's points to the map: what the map lacks is far from it, and shows.
             far_mm = 1e3 * mapping.distances(every, made)
             few = _some(len(every))
-            painted = axes.scatter(
-                *_plan(every[few]).T, c=np.minimum(far_mm[few], limit_mm), s=0.4, cmap="inferno_r", vmin=0, vmax=limit_mm
-            )
+            colours = {"c": np.minimum(far_mm[few], limit_mm), "cmap": "inferno_r", "vmin": 0, "vmax": limit_mm}
+            painted = axes.scatter(*_plan(every)[few].T, s=0.4, **colours)
             axes.set_aspect("equal")
             axes.set_axis_off()
             axes.set_title(f"{recording}, {POLICIES[policy][0]}, L = {L}", fontsize=9, loc="left")

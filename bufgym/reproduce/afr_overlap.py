@@ -111,7 +111,8 @@ class Reproduction(FrameFigure):
             for name, line in (("afr", "-"), ("oldest", "--")):
                 label = f"{recording}, {'AFR' if name == 'afr' else 'Drop Oldest'}"
                 right.plot(played.column("d"), played.column(f"{name}_of_best"), line, color=colour, label=label)
-        finish(left, "V by frames: mean, 10 to 90 %", xlabel="distance d, frames", ylabel="part that is new", ylim=(0, 1))
+        finish(left, "V by frames: mean, 10 to 90 %", xlabel="distance d, frames", ylim=(0, 1))
+        left.set_ylabel("part that is new")
         finish(middle, "V by motion", xlabel="distance d, fields of view", ylim=(0, 1))
         finish(right, "H by the measured V", xlabel="interruption T, frames", ylabel="of the best in hindsight")
         right.legend(frameon=False, fontsize=8)

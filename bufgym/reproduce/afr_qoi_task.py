@@ -24,8 +24,9 @@ MEASURES = {
     "H_motion": "motion",
     "H_overlap": "overlap",
     "coverage": "coverage",
+    "least_overlap": "least overlap",
 }
-"""Column -> by which V, or what in its place."""
+"""Column -> by which V, or what in its place; the last is the worst of all steps, where the others are sums."""
 TASKS = {
     "rmse_mm": "map error",
     "uncovered": "map's holes",
@@ -96,11 +97,11 @@ class Reproduction(FrameFigure):
             "stands": all(right),
             "right": sum(right),
             "asked": len(right),
-            "best": "; ".join(f"{task} on {recording}: {text}" for (recording, task), text in best.items()) or "unknown",
+            "best": "; ".join(f"{task} on {where}: {text}" for (where, task), text in best.items()) or "unknown",
         }
 
     def draw(self, rows: Rows, figure: Any) -> None:
-        colours = (COLOURS["other"], COLOURS["afr"], COLOURS["random"], COLOURS["orange"])
+        colours = (COLOURS["other"], COLOURS["afr"], COLOURS["random"], COLOURS["orange"], COLOURS["pink"])
         pairs = rows.distinct("recording", "scope")
         panels = figure.subplots(1, len(pairs), squeeze=False, sharey=True)[0]
         ticks = np.arange(len(TASKS))
@@ -108,14 +109,14 @@ class Reproduction(FrameFigure):
             for n, (measure, colour) in enumerate(zip(MEASURES.values(), colours, strict=True)):
                 shown = rows.where(recording=recording, scope=scope, measure=measure)
                 value, low, high = (shown.column(name) for name in ("spearman", "low", "high"))
-                aside = ticks + 0.18 * (n - (len(MEASURES) - 1) / 2)
+                aside = ticks + 0.15 * (n - (len(MEASURES) - 1) / 2)
                 axes.vlines(aside, low, high, color=colour, linewidth=1.5)
                 axes.plot(aside, value, "o", color=colour, markersize=5, label=measure)
             axes.axhline(0, color=".4", linewidth=0.8)
             axes.set_xticks(ticks, [text.replace(" ", "\n", 1) for text in TASKS.values()], fontsize=8)
             finish(axes, f"{recording}, {scope}", ylim=(-1, 0.6))
         panels[0].set_ylabel("Spearman's correlation (lower is better)")
-        legend_below(figure, 4, panels[0])
+        legend_below(figure, 5, panels[0])
 
 
 def _less_mean(numbers: NDArray[np.float64], cell: list[Any]) -> NDArray[np.float64]:
@@ -130,5 +131,3 @@ def _spelled(rows: Rows) -> str:
     if np.isnan(row["spearman"]):
         return "-"
     return f"{row['spearman']:+.2f} [{row['low']:+.2f}, {row['high']:+.2f}]"
-
-
