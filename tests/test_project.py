@@ -266,7 +266,7 @@ def test_one_version_everywhere() -> None:
 
 # -------------------- (d) light import
 
-HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "matplotlib", "scipy", "pandas", "pyarrow")
+HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "matplotlib", "scipy", "pandas", "pyarrow", "cv2", "rvl")
 
 
 def heavy_modules_after(statement: str) -> set[str]:

@@ -81,7 +81,7 @@ def grid_of(sequence: Sequence, voxel_m: float = VOXEL_M) -> Grid:
 
 
 def points_of(depth: npt.NDArray[np.float32], camera: Camera, stride: int = 1) -> Float64Array:
-    """The points of a depth image in the camera's frame, float64[m, 3]; of every ``stride``-th pixel of the camera's."""
+    """The points of a depth image of every ``stride``-th pixel, in the camera's frame, float64[m, 3]."""
     v, u = np.nonzero((depth >= tsdf.NEAR_M) & (depth <= FAR_M))
     z = depth[v, u].astype(np.float64)
     x, y = (stride * u - camera.cx) * z / camera.fx, (stride * v - camera.cy) * z / camera.fy

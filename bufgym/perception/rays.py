@@ -92,7 +92,7 @@ def _hit_ball(ball: Any, ox: float, oy: float, oz: float, dx: float, dy: float, 
         return -1.0
     t = (-b - math.sqrt(root)) / a
     face[0], face[1], face[2] = (px + t * dx) / ball[3], (py + t * dy) / ball[3], (pz + t * dz) / ball[3]
-    return t
+    return float(t)
 
 
 @kernel

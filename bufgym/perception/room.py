@@ -13,7 +13,7 @@ import numpy as np
 
 from bufgym.errors import BufgymError
 from bufgym.perception import rays
-from bufgym.perception.frames import Camera, Depth, Image, Sequence
+from bufgym.perception.frames import Depth, Image, Sequence
 from bufgym.perception.mapping import lens_of
 from bufgym.perception.recordings import SEVEN_SCENES_CAMERA, matrices
 from bufgym.traces.generate.draws import stream
@@ -183,15 +183,16 @@ def furnished(rng: np.random.Generator, size_m: Float64Array, way: Float64Array)
         way: float64[n, 3], where the camera goes; no thing stands there.
     """
     boxes = [np.array([*size_m / 2, *size_m / 2, 1.0, 0.0])]
-    balls = []
+    balls: list[Float64Array] = []
     for n in range(BOXES + BALLS):
         for _ in range(_TRIES):
-            thing = _ball(rng, size_m) if n >= BOXES else _box(rng, size_m, n)
-            radius = thing[3] if n >= BOXES else float(np.linalg.norm(thing[3:5]))
-            flat = np.linalg.norm(way[:, :2] - thing[:2], axis=1) < radius + FREE_M
-            above = thing[3] if n >= BOXES else thing[5]
-            if not (flat & (np.abs(way[:, 2] - thing[2]) < above + FREE_M)).any():
-                (balls if n >= BOXES else boxes).append(thing)
+            ball = n >= BOXES
+            thing = _ball(rng, size_m) if ball else _box(rng, size_m, n)
+            reach = thing[3] if ball else np.linalg.norm(thing[3:5])
+            near = np.linalg.norm(way[:, :2] - thing[:2], axis=1) < reach + FREE_M
+            near &= np.abs(way[:, 2] - thing[2]) < thing[3 if ball else 5] + FREE_M
+            if not near.any():
+                (balls if ball else boxes).append(thing)
                 break
     return Scene(np.array(boxes + balls), len(boxes))
 
@@ -199,7 +200,7 @@ def furnished(rng: np.random.Generator, size_m: Float64Array, way: Float64Array)
 def _box(rng: np.random.Generator, size_m: Float64Array, n: int) -> Float64Array:
     """Of four things one stands at a wall, one on the floor, and two hang at a wall."""
     half = np.array([0.15 + 0.4 * rng.random(), 0.12 + 0.2 * rng.random(), 0.2 + 0.75 * rng.random()])
-    turn = 0.5 * np.pi * rng.integers(4)
+    turn = 0.5 * np.pi * int(rng.integers(4))
     if n % 4 == 1:
         half[2] *= 0.45
         turn = 2 * np.pi * rng.random()

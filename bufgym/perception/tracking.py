@@ -23,7 +23,7 @@ from bufgym.traces.trace import Float64Array
 
 LEVELS: Final = ((4, 10), (2, 5), (1, 4))
 """(stride, steps) from coarse to fine, as KinectFusion has them."""
-SMALL_STEP: Final = 1e-4
+SMALL_STEP: Final = 3e-4
 """A level ends early at a smaller step, rad and m."""
 SAME_SURFACE: Final = 0.05
 """Neighbouring pixels are of one surface if their distances differ by at most this share."""
@@ -180,7 +180,7 @@ class Tracker:
             self._seen,
         )
         icp.orient(self._seen, np.ascontiguousarray(pose[:3, 3]), SAME_SURFACE, self._seen_normals)
-        to_model_camera = np.linalg.inv(pose)
+        to_model_camera = np.asarray(np.linalg.inv(pose), np.float64)
         for stride, most_steps in LEVELS:
             for _ in range(most_steps):
                 step = self._step(stride, pose, to_model_camera)

@@ -148,8 +148,8 @@ def raycast(
     """The surface as seen from ``to_world``: float32[height, width, 3] in the world, NaN where none is seen.
 
     ``hint`` float32[height, width] is a depth that was fused from there, 0 where none: what lies in front of it by more
-    than the truncation was found free, so the ray begins there. It goes on by what the function says is free, at least a voxel and at most the truncation; where it passes from
-    positive to negative, both sides known, lies the surface.
+    than the truncation was found free, so the ray begins there. It goes on by what the function says is free, from a
+    voxel to 0.8 of the truncation, as much where nothing is known; where it passes from positive to negative, both sides known, lies the surface.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     m = to_world
@@ -165,7 +165,7 @@ def raycast(
             ox = (m[0, 3] - origin_m[0]) / voxel_m
             oy = (m[1, 3] - origin_m[1]) / voxel_m
             oz = (m[2, 3] - origin_m[2]) / voxel_m
-            low, high = max(NEAR_M, hint[v, u] - 2.0 * truncation_m), far_m
+            low, high = max(NEAR_M, hint[v, u] - 1.5 * truncation_m), far_m
             low, high = _clipped(low, high, ox, gx)
             low, high = _clipped(low, high, tsdf.shape[0] - 1.0 - ox, -gx)
             low, high = _clipped(low, high, oy, gy)
@@ -176,11 +176,11 @@ def raycast(
             while z < high:
                 i, j, k = int(ox + gx * z + 0.5), int(oy + gy * z + 0.5), int(oz + gz * z + 0.5)
                 if weight[i, j, k] == 0.0:
-                    before, step = -1.0, voxel_m
+                    before, step = -1.0, 0.8 * truncation_m
                 else:
                     value = tsdf[i, j, k]
                     if value < 0.0:
-                        if before > 0.0:
+                        if before >= 0.0:
                             back = z - step
                             near = _trilinear(tsdf, weight, ox + gx * back, oy + gy * back, oz + gz * back)
                             far = _trilinear(tsdf, weight, ox + gx * z, oy + gy * z, oz + gz * z)

@@ -1,0 +1,124 @@
+"""Maps: a flat wall worked by hand, a slow twin, the error of a shifted plane, and the same bits every time."""
+
+from __future__ import annotations
+
+import frame_cases
+import naive_tsdf
+import numpy as np
+import pytest
+
+from bufgym.errors import BufgymError
+from bufgym.perception.frames import Camera
+from bufgym.perception.mapping import COVERED_M, Grid, Map, error, fuse, grid_of
+from bufgym.perception.room import room
+
+CAMERA = Camera(8, 6, 4.0, 4.0, 3.5, 2.5)
+AHEAD = Grid((0.0, 0.0, 0.4), (2, 2, 12), 0.1)
+"""Columns of voxels straight ahead, at 0.4, 0.5 ... 1.5 m; the truncation is 0.3 m."""
+
+
+def wall(*depths_m: float, camera: Camera = CAMERA) -> frame_cases.Held:
+    """A flat wall at each of these distances, a frame each, all seen from the origin."""
+    shape = (camera.height, camera.width)
+    depths = [np.full(shape, depth_m, np.float32) for depth_m in depths_m]
+    return frame_cases.Held(camera, depths, [np.eye(4)] * len(depths))
+
+
+def test_a_flat_wall_as_worked_by_hand() -> None:
+    """At 1 m: free up to 0.7 m, then (1 - z) / 0.3, nothing known behind 1.3 m."""
+    found = fuse(wall(1.0), [0], AHEAD)
+    assert found.tsdf[0, 0] == pytest.approx([1, 1, 1, 1, 2 / 3, 1 / 3, 0, -1 / 3, -2 / 3, -1, 0, 0], abs=1e-6)
+    assert found.weight[0, 0].tolist() == [1] * 10 + [0] * 2
+    assert found.points()[:, 2] == pytest.approx(np.ones(4), abs=1e-6)
+
+
+def test_two_frames_meet_in_the_middle() -> None:
+    found = fuse(wall(1.0, 1.1), [0, 1], AHEAD)
+    assert found.points()[:, 2] == pytest.approx(np.full(4, 1.05), abs=1e-6)
+    assert found.weight.max() == 2
+    assert fuse(wall(1.0, 1.1), [1], AHEAD).points()[:, 2] == pytest.approx(np.full(4, 1.1), abs=1e-6)
+
+
+def test_weights_end_where_they_are_told_to() -> None:
+    """With a memory of one frame the third counts half."""
+    found = Map.empty(AHEAD)
+    for depth_m in (1.0, 1.0, 1.1):
+        found.add(wall(depth_m).depth(0), CAMERA, np.eye(4), most_weight=1.0)
+    assert found.points()[:, 2] == pytest.approx(np.full(4, 1.05), abs=1e-6)
+
+
+def test_a_frame_without_depth_adds_nothing() -> None:
+    assert not fuse(wall(0.0), [0], AHEAD).weight.any()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_kernels_do_what_their_twins_do(seed: int) -> None:
+    """From any pose, in front of voxels and behind them."""
+    rng = np.random.default_rng(seed)
+    pose = np.eye(4)
+    pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    pose[:3, :3] *= np.linalg.det(pose[:3, :3])
+    pose[:3, 3] = rng.normal(size=3) * 0.3
+    depth = rng.uniform(0.2, 1.5, (6, 8)).astype(np.float32)
+    grid = Grid((-0.8, -0.8, -0.8), (9, 8, 7), 0.2)
+    found, slow = Map.empty(grid), Map.empty(grid)
+    for _ in range(2):
+        found.add(depth, CAMERA, pose)
+        naive_tsdf.integrate(grid, depth, CAMERA, pose, slow.tsdf, slow.weight)
+    assert found.weight.any()
+    assert found.weight.tolist() == slow.weight.tolist()
+    assert found.tsdf == pytest.approx(slow.tsdf, abs=1e-5)
+    rounded = {tuple(point) for point in np.round(1000 * found.points(), 2).tolist()}
+    assert rounded == naive_tsdf.surface(grid, found.tsdf, found.weight)
+
+
+def test_the_error_of_a_shifted_plane() -> None:
+    """A wall 2 cm off is 2 cm off both ways and covered; 6 cm off it is uncovered."""
+    reference = fuse(wall(1.0), [0], AHEAD)
+    near, far = (error(fuse(wall(1.0 + shift_m), [0], AHEAD), reference) for shift_m in (0.02, 0.06))
+    assert (near.to_reference_m, near.from_reference_m, near.rmse_m) == pytest.approx((0.02,) * 3, abs=1e-5)
+    assert near.uncovered == 0
+    assert far.rmse_m == pytest.approx(0.06, abs=1e-5)
+    assert COVERED_M < 0.06
+    assert far.uncovered == 1
+
+
+def test_what_is_missing_is_an_error_one_way_only() -> None:
+    """Half the wall was never seen: nothing that is there is wrong."""
+    grid = Grid((-0.5, -0.2, 0.4), (11, 5, 12), 0.1)
+    sequence = wall(1.0)
+    half = frame_cases.Held(CAMERA, [sequence.depth(0).copy()], [np.eye(4)])
+    half.depth(0)[:, 4:] = 0
+    found = error(fuse(half, [0], grid), fuse(sequence, [0], grid))
+    assert found.to_reference_m == 0
+    # Pixels 0 to 3 see x < 0; of the points at 0 to 0.5 m each is as far away as it lies from that at -0.1 m.
+    assert found.uncovered == pytest.approx(6 / 11)
+    assert found.from_reference_m == pytest.approx(np.sqrt((0.01 + 0.04 + 0.09 + 0.16 + 0.25 + 0.36) / 11), abs=1e-6)
+
+
+def test_the_grid_holds_all_that_was_seen() -> None:
+    grid = grid_of(wall(1.0), voxel_m=0.1)
+    assert grid.truncation_m == pytest.approx(0.3)
+    low = np.array(grid.origin_m)
+    high = low + grid.voxel_m * (np.array(grid.shape) - 1)
+    assert low == pytest.approx([-3.5 / 4 - 0.3, -2.5 / 4 - 0.3, 0.7])
+    assert (high >= [3.5 / 4 + 0.3, 2.5 / 4 + 0.3, 1.3 - 1e-9]).all()
+
+
+def test_same_frames_same_map_bit_for_bit() -> None:
+    sequence = room(2, frames=4).reduced(20)
+    grid = grid_of(sequence, 0.2)
+    first, again = (fuse(sequence, range(4), grid) for _ in range(2))
+    assert first.tsdf.tobytes() == again.tsdf.tobytes()
+    assert first.points().tobytes() == again.points().tobytes()
+
+
+def test_errors() -> None:
+    with pytest.raises(BufgymError, match=r"voxel_m = 0\.0: must be a finite number above 0"):
+        Grid((0.0, 0.0, 0.0), (2, 2, 2), 0.0)
+    with pytest.raises(BufgymError, match="grid of 1000 x 1000 x 1000 voxels"):
+        Grid((0.0, 0.0, 0.0), (1000, 1000, 1000))
+    with pytest.raises(BufgymError, match="held: no frame holds a depth"):
+        grid_of(wall(0.0))
+    with pytest.raises(BufgymError, match="the map holds no surface"):
+        error(Map.empty(AHEAD), fuse(wall(1.0), [0], AHEAD))

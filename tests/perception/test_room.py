@@ -1,0 +1,112 @@
+"""The made-up room: depths worked by hand, a Kinect's steps and shadows, and the same frames for the same seed."""
+
+from __future__ import annotations
+
+import frame_cases  # noqa: F401  skips where the extra is absent
+import numpy as np
+import pytest
+
+from bufgym.errors import BufgymError
+from bufgym.perception.mapping import grid_of
+from bufgym.perception.rays import BASELINE_M
+from bufgym.perception.room import FREE_M, Room, Scene, room
+from bufgym.traces.poses import Poses
+
+# In the middle of a room of 6 x 4 x 2 m, looking along +x: z of the camera is the world's x, x its -y, y its -z.
+LOOKING = np.array([[0.0, 0, 1, 3], [-1, 0, 0, 2], [0, -1, 0, 1], [0, 0, 0, 1]])
+EMPTY = [[3.0, 2, 1, 3, 2, 1, 1, 0]]
+SMALL = 20
+"""32 x 24 pixels."""
+
+
+def scene(*things: list[float], balls: int | None = None, stride: int = SMALL) -> Room:
+    all_things = np.array(EMPTY + list(things))
+    where = Scene(all_things, len(all_things) if balls is None else balls)
+    return Room("test", where, np.array([0], np.int64), LOOKING[None], 3, stride)
+
+
+def test_a_wall_ahead_is_three_metres_away_in_every_pixel() -> None:
+    """z is measured along the axis, not along the ray; above and below the ceiling and floor come nearer."""
+    depth = scene().true_depth(0)
+    assert depth[8:17] == pytest.approx(np.full((9, 32), 3.0))
+    # The topmost row looks up by 240 / 585: the ceiling, 1 m above, is 585 / 240 = 2.4375 m away.
+    assert depth[0] == pytest.approx(np.full(32, 2.4375))
+
+
+def test_a_ball_and_a_turned_box_ahead() -> None:
+    """The ball's nearest point is its radius before its centre; a box turned by 45 degrees shows its edge."""
+    ball = scene([4.5, 2, 1, 0.25, 0, 0, 0, 0], balls=1)
+    assert ball.true_depth(0)[12, 16] == pytest.approx(1.25)
+    turn = np.pi / 4
+    box = scene([4.5, 2, 1, 0.5, 0.5, 0.5, np.cos(turn), np.sin(turn)])
+    assert box.true_depth(0)[12, 16] == pytest.approx(1.5 - np.sqrt(0.5))
+
+
+def test_a_kinects_depth_comes_in_steps_of_an_eighth_of_a_pixel() -> None:
+    """585 px x 7.5 cm = 43.875 m px: at 3 m a disparity of 14.625 px = 117 steps, so 118 steps are 2.975 m."""
+    middle = scene().depth(0)[8:17]
+    steps = 8 * 585 * BASELINE_M / middle
+    assert np.rint(steps) == pytest.approx(steps, abs=0.03)  # whole mm
+    assert {115, 116, 117, 118, 119} >= set(np.rint(steps).astype(int).ravel()) >= {116, 117, 118}
+    assert middle.std() == pytest.approx(0.5 * 3.0 / 117, rel=0.5)
+
+
+def test_what_the_projector_does_not_reach_is_missing() -> None:
+    """Behind a box at 1.5 m a wall at 3 m has a shadow of f b (1/1.5 - 1/3) = 14.6 px on the camera's left."""
+    thing = [4.55, 2, 1, 0.05, 0.3, 0.3, 1, 0]
+    row = scene(thing, stride=1).depth(0)[240]
+    missing = np.flatnonzero(row == 0)
+    # The box's left edge is at 320 - 585 * 0.3 / 1.5 = 203.
+    assert missing.min() == pytest.approx(203 - 14.6, abs=1.1)
+    assert missing.max() == pytest.approx(202, abs=1.1)
+    assert len(missing) == missing.max() - missing.min() + 1
+
+
+def test_reduced_frames_are_pixels_of_the_whole() -> None:
+    whole = room(1, frames=2).reduced(10)
+    half = whole.reduced(2)
+    assert (half.depth(1) == whole.depth(1)[::2, ::2]).all()
+    assert (half.grey(1) == whole.grey(1)[::2, ::2]).all()
+
+
+def test_a_seed_gives_the_same_frames_and_another_seed_others() -> None:
+    first, again, other = (room(seed, frames=3).reduced(SMALL) for seed in (7, 7, 8))
+    for k in (2, 0):
+        assert first.depth(k).tobytes() == again.depth(k).tobytes()
+        assert first.grey(k).tobytes() == again.grey(k).tobytes()
+    assert first.depth(0).tobytes() != other.depth(0).tobytes()
+    assert first.depth(0).tobytes() != first.depth(1).tobytes()  # noise is drawn for every frame
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_thing_stands_in_the_cameras_way(seed: int) -> None:
+    made = room(seed)
+    place = made.poses[:, :3, 3]
+    assert len(made) == 794
+    for box in made.scene.things[1 : made.scene.balls]:
+        turned = (place - box[:3]) @ np.array([[box[6], -box[7], 0], [box[7], box[6], 0], [0, 0, 1]])
+        assert (np.abs(turned) > box[3:6] + 0.5 * FREE_M).any(axis=1).all()
+    rotation = made.poses[:, :3, :3]
+    assert rotation @ rotation.transpose(0, 2, 1) == pytest.approx(np.tile(np.eye(3), (794, 1, 1)))
+    assert np.linalg.det(rotation) == pytest.approx(np.ones(794))
+
+
+def test_a_given_trajectory_lies_in_the_middle_of_a_room_that_holds_it() -> None:
+    """9 m along x, in 1 s at 10 Hz: the room is 9 + 2 x 1.2 m long."""
+    place = np.array([[100.0, 5, 0], [109, 5, 0]])
+    turned = np.tile([-0.5, 0.5, -0.5, 0.5], (2, 1))
+    made = room(0, Poses(np.array([0, 1_000_000]), place, turned), rate_hz=10)
+    assert len(made) == 11
+    assert made.scene.things[0, :3] == pytest.approx([5.7, 2.1, 1.3])
+    assert made.poses[[0, -1], 0, 3] == pytest.approx([1.2, 10.2])
+    assert made.poses[0, :3, :3] == pytest.approx(LOOKING[:3, :3])
+    assert grid_of(made.reduced(SMALL)).shape > (20, 20, 20)
+
+
+def test_errors() -> None:
+    with pytest.raises(BufgymError, match="frames = 1, rate_hz = 30"):
+        room(0, frames=1)
+    with pytest.raises(BufgymError, match="seed = -1"):
+        room(-1)
+    with pytest.raises(BufgymError, match="frame 2: must be from 0 to 1"):
+        room(0, frames=2).reduced(SMALL).depth(2)

@@ -1,0 +1,171 @@
+"""Tracking: a known movement is found again, a gap that is too long is a failure, and its kernels as worked by hand."""
+
+from __future__ import annotations
+
+import functools
+
+import frame_cases
+import numpy as np
+import pytest
+
+from bufgym.errors import BufgymError
+from bufgym.perception import icp
+from bufgym.perception.frames import Camera, Sequence
+from bufgym.perception.mapping import Grid, Map, fuse, lens_of
+from bufgym.perception.room import Room, room
+from bufgym.perception.tracking import Tracker, TrackingSettings, difference, track
+from bufgym.perception.tsdf import raycast
+
+CAMERA = Camera(8, 6, 4.0, 4.0, 3.5, 2.5)
+NOWHERE = np.zeros((6, 8), np.float32)
+
+
+def plane(z: float) -> np.ndarray:
+    """The points of a wall at z as the camera sees them, float32[6, 8, 3]."""
+    points = np.zeros((6, 8, 3), np.float32)
+    icp.unproject(np.full((6, 8), z, np.float32), 10.0, lens_of(CAMERA), points)
+    return points
+
+
+def test_unprojected_points() -> None:
+    points = plane(2.0)
+    assert points[0, 0].tolist() == [-1.75, -1.25, 2.0]
+    icp.unproject(NOWHERE, 10.0, lens_of(CAMERA), points)
+    assert np.isnan(points).all()
+
+
+def test_normals_face_the_camera_and_stop_at_edges() -> None:
+    points, normals = plane(2.0), np.zeros((6, 8, 3), np.float32)
+    icp.orient(points, np.zeros(3), 0.3, normals)
+    assert normals[1:5, 1:7].reshape(-1, 3) == pytest.approx(np.tile([0, 0, -1.0], (24, 1)))
+    assert np.isnan(normals[0]).all()
+    points[:, 4:, 2] = 9.0  # another wall behind
+    icp.orient(points, np.zeros(3), 0.3, normals)
+    assert np.isnan(normals[1:5, 3:5]).all()
+    assert not np.isnan(normals[1:5, 1:3]).any()
+
+
+def test_smoothing_stays_on_one_surface() -> None:
+    depth = np.array([[1.0, 1.02, 3.0], [1.0, 0.0, 3.0]], np.float32)
+    result = np.zeros_like(depth)
+    icp.smooth(depth, 1, 0.05, result)
+    assert result == pytest.approx(np.array([[3.02 / 3, 3.02 / 3, 3.0], [3.02 / 3, 0.0, 3.0]]), rel=1e-6)
+
+
+def test_the_normal_equations_of_a_wall_that_is_five_centimetres_off() -> None:
+    """All 24 points with a normal have a pair; moving back by 5 cm along z brings all into the plane."""
+    model, points = plane(2.0), plane(2.05)
+    normals = np.zeros((2, 6, 8, 3), np.float32)
+    for vertices, result in zip((points, model), normals, strict=True):
+        icp.orient(vertices, np.zeros(3), 0.5, result)
+    sums = np.zeros((8, 8))
+    pose = np.eye(4)
+    arguments = (points, normals[0], 1, pose, model, normals[1], pose, lens_of(CAMERA))
+    # Seen through the same pixel the pairs at the corner are 5 cm x (1, 2.5 / 4, 1.5 / 4) apart, 6.1 cm.
+    assert icp.normal_equations(*arguments, 0.07, 0.9, np.zeros(8), sums) == 24
+    assert sums[7, 7] == 24
+    assert sums[6, 6] == pytest.approx(24 * 0.05**2, rel=1e-5)
+    assert -sums[5, 6] / sums[5, 5] == pytest.approx(-0.05, rel=1e-5)
+    assert (sums == sums.T).all()
+    icp.normal_equations(*arguments, 0.04, 0.9, np.zeros(8), sums)
+    assert sums[7, 7] == 0
+
+
+def test_the_model_is_seen_where_it_is() -> None:
+    """A wall at 1 m, fused, then looked at from 20 cm behind; with and without a hint where it is."""
+    sequence = frame_cases.Held(CAMERA, [np.full((6, 8), 1.0, np.float32)], [np.eye(4)])
+    grid = Grid((-1.2, -0.9, 0.0), (49, 37, 28), 0.05)
+    found = fuse(sequence, [0], grid)
+    behind = np.eye(4)
+    behind[2, 3] = -0.2
+    for hint in (NOWHERE, np.full((6, 8), 1.2, np.float32)):
+        vertices = np.zeros((6, 8, 3), np.float32)
+        place = (np.array(grid.origin_m), grid.voxel_m, grid.truncation_m, 4.0, lens_of(CAMERA), behind)
+        raycast(found.tsdf, found.weight, *place, hint, vertices)
+        assert vertices[1:5, 1:7, 2] == pytest.approx(np.ones((4, 6)), abs=1e-3)
+        assert vertices[2, 3, 0] == pytest.approx(-0.5 / 4 * 1.2, abs=1e-3)
+
+
+def test_the_difference_of_two_poses() -> None:
+    assert difference(np.eye(4), frame_cases.TURNED) == pytest.approx((0.5, 90.0))
+    assert difference(frame_cases.TURNED, frame_cases.TURNED) == pytest.approx((0.0, 0.0))
+
+
+@functools.cache
+def walk() -> Sequence:
+    return room(0, frames=80).reduced(4).loaded()
+
+
+@pytest.mark.slow
+def test_a_known_movement_is_found_again() -> None:
+    """3 cm to the right, 2 cm down, 1 cm ahead, and a turn of 1.5 degrees: found within 6 mm and 0.3 degrees."""
+    still = room(0, frames=2)
+    angle = np.radians(1.5)
+    moved = np.eye(4)
+    moved[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    moved[:3, 3] = 0.03, 0.02, 0.01
+    poses = np.stack([still.poses[0], still.poses[0] @ moved])
+    sequence = Room("moved", still.scene, still.time_us, poses, 0, stride=4)
+    depths = [sequence.true_depth(k) for k in range(2)]
+    grid = Grid((-0.2, -0.2, -0.2), (136, 116, 76))
+    tracker = Tracker(sequence.camera, grid)
+    tracker.begin(depths[0], poses[0])
+    pose = tracker.follow(depths[1])
+    assert pose is not None
+    off_m, off_deg = difference(pose, poses[1])
+    assert off_m < 0.006
+    assert off_deg < 0.3
+
+
+@pytest.mark.slow
+def test_it_follows_every_frame_and_fails_at_a_gap() -> None:
+    """The same frames with 40 of them missing: lost at the first frame after the gap."""
+    sequence = walk()
+    whole = track(sequence, range(80))
+    assert not whole.failed
+    assert whole.where is None
+    assert whole.error_m.max() < 0.05
+    assert whole.error_m[0] == 0
+    torn = track(sequence, [*range(20), *range(60, 80)])
+    assert torn.failed
+    assert torn.where == 60
+    assert torn.error_m[:20].tolist() == whole.error_m[:20].tolist()
+    assert np.isnan(torn.error_deg[20:]).all()
+    assert np.isnan(torn.poses[20:]).all()
+
+
+@pytest.mark.slow
+def test_same_frames_same_track_bit_for_bit() -> None:
+    first, again = (track(walk(), range(0, 20, 2)) for _ in range(2))
+    assert first.poses.tobytes() == again.poses.tobytes()
+
+
+@pytest.mark.slow
+def test_a_step_that_is_off_is_a_failure() -> None:
+    """The recording claims a jump that its frames do not show."""
+    sequence = walk()
+    told = frame_cases.Held(sequence.camera, [sequence.depth(k) for k in range(6)], list(sequence.poses[:6]))
+    told.poses[4:, 0, 3] += 0.2
+    assert track(told, range(6)).where == 4
+    assert track(told, range(6), settings=TrackingSettings(most_error_m=0.3)).where is None
+
+
+def test_a_single_wall_leaves_the_way_along_it_open() -> None:
+    """Nothing says how far the camera moved along a wall: the tracker says that it is lost."""
+    grid = Grid((-1.2, -0.9, 0.0), (49, 37, 28), 0.05)
+    tracker = Tracker(CAMERA, grid, TrackingSettings(apart_m=10.0, least_pairs=0.0))
+    tracker.begin(NOWHERE, np.eye(4))
+    assert tracker.follow(np.full((6, 8), 1.0, np.float32)) is None
+    assert (tracker.model.weight == Map.empty(grid).weight).all()
+
+
+@pytest.mark.parametrize("frames", [[], [3, 2], [2, 2], [-1, 1], [1, 80]])
+def test_frames_that_are_not_in_order(frames: list[int]) -> None:
+    with pytest.raises(BufgymError, match="at least one index below 80, increasing"):
+        track(room(0, frames=80).reduced(20), frames)
+
+
+@pytest.mark.parametrize("field", ["apart_m", "apart_deg", "most_error_m", "most_error_deg", "least_pairs"])
+def test_settings_that_mean_nothing(field: str) -> None:
+    with pytest.raises(BufgymError, match=f"{field} = -1"):
+        TrackingSettings(**{field: -1})
