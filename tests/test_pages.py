@@ -67,6 +67,7 @@ PARSED = {
     r"python train\.py .*": "minutes to hours; tests/test_train.py",
     r"python -m agents\..*": "needs a run's folder; tests/test_agents.py, test_scheduling.py, test_ablation.py",
     r"python examples/view_missed\.py": "tests/test_training_examples.py",
+    r"python examples/trackers\.py.*": "needs small_gicp; tests/perception/test_trackers.py",
     r"python -m pytest .*": "a test",
     r"make .*": "a rule of the Makefile",
     r"pip install .*|python3 -m venv .*|pre-commit install|source \.venv/bin/activate": "set-up; .ci/install-matrix",
@@ -291,8 +292,13 @@ def test_pages_whose_programs_run_elsewhere_have_some() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("block", PROGRAMS, ids=[f"{block.page}-{k}" for k, block in enumerate(PROGRAMS)])
 def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for package in ("sb3_contrib", "cma", "pettingzoo", "mcap"):
-        needs = {"cma": "agents.objectives", "pettingzoo": "parallel_env", "mcap": ".mcap"}.get(package, package)
+    for package in ("sb3_contrib", "cma", "pettingzoo", "mcap", "cv2"):
+        needs = {
+            "cma": "agents.objectives",
+            "pettingzoo": "parallel_env",
+            "mcap": ".mcap",
+            "cv2": "bufgym.perception",
+        }.get(package, package)
         if needs in block.text:
             pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)

@@ -102,7 +102,7 @@ def normal_equations(
         pose: float64[4, 4], camera to world, the estimate so far.
         model, model_normals: the surface as seen from another pose, in the world.
         to_model_camera: float64[4, 4], world to the camera of that pose.
-        lens: of both.
+        lens: of the model's camera.
         apart_m: pairs farther apart are none, m.
         cosine: pairs whose normals differ by more than the angle of this cosine are none.
         jacobian: float64[8], scratch: of one pair the 6 derivatives of the distance to the plane, that distance, and 1.

@@ -21,8 +21,11 @@ from bufgym.perception.mapping import FAR_M, Grid, Map, grid_of, lens_of
 from bufgym.traces.poses import rotations
 from bufgym.traces.trace import Float64Array
 
-LEVELS: Final = ((4, 10), (2, 5), (1, 4))
-"""(stride, steps) from coarse to fine, as KinectFusion has them."""
+LEVELS: Final = ((4, 10), (2, 5), (1, 2))
+"""(stride, most steps) from coarse to fine. KinectFusion takes four at the finest; two change no result here, and save
+a millisecond."""
+MODEL_STRIDE: Final = 2
+"""The model is looked at through every second pixel: at 160x120 these are 2.7 cm apart at 2 m, finer than voxels."""
 SMALL_STEP: Final = 3e-4
 """A level ends early at a smaller step, rad and m."""
 SAME_SURFACE: Final = 0.05
@@ -140,12 +143,15 @@ class Tracker:
         self.model = Map.empty(grid)
         self.pose = np.eye(4)
         self._camera, self._lens = camera, lens_of(camera)
-        shape = (camera.height, camera.width, 3)
+        self._stride = 1 if camera.height % MODEL_STRIDE or camera.width % MODEL_STRIDE else MODEL_STRIDE
+        model_camera = camera.every(self._stride)
+        self._model_lens = lens_of(model_camera)
+        shape, model_shape = ((c.height, c.width, 3) for c in (camera, model_camera))
         self._smooth = np.zeros(shape[:2], np.float32)
         self._points, self._normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        self._seen, self._seen_normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self._seen, self._seen_normals = np.zeros(model_shape, np.float32), np.zeros(model_shape, np.float32)
         self._jacobian, self._sums = np.zeros(8), np.zeros((8, 8))
-        self._hint: Depth = self._smooth
+        self._hint: Depth = np.zeros(model_shape[:2], np.float32)
 
     def begin(self, depth: Depth, pose: Float64Array) -> None:
         """The first frame, at a known pose."""
@@ -159,7 +165,7 @@ class Tracker:
         return pose
 
     def _fuse(self, depth: Depth, pose: Float64Array) -> None:
-        self.pose, self._hint = pose, depth
+        self.pose, self._hint = pose, np.ascontiguousarray(depth[:: self._stride, :: self._stride])
         self.model.add(depth, self._camera, pose, MOST_WEIGHT)
 
     def _aligned(self, depth: Depth) -> Float64Array | None:
@@ -174,7 +180,7 @@ class Tracker:
             grid.voxel_m,
             grid.truncation_m,
             FAR_M,
-            lens,
+            self._model_lens,
             pose,
             self._hint,
             self._seen,
@@ -201,7 +207,7 @@ class Tracker:
             self._seen,
             self._seen_normals,
             to_model_camera,
-            self._lens,
+            self._model_lens,
             self.settings.apart_m,
             float(np.cos(np.radians(self.settings.apart_deg))),
             self._jacobian,

@@ -149,7 +149,8 @@ def raycast(
 
     ``hint`` float32[height, width] is a depth that was fused from there, 0 where none: what lies in front of it by more
     than the truncation was found free, so the ray begins there. It goes on by what the function says is free, from a
-    voxel to 0.8 of the truncation, as much where nothing is known; where it passes from positive to negative, both sides known, lies the surface.
+    voxel to 0.8 of the truncation, as much where nothing is known; where it passes from positive to negative, both
+    sides known, lies the surface.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     m = to_world

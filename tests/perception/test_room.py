@@ -51,6 +51,7 @@ def test_a_kinects_depth_comes_in_steps_of_an_eighth_of_a_pixel() -> None:
     assert middle.std() == pytest.approx(0.5 * 3.0 / 117, rel=0.5)
 
 
+@pytest.mark.slow
 def test_what_the_projector_does_not_reach_is_missing() -> None:
     """Behind a box at 1.5 m a wall at 3 m has a shadow of f b (1/1.5 - 1/3) = 14.6 px on the camera's left."""
     thing = [4.55, 2, 1, 0.05, 0.3, 0.3, 1, 0]
