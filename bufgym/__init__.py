@@ -22,7 +22,7 @@ ENVIRONMENTS = {
 ON_TASKS = {
     "bufgym/Mapping-v0": (
         "bufgym.perception.worth:mapping",
-        "a made-up room is filmed; the reward is what it is worth",
+        "a made-up room is filmed: what are the frames worth?",
     ),
 }
 """The same for environments whose reward is a robot's own task; they need the extra ``perception``."""

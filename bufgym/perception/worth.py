@@ -7,7 +7,7 @@ episode to episode. At its end each of these terms says what the frames that arr
 |---|---|---|
 | `covered` | the part of the scene that some frame has seen | a map; the default |
 | `followed` | the least part of a frame that the one before it has seen | tracking: a stand-in that takes no time |
-| `tracked` | how far tracking gets along the frames, as a part of the recording | tracking itself: a second an episode |
+| `tracked` | how far tracking gets along the frames, as a part of all | tracking itself: a second an episode |
 
 To train on tracking take `followed`, to evaluate `tracked`: ``reward={"followed": 1, "tracked": 0}`` reports the second
 without counting it.
@@ -84,13 +84,17 @@ def covered(step: Any, memory: Memory) -> float:
 @reward_term("followed", unit="part of a frame", one_queue=True)
 def followed(step: Any, memory: Memory) -> float:
     """at the end, the least part of a frame that the one before it has seen: stands in for `tracked`"""
-    return views.least_overlap(scene().seen, _arrived(step)) if step.ended else 0.0
+    if not step.ended:
+        return 0.0
+    # From the recording's first frame to its last: who sends little must not seem to have lost little.
+    return views.least_overlap(scene().seen, np.union1d(_arrived(step), [0, FRAMES - 1]))
 
 
 @reward_term("tracked", unit="part of the recording", one_queue=True)
 def tracked(step: Any, memory: Memory) -> float:
     """at the end, how far tracking gets along the frames that arrived (`bufgym/Mapping-v0`); about a second"""
-    if not step.ended:
+    if not step.ended or not len(frames := _arrived(step)):
         return 0.0
-    where = tracking.track(scene().small, _arrived(step), scene().grid).where
-    return 1.0 if where is None else where / FRAMES
+    track = tracking.track(scene().small, frames, scene().grid)
+    reached = frames[~np.isnan(track.poses[:, 0, 0])]
+    return float(reached[-1] - frames[0]) / (FRAMES - 1)

@@ -22,13 +22,12 @@ def made(**settings: Any) -> Any:
     return gym.make("bufgym/Mapping-v0", **settings).unwrapped
 
 
-def played(env: Any, action: int | None) -> tuple[list[float], dict[str, Any]]:
-    """Rewards of an episode and its last info; None takes the first valid action."""
-    _, info = env.reset(seed=1)
-    rewards, ended = [], False
+def played(env: Any, action: int) -> tuple[list[float], dict[str, Any]]:
+    """Rewards of an episode and its last info."""
+    env.reset(seed=1)
+    rewards, ended, info = [], False, {}
     while not ended:
-        choice = int(np.argmax(info["action_mask"])) if action is None else action
-        _, reward, ended, _, info = env.step(choice)
+        _, reward, ended, _, info = env.step(action)
         rewards.append(reward)
     return rewards, info
 
@@ -38,26 +37,26 @@ def test_gymnasium_finds_nothing_to_complain_about() -> None:
 
 
 def test_what_is_paid_comes_at_the_end() -> None:
-    """Slot 0 goes where the queue is full: Drop Oldest."""
-    reward = {"covered": 1.0, "followed": 0.0, "tracked": 0.0}
-    rewards, info = played(made(reward=reward), 0)
-    terms = info["reward_terms"]
-    assert not any(rewards[:-1]) and rewards[-1] == terms["covered"]
-    assert all(0 < terms[name] <= 1 for name in reward)
-    # Who rejects all that comes while the queue is full sees less, and loses track sooner.
-    _, worse = played(made(reward=reward, capacity=1), 1)
-    assert worse["reward_terms"]["followed"] <= terms["followed"]
-
-
-def test_the_reward_is_that_of_the_frames_which_arrived() -> None:
+    """Slot 0 goes where the queue is full: Drop Oldest. The terms are those of the frames which arrived."""
     from bufgym.perception import views, worth
 
-    env = made(reward="followed")
-    rewards, _ = played(env, 0)
+    env = made(reward={"covered": 1.0, "followed": 0.0, "tracked": 0.0})
+    rewards, info = played(env, 0)
+    terms = info["reward_terms"]
+    assert not any(rewards[:-1]) and rewards[-1] == terms["covered"] > 0
     log = np.asarray(env.rows.senders.batch.log[0])[: worth.FRAMES]
     kept = np.flatnonzero(log["transmitted_us"] >= 0)
     assert 40 < len(kept) < worth.FRAMES
-    assert rewards[-1] == views.least_overlap(worth.scene().seen, kept)
+    assert terms["covered"] == worth.scene().coverage.share(kept)
+    assert terms["followed"] == views.least_overlap(worth.scene().seen, np.union1d(kept, [0, worth.FRAMES - 1]))
+    assert 0 <= terms["tracked"] <= 1
+
+
+def test_who_sends_nothing_earns_nothing() -> None:
+    env = made(reward={"covered": 1.0, "followed": 1.0, "tracked": 1.0})
+    rewards, info = played(env, env.action_space.n - 2)  # rejects all
+    assert info["delivered"] == 0 and rewards[-1] < 0.5
+    assert info["reward_terms"]["covered"] == info["reward_terms"]["tracked"] == 0
 
 
 def test_its_terms_are_for_its_recording_alone() -> None:
