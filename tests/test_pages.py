@@ -67,6 +67,7 @@ PARSED = {
     r"python train\.py .*": "minutes to hours; tests/test_train.py",
     r"python -m agents\..*": "needs a run's folder; tests/test_agents.py, test_scheduling.py, test_ablation.py",
     r"python examples/view_missed\.py": "tests/test_training_examples.py",
+    r"bufgym trace fetch tum-rgbd-desk": "downloads 0.4 GB; tests/traces/test_fetch.py",
     r"python examples/trackers\.py.*": "needs small_gicp; tests/perception/test_trackers.py",
     r"python -m pytest .*": "a test",
     r"make .*": "a rule of the Makefile",
