@@ -7,7 +7,7 @@ episode to episode. At its end each of these terms says what the frames that arr
 |---|---|---|
 | `covered` | the part of the scene that some frame has seen | a map; the default |
 | `followed` | the least part of a frame that the one before it has seen | tracking: a stand-in that takes no time |
-| `tracked` | how far tracking gets along the frames, as a part of all | tracking itself: a second an episode |
+| `tracked` | how far tracking gets along the frames, as a part of all | tracking itself: seconds an episode |
 
 To train on tracking take `followed`, to evaluate `tracked`: ``reward={"followed": 1, "tracked": 0}`` reports the second
 without counting it.
@@ -35,8 +35,8 @@ from bufgym.traces.workload import Workload
 SEED: Final = 0
 FRAMES: Final = 240
 """Of the recording: 8 s."""
-WIDTH: Final = 80
-"""Frames are tracked at 80 x 60."""
+WIDTH, VIEW_WIDTH = 160, 80
+"""Frames are tracked at 160 x 120; how far views overlap is counted at 80 x 60."""
 SCALE: Final = 0.25
 """Of the shipped links: then they carry about half of the frames."""
 
@@ -45,7 +45,7 @@ class Scene(NamedTuple):
     """The recording, and what the terms need of it."""
 
     whole: Sequence
-    small: Sequence
+    film: Sequence
     grid: Grid
     seen: NDArray[np.float32]
     coverage: views.Coverage
@@ -53,10 +53,11 @@ class Scene(NamedTuple):
 
 @functools.cache
 def scene() -> Scene:
-    """Filmed once a process, in about a second."""
+    """Filmed once a process, in some seconds."""
     whole = room.room(SEED, frames=FRAMES)
-    small = whole.reduced(whole.camera.width // WIDTH).loaded()
-    return Scene(whole, small, grid_of(small), views.seen_shares(small), views.Coverage(small))
+    film = whole.reduced(whole.camera.width // WIDTH).loaded()
+    small = film.reduced(WIDTH // VIEW_WIDTH)
+    return Scene(whole, film, grid_of(film), views.seen_shares(small), views.Coverage(small))
 
 
 def mapping() -> Uplink:
@@ -92,9 +93,9 @@ def followed(step: Any, memory: Memory) -> float:
 
 @reward_term("tracked", unit="part of the recording", one_queue=True)
 def tracked(step: Any, memory: Memory) -> float:
-    """at the end, how far tracking gets along the frames that arrived (`bufgym/Mapping-v0`); about a second"""
+    """at the end, how far tracking gets along the frames that arrived (`bufgym/Mapping-v0`); some seconds"""
     if not step.ended or not len(frames := _arrived(step)):
         return 0.0
-    track = tracking.track(scene().small, frames, scene().grid)
+    track = tracking.track(scene().film, frames, scene().grid)
     reached = frames[~np.isnan(track.poses[:, 0, 0])]
     return float(reached[-1] - frames[0]) / (FRAMES - 1)
