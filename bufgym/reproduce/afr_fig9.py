@@ -154,8 +154,8 @@ class Reproduction(Figure):
                 times = {"inside_us": inside, "called_median_us": median, "called_p99_us": p99}
                 rows.append({"policy": policy.name, **times, "paper": PAPER.get(policy.name, "-")})
         if self.images and (found := with_images_us(self.images)) is not None:
-            times = {"inside_us": None, "called_median_us": found[0], "called_p99_us": found[1]}
-            rows.append({"policy": IMAGES, **times, "paper": PAPER[IMAGES]})
+            called = {"called_median_us": found[0], "called_p99_us": found[1]}
+            rows.append({"policy": IMAGES, "inside_us": None, **called, "paper": PAPER[IMAGES]})
         return rows
 
     def tables(self, rows: Rows) -> list[str]:
