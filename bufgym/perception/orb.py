@@ -44,8 +44,9 @@ class OrbSimilarity:
         pair = (i, j) if i < j else (j, i)
         if pair not in self._known:
             first, second = self._of(pair[0]), self._of(pair[1])
-            near = [m for m in self._matcher.match(first, second) if m.distance <= NEAR_BITS] if len(first) else []
-            self._known[pair] = len(near) / max(len(first), len(second), 1)
+            fewest, most = sorted((len(first), len(second)))
+            near = sum(m.distance <= NEAR_BITS for m in self._matcher.match(first, second)) if fewest else 0
+            self._known[pair] = near / max(most, 1)
         return self._known[pair]
 
     def _of(self, k: int) -> NDArray[np.uint8]:
