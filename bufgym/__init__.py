@@ -19,6 +19,14 @@ ENVIRONMENTS = {
 }
 """Id -> (name of the scenario, what it is)."""
 
+ON_TASKS = {
+    "bufgym/Mapping-v0": (
+        "bufgym.perception.worth:mapping",
+        "a made-up room is filmed: what are the frames worth?",
+    ),
+}
+"""The same for environments whose reward is a robot's own task; they need the extra ``perception``."""
+
 for _id, (_scenario, _) in ENVIRONMENTS.items():
     if _id not in _gym.registry:
         _gym.register(
@@ -26,4 +34,13 @@ for _id, (_scenario, _) in ENVIRONMENTS.items():
             entry_point="bufgym.envs:SenderEnv",
             vector_entry_point="bufgym.envs:SenderVectorEnv",
             kwargs={"scenario": _scenario, **({"capacity": 32} if _scenario == "topics" else {})},
+        )
+
+for _id, (_scenario, _) in ON_TASKS.items():
+    if _id not in _gym.registry:
+        _gym.register(
+            _id,
+            entry_point="bufgym.envs:SenderEnv",
+            vector_entry_point="bufgym.envs:SenderVectorEnv",
+            kwargs={"scenario": _scenario, "reward": "covered"},
         )

@@ -21,7 +21,7 @@ REPO = Path(__file__).resolve().parent.parent
 
 
 def test_every_environment_has_a_page_with_its_history() -> None:
-    assert set(environments.HISTORY) == {*bufgym.ENVIRONMENTS, environments.FLEET}
+    assert set(environments.HISTORY) == {*bufgym.ENVIRONMENTS, *bufgym.ON_TASKS, environments.FLEET}
     for id, history in environments.HISTORY.items():
         assert id.endswith(history[0].name)
 

@@ -35,8 +35,12 @@ HISTORY = {
     "bufgym/Suite-v0": (Version("v0", "0.1.0", "first version"),),
     "bufgym/Topics-v0": (Version("v0", "0.1.0", "first version"),),
     FLEET: (Version("v0", "0.1.0", "first version"),),
+    "bufgym/Mapping-v0": (Version("v0", "0.3.0", "first version"),),
 }
 """Every environment's versions, newest first."""
+
+SCENARIOS = bufgym.ENVIRONMENTS | bufgym.ON_TASKS
+"""Id -> (name of the scenario, what it is)."""
 
 
 TOPICS = """\
@@ -56,7 +60,7 @@ def slug(id: str) -> str:
 
 def about(id: str) -> str:
     """What it is, in a line."""
-    return "robots that share one cell (PettingZoo)" if id == FLEET else bufgym.ENVIRONMENTS[id][1]
+    return "robots that share one cell (PettingZoo)" if id == FLEET else SCENARIOS[id][1]
 
 
 def title(id: str) -> str:
@@ -129,7 +133,7 @@ def _class(id: str) -> Any:
 def _scenario(id: str) -> Any:
     if id == FLEET:
         return FleetScenario.of(4, "lte").uplink
-    return scenario.get(bufgym.ENVIRONMENTS[id][0])
+    return scenario.get(SCENARIOS[id][0])
 
 
 def _make(id: str) -> str:

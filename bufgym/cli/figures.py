@@ -51,7 +51,7 @@ def _text(name: str, out: Path, data: Path | None, *, named: bool) -> str:
     if needs is not None and data is None and not named:
         return f"{name}: left out; it needs a folder of recordings (--data DIR) with {needs}"
     try:
-        return reproduce.run(name, out, **({} if needs is None else {"data": data}))
+        return reproduce.run(name, out, **({"data": data} if name in reproduce.TAKES_DATA else {}))
     except BufgymError as error:
         if named:
             raise

@@ -127,6 +127,11 @@ def _rendered_topics(name: str, episode: Episode) -> list[NDArray[np.uint8]]:
     return pictures
 
 
+def _mapping() -> Frames:
+    scenario = get("bufgym.perception.worth:mapping")
+    return _compared(QUEUE, draw(scenario, 2), scenario, "A made-up room is filmed over LTE, L = 8")
+
+
 def _fleet() -> Frames:
     titles, films = zip(*map(_rendered_cell, ("drop-oldest", "learned-motion")), strict=True)
     return _stacked(titles, films)
@@ -170,4 +175,5 @@ FILMS: dict[str, Film] = {
     "suite": Film("bufgym/Suite-v0", "a blackout of ten seconds, from the suite outage-v1", _suite),
     "topics": Film("bufgym/Topics-v0", "eight topics over one uplink: Robofleet beside the learned scheduler", _topics),
     "fleet": Film("bufgym_fleet_v0", "eight robots share one cell: Drop Oldest beside the learned agent", _fleet),
+    "mapping": Film("bufgym/Mapping-v0", "a made-up room is filmed: four policies, one link", _mapping),
 }

@@ -24,8 +24,9 @@ from bufgym.traces.trace import Float64Array
 LEVELS: Final = ((4, 10), (2, 5), (1, 2))
 """(stride, most steps) from coarse to fine. KinectFusion takes four at the finest; two change no result here, and save
 a millisecond."""
-MODEL_STRIDE: Final = 2
-"""The model is looked at through every second pixel: at 160x120 these are 2.7 cm apart at 2 m, finer than voxels."""
+MODEL_WIDTH: Final = 80
+"""The model is looked at through about so many pixels a row: of 160 every second, which are 2.7 cm apart at 2 m, finer
+than voxels."""
 SMALL_STEP: Final = 3e-4
 """A level ends early at a smaller step, rad and m."""
 SAME_SURFACE: Final = 0.05
@@ -78,6 +79,8 @@ class Track:
     """float64[m], the same of the orientation, degrees."""
     where: int | None
     """The frame (index of the sequence) at which tracking failed; None if it never did."""
+    model: Map
+    """What it made of the frames until then, at the poses found."""
 
     @property
     def failed(self) -> bool:
@@ -112,9 +115,9 @@ def track(
     for n, k in enumerate(arrived.tolist()[1:], 1):
         pose = tracker.follow(sequence.depth(k))
         if pose is None or _jumped(poses[n - 1], pose, truth[n - 1], truth[n], settings):
-            return Track(arrived, poses, errors[0], errors[1], k)
+            return Track(arrived, poses, errors[0], errors[1], k, tracker.model)
         poses[n], errors[:, n] = pose, difference(pose, truth[n])
-    return Track(arrived, poses, errors[0], errors[1], None)
+    return Track(arrived, poses, errors[0], errors[1], None, tracker.model)
 
 
 def _jumped(
@@ -141,7 +144,8 @@ class Tracker:
         self.model = Map.empty(grid)
         self.pose = np.eye(4)
         self._camera, self._lens = camera, lens_of(camera)
-        self._stride = 1 if camera.height % MODEL_STRIDE or camera.width % MODEL_STRIDE else MODEL_STRIDE
+        stride = max(1, camera.width // MODEL_WIDTH)
+        self._stride = 1 if camera.height % stride or camera.width % stride else stride
         model_camera = camera.every(self._stride)
         self._model_lens = lens_of(model_camera)
         shape, model_shape = ((c.height, c.width, 3) for c in (camera, model_camera))

@@ -2,8 +2,9 @@
 
 ``run("afr-fig5", Path("out"))`` returns a text to print and saves the numbers (CSV) and the picture (PNG) under
 ``out``. Each figure is one module with a class ``Reproduction``, imported only when it is asked for. The numbers need
-nothing beyond bufgym (those of robofleet-table1 its extra ``robofleet``); the picture needs matplotlib, which comes
-with ``bufgym[plot]``. Keys in brackets, such as [wang2022afr], are those of docs/references.bib.
+nothing beyond bufgym (those of robofleet-table1 its extra ``robofleet``, those on frames ``perception`` and ``bench``);
+the picture needs matplotlib, which comes with ``bufgym[plot]``. Keys in brackets, such as [wang2022afr], are those of
+docs/references.bib.
 """
 
 from __future__ import annotations
@@ -21,6 +22,12 @@ FIGURES: dict[str, str] = {name: texts["title"] for name, texts in statements().
 
 NEEDS_DATA: dict[str, str] = {name: texts["needs"] for name, texts in statements().items() if "needs" in texts}
 """Figures over recordings -> what the folder given as their option ``data`` must hold."""
+
+TAKES_DATA = (*NEEDS_DATA, *(name for name, texts in statements().items() if "data" in texts))
+"""Those, and the ones that show more with such a folder than without."""
+
+STORE = "frame-runs.jsonl"
+"""Runs on frames take minutes: those that are finished are kept here, for other figures and against a kill."""
 
 
 def figure(name: str, **options: Any) -> Figure:
@@ -49,6 +56,8 @@ def run(name: str, out: Path | None = None, **options: Any) -> str:
         options: fields of that figure's ``Reproduction``, such as ``runs`` for afr-fig5.
     """
     reproduction = figure(name, **options)
+    if out is not None and getattr(reproduction, "store", out) is None:
+        reproduction = figure(name, **options, store=out / STORE)
     rows = reproduction.simulate()
     lines = report(name, reproduction, rows)
     if out is not None:

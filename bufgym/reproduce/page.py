@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym.errors import BufgymError
-from bufgym.reproduce import FIGURES, NEEDS_DATA, figure
+from bufgym.reproduce import FIGURES, TAKES_DATA, figure
 from bufgym.reproduce.figure import facts_of, source, statements
 
 PAPERS = {
@@ -76,7 +76,7 @@ def claims_page(data: Path | None = None) -> str:
         for name in statements():
             if name.startswith(f"{paper}-"):
                 try:
-                    lines += claim_rows(name, **({"data": data} if name in NEEDS_DATA else {}))
+                    lines += claim_rows(name, **({"data": data} if name in TAKES_DATA else {}))
                 except BufgymError as error:
                     lines.append(f"| | {FIGURES[name]} | `{name}` | | not checked | {error} |")
         lines.append("")

@@ -24,6 +24,7 @@ SHORT: dict[str, Any] = {
     "runs": 2,
     "sweep_kb": (500,),
 }
+FRAMES: dict[str, Any] = {"frames": 40, "capacities": (2,), "policies": ("drop-oldest", "afr"), "offsets": 2, "jobs": 1}
 SMALL: dict[str, dict[str, Any]] = {
     "afr-fig1": {},
     "afr-fig2": {},
@@ -36,7 +37,11 @@ SMALL: dict[str, dict[str, Any]] = {
     "afr-fig8-gap": {**SHORT, "motion": ["drive-0"], "more_runs": 3},
     "afr-vs-random": {"max_capacity": 8, "last_T": 20},
     "afr-theorems": {"max_capacity": 4, "last_T": 40},
-    "afr-fig9": {"decisions": 1000, "calls": 100},
+    "afr-fig9": {"decisions": 1000, "calls": 100, "images": 3 if JIT else 0},
+    "afr-fig7": FRAMES,
+    "afr-fig8": FRAMES,
+    "afr-overlap": {**FRAMES, "capacity": 2, "distances": (1, 4, 8), "motions": (0.05, 0.1)},
+    "afr-qoi-task": {**FRAMES, "offsets": 3},
     "small-link": {"capacities": (2, 3), "runs": 3, "arrivals": 12, "depth": 3},
     "robofleet-table1": {"points": 50},
     "robofleet-fig3": {"rates_hz": (5, 100), "duration_s": 0.5, "runs": 1},
@@ -47,7 +52,11 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 """Options that keep each figure short; a new figure must add its own."""
 
-NEEDS_LIBRARIES = {"robofleet-table1": ("rosbags", "flatbuffers")}
+OF_FRAMES = [name for name, options in SMALL.items() if "offsets" in options]
+NEEDS_LIBRARIES = {
+    "robofleet-table1": ("rosbags", "flatbuffers"),
+    **dict.fromkeys(OF_FRAMES, ("cv2", "rvl", "scipy")),
+}
 
 CLAIMS = Path(__file__).parent.parent.parent / "docs" / "claims.md"
 
@@ -58,6 +67,8 @@ PNG = b"\x89PNG\r\n\x1a\n"
 def test_saves_its_numbers_and_its_figure(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for library in ("matplotlib", *NEEDS_LIBRARIES.get(name, ())):
         pytest.importorskip(library)
+    if not JIT and name in OF_FRAMES:
+        pytest.skip("without compilation a room takes minutes to draw")
     if not JIT:
         from bufgym.reproduce import afr_fig5
 

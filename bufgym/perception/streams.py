@@ -1,0 +1,79 @@
+"""A recording sent over a link: its frames as an episode, and which of them arrive under a policy."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import policies, sim
+from bufgym.model.link import Link
+from bufgym.perception.frames import Depth, Image, Sequence
+from bufgym.policies.registry import Policy
+from bufgym.scenario import Episode
+from bufgym.scenario.arrivals import messages
+from bufgym.scenario.suites import motion_value
+from bufgym.sim import metrics
+from bufgym.traces import Trace
+
+SIZED_EVERY = 10
+"""Every so many frames one is encoded; the size of those between lies between theirs."""
+
+
+class First(Sequence):
+    """A recording that ends early."""
+
+    def __init__(self, whole: Sequence, frames: int) -> None:
+        self.name, self.camera = whole.name, whole.camera
+        self.time_us, self.poses = whole.time_us[:frames], whole.poses[:frames]
+        self._whole = whole
+
+    def depth(self, k: int) -> Depth:
+        return self._whole.depth(k)
+
+    def image(self, k: int) -> Image:
+        return self._whole.image(k)
+
+    def size_bytes(self, k: int) -> int:
+        return self._whole.size_bytes(k)
+
+
+def first(sequence: Sequence, frames: int) -> Sequence:
+    """The recording's first frames; all of them where there are no more."""
+    return sequence if len(sequence) <= frames else First(sequence, frames)
+
+
+@lru_cache(maxsize=8)
+def sizes(sequence: Sequence, every: int = SIZED_EVERY) -> NDArray[np.int64]:
+    """int64[frames]: bytes of each frame as it is sent."""
+    encoded = np.unique(np.append(np.arange(0, len(sequence), every), len(sequence) - 1))
+    measured = [sequence.size_bytes(int(k)) for k in encoded]
+    return np.rint(np.interp(np.arange(len(sequence)), encoded, measured)).astype(np.int64)
+
+
+def fading(stream_us: int, trace: Trace, offset_us: int = 0) -> Link:
+    """The link that is met when a stream of this length begins ``offset_us`` into the trace's stretch of that length.
+
+    What follows the stretch is the stretch again. So whatever the offset, the link carries the same while the stream
+    lasts, and a fade is only met at another place of the camera's way: earlier by the offset.
+    """
+    until_us = min(int(stream_us), int(trace.duration_us))
+    inside = trace.time_us < until_us
+    time_us = np.append(trace.time_us[inside], until_us)
+    carried = Link(trace).carried_at(until_us)
+    cumulative = np.append(trace.cumulative_bytes[inside], carried)
+    return Link(Trace(trace.name, time_us, cumulative, after="loop"), int(offset_us) % until_us)
+
+
+def episode(sequence: Sequence, size_bytes: NDArray[np.int64], link: Link, seed: int = 0) -> Episode:
+    """The frames as they come, x being the camera's motion; ``seed``: of what randomised policies draw."""
+    x = sequence.motion().at(sequence.time_us)
+    arrivals = messages(sequence.time_us, size_bytes, x - x[0])
+    return Episode(arrivals, link).with_uniforms(np.random.Generator(np.random.PCG64(seed)))
+
+
+def received(policy: str | Policy, one: Episode, capacity: int) -> tuple[int, ...]:
+    """The frames that arrive, by their numbers, with a queue of ``capacity`` messages under ``policy``."""
+    senders = sim.run(policies.get(policy), [one], capacity, motion_value())
+    return tuple(metrics.received(senders, 0)["seq"].tolist())

@@ -1,0 +1,155 @@
+"""Fig. 7 of the AFR paper: the error of the map that is made of the frames received, against the queue size.
+
+The frames are fused with their true poses (``bufgym.perception.mapping``) and the map is compared with that of all
+frames. A second map has the poses that tracking finds along the frames received, up to where it breaks: the paper's
+maps are made by SLAM, which knows no true poses. If that explains the difference, the second shows it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
+from bufgym.perception import mapping
+from bufgym.reproduce.correlation import spearman
+from bufgym.reproduce.figure import finish, legend_below
+from bufgym.reproduce.frame_runs import POLICIES, FrameFigure, Setting
+from bufgym.reproduce.rows import Rows
+
+RESAMPLES = 2000
+CONFIDENCE = 0.95
+PAPER = {"drop-oldest": -0.20, "random": -0.10, "orbbuf-images": -0.10}
+"""What AFR's error is less than that of others, about."""
+SHOWN = ("drop-oldest", "random", "afr", "learned-motion")
+"""Policies whose maps are drawn, at the smallest L and the paper's alignment."""
+SLICE = 30_000
+"""Points of a map that are drawn."""
+
+
+def change(rows: Rows, column: str, policy: str, other: str) -> Interval:
+    """Mean of the column under ``policy`` over that under ``other``, less 1; the interval is over offsets.
+
+    The bootstrap is paired: an offset is drawn with all its runs, of both policies.
+    """
+    ours, theirs = (
+        np.array([rows.mean(column, k=k, policy=name) for k in rows.distinct("k")]) for name in (policy, other)
+    )
+    weights = times_drawn(len(ours), RESAMPLES, stream(0, f"{column} {policy} {other}"))
+    return percentile_interval((weights @ ours) / (weights @ theirs) - 1, CONFIDENCE)
+
+
+def spelled(interval: Interval) -> str:
+    """-7 % [-9, -4]."""
+    return f"{interval.value:+.1%} [{interval.low:+.1%}, {interval.high:+.1%}]"
+
+
+@dataclass(frozen=True)
+class Reproduction(FrameFigure):
+    """Error of the map under each policy at each L, on each recording."""
+
+    def simulate(self) -> Rows:
+        return self.play("map", "track")
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines: list[str] = []
+        labels: dict[Any, str] = {name: style[0] for name, style in POLICIES.items()}
+        for recording in rows.distinct("recording"):
+            for title, some in (("the paper's alignment", rows.where(k=0)), ("the sweep", rows)):
+                shown = some.where(recording=recording)
+                lines += [f"{recording}, RMSE of the map in mm by L, {title}:"]
+                lines += [*shown.pivot("policy", "L", "rmse_mm", ".2f", labels), ""]
+        return lines[:-1]
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        main = self.recordings[-1]
+        facts: dict[str, Any] = {"about": self.about(), "main": main, "offsets": self.offsets}
+        for other, paper in PAPER.items():
+            key = other.removeprefix("drop-").removesuffix("-images")
+            facts[key] = None
+            if {"afr", other} <= set(self.policies):
+                shown = {name: rows.where(recording=name) for name in self.recordings}
+                found = {name: change(some, "rmse_mm", "afr", other) for name, some in shown.items()}
+                first = {name: change(some.where(k=0), "rmse_mm", "afr", other) for name, some in shown.items()}
+                slam = {name: change(some, "slam_rmse_mm", "afr", other) for name, some in shown.items()}
+                lack = {name: change(some, "slam_uncovered", "afr", other) for name, some in shown.items()}
+                facts[key] = found[main].high < 0 and found[main].low <= paper
+                facts[f"{key}_change"] = "; ".join(f"{name} {spelled(i)}" for name, i in found.items())
+                facts[f"{key}_paper"] = "; ".join(f"{name} {i.value:+.1%}" for name, i in first.items())
+                facts[f"{key}_slam"] = "; ".join(f"{name} {spelled(i)}" for name, i in slam.items())
+                facts[f"{key}_lack"] = "; ".join(f"{name} {spelled(i)}" for name, i in lack.items())
+        if "drop-oldest" in self.policies and "afr" in self.policies:
+            facts["moves"] = self.where_it_moves(rows.where(recording=main))
+        return facts
+
+    def where_it_moves(self, rows: Rows) -> str:
+        """Spearman's correlation, over the offsets, of how far the camera moves in Drop Oldest's longest gap and AFR's
+        change of the error."""
+        moved, won = [], []
+        x = self.stage(rows[0]["recording"]).whole.motion().at(self.stage(rows[0]["recording"]).whole.time_us)
+        for k in rows.distinct("k"):
+            kept = [self.kept(Setting(rows[0]["recording"], k, L, "drop-oldest")) for L in self.capacities]
+            moved.append(float(np.mean([np.diff(x[list(frames)]).max() for frames in kept])))
+            won.append(rows.mean("rmse_mm", k=k, policy="afr") / rows.mean("rmse_mm", k=k, policy="drop-oldest") - 1)
+        return f"{spearman(np.array(moved), np.array(won)):+.2f}"
+
+    def size_inches(self, rows: Rows) -> tuple[float, float]:
+        return 3.2 * max(2, len(self.shown)), 3.4 + 3.0 * len(self.recordings)
+
+    @property
+    def shown(self) -> list[str]:
+        """Policies whose maps are drawn."""
+        return [name for name in SHOWN if name in self.policies] or [self.policies[0]]
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        heights = [3.4, *[3.0] * len(self.recordings)]
+        above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
+        panels = above.subplots(1, 2 * len(self.recordings), squeeze=False)[0]
+        for n, recording in enumerate(self.recordings):
+            for axes, title, some in (
+                (panels[2 * n], "the paper's alignment", rows.where(k=0)),
+                (panels[2 * n + 1], f"sweep of {self.offsets}", rows),
+            ):
+                for policy in self.policies:
+                    label, colour, marker = POLICIES[policy]
+                    means = [some.mean("rmse_mm", recording=recording, policy=policy, L=L) for L in self.capacities]
+                    axes.plot(self.capacities, means, marker=marker, color=colour, markersize=4, label=label)
+                axes.set_xticks(self.capacities)
+                finish(axes, f"{recording}: {title}", xlabel="queue size L")
+        panels[0].set_ylabel("RMSE of the map, mm")
+        legend_below(figure, 4, panels[0])
+        for part, recording in zip(below, self.recordings, strict=True):
+            self._maps(part, recording)
+
+    def _maps(self, part: Any, recording: str) -> None:
+        """The maps of some policies from above, each point by its distance to the map of all frames."""
+        on, L = self.stage(recording), min(self.capacities)
+        every = on.reference.points()
+        limit_mm = 20.0
+        panels = part.subplots(1, len(self.shown), squeeze=False, sharex=True, sharey=True)[0]
+        for axes, policy in zip(panels, self.shown, strict=True):
+            made = mapping.fuse(on.sequence, self.kept(Setting(recording, 0, L, policy)), on.grid).points()
+            # From the reference's points to the map: what the map lacks is far from it, and shows.
+            far_mm = 1e3 * mapping.distances(every, made)
+            few = _some(len(every))
+            colours = {"c": np.minimum(far_mm[few], limit_mm), "cmap": "inferno_r", "vmin": 0, "vmax": limit_mm}
+            painted = axes.scatter(*_plan(every)[few].T, s=0.4, **colours)
+            axes.set_aspect("equal")
+            axes.set_axis_off()
+            axes.set_title(f"{recording}, {POLICIES[policy][0]}, L = {L}", fontsize=9, loc="left")
+        part.colorbar(painted, ax=list(panels), label="distance to this map, mm", shrink=0.8)
+
+
+def _some(points: int) -> NDArray[np.int64]:
+    """Which points are drawn, the same for every map."""
+    return np.random.Generator(np.random.PCG64(0)).permutation(points)[:SLICE]
+
+
+def _plan(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """float64[points, 2]: seen along the direction in which they spread least."""
+    flat = points - points.mean(axis=0)
+    _, _, axes = np.linalg.svd(flat[_some(len(flat))[:2000]], full_matrices=False)
+    return np.asarray(flat @ axes[:2].T, np.float64)

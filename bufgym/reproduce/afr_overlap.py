@@ -1,0 +1,185 @@
+"""Eq. 3-6 of the AFR paper against views of real frames: is V as it is assumed to be, and does it matter?
+
+The paper's V is a function of the distance d between two frames: 0 at 0 (Eq. 3), at most 1 (Eq. 4), non-decreasing (Eq.
+5), concave (Eq. 6), the last of which it calls "a little strong". Here V(i, j) is measured for every pair of frames of
+a recording (``bufgym.perception.views``): the part of frame j that frame i has not seen. Eq. 3 and 4 then hold by
+definition; the other two are asked at each frame i, with distances d and 2 d: V(i, i + 2d) >= V(i, i + d), and
+V(i, i + 2d) <= 2 V(i, i + d). The distance is a number of frames, or motion of the camera.
+
+Whether it matters is asked as the paper's theorems ask: one interruption of T frames begins at frame i, a queue of L
+messages; H of what AFR keeps, of what Drop Oldest keeps, and of the best L frames in hindsight, all by the measured V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.perception.views import overlap_information
+from bufgym.reproduce.afr_theorems import gaps_of
+from bufgym.reproduce.figure import COLOURS, finish, legend_below, several, whole
+from bufgym.reproduce.frame_runs import FrameFigure
+from bufgym.reproduce.rows import Row, Rows, table
+from bufgym.scenario.checks import above_0
+
+NOISE = 0.05
+"""What V may fall or rise too much and still count as keeping a rule: edges and noise of the depth."""
+EVERY = 10
+"""Interruptions begin at every so many frames."""
+
+
+@dataclass(frozen=True)
+class Reproduction(FrameFigure):
+    """How often Eq. 5 and 6 are broken at each distance, and what the policies gain by the measured V."""
+
+    capacity: int = 8
+    distances: Sequence[int] = (1, 2, 4, 8, 12, 18, 27, 40, 60, 90)
+    """d, and T of the interruptions where it is above L; messages."""
+    motions: Sequence[float] = (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5)
+    """d in fields of view."""
+
+    RULES = {"capacity": whole(), "distances": several(whole()), "motions": several(above_0)}
+    SIZE_INCHES = (11.0, 3.8)
+
+    def simulate(self) -> Rows:
+        rows = Rows()
+        for recording in self.recordings:
+            seen = self.stage(recording).seen
+            v = 1.0 - seen.astype(np.float64)
+            x = self.stage(recording).whole.motion().at(self.stage(recording).whole.time_us)
+            number = np.arange(len(x), dtype=np.float64)
+            for by, at, distances in (("frames", number, self.distances), ("motion", x, self.motions)):
+                for d in distances:
+                    if (rules := _rules(v, at, d)) is not None:
+                        played = by == "frames" and self.capacity < d
+                        gained = _gained(v, seen, self.capacity, int(d)) if played else _NOTHING
+                        rows.append({"recording": recording, "by": by, "d": float(d)} | rules | gained)
+        return rows
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines: list[str] = []
+        heads = ["d", "mean V", "10 %", "90 %", "Eq. 5 broken", "Eq. 6 broken", "by"]
+        for recording, by in rows.distinct("recording", "by"):
+            shown = rows.where(recording=recording, by=by)
+            cells = [heads, *([f"{row['d']:g}", *(f"{row[name]:.3f}" for name in _RULES)] for row in shown)]
+            lines += [f"{recording}, d in {'frames' if by == 'frames' else 'fields of view'}:", *table(cells), ""]
+        return lines[:-1]
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        by_frames = rows.where(by="frames")
+        played = Rows(row for row in by_frames if row["behind"] is not None)
+        facts: dict[str, Any] = {"about": self.about(), "noise": NOISE}
+        for rule in ("broken_5", "broken_6"):
+            facts[rule] = "; ".join(
+                f"{recording} {shown.mean(rule, by='frames'):.0%} of the cases by frames, "
+                f"{shown.mean(rule, by='motion'):.0%} by motion"
+                for recording in rows.distinct("recording")
+                for shown in [rows.where(recording=recording)]
+            )
+        facts["excess"] = float(rows.column("excess_6").max())
+        facts["rising"] = bool((rows.column("broken_5") < NOISE).all())
+        facts["concave"] = bool((rows.column("broken_6") < NOISE).all())
+        facts["mean_concave"] = _concave_in_the_mean(rows)
+        facts["mean_breaks"] = _breaks_in_the_mean(rows)
+        if played:
+            behind = {r: played.mean("behind", recording=r) for r in played.distinct("recording")}
+            facts["matters"] = max(behind.values()) <= NOISE
+            facts["behind"] = "; ".join(f"{r} {share:.1%}" for r, share in behind.items())
+            facts["of_best"] = "; ".join(
+                f"{r} AFR {played.mean('afr_of_best', recording=r):.3f}, "
+                f"Drop Oldest {played.mean('oldest_of_best', recording=r):.3f}"
+                for r in behind
+            )
+        else:
+            facts |= {"behind": "not played", "of_best": "not played"}
+        return facts
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        colours = dict(zip(self.recordings, (COLOURS["afr"], COLOURS["drop-oldest"]), strict=False))
+        left, middle, right = figure.subplots(1, 3)
+        for recording, colour in colours.items():
+            for axes, by in ((left, "frames"), (middle, "motion")):
+                shown = rows.where(recording=recording, by=by)
+                d = shown.column("d")
+                axes.fill_between(d, shown.column("V_low"), shown.column("V_high"), color=colour, alpha=0.2)
+                axes.plot(d, shown.column("V"), "o-", color=colour, markersize=4, label=recording)
+            played = Rows(row for row in rows.where(recording=recording, by="frames") if row["behind"] is not None)
+            for name, line in (("afr", "-"), ("oldest", "--")):
+                label = f"{recording}, {'AFR' if name == 'afr' else 'Drop Oldest'}"
+                right.plot(played.column("d"), played.column(f"{name}_of_best"), line, color=colour, label=label)
+        finish(left, "V by frames: mean, 10 to 90 %", xlabel="distance d, frames", ylim=(0, 1))
+        left.set_ylabel("part that is new")
+        finish(middle, "V by motion", xlabel="distance d, fields of view", ylim=(0, 1))
+        finish(right, "H by the measured V", xlabel="interruption T, frames", ylabel="of the best in hindsight")
+        right.legend(frameon=False, fontsize=8)
+        legend_below(figure, 2, left)
+
+
+_RULES = ("V", "V_low", "V_high", "broken_5", "broken_6", "excess_6")
+_NOTHING: Row = {"behind": None, "afr_of_best": None, "oldest_of_best": None}
+
+
+def _rules(v: NDArray[np.float64], at: NDArray[np.float64], d: float) -> Row | None:
+    """V at distance ``d`` from each frame, and how often a rule is broken from there on to 2 d; None if nothing is.
+
+    Args:
+        v: float64[frames, frames], V(i, j).
+        at: float64[frames], where each frame lies; non-decreasing.
+        d: the distance.
+    """
+    once, twice = (np.searchsorted(at, at + distance - 1e-9) for distance in (d, 2 * d))
+    i = np.flatnonzero(twice < len(at))
+    if not len(i):
+        return None
+    near, far = v[i, once[i]], v[i, twice[i]]
+    excess = far - 2 * near
+    return {
+        "V": float(near.mean()),
+        "V_twice": float(far.mean()),
+        "V_low": float(np.quantile(near, 0.1)),
+        "V_high": float(np.quantile(near, 0.9)),
+        "broken_5": float((far < near - NOISE).mean()),
+        "broken_6": float((excess > NOISE).mean()),
+        "excess_6": float(excess[excess > NOISE].mean()) if (excess > NOISE).any() else 0.0,
+    }
+
+
+def _gained(v: NDArray[np.float64], seen: NDArray[np.float32], L: int, T: int) -> Row:
+    """H of AFR and of Drop Oldest over that of the best, by the measured V, over interruptions of T frames."""
+    starts = np.arange(0, len(v) - T - 1, EVERY)
+    if not len(starts):
+        return _NOTHING
+    kept = {name: np.append(0, np.cumsum(gaps_of(policy, L, [T])[0])) for name, policy in _POLICIES.items()}
+    gained = {name: np.array([overlap_information(seen, i + rows) for i in starts]) for name, rows in kept.items()}
+    best = np.array([1.0 + best_gain(v[i : i + T + 2, i : i + T + 2], L) for i in starts])
+    return {
+        "behind": float((gained["afr"] < gained["oldest"] - NOISE).mean()),
+        "afr_of_best": float(gained["afr"].sum() / best.sum()),
+        "oldest_of_best": float(gained["oldest"].sum() / best.sum()),
+    }
+
+
+_POLICIES = {"afr": "afr", "oldest": "drop-oldest"}
+
+
+def best_gain(v: NDArray[np.float64], L: int) -> float:
+    """The most that ``L`` frames at most can gain between the first and the last one, by V(i, j) = ``v[i, j]``."""
+    later = np.triu(np.ones(v.shape, np.bool_), 1)
+    step = np.where(later, v, -np.inf)
+    reached = step[0].copy()
+    for _ in range(L):
+        reached = np.maximum(reached, (reached[:, None] + step).max(axis=0))
+    return float(reached[-1])
+
+
+def _concave_in_the_mean(rows: Rows) -> bool:
+    return all(row["V_twice"] <= 2 * row["V"] for row in rows)
+
+
+def _breaks_in_the_mean(rows: Rows) -> str:
+    broken = [f"{r['recording']} d = {r['d']:g} ({r['by']})" for r in rows if r["V_twice"] > 2 * r["V"]]
+    return ", ".join(broken) or "nowhere"

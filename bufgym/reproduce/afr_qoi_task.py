@@ -1,0 +1,133 @@
+"""Quantity of Information against what it stands for: which V tells best how good the map is, and who keeps track?
+
+Every run of Fig. 7 and 8 has its information by time, by motion, by measured overlap, and its coverage, and beside it
+the error of the map, what the map lacks, and whether tracking broke. Correlation is Spearman's over the runs of a
+recording; the bootstrap draws whole offsets of the fade. *Within* compares runs of the same queue size and offset
+alone: it asks whether V tells policies apart, where the whole correlation may just say that a larger queue is better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.reproduce.correlation import spearman_over
+from bufgym.reproduce.figure import COLOURS, finish, legend_below
+from bufgym.reproduce.frame_runs import FrameFigure
+from bufgym.reproduce.rows import Rows, table
+
+MEASURES = {
+    "H_time": "time",
+    "H_motion": "motion",
+    "H_overlap": "overlap",
+    "coverage": "coverage",
+    "least_overlap": "least overlap",
+}
+"""Column -> by which V, or what in its place; the last is the worst of all steps, where the others are sums."""
+TASKS = {
+    "rmse_mm": "map error",
+    "uncovered": "map's holes",
+    "failed": "tracking failure",
+    "slam_rmse_mm": "error with tracked poses",
+}
+"""Column -> what is bad for the robot; a good measure falls where it grows."""
+ACROSS, WITHIN = "all runs", "within"
+
+
+@dataclass(frozen=True)
+class Reproduction(FrameFigure):
+    """Correlation of each measure of information with each measure of the task, on each recording."""
+
+    SIZE_INCHES = (11.0, 4.2)
+
+    def simulate(self) -> Rows:
+        """A row for each recording, measure and task; the runs themselves are in the figures of which they are."""
+        runs = self.play("map", "track")
+        rows = Rows()
+        for recording in self.recordings:
+            shown = runs.where(recording=recording)
+            offset = np.array(shown.column("k"), np.int64)
+            cell = [(row["k"], row["L"]) for row in shown]
+            for scope in (ACROSS, WITHIN):
+                for measure in MEASURES:
+                    for task in TASKS:
+                        a, b = shown.column(measure), shown.column(task)
+                        if scope == WITHIN:
+                            a, b = _less_mean(a, cell), _less_mean(b, cell)
+                        found = spearman_over(a, b, offset, f"{recording} {measure} {task} {scope}")
+                        rows.append(
+                            {
+                                "recording": recording,
+                                "scope": scope,
+                                "measure": MEASURES[measure],
+                                "task": TASKS[task],
+                                "spearman": found.value,
+                                "low": found.low,
+                                "high": found.high,
+                                "runs": len(a),
+                            }
+                        )
+        return rows
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines: list[str] = []
+        for recording, scope in rows.distinct("recording", "scope"):
+            shown = rows.where(recording=recording, scope=scope)
+            cells: list[list[object]] = [["", *TASKS.values()]]
+            for measure in MEASURES.values():
+                cells.append([measure, *(_spelled(shown.where(measure=measure, task=t)) for t in TASKS.values())])
+            lines += [f"{recording}, {scope}: Spearman's correlation [95 %]", *table(cells), ""]
+        return lines[:-1]
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        best = {}
+        for recording in self.recordings:
+            for task in ("map error", "tracking failure"):
+                shown = rows.where(recording=recording, scope=WITHIN, task=task)
+                known = [row for row in shown if not np.isnan(row["spearman"])]
+                if known:
+                    row = min(known, key=lambda row: float(row["spearman"]))
+                    best[recording, task] = f"{row['measure']} ({_spelled(Rows([row]))})"
+        right = [row["high"] < 0 for row in rows.where(scope=ACROSS, task="map error")]
+        return {
+            "about": self.about(),
+            "stands": all(right),
+            "right": sum(right),
+            "asked": len(right),
+            "best": "; ".join(f"{task} on {where}: {text}" for (where, task), text in best.items()) or "unknown",
+        }
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        colours = (COLOURS["other"], COLOURS["afr"], COLOURS["random"], COLOURS["orange"], COLOURS["pink"])
+        pairs = rows.distinct("recording", "scope")
+        panels = figure.subplots(1, len(pairs), squeeze=False, sharey=True)[0]
+        ticks = np.arange(len(TASKS))
+        for axes, (recording, scope) in zip(panels, pairs, strict=True):
+            for n, (measure, colour) in enumerate(zip(MEASURES.values(), colours, strict=True)):
+                shown = rows.where(recording=recording, scope=scope, measure=measure)
+                value, low, high = (shown.column(name) for name in ("spearman", "low", "high"))
+                aside = ticks + 0.15 * (n - (len(MEASURES) - 1) / 2)
+                axes.vlines(aside, low, high, color=colour, linewidth=1.5)
+                axes.plot(aside, value, "o", color=colour, markersize=5, label=measure)
+            axes.axhline(0, color=".4", linewidth=0.8)
+            axes.set_xticks(ticks, [text.replace(" ", "\n", 1) for text in TASKS.values()], fontsize=8)
+            finish(axes, f"{recording}, {scope}", ylim=(-1, 0.6))
+        panels[0].set_ylabel("Spearman's correlation (lower is better)")
+        legend_below(figure, 5, panels[0])
+
+
+def _less_mean(numbers: NDArray[np.float64], cell: list[Any]) -> NDArray[np.float64]:
+    """Each less the mean of those of its cell."""
+    _, place = np.unique(np.array(cell), axis=0, return_inverse=True)
+    means = np.bincount(place, numbers) / np.bincount(place)
+    return np.asarray(numbers - means[place], np.float64)
+
+
+def _spelled(rows: Rows) -> str:
+    (row,) = rows
+    if np.isnan(row["spearman"]):
+        return "-"
+    return f"{row['spearman']:+.2f} [{row['low']:+.2f}, {row['high']:+.2f}]"

@@ -1,0 +1,181 @@
+"""What Fig. 7 and 8 of the AFR paper share when frames are really mapped and tracked: recordings, link, runs.
+
+The paper streams 794 RGB-D frames at 30 Hz over car_0002. Here the same number of frames comes from a recording of a
+Kinect (7-Scenes, with ``--data``) and from a made-up room, each as long as it really is when encoded. The link is that
+of the paper (with ``--data``; a made-up fade without) for as long as the stream lasts, and then again.
+
+Where the fade meets the camera's motion decides much. The paper shows one *alignment*: the link begins with the stream.
+Beside it stands a sweep that was fixed before anything had been run: the link begins k tenths of the stream later, so
+the fade comes earlier by as much, k = 0 .. ``offsets`` - 1; k = 0 is the paper's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bufgym import traces
+from bufgym.perception import streams, views
+from bufgym.reproduce.afr_evaluation import LINK, PAPER_FRAMES, STYLES
+from bufgym.reproduce.figure import COLOURS, Figure, several, whole
+from bufgym.reproduce.frame_tasks import (
+    IMAGES,
+    OFFSETS,
+    SEVEN_SCENES,
+    SLOW,
+    Kind,
+    Stage,
+    Store,
+    Task,
+    carried_out,
+    carry_out,
+    stage,
+)
+from bufgym.reproduce.rows import Row, Rows
+from bufgym.scenario.suites import CAPACITIES, motion_value, time_value
+from bufgym.traces import Trace
+
+RECORDINGS = {"room": "a made-up room", "7-scenes": "7-Scenes, Kinect"}
+"""Name -> what it is; the second needs a folder of recordings."""
+
+POLICIES = {
+    "drop-oldest": STYLES["drop-oldest"],
+    "random": STYLES["random"],
+    IMAGES: ("ORBBuf, images", COLOURS["pink"], "D"),
+    "orbbuf": ("ORBBuf, motion", "#882255", "d"),
+    "afr": STYLES["afr"],
+    "min-motion-gap": ("min-motion-gap", COLOURS["orange"], "v"),
+    "learned-motion": ("learned-motion", COLOURS["sky"], "P"),
+    "clairvoyant": ("clairvoyant", COLOURS["oracle-ideal"], "*"),
+}
+"""Policy -> label, colour, marker. The clairvoyant plans for motion QoI."""
+
+
+def fade() -> Trace:
+    """In place of the paper's link: 2.2 MB/s, which is about its mean, and 0.4 from second 21 to second 24."""
+    return Trace.steps([(21, 2.2e6), (3, 0.4e6), (30, 2.2e6)], name="fade")
+
+
+class Setting(NamedTuple):
+    """One run: which policy, with which queue, on which recording, with the fade where."""
+
+    recording: str
+    k: int
+    L: int
+    policy: str
+
+
+@dataclass(frozen=True)
+class FrameFigure(Figure):
+    """A figure of runs of every policy at each L, on each recording and with the fade at each offset."""
+
+    data: Path | None = None
+    """Folder of recordings; without one the made-up room and a made-up fade alone."""
+    frames: int = PAPER_FRAMES
+    capacities: Sequence[int] = CAPACITIES
+    policies: Sequence[str] = tuple(POLICIES)
+    offsets: int = OFFSETS
+    """Runs of the sweep; the fade comes a tenth of the stream earlier in each."""
+    jobs: int = -1
+    """Processes side by side; -1: one a core."""
+    store: Path | None = None
+    """File of the tasks that have been carried out; None keeps nothing."""
+
+    RULES = {"frames": whole(30), "capacities": several(whole()), "offsets": whole(1, OFFSETS)}
+
+    @property
+    def recordings(self) -> list[str]:
+        """Those that are there."""
+        real = self.data is not None and (self.data / SEVEN_SCENES).is_dir()
+        return ["room", *(["7-scenes"] if real else [])]
+
+    @cached_property
+    def link(self) -> Trace:
+        """The paper's where it is there."""
+        path = None if self.data is None else self.data / LINK
+        return fade() if path is None or not path.is_file() else traces.read_trace(path)
+
+    def stage(self, recording: str) -> Stage:
+        """The recording, opened once."""
+        return stage(recording, None if self.data is None else str(self.data), self.frames)
+
+    def settings(self) -> list[Setting]:
+        """Every run, in the order of the rows."""
+        return [
+            Setting(recording, k, L, policy)
+            for recording in self.recordings
+            for k in range(self.offsets)
+            for L in self.capacities
+            for policy in self.policies
+        ]
+
+    @cached_property
+    def done(self) -> Store:
+        """What has been carried out."""
+        return Store(self.store)
+
+    def task(self, kind: Kind, setting: Setting) -> Task:
+        """What is to be found out of this run."""
+        data = None if self.data is None else str(self.data)
+        about = (setting.k, setting.L) if kind == "kept" else self.kept(setting)
+        return Task(kind, setting.recording, data, self.frames, about, setting.policy, self.link)
+
+    def kept(self, setting: Setting) -> tuple[int, ...]:
+        """The frames that arrive in this run."""
+        if setting not in self._kept:
+            task = self.task("kept", setting)
+            if setting.policy in SLOW:
+                carry_out([task], self.done, 1)
+                self._kept[setting] = tuple(self.done[task]["kept"])
+            else:
+                self._kept[setting] = carried_out(task)[1]["kept"]
+        return self._kept[setting]
+
+    @cached_property
+    def _kept(self) -> dict[Setting, tuple[int, ...]]:
+        return {}
+
+    def play(self, *kinds: Kind) -> Rows:
+        """A row for each run: its frames, its information by each V, and what the tasks of these kinds gave."""
+        settings = self.settings()
+        carry_out([self.task("kept", one) for one in settings if one.policy in SLOW], self.done, self.jobs)
+        carry_out([self.task(kind, setting) for kind in kinds for setting in settings], self.done, self.jobs)
+        rows = Rows()
+        for setting in settings:
+            row: Row = setting._asdict() | {"received": len(self.kept(setting))} | self.information(setting)
+            for kind in kinds:
+                row |= self.done[self.task(kind, setting)]
+            rows.append(row)
+        return rows
+
+    def information(self, setting: Setting) -> Row:
+        """H of the run's frames by time, by motion and by measured overlap, and what of the scene they cover."""
+        kept, on = self.kept(setting), self.stage(setting.recording)
+        x = on.episode(self.link, 0).arrivals["x"][list(kept)]
+        return {
+            "H_time": time_value().information(np.array(kept, np.float64)),
+            "H_motion": motion_value().information(x),
+            "H_overlap": views.overlap_information(on.seen, kept),
+            "least_overlap": views.least_overlap(on.seen, kept),
+            "coverage": on.coverage.share(kept),
+        }
+
+    def about(self) -> str:
+        """What meets the policies, in sentences."""
+        parts = []
+        for recording in self.recordings:
+            whole = self.stage(recording).whole
+            size_kb = float(streams.sizes(whole).mean()) / 1e3
+            seconds = float(whole.time_us[-1]) / 1e6
+            carried = self.stage(recording).episode(self.link, 0).link.carried_at(int(whole.time_us[-1]))
+            demand = float(streams.sizes(whole).sum())
+            parts.append(
+                f"{recording}: {RECORDINGS[recording]}, {len(whole)} frames of {size_kb:.0f} kB in {seconds:.1f} s, "
+                f"of which the link {self.link.name} carries {carried / demand:.0%}."
+            )
+        return "\n\n".join(parts)

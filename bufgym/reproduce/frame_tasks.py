@@ -1,0 +1,213 @@
+"""Runs on frames, one task each: which frames of a recording arrive, and what map and what track they make.
+
+What a task gave is kept in a file by what it was asked, and by nothing else. So figures share their runs, equal runs
+are run once, and what was killed goes on where it was.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import __version__
+from bufgym.benchmark import cluster
+from bufgym.benchmark.run import bar
+from bufgym.errors import BufgymError
+from bufgym.perception import frames as depth_frames
+from bufgym.perception import mapping, orb, room, streams, tracking, views
+from bufgym.reproduce.rows import Row
+from bufgym.scenario import Episode
+from bufgym.traces import Trace
+
+SEVEN_SCENES = "rgbd_7scenes"
+WIDTH, VIEW_WIDTH = 160, 80
+"""Frames are mapped and tracked at 160 x 120; how far views overlap is counted at 80 x 60. Tracking there would take
+two thirds of the time, and loses runs that are followed at 160 x 120."""
+OFFSETS = 10
+"""Places of the fade: it comes a tenth of the stream earlier at each."""
+
+IMAGES = "orbbuf-images"
+"""ORBBuf by the images themselves: a policy of each episode, not registered."""
+SLOW = (IMAGES, "clairvoyant")
+"""Policies that take seconds for a run; which frames they keep is a task of its own."""
+
+Kind = Literal["kept", "map", "track"]
+
+
+# --- one recording ---------------------------------------------------------------------------------------------------
+
+
+class Stage:
+    """A recording at the size at which it is mapped and tracked, and what every run on it needs."""
+
+    def __init__(self, name: str, data: str | None, frames: int) -> None:
+        if name == "room":
+            whole_size = room.room(0, frames=frames)
+        elif data is None:
+            raise BufgymError(f"recording {name}: needs a folder of recordings (--data DIR) with {SEVEN_SCENES}")
+        else:
+            whole_size = depth_frames.open_sequence(Path(data) / SEVEN_SCENES)
+        self.whole = streams.first(whole_size, frames)
+        self.sequence = self.whole.reduced(self.whole.camera.width // WIDTH).loaded()
+        self.small = self.sequence.reduced(WIDTH // VIEW_WIDTH).loaded()
+
+    @cached_property
+    def grid(self) -> mapping.Grid:
+        """Of every map."""
+        return mapping.grid_of(self.sequence)
+
+    @cached_property
+    def reference(self) -> mapping.Map:
+        """The map of all frames."""
+        return mapping.fuse(self.sequence, range(len(self.sequence)), self.grid)
+
+    @cached_property
+    def tracked_reference(self) -> mapping.Map:
+        """The map that tracking makes of all frames, drift included."""
+        return tracking.track(self.sequence, range(len(self.sequence)), self.grid).model
+
+    @cached_property
+    def similar(self) -> orb.OrbSimilarity:
+        """Of the images, as the sender has them."""
+        return orb.OrbSimilarity(self.whole.grey)
+
+    @cached_property
+    def seen(self) -> NDArray[np.float32]:
+        """See ``views.seen_shares``."""
+        return views.seen_shares(self.small)
+
+    @cached_property
+    def coverage(self) -> views.Coverage:
+        """Of its scene."""
+        return views.Coverage(self.small)
+
+    def episode(self, trace: Trace, k: int) -> Episode:
+        """The stream over this link, the fade k tenths of it earlier than in the paper."""
+        stream_us = int(self.whole.time_us[-1])
+        link = streams.fading(stream_us, trace, k * stream_us // OFFSETS)
+        return streams.episode(self.whole, streams.sizes(self.whole), link, seed=k)
+
+    def kept(self, policy: str, trace: Trace, k: int, L: int) -> tuple[int, ...]:
+        """The frames that arrive."""
+        one = self.episode(trace, k)
+        return streams.received(orb.orbbuf_by(self.similar, one) if policy == IMAGES else policy, one, L)
+
+    def mapped(self, kept: Sequence[int]) -> Row:
+        """Error of the map of these frames with their true poses."""
+        return errors(mapping.error(mapping.fuse(self.sequence, kept, self.grid), self.reference))
+
+    def tracked(self, kept: Sequence[int]) -> Row:
+        """Where tracking along these frames breaks, and how far the map that it made till then is from that which it
+        makes of all frames: both drift alike, so what differs is due to the frames that are missing."""
+        track = tracking.track(self.sequence, kept, self.grid)
+        found = errors(mapping.error(track.model, self.tracked_reference))
+        row: Row = {"failed": track.failed, "failed_at": track.where}
+        return row | {f"slam_{name}": number for name, number in found.items()}
+
+
+def errors(error: mapping.MapError) -> Row:
+    """A map's error in mm, and what of the scene it lacks."""
+    return {
+        "rmse_mm": 1e3 * error.rmse_m,
+        "to_reference_mm": 1e3 * error.to_reference_m,
+        "from_reference_mm": 1e3 * error.from_reference_m,
+        "uncovered": error.uncovered,
+    }
+
+
+@functools.lru_cache(maxsize=2)
+def stage(name: str, data: str | None, frames: int) -> Stage:
+    """One for each process: to open a recording takes seconds."""
+    return Stage(name, data, frames)
+
+
+# --- tasks -----------------------------------------------------------------------------------------------------------
+
+
+class Task(NamedTuple):
+    """What is to be found out: the map or the track of some frames of a recording, or which ones a policy keeps."""
+
+    kind: Kind
+    recording: str
+    data: str | None
+    frames: int
+    about: tuple[int, ...]
+    """The frames; of ``kept`` (k, L): the offset of the fade, and the queue."""
+    policy: str
+    trace: Trace
+    """The link."""
+
+    @property
+    def key(self) -> str:
+        """Tells it from all others, wherever the data lie; maps and tracks depend on their frames alone."""
+        run = {"kept": f"{self.policy} {self.trace.name}", "track": f"{WIDTH}", "map": ""}[self.kind]
+        text = f"{__version__} {self.kind} {self.recording} {self.frames} {self.about} {run}"
+        return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def carried_out(task: Task) -> tuple[str, Row]:
+    """The task's key and what it gave."""
+    on = stage(task.recording, task.data, task.frames)
+    if task.kind == "kept":
+        return task.key, {"kept": on.kept(task.policy, task.trace, *task.about)}
+    return task.key, on.mapped(task.about) if task.kind == "map" else on.tracked(task.about)
+
+
+class Store:
+    """Results of tasks by their keys, in memory and, if ``path`` is given, a line each in a file."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._held: dict[str, Row] = {}
+        self._cut = False
+        if path is not None and path.exists():
+            text = path.read_text(encoding="utf-8")
+            self._cut = not text.endswith("\n")
+            for line in text.splitlines():
+                try:
+                    key, row = json.loads(line)
+                except ValueError:
+                    continue  # the line that a kill cut short
+                self._held[key] = row
+
+    def __contains__(self, task: Task) -> bool:
+        return task.key in self._held
+
+    def __getitem__(self, task: Task) -> Row:
+        return self._held[task.key]
+
+    def add(self, key: str, row: Row) -> None:
+        """Keep what a task gave."""
+        self._held[key] = row
+        if self._path is not None:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write("\n" * self._cut + json.dumps([key, row]) + "\n")
+            self._cut = False
+
+
+def carry_out(tasks: Iterable[Task], store: Store, jobs: int) -> None:
+    """Carry out what the store does not have yet; each task once."""
+    missing = list({task.key: task for task in tasks if task not in store}.values())
+    if not missing:
+        return
+    with bar(len(missing), show=True, unit="run") as advance:
+        for key, row in _spread(missing, jobs):
+            store.add(key, row)
+            advance(1)
+
+
+def _spread(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[str, Row]]:
+    if jobs == 1:
+        yield from map(carried_out, tasks)
+    else:
+        calls = ((carried_out, (task,)) for task in tasks)
+        yield from cluster.spread(calls, len(tasks), jobs, "loky", None)

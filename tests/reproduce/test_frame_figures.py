@@ -1,0 +1,155 @@
+"""Figures on frames that are mapped and tracked: tasks that are kept, the sweep, what the texts say of the numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bufgym.kernel import JIT
+from bufgym.reproduce import STORE, afr_fig7, afr_fig8, afr_overlap, afr_qoi_task, frame_tasks, run
+from bufgym.reproduce.correlation import spearman, spearman_over
+from bufgym.reproduce.frame_runs import POLICIES, FrameFigure, Setting
+from bufgym.reproduce.frame_tasks import Store, Task, carry_out
+from bufgym.reproduce.rows import Rows
+from bufgym.traces import Trace
+
+LINK = Trace.constant(1e6, 10.0, name="link")
+
+
+def task(kept: tuple[int, ...], kind: Any = "map") -> Task:
+    return Task(kind, "room", None, 40, kept, "afr", LINK)
+
+
+# -------------------- tasks
+
+
+def test_a_task_is_known_by_what_is_asked() -> None:
+    assert task((0, 3)).key == task((0, 3))._replace(data="elsewhere", policy="random").key
+    others = [task((0, 4)), task((0, 3), "track"), task((0, 3))._replace(frames=41), task((0, 3), "kept")]
+    assert len({task((0, 3)).key, *(other.key for other in others)}) == 5
+    assert task((0, 3), "kept").key != task((0, 3), "kept")._replace(policy="random").key
+
+
+def test_what_is_finished_is_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def carried_out(one: Task) -> tuple[str, dict[str, Any]]:
+        asked.append(one.key)
+        return one.key, {"rmse_mm": float(len(one.about))}
+
+    monkeypatch.setattr(frame_tasks, "carried_out", carried_out)
+    path = tmp_path / "new" / "runs.jsonl"
+    carry_out([task((0, 1)), task((0, 1)), task((0, 1, 2))], Store(path), 1)
+    assert len(asked) == 2  # equal tasks once
+    with path.open("a") as file:
+        file.write('["cut short by a ki')
+    again = Store(path)
+    carry_out([task((0, 1)), task((0, 5, 6))], again, 1)
+    assert asked[2:] == [task((0, 5, 6)).key]
+    assert again[task((0, 1))] == {"rmse_mm": 2.0}
+    assert Store(path)[task((0, 5, 6))] == {"rmse_mm": 3.0}  # also behind the line that was cut short
+
+
+# -------------------- numbers
+
+
+def test_spearman() -> None:
+    a = np.array([1.0, 2, 3, 4])
+    assert spearman(a, np.exp(a)) == pytest.approx(1)
+    assert spearman(a, np.array([4.0, 3, 1, 2])) == pytest.approx(-0.8)  # 1 - 6 (9 + 1 + 4 + 4) / (4 x 15)
+    assert np.isnan(spearman(a, np.ones(4)))
+
+
+def test_spearman_over_groups_draws_whole_groups() -> None:
+    """Within each group b falls with a; whichever groups are drawn, it is -1."""
+    a, group = np.array([1.0, 2, 1, 2, 1, 2]), np.repeat([0, 1, 2], 2)
+    assert spearman_over(a, -a, group, "falls") == pytest.approx((-1, -1, -1))
+
+
+def test_the_change_is_paired_over_offsets() -> None:
+    """AFR is 10 % below at every place of the fade, however much these differ: the interval has no width."""
+    pairs = [("drop-oldest", 10.0), ("afr", 9.0)]
+    rows = Rows({"k": k, "L": 5, "policy": p, "rmse_mm": mm * (1 + k)} for k in range(4) for p, mm in pairs)
+    assert afr_fig7.change(rows, "rmse_mm", "afr", "drop-oldest") == pytest.approx((-0.1, -0.1, -0.1))
+    assert afr_fig7.spelled(afr_fig7.change(rows, "rmse_mm", "afr", "drop-oldest")) == "-10.0% [-10.0%, -10.0%]"
+
+
+def test_the_claims_of_fig8_count_failures() -> None:
+    """Of ten runs at each of two L Drop Oldest breaks 6, AFR 2 and the agent 1, at L = 5 alone."""
+    broken = {("drop-oldest", 5): 4, ("drop-oldest", 15): 2, ("afr", 5): 2, ("learned-motion", 5): 1}
+    policies = ("drop-oldest", "afr", "learned-motion")
+    rows = Rows(
+        {"recording": "room", "k": k, "L": L, "policy": p, "failed": k < broken.get((p, L), 0), "failed_at": None}
+        for p in policies
+        for L in (5, 15)
+        for k in range(10)
+    )
+    fig8 = afr_fig8.Reproduction(policies=policies, capacities=(5, 15))
+    object.__setattr__(fig8, "about", lambda: "")
+    facts = fig8.claims(rows)
+    assert facts["counts"] == "drop-oldest 6, afr 2, learned-motion 1"
+    assert facts["third"] and facts["large"] and facts["learned"]
+    assert not facts["oldest"] and not facts["afr"]  # 30 % of the runs, and 10 %
+    assert afr_fig8.failures(rows, policy="afr", L=15) == 0
+    rows[30]["failed"] = True  # AFR's first at L = 15
+    assert not fig8.claims(rows)["large"] and not fig8.claims(rows)["third"]
+
+
+def test_the_best_frames_in_hindsight() -> None:
+    """Four frames: 0 to 1 and 1 to 3 are new by 0.5 each, all else by 0.1; one frame between may be kept."""
+    v = np.full((4, 4), 0.1)
+    v[0, 1] = v[1, 3] = 0.5
+    assert afr_overlap.best_gain(v, 1) == 1.0
+    assert afr_overlap.best_gain(v, 0) == pytest.approx(0.1)
+
+
+def test_rules_at_a_distance() -> None:
+    """V = 0, 0.1, 0.4, 0.3 at distance 0..3 from frame 0: from 1 to 2 it more than doubles."""
+    v = np.zeros((4, 4))
+    v[0] = [0, 0.1, 0.4, 0.3]
+    found = afr_overlap._rules(v, np.arange(4.0), 1)
+    assert found is not None and found["broken_6"] == 0.5  # at frame 0; frame 1 sees nothing new
+    assert found["excess_6"] == pytest.approx(0.2) and found["broken_5"] == 0
+    assert afr_overlap._rules(v, np.arange(4.0), 2) is None  # 4 frames on is beyond the end
+
+
+def test_within_compares_runs_of_one_cell_alone() -> None:
+    less = afr_qoi_task._less_mean(np.array([1.0, 3, 10, 30]), [(0, 5), (0, 5), (1, 5), (1, 5)])
+    assert less.tolist() == [-1, 1, -10, 10]
+
+
+# -------------------- on the made-up room
+
+SMALL: dict[str, Any] = {"frames": 40, "capacities": (2,), "offsets": 2, "jobs": 1}
+
+
+@pytest.mark.skipif(not JIT, reason="without compilation a room takes minutes to draw")
+def test_a_run_on_the_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for library in ("cv2", "rvl", "scipy"):
+        pytest.importorskip(library)
+    policies = ("drop-oldest", "orbbuf-images", "clairvoyant")
+    text = run("afr-fig8", tmp_path, **SMALL, policies=policies)
+    assert "room, runs of 2 in which tracking breaks" in text and (tmp_path / STORE).is_file()
+
+    def carried_out(one: Task) -> Any:
+        raise AssertionError(f"done again: {one}")
+
+    fig8 = afr_fig8.Reproduction(**SMALL, policies=policies, store=tmp_path / STORE)
+    monkeypatch.setattr(frame_tasks, "carried_out", carried_out)
+    rows = fig8.simulate()
+    assert len(rows) == 2 * len(policies)
+    for row in rows:
+        assert 2 < row["received"] < 40 and 0 < row["coverage"] <= 1 and 0 <= row["least_overlap"] <= 1
+        assert row["received"] == len(fig8.kept(Setting("room", row["k"], 2, row["policy"])))
+    # The images and the plan are kept; which frames Drop Oldest keeps is found out again, as it takes no time.
+    assert fig8.recordings == ["room"] and fig8.link.name == "fade"
+
+
+def test_recordings_are_shown_where_they_are(tmp_path: Path) -> None:
+    assert FrameFigure.recordings.fget(afr_fig8.Reproduction(data=tmp_path)) == ["room"]  # type: ignore[attr-defined]
+    (tmp_path / "rgbd_7scenes").mkdir()
+    assert afr_fig8.Reproduction(data=tmp_path).recordings == ["room", "7-scenes"]
+    assert set(afr_fig7.SHOWN) <= set(POLICIES)
