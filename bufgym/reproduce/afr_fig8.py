@@ -30,7 +30,7 @@ class Reproduction(FrameFigure):
         lines: list[str] = []
         for recording in rows.distinct("recording"):
             shown = rows.where(recording=recording)
-            heads = ["policy", *map(str, self.capacities), "all", "of", "paper's alignment, L that fail"]
+            heads: list[object] = ["policy", *map(str, self.capacities), "all", "of", "paper's alignment, L that fail"]
             cells: list[list[object]] = [heads]
             for policy in self.policies:
                 counts = [failures(shown, policy=policy, L=L) for L in self.capacities]

@@ -50,7 +50,7 @@ class Stage:
 
     def __init__(self, name: str, data: str | None, frames: int) -> None:
         if name == "room":
-            whole_size = room.room(0, frames=frames)
+            whole_size: depth_frames.Sequence = room.room(0, frames=frames)
         elif data is None:
             raise BufgymError(f"recording {name}: needs a folder of recordings (--data DIR) with {SEVEN_SCENES}")
         else:
