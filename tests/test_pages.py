@@ -62,7 +62,7 @@ PARSED = {
     r"bufgym trace fit .*": "needs recordings; tests/traces/test_fit.py",
     r"bufgym (perf( --peers| --profile)?|warmup)": "tests/benchmark/test_perf_and_play.py, test_warmup.py",
     r"bufgym (topics --policy-file|play|bench --policies .*seeds) .*": "tests/test_readme.py",
-    r"bufgym bench --workload drive\.mcap .*": "tests/test_cli_workload.py",
+    r"bufgym bench --workload (drive\.mcap .*|FILE\.mcap)": "tests/test_cli_workload.py",
     r"bufgym bench .*(my-agent.zip|every-second|drive\.csv).*": "the tutorial before it makes its files; test_site.py",
     r"python3? (-m bufgym\.ros1|examples/ros[12]/fade\.py).*": "needs ROS; tests/live/test_ros1.py, test_ros2.py",
     r"python train\.py .*": "minutes to hours; tests/test_train.py",
