@@ -39,6 +39,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "afr-fig9": {"decisions": 1000, "calls": 100},
     "small-link": {"capacities": (2, 3), "runs": 3, "arrivals": 12, "depth": 3},
     "robofleet-table1": {"points": 50},
+    "robofleet-table2": {"topics": (1, 5), "rate_hz": 2, "seconds": 1},
     "robofleet-fig3": {"rates_hz": (5, 100), "duration_s": 0.5, "runs": 1},
     "robofleet-fig4": {"dropouts_s": (1,), "links_mbit_per_s": (100,), "kinds": ("CompressedImage",), "runs": 2},
     "robofleet-fig5": {"fall_s": 3, "stay_s": 1, "runs": 1},
@@ -47,7 +48,7 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 """Options that keep each figure short; a new figure must add its own."""
 
-NEEDS_LIBRARIES = {"robofleet-table1": ("rosbags", "flatbuffers")}
+NEEDS_LIBRARIES = {"robofleet-table1": ("rosbags", "flatbuffers"), "robofleet-table2": ("rosbags", "websockets", "re2")}
 
 CLAIMS = Path(__file__).parent.parent.parent / "docs" / "claims.md"
 
