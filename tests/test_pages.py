@@ -66,6 +66,7 @@ PARSED = {
     r"bufgym bench .*(my-agent.zip|every-second|drive\.csv).*": "the tutorial before it makes its files; test_site.py",
     r"python3? (-m bufgym\.ros1|examples/ros[12]/fade\.py).*": "needs ROS; tests/live/test_ros1.py, test_ros2.py",
     r"python train\.py .*": "minutes to hours; tests/test_train.py",
+    r"python tests/relay/(engines|load)\.py.*": "measures, for a minute; what it drives: tests/relay",
     r"python -m agents\..*": "needs a run's folder; tests/test_agents.py, test_scheduling.py, test_ablation.py",
     r"python examples/view_missed\.py": "tests/test_training_examples.py",
     r"bufgym trace fetch tum-rgbd-desk": "downloads 0.4 GB; tests/traces/test_fetch.py",
