@@ -136,6 +136,29 @@ class Tokens:
 
 
 @dataclass(frozen=True)
+class Mesh:
+    """Other relays that share topics with this one (extra ``zenoh``)."""
+
+    listen: str
+    """HOST:PORT for them. Who connects there is believed as a relay is."""
+    connect: tuple[str, ...] = ()
+    """Where others listen; each needs to know one."""
+    certificate: str = ""
+    """PEM files: its own certificate and key, and the authority that must have signed the others'. Else no TLS."""
+    key: str = ""
+    authority: str = ""
+
+    def __post_init__(self) -> None:
+        for address in (self.listen, *self.connect):
+            host, colon, port = address.rpartition(":") if isinstance(address, str) else ("", "", "")
+            if not (host and colon and port.isdecimal() and 0 < int(port) <= 65_535):
+                raise BufgymError(f"mesh: address {address!r}: must be HOST:PORT")
+        files = self.certificate, self.key, self.authority
+        if not all(isinstance(name, str) for name in files) or any(files) != all(files):
+            raise BufgymError("mesh: certificate, key and authority: must be given together")
+
+
+@dataclass(frozen=True)
 class Rotation:
     """Files of a log: when one is full the next begins, and the oldest goes."""
 
@@ -174,6 +197,7 @@ class Config:
     """Of MCAP files with all that a rule for the recorder allows."""
     tls: Tls | None = None
     tokens: Tokens | None = None
+    mesh: Mesh | None = None
 
     def __post_init__(self) -> None:
         whole("port", self.port, 0, 65_535)
@@ -197,6 +221,7 @@ _TABLES: Final[Mapping[str, Any]] = {
     "recording": Rotation,
     "tls": Tls,
     "tokens": Tokens,
+    "mesh": Mesh,
 }
 
 
@@ -220,14 +245,20 @@ def load(path: str | Path) -> Config:
             settings["folder"] = beside / _text("folder", settings["folder"])
         config: Config = _made(Config, "", settings)
         if config.tls is not None:
-            paths = {each.name: getattr(config.tls, each.name) for each in fields(Tls)}
-            tls = Tls(**{name: str(beside / _text(name, value)) if value else "" for name, value in paths.items()})
-            config = replace(config, tls=tls)
+            config = replace(config, tls=_beside(beside, config.tls, "certificate", "key", "clients"))
+        if config.mesh is not None:
+            config = replace(config, mesh=_beside(beside, config.mesh, "certificate", "key", "authority"))
         if config.tokens is not None and "://" not in config.tokens.keys:
             config = replace(config, tokens=replace(config.tokens, keys=str(beside / config.tokens.keys)))
         return config
     except BufgymError as error:
         raise error if str(error).startswith(f"{path}") else BufgymError(f"{path}: {error}") from None
+
+
+def _beside(folder: Path, table: Any, *names: str) -> Any:
+    """The table, with the files that it names in this folder."""
+    files = {name: _text(name, getattr(table, name)) for name in names}
+    return replace(table, **{name: str(folder / file) if file else "" for name, file in files.items()})
 
 
 def _made(kind: Any, name: str, table: Any) -> Any:

@@ -89,6 +89,8 @@ class Connection:
             self._hub.audit("left", session=self.session.name, **self.identity.as_json())
         if fault is not None:
             await self._refuse_and_close("frame", fault)
+        elif self._ending is not None:
+            await self._ending  # with its reason, which the end of this would not say
 
     async def _hello(self) -> None:
         data = await self._socket.recv()
@@ -164,14 +166,14 @@ class Connection:
         while self._ending is None:
             data = await self._socket.recv()
             if isinstance(data, bytes):
-                self._answer(wire.decode(data, self._hub.config.limits.message_bytes))
+                await self._answer(wire.decode(data, self._hub.config.limits.message_bytes))
             elif len(data) > MAX_JSON_BYTES:
                 raise WireError(f"text of {len(data)} characters: must be at most {MAX_JSON_BYTES}")
             else:
                 said = wire.heard(data)
                 match said["op"]:
                     case "publish":
-                        self._answer(wire.from_json(said))
+                        await self._answer(wire.from_json(said))
                     case "subscribe":
                         await self._subscribe(said)
                     case "unsubscribe":
@@ -203,10 +205,10 @@ class Connection:
         else:
             self.tell("replayed", id=said["id"], **part)
 
-    def _answer(self, message: wire.Message) -> None:
+    async def _answer(self, message: wire.Message) -> None:
         """Publish it, or say why not: of a no_drop message every time, of others now and then."""
         try:
-            self._publish(message)
+            await self._publish(message)
         except RefusedError as refused:
             first = self._hub.audit.repeated(
                 what="publish",
@@ -219,7 +221,7 @@ class Connection:
             if message.no_drop or first:
                 self._refuse("publish", refused, topic=message.topic, seq=message.seq)
 
-    def _publish(self, message: wire.Message) -> None:
+    async def _publish(self, message: wire.Message) -> None:
         hub, topic = self._hub, message.topic
         again = message.no_drop and 0 < message.seq <= self.session.received
         if not again:
@@ -238,7 +240,12 @@ class Connection:
         if not again:
             if message.seq != self.session.received + 1:
                 raise RefusedError("out_of_order", f"seq = {message.seq}: must be {self.session.received + 1}")
-            hub.hold(self, message)
+            elsewhere = 0 if hub.others is None else await hub.others.hold(self.session, message)
+            if elsewhere is None:
+                self.end("another relay does not answer")  # it connects again, and sends this again
+                return
+            if message.seq > self.session.received:  # else it was taken meanwhile, over another connection
+                hub.hold(self, message, elsewhere)
         self.tell("ack", seq=message.seq)
 
     async def _subscribe(self, said: Mapping[str, Any]) -> None:

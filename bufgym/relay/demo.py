@@ -11,7 +11,9 @@ from typing import Final
 
 from bufgym.live.shaped import ShapedLink
 from bufgym.model.link import Link
+from bufgym.policies import registry
 from bufgym.policies.registry import Policy
+from bufgym.relay import policies
 from bufgym.relay.config import Config, Rule
 from bufgym.relay.madeup import CONFIG, MadeUp
 from bufgym.relay.robot import Robot
@@ -23,6 +25,8 @@ CLEAR_BPS: Final = 1_000_000
 FADED_BPS: Final = 100_000
 """A robot wants 550 kbit/s."""
 FADES_S: Final = 24.0
+PATIENCE_S: Final = 3.0
+"""Until the wait for the compiler is explained."""
 DELAY_US: Final = 20_000
 
 
@@ -45,9 +49,10 @@ async def running(
     fades: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> AsyncIterator[int]:
-    """The port of a relay that this machine may use, and that ``robots`` made-up ones are connected to.
+    """The port of a relay that this machine may use, and that ``robots`` made-up ones connect to.
 
-    ``folder``: it records there.
+    The relay and its page are there at once; the robots come when their queue is compiled, which the first time takes
+    up to a minute. ``folder``: it records there.
     """
     rules = (Rule(address="127.0.0.1", send=True, receive=True), Rule(recorder=True, receive=True))
     server = Server(Config(port=port, rules=rules[: 1 if folder is None else 2], folder=folder))
@@ -55,14 +60,9 @@ async def running(
     async with contextlib.AsyncExitStack() as stack:
         port = await server.start()
         stack.push_async_callback(server.close)
-        tasks = []
-        for number in range(robots):
-            to = port
-            if fades:
-                link = ShapedLink(Link(fading(number), propagation_us=DELAY_US), ("127.0.0.1", port))
-                to = await link.listen()
-                stack.push_async_callback(link.close)
-            robot = Robot(
+
+        def robot(number: int, to: int) -> Robot:
+            return Robot(
                 f"ws://127.0.0.1:{to}",
                 f"robot-{number + 1}",
                 MadeUp(number, client.streams),
@@ -71,10 +71,34 @@ async def running(
                 window=client.window,
                 say=say,
             )
-            tasks.append(asyncio.create_task(robot.run()))
+
+        async def run(number: int, to: int) -> None:
+            await compiled
+            await robot(number, to).run()
+
+        compiled = asyncio.create_task(_compiled(policy, say))
+        tasks = [compiled]
+        for number in range(robots):
+            to = port
+            if fades:
+                link = ShapedLink(Link(fading(number), propagation_us=DELAY_US), ("127.0.0.1", port))
+                to = await link.listen()
+                stack.push_async_callback(link.close)
+            tasks.append(asyncio.create_task(run(number, to)))
         try:
             yield port
         finally:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _compiled(policy: str | Policy, say: Callable[[str], None]) -> None:
+    """Returns when a robot's queue is compiled; says that this is what takes the time, where it does."""
+    compiling = asyncio.create_task(asyncio.to_thread(policies.compiled, registry.get(policy)))
+    try:
+        async with asyncio.timeout(PATIENCE_S):
+            await asyncio.shield(compiling)
+    except TimeoutError:
+        say("the robots come when their queue is compiled: up to a minute, the first time")
+        await compiling

@@ -79,6 +79,13 @@ class Member(Protocol):
         """Close it."""
 
 
+class Others(Protocol):
+    """Other relays."""
+
+    async def hold(self, sender: Session, message: wire.Message) -> int | None:
+        """How many receivers they hold it for; None: not all have answered."""
+
+
 class Hub:
     """All that the connections share."""
 
@@ -96,6 +103,8 @@ class Hub:
         self._sent = 0
         self._dropped = 0
         self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
+        self.others: Others | None = None
+        """The other relays, if it has any."""
 
     # --- who is here --------------------------------------------------------------------------------------------------
 
@@ -165,16 +174,23 @@ class Hub:
             ]
         return route
 
-    def hold(self, sender: Member, message: wire.Message) -> None:
-        """Keep a no_drop message until its receivers have acked it.
+    def hold(
+        self, sender: Member, message: wire.Message, elsewhere: int = 0, taken: tuple[Session, int] | None = None
+    ) -> int:
+        """Keep a no_drop message until its receivers have acked it; how many they are.
+
+        Args:
+            elsewhere: its receivers at other relays, which hold it already.
+            taken: from whom, and under which number; None: the sender's session, and the message's.
 
         Raises RefusedError: nobody is to get it, or there is no room.
         """
         receivers = self._holders(sender, message.topic)
-        if not receivers:
+        if not receivers and not elsewhere:
             raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it")
         frame = wire.encode(message)
-        self.store.hold(sender.session, message.seq, message.topic, frame, receivers)
+        session, number = taken or (sender.session, message.seq)
+        self.store.hold(session, number, message.topic, frame, receivers)
         self.received += 1
         if self.recorder is not None:
             self.recorder(message)
@@ -184,6 +200,7 @@ class Hub:
         for member, subscription in self._route(message.topic):
             if member is not sender and not member.acks:
                 member.offer(subscription, Frame(message))
+        return len(receivers)
 
     def _holders(self, sender: Member, topic: str) -> list[Session]:
         """The sessions that are to get a no_drop message: here, away, or back and about to subscribe again."""

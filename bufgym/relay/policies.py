@@ -41,7 +41,12 @@ def new_queue(chosen: Policy, capacity: int) -> PolicyQueue:
 @functools.lru_cache(256)
 def warm(name: str) -> Policy:
     """The policy, after one message has gone through a queue of it: now it is compiled."""
-    queue = new_queue(policy(name), PLACES)
+    return compiled(policy(name))
+
+
+def compiled(chosen: Policy) -> Policy:
+    """The same for one that has no name here."""
+    queue = new_queue(chosen, PLACES)
     queue.put(b"", 1)
     queue.get(0)
     queue.gone()

@@ -120,7 +120,7 @@ class RobofleetConnection(Connection):
             message = wire.Message(flat.topic, data, ROBOFLEET, flat.type)
             if self._hub.is_no_drop(flat.topic):
                 message = message._replace(no_drop=True, seq=self.session.received + 1)
-            self._answer(message)
+            await self._answer(message)
 
     async def _ordered(self, flat: Flat) -> None:
         """Subscribe, or no longer; as in its server, a client with bytes pending is skipped."""

@@ -25,6 +25,7 @@ from bufgym.relay.config import Config
 from bufgym.relay.connection import HELLO_BYTES, Connection
 from bufgym.relay.hub import Hub
 from bufgym.relay.identity import Verifier, server_context
+from bufgym.relay.mesh import Others
 from bufgym.relay.quota import RefusedError
 from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
@@ -167,10 +168,14 @@ class Server:
         self._tls = None if config.tls is None else server_context(config.tls)
         self._server: WebSocketServer | None = None
         self._ticking: asyncio.Task[None] | None = None
+        self._others: Others | None = None
 
     async def start(self) -> int:
         """Listen; the port. The default policy is compiled while robots connect again."""
         limits = self.config.limits
+        if self.config.mesh is not None:
+            self.hub.others = self._others = Others(self.hub, self.config.mesh)
+            await self._others.start()
         try:
             self._server = await serve(
                 self._serve,
@@ -213,6 +218,8 @@ class Server:
             self._server.close()
             await self._server.wait_closed()
             await self._warming
+        if self._others is not None:
+            await self._others.close()
         self.hub.close()
 
     async def _serve(self, socket: ServerConnection) -> None:

@@ -162,6 +162,8 @@ class Store:
     def hold(self, sender: Session, seq: int, topic: str, frame: bytes, receivers: Sequence[Session]) -> None:
         """Take the sender's message number ``seq`` for these receivers; it is on disk when this returns.
 
+        Without receivers, whom other relays have, the number alone is taken.
+
         Raises RefusedError: no room; then its number is not used.
         """
         full = next((each for each in receivers if each.held >= self.limits.messages), None)
@@ -173,20 +175,23 @@ class Store:
             for session in (sender, *receivers):
                 self._remember(session)
             with self._transaction():
-                cursor = self._db.execute(
-                    "INSERT INTO message (sender, seq, topic, frame, receivers, waiting, lost) "
-                    "VALUES (?, ?, ?, ?, ?, ?, 0)",
-                    (sender.id, seq, topic, frame, len(receivers), len(receivers)),
+                message = (
+                    receivers
+                    and self._db.execute(
+                        "INSERT INTO message (sender, seq, topic, frame, receivers, waiting, lost) "
+                        "VALUES (?, ?, ?, ?, ?, ?, 0)",
+                        (sender.id, seq, topic, frame, len(receivers), len(receivers)),
+                    ).lastrowid
                 )
                 for receiver in receivers:
                     number = receiver.numbered + 1
-                    self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, cursor.lastrowid))
+                    self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, message))
                     self._db.execute("UPDATE session SET numbered = ? WHERE id = ?", (number, receiver.id))
                 self._db.execute("UPDATE session SET received = ? WHERE id = ?", (seq, sender.id))
         except sqlite3.Error as error:
             raise RefusedError("store_full", f"the store cannot be written: {error}") from None
         sender.received = seq
-        self.bytes += len(frame)
+        self.bytes += len(frame) if receivers else 0
         for receiver in receivers:
             receiver.numbered += 1
             receiver.held += 1

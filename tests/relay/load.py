@@ -3,7 +3,8 @@
 python tests/relay/load.py --robots 20 --viewers 5 --seconds 60 [--slow]
 python tests/relay/load.py --idle 1000
 
-The relay has a process of its own; robots and viewers share another, so give the machine cores enough.
+The relay has a process of its own; robots and viewers share another. So that this measures the relay and not them,
+robots send frames that are made beforehand, and viewers read no more of a frame than its header.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import asyncio
 import contextlib
 import os
+import struct
 import sys
 import time
 from pathlib import Path
@@ -20,11 +22,16 @@ from typing import Any
 import numpy as np
 from relay_cases import client, settings
 
+from bufgym.relay import wire
 from bufgym.relay.config import Limits
 from bufgym.relay.server import serve_forever
 from bufgym.relay.wire import Message
 
 SIZE_BYTES, RATE_HZ = 50_000, 10
+_LENGTH, _PART, _STAMP = struct.Struct("!H"), struct.Struct("!Q"), struct.Struct("!q")
+_BINARY, _PING, _PONG, _MASKED = 0x82, 0x89, 0x8A, 0x80
+_HEAD_BYTES = 10 + 32
+"""Of a WebSocket's frame, at most, and of a message with its stamp."""
 
 
 class Relay:
@@ -69,27 +76,90 @@ async def idle(count: int) -> None:
         )
 
 
+class Camera:
+    """A message's frame, with 0 for a mask: only the stamp changes."""
+
+    def __init__(self, robot: int) -> None:
+        message = Message(f"/robots/{robot}/camera", os.urandom(SIZE_BYTES), "raw")
+        data = wire.encode(message)
+        self._frame = bytearray(bytes([_BINARY, _MASKED | 127]) + _PART.pack(len(data)) + bytes(4) + data)
+
+    def frame(self) -> bytes:
+        """As it goes out now."""
+        _STAMP.pack_into(self._frame, 14 + 24, time.time_ns() // 1000)
+        return bytes(self._frame)
+
+
+class Viewer(asyncio.BufferedProtocol):
+    """Takes frames off a connection that ``client`` has made; ``latency_us`` gets that of each message."""
+
+    def __init__(self, transport: Any) -> None:
+        self.latency_us: list[int] = []
+        self._buffer, self._end, self._skip = bytearray(2**18), 0, 0
+        self._transport = transport
+        transport.set_protocol(self)
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        return memoryview(self._buffer)[self._end :]
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self._end += nbytes
+        at = 0
+        while True:
+            skipped = min(self._skip, self._end - at)
+            self._skip -= skipped
+            at += skipped
+            head = self._buffer[at : min(at + _HEAD_BYTES, self._end)]
+            if self._skip or not (length := self._frame(head)):
+                break
+            self._skip = length
+        left = self._buffer[at : self._end]
+        self._buffer[: len(left)] = left
+        self._end = len(left)
+
+    def _frame(self, head: bytearray) -> int:
+        """Bytes of the frame that begins so; 0 if too little of it is here."""
+        if len(head) < 2:
+            return 0
+        kind, size, at = head[0], head[1], 2
+        if size >= 126:
+            form, at = (_LENGTH, 4) if size == 126 else (_PART, 10)
+            if len(head) < at:
+                return 0
+            (size,) = form.unpack_from(head, 2)
+        if len(head) < min(at + size, at + 32):
+            return 0
+        if kind == _BINARY:
+            self.latency_us.append(time.time_ns() // 1000 - int(_STAMP.unpack_from(head, at + 24)[0]))
+        elif kind == _PING:
+            self._transport.write(bytes([_PONG, _MASKED | size]) + bytes(4) + head[at : at + size])
+        return at + size
+
+
 async def busy(robots: int, viewers: int, seconds: float, slow: bool) -> None:
     async with Relay.started() as relay:
         latency_us: list[list[int]] = [[] for _ in range(viewers)]
 
         async def view(k: int) -> None:
-            buffer_bytes = 65_536 if slow and k == 0 else None
-            async with client(relay.port, receive_buffer_bytes=buffer_bytes, name=f"viewer-{k}") as one:
+            slowly = slow and k == 0
+            async with client(relay.port, receive_buffer_bytes=65_536 if slowly else None, name=f"viewer-{k}") as one:
                 await one.subscribe("^/robots/")
+                if not slowly:
+                    latency_us[k] = Viewer(one.socket.transport).latency_us
+                    await asyncio.Event().wait()
                 while True:
                     message = await one.next(1e6)
                     if isinstance(message, Message):
                         latency_us[k].append(time.time_ns() // 1000 - message.stamp_us)
-                        await asyncio.sleep(SIZE_BYTES / 1e5 if slow and k == 0 else 0)
+                        await asyncio.sleep(SIZE_BYTES / 1e5)
 
         async def publish(k: int) -> None:
             async with client(relay.port, name=f"robot-{k}") as one:
                 await asyncio.sleep(k / robots / RATE_HZ)
-                began_s, body = time.monotonic(), os.urandom(SIZE_BYTES)
+                began_s, camera = time.monotonic(), Camera(k)
                 for i in range(round(seconds * RATE_HZ)):
                     await asyncio.sleep(max(0.0, began_s + i / RATE_HZ - time.monotonic()))
-                    await one.put(f"/robots/{k}/camera", body, seq=i, stamp_us=time.time_ns() // 1000)
+                    one.socket.transport.write(camera.frame())
 
         watching = [asyncio.create_task(view(k)) for k in range(viewers)]
         await asyncio.sleep(5.0)  # until the policy is compiled

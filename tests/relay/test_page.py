@@ -68,10 +68,14 @@ class Page:
         self.page = browser.new_page(**options)
         self.faults: list[str] = []
         self.asked: list[str] = []
-        self.page.on("console", lambda message: self.faults.append(message.text) if message.type == "error" else None)
+        self.page.on("console", self._hear)
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(f"http://127.0.0.1:{port}/")
+
+    def _hear(self, message: Any) -> None:
+        if "willReadFrequently" not in message.text:  # said of ``SEES``, not of the page
+            self.faults.append(message.text)
 
     def until(self, expression: str) -> None:
         """Wait until this holds on the page."""

@@ -44,6 +44,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "afr-qoi-task": {**FRAMES, "offsets": 3},
     "small-link": {"capacities": (2, 3), "runs": 3, "arrivals": 12, "depth": 3},
     "robofleet-table1": {"points": 50},
+    "robofleet-table2": {"topics": (1, 5), "rate_hz": 2, "seconds": 1},
     "robofleet-fig3": {"rates_hz": (5, 100), "duration_s": 0.5, "runs": 1},
     "robofleet-fig4": {"dropouts_s": (1,), "links_mbit_per_s": (100,), "kinds": ("CompressedImage",), "runs": 2},
     "robofleet-fig5": {"fall_s": 3, "stay_s": 1, "runs": 1},
@@ -55,6 +56,7 @@ SMALL: dict[str, dict[str, Any]] = {
 OF_FRAMES = [name for name, options in SMALL.items() if "offsets" in options]
 NEEDS_LIBRARIES = {
     "robofleet-table1": ("rosbags", "flatbuffers"),
+    "robofleet-table2": ("rosbags", "websockets", "re2"),
     **dict.fromkeys(OF_FRAMES, ("cv2", "rvl", "scipy")),
 }
 
