@@ -37,8 +37,8 @@ CARDS = {
         decides="what to drop from one queue, of any L",
         sees="the queue, the clock and the socket; neither odometry nor V",
         limits="trained on the same episodes as learned-motion",
-        fails="Where V saturates it has up to eleven times AFR's regret: it does not see V. On the Belgium 4G logs it has"
-        " about AFR's, in some cells more.",
+        fails="Where V saturates it has up to eleven times AFR's regret: it does not see V. On the Belgium 4G logs"
+        " it has about AFR's, in some cells more.",
     ),
     "learned-scheduler": Card(
         results="topics.md",
