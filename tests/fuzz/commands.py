@@ -64,6 +64,7 @@ WORK = (
     ("bufgym.benchmark.leaderboard", "make"),
     ("bufgym.benchmark.leaderboard", "validate"),
     ("bufgym.benchmark.perf", "measure"),
+    ("bufgym.benchmark.perf_queue", "measure"),
     ("bufgym.traces.datasets.fetch", "fetch_dataset"),
     ("bufgym.cli.figures", "_text"),
     ("bufgym.gallery", "page"),
@@ -72,6 +73,7 @@ WORK = (
     ("bufgym.cli.live", "run_async"),
     ("bufgym.cli.ros2", "run_async"),
     ("bufgym.cli.relay", "run_async"),
+    ("bufgym.cli.relay_robots", "run_async"),
     ("bufgym.live.validate", "validate"),
     ("bufgym.expert.dataset", "make"),
 )
@@ -80,10 +82,14 @@ WORK = (
 
 def leave_out_work() -> None:
     import importlib
+    import inspect
 
     from bufgym.errors import BufgymError
 
-    def left_out(*_: object, **__: object) -> NoReturn:
+    def left_out(*given: object, **__: object) -> NoReturn:
+        for one in given:
+            if inspect.iscoroutine(one):  # else Python warns that nobody awaited it
+                one.close()
         raise BufgymError("left out")
 
     for module, name in WORK:
