@@ -209,9 +209,11 @@ class Settings:
     def _check_fields(self) -> None:
         """The rule of what an evolved agent reads."""
         known = [name for name in self.observed if name in NAMES]
-        merged = {"motion_merged", "time_merged"} & set(known)
+        merged = {"motion_merged", "time_merged", "index_merged"} & set(known)
         if len(set(known)) < len(self.observed) or not merged or "rank" not in known:
-            rule = "must be rank, motion_merged or time_merged, and others of the observation's, each once"
+            rule = (
+                "must be rank, motion_merged, time_merged or index_merged, and others of the observation's, each once"
+            )
             self._refuse("fields", f"{rule} (bufgym list observations)")
 
     def _check_suites(self) -> None:

@@ -209,7 +209,7 @@ int main(void)
     int k;
     bufgym_init(&q, 1000);
     for (k = 0; k < 4; k++) {
-        struct bufgym_message message = {1000 + 10 * k, sizes[k], k, 0.0, (void *)&sizes[k]};
+        struct bufgym_message message = {1000 + 10 * k, sizes[k], k, 0.0, 0, (void *)&sizes[k]};
         do {
             int decision = bufgym_arrival(&q, message, 0);
             printf("%d:%d ", decision, decision == BUFGYM_ACCEPT ? 0 : *(const int *)q.dropped.data);

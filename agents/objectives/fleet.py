@@ -54,7 +54,7 @@ def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
     if agent.mix is not None:
         rows, columns = map(wide.context.index, agent.context), map(wide.slot.index, agent.slot)
         mix[np.ix_(list(rows), list(columns))] = agent.mix
-    return replace(wide, mix=mix, still=widened(agent.still, more) if agent.still else None)
+    return replace(wide, mix=mix, still=widened(agent.still, more) if agent.still else None, shortcuts=agent.shortcuts)
 
 
 def _padded(network: Network, more: int) -> Network:

@@ -48,7 +48,7 @@ WORST = 3.0
 def start(fields: tuple[str, ...], width: int, rng: np.random.Generator) -> Weights:
     """Drop what leaves the smallest merged gap (of motion, where it is seen), rather old than new; accept with room."""
     weights = learned.random_weights(fields, (width,) if width else (), rng)
-    merged = "motion_merged" if "motion_merged" in fields else "time_merged"
+    merged = next(name for name in ("motion_merged", "index_merged", "time_merged") if name in fields)
     weights.drop.skip[fields.index(merged)] = -10.0
     weights.drop.skip[fields.index("rank")] = -0.4
     weights.accept.bias[0] = 5.0

@@ -66,10 +66,11 @@ class Reproduction(FrameFigure):
 
     def claims(self, rows: Rows) -> dict[str, Any]:
         main = self.recordings[-1]
-        facts: dict[str, Any] = {"about": self.about(), "main": main, "offsets": self.offsets}
+        facts: dict[str, Any] = {"about": self.about(), "main": main, "offsets": self.offsets, "moves": "not run"}
         for other, paper in PAPER.items():
             key = other.removeprefix("drop-").removesuffix("-images")
             facts[key] = None
+            facts |= {f"{key}_{what}": "not run" for what in ("change", "paper", "slam", "lack")}
             if {"afr", other} <= set(self.policies):
                 shown = {name: rows.where(recording=name) for name in self.recordings}
                 found = {name: change(some, "rmse_mm", "afr", other) for name, some in shown.items()}

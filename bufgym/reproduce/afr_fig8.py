@@ -6,6 +6,7 @@ repeats one alignment ten times; here a run has the fade at each of ten places, 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +47,8 @@ class Reproduction(FrameFigure):
         shown = rows.where(recording=main)
         facts: dict[str, Any] = {"about": self.about(), "main": main, "offsets": self.offsets}
         rates = {policy: failures(shown, policy=policy) / len(shown.where(policy=policy)) for policy in self.policies}
+        facts |= dict.fromkeys(("oldest_rate", "afr_rate"), math.nan)  # of policies that were not run
+        facts |= dict.fromkeys(("large_count", "afr_count", "oldest_count", "learned_count"), "not run")
         large = Rows(row for row in shown if row["L"] > 10)
         facts["rates"] = ", ".join(f"{policy} {rate:.0%}" for policy, rate in rates.items())
         counts = {policy: failures(shown, policy=policy) for policy in self.policies}

@@ -97,7 +97,7 @@ class Reproduction(FrameFigure):
             "stands": all(right),
             "right": sum(right),
             "asked": len(right),
-            "best": "; ".join(f"{task} on {where}: {text}" for (where, task), text in best.items()) or "unknown",
+            "ranking": "; ".join(f"{task} on {where}: {text}" for (where, task), text in best.items()) or "unknown",
         }
 
     def draw(self, rows: Rows, figure: Any) -> None:

@@ -37,7 +37,7 @@ from bufgym.observe import (
     observe_slots,
 )
 from bufgym.oracle import clairvoyant
-from bufgym.policies import learned
+from bufgym.policies import learned, small_queue
 from bufgym.policies import weights as weights_file
 from bufgym.policies.learned import NAMES, Network, Weights
 from bufgym.policies.registry import Policy
@@ -92,6 +92,10 @@ def twin(whole):
         bends_once = v[0] == qoi.SATURATING or (v[0] == qoi.TABULATED and v[int(v[1]) + 3] == v[-1])
         if whole.shortcuts and (bends_once or (level and flows)):
             return policies.get("greedy-qoi").on_arrival(buffer, arrival, memory)
+        if whole.shortcuts and buffer.service_ratio < 0.07 and buffer.drained_bytes == 0:
+            plan = small_queue.planned(buffer, arrival, small_queue.packed())  # test_small_queue.py has its twin
+            if plan != small_queue.NONE:
+                return plan
         made = whole.still if whole.still is not None and buffer.service_ratio < 0.07 else whole
         s, L = len(buffer.slots), buffer.capacity
         slots, context = np.zeros((len(SLOT_NAMES), L + 1)), np.zeros(len(CONTEXT_NAMES))

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from relay_cases import relay, settings
-from test_client import compiled, until
+from test_relay_client import compiled, until
 
 pytest.importorskip("foxglove", reason="no foxglove here: the extra foxglove")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_client import compiled
+from test_relay_client import compiled
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 for library in ("websockets", "re2", "rosbags", "PIL"):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from relay_cases import relay, settings
-from test_client import compiled, until
+from test_relay_client import compiled, until
 
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
