@@ -37,7 +37,8 @@ RUN = {
     r"bufgym dataset make --kind mixed .*": "--episodes 3 --option duration_s=2.0",
     r"bufgym dataset make --suite lte-v1 .*": "--episodes 2 --out data",
     # In this process: another's, made for a test before, may have been begun in another folder.
-    r"bufgym (fleet --robots 1|topics --config \S+ --trace) .*": "--seeds 1 --jobs 1",
+    r"bufgym fleet --robots 1 .*": "--seeds 1 --jobs 1",
+    r"bufgym topics --config \S+ --trace .*": "--seeds 1",
     r"bufgym topics --config \S+": "--seeds 1 --policies robofleet",
     r"bufgym (--help|list \w+|export runs/motion/.*|gallery|trace fetch --list|trace from-bag drive\.mcap)": "",
     r"bufgym trace generate .*": "-o made.csv",

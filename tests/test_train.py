@@ -335,7 +335,7 @@ EVOLUTION = {"algo": "evolution", "suite": "interruption-v1"}
         ({"suite": "lte-v1,topics-v1"}, "suite lte-v1,topics-v1: a scheduler learns from one suite alone"),
         ({"suite": "fleet-v1", "algo": "dqn"}, "suite fleet-v1: a fleet's agent learns from one suite alone"),
         ({"algo": "evolution"}, "learns from a suite's episodes: name one"),
-        ({**EVOLUTION, "fields": "rank"}, "fields = 'rank': must be rank, motion_merged or time_merged"),
+        ({**EVOLUTION, "fields": "rank"}, "fields = 'rank': must be rank, motion_merged, time_merged or index_merged"),
         ({**EVOLUTION, "fields": "rank,time_merged,colour"}, "fields = 'rank,time_merged,colour': must be"),
         ({**EVOLUTION, "suite": "sustained-v1", "warm_up": 9}, "warm_up = 9: needs a suite of interruptions"),
         ({"resume": True}, "there is no run in"),
