@@ -12,6 +12,7 @@ from bufgym.errors import BufgymError
 from bufgym.live.channels import Channel
 from bufgym.live.frames import ACK, DATA, GOODBYE, GREETING, STREAM_BYTES, Frame, FrameError
 from bufgym.live.queue import Item, PolicyQueue
+from bufgym.live.tasks import until_one_ends
 
 Leaves = Literal["acked", "sent", "written"]
 """When a message has left: the receiver has acked it; the receiver's system has (SIOCOUTQ); this system has taken it.
@@ -91,15 +92,7 @@ class Sender:
 
     async def _converse(self, channel: Channel) -> None:
         """Send and take acks until all is done."""
-        tasks = [asyncio.create_task(self._send_all(channel)), asyncio.create_task(self._take_acks(channel))]
-        try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+        await until_one_ends(self._send_all(channel), self._take_acks(channel))
 
     async def _send_all(self, channel: Channel) -> None:
         for unacked in list(self._unacked):

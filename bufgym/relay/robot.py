@@ -16,7 +16,7 @@ from typing import Any, Final, Protocol
 
 from bufgym.errors import BufgymError
 from bufgym.live.odometry import Odometry
-from bufgym.live.tasks import Tasks
+from bufgym.live.tasks import Tasks, until_one_ends
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
@@ -146,15 +146,9 @@ class Robot:
     async def run(self) -> None:
         """Until the source has no more, or cancelled."""
         own = [self.client.run(), self._every(STATUS_S, self._say_status), self._every(QUEUE_S, self._say_queue)]
-        tasks = [asyncio.create_task(work) for work in (self.source.run(self), *own)]
         try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
+            await until_one_ends(self.source.run(self), *own)
         finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
             await self._pings.end()
 
     async def _every(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
