@@ -49,6 +49,7 @@ class Sender:
         self._max_body_bytes = 0
         self._next = 0  # the number of the message that the queue hands out next
         self._left = 0  # messages of which the queue knows that they have left
+        self._said_goodbye = False  # all is acked: the receiver hangs up, perhaps before our goodbye is known as sent
 
     async def run(self) -> None:
         """Send until the queue is closed and all that it held is acked. Cancel it to give up.
@@ -92,7 +93,11 @@ class Sender:
 
     async def _converse(self, channel: Channel) -> None:
         """Send and take acks until all is done."""
-        await until_one_ends(self._send_all(channel), self._take_acks(channel))
+        try:
+            await until_one_ends(self._send_all(channel), self._take_acks(channel))
+        except (OSError, TimeoutError):
+            if not self._said_goodbye:
+                raise
 
     async def _send_all(self, channel: Channel) -> None:
         for unacked in list(self._unacked):
@@ -105,6 +110,7 @@ class Sender:
                 await self._an_ack()
         while self._unacked:
             await self._an_ack()
+        self._said_goodbye = True
         await channel.send(Frame(GOODBYE, 0))
 
     async def _send(self, channel: Channel, item: Item) -> None:

@@ -19,7 +19,7 @@ from bufgym.errors import BufgymError
 from bufgym.live import LogFile, PolicyQueue, read_log, replay
 from bufgym.live import sender as sending
 from bufgym.live.channels import TRANSPORTS, TcpChannel
-from bufgym.live.frames import DATA, GREETING, HEADER_BYTES, Frame, FrameError, header, parse
+from bufgym.live.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, Frame, FrameError, header, parse
 from bufgym.live.receiver import Received, Receiver, Recording, listener
 from bufgym.live.sender import Sender
 from bufgym.live.shaped import ShapedLink
@@ -190,6 +190,50 @@ def test_a_message_larger_than_the_receiver_takes_is_an_error() -> None:
         await receiver.close()
 
     within(story())
+
+
+def test_a_receiver_that_hangs_up_before_the_goodbye_is_known_as_sent_is_no_fault() -> None:
+    """As over a bus, whose ``publish`` returns late: everything is acked, so nothing is begun again."""
+
+    class Hasty:
+        """Acks at once; hangs up on a goodbye whose sending has not returned."""
+
+        def __init__(self) -> None:
+            self.answers: asyncio.Queue[Frame | None] = asyncio.Queue()
+
+        async def send(self, frame: Frame) -> None:
+            if frame.kind == GOODBYE:
+                self.answers.put_nowait(None)
+                await asyncio.sleep(10)
+            self.answers.put_nowait(Frame(GREETING, 0, 1000) if frame.kind == GREETING else Frame(ACK, frame.number))
+
+        async def receive(self) -> Frame:
+            answer = await self.answers.get()
+            if answer is None:
+                raise ConnectionResetError("the peer has gone")
+            return answer
+
+        def left_bytes(self) -> int | None:
+            return None
+
+        def close(self) -> None:
+            pass
+
+    async def story() -> None:
+        connections: list[Hasty] = []
+
+        async def connect() -> Hasty:
+            connections.append(Hasty())
+            return connections[-1]
+
+        queue = PolicyQueue("drop-oldest", 4)
+        sender = Sender(queue, connect)
+        queue.put(b"last words", 10)
+        queue.close()
+        await sender.run()
+        assert len(connections) == 1 and not sender.faults
+
+    within(story(), 5)
 
 
 def test_a_slow_receiver_slows_the_sender_not_the_robot() -> None:
