@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as Seq
 from functools import lru_cache
 
 import numpy as np
@@ -47,9 +48,17 @@ def first(sequence: Sequence, frames: int) -> Sequence:
 @lru_cache(maxsize=8)
 def sizes(sequence: Sequence, every: int = SIZED_EVERY) -> NDArray[np.int64]:
     """int64[frames]: bytes of each frame as it is sent."""
-    encoded = np.unique(np.append(np.arange(0, len(sequence), every), len(sequence) - 1))
-    measured = [sequence.size_bytes(int(k)) for k in encoded]
-    return np.rint(np.interp(np.arange(len(sequence)), encoded, measured)).astype(np.int64)
+    return between([sequence.size_bytes(int(k)) for k in encoded(len(sequence), every)], len(sequence), every)
+
+
+def encoded(frames: int, every: int = SIZED_EVERY) -> NDArray[np.int64]:
+    """The frames whose sizes are measured: every so many, and the last."""
+    return np.unique(np.append(np.arange(0, frames, every), frames - 1))
+
+
+def between(measured: Seq[int], frames: int, every: int = SIZED_EVERY) -> NDArray[np.int64]:
+    """int64[frames]: the sizes of all frames from those of ``encoded``."""
+    return np.rint(np.interp(np.arange(frames), encoded(frames, every), measured)).astype(np.int64)
 
 
 def fading(stream_us: int, trace: Trace, offset_us: int = 0) -> Link:

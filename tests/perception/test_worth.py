@@ -36,6 +36,17 @@ def test_gymnasium_finds_nothing_to_complain_about() -> None:
     check_env(made(observation="flat"))
 
 
+def test_frames_have_the_sizes_that_they_are_said_to_have() -> None:
+    """Two of them encoded again; in between they follow the neighbours that were."""
+    from bufgym.perception import streams, worth
+
+    made()
+    whole, sizes = worth.recording(), streams.between(worth.SIZES, worth.FRAMES)
+    measured = {k: whole.size_bytes(k) for k in (120, 239)}
+    assert measured == pytest.approx({k: int(sizes[k]) for k in measured}, rel=0.01)
+    assert len(worth.SIZES) == len(streams.encoded(worth.FRAMES)) and sizes[5] == (sizes[0] + sizes[10]) // 2
+
+
 def test_what_is_paid_comes_at_the_end() -> None:
     """Slot 0 goes where the queue is full: Drop Oldest. The terms are those of the frames which arrived."""
     from bufgym.perception import views, worth
