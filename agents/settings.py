@@ -23,7 +23,10 @@ MOTION = (
 )
 """Fields with odometry and V."""
 
-SEES = {"time": TIME, "motion": MOTION}
+LINK = (*MOTION, "rate_short", "rate_medium", "rate_long", "rate_trend", "time_to_free")
+"""These, and the link's rate as the socket shows it."""
+
+SEES = {"time": TIME, "motion": MOTION, "link": LINK}
 
 Kind = Literal["environment", "queue", "topics", "fleet"]
 """What a run trains on: one environment, suites of one queue, a suite of many topics, or one of many robots."""
@@ -74,10 +77,13 @@ class Settings:
     """L of a suite's episodes, such as 5,10,25; by default the suite's own."""
     algo: Literal["maskable-ppo", "ppo", "dqn", "evolution"] = "maskable-ppo"
     """PPO with action masks, PPO without, double DQN with masks, or CMA-ES over whole episodes (suites only)."""
-    sees: Literal["motion", "time"] = "motion"
-    """What an evolved agent sees: odometry as well, or the clock alone."""
+    sees: Literal["motion", "time", "link"] = "motion"
+    """What an evolved agent sees: odometry as well, or the clock alone; link: odometry and the link's rate."""
     fields: str = ""
     """Fields that an evolved agent reads, such as rank,motion_merged,stalled; by default those of --sees."""
+    start: str = ""
+    """Go on from the agent in this file (.safetensors), which then reads --fields besides its own: these count nothing
+    at first. Its scorer of links that stand still stays as it is. With evolution of one queue's suites."""
     hidden: Units = 0
     """Hidden units of an evolved agent; with none, its scores are linear in what the context makes of the slots."""
     still_hidden: Units = 6
@@ -182,6 +188,8 @@ class Settings:
                     self._refuse(name, broken)
             if get_origin(hint) is Literal and value not in get_args(hint):
                 self._refuse(name, f"must be one of {', '.join(get_args(hint))}")
+        if self.start and (self.kind != "queue" or self.algo != "evolution" or self.warm_up):
+            self._refuse("start", "evolution of one queue's suites alone begins from a file, and without warm_up")
         if self.kind == "environment" and self.env not in ENVIRONMENTS:
             self._refuse("env", f"must be one of {', '.join(ENVIRONMENTS)}")
         if self.kind == "environment" and self.env == "bufgym/Topics-v0":

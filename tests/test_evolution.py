@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +21,17 @@ from agents.mixed_env import Cell, cells  # noqa: E402
 from agents.objectives import queue  # noqa: E402
 from agents.objectives.objective import to_vector, with_vector  # noqa: E402
 from agents.runs import MODEL, prepare  # noqa: E402
-from agents.settings import MOTION, SEES, TIME, Settings  # noqa: E402
+from agents.settings import LINK, MOTION, SEES, TIME, Settings  # noqa: E402
 from bufgym import policies  # noqa: E402
+from bufgym.errors import BufgymError  # noqa: E402
+from bufgym.model.qoi import exponential  # noqa: E402
 from bufgym.oracle import integer, law  # noqa: E402
 from bufgym.oracle.lengths import EveryLength  # noqa: E402
 from bufgym.policies import learned, weights  # noqa: E402
-from bufgym.scenario import Interruption  # noqa: E402
+from bufgym.scenario import Interruption, Streams, Uplink  # noqa: E402
 from bufgym.sim import run  # noqa: E402
 from bufgym.sim.metrics import outcome  # noqa: E402
+from bufgym.traces import Trace  # noqa: E402
 
 TINY = Settings(
     suite="interruption-v1",
@@ -53,6 +57,41 @@ def test_it_begins_with_the_smallest_merged_gap(sees: str, like: str) -> None:
     weights.drop.skip[weights.fields.index("rank")] = 0.0
     lengths = EveryLength(SHORT.scenario, [5])
     assert lengths.regrets(learned.policy("first", weights)) == lengths.regrets(policies.get(like))
+
+
+def test_an_agent_that_reads_more_decides_the_same_at_first() -> None:
+    """New inputs are zeros in every layer, in the mixing and in the scorer of still links."""
+    rng = np.random.default_rng(1)
+    old = replace(queue.start(MOTION, 3, rng), still=queue.start(MOTION, 2, rng))
+    old = with_vector(old, rng.normal(size=len(to_vector(old))))
+    new = old.reading(LINK)
+    assert new.fields == LINK and new.still is not None and new.still.fields == LINK
+    assert new.mix is not None and new.mix.shape == (len(new.context), len(new.slot)) == (10, 5)
+    slow = Trace(
+        "slow", np.array([0, 1_000_000, 3_000_000, 10_000_000]), np.array([0, 3_000_000, 3_500_000, 20_000_000])
+    )
+    episode = Uplink(traces=(slow,), duration_s=20).draw(Streams.seeded(3))
+    before, after = (
+        run(learned.policy("mine", weights), [episode], 8, exponential(0.9)).batch.log for weights in (old, new)
+    )
+    assert (before == after).all()
+
+
+def test_it_goes_on_from_a_file(tmp_path: Path) -> None:
+    """What is evolved on other links keeps the scorer of links that stand still, and begins no worse than the file."""
+    rng = np.random.default_rng(1)
+    old = replace(queue.start(MOTION, 3, rng), still=queue.start(MOTION, 2, rng))
+    file = weights.save(tmp_path / "old.safetensors", old, {"name": "old"})
+    settings = replace(TINY, suite="lte-v1", start=str(file), sees="link", steps=1, name="on", test_seeds=1).checked()
+    begun = queue.QueueObjective(settings, tmp_path, 0).start()
+    assert begun.fields == LINK and len(to_vector(begun)) > len(to_vector(old))
+    state = Evolution.around(begun, 0.3, 0)
+    moved = state.weights(to_vector(begun) + 1)
+    assert moved.still is not None and begun.still is not None
+    assert (moved.still.drop.flat() == begun.still.drop.flat()).all() and (moved.drop.flat() != begun.drop.flat()).any()
+    for broken in ({"warm_up": 10}, {"algo": "ppo"}, {"suite": "topics-v1"}):
+        with pytest.raises(BufgymError, match=r"start = .*: evolution of one queue's suites"):
+            replace(settings, **{"algo": "evolution", **broken}).checked()
 
 
 def test_weights_are_a_vector_and_back() -> None:

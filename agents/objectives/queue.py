@@ -23,7 +23,7 @@ from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.tasks.bound import best
 from bufgym.oracle.lengths import EveryLength
 from bufgym.oracle.measure import BASELINE, regret
-from bufgym.policies import Policy, learned
+from bufgym.policies import Policy, learned, weights
 from bufgym.policies.learned import Weights
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import Senders
@@ -220,12 +220,14 @@ class QueueObjective(Objective):
         return suite_objectives(self.settings, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
 
     def start(self) -> Weights:
-        """The smallest merged gap goes; with a warm-up in both scorers."""
+        """The smallest merged gap goes, with a warm-up in both scorers; or what an earlier agent does."""
         settings, fields = self.settings, self.settings.observed
-        weights = start(fields, settings.hidden, np.random.default_rng(self.seed))
+        if settings.start:
+            return weights.read(settings.start)[0].reading(fields)
+        first = start(fields, settings.hidden, np.random.default_rng(self.seed))
         if not self.warm_up:
-            return weights
-        return replace(weights, still=start(fields, settings.still_hidden, np.random.default_rng(self.seed)))
+            return first
+        return replace(first, still=start(fields, settings.still_hidden, np.random.default_rng(self.seed)))
 
     def measure(self, policy: Policy, episodes: Sequence[SuiteObjective], part: int | None = None) -> float:
         """Regret over the rivals', mean over the suites."""

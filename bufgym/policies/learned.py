@@ -23,7 +23,7 @@ The file is safetensors with JSON metadata: reading it runs nothing.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,6 +163,17 @@ class Weights(ScorerWeights):
         scorers = [self] if self.still is None else [self, self.still]
         plans = [packed()] if self.shortcuts else []
         return np.concatenate([[float(self.shortcuts)], *(scorer.pack(scorer.mix) for scorer in scorers), *plans])
+
+    def reading(self, fields: tuple[str, ...]) -> Weights:
+        """The same decisions by weights that read these fields too: what is new counts nothing."""
+        new = tuple(name for name in fields if name not in self.fields)
+        drop, accept = (network.with_inputs(len(new)) for network in (self.drop, self.accept))
+        still = self.still and self.still.reading(fields)
+        more = replace(self, fields=self.fields + new, drop=drop, accept=accept, still=still)
+        if self.mix is None:
+            return more
+        rows, columns = (len(more.context) - len(self.context), len(more.slot) - len(self.slot))
+        return replace(more, mix=np.pad(self.mix, ((0, rows), (0, columns))))
 
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:

@@ -192,6 +192,13 @@ class Network:
             tensors |= {f"{k}.weight": weight, f"{k}.bias": bias}
         return tensors | {"out": self.out}
 
+    def with_inputs(self, n: int) -> Network:
+        """The same with n more inputs at the end, which count nothing."""
+        layers = tuple(
+            (weight if k else np.pad(weight, ((0, n), (0, 0))), bias) for k, (weight, bias) in enumerate(self.layers)
+        )
+        return Network(np.pad(self.skip, (0, n)), self.bias, layers, self.out)
+
     @staticmethod
     def of(tensors: Mapping[str, NDArray[np.float32]]) -> Network:
         """The network of these ``tensors``."""
