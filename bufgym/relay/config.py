@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from bufgym.errors import BufgymError
-from bufgym.model.checks import above_0, whole
-from bufgym.model.topics import check_window
+from bufgym.files import check_keys, read_toml
+from bufgym.model.checks import above_0, check_window, whole
 from bufgym.relay.patterns import pattern
-from bufgym.scenario.configuration import check_keys, read_toml
 
 PORT: Final = 7420
 NO_DROP: Final = ("/robots/[^/]+/command",)

@@ -159,8 +159,6 @@ class Server:
     """
 
     def __init__(self, config: Config) -> None:
-        for name in config.policies:
-            policies.policy(name)
         self.config = config
         self.hub = Hub(config)
         self._door = Door(self.hub)
@@ -171,7 +169,7 @@ class Server:
         self._others: Others | None = None
 
     async def start(self) -> int:
-        """Listen; the port. The default policy is compiled while robots connect again."""
+        """Listen; the port. What the policies need is imported, and the first compiled, while robots connect again."""
         limits = self.config.limits
         if self.config.mesh is not None:
             self.hub.others = self._others = Others(self.hub, self.config.mesh)
@@ -199,7 +197,7 @@ class Server:
             )
         except OSError as error:
             raise BufgymError(f"{self.config.host}:{self.config.port}: {error.strerror or error}") from None
-        self._warming = asyncio.create_task(asyncio.to_thread(policies.warm, self.config.policies[0]))
+        self._warming = asyncio.create_task(asyncio.to_thread(self._warm))
         self._ticking = asyncio.create_task(self._tick())
         self.hub.audit("started", host=self.config.host, port=self.port)
         return self.port
@@ -210,6 +208,17 @@ class Server:
         assert self._server is not None
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
+    def _warm(self) -> None:
+        policies.check(self.config.policies)
+        policies.warm(self.config.policies[0])
+
+    async def warm(self) -> None:
+        """Returns when the first policy is compiled.
+
+        Raises BufgymError: the configuration names one that there is not.
+        """
+        await asyncio.shield(self._warming)
+
     async def close(self) -> None:
         """Close all connections; what is held stays on disk."""
         if self._ticking is not None:
@@ -217,7 +226,7 @@ class Server:
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
-            await self._warming
+            await asyncio.wait([self._warming])
         if self._others is not None:
             await self._others.close()
         self.hub.close()
@@ -261,6 +270,7 @@ async def serve_forever(config: Config, say: Any = print) -> None:
     scheme = "http" if config.tls is None else "https"
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
     try:
+        await server.warm()
         await asyncio.Event().wait()
     finally:
         await server.close()
