@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from http import HTTPStatus
-from typing import Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server as WebSocketServer
@@ -29,6 +29,9 @@ from bufgym.relay.mesh import Others
 from bufgym.relay.quota import RefusedError
 from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
+
+if TYPE_CHECKING:
+    from bufgym.relay.foxglove import Window
 
 _PING_S: Final = 20.0
 _PONG_S: Final = 60.0
@@ -167,6 +170,8 @@ class Server:
         self._server: WebSocketServer | None = None
         self._ticking: asyncio.Task[None] | None = None
         self._others: Others | None = None
+        self.window: Window | None = None
+        """Where Foxglove connects to, if the configuration has such a place."""
 
     async def start(self) -> int:
         """Listen; the port. What the policies need is imported, and the first compiled, while robots connect again."""
@@ -174,6 +179,11 @@ class Server:
         if self.config.mesh is not None:
             self.hub.others = self._others = Others(self.hub, self.config.mesh)
             await self._others.start()
+        if self.config.foxglove is not None:
+            from bufgym.relay.foxglove import Window  # not at start-up: few need it
+
+            self.window = Window(self.config.foxglove, self.config.rules)
+            self.hub.own.append(self.window)
         try:
             self._server = await serve(
                 self._serve,
@@ -269,6 +279,8 @@ async def serve_forever(config: Config, say: Any = print) -> None:
     port = await server.start()
     scheme = "http" if config.tls is None else "https"
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
+    if server.window is not None:
+        say(f"ws://{server.window.address}: Foxglove, Lichtblick")
     try:
         await server.warm()
         await asyncio.Event().wait()

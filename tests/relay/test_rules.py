@@ -15,7 +15,7 @@ from relay_cases import client, relay, run, settings
 
 from bufgym.errors import BufgymError
 from bufgym.relay.config import Rule
-from bufgym.relay.rules import RECORDER, Identity, Permissions, plain_address
+from bufgym.relay.rules import FOXGLOVE, RECORDER, Identity, Permissions, plain_address
 
 IDENTITIES = {
     "address": (Rule(address="10.0.0.7", send=True), Identity("10.0.0.7"), Identity("10.0.0.8")),
@@ -24,6 +24,7 @@ IDENTITIES = {
     "email": (Rule(email="A@x.org", send=True), Identity("1.2.3.4", "a@X.org"), Identity("1.2.3.4", "b@x.org")),
     "no email": (Rule(email="a@x.org", send=True), Identity("1.2.3.4", "a@x.org"), Identity("1.2.3.4")),
     "recorder": (Rule(recorder=True, send=True), RECORDER, Identity("10.0.0.7")),
+    "foxglove": (Rule(foxglove=True, send=True), FOXGLOVE, RECORDER),
     "all but it": (Rule(address="0.0.0.0/0", send=True), Identity("10.0.0.7"), RECORDER),
 }
 
@@ -34,7 +35,7 @@ IDENTITIES = {
 def test_each_kind_of_rule(kind: str, verb: str, topic: str) -> None:
     """Allowed is this identity, this verb, this whole topic; everything else is denied."""
     rule, who, other = IDENTITIES[kind]
-    fields = {"address": rule.address, "email": rule.email, "recorder": rule.recorder}
+    fields = {name: getattr(rule, name) for name in ("address", "email", "recorder", "foxglove")}
     for allowed in ("send", "receive"):
         rules = [Rule(**fields, **{allowed: True}, topic="/a/b")]  # type: ignore[arg-type]
         assert Permissions(rules, who).allow(verb, topic) == (verb == allowed and topic == "/a/b")  # type: ignore[arg-type]
@@ -52,6 +53,7 @@ def test_addresses_are_taken_as_they_are_meant() -> None:
     [
         ({"send": True}, "needs one identity"),
         ({"address": "10.0.0.1", "email": "a@x.org", "send": True}, "needs one identity"),
+        ({"recorder": True, "foxglove": True, "send": True}, "needs one identity"),
         ({"address": "10.0.0.1"}, "must allow send or receive"),
         ({"address": "10.0.0.1/8", "send": True}, "has host bits set"),
         ({"address": "robot", "send": True}, "does not appear to be"),
