@@ -14,6 +14,7 @@ def add(commands: Commands) -> None:
     reproduce.add_argument("names", nargs="*", metavar="NAME", help="which; 'all' for all; none lists them")
     reproduce.add_argument("--data", metavar="DIR", help="folder of recordings, for the figures that need one")
     reproduce.add_argument("--claims", metavar="FILE", help="run every figure and write the page of claims (Markdown)")
+    reproduce.add_argument("--live", action="store_true", help="robofleet-fig3 to -fig7 on real sockets too")
     reproduce.add_argument("--out", default="reproduced", metavar="DIR", help="where pictures go (%(default)s)")
 
 
@@ -40,6 +41,9 @@ def _reproduce(options: argparse.Namespace) -> None:
     out = Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
     for k, name in enumerate(names):
+        if options.live:
+            print(("\n" if k else "") + reproduce.run_live(name, out), flush=True)
+            continue
         print(("\n" if k else "") + _text(name, out, data, named=name in options.names), flush=True)
 
 

@@ -110,16 +110,24 @@ async def told(one: Client, uniform: random.Random) -> None:
                 await one.socket.send(mutated(uniform, uniform.choice(texts), texts).decode(errors="replace"))
 
 
+async def some_at_once(attack: Callable[[int], Awaitable[None]]) -> None:
+    """A tenth of the full count."""
+    count = max(20, COUNT // 10)
+    for first in range(0, count, 20):
+        await asyncio.gather(*(attack(k) for k in range(first, min(first + 20, count))))
+
+
 def test_broken_frames_on_sockets() -> None:
     async def story() -> None:
         async with relay(settings(rules=(OPEN,), limits=LIMITS)) as server:
             before = resident_bytes()
 
             async def attack() -> None:
-                for k in range(max(20, COUNT // 10)):
-                    uniform = random.Random(f"{SEED}-socket-{k}")
-                    async with client(server.port, name="attacker") as one:
-                        await told(one, uniform)
+                await some_at_once(broken)
+
+            async def broken(k: int) -> None:
+                async with client(server.port, name="attacker") as one:
+                    await told(one, random.Random(f"{SEED}-socket-{k}"))
 
             await bystander(server, attack)
             assert server.hub.audit.refused > 0
@@ -135,14 +143,16 @@ def test_broken_handshakes() -> None:
         async with relay(settings(rules=(OPEN,), limits=Limits(connections=500, hello_s=0.3))) as server:
 
             async def attack() -> None:
-                for k in range(max(20, COUNT // 10)):
-                    uniform = random.Random(f"{SEED}-handshake-{k}")
-                    async with stranger(server.port) as (reader, writer):
-                        writer.write(mutated(uniform, REQUEST, [REQUEST, b"GET /../server.py HTTP/1.1\r\n\r\n"]))
-                        if uniform.random() < 0.9:
-                            writer.write_eof()
-                        with contextlib.suppress(OSError):
-                            assert b"import" not in await asyncio.wait_for(reader.read(), 10)
+                await some_at_once(broken)
+
+            async def broken(k: int) -> None:
+                uniform = random.Random(f"{SEED}-handshake-{k}")
+                async with stranger(server.port) as (reader, writer):
+                    writer.write(mutated(uniform, REQUEST, [REQUEST, b"GET /../server.py HTTP/1.1\r\n\r\n"]))
+                    if uniform.random() < 0.9:
+                        writer.write_eof()
+                    with contextlib.suppress(OSError):
+                        assert b"import" not in await asyncio.wait_for(reader.read(), 10)
 
             await bystander(server, attack)
             assert any(entry.get("what") == "connection" for entry in server.hub.audit.recent)
