@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.live.sender import Leaves
 from bufgym.live.validate import play
 from bufgym.model.qoi import Value
 from bufgym.policies import Policy
@@ -27,7 +28,7 @@ def received_s(policy: Policy, senders: Senders, value: Value, speed: float) -> 
     episode = senders.episodes[0]
     assert episode is not None
     bounded = replace(policy, unbounded=False)  # there is room for all messages
-    leaves = "acked" if policy.client.awaits_acks else "sent"
+    leaves: Leaves = "acked" if policy.client.awaits_acks else "sent"
     came = asyncio.run(
         play(bounded, episode, senders.capacity, value, topics=senders.topics, leaves=leaves, speed=speed)
     )
