@@ -104,7 +104,7 @@ async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
 
     async def publish() -> None:
         while True:
-            sent.append(f"text {len(sent)}")
+            sent.append(f"text {len(sent):06}")  # 12 bytes with the 0: DDS fills up to a multiple of 4
             node.publish(sent[-1])
             await asyncio.sleep(0.05)
 
