@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from bufgym.errors import BufgymError
+from bufgym.errors import BufgymError, where
 
 PACKAGE = Path(__file__).resolve().parent
 
 FREELY_UNPACKED_BYTES = 64 * 2**20
 MOST_UNPACKED = 100
 """No recording or data set of text is packed so well; a bomb is packed a thousand times smaller or more."""
+
+MAX_TOML_BYTES = 2**18
+"""A client of a thousand topics has less."""
+MAX_DOTS = 100
+"""In a line."""
 
 
 def read_whole(path: str | os.PathLike[str], most_bytes: int) -> bytes:
@@ -44,6 +51,28 @@ def read_utf8(path: str | os.PathLike[str], most_bytes: int) -> str:
         return read_whole(path, most_bytes).decode("utf-8")
     except UnicodeDecodeError:
         raise BufgymError(f"{path}: must be UTF-8 text") from None
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """What the TOML file holds."""
+    text = read_utf8(path, MAX_TOML_BYTES)
+    for number, line in enumerate(text.split("\n"), 1):
+        # The parser's memory grows with the square of a dotted key's parts.
+        if line.count(".") > MAX_DOTS:
+            raise BufgymError(where(path, number, None, f"must have at most {MAX_DOTS} dots"))
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise BufgymError(f"{path}: nested too deep") from None
+    except ValueError as error:  # tomllib's own, and int()'s for thousands of digits
+        raise BufgymError(f"{path}: {str(error).partition(';')[0]}") from None
+
+
+def check_keys(table: Mapping[str, Any], known: set[str], first: str = "") -> None:
+    """Every key of the table is known; ``first``: what the message names before the known keys."""
+    unknown = sorted(set(table) - known)
+    if unknown:
+        raise BufgymError(f"unknown key {unknown[0]!r}; known: {first}{', '.join(sorted(known))}")
 
 
 def unpacked_limit(packed_bytes: int) -> int:

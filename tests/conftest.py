@@ -10,6 +10,8 @@ Hypothesis profiles, chosen by the environment variable HYPOTHESIS_PROFILE:
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -48,3 +50,18 @@ def shared_data() -> Path:
         where = "$BUFGYM_SHARED_DATA" if named else "shared/data beside the checkout"
         pytest.skip(f"recorded data absent: {where} is no folder (set BUFGYM_SHARED_DATA)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def ros(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment in which a process of this Python has ROS 1."""
+    from ros1_cases import environment
+
+    where = environment(tmp_path_factory.mktemp("ros"))
+    names = "rospy, rosmaster, sensor_msgs.msg, nav_msgs.msg"
+    done = subprocess.run(
+        [sys.executable, "-c", f"import {names}"], env=where, capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        pytest.skip(f"ROS 1 (python3-rospy and others) is not here: {done.stderr.strip().splitlines()[-1]}")
+    return where

@@ -14,6 +14,7 @@ def add(commands: Commands) -> None:
     reproduce.add_argument("names", nargs="*", metavar="NAME", help="which; 'all' for all; none lists them")
     reproduce.add_argument("--data", metavar="DIR", help="folder of recordings, for the figures that need one")
     reproduce.add_argument("--claims", metavar="FILE", help="run every figure and write the page of claims (Markdown)")
+    reproduce.add_argument("--live", action="store_true", help="robofleet-fig3 to -fig7 on real sockets too")
     reproduce.add_argument("--out", default="reproduced", metavar="DIR", help="where pictures go (%(default)s)")
 
 
@@ -40,10 +41,10 @@ def _reproduce(options: argparse.Namespace) -> None:
     out = Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
     for k, name in enumerate(names):
-        print(("\n" if k else "") + _text(name, out, data, named=name in options.names), flush=True)
+        print(("\n" if k else "") + _text(name, out, data, named=name in options.names, live=options.live), flush=True)
 
 
-def _text(name: str, out: Path, data: Path | None, *, named: bool) -> str:
+def _text(name: str, out: Path, data: Path | None, *, named: bool, live: bool) -> str:
     """The figure; one that was not asked for by name is left out where it can't be made, such as without a library."""
     from bufgym import reproduce
 
@@ -51,6 +52,8 @@ def _text(name: str, out: Path, data: Path | None, *, named: bool) -> str:
     if needs is not None and data is None and not named:
         return f"{name}: left out; it needs a folder of recordings (--data DIR) with {needs}"
     try:
+        if live:
+            return reproduce.run_live(name, out)
         return reproduce.run(name, out, **({"data": data} if name in reproduce.TAKES_DATA else {}))
     except BufgymError as error:
         if named:

@@ -32,8 +32,9 @@ def _serve(options: argparse.Namespace) -> None:
 
     settings = config.load(options.config)
     with needs("websockets"):
-        from bufgym.relay import server
+        from bufgym.relay import policies, server
     if options.check:
+        policies.check(settings.policies)
         print(f"{options.config}: {len(settings.rules)} rules, {settings.host}:{settings.port}")
         return
     run_async(server.serve_forever(settings, _say))

@@ -141,5 +141,5 @@ def _bridge(url: str, name: str, port: int, topics: str = "^/", **session: Any) 
     from bufgym.relay.session import Session
 
     bridge = Bridge(Session(url, name, say=_say, **session), port, pattern=topics)
-    print(f"ws://127.0.0.1:{bridge.port}: Foxglove, Lichtblick -> {url}; Ctrl-C ends it", flush=True)
+    print(f"ws://{bridge.address}: Foxglove, Lichtblick -> {url}; Ctrl-C ends it", flush=True)
     return bridge

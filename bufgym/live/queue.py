@@ -31,10 +31,10 @@ from bufgym.live.log import LogFile, Record, settings
 from bufgym.live.row import ROOM, Row
 from bufgym.model import qoi
 from bufgym.model.buffer import check_limits
-from bufgym.model.checks import is_number, whole
+from bufgym.model.checks import check_window, is_number, whole
 from bufgym.model.link import MAX_TIME_US
 from bufgym.model.qoi import Value
-from bufgym.model.topics import Topic, check_window
+from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
 
 FIRST_US: Final = 2

@@ -20,6 +20,7 @@ from bufgym.live.runs import Run
 from bufgym.live.sender import Leaves, Sender
 from bufgym.live.shaped import ShapedLink
 from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode, Streams, Uplink
 from bufgym.sim import run
@@ -32,6 +33,7 @@ async def play(
     capacity: int,
     value: Value,
     *,
+    topics: Sequence[Topic] = (),
     transport: str = "tcp",
     leaves: Leaves = "acked",
     small: bool = True,
@@ -45,6 +47,7 @@ async def play(
     ``received_ns`` counts from the episode's beginning, as ``at_us`` does, but as this system's time runs.
 
     Args:
+        topics: the rules for each; none for one queue without rules.
         transport: one of ``TRANSPORTS`` over TCP.
         leaves: when a message has left, see ``Sender``.
         small: small buffers in the system; else its default ones.
@@ -55,7 +58,7 @@ async def play(
     """
     if transport not in TRANSPORTS:
         raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
-    warm(PolicyQueue(policy, capacity, value=value, window=episode.window))
+    warm(PolicyQueue(policy, capacity, value=value, topics=topics, window=episode.window))
     came: list[Received] = []
 
     def take(message: Received) -> None:
@@ -71,6 +74,7 @@ async def play(
         policy,
         capacity,
         value=value,
+        topics=topics,
         window=episode.window,
         seed=seed,
         log=None if log is None else log.append,
@@ -86,7 +90,7 @@ async def play(
             wait_s = began_s + float(message["arrival_us"]) / 1e6 / speed - time.monotonic()
             await asyncio.sleep(max(0.0, wait_s))
             size_bytes = int(message["size_bytes"])
-            queue.put(bodies[:size_bytes], size_bytes, float(message["x"]))
+            queue.put(bodies[:size_bytes], size_bytes, float(message["x"]), int(message["topic"]))
         queue.close()
         await sending
     finally:

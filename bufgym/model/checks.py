@@ -11,6 +11,8 @@ import numpy as np
 
 from bufgym.errors import BufgymError
 
+MAX_WINDOW = 10**6
+
 
 def is_number(value: Any) -> bool:
     """Whether ``value`` is an int or a float, Python's or numpy's; True and False are not."""
@@ -44,6 +46,11 @@ def whole(name: str, number: Any, least: int = 0, most: int | None = None, *, sy
         bounds = f">= {least}" if most is None else f"from {least} to {most}"
         raise BufgymError(f"{name} = {number!r}: {symbol and f'{symbol} '}must be a whole number {bounds}")
     return int(number)
+
+
+def check_window(window: Any) -> int:
+    """n_T, messages on their way and not acked, or an error."""
+    return whole("window", window, 1, MAX_WINDOW, symbol="n_T")
 
 
 def check_name(what: str, name: Any) -> None:

@@ -21,7 +21,6 @@ from bufgym.model.checks import is_number, whole
 from bufgym.model.qoi import Value
 
 MAX_TOPICS = 256
-MAX_WINDOW = 10**6
 MAX_NUMBER = 1e12
 """The largest priority, weight, rate limit (Hz) and deadline (s)."""
 NO_DEADLINE_US = 2**62
@@ -112,11 +111,6 @@ def copies_of(topics: Sequence[Topic], consumers: int) -> list[Topic]:
         for c in range(consumers)
         for topic in topics
     ]
-
-
-def check_window(window: Any) -> int:
-    """n_T, or an error."""
-    return whole("window", window, 1, MAX_WINDOW, symbol="n_T")
 
 
 def check_ack_delay(ack_delay_us: Any) -> int:

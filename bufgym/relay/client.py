@@ -184,7 +184,7 @@ class Client(Session):
                 if away.answered is not None:
                     await asyncio.wait([away.answered])
                     if (error := away.answered.exception()) is not None:
-                        self._note(str(error))
+                        self.note(str(error))
                 else:
                     await self._left()
                 self._away.popleft()

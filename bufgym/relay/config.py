@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from bufgym.errors import BufgymError
-from bufgym.model.checks import above_0, whole
-from bufgym.model.topics import check_window
+from bufgym.files import check_keys, read_toml
+from bufgym.model.checks import above_0, check_window, whole
 from bufgym.relay.patterns import pattern
-from bufgym.scenario.configuration import check_keys, read_toml
 
 PORT: Final = 7420
 NO_DROP: Final = ("/robots/[^/]+/command",)
@@ -36,14 +35,17 @@ class Rule:
     """That of a token or a client's certificate."""
     recorder: bool = False
     """The relay's own recorder."""
+    foxglove: bool = False
+    """Whoever connects to the relay's Foxglove server."""
     send: bool = False
     receive: bool = False
     topic: str = ".*"
 
     def __post_init__(self) -> None:
-        if (self.address != "") + (self.email != "") + (self.recorder is True) != 1:
-            raise BufgymError("rule: needs one identity: an address, an email, or recorder = true")
-        for name in ("send", "receive", "recorder"):
+        own = (self.recorder is True) + (self.foxglove is True)
+        if (self.address != "") + (self.email != "") + own != 1:
+            raise BufgymError("rule: needs one identity: an address, an email, recorder = true, or foxglove = true")
+        for name in ("send", "receive", "recorder", "foxglove"):
             if not isinstance(getattr(self, name), bool):
                 raise BufgymError(f"rule: {name} = {getattr(self, name)!r}: must be true or false")
         if not (self.send or self.receive):
@@ -56,6 +58,11 @@ class Rule:
         elif self.email and (not isinstance(self.email, str) or not self.email.isprintable()):
             raise BufgymError(f"rule: email = {self.email!r}: must be a text")
         pattern(self.topic)
+
+    @property
+    def own(self) -> str:
+        """Which of the relay's own it is for; empty for those of strangers."""
+        return "recorder" if self.recorder else "foxglove" if self.foxglove else ""
 
 
 @dataclass(frozen=True)
@@ -159,6 +166,19 @@ class Mesh:
 
 
 @dataclass(frozen=True)
+class Foxglove:
+    """Where Foxglove and Lichtblick connect to (extra ``foxglove``), who see what rules with ``foxglove`` allow."""
+
+    host: str = "127.0.0.1"
+    port: int = 8765
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.host, str) or not self.host:
+            raise BufgymError(f"foxglove: host = {self.host!r}: must be a text")
+        whole("foxglove: port", self.port, 0, 65_535)
+
+
+@dataclass(frozen=True)
 class Rotation:
     """Files of a log: when one is full the next begins, and the oldest goes."""
 
@@ -198,6 +218,7 @@ class Config:
     tls: Tls | None = None
     tokens: Tokens | None = None
     mesh: Mesh | None = None
+    foxglove: Foxglove | None = None
 
     def __post_init__(self) -> None:
         whole("port", self.port, 0, 65_535)
@@ -222,6 +243,7 @@ _TABLES: Final[Mapping[str, Any]] = {
     "tls": Tls,
     "tokens": Tokens,
     "mesh": Mesh,
+    "foxglove": Foxglove,
 }
 
 

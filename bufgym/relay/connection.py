@@ -15,7 +15,6 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import WebSocketException
 
 from bufgym.errors import BufgymError
-from bufgym.model.buffer import MAX_CAPACITY
 from bufgym.model.checks import whole
 from bufgym.relay import policies, replay, wire
 from bufgym.relay.config import DEFAULT_CAPACITY
@@ -33,6 +32,8 @@ from bufgym.relay.wire import WireError
 HELLO_BYTES: Final = 2**16
 """Of a frame from a client that has not yet said who it is."""
 MAX_PRIORITY: Final = 1e6
+MAX_CAPACITY: Final = 1_000
+"""Of a subscriber's queue."""
 _SESSION: Final = re.compile(r"[\w.-]{1,64}", re.ASCII)
 _POLICY_VIOLATION: Final = 1008
 _ORDERS: Final = ("subscribe", "unsubscribe", "publish", "ack", "recordings", "replay")
@@ -270,7 +271,7 @@ class Connection:
         name, capacity = said.get("policy", config.policies[0]), said.get("capacity", DEFAULT_CAPACITY)
         if name not in config.policies:
             raise RefusedError("wrong", f"policy {name!r}: must be one of {', '.join(config.policies)}")
-        whole("capacity", capacity, 1, min(MAX_CAPACITY, 1_000))
+        whole("capacity", capacity, 1, MAX_CAPACITY)
         priority = float(said.get("priority", 1.0))
         if not 0 <= priority <= MAX_PRIORITY:
             raise RefusedError("wrong", f"priority = {priority}: must be from 0 to {MAX_PRIORITY:g}")

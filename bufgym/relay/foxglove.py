@@ -1,4 +1,4 @@
-"""What a viewer at a relay sees, in Foxglove's own WebSocket protocol (``foxglove-sdk``, extra ``foxglove``).
+"""What a relay or a viewer there sees, in Foxglove's own WebSocket protocol (``foxglove-sdk``, extra ``foxglove``).
 
 Foxglove and Lichtblick connect to it as to any robot. Messages of ROS go through as they are, with their definitions;
 pictures become CompressedImage, and poses also transforms, so that the map shows every robot where it is.
@@ -8,22 +8,29 @@ from __future__ import annotations
 
 import asyncio
 import re
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, Final
 
 from bufgym.errors import BufgymError
 from bufgym.live.extra import needs
 from bufgym.relay import ros_messages, wire
+from bufgym.relay.config import Foxglove, Rule
+from bufgym.relay.recorder import SCHEMAS
+from bufgym.relay.rules import FOXGLOVE, Permissions
 from bufgym.relay.session import Session
 
-PORT: Final = 8765
+MAX_CHANNELS: Final = 10_000
+"""Strangers make them, by topics and types; beyond them nothing new is shown."""
+_TRANSFORMS: Final = ("/tf", "", "")
 _PICTURES: Final = ("jpeg", "png")
 _ROBOT: Final = re.compile(r"/robots/([^/]+)/")
 
 
-class Bridge:
-    """Shows what ``session`` receives on topics in which ``pattern`` is found."""
+class Screen:
+    """Foxglove's server, which shows what ``show`` is given to all that connect."""
 
-    def __init__(self, session: Session, port: int = PORT, host: str = "127.0.0.1", pattern: str = "^/") -> None:
+    def __init__(self, host: str, port: int) -> None:
         with needs("foxglove", "foxglove", "bufgym.relay"):
             import foxglove
         self._foxglove = foxglove
@@ -32,23 +39,20 @@ class Bridge:
             self._server = foxglove.start_server(name="bufgym relay", host=host, port=port, context=self._context)
         except Exception as error:  # of its own kinds
             raise BufgymError(f"{host}:{port}: Foxglove's server: {error}") from None
-        self.port: int = self._server.port
+        self.address = f"{host}:{self._server.port}"
         """Where it listens."""
-        self.session = session
         self._channels: dict[tuple[str, str, str], Any] = {}
-        session.subscribe(pattern, self.show)
 
-    async def run(self) -> None:
-        """Until cancelled."""
-        try:
-            await self.session.run()
-        finally:
-            await asyncio.to_thread(self._server.stop)
+    def close(self) -> None:
+        """Nobody is connected any more."""
+        self._server.stop()
 
     def show(self, message: wire.Message) -> None:
         """One message."""
         key = message.topic, message.encoding, message.type
         if key not in self._channels:
+            if len(self._channels) >= MAX_CHANNELS:
+                return
             self._channels[key] = self._channel(message)
         time_ns = max(0, message.stamp_us) * 1000
         payload = bytes(message.payload)
@@ -61,19 +65,22 @@ class Bridge:
             return
         self._channels[key].log(payload, log_time=time_ns)
         if message.encoding == "cdr" and message.type in ros_messages.POSES:
-            self._transform(ros_messages.read(payload, message.type), message.topic, time_ns)
+            with suppress(BufgymError):  # it says what it is not
+                self._transform(ros_messages.read(payload, message.type), message.topic, time_ns)
 
     def _channel(self, message: wire.Message) -> Any:
         if message.encoding in _PICTURES:
             from foxglove.channels import CompressedImageChannel
 
             return CompressedImageChannel(message.topic, context=self._context)
-        schema = None
+        definition = b""
         if message.encoding == "cdr":
-            definition = ros_messages.definition(message.type) or ""
-            schema = self._foxglove.Schema(name=message.type, encoding="ros2msg", data=definition.encode())
+            definition = (ros_messages.definition(message.type) or "").encode()
         elif message.encoding == "json":
-            schema = self._foxglove.Schema(name=message.type or "object", encoding="jsonschema", data=_OBJECT)
+            definition = b'{"type": "object"}'
+        schema = self._foxglove.Schema(
+            name=message.type or "object", encoding=SCHEMAS.get(message.encoding, ""), data=definition
+        )
         return self._foxglove.Channel(
             message.topic, schema=schema, message_encoding=message.encoding, context=self._context
         )
@@ -100,8 +107,34 @@ class Bridge:
         )
 
 
-_TRANSFORMS: Final = ("/tf", "", "")
-_OBJECT: Final = b'{"type": "object"}'
+class Bridge:
+    """A screen for what ``session`` receives on topics in which ``pattern`` is found."""
+
+    def __init__(self, session: Session, port: int, host: str = "127.0.0.1", pattern: str = "^/") -> None:
+        self._screen = Screen(host, port)
+        self.address = self._screen.address
+        self.session = session
+        session.subscribe(pattern, self._screen.show)
+
+    async def run(self) -> None:
+        """Until cancelled."""
+        try:
+            await self.session.run()
+        finally:
+            await asyncio.to_thread(self._screen.close)
+
+
+class Window(Screen):
+    """The relay's own screen: who looks there sees what rules with ``foxglove`` allow."""
+
+    def __init__(self, settings: Foxglove, rules: Sequence[Rule]) -> None:
+        super().__init__(settings.host, settings.port)
+        self._permissions = Permissions(rules, FOXGLOVE)
+
+    def __call__(self, message: wire.Message) -> None:
+        """Show it, if a rule allows it."""
+        if self._permissions.allow("receive", message.topic):
+            self.show(message)
 
 
 def _frame(topic: str) -> str:
@@ -113,4 +146,4 @@ def _frame(topic: str) -> str:
 def _timestamp(time_ns: int) -> Any:
     from foxglove.messages import Timestamp
 
-    return Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
+    return Timestamp(sec=min(time_ns // 10**9, 2**32 - 1), nsec=time_ns % 10**9)

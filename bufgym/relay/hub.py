@@ -86,6 +86,16 @@ class Others(Protocol):
         """How many receivers they hold it for; None: not all have answered."""
 
 
+class Own(Protocol):
+    """One of the relay's own that gets messages besides its clients: the recorder, the Foxglove server."""
+
+    def __call__(self, message: wire.Message) -> None:
+        """Take it, if a rule allows it."""
+
+    def close(self) -> None:
+        """It was the last."""
+
+
 class Hub:
     """All that the connections share."""
 
@@ -97,7 +107,8 @@ class Hub:
         self.audit = Audit(config.folder, config.audit)
         self.quotas = Quotas(config.limits, clock)
         self.store = Store(config.folder, config.store, config.limits.sessions)
-        self.recorder = Recorder.of(config)
+        recorder = Recorder.of(config)
+        self.own: list[Own] = [] if recorder is None else [recorder]
         self.members: dict[Session, Member] = {}
         self.received = 0
         self._sent = 0
@@ -154,8 +165,8 @@ class Hub:
     def publish(self, sender: Member | None, message: wire.Message) -> None:
         """To each subscriber's queue but its sender's."""
         self.received += 1
-        if self.recorder is not None:
-            self.recorder(message)
+        for each in self.own:
+            each(message)
         frame = Frame(message)
         for member, subscription in self._route(message.topic):
             if member is not sender:
@@ -192,8 +203,8 @@ class Hub:
         session, number = taken or (sender.session, message.seq)
         self.store.hold(session, number, message.topic, frame, receivers)
         self.received += 1
-        if self.recorder is not None:
-            self.recorder(message)
+        for each in self.own:
+            each(message)
         for session in receivers:
             if session in self.members:
                 self.members[session].wake()
@@ -249,8 +260,8 @@ class Hub:
 
     def close(self) -> None:
         """Finish the files."""
-        if self.recorder is not None:
-            self.recorder.close()
+        for each in self.own:
+            each.close()
         self.audit.close()
         self.store.close()
 

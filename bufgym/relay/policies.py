@@ -1,39 +1,44 @@
-"""How a subscriber's queue decides: any of the relay's policies by name, and what Robofleet's server does."""
+"""How a subscriber's queue decides: any of the relay's policies by name, and what Robofleet's server does.
+
+A relay listens before it knows any: what compiles is imported where it is used, first by ``warm`` in a thread.
+"""
 
 from __future__ import annotations
 
 import functools
-from typing import Final
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final
 
-from bufgym.live import PolicyQueue
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer
-from bufgym.model.topics import Topic
-from bufgym.policies import registry
-from bufgym.policies.registry import Arrival, Memory, Policy
+if TYPE_CHECKING:
+    from bufgym.live import PolicyQueue
+    from bufgym.policies.registry import Policy
 
+SKIP_PENDING: Final = "skip-pending"
 PLACES: Final = 32
 """Topics that share a queue, where the policy knows topics."""
 ROOM: Final = 64
 """Messages between two tidyings of a queue's bookkeeping: little, as there are many queues."""
 
 
-def skip_pending(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """A receiver that has bytes pending is skipped: nothing is queued (Robofleet's server)."""
-    return REJECT if buffer.busy else ACCEPT
-
-
-SKIP_PENDING: Final = Policy(
-    "skip-pending", skip_pending, source="Robofleet's server (ut-amrl/robofleet_server)", compile=True
-)
-
-
 def policy(name: str) -> Policy:
     """The policy of this name, with settings as ``decimate:every=2``."""
-    return SKIP_PENDING if name == SKIP_PENDING.name else registry.get(name)
+    from bufgym.policies import registry
+    from bufgym.relay import skip_pending
+
+    return skip_pending.POLICY if name == SKIP_PENDING else registry.get(name)
+
+
+def check(names: Iterable[str]) -> None:
+    """All of these are policies."""
+    for name in names:
+        policy(name)
 
 
 def new_queue(chosen: Policy, capacity: int) -> PolicyQueue:
     """A queue for the messages of up to ``PLACES`` topics, or of one for a policy that knows none."""
+    from bufgym.live import PolicyQueue
+    from bufgym.model.topics import Topic
+
     topics = tuple(Topic(f"/{k}") for k in range(PLACES)) if chosen.for_topics else ()
     return PolicyQueue(chosen, capacity, topics=topics, room=ROOM)
 

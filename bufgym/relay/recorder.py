@@ -14,7 +14,7 @@ from bufgym.relay.rules import RECORDER, Permissions
 FOLDER: Final = "recordings"
 _FLUSH_S: Final = 0.5
 """A relay that is killed loses what it recorded in the time since the last flush."""
-_SCHEMAS: Final = {"json": "jsonschema", "cdr": "ros2msg", "ros1": "ros1msg"}
+SCHEMAS: Final = {"json": "jsonschema", "cdr": "ros2msg", "ros1": "ros1msg"}
 """How MCAP's schemas of an encoding are written."""
 
 
@@ -88,7 +88,7 @@ class Recorder:
         key = encoding, type
         if key not in self._schemas:
             text = b'{"type": "object"}' if encoding == "json" else b""
-            self._schemas[key] = self._writer.register_schema(type, _SCHEMAS.get(encoding, ""), text)
+            self._schemas[key] = self._writer.register_schema(type, SCHEMAS.get(encoding, ""), text)
         return self._schemas[key]
 
     def close(self) -> None:

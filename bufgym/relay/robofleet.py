@@ -130,7 +130,7 @@ class RobofleetConnection(Connection):
             return
         try:
             chosen = pattern(flat.pattern)
-            warmed = await asyncio.to_thread(policies.warm, policies.SKIP_PENDING.name)
+            warmed = await asyncio.to_thread(policies.warm, policies.SKIP_PENDING)
             if flat.pattern not in self.subscriptions:
                 self._quota.subscribe()
         except BufgymError as error:

@@ -7,8 +7,7 @@ one of the topics that the robot was told to receive.
 from __future__ import annotations
 
 import asyncio
-import importlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
@@ -16,10 +15,12 @@ from bufgym.errors import BufgymError
 from bufgym.relay import ros_messages, wire
 from bufgym.relay.robot import Robot
 from bufgym.ros2.names import Published, published
-from bufgym.ros2.relay import LOOK_S, own_node, resolved
+from bufgym.ros2.relay import LOOK_S, matched, own_node, resolved
 from bufgym.scenario import Stream
 
 NODE: Final = "bufgym_robot"
+Outlet = Callable[[bytes], None]
+"""Publishes a message in CDR here."""
 
 
 class _Ros:
@@ -43,14 +44,22 @@ class _Ros:
         elif type in ros_messages.POSES:
             robot.locate(payload, type, encoding)
 
-    def _listen(self, robot: Robot, publish: Callable[[str, wire.Message], None]) -> None:
-        """Hand on what comes for the topics that this robot receives."""
+    def _listen(self, robot: Robot, advertise: Callable[[Published], Awaitable[Outlet]]) -> None:
+        """Hand on what comes for the topics that this robot receives; what cannot be handed on is noted."""
         before = robot.topic("to")
+        outlets: dict[Published, Outlet] = {}
 
-        def take(message: wire.Message) -> None:
+        async def take(message: wire.Message) -> None:
             name = message.topic.removeprefix(before)
-            if name in self._receive and message.encoding == "cdr":
-                publish(name, message)
+            if name not in self._receive or message.encoding != "cdr":
+                return
+            try:
+                topic = Published(name, message.type)
+                if topic not in outlets:
+                    outlets[topic] = await advertise(topic)
+                outlets[topic](bytes(message.payload))
+            except Exception as error:  # strangers' messages; and ROS has errors of its own kinds
+                robot.client.note(f"{message.topic}: not published: {error}")
 
         if self._receive:
             robot.client.subscribe(f"^{before}/", take)
@@ -69,22 +78,26 @@ class Ros2(_Ros):
     async def run(self, robot: Robot) -> None:
         with own_node(NODE) as here:
             from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+            from rclpy.serialization import deserialize_message
 
             executor = SingleThreadedExecutor(context=here.context)
             executor.add_node(here)
-            publishers: dict[str, Any] = {}
 
-            def publish(name: str, message: wire.Message) -> None:
-                if name not in publishers:
-                    topic = Published(name, message.type)
-                    publishers[name] = here.create_publisher(topic.message_class, name, topic.qos)
-                publishers[name].publish(bytes(message.payload))
+            async def advertise(topic: Published) -> Outlet:
+                publisher = here.create_publisher(topic.message_class, topic.name, topic.qos)
+                await matched(publisher.get_subscription_count)
+
+                def publish(payload: bytes) -> None:
+                    deserialize_message(payload, topic.message_class)  # nodes would meet what is broken
+                    publisher.publish(payload)
+
+                return publish
 
             def spin() -> None:
                 with suppress(ExternalShutdownException):
                     executor.spin()
 
-            self._listen(robot, publish)
+            self._listen(robot, advertise)
             spinning = asyncio.create_task(asyncio.to_thread(spin))
             try:
                 await self._look(here, robot)
@@ -126,18 +139,19 @@ class Ros1(_Ros):
         with _needs_rospy():
             import rospy
         rospy.init_node(NODE, anonymous=True, disable_signals=True)
-        publishers: dict[str, Any] = {}
 
-        def publish(name: str, message: wire.Message) -> None:
-            package, _, kind = message.type.partition("/msg/")
-            if name not in publishers:
-                made = getattr(importlib.import_module(f"{package}.msg"), kind)
-                publishers[name] = rospy.Publisher(name, made, queue_size=10)
-            sent = rospy.AnyMsg()
-            sent._buff = ros_messages.as_ros1(bytes(message.payload), message.type)
-            publishers[name].publish(sent)
+        async def advertise(topic: Published) -> Outlet:
+            publisher = rospy.Publisher(topic.name, topic.message_class, queue_size=10)
+            await matched(publisher.get_num_connections)
 
-        self._listen(robot, publish)
+            def publish(payload: bytes) -> None:
+                sent = rospy.AnyMsg()
+                sent._buff = ros_messages.as_ros1(payload, topic.type)
+                publisher.publish(sent)
+
+            return publish
+
+        self._listen(robot, advertise)
         subscribers = [rospy.Subscriber(name, rospy.AnyMsg, self._taker(robot, name)) for name in self._wanted]
         try:
             await asyncio.Event().wait()

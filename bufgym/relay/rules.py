@@ -28,7 +28,8 @@ class Identity:
     address: str = ""
     email: str = ""
     """Of a token or a certificate that was verified."""
-    recorder: bool = False
+    own: str = ""
+    """One of the relay's own, as ``Rule.own``."""
     until_s: float = math.inf
     """Its token ends then, s since 1970."""
 
@@ -42,7 +43,7 @@ class Identity:
         return {name: value for name, value in asdict(self).items() if name in ("address", "email")}
 
 
-RECORDER: Final = Identity(recorder=True)
+RECORDER, FOXGLOVE = Identity(own="recorder"), Identity(own="foxglove")
 
 
 def plain_address(text: str) -> str:
@@ -54,8 +55,8 @@ def plain_address(text: str) -> str:
 
 def means(rule: Rule, identity: Identity) -> bool:
     """Whether the rule's identity is this one."""
-    if rule.recorder or identity.recorder:
-        return rule.recorder and identity.recorder
+    if rule.own or identity.own:
+        return rule.own == identity.own
     if rule.email:
         return rule.email.lower() == identity.email.lower()
     return ipaddress.ip_address(identity.address) in ipaddress.ip_network(rule.address)

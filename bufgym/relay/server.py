@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from http import HTTPStatus
-from typing import Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server as WebSocketServer
@@ -29,6 +29,9 @@ from bufgym.relay.mesh import Others
 from bufgym.relay.quota import RefusedError
 from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
+
+if TYPE_CHECKING:
+    from bufgym.relay.foxglove import Window
 
 _PING_S: Final = 20.0
 _PONG_S: Final = 60.0
@@ -159,8 +162,6 @@ class Server:
     """
 
     def __init__(self, config: Config) -> None:
-        for name in config.policies:
-            policies.policy(name)
         self.config = config
         self.hub = Hub(config)
         self._door = Door(self.hub)
@@ -169,13 +170,20 @@ class Server:
         self._server: WebSocketServer | None = None
         self._ticking: asyncio.Task[None] | None = None
         self._others: Others | None = None
+        self.window: Window | None = None
+        """Where Foxglove connects to, if the configuration has such a place."""
 
     async def start(self) -> int:
-        """Listen; the port. The default policy is compiled while robots connect again."""
+        """Listen; the port. What the policies need is imported, and the first compiled, while robots connect again."""
         limits = self.config.limits
         if self.config.mesh is not None:
             self.hub.others = self._others = Others(self.hub, self.config.mesh)
             await self._others.start()
+        if self.config.foxglove is not None:
+            from bufgym.relay.foxglove import Window  # not at start-up: few need it
+
+            self.window = Window(self.config.foxglove, self.config.rules)
+            self.hub.own.append(self.window)
         try:
             self._server = await serve(
                 self._serve,
@@ -199,7 +207,7 @@ class Server:
             )
         except OSError as error:
             raise BufgymError(f"{self.config.host}:{self.config.port}: {error.strerror or error}") from None
-        self._warming = asyncio.create_task(asyncio.to_thread(policies.warm, self.config.policies[0]))
+        self._warming = asyncio.create_task(asyncio.to_thread(self._warm))
         self._ticking = asyncio.create_task(self._tick())
         self.hub.audit("started", host=self.config.host, port=self.port)
         return self.port
@@ -210,6 +218,17 @@ class Server:
         assert self._server is not None
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
+    def _warm(self) -> None:
+        policies.check(self.config.policies)
+        policies.warm(self.config.policies[0])
+
+    async def warm(self) -> None:
+        """Returns when the first policy is compiled.
+
+        Raises BufgymError: the configuration names one that there is not.
+        """
+        await asyncio.shield(self._warming)
+
     async def close(self) -> None:
         """Close all connections; what is held stays on disk."""
         if self._ticking is not None:
@@ -217,7 +236,7 @@ class Server:
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
-            await self._warming
+            await asyncio.wait([self._warming])
         if self._others is not None:
             await self._others.close()
         self.hub.close()
@@ -260,7 +279,10 @@ async def serve_forever(config: Config, say: Any = print) -> None:
     port = await server.start()
     scheme = "http" if config.tls is None else "https"
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
+    if server.window is not None:
+        say(f"ws://{server.window.address}: Foxglove, Lichtblick")
     try:
+        await server.warm()
         await asyncio.Event().wait()
     finally:
         await server.close()

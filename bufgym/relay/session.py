@@ -115,14 +115,17 @@ class Session:
         self._connection: Any = None
         self._tasks = Tasks()
 
-    async def command(self, topic: str, data: Any) -> None:
-        """Send ``data`` (JSON) on a no_drop topic; returns once the relay holds it. It arrives exactly once.
+    async def command(self, topic: str, data: Any, type: str = "") -> None:
+        """Send ``data`` on a no_drop topic; returns once the relay holds it. It arrives exactly once.
+
+        With a ``type`` of ROS, as ``geometry_msgs/msg/Twist``, it is bytes in CDR; else it is sent as JSON.
 
         Raises:
             BufgymError: the relay refused it, and why.
         """
-        payload = json.dumps(data, separators=(",", ":"), allow_nan=False).encode()
-        message = wire.Message(topic, payload, stamp_us=time.time_ns() // 1000, no_drop=True)
+        encoding = "cdr" if type else "json"
+        payload = data if type else json.dumps(data, separators=(",", ":"), allow_nan=False).encode()
+        message = wire.Message(topic, payload, encoding, type, stamp_us=time.time_ns() // 1000, no_drop=True)
         answered = self._unanswered.put(message)
         self._wanted.set()
         await answered
@@ -172,7 +175,7 @@ class Session:
                 except (OSError, TimeoutError, wire.WireError, WebSocketException) as error:
                     # A relay that does not even talk to this address says why in its page.
                     page = getattr(getattr(error, "response", None), "body", None) or b""
-                    self._note(f"{type(error).__name__}: {error} {page.decode(errors='replace')}".strip())
+                    self.note(f"{type(error).__name__}: {error} {page.decode(errors='replace')}".strip())
                 finally:
                     self.connected.clear()
                     self.ready.clear()
@@ -185,7 +188,8 @@ class Session:
             self._unanswered.give_up(f"{self.name}: the client has ended")
             await self._tasks.end()
 
-    def _note(self, fault: str) -> None:
+    def note(self, fault: str) -> None:
+        """What went wrong, said once however often it comes in a row."""
         if not self.faults or self.faults[-1] != fault:
             self._report(f"{self.name}: {fault}")
         self.faults.append(fault)
@@ -302,5 +306,5 @@ class Session:
             if said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
                 self._unanswered.refuse(said["code"], said["why"])
             else:
-                self._note(f"{said['what']} refused: {said['code']}: {said['why']}")
+                self.note(f"{said['what']} refused: {said['code']}: {said['why']}")
         self._wanted.set()

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from bufgym.live import PolicyQueue
-from bufgym.live.queue import Item
-from bufgym.policies.registry import Policy
 from bufgym.relay.patterns import Pattern
 from bufgym.relay.policies import PLACES, new_queue
+
+if TYPE_CHECKING:
+    from bufgym.live import Item, PolicyQueue
+    from bufgym.policies.registry import Policy
 
 MAX_QUEUES: Final = 64
 """Of a subscription: topics beyond them share queues."""

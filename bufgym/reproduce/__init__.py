@@ -16,6 +16,7 @@ from typing import Any
 
 from bufgym.errors import BufgymError
 from bufgym.reproduce.figure import Figure, report, save_picture, statements
+from bufgym.reproduce.on_sockets import apart
 
 FIGURES: dict[str, str] = {name: texts["title"] for name, texts in statements().items() if "title" in texts}
 """Name -> what it shows, in one line."""
@@ -36,15 +37,19 @@ def figure(name: str, **options: Any) -> Figure:
     Raises:
         BufgymError: an unknown name or option, or an option's value that cannot be used.
     """
-    if name not in FIGURES:
-        raise BufgymError(f"unknown figure {name!r}; known: {', '.join(FIGURES)}")
-    kind = importlib.import_module(f"bufgym.reproduce.{name.replace('-', '_')}").Reproduction
+    kind = _kind(name)
     known = [option.name for option in fields(kind)]
     for option in options:
         if option not in known:
             raise BufgymError(f"{name}: no option {option!r}; it has: {', '.join(known)}")
     reproduction: Figure = kind(**options)
     return reproduction
+
+
+def _kind(name: str) -> Any:
+    if name not in FIGURES:
+        raise BufgymError(f"unknown figure {name!r}; known: {', '.join(FIGURES)}")
+    return importlib.import_module(f"bufgym.reproduce.{name.replace('-', '_')}").Reproduction
 
 
 def run(name: str, out: Path | None = None, **options: Any) -> str:
@@ -67,3 +72,28 @@ def run(name: str, out: Path | None = None, **options: Any) -> str:
         except BufgymError as error:  # the numbers stand without it
             lines.append(f"no figure: {error}")
     return "\n".join(lines)
+
+
+def run_live(name: str, out: Path | None = None, **options: Any) -> str:
+    """One figure on real sockets and simulated, with the options of its ``LIVE``, which are fewer and shorter runs.
+
+    Args:
+        name: one of robofleet-fig3 to -fig7.
+        out: folder for CSV and PNG of both; None saves nothing.
+        options: as for ``run``, instead of those of ``LIVE``.
+    """
+    if not hasattr(_kind(name), "LIVE"):
+        raise BufgymError(f"{name}: is not played on sockets; robofleet-fig3 to robofleet-fig7 are")
+    options = {**_kind(name).LIVE, **options}
+    lines, played = [FIGURES[name], f"Options: {options}"], {}
+    for medium, speed in (("simulated", 0.0), ("live", options["live"])):
+        reproduction = figure(name, **{**options, "live": speed})
+        rows = played[medium] = reproduction.simulate()
+        lines += ["", f"{medium.capitalize()}:", *reproduction.tables(rows)]
+        if out is not None:
+            lines.append(f"numbers: {rows.save(out / f'{name}-{medium}.csv')}")
+            try:
+                lines.append(f"figure: {save_picture(reproduction, rows, out / f'{name}-{medium}.png')}")
+            except BufgymError as error:  # the numbers stand without it
+                lines.append(f"no figure: {error}")
+    return "\n".join([*lines, "", "Live, beside simulated:", *apart(played["simulated"], played["live"])])

@@ -4,8 +4,9 @@ The paper [sikand2021robofleet] sends with n_T = 1 in its experiments; so do we.
 each figure. Arrivals are jittered by up to a tenth of their period, which is what differs from run to run; every sender
 meets the same ones.
 
-Left out on purpose: TCP (a link that stands still is found again at once, unless a figure takes a silence as option),
-the bytes of pings and pongs, encoding time, and whatever lies behind the server.
+With ``live`` the same messages go over real sockets (``on_sockets``), in the fewer and shorter runs of a figure's
+``LIVE``. Left out of the simulation on purpose: TCP (a link that stands still is found again at once, unless a figure
+takes a silence as option), the bytes of pings and pongs, encoding time, and whatever lies behind the server.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from bufgym import policies, sim
 from bufgym.benchmark.run import draw
 from bufgym.model.topics import Topic
+from bufgym.reproduce import on_sockets
 from bufgym.reproduce.figure import COLOURS, Figure, at_least_0, several, whole
 from bufgym.reproduce.rows import Rows
 from bufgym.scenario import Client, Stream
@@ -150,8 +152,12 @@ def send(
     round_trip_ms: float = ROUND_TRIP_MS,
     queue_size: int = QUEUE_SIZE,
     consumers: int = 1,
+    live: float = 0.0,
 ) -> Sent:
-    """What becomes of the streams' messages when one of ``PROGRAMS`` sends them; ``link`` begins with the first."""
+    """What becomes of the streams' messages when one of ``PROGRAMS`` sends them; ``link`` begins with the first.
+
+    ``live``: they go over real sockets, so many times as fast; 0: they are simulated.
+    """
     program = PROGRAMS[name]
     rules: dict[str, Any] = {"no_drop": True} if program.all_no_drop else {}
     if program.queued:
@@ -168,11 +174,14 @@ def send(
     )
     # Room for all: a no_drop queue knows no limit.
     room = client.max_messages * consumers
-    senders = sim.run(policies.get(program.policy), [draw(client, seed)], room, client.value, topics=client.topics)
+    policy = policies.get(program.policy)
+    senders = sim.run(policy, [draw(client, seed)], room, client.value, topics=client.topics)
     sender = senders.batch.senders[0]
     arrivals = np.asarray(senders.batch.arrivals[0])[: sender["arrivals"]]
     transmitted_us = np.asarray(senders.batch.log[0])[: sender["arrivals"]]["transmitted_us"]
     received_s = np.where(transmitted_us == sim.NEVER, np.nan, (transmitted_us + sender["propagation_us"]) / 1e6)
+    if live:
+        received_s = on_sockets.received_s(policy, senders, client.value, live)
     consumer, topic = np.divmod(arrivals["topic"], len(streams))
     return Sent(topic, consumer, arrivals["arrival_us"] / 1e6, received_s)
 
@@ -185,8 +194,11 @@ class ClientFigure(Figure):
     """Half of it to the server, the whole from the end of a message's transmission to its pong."""
     runs: int = 5
     """Differ by arrival jitter."""
+    live: float = 0.0
+    """How much faster than in truth messages go over real sockets; 0: they are simulated."""
 
     RULES = {
+        "live": at_least_0,
         "round_trip_ms": at_least_0,
         "queue_size": whole(),
         "queue_sizes": several(whole()),
@@ -202,7 +214,7 @@ class ClientFigure(Figure):
         """``send`` with the figure's own options."""
         if "queue_size" not in client:
             client["queue_size"] = getattr(self, "queue_size", QUEUE_SIZE)
-        return send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, **client)
+        return send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, live=self.live, **client)
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ class Reproduction(CloudFigure):
     duration_s: float = 20.0
     """How long is published; without drops the latency depends on it."""
 
+    LIVE = {"rates_hz": (2, 8, 16, 24), "mbit_per_s": 20.0, "duration_s": 3.0, "runs": 1, "live": 1.0}
     SIZE_INCHES = (10.0, 4.4)
 
     @property

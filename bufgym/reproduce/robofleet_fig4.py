@@ -63,6 +63,7 @@ class Reproduction(CloudFigure):
         "silence_s": at_least_0,
         "factor": above_0,
     }
+    LIVE = {"dropouts_s": (5, 10), "links_mbit_per_s": (12,), "kinds": ("PointCloud2",), "runs": 1, "live": 5.0}
     SIZE_INCHES = (11.0, 4.8)
 
     def __post_init__(self) -> None:

@@ -38,6 +38,7 @@ class Reproduction(CloudFigure):
     stay_s: float = 5.0
     """How long it then stays, and messages still come."""
     RULES = {"from_mbit_per_s": above_0, "to_mbit_per_s": above_0, "fall_s": above_0, "stay_s": at_least_0}
+    LIVE = {"runs": 1, "live": 1.0}
     SIZE_INCHES = (7.5, 5.8)
 
     def __post_init__(self) -> None:

@@ -41,6 +41,7 @@ class Reproduction(ClientFigure):
     duration_s: float = 60.0
     """How long is published."""
 
+    LIVE = {"points": (4_000,), "max_consumers": 4, "queue_sizes": (10,), "duration_s": 20.0, "runs": 1, "live": 2.0}
     RULES = {"points": several(whole(1, 10**7)), "max_consumers": whole(2, 100)}
 
     def simulate(self) -> Rows:

@@ -71,6 +71,14 @@ class Reproduction(ClientFigure):
         "bad_s": above_0,
         "after_s": above_0,
     }
+    LIVE = {
+        "bad_mbit_per_s": (1.0,),
+        "image_priorities": (1.0,),
+        "bad_from": 100,
+        "after_s": 40.0,
+        "runs": 1,
+        "live": 4.0,
+    }
     SIZE_INCHES = (8.0, 7.2)
 
     def __post_init__(self) -> None:

@@ -167,7 +167,7 @@ async def receive(
                     publishers[topic] = None
                     say(f"{topic.name}: dropped: {error}")
                 else:
-                    await _matched(publishers[topic])
+                    await matched(publishers[topic].get_subscription_count)
             if publishers[topic] is not None:
                 publishers[topic].publish(body)
 
@@ -179,8 +179,8 @@ async def receive(
             await receiver.close()
 
 
-async def _matched(publisher: Any) -> None:
+async def matched(subscribers: Callable[[], int]) -> None:
     """Subscribers that are there already find a new publisher within some 100 ms; until then they would miss it."""
     deadline_s = time.monotonic() + _MATCH_S
-    while publisher.get_subscription_count() == 0 and time.monotonic() < deadline_s:
+    while subscribers() == 0 and time.monotonic() < deadline_s:
         await asyncio.sleep(0.01)

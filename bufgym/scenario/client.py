@@ -18,10 +18,10 @@ from bufgym.errors import BufgymError
 from bufgym.kernel import records
 from bufgym.model import qoi
 from bufgym.model.buffer import MESSAGE
-from bufgym.model.checks import whole
+from bufgym.model.checks import check_window, whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
-from bufgym.model.topics import Topic, check_topics, check_window
+from bufgym.model.topics import Topic, check_topics
 from bufgym.scenario.arrivals import read_only
 from bufgym.scenario.checks import (
     as_tuple,

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from bufgym.errors import BufgymError, where
-from bufgym.files import read_utf8
+from bufgym.errors import BufgymError
+from bufgym.files import check_keys, read_toml
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.scenario.client import Client, Stream
@@ -51,11 +50,6 @@ def client_over_lte() -> Client:
     return Client(robofleet_example(), **shipped(), scale=0.25)
 
 
-MAX_TOML_BYTES = 2**18
-"""A client of a thousand topics has less."""
-MAX_DOTS = 100
-"""In a line."""
-
 _TOPIC_KEYS = {f.name for f in fields(Topic)} - {"value"}
 _STREAM_KEYS = {"rate_hz", "size_bytes", "jitter", "size_cv", "moves"}
 _CLIENT_KEYS = {"window", "propagation_us", "round_trip_us", "consumers", "duration_s"}
@@ -80,28 +74,6 @@ def read_client(path: str | Path, **parameters: Any) -> Client:
         return Client(tuple(map(_stream, tables)), **{**settings, **recordings, **parameters})
     except BufgymError as error:
         raise error if str(error).startswith(f"{path}") else BufgymError(f"{path}: {error}") from None
-
-
-def read_toml(path: str | Path) -> dict[str, Any]:
-    """What the TOML file holds."""
-    text = read_utf8(path, MAX_TOML_BYTES)
-    for number, line in enumerate(text.split("\n"), 1):
-        # The parser's memory grows with the square of a dotted key's parts.
-        if line.count(".") > MAX_DOTS:
-            raise BufgymError(where(path, number, None, f"must have at most {MAX_DOTS} dots"))
-    try:
-        return tomllib.loads(text)
-    except RecursionError:
-        raise BufgymError(f"{path}: nested too deep") from None
-    except ValueError as error:  # tomllib's own, and int()'s for thousands of digits
-        raise BufgymError(f"{path}: {str(error).partition(';')[0]}") from None
-
-
-def check_keys(table: Mapping[str, Any], known: set[str], first: str = "") -> None:
-    """Every key of the table is known; ``first``: what the message names before the known keys."""
-    unknown = sorted(set(table) - known)
-    if unknown:
-        raise BufgymError(f"unknown key {unknown[0]!r}; known: {first}{', '.join(sorted(known))}")
 
 
 def _stream(table: Any) -> Stream:

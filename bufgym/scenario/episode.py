@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.model.checks import whole
+from bufgym.model.checks import check_window, whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
-from bufgym.model.topics import Topic, check_ack_delay, check_window
+from bufgym.model.topics import Topic, check_ack_delay
 from bufgym.scenario.arrivals import check_messages, read_only, sealed
 from bufgym.traces.workload import MAX_MESSAGES
 

@@ -7,7 +7,8 @@ from cases import order
 from test_topics import V, after_run, episode
 
 from bufgym.errors import BufgymError
-from bufgym.model.topics import Topic, check_topics, check_window
+from bufgym.model.checks import check_window
+from bufgym.model.topics import Topic, check_topics
 from bufgym.sim import Senders
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -35,33 +34,6 @@ pytestmark = pytest.mark.skipif(not JIT, reason="uncompiled, decisions take as l
 
 REPO = Path(__file__).resolve().parents[2]
 FADE = REPO / "examples" / "ros1" / "fade.py"
-SYSTEM = Path("/usr/lib/python3/dist-packages")
-"""Where Debian has rospy, which is plain Python: behind this interpreter's own packages it runs here too."""
-
-
-def environment(folder: Path) -> dict[str, str]:
-    """ROS 1's own packages stand before this interpreter's: ROS 2 calls its messages by the same names."""
-    own = folder / "own"
-    own.mkdir()
-    for pattern in ("ros*", "gen*", "*_msgs", "*_srvs"):
-        for package in SYSTEM.glob(pattern):
-            if package.is_dir() and not (own / package.name).exists():
-                (own / package.name).symlink_to(package)
-    places = [REPO, own, *(place for place in sys.path if place.endswith("site-packages")), SYSTEM]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, places)), "ROS_LOG_DIR": str(folder)}
-
-
-@pytest.fixture(scope="session")
-def ros(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The environment in which a process of this Python has ROS 1."""
-    where = environment(tmp_path_factory.mktemp("ros"))
-    names = "rospy, rosmaster, sensor_msgs.msg, nav_msgs.msg"
-    done = subprocess.run(
-        [sys.executable, "-c", f"import {names}"], env=where, capture_output=True, text=True, check=False
-    )
-    if done.returncode != 0:
-        pytest.skip(f"ROS 1 (python3-rospy and others) is not here: {done.stderr.strip().splitlines()[-1]}")
-    return where
 
 
 def python(ros: dict[str, str], *command: Any) -> str:

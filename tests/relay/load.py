@@ -27,7 +27,7 @@ from bufgym.relay.config import Limits
 from bufgym.relay.server import serve_forever
 from bufgym.relay.wire import Message
 
-SIZE_BYTES, RATE_HZ = 50_000, 10
+SIZE_BYTES, RATE_HZ, MEMORY_S = 50_000, 10, 30.0
 _LENGTH, _PART, _STAMP = struct.Struct("!H"), struct.Struct("!Q"), struct.Struct("!q")
 _BINARY, _PING, _PONG, _MASKED = 0x82, 0x89, 0x8A, 0x80
 _HEAD_BYTES = 10 + 32
@@ -161,7 +161,15 @@ async def busy(robots: int, viewers: int, seconds: float, slow: bool) -> None:
                     await asyncio.sleep(max(0.0, began_s + i / RATE_HZ - time.monotonic()))
                     one.socket.transport.write(camera.frame())
 
+        memory_mb: list[float] = []
+
+        async def watch_memory() -> None:
+            while True:
+                await asyncio.sleep(MEMORY_S)
+                memory_mb.append(relay.megabytes)
+
         watching = [asyncio.create_task(view(k)) for k in range(viewers)]
+        watching.append(asyncio.create_task(watch_memory()))
         await asyncio.sleep(5.0)  # until the policy is compiled
         began_s, cpu_s, before = time.monotonic(), relay.cpu_s, relay.megabytes
         await asyncio.gather(*(publish(k) for k in range(robots)))
@@ -170,6 +178,7 @@ async def busy(robots: int, viewers: int, seconds: float, slow: bool) -> None:
         for task in watching:
             task.cancel()
         print(f"{robots} robots, {viewers} viewers: {cores:.2f} cores, {before:.0f} -> {relay.megabytes:.0f} MB")
+        print(f"every {MEMORY_S:g} s: {' '.join(f'{mb:.0f}' for mb in memory_mb)} MB")
         for k, times_us in enumerate(latency_us):
             median, late, longest = np.percentile(times_us, [50, 99, 100]) / 1e3
             of = round(seconds * RATE_HZ) * robots

@@ -66,6 +66,8 @@ def test_its_files_lie_beside_it(tmp_path: Path) -> None:
         ("[audit]\nbytes = 3", "audit: bytes = 3: must be"),
         ('[tls]\nkey = "a"', "tls: missing 1 required positional argument: 'certificate'"),
         ('[tokens]\nissuer = "a"\naudience = "b"\nkeys = "c"\nalgorithms = ["HS256"]', "tokens: algorithms"),
+        ("[foxglove]\nport = -1", "foxglove: port = -1: must be a whole number from 0"),
+        ("[foxglove]\nhost = 3", "foxglove: host = 3: must be a text"),
         ('no_drop = ["("]', "pattern '('"),
         ("folder = 3", "folder = 3: must be a text"),
         ("policies = []", "policies: needs at least one"),

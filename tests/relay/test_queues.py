@@ -14,7 +14,7 @@ from bufgym.relay import policies
 from bufgym.relay.config import POLICIES, Config
 from bufgym.relay.patterns import MAX_CHARACTERS, pattern
 from bufgym.relay.quota import Bucket, Quotas
-from bufgym.relay.server import Server
+from bufgym.relay.server import Server, serve_forever
 from bufgym.relay.subscriber import Subscription, next_lane
 
 
@@ -156,7 +156,7 @@ def test_quotas_are_remembered_for_a_while() -> None:
 
 def test_a_policy_that_there_is_not() -> None:
     with pytest.raises(BufgymError, match="unknown policy 'newest'"):
-        Server(settings(policies=("newest",)))
+        asyncio.run(serve_forever(settings(policies=("newest",))))
 
 
 def test_a_port_that_is_taken() -> None:

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 
 from relay_cases import client, relay, run, settings
 
 from bufgym.relay.config import Limits, Rule
 from bufgym.relay.wire import Message
+
+
+def test_a_relay_listens_before_the_compiler_is_imported() -> None:
+    """Robots come back to one that was killed as soon as it listens; the policies follow in a thread."""
+    program = "import bufgym.relay.server, sys; print('numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
 
 
 def test_a_message_goes_to_each_subscriber_but_its_sender() -> None:

@@ -17,7 +17,7 @@ const say = (element, text) => { if (element.textContent !== String(text)) eleme
 const escaped = text => text.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
 
 const robots = new Map();
-let chosen = null, replay = null, textMs = -Infinity, wanted = "";
+let chosen = null, replay = null, textMs = -Infinity, texts = false, wanted = "";
 
 const map = new Map2D($("map"), choose);
 const relay = new Relay({
@@ -98,6 +98,7 @@ function takeQueue(robot, queue, ms, own = true) {
   if (own) robot.queueMs = ms;
   robot.history.push({ms, queued: queue.queued, capacity: queue.capacity, rate: queue.rate_bps ?? 0, dropped: queue.dropped, drops: 0});
   robot.history.sort((one, other) => one.ms - other.ms);
+  while (robot.history[0].ms < ms - HISTORY_MS - 1000) robot.history.shift();
   for (let k = 1; k < robot.history.length; k++) {
     const [before, entry] = [robot.history[k - 1], robot.history[k]];
     entry.drops = Math.max(0, entry.dropped - before.dropped) / Math.max(0.1, (entry.ms - before.ms) / 1000);
@@ -318,21 +319,23 @@ function frame(clockMs) {
   requestAnimationFrame(frame);
   replay?.frame(clockMs);
   map.draw([...robots.values()], chosen, nowMs());
-  const robot = robots.get(chosen), saying = clockMs - textMs > TEXT_MS;
+  const robot = robots.get(chosen);
   if (robot) {
     showPicture(robot);
     if (robot.scanChanged) drawScan($("scan"), robot.scan, robot.tint);
     if (robot.queueChanged) drawSlots($("slots"), robot.queue);
     robot.scanChanged = robot.queueChanged = false;
   }
-  if (!saying) return;
+  if (clockMs - textMs < TEXT_MS / 2) return;
   textMs = clockMs;
+  texts = !texts;                                   // in turn: both in one frame are the longest of all
+  if (!texts) {
+    if (robot) drawHistory($("history"), robot.history, nowMs());
+    return;
+  }
   sayRobots();
   if (replay) sayReplay();
-  if (!robot) return;
-  while (robot.history.length && robot.history[0].ms < nowMs() - HISTORY_MS - 1000) robot.history.shift();
-  drawHistory($("history"), robot.history, nowMs());
-  sayChosen(robot);
+  if (robot) sayChosen(robot);
 }
 requestAnimationFrame(frame);
 

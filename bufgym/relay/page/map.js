@@ -15,6 +15,7 @@ export class Map2D {
     this.forget();
     this.follow = true;                             // until somebody moves the map
     this.view = {x: 0, y: 0, scale: 40};            // pixels for a metre
+    this.middle = [0, 0];                           // of the canvas, pixels: to ask the page for each point takes long
     this.pointers = new Map();
     this.listen();
   }
@@ -86,7 +87,7 @@ export class Map2D {
   }
 
   at(x, y) {
-    return [(x - this.view.x) * this.view.scale + this.canvas.clientWidth / 2, (this.view.y - y) * this.view.scale + this.canvas.clientHeight / 2];
+    return [(x - this.view.x) * this.view.scale + this.middle[0], (this.view.y - y) * this.view.scale + this.middle[1]];
   }
 
   // Where a laser's rays ended.
@@ -126,6 +127,7 @@ export class Map2D {
 
   draw(robots, chosen, nowMs) {
     this.robots = robots;
+    this.middle = [this.canvas.clientWidth / 2, this.canvas.clientHeight / 2];
     const clock = performance.now();
     if (clock - this.belowMs > REDRAW_MS) {
       if (this.follow) this.fit(robots);
@@ -184,7 +186,10 @@ export class Map2D {
       drawing.lineWidth = robot.name === chosen ? 2.5 : 1.5;
       drawing.globalAlpha = robot.name === chosen ? 0.75 : 0.4;
       drawing.beginPath();
-      for (const point of robot.trail) drawing.lineTo(...this.at(point.x, point.y));
+      for (const point of robot.trail) {
+        const [x, y] = this.at(point.x, point.y);
+        drawing.lineTo(x, y);
+      }
       drawing.stroke();
     }
     drawing.globalAlpha = 1;

@@ -1,0 +1,17 @@
+"""What Robofleet's server does with a receiver that has bytes pending, as a policy."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer
+from bufgym.policies.registry import Arrival, Memory, Policy
+from bufgym.relay.policies import SKIP_PENDING
+
+
+def skip_pending(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """It is skipped: nothing is queued."""
+    return REJECT if buffer.busy else ACCEPT
+
+
+POLICY: Final = Policy(SKIP_PENDING, skip_pending, source="Robofleet's server (ut-amrl/robofleet_server)", compile=True)

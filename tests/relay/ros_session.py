@@ -1,0 +1,159 @@
+"""A robot of ROS at a relay, for test_relay_ros.py: prints what came each way. Needs rospy and rosmaster, or rclpy.
+
+node --/chatter, /odom--> ``bufgym relay robot`` --> relay --> viewer; viewer --/robots/r/to/speech--> node
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from relay_cases import relay, settings
+
+from bufgym.errors import BufgymError
+from bufgym.relay.session import Session
+from bufgym.relay.wire import Message
+
+TEXT = "std_msgs/msg/String"
+CONFIG = '[[topic]]\nname = "chatter"\nrate_hz = 20\nsize_bytes = 20\n'
+COMMANDS = [str(k) for k in range(8)]
+
+
+def cdr(text: str) -> bytes:
+    """A ``std_msgs/msg/String`` by hand: little endian, the length with the 0 at the end, the text."""
+    return b"\0\1\0\0" + (len(text) + 1).to_bytes(4, "little") + text.encode() + b"\0"
+
+
+class Node:
+    """What both versions have: it publishes texts and one pose, and hears."""
+
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+        self.publish: Callable[[str], None]
+
+    def _take(self, text: Any) -> None:
+        self.heard.append(text.data)
+
+    @staticmethod
+    def _posed(odometry: Any) -> Any:
+        odometry.header.frame_id = "map"
+        odometry.pose.pose.position.x, odometry.pose.pose.orientation.w = 3.0, 1.0
+        return odometry
+
+
+class Node1(Node):
+    def __init__(self, folder: str) -> None:
+        super().__init__()
+        from rosmaster.master import Master
+
+        master = Master(0)
+        master.start()
+        port = master.master_node.server.socket.getsockname()[1]
+        os.environ.update(ROS_MASTER_URI=f"http://127.0.0.1:{port}", ROS_IP="127.0.0.1", ROS_LOG_DIR=folder)
+        import rospy
+        from nav_msgs.msg import Odometry
+        from std_msgs.msg import String
+
+        rospy.init_node("node", disable_signals=True, disable_rosout=True)
+        texts, poses = rospy.Publisher("chatter", String, queue_size=9), rospy.Publisher("odom", Odometry, queue_size=9)
+        rospy.Subscriber("speech", String, self._take)
+
+        def publish(text: str) -> None:
+            texts.publish(text)
+            poses.publish(self._posed(Odometry()))
+
+        self.publish = publish
+
+
+class Node2(Node):
+    def __init__(self, folder: str) -> None:
+        super().__init__()
+        os.environ["ROS_DOMAIN_ID"] = str(20 + os.getpid() % 80)  # another for each run: two may run at a time
+        import rclpy
+        from nav_msgs.msg import Odometry
+        from std_msgs.msg import String
+
+        rclpy.init(args=[])
+        node = rclpy.create_node("node")
+        texts, poses = node.create_publisher(String, "chatter", 9), node.create_publisher(Odometry, "odom", 9)
+        node.create_subscription(String, "speech", self._take, 9)
+        threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
+
+        def publish(text: str) -> None:
+            texts.publish(String(data=text))
+            poses.publish(self._posed(Odometry()))
+
+        self.publish = publish
+
+
+async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
+    config = folder / "client.toml"
+    config.write_text(CONFIG)
+    came: list[Message] = []
+    location: list[Any] = []
+    sent: list[str] = []
+
+    def take_status(message: Message) -> None:
+        location.append(json.loads(bytes(message.payload))["location"])
+
+    async def publish() -> None:
+        while True:
+            sent.append(f"text {len(sent):06}")  # 12 bytes with the 0: DDS fills up to a multiple of 4
+            node.publish(sent[-1])
+            await asyncio.sleep(0.05)
+
+    async def command(*what: Any) -> None:
+        while True:
+            try:
+                await viewer.command(*what)
+                return
+            except BufgymError as error:  # the robot has not subscribed yet
+                assert "no_receiver" in str(error), error
+                await asyncio.sleep(0.05)
+
+    async with relay(settings(no_drop=("/robots/[^/]+/(command|to/.*)",))) as server:
+        url = f"ws://127.0.0.1:{server.port}"
+        words = ["relay", "robot", "--to", url, "--name", "r", "--config", str(config), "--ros", version]
+        words += ["--odom", "odom", "--receive", "speech", "--policies", "drop-oldest"]
+        robot = await asyncio.create_subprocess_exec(sys.executable, "-m", "bufgym", *words, stdout=sys.stderr)
+        viewer = Session(url, "viewer", say=lambda text: print(text, file=sys.stderr))
+        viewer.subscribe("^/robots/r/chatter$", came.append)
+        viewer.subscribe("^/robots/r/status$", take_status)
+        tasks = [asyncio.create_task(work) for work in (viewer.run(), publish())]
+        try:
+            while len(came) < 10 or not any(location):
+                await asyncio.sleep(0.01)
+            # What is no message, of no type that is here, or not for this robot's ROS, stops nothing.
+            await command("/robots/r/to/speech", b"\0\1\0\0\xff\xff\xff\xff", TEXT)
+            await command("/robots/r/to/speech", b"", "no_such_msgs/msg/B")
+            await command("/robots/r/to/private", cdr("secret"), TEXT)
+            for text in COMMANDS:
+                await command("/robots/r/to/speech", cdr(text), TEXT)
+            while len(node.heard) < len(COMMANDS):
+                await asyncio.sleep(0.01)
+            assert robot.returncode is None
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            robot.terminate()
+            await robot.wait()
+    return {
+        "exact": all(bytes(message.payload) in {cdr(text) for text in sent} for message in came),
+        "kinds": sorted({(message.encoding, message.type) for message in came}),
+        "heard": node.heard,
+        "location": next(filter(None, location)),
+    }
+
+
+if __name__ == "__main__":
+    version, folder = sys.argv[1:]
+    node = {"1": Node1, "2": Node2}[version](folder)
+    print(json.dumps(asyncio.run(asyncio.wait_for(story(node, version, Path(folder)), 100))), flush=True)
+    os._exit(0)
