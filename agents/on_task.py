@@ -10,6 +10,7 @@ coverage really are.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -116,7 +117,7 @@ def tested(policy: Policy, episodes: Episodes) -> dict[str, NDArray[np.float64]]
     return {name: np.array([measure(frames) for frames in arrived]) for name, measure in TESTED.items()}
 
 
-def page(
+def main(
     generations: int = 120, seeds: int = 2, capacity: int = 8, episodes: int = 16, out: Path | None = None
 ) -> None:
     """The table of what agents reach that were evolved by each reward, beside fixed policies.
@@ -132,9 +133,10 @@ def page(
     test = Episodes([(links - 1 - k % TEST_LINKS, k) for k in range(episodes)], capacity)
     found = {name: [tested(policies.get(name), test)] for name in RIVALS}
     for reward in REWARDS:
-        found[f"agent by {reward}"] = [
-            tested(evolved(reward, capacity, seed, generations), test) for seed in range(seeds)
-        ]
+        found[f"agent by {reward}"] = runs = []
+        for seed in range(seeds):
+            runs.append(tested(evolved(reward, capacity, seed, generations), test))
+            print(f"agent by {reward}, seed {seed}: tracked {runs[-1]['tracked'].mean():.3f}", file=sys.stderr)
     base = found[RIVALS[0]][0]["tracked"]
     weights = times_drawn(episodes, RESAMPLES, stream(0, "on task")) / episodes
     rows = []
@@ -147,4 +149,4 @@ def page(
 
 
 if __name__ == "__main__":
-    command(page)
+    command(main)

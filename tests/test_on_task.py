@@ -41,6 +41,6 @@ def test_a_task_is_the_mean_of_its_reward() -> None:
 def test_the_page_has_every_agent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(on_task, "PART_EPISODES", 2)
     monkeypatch.setitem(on_task.TESTED, "tracked", worth.coverage_of)  # seconds an episode less
-    on_task.page(generations=2, seeds=1, capacity=2, episodes=2)
+    on_task.main(generations=2, seeds=1, capacity=2, episodes=2)
     lines = [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()]
     assert lines[2:] == [f"| {name}" for name in (*on_task.RIVALS, *(f"agent by {one}" for one in on_task.REWARDS))]
