@@ -69,6 +69,7 @@ TRAINING = [
     "agents.report",
     "agents.goals",
     "agents.scheduling",
+    "agents.on_task",
     "agents.ablation",
     "agents.small_queue",
     "train",

@@ -7,13 +7,18 @@ from pathlib import Path
 
 from bufgym.cli.options import Commands, columns, command
 from bufgym.errors import BufgymError
+from bufgym.files import read_whole
 
 
 def add(commands: Commands) -> None:
     reproduce = command(commands, "reproduce", _reproduce, "figures and tables of the papers, our number beside theirs")
     reproduce.add_argument("names", nargs="*", metavar="NAME", help="which; 'all' for all; none lists them")
     reproduce.add_argument("--data", metavar="DIR", help="folder of recordings, for the figures that need one")
-    reproduce.add_argument("--claims", metavar="FILE", help="run every figure and write the page of claims (Markdown)")
+    reproduce.add_argument(
+        "--claims",
+        metavar="FILE",
+        help="run every figure and write the page of claims (Markdown); with names: renew the rows of these figures",
+    )
     reproduce.add_argument("--live", action="store_true", help="robofleet-fig3 to -fig7 on real sockets too")
     reproduce.add_argument("--out", default="reproduced", metavar="DIR", help="where pictures go (%(default)s)")
 
@@ -24,14 +29,7 @@ def _reproduce(options: argparse.Namespace) -> None:
     data = None if options.data is None else Path(options.data)
     if data is not None and not data.is_dir():
         raise BufgymError(f"{data}: no such folder (--data)")
-    if options.claims is not None:
-        from bufgym.reproduce.page import claims_page
-
-        Path(options.claims).write_text(claims_page(data), encoding="utf-8")
-        print(f"claims: {options.claims}")
-        if not options.names:
-            return
-    if not options.names:
+    if not options.names and options.claims is None:
         print("figures (bufgym reproduce NAME..., or all)\n" + columns(list(reproduce.FIGURES.items())))
         return
     for name in options.names:
@@ -39,9 +37,21 @@ def _reproduce(options: argparse.Namespace) -> None:
             raise BufgymError(f"unknown figure {name!r}; known: all, {', '.join(reproduce.FIGURES)}")
     names = list(reproduce.FIGURES) if "all" in options.names else list(dict.fromkeys(options.names))
     out = Path(options.out)
+    if options.claims is not None:
+        _claims(Path(options.claims), names, out, data)
+        return
     out.mkdir(parents=True, exist_ok=True)
     for k, name in enumerate(names):
         print(("\n" if k else "") + _text(name, out, data, named=name in options.names, live=options.live), flush=True)
+
+
+def _claims(page: Path, names: list[str], out: Path, data: Path | None) -> None:
+    """Write the page of claims, or renew the rows of these figures in it."""
+    from bufgym.reproduce.page import claims_page, renewed
+
+    text = renewed(read_whole(page, 2**20).decode(), names, data, out) if names else claims_page(data, out)
+    page.write_text(text, encoding="utf-8")
+    print(f"claims: {page}")
 
 
 def _text(name: str, out: Path, data: Path | None, *, named: bool, live: bool) -> str:

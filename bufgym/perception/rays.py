@@ -25,6 +25,8 @@ NEAREST_M, FARTHEST_M = 0.4, 5.0
 """What can be measured, m."""
 GRAZING = 0.12
 """Cosine of the angle to the surface's normal below which the dots are too stretched."""
+SLACK = 1e-3
+"""Things are looked for beyond their bounds by so much, pixels and m, so that rounding hides none."""
 
 _MASK = 0xFFFFFFFF
 
@@ -126,11 +128,52 @@ def cull(things: Any, balls: int, lens: Any, width: int, height: int, to_camera:
 
 
 @kernel
+def bound(
+    things: Any, balls: int, seen: Any, count: int, lens: Any, to_camera: Any, aside_m: float, bounds: Any
+) -> None:
+    """Write to ``bounds`` float64[n, 5] between which columns and rows each thing lies, and its least depth.
+
+    It is seen by an eye that is ``aside_m`` right of the camera and looks along with it. A box's corners bound it, and
+    those of a cube bound a ball; what reaches behind the eye, as the room does, may be anywhere.
+    """
+    m = to_camera
+    for i in range(count):
+        t = things[seen[i]]
+        ball = seen[i] >= balls
+        half_y, half_z = (t[3], t[3]) if ball else (t[4], t[5])
+        c, s = (1.0, 0.0) if ball else (t[6], t[7])
+        left, right, top, bottom, near = math.inf, -math.inf, math.inf, -math.inf, math.inf
+        for corner in range(8):
+            a = t[3] if corner & 1 else -t[3]
+            b = half_y if corner & 2 else -half_y
+            wx, wy, wz = t[0] + c * a - s * b, t[1] + s * a + c * b, t[2] + (half_z if corner & 4 else -half_z)
+            z = m[2, 0] * wx + m[2, 1] * wy + m[2, 2] * wz + m[2, 3]
+            near = min(near, z)
+            if z > 0.0:
+                u = lens[0] * (m[0, 0] * wx + m[0, 1] * wy + m[0, 2] * wz + m[0, 3] - aside_m) / z + lens[2]
+                v = lens[1] * (m[1, 0] * wx + m[1, 1] * wy + m[1, 2] * wz + m[1, 3]) / z + lens[3]
+                left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+        if near <= SLACK:
+            left, right, top, bottom, near = -math.inf, math.inf, -math.inf, math.inf, -math.inf
+        bounds[i, 0], bounds[i, 1] = left - SLACK, right + SLACK
+        bounds[i, 2], bounds[i, 3] = top - SLACK, bottom + SLACK
+        bounds[i, 4] = near - SLACK
+
+
+@kernel
+def _within(bounds: Any, i: int, u: float, v: float, z: float) -> bool:
+    """Whether what the eye sees at this column and row, up to this depth, may be thing ``i`` of those seen."""
+    columns = bounds[i, 0] <= u <= bounds[i, 1]
+    return bool(columns and bounds[i, 2] <= v <= bounds[i, 3] and bounds[i, 4] <= z)
+
+
+@kernel
 def render(
     things: Any,
     balls: int,
     seen: Any,
     count: int,
+    bounds: Any,
     lens: Any,
     stride: int,
     to_world: Any,
@@ -146,6 +189,7 @@ def render(
     Args:
         things: float64[n, 8], boxes and from number ``balls`` on balls; the first box is the room, seen from inside.
         seen, count: those that the camera may see (see `cull`).
+        bounds: float64[2, n, 5], where they lie for the camera, and for the projector (see `bound`).
         lens: of the whole camera.
         to_world: float64[4, 4], camera to world.
         noisy: measure as a Kinect does; otherwise the true depth of every pixel.
@@ -165,6 +209,8 @@ def render(
             dz = m[2, 0] * a + m[2, 1] * b + m[2, 2]
             z, thing = math.inf, 0
             for i in range(count):
+                if not _within(bounds[0], i, u, v, z):
+                    continue
                 n = seen[i]
                 hit = _distance(things, balls, n, ox, oy, oz, dx, dy, dz, face)
                 if 0.0 < hit < z:
@@ -182,8 +228,10 @@ def render(
             if -(nx * dx + ny * dy + nz * dz) < GRAZING * math.sqrt(dx * dx + dy * dy + dz * dz):
                 continue
             # Does the projector reach the place? A ray from there, one long up to it.
-            lit = True
+            lit, lit_u = True, u - lens[0] * BASELINE_M / z
             for i in range(1, count):
+                if not _within(bounds[1], i, lit_u, v, z):
+                    continue
                 n = seen[i]
                 hit = _distance(things, balls, n, lx, ly, lz, x - lx, y - ly, w - lz, face)
                 if 0.0 < hit < 0.995:

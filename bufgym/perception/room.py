@@ -13,7 +13,7 @@ import numpy as np
 
 from bufgym.errors import BufgymError
 from bufgym.perception import rays
-from bufgym.perception.frames import Depth, Image, Sequence
+from bufgym.perception.frames import Depth, Image, Sequence, encoded_bytes
 from bufgym.perception.mapping import lens_of
 from bufgym.perception.recordings import SEVEN_SCENES_CAMERA, matrices
 from bufgym.traces.generate.draws import stream
@@ -90,8 +90,13 @@ class Room(Sequence):
         lens, seen = lens_of(whole), np.empty(len(scene.things), np.int64)
         to_camera = np.linalg.inv(pose)
         count = rays.cull(scene.things, scene.balls, lens, whole.width, whole.height, to_camera, seen)
+        bounds = np.empty((2, len(scene.things), 5))
+        for eye, aside_m in enumerate((0.0, rays.BASELINE_M)):
+            rays.bound(scene.things, scene.balls, seen, count, lens, to_camera, aside_m, bounds[eye])
         stride, seed, face = self._stride, self._seed, np.empty(6)
-        rays.render(scene.things, scene.balls, seen, count, lens, stride, pose, seed, k, noisy, face, depth, grey)
+        rays.render(
+            scene.things, scene.balls, seen, count, bounds, lens, stride, pose, seed, k, noisy, face, depth, grey
+        )
         return depth, grey
 
     def reduced(self, stride: int) -> Sequence:
@@ -99,8 +104,8 @@ class Room(Sequence):
         return Room(self.name, self.scene, self.time_us, self.poses, self._seed, self._stride * stride)
 
     def size_bytes(self, k: int) -> int:
-        whole = self if self._stride == 1 else Room(self.name, self.scene, self.time_us, self.poses, self._seed)
-        return Sequence.size_bytes(whole, k)
+        whole = Room(self.name, self.scene, self.time_us, self.poses, self._seed)
+        return encoded_bytes(*whole.rendered(k))
 
 
 def room(

@@ -7,7 +7,7 @@ a camera that moved on too far between two frames that arrived is lost, as it is
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -88,8 +88,19 @@ class Track:
         return self.where is not None
 
 
+def smoothed(depth: Depth) -> Depth:
+    """The depth image whose normals are taken."""
+    result = np.empty_like(depth)
+    icp.smooth(depth, SMOOTH_RADIUS, SAME_SURFACE / 2, result)
+    return result
+
+
 def track(
-    sequence: Sequence, frames: Iterable[int], grid: Grid | None = None, settings: TrackingSettings | None = None
+    sequence: Sequence,
+    frames: Iterable[int],
+    grid: Grid | None = None,
+    settings: TrackingSettings | None = None,
+    smooth: Callable[[int], Depth] | None = None,
 ) -> Track:
     """Follow the camera through the frames that arrived, until that fails.
 
@@ -98,6 +109,7 @@ def track(
         frames: the indices of those that arrived, in order.
         grid: of the model; by default `grid_of` the whole recording.
         settings: by default `TrackingSettings()`.
+        smooth: `smoothed` of frame k, for those who track one recording again and again and keep it.
 
     Raises:
         BufgymError: no frame, or frames that are not in order.
@@ -113,7 +125,7 @@ def track(
     tracker = Tracker(sequence.camera, grid or grid_of(sequence), settings)
     tracker.begin(sequence.depth(int(arrived[0])), poses[0])
     for n, k in enumerate(arrived.tolist()[1:], 1):
-        pose = tracker.follow(sequence.depth(k))
+        pose = tracker.follow(sequence.depth(k), smooth(k) if smooth else None)
         if pose is None or _jumped(poses[n - 1], pose, truth[n - 1], truth[n], settings):
             return Track(arrived, poses, errors[0], errors[1], k, tracker.model)
         poses[n], errors[:, n] = pose, difference(pose, truth[n])
@@ -149,7 +161,6 @@ class Tracker:
         model_camera = camera.every(self._stride)
         self._model_lens = lens_of(model_camera)
         shape, model_shape = ((c.height, c.width, 3) for c in (camera, model_camera))
-        self._smooth = np.zeros(shape[:2], np.float32)
         self._points, self._normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self._seen, self._seen_normals = np.zeros(model_shape, np.float32), np.zeros(model_shape, np.float32)
         self._jacobian, self._sums = np.zeros(8), np.zeros((8, 8))
@@ -159,9 +170,12 @@ class Tracker:
         """The first frame, at a known pose."""
         self._fuse(depth, pose)
 
-    def follow(self, depth: Depth) -> Float64Array | None:
-        """The pose of the next frame, camera to world, which is then part of the model; None if it is lost."""
-        pose = self._aligned(depth)
+    def follow(self, depth: Depth, smooth: Depth | None = None) -> Float64Array | None:
+        """The pose of the next frame, camera to world, which is then part of the model; None if it is lost.
+
+        ``smooth``: `smoothed` of it, where that is known.
+        """
+        pose = self._aligned(smoothed(depth) if smooth is None else smooth)
         if pose is not None:
             self._fuse(depth, pose)
         return pose
@@ -170,10 +184,9 @@ class Tracker:
         self.pose, self._hint = pose, np.ascontiguousarray(depth[:: self._stride, :: self._stride])
         self.model.add(depth, self._camera, pose, MOST_WEIGHT)
 
-    def _aligned(self, depth: Depth) -> Float64Array | None:
+    def _aligned(self, smooth: Depth) -> Float64Array | None:
         model, grid, lens, pose = self.model, self.model.grid, self._lens, self.pose
-        icp.smooth(depth, SMOOTH_RADIUS, SAME_SURFACE / 2, self._smooth)
-        icp.unproject(self._smooth, FAR_M, lens, self._points)
+        icp.unproject(smooth, FAR_M, lens, self._points)
         icp.orient(self._points, np.zeros(3), SAME_SURFACE, self._normals)
         tsdf.raycast(
             model.tsdf,

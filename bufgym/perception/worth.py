@@ -94,6 +94,31 @@ def mapping() -> Uplink:
     return Uplink(traces=shipped()["traces"], workload=film, scale=(SCALE,), value=motion_value())
 
 
+def coverage_of(frames: NDArray[np.int64]) -> float:
+    """The part of the scene that these frames have seen."""
+    return scene().coverage.share(frames)
+
+
+def least_followed(frames: NDArray[np.int64]) -> float:
+    """The least part of a frame that the one before it has seen.
+
+    From the recording's first frame to its last: who sends little must not seem to have lost little.
+    """
+    return views.least_overlap(scene().seen, np.union1d(frames, [0, FRAMES - 1]))
+
+
+def tracked_part(frames: NDArray[np.int64]) -> float:
+    """How far tracking gets along these frames, as a part of the recording."""
+    if not len(frames):
+        return 0.0
+    track = tracking.track(scene().film, frames, scene().grid)
+    reached = frames[~np.isnan(track.poses[:, 0, 0])]
+    return float(reached[-1] - frames[0]) / (FRAMES - 1)
+
+
+# --- the same as rewards ---------------------------------------------------------------------------------------------
+
+
 def _arrived(step: Any) -> NDArray[np.int64]:
     """int64[frames]: those that were transmitted, by their numbers."""
     n = len(step.log)
@@ -105,23 +130,16 @@ def _arrived(step: Any) -> NDArray[np.int64]:
 @reward_term("covered", unit="part of the scene", one_queue=True)
 def covered(step: Any, memory: Memory) -> float:
     """at the end, the part of the scene that the frames which arrived have seen (`bufgym/Mapping-v0`)"""
-    return scene().coverage.share(_arrived(step)) if step.ended else 0.0
+    return coverage_of(_arrived(step)) if step.ended else 0.0
 
 
 @reward_term("followed", unit="part of a frame", one_queue=True)
 def followed(step: Any, memory: Memory) -> float:
     """at the end, the least part of a frame that the one before it has seen: stands in for `tracked`"""
-    if not step.ended:
-        return 0.0
-    # From the recording's first frame to its last: who sends little must not seem to have lost little.
-    return views.least_overlap(scene().seen, np.union1d(_arrived(step), [0, FRAMES - 1]))
+    return least_followed(_arrived(step)) if step.ended else 0.0
 
 
 @reward_term("tracked", unit="part of the recording", one_queue=True)
 def tracked(step: Any, memory: Memory) -> float:
     """at the end, how far tracking gets along the frames that arrived (`bufgym/Mapping-v0`); some seconds"""
-    if not step.ended or not len(frames := _arrived(step)):
-        return 0.0
-    track = tracking.track(scene().film, frames, scene().grid)
-    reached = frames[~np.isnan(track.poses[:, 0, 0])]
-    return float(reached[-1] - frames[0]) / (FRAMES - 1)
+    return tracked_part(_arrived(step)) if step.ended else 0.0

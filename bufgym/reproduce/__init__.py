@@ -52,6 +52,14 @@ def _kind(name: str) -> Any:
     return importlib.import_module(f"bufgym.reproduce.{name.replace('-', '_')}").Reproduction
 
 
+def kept_under(out: Path | None, name: str, **options: Any) -> Figure:
+    """The figure ``name``; if it takes minutes, what is finished of it is kept in this folder."""
+    made = figure(name, **options)
+    if out is not None and getattr(made, "store", out) is None:
+        return figure(name, **options, store=out / STORE)
+    return made
+
+
 def run(name: str, out: Path | None = None, **options: Any) -> str:
     """Reproduce one figure; the text compares our numbers with the paper's.
 
@@ -60,9 +68,7 @@ def run(name: str, out: Path | None = None, **options: Any) -> str:
         out: folder for ``<name>.csv`` and ``<name>.png``, made where absent; None saves nothing.
         options: fields of that figure's ``Reproduction``, such as ``runs`` for afr-fig5.
     """
-    reproduction = figure(name, **options)
-    if out is not None and getattr(reproduction, "store", out) is None:
-        reproduction = figure(name, **options, store=out / STORE)
+    reproduction = kept_under(out, name, **options)
     rows = reproduction.simulate()
     lines = report(name, reproduction, rows)
     if out is not None:

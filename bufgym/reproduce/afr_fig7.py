@@ -120,8 +120,10 @@ class Reproduction(FrameFigure):
                     axes.plot(self.capacities, means, marker=marker, color=colour, markersize=4, label=label)
                 axes.set_xticks(self.capacities)
                 finish(axes, f"{recording}: {title}", xlabel="queue size L")
+            panels[2 * n + 1].sharey(panels[2 * n])
+            panels[2 * n].autoscale(axis="y")
         panels[0].set_ylabel("RMSE of the map, mm")
-        legend_below(figure, 4, panels[0])
+        legend_below(above, len(self.policies), panels[0])
         for part, recording in zip(below, self.recordings, strict=True):
             self._maps(part, recording)
 

@@ -86,7 +86,7 @@ class Reproduction(FrameFigure):
                 left.plot(aside, [0.0] * len(aside), "|", color=colour, markersize=5)  # so that 0 is seen, too
             left.set_xticks(ticks, [str(L) for L in self.capacities])
             finish(left, f"{recording}: tracking breaks", xlabel="queue size L", ylabel=f"runs of {self.offsets}")
-            left.set_ylim(0, self.offsets)
+            left.set_ylim(0, 1.04 * self.offsets)
             self._broken(right, recording, shown)
         legend_below(figure, 4, panels[0][0])
 

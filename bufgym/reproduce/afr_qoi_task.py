@@ -9,6 +9,7 @@ alone: it asks whether V tells policies apart, where the whole correlation may j
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from bufgym.reproduce.correlation import spearman_over
 from bufgym.reproduce.figure import COLOURS, finish, legend_below
-from bufgym.reproduce.frame_runs import FrameFigure
+from bufgym.reproduce.frame_runs import POLICIES, FrameFigure
 from bufgym.reproduce.rows import Rows, table
 
 MEASURES = {
@@ -41,14 +42,16 @@ ACROSS, WITHIN = "all runs", "within"
 class Reproduction(FrameFigure):
     """Correlation of each measure of information with each measure of the task, on each recording."""
 
-    SIZE_INCHES = (11.0, 4.2)
+    @cached_property
+    def runs(self) -> Rows:
+        """Those of Fig. 7 and 8."""
+        return self.play("map", "track")
 
     def simulate(self) -> Rows:
         """A row for each recording, measure and task; the runs themselves are in the figures of which they are."""
-        runs = self.play("map", "track")
         rows = Rows()
         for recording in self.recordings:
-            shown = runs.where(recording=recording)
+            shown = self.runs.where(recording=recording)
             offset = np.array(shown.column("k"), np.int64)
             cell = [(row["k"], row["L"]) for row in shown]
             for scope in (ACROSS, WITHIN):
@@ -80,6 +83,13 @@ class Reproduction(FrameFigure):
             for measure in MEASURES.values():
                 cells.append([measure, *(_spelled(shown.where(measure=measure, task=t)) for t in TASKS.values())])
             lines += [f"{recording}, {scope}: Spearman's correlation [95 %]", *table(cells), ""]
+        for recording in rows.distinct("recording"):
+            shown = self.runs.where(recording=recording)
+            lines += [f"{recording}, mean of all runs (of failures: their part):", *table(_means(shown)), ""]
+            for column in (*MEASURES, "rmse_mm"):
+                order = " > ".join(POLICIES[policy][0] for policy in ranked(shown, column))
+                lines.append(f"best first by {(MEASURES | TASKS)[column]}: {order}")
+            lines.append("")
         return lines[:-1]
 
     def claims(self, rows: Rows) -> dict[str, Any]:
@@ -100,12 +110,15 @@ class Reproduction(FrameFigure):
             "ranking": "; ".join(f"{task} on {where}: {text}" for (where, task), text in best.items()) or "unknown",
         }
 
+    def size_inches(self, rows: Rows) -> tuple[float, float]:
+        return 11.0, 3.7 * len(self.recordings) + 0.4
+
     def draw(self, rows: Rows, figure: Any) -> None:
         colours = (COLOURS["other"], COLOURS["afr"], COLOURS["random"], COLOURS["orange"], COLOURS["pink"])
         pairs = rows.distinct("recording", "scope")
-        panels = figure.subplots(1, len(pairs), squeeze=False, sharey=True)[0]
+        panels = figure.subplots(len(self.recordings), 2, squeeze=False, sharey=True)
         ticks = np.arange(len(TASKS))
-        for axes, (recording, scope) in zip(panels, pairs, strict=True):
+        for axes, (recording, scope) in zip(panels.flat, pairs, strict=True):
             for n, (measure, colour) in enumerate(zip(MEASURES.values(), colours, strict=True)):
                 shown = rows.where(recording=recording, scope=scope, measure=measure)
                 value, low, high = (shown.column(name) for name in ("spearman", "low", "high"))
@@ -114,9 +127,26 @@ class Reproduction(FrameFigure):
                 axes.plot(aside, value, "o", color=colour, markersize=5, label=measure)
             axes.axhline(0, color=".4", linewidth=0.8)
             axes.set_xticks(ticks, [text.replace(" ", "\n", 1) for text in TASKS.values()], fontsize=8)
-            finish(axes, f"{recording}, {scope}", ylim=(-1, 0.6))
-        panels[0].set_ylabel("Spearman's correlation (lower is better)")
-        legend_below(figure, 5, panels[0])
+            whose = "all runs" if scope == ACROSS else "policies at the same L and fade"
+            finish(axes, f"{recording}: {whose}", ylim=(-1, 0.6))
+        for axes in panels[:, 0]:
+            axes.set_ylabel("Spearman's correlation\n(lower is better)")
+        legend_below(figure, 5, panels[0, 0])
+
+
+def ranked(runs: Rows, column: str) -> list[str]:
+    """The policies by their mean over all runs, best first: the most of a measure, the least of what is bad."""
+    sign = -1 if column in MEASURES else 1
+    return sorted(runs.distinct("policy"), key=lambda policy: sign * runs.mean(column, policy=policy))
+
+
+def _means(runs: Rows) -> list[list[object]]:
+    """Of every policy, those with the best maps first."""
+    cells: list[list[object]] = [["policy", *MEASURES.values(), *TASKS.values()]]
+    for policy in ranked(runs, "rmse_mm"):
+        means = [f"{runs.mean(column, policy=policy):.3f}" for column in (*MEASURES, *TASKS)]
+        cells.append([POLICIES[policy][0], *means])
+    return cells
 
 
 def _less_mean(numbers: NDArray[np.float64], cell: list[Any]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -72,7 +72,12 @@ class Stage:
     @cached_property
     def tracked_reference(self) -> mapping.Map:
         """The map that tracking makes of all frames, drift included."""
-        return tracking.track(self.sequence, range(len(self.sequence)), self.grid).model
+        return tracking.track(self.sequence, range(len(self.sequence)), self.grid, smooth=self.smooth).model
+
+    @cached_property
+    def smooth(self) -> Callable[[int], depth_frames.Depth]:
+        """Each frame's depth as tracking smooths it: the same in every run."""
+        return functools.cache(lambda k: tracking.smoothed(self.sequence.depth(k)))
 
     @cached_property
     def similar(self) -> orb.OrbSimilarity:
@@ -107,7 +112,7 @@ class Stage:
     def tracked(self, kept: Sequence[int]) -> Row:
         """Where tracking along these frames breaks, and how far the map that it made till then is from that which it
         makes of all frames: both drift alike, so what differs is due to the frames that are missing."""
-        track = tracking.track(self.sequence, kept, self.grid)
+        track = tracking.track(self.sequence, kept, self.grid, smooth=self.smooth)
         found = errors(mapping.error(track.model, self.tracked_reference))
         row: Row = {"failed": track.failed, "failed_at": track.where}
         return row | {f"slam_{name}": number for name, number in found.items()}

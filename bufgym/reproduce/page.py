@@ -1,16 +1,17 @@
 """The page docs/claims.md: every sentence of the papers that we know of, the command that tests it, what comes out.
 
 ``bufgym reproduce --claims docs/claims.md --data DIR`` writes it. Without recordings the figures that need them are
-left as not checked.
+left as not checked. ``bufgym reproduce afr-fig7 --claims docs/claims.md`` renews the rows of one figure.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from bufgym.errors import BufgymError
-from bufgym.reproduce import FIGURES, TAKES_DATA, figure
+from bufgym.reproduce import FIGURES, TAKES_DATA, kept_under
 from bufgym.reproduce.figure import facts_of, source, statements
 
 PAPERS = {
@@ -40,8 +41,8 @@ with the folder of recordings; `make test` compares the rows marked † with wha
 """
 
 
-def claim_rows(name: str, **options: Any) -> list[str]:
-    """The rows of one section of ``afr.toml`` or ``robofleet.toml``, in Markdown.
+def claim_rows(name: str, out: Path | None = None, **options: Any) -> list[str]:
+    """The rows of one section of ``afr.toml`` or ``robofleet.toml``, in Markdown; ``out`` as in ``kept_under``.
 
     Raises:
         BufgymError: the figure cannot be made, such as without recordings.
@@ -49,7 +50,7 @@ def claim_rows(name: str, **options: Any) -> list[str]:
     texts = statements()[name]
     facts: dict[str, Any] = {}
     if name in FIGURES:
-        reproduction = figure(name, **options)
+        reproduction = kept_under(out, name, **options)
         facts = facts_of(reproduction, reproduction.simulate())
     command = f"`{name}`{' †' if texts.get('fast') else ''}" if name in FIGURES else ""
     lines = []
@@ -67,7 +68,11 @@ def claim_rows(name: str, **options: Any) -> list[str]:
     return lines
 
 
-def claims_page(data: Path | None = None) -> str:
+def _rows(name: str, data: Path | None, out: Path | None) -> list[str]:
+    return claim_rows(name, out, **({"data": data} if name in TAKES_DATA else {}))
+
+
+def claims_page(data: Path | None = None, out: Path | None = None) -> str:
     """The whole page; it runs every figure."""
     lines = [HEAD]
     for paper, title in PAPERS.items():
@@ -76,8 +81,25 @@ def claims_page(data: Path | None = None) -> str:
         for name in statements():
             if name.startswith(f"{paper}-"):
                 try:
-                    lines += claim_rows(name, **({"data": data} if name in TAKES_DATA else {}))
+                    lines += _rows(name, data, out)
                 except BufgymError as error:
                     lines.append(f"| | {FIGURES[name]} | `{name}` | | not checked | {error} |")
         lines.append("")
     return "\n".join(lines)
+
+
+def renewed(page: str, names: Iterable[str], data: Path | None = None, out: Path | None = None) -> str:
+    """The page with the rows of these figures made again; it runs no other.
+
+    Raises:
+        BufgymError: the page has no row of one of them.
+    """
+    lines = page.splitlines()
+    for name in names:
+        own = [n for n, line in enumerate(lines) if f"| `{name}` |" in line or f"| `{name}` † |" in line]
+        if not own:
+            raise BufgymError(
+                f"figure {name}: no row of it in the page of claims; without names the page is written whole"
+            )
+        lines[own[0] : own[-1] + 1] = _rows(name, data, out)
+    return "\n".join(lines) + "\n"

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from bufgym.errors import BufgymError
+from bufgym.kernel import JIT
+from bufgym.perception import rays
+from bufgym.perception.frames import encoded_bytes
 from bufgym.perception.mapping import grid_of
 from bufgym.perception.rays import BASELINE_M
 from bufgym.perception.room import FREE_M, Room, Scene, room
@@ -77,6 +80,29 @@ def test_a_seed_gives_the_same_frames_and_another_seed_others() -> None:
         assert first.grey(k).tobytes() == again.grey(k).tobytes()
     assert first.depth(0).tobytes() != other.depth(0).tobytes()
     assert first.depth(0).tobytes() != first.depth(1).tobytes()  # noise is drawn for every frame
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_seen_is_the_same_without_bounds(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Things are looked for within their bounds alone: every thing for every pixel finds nothing else."""
+    made = room(seed).reduced(8 if JIT else 40)
+    frames = range(0, 794, 60)
+    bounded = [made.rendered(k) for k in frames]
+
+    def nowhere(*arguments: object) -> None:
+        bounds = arguments[-1]
+        assert isinstance(bounds, np.ndarray)
+        bounds[:] = [-np.inf, np.inf, -np.inf, np.inf, -np.inf]
+
+    monkeypatch.setattr(rays, "bound", nowhere)
+    for k, (depth, grey) in zip(frames, bounded, strict=True):
+        everything = made.rendered(k)
+        assert depth.tobytes() == everything[0].tobytes() and grey.tobytes() == everything[1].tobytes()
+
+
+def test_a_frames_size_is_that_of_both_pictures_at_once() -> None:
+    made = room(0, frames=2)
+    assert made.reduced(4).size_bytes(1) == made.size_bytes(1) == encoded_bytes(made.depth(1), made.image(1))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -13,7 +13,7 @@ from bufgym.perception import icp
 from bufgym.perception.frames import Camera, Sequence
 from bufgym.perception.mapping import Grid, Map, fuse, lens_of
 from bufgym.perception.room import Room, room
-from bufgym.perception.tracking import Tracker, TrackingSettings, difference, track
+from bufgym.perception.tracking import Tracker, TrackingSettings, difference, smoothed, track
 from bufgym.perception.tsdf import raycast
 
 CAMERA = Camera(8, 6, 4.0, 4.0, 3.5, 2.5)
@@ -138,6 +138,22 @@ def test_it_follows_every_frame_and_fails_at_a_gap() -> None:
 def test_same_frames_same_track_bit_for_bit() -> None:
     first, again = (track(walk(), range(0, 20, 2)) for _ in range(2))
     assert first.poses.tobytes() == again.poses.tobytes()
+
+
+@pytest.mark.slow
+def test_smoothed_depths_that_are_kept_change_nothing() -> None:
+    """One run asks for those of all its frames but the first, and finds the same poses."""
+    asked: list[int] = []
+
+    def smooth(k: int) -> np.ndarray:
+        asked.append(k)
+        return smoothed(walk().depth(k))
+
+    plain, kept = track(walk(), range(0, 20, 2)), track(walk(), range(0, 20, 2), smooth=smooth)
+    assert asked == list(range(2, 20, 2))
+    assert kept.poses.tobytes() == plain.poses.tobytes() and kept.model.tsdf.tobytes() == plain.model.tsdf.tobytes()
+    again = track(walk(), range(0, 20, 2), smooth=lambda k: walk().depth(k))
+    assert again.poses.tobytes() != plain.poses.tobytes()  # what is given is what is used
 
 
 @pytest.mark.slow

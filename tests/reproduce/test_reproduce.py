@@ -137,6 +137,21 @@ def test_the_command_writes_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "(--data DIR)" in text and "| not checked |" in text
 
 
+def test_the_rows_of_one_figure_are_renewed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Fig. 4's row is made again, and those of figures that are not named stay, however old."""
+    page, old = tmp_path / "claims.md", "| place | an old sentence | `{}` | ours | not checked | |"
+    page.write_text(
+        "\n".join(["# Head", "", old.format("afr-fig4").replace("fig4`", "fig4` †"), old.format("afr-fig5")])
+    )
+    command = ["reproduce", "afr-fig4", "--claims", str(page), "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    assert page.read_text().splitlines() == ["# Head", "", *claim_rows("afr-fig4"), old.format("afr-fig5")]
+    assert main(["reproduce", "afr-fig6", *command[2:]]) == 2
+    assert "figure afr-fig6: no row of it in the page of claims" in capsys.readouterr().err
+
+
 def test_what_is_cited_is_in_the_references() -> None:
     keys = set(re.findall(r"^@\w+\{(\w+),", (CLAIMS.parent / "references.bib").read_text(encoding="utf-8"), re.M))
     texts = [CLAIMS, *(CLAIMS.parent.parent / "bufgym" / "reproduce").glob("*.py")]

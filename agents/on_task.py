@@ -1,0 +1,152 @@
+"""Does an agent that is rewarded by the robot's own task do it better? Evolution asks, on `bufgym/Mapping-v0`.
+
+    python -m agents.on_task
+
+A small slot scorer is evolved under each of three rewards: the information that arrives, by the motion of the camera
+(what every environment pays by default), `covered`, and `followed`, which stands in for `tracked` as that takes seconds
+an episode. All begin as the rule `min-motion-gap`, and are tested on links that none has seen, by what tracking and
+coverage really are.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.cma_es import Evolution
+from agents.objectives.objective import Objective, policy_of
+from agents.objectives.queue import start
+from agents.page import command, publish, table
+from agents.settings import MOTION
+from bufgym import policies
+from bufgym.benchmark.bootstrap import percentile_interval, stream, times_drawn
+from bufgym.benchmark.run import by_trace, draw
+from bufgym.perception import worth
+from bufgym.policies import Policy
+from bufgym.policies.learned import Weights
+from bufgym.sim import Senders
+
+TEST_LINKS = 2
+"""Of the shipped links the last so many are for tests alone."""
+PARTS, PART_EPISODES = 8, 24
+"""Training episodes come in so many parts of so many, one a generation in turn."""
+HIDDEN, SIGMA = 4, 0.3
+"""Hidden units of the scorer, and the search's first step size."""
+RIVALS = ("afr", "drop-oldest", "min-motion-gap", "learned-motion")
+RESAMPLES, CONFIDENCE = 2000, 0.95
+
+Frames = NDArray[np.int64]
+
+
+def information(frames: Frames) -> float:
+    """H of these frames by motion."""
+    scenario = worth.mapping()
+    x = scenario.workload.x if scenario.workload is not None else None
+    assert x is not None
+    return scenario.value.information(x[frames])
+
+
+REWARDS: Mapping[str, Callable[[Frames], float]] = {
+    "information": information,
+    "covered": worth.coverage_of,
+    "followed": worth.least_followed,
+}
+"""What agents are evolved by."""
+TESTED: Mapping[str, Callable[[Frames], float]] = {**REWARDS, "tracked": worth.tracked_part}
+"""What they are tested by."""
+
+
+class Episodes:
+    """Episodes of `bufgym/Mapping-v0` side by side, with a queue of L messages."""
+
+    def __init__(self, pairs: Sequence[tuple[int, int]], L: int) -> None:
+        """``pairs``: (link, seed) of each."""
+        scenario = worth.mapping()
+        links = by_trace(scenario)
+        self.episodes = [draw(links[link][1], seed) for link, seed in pairs]
+        self._senders = Senders(len(pairs), L, scenario.value, max_messages=scenario.max_messages)
+        self.decisions = len(pairs) * worth.FRAMES
+
+    def arrived(self, policy: Policy) -> list[Frames]:
+        """The frames that arrive in each episode."""
+        for i, episode in enumerate(self.episodes):
+            self._senders.load(i, episode)
+        self._senders.run(policy)
+        transmitted = np.asarray(self._senders.batch.log["transmitted_us"])[:, : worth.FRAMES]
+        return [np.flatnonzero(row >= 0) for row in transmitted]
+
+
+class Task(Objective):
+    """The mean of a reward over episodes of the links that are for training."""
+
+    name = "on-task"
+    best = max
+
+    def __init__(self, reward: str, L: int, seed: int) -> None:
+        self.reward = REWARDS[reward]
+        rng, links = np.random.default_rng(seed), len(worth.mapping().traces) - TEST_LINKS
+        self.training = [
+            [Episodes([(k % links, int(rng.integers(10**6))) for k in range(PART_EPISODES)], L)] for _ in range(PARTS)
+        ]
+
+    def start(self) -> Weights:
+        """The smallest merged gap of motion goes."""
+        return start(MOTION, HIDDEN, np.random.default_rng(0))
+
+    def measure(self, policy: Policy, episodes: Any, part: int | None = None) -> float:
+        return float(np.mean([self.reward(frames) for each in episodes for frames in each.arrived(policy)]))
+
+
+def evolved(reward: str, L: int, seed: int, generations: int) -> Policy:
+    """The agent after so many generations."""
+    task = Task(reward, L, seed)
+    state = Evolution.around(task.start(), SIGMA, seed)
+    for _ in range(generations):
+        state.generation(task)
+    return policy_of(task.name, state.agent)
+
+
+def tested(policy: Policy, episodes: Episodes) -> dict[str, NDArray[np.float64]]:
+    """Measure -> of each episode."""
+    arrived = episodes.arrived(policy)
+    return {name: np.array([measure(frames) for frames in arrived]) for name, measure in TESTED.items()}
+
+
+def main(
+    generations: int = 120, seeds: int = 2, capacity: int = 8, episodes: int = 16, out: Path | None = None
+) -> None:
+    """The table of what agents reach that were evolved by each reward, beside fixed policies.
+
+    Args:
+        generations: of 16 candidates each.
+        seeds: training seeds of each reward.
+        capacity: L, messages.
+        episodes: for the test, on the links that are for it.
+        out: the Markdown file; printed in any case.
+    """
+    links = len(worth.mapping().traces)
+    test = Episodes([(links - 1 - k % TEST_LINKS, k) for k in range(episodes)], capacity)
+    found = {name: [tested(policies.get(name), test)] for name in RIVALS}
+    for reward in REWARDS:
+        found[f"agent by {reward}"] = runs = []
+        for seed in range(seeds):
+            runs.append(tested(evolved(reward, capacity, seed, generations), test))
+            print(f"agent by {reward}, seed {seed}: tracked {runs[-1]['tracked'].mean():.3f}", file=sys.stderr)
+    base = found[RIVALS[0]][0]["tracked"]
+    weights = times_drawn(episodes, RESAMPLES, stream(0, "on task")) / episodes
+    rows = []
+    for name, runs in found.items():
+        means = [f"{np.mean([run[measure] for run in runs]):.3f}" for measure in TESTED]
+        ahead = percentile_interval(weights @ (np.mean([run["tracked"] for run in runs], axis=0) - base), CONFIDENCE)
+        spread = f"{ahead.value:+.3f} [{ahead.low:+.3f}, {ahead.high:+.3f}]" if name != RIVALS[0] else ""
+        rows.append([name, *means, spread])
+    publish("\n".join(table(["", *TESTED, "tracked, less AFR's [95 %]"], rows)), out)
+
+
+if __name__ == "__main__":
+    command(main)

@@ -1,0 +1,46 @@
+"""Agents that are evolved by the robot's own task: episodes, rewards, and the table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+for extra in ("sb3_contrib", "cma", "cv2", "rvl"):
+    pytest.importorskip(extra, reason="the extra [train] or [perception] is not installed")
+
+from agents import on_task  # noqa: E402  (these need the extras)
+from bufgym import policies, sim  # noqa: E402
+from bufgym.kernel import JIT  # noqa: E402
+from bufgym.perception import streams, worth  # noqa: E402
+
+pytestmark = pytest.mark.skipif(not JIT, reason="without compilation a room takes minutes to draw")
+
+
+def test_frames_arrive_as_they_do_one_episode_at_a_time() -> None:
+    side_by_side = on_task.Episodes([(0, 3), (5, 4)], 4)
+    arrived = side_by_side.arrived(policies.get("afr"))
+    for episode, frames in zip(side_by_side.episodes, arrived, strict=True):
+        assert frames.tolist() == list(streams.received("afr", episode, 4))
+        senders = sim.run(policies.get("afr"), [episode], 4, worth.mapping().value)
+        sender = senders.batch.senders[0]
+        assert on_task.information(frames) == pytest.approx(float(sender["delivered_gain"]) + 1)
+    assert arrived[0].tolist() != arrived[1].tolist()
+
+
+def test_a_task_is_the_mean_of_its_reward() -> None:
+    """Who sends all frames has seen all; training leaves the last two links alone."""
+    task = on_task.Task("covered", 4, 0)
+    episodes = task.training[0]
+    covered = [worth.coverage_of(frames) for frames in episodes[0].arrived(policies.get("drop-oldest"))]
+    assert task.measure(policies.get("drop-oldest"), episodes) == pytest.approx(np.mean(covered))
+    assert task.fitness(policies.get("drop-oldest"), 0, False) == -task.measure(policies.get("drop-oldest"), episodes)
+    trained_on = {each.link.trace.name for part in task.training for each in part[0].episodes}
+    assert trained_on.isdisjoint({trace.name for trace in worth.mapping().traces[-on_task.TEST_LINKS :]})
+
+
+def test_the_page_has_every_agent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(on_task, "PART_EPISODES", 2)
+    monkeypatch.setitem(on_task.TESTED, "tracked", worth.coverage_of)  # seconds an episode less
+    on_task.main(generations=2, seeds=1, capacity=2, episodes=2)
+    lines = [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()]
+    assert lines[2:] == [f"| {name}" for name in (*on_task.RIVALS, *(f"agent by {one}" for one in on_task.REWARDS))]
