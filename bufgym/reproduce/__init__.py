@@ -10,13 +10,14 @@ docs/references.bib.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from bufgym.errors import BufgymError
 from bufgym.reproduce.figure import Figure, report, save_picture, statements
-from bufgym.reproduce.on_sockets import apart
+from bufgym.reproduce.rows import Rows
 
 FIGURES: dict[str, str] = {name: texts["title"] for name, texts in statements().items() if "title" in texts}
 """Name -> what it shows, in one line."""
@@ -71,13 +72,18 @@ def run(name: str, out: Path | None = None, **options: Any) -> str:
     reproduction = kept_under(out, name, **options)
     rows = reproduction.simulate()
     lines = report(name, reproduction, rows)
-    if out is not None:
-        lines.append(f"numbers: {rows.save(out / f'{name}.csv')}")
-        try:
-            lines.append(f"figure: {save_picture(reproduction, rows, out / f'{name}.png')}")
-        except BufgymError as error:  # the numbers stand without it
-            lines.append(f"no figure: {error}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *_saved(reproduction, rows, out, name)])
+
+
+def _saved(reproduction: Figure, rows: Rows, out: Path | None, stem: str) -> Iterator[str]:
+    """Save the numbers and the picture in the folder, if there is one; where they are."""
+    if out is None:
+        return
+    yield f"numbers: {rows.save(out / f'{stem}.csv')}"
+    try:
+        yield f"figure: {save_picture(reproduction, rows, out / f'{stem}.png')}"
+    except BufgymError as error:  # the numbers stand without it
+        yield f"no figure: {error}"
 
 
 def run_live(name: str, out: Path | None = None, **options: Any) -> str:
@@ -88,6 +94,8 @@ def run_live(name: str, out: Path | None = None, **options: Any) -> str:
         out: folder for CSV and PNG of both; None saves nothing.
         options: as for ``run``, instead of those of ``LIVE``.
     """
+    from bufgym.reproduce.on_sockets import apart  # sockets, threads: not for those who only simulate
+
     if not hasattr(_kind(name), "LIVE"):
         raise BufgymError(f"{name}: is not played on sockets; robofleet-fig3 to robofleet-fig7 are")
     options = {**_kind(name).LIVE, **options}
@@ -96,10 +104,5 @@ def run_live(name: str, out: Path | None = None, **options: Any) -> str:
         reproduction = figure(name, **{**options, "live": speed})
         rows = played[medium] = reproduction.simulate()
         lines += ["", f"{medium.capitalize()}:", *reproduction.tables(rows)]
-        if out is not None:
-            lines.append(f"numbers: {rows.save(out / f'{name}-{medium}.csv')}")
-            try:
-                lines.append(f"figure: {save_picture(reproduction, rows, out / f'{name}-{medium}.png')}")
-            except BufgymError as error:  # the numbers stand without it
-                lines.append(f"no figure: {error}")
+        lines += _saved(reproduction, rows, out, f"{name}-{medium}")
     return "\n".join([*lines, "", "Live, beside simulated:", *apart(played["simulated"], played["live"])])

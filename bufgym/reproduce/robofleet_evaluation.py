@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from bufgym import policies, sim
 from bufgym.benchmark.run import draw
 from bufgym.model.topics import Topic
-from bufgym.reproduce import on_sockets
 from bufgym.reproduce.figure import COLOURS, Figure, at_least_0, several, whole
 from bufgym.reproduce.rows import Rows
 from bufgym.scenario import Client, Stream
@@ -181,6 +180,8 @@ def send(
     transmitted_us = np.asarray(senders.batch.log[0])[: sender["arrivals"]]["transmitted_us"]
     received_s = np.where(transmitted_us == sim.NEVER, np.nan, (transmitted_us + sender["propagation_us"]) / 1e6)
     if live:
+        from bufgym.reproduce import on_sockets  # not for those who only simulate
+
         received_s = on_sockets.received_s(policy, senders, client.value, live)
     consumer, topic = np.divmod(arrivals["topic"], len(streams))
     return Sent(topic, consumer, arrivals["arrival_us"] / 1e6, received_s)
