@@ -62,7 +62,7 @@ PARSED = {
     r"bufgym export .* --to c .*": "compiles for 40 s; tests/test_c_export.py",
     r"bufgym reproduce (afr-fig9|small-link)": "tests/reproduce/test_reproduce.py",
     r"bufgym reproduce afr-(fig7 afr-fig8|qoi-task|overlap) --data DIR": "minutes to an hour; test_frame_figures.py",
-    r"bufgym reproduce robofleet-fig3 --live": "two minutes; tests/live/test_figures_live.py",
+    r"bufgym reproduce robofleet-fig[3-7] --live": "a minute and more; tests/live/test_figures_live.py",
     r"bufgym trace fit .*": "needs recordings; tests/traces/test_fit.py",
     r"bufgym (perf( --peers| --profile| --queue)?|warmup)": "tests/benchmark/test_perf_and_play.py, test_warmup.py",
     r"bufgym (topics --policy-file|play|bench --policies .*seeds) .*": "tests/test_readme.py",

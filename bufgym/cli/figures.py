@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import itertools
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from bufgym.cli.options import Commands, columns, command
 from bufgym.errors import BufgymError
-from bufgym.files import read_whole
+from bufgym.files import read_whole, replaced
 
 
 def add(commands: Commands) -> None:
@@ -26,6 +31,8 @@ def add(commands: Commands) -> None:
 def _reproduce(options: argparse.Namespace) -> None:
     from bufgym import reproduce
 
+    if options.live and options.claims is not None:
+        raise BufgymError("--live: not with --claims, whose numbers are simulated")
     data = None if options.data is None else Path(options.data)
     if data is not None and not data.is_dir():
         raise BufgymError(f"{data}: no such folder (--data)")
@@ -50,7 +57,8 @@ def _claims(page: Path, names: list[str], out: Path, data: Path | None) -> None:
     from bufgym.reproduce.page import claims_page, renewed
 
     text = renewed(read_whole(page, 2**20).decode(), names, data, out) if names else claims_page(data, out)
-    page.write_text(text, encoding="utf-8")
+    with replaced(page) as temporary:
+        temporary.write_text(text, encoding="utf-8")
     print(f"claims: {page}")
 
 
@@ -63,9 +71,29 @@ def _text(name: str, out: Path, data: Path | None, *, named: bool, live: bool) -
         return f"{name}: left out; it needs a folder of recordings (--data DIR) with {needs}"
     try:
         if live:
-            return reproduce.run_live(name, out)
+            return reproduce.run_live(name, out, partial(_steps, name))
         return reproduce.run(name, out, **({"data": data} if name in reproduce.TAKES_DATA else {}))
     except BufgymError as error:
         if named:
             raise
         return f"{name}: left out: {error}"
+
+
+@contextmanager
+def _steps(name: str, runs: int, takes_s: float) -> Iterator[Callable[[], None]]:
+    """How far the live runs are: a bar, or lines where there is no terminal."""
+    from bufgym.benchmark.run import bar
+
+    def note(text: str) -> None:
+        print(f"{name}: {text}", file=sys.stderr, flush=True)
+
+    note(f"{runs} runs on real sockets take about {takes_s:.0f} s")
+    numbers = itertools.count(1)
+    with bar(runs, show=True) as advance:
+
+        def step() -> None:
+            advance(1)
+            if not sys.stderr.isatty():
+                note(f"run {next(numbers)} of {runs}")
+
+        yield step

@@ -105,11 +105,19 @@ def _demo(options: argparse.Namespace) -> None:
     import asyncio
     import webbrowser
 
-    from bufgym.relay import demo
+    from bufgym.policies import registry
+    from bufgym.relay import demo, policies
 
     (policy,) = loaded([options.policies or "robofleet"])[0]
 
     async def show() -> None:
+        shown, chosen = options.no_browser, registry.get(policy)
+        if options.port and not await asyncio.to_thread(policies.kept, chosen):
+            # Seen at once is worth more than fast: a while later the fast ones take over.
+            async with demo.uncompiled(_words(options)):
+                await asyncio.to_thread(policies.compiled, chosen)
+            shown = True
+            _say("compiled: the robots begin anew")
         folder = None if options.folder is None else Path(options.folder)
         async with (
             demo.running(options.robots, options.port, policy=policy, folder=folder, say=_say) as port,
@@ -119,11 +127,19 @@ def _demo(options: argparse.Namespace) -> None:
             print(f"{page}: {options.robots} robots; Ctrl-C ends it", flush=True)
             if options.foxglove is not None:
                 tasks.create_task(_bridge(f"ws://127.0.0.1:{port}", "foxglove", options.foxglove).run())
-            if not options.no_browser:
+            if not shown:
                 webbrowser.open(page)
             await asyncio.Event().wait()
 
     run_async(show())
+
+
+def _words(options: argparse.Namespace) -> list[str]:
+    """What a demonstration is called with that lasts only until this one begins: so it records nothing."""
+    words = ["--robots", str(options.robots), "--port", str(options.port)]
+    words += [] if options.policies is None else ["--policies", options.policies]
+    words += [] if options.foxglove is None else ["--foxglove", str(options.foxglove)]
+    return [*words, "--no-browser"] if options.no_browser else words
 
 
 def _foxglove(options: argparse.Namespace) -> None:

@@ -7,12 +7,13 @@ check the compiled code against its own text.
 
 from bufgym.kernel.announce import compile_silently
 from bufgym.kernel.arrays import at, item, prefetch, records, stretch, table
-from bufgym.kernel.cache import FOLDER, JIT
+from bufgym.kernel.cache import FOLDER, JIT, NotKeptError, only_kept
 from bufgym.kernel.compile import compile_for, direct, entry, interruptible, kernel, located
 
 __all__ = [
     "FOLDER",
     "JIT",
+    "NotKeptError",
     "at",
     "compile_for",
     "compile_silently",
@@ -22,6 +23,7 @@ __all__ = [
     "item",
     "kernel",
     "located",
+    "only_kept",
     "prefetch",
     "records",
     "stretch",

@@ -9,6 +9,8 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, cast
 
@@ -122,3 +124,27 @@ class Code(caching.FunctionCache):
         cache = cast(Any, self)
         name, stamp = f"{cache._impl.filename_base}-{role}", cache._impl.locator.get_source_stamp()
         cache._cache_file = cast(Any, CodeFiles)(cache._cache_path, name, stamp)
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        """What is kept of it; None if nothing is."""
+        kept = cast(Any, super()).load_overload(signature, target)
+        if kept is None and _ONLY_KEPT.get():
+            raise NotKeptError
+        return kept
+
+
+class NotKeptError(Exception):
+    """What was asked for must be compiled first."""
+
+
+_ONLY_KEPT: ContextVar[bool] = ContextVar("only_kept", default=False)
+
+
+@contextlib.contextmanager
+def only_kept() -> Iterator[None]:
+    """In this block nothing is compiled: what is not on disk raises a ``NotKeptError``."""
+    token = _ONLY_KEPT.set(True)
+    try:
+        yield
+    finally:
+        _ONLY_KEPT.reset(token)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -41,6 +42,7 @@ async def play(
     seed: int = 0,
     log: list[Record] | None = None,
     port: int = 0,
+    until_s: float = math.inf,
 ) -> list[Received]:
     """What arrives at the other end of real sockets, when ``policy`` sends the messages of ``episode`` over its link.
 
@@ -55,6 +57,7 @@ async def play(
         seed: of the draws of randomised policies.
         log: takes the queue's records.
         port: the receiver's (0: any); over MQTT the broker's.
+        until_s: after the last message, what arrives later is not waited for; in the episode's time.
     """
     if transport not in TRANSPORTS:
         raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
@@ -92,7 +95,10 @@ async def play(
             size_bytes = int(message["size_bytes"])
             queue.put(bodies[:size_bytes], size_bytes, float(message["x"]), int(message["topic"]))
         queue.close()
-        await sending
+        rest_s = began_s + until_s / speed - time.monotonic()
+        await asyncio.wait([sending], timeout=None if rest_s == math.inf else max(0.0, rest_s))
+        if sending.done():
+            sending.result()  # or its error
     finally:
         sending.cancel()
         await asyncio.gather(sending, return_exceptions=True)

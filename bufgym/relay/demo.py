@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterator, Callable
+import os
+import sys
+from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -91,6 +93,22 @@ async def running(
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+
+
+@contextlib.asynccontextmanager
+async def uncompiled(words: Sequence[str]) -> AsyncIterator[None]:
+    """``bufgym relay demo`` with these words in a process that compiles nothing, as long as the block takes.
+
+    So three robots and their relay take three quarters of a core.
+    """
+    command = [sys.executable, "-m", "bufgym", "relay", "demo", *words]
+    process = await asyncio.create_subprocess_exec(*command, env={**os.environ, "NUMBA_DISABLE_JIT": "1"})
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ProcessLookupError):  # it has ended by itself
+            process.terminate()
+        await process.wait()
 
 
 async def _compiled(policy: str | Policy, say: Callable[[str], None]) -> None:

@@ -10,10 +10,11 @@ docs/references.bib.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, cast
 
 from bufgym.errors import BufgymError
 from bufgym.reproduce.figure import Figure, report, save_picture, statements
@@ -86,12 +87,17 @@ def _saved(reproduction: Figure, rows: Rows, out: Path | None, stem: str) -> Ite
         yield f"no figure: {error}"
 
 
-def run_live(name: str, out: Path | None = None, **options: Any) -> str:
+Watch: TypeAlias = Callable[[int, float], AbstractContextManager[Callable[[], None]]]
+"""Called with how many runs are to be played and how long that takes, s; gives what is called after each."""
+
+
+def run_live(name: str, out: Path | None = None, watch: Watch | None = None, **options: Any) -> str:
     """One figure on real sockets and simulated, with the options of its ``LIVE``, which are fewer and shorter runs.
 
     Args:
         name: one of robofleet-fig3 to -fig7.
         out: folder for CSV and PNG of both; None saves nothing.
+        watch: who waits is told how far the live runs are.
         options: as for ``run``, instead of those of ``LIVE``.
     """
     from bufgym.reproduce.on_sockets import apart  # sockets, threads: not for those who only simulate
@@ -99,10 +105,16 @@ def run_live(name: str, out: Path | None = None, **options: Any) -> str:
     if not hasattr(_kind(name), "LIVE"):
         raise BufgymError(f"{name}: is not played on sockets; robofleet-fig3 to robofleet-fig7 are")
     options = {**_kind(name).LIVE, **options}
-    lines, played = [FIGURES[name], f"Options: {options}"], {}
-    for medium, speed in (("simulated", 0.0), ("live", options["live"])):
-        reproduction = figure(name, **{**options, "live": speed})
-        rows = played[medium] = reproduction.simulate()
+    simulated, live = (cast(Any, figure(name, **{**options, "live": speed})) for speed in (0.0, options["live"]))
+    lengths_s: list[float] = []
+    simulated.watchers.append(lengths_s.append)
+    played = [simulated.simulate()]
+    runs, takes_s = len(lengths_s), sum(lengths_s) / live.live
+    with nullcontext(lambda: None) if watch is None else watch(runs, takes_s) as step:
+        live.watchers.append(lambda _: step())
+        played.append(live.simulate())
+    lines = [FIGURES[name], f"Options: {options}"]
+    for medium, reproduction, rows in zip(("simulated", "live"), (simulated, live), played, strict=True):
         lines += ["", f"{medium.capitalize()}:", *reproduction.tables(rows)]
         lines += _saved(reproduction, rows, out, f"{name}-{medium}")
-    return "\n".join([*lines, "", "Live, beside simulated:", *apart(played["simulated"], played["live"])])
+    return "\n".join([*lines, "", "Live, beside simulated:", *apart(*played)])

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +22,20 @@ UNITS = ("_s", "_ms", "_hz")
 """Columns with these are compared."""
 
 
-def received_s(policy: Policy, senders: Senders, value: Value, speed: float) -> NDArray[np.float64]:
+def received_s(
+    policy: Policy, senders: Senders, value: Value, speed: float, until_s: float = math.inf
+) -> NDArray[np.float64]:
     """float64[messages]: when each message of the first sender arrived, NaN for never; ``senders`` has simulated them.
 
-    A program that awaits no acks sends the next message when the other end of its connection has the last.
+    A program that awaits no acks sends the next message when the other end of its connection has the last. What arrives
+    after ``until_s`` is not waited for.
     """
     episode = senders.episodes[0]
     assert episode is not None
     bounded = replace(policy, unbounded=False)  # there is room for all messages
     leaves: Leaves = "acked" if policy.client.awaits_acks else "sent"
-    came = asyncio.run(
-        play(bounded, episode, senders.capacity, value, topics=senders.topics, leaves=leaves, speed=speed)
-    )
+    settings: dict[str, Any] = {"topics": senders.topics, "leaves": leaves, "speed": speed, "until_s": until_s}
+    came = asyncio.run(play(bounded, episode, senders.capacity, value, **settings))
     times_s = np.full(len(episode.arrivals), np.nan)
     for message in came:
         times_s[message.seq] = message.received_ns / 1e9 * speed

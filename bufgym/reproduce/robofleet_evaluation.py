@@ -11,9 +11,11 @@ takes a silence as option), the bytes of pings and pongs, encoding time, and wha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,10 +154,12 @@ def send(
     queue_size: int = QUEUE_SIZE,
     consumers: int = 1,
     live: float = 0.0,
+    watched_s: float = math.inf,
 ) -> Sent:
     """What becomes of the streams' messages when one of ``PROGRAMS`` sends them; ``link`` begins with the first.
 
-    ``live``: they go over real sockets, so many times as fast; 0: they are simulated.
+    ``live``: they go over real sockets, so many times as fast; 0: they are simulated. ``watched_s``: what is received
+    later does not matter, and live it is not waited for.
     """
     program = PROGRAMS[name]
     rules: dict[str, Any] = {"no_drop": True} if program.all_no_drop else {}
@@ -182,7 +186,7 @@ def send(
     if live:
         from bufgym.reproduce import on_sockets  # not for those who only simulate
 
-        received_s = on_sockets.received_s(policy, senders, client.value, live)
+        received_s = on_sockets.received_s(policy, senders, client.value, live, watched_s)
     consumer, topic = np.divmod(arrivals["topic"], len(streams))
     return Sent(topic, consumer, arrivals["arrival_us"] / 1e6, received_s)
 
@@ -209,13 +213,50 @@ class ClientFigure(Figure):
         "duration_s": above_0,
     }
 
+    @functools.cached_property
+    def watchers(self) -> list[Callable[[float], None]]:
+        """Each is told after each run how long it took, s."""
+        return []
+
+    @functools.cached_property
+    def played(self) -> dict[Any, Any]:
+        """See ``played_once``."""
+        return {}
+
     def send(
         self, name: str, streams: Sequence[Stream], link: Trace, duration_s: float, seed: int, **client: Any
     ) -> Sent:
         """``send`` with the figure's own options."""
         if "queue_size" not in client:
             client["queue_size"] = getattr(self, "queue_size", QUEUE_SIZE)
-        return send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, live=self.live, **client)
+        sent = send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, live=self.live, **client)
+        last_s = float(np.nanmax(sent.received_s, initial=duration_s))
+        for told in self.watchers:
+            told(min(last_s, max(duration_s, client.get("watched_s", math.inf))))
+        return sent
+
+
+Kind = TypeVar("Kind", bound=ClientFigure)
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def played_once(
+    run: Callable[Concatenate[Kind, Arguments], Result],
+) -> Callable[Concatenate[Kind, Arguments], Result]:
+    """A run of a figure, which live takes its time: who asks for the same one again, such as a picture, is given it."""
+
+    @functools.wraps(run)
+    def once(figure: Kind, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+        if not figure.live:
+            return run(figure, *arguments, **named)
+        key = arguments, tuple(named.items())
+        if key not in figure.played:
+            figure.played[key] = run(figure, *arguments, **named)
+        result: Result = figure.played[key]
+        return result
+
+    return once
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import numpy as np
 
 from bufgym.errors import BufgymError
 from bufgym.reproduce.figure import COLOURS, at_least_0, finish, legend_below, several
-from bufgym.reproduce.robofleet_evaluation import MBIT, PROGRAMS, CloudFigure, Sent, stream
+from bufgym.reproduce.robofleet_evaluation import MBIT, PROGRAMS, CloudFigure, Sent, played_once, stream
 from bufgym.reproduce.rows import Rows, table
 from bufgym.scenario.checks import above_0
 from bufgym.traces import Trace
@@ -63,7 +63,7 @@ class Reproduction(CloudFigure):
         "silence_s": at_least_0,
         "factor": above_0,
     }
-    LIVE = {"dropouts_s": (5, 10), "links_mbit_per_s": (12,), "kinds": ("PointCloud2",), "runs": 1, "live": 5.0}
+    LIVE = {"dropouts_s": (2, 4), "links_mbit_per_s": (6,), "kinds": ("CompressedImage",), "runs": 1, "live": 4.0}
     SIZE_INCHES = (11.0, 4.8)
 
     def __post_init__(self) -> None:
@@ -75,6 +75,7 @@ class Reproduction(CloudFigure):
         if self.shown_s is not None and self.shown_s not in self.dropouts_s:
             raise BufgymError(f"shown_s = {self.shown_s!r}: must be one of dropouts_s")
 
+    @played_once
     def run(self, kind: str, mbit: float, dropout_s: float, name: str, seed: int) -> tuple[float, Sent]:
         """(when the link goes away, what became of the messages) for one dropout."""
         away_s = BEFORE_S + float(np.random.default_rng(seed).random()) / RATES_HZ[kind]

@@ -38,7 +38,16 @@ class Reproduction(CloudFigure):
     stay_s: float = 5.0
     """How long it then stays, and messages still come."""
     RULES = {"from_mbit_per_s": above_0, "to_mbit_per_s": above_0, "fall_s": above_0, "stay_s": at_least_0}
-    LIVE = {"runs": 1, "live": 1.0}
+    LIVE = {
+        "rate_hz": 5.0,
+        "points": 5_000,
+        "from_mbit_per_s": 25.0,
+        "to_mbit_per_s": 1.0,
+        "stay_s": 3.0,
+        "runs": 1,
+        "live": 1.0,
+    }
+    """A quarter of the bytes a second, over a quarter of the link."""
     SIZE_INCHES = (7.5, 5.8)
 
     def __post_init__(self) -> None:
@@ -60,7 +69,7 @@ class Reproduction(CloudFigure):
         streams = (stream("PointCloud2", self.rate_hz, points=self.points),)
         rows = Rows()
         for name, seed in product(SENDERS, range(self.runs)):
-            received = self.send(name, streams, link, self.until_s, seed).received
+            received = self.send(name, streams, link, self.until_s, seed, watched_s=math.ceil(self.until_s)).received
             for second in range(math.ceil(self.until_s)):
                 within = (second <= received.received_s) & (received.received_s < second + 1)
                 latency_s = received.latency_s[within]

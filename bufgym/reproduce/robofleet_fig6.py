@@ -41,7 +41,7 @@ class Reproduction(ClientFigure):
     duration_s: float = 60.0
     """How long is published."""
 
-    LIVE = {"points": (4_000,), "max_consumers": 4, "queue_sizes": (10,), "duration_s": 20.0, "runs": 1, "live": 2.0}
+    LIVE = {"points": (4_000,), "max_consumers": 4, "queue_sizes": (10,), "duration_s": 6.0, "runs": 1, "live": 1.0}
     RULES = {"points": several(whole(1, 10**7)), "max_consumers": whole(2, 100)}
 
     def simulate(self) -> Rows:
@@ -52,7 +52,8 @@ class Reproduction(ClientFigure):
             self.points, range(1, self.max_consumers + 1), senders, range(self.runs)
         ):
             topic = stream("PointCloud2", self.rate_hz, points=points)
-            sent = self.send(name, (topic,), link, self.duration_s, seed, queue_size=queue, consumers=n)
+            settings = {"queue_size": queue, "consumers": n, "watched_s": self.duration_s}
+            sent = self.send(name, (topic,), link, self.duration_s, seed, **settings)
             in_time = sent.received_s <= self.duration_s
             latency_s = sent.latency_s[in_time]
             label = f"native ROS, queue of {queue}" if name == "ros-native" else PROGRAMS[name].label.split(",")[0]
@@ -123,7 +124,7 @@ class Reproduction(ClientFigure):
         }
 
     def size_inches(self, rows: Rows) -> tuple[float, float]:
-        return 4.4 * len(self.points) + 0.4, 4.2
+        return max(5.6, 4.4 * len(self.points) + 0.4), 4.2  # the legend's width is the least
 
     def draw(self, rows: Rows, figure: Any) -> None:
         panels = figure.subplots(1, len(self.points), squeeze=False)[0]

@@ -18,7 +18,17 @@ import numpy as np
 
 from bufgym.errors import BufgymError
 from bufgym.reproduce.figure import COLOURS, finish, legend_below, several, whole
-from bufgym.reproduce.robofleet_evaluation import BYTES, MBIT, PROGRAMS, QUEUE_SIZE, ClientFigure, Sent, p95, stream
+from bufgym.reproduce.robofleet_evaluation import (
+    BYTES,
+    MBIT,
+    PROGRAMS,
+    QUEUE_SIZE,
+    ClientFigure,
+    Sent,
+    p95,
+    played_once,
+    stream,
+)
 from bufgym.reproduce.rows import Row, Rows, table
 from bufgym.scenario.checks import above_0
 from bufgym.traces import Trace
@@ -74,10 +84,11 @@ class Reproduction(ClientFigure):
     LIVE = {
         "bad_mbit_per_s": (1.0,),
         "image_priorities": (1.0,),
-        "bad_from": 100,
-        "after_s": 40.0,
+        "bad_from": 50,
+        "bad_s": 15.0,
+        "after_s": 25.0,
         "runs": 1,
-        "live": 4.0,
+        "live": 2.0,
     }
     SIZE_INCHES = (8.0, 7.2)
 
@@ -97,6 +108,7 @@ class Reproduction(ClientFigure):
         from_s = self.bad_from / COUNTED_HZ
         return from_s, from_s + self.bad_s
 
+    @played_once
     def run(self, bad: float, name: str, image_priority: float, seed: int) -> Sent:
         """What became of the messages of one drive through the zone."""
         rates = ((self.zone_s[0], self.good_mbit_per_s), (self.bad_s, bad), (self.after_s, self.good_mbit_per_s))

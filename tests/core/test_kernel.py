@@ -90,6 +90,23 @@ def test_what_is_not_announced(tmp_path: Path, before: str) -> None:
 
 
 @needs_compilation
+def test_who_wants_only_what_is_kept_compiles_nothing(tmp_path: Path) -> None:
+    asked = """
+import sys
+from bufgym.kernel import NotKeptError, only_kept
+try:
+    with only_kept():
+        print(double(21))
+except NotKeptError:
+    print(double(21))
+    print("compiled", file=sys.stderr)
+"""
+    (tmp_path / "tale.py").write_text(TALE.format(before="").replace("print(double(21))", asked))
+    assert run(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == "compiled\n"
+    assert run(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
+
+
+@needs_compilation
 def test_where_no_folder_can_be_written_a_temporary_one_serves(tmp_path: Path) -> None:
     nowhere = "import os; os.environ.pop('NUMBA_CACHE_DIR', None); os.access = lambda *_: False"
     done = run(tmp_path, before=nowhere, TMPDIR=str(tmp_path))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from cli_cases import fails
 
+from bufgym.cli import main
 from bufgym.kernel import JIT
 from bufgym.reproduce import figure, run_live
 
@@ -26,7 +29,18 @@ compiled = pytest.mark.skipif(not JIT, reason="uncompiled, decisions take as lon
 @pytest.mark.parametrize("name", SMALL)
 def test_each_is_played_live(name: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    text = run_live(name, tmp_path, **SMALL[name])
+    expected, steps = list[tuple[int, float]](), list[int]()
+
+    @contextmanager
+    def watch(runs: int, takes_s: float) -> Iterator[Callable[[], None]]:
+        expected.append((runs, takes_s))
+        yield lambda: steps.append(1)
+
+    text = run_live(name, tmp_path, watch, **SMALL[name])
+    ((runs, takes_s),) = expected
+    assert len(steps) == runs  # a picture of runs that were played plays none again
+    if name == "robofleet-fig6":  # one and two consumers, three programs, 1 s each: what comes later is not awaited
+        assert (runs, takes_s) == (6, 6.0)
     assert "Live, beside simulated:\n  " in text
     for medium in ("simulated", "live"):
         assert str(tmp_path / f"{name}-{medium}.csv") in text
@@ -45,6 +59,21 @@ def test_on_an_easy_link_nothing_is_dropped_live_either() -> None:
     # No sooner than the link carries them, and half a round trip later: 64 ms and 225 ms, and 5 ms.
     least_ms = {row["sender"]: 230.0 if row["sender"] == "rosbridge" else 69.0 for row in rows}
     assert all(row["latency_ms"] > 0.9 * least_ms[row["sender"]] for row in rows)
+
+
+@compiled
+def test_the_command_says_how_far_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from bufgym.reproduce.robofleet_fig5 import Reproduction
+
+    monkeypatch.setattr(Reproduction, "LIVE", {**Reproduction.LIVE, **SMALL["robofleet-fig5"], "live": 4.0})
+    assert main(["reproduce", "robofleet-fig5", "--live", "--out", str(tmp_path)]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("robofleet-fig5: ")]
+    assert told == [
+        "robofleet-fig5: 4 runs on real sockets take about 2 s",  # 2 s, four programs, four times as fast
+        *(f"robofleet-fig5: run {k} of 4" for k in (1, 2, 3, 4)),
+    ]
 
 
 def test_others_are_not(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

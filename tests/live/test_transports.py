@@ -60,6 +60,13 @@ def test_on_sockets_as_in_the_simulator(transport: str, request: pytest.FixtureR
     assert played.outcome.qoi == V.information([message.x for message in came])
 
 
+def test_what_comes_too_late_is_not_awaited() -> None:
+    """The link carries 10 kB in 0.1 s and then nothing: of two messages of 6 kB the second never comes."""
+    link = Link(Trace.steps([(0.1, 100_000), (1.0, 0)], after="stop"))
+    came = live(Episode(messages(np.array([0, 1000]), 6_000), link), until_s=0.5)
+    assert [message.seq for message in came] == [0]
+
+
 def test_what_the_systems_buffers_hide_is_lost() -> None:
     """With default buffers the system takes megabytes at once, which no policy can drop any more.
 

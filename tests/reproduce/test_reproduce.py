@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli_cases import fails
 
 from bufgym.cli import main
 from bufgym.errors import BufgymError
@@ -150,6 +151,22 @@ def test_the_rows_of_one_figure_are_renewed(
     assert page.read_text().splitlines() == ["# Head", "", *claim_rows("afr-fig4"), old.format("afr-fig5")]
     assert main(["reproduce", "afr-fig6", *command[2:]]) == 2
     assert "figure afr-fig6: no row of it in the page of claims" in capsys.readouterr().err
+
+
+def test_a_page_that_cannot_be_written_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from bufgym.reproduce import page
+
+    file = tmp_path / "claims.md"
+    file.write_text("what was known")
+    monkeypatch.setattr(page, "claims_page", lambda data, out: "new, and no text \udc80")
+    with pytest.raises(UnicodeEncodeError):
+        main(["reproduce", "--claims", str(file)])
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("claims.md", "what was known")]
+
+
+def test_claims_are_not_made_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["reproduce", "robofleet-fig3", "--live", "--claims", str(tmp_path / "claims.md")]
+    fails(command, "--live: not with --claims, whose numbers are simulated", capsys)
 
 
 def test_what_is_cited_is_in_the_references() -> None:
