@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import math
 import os
+import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
@@ -103,11 +104,25 @@ async def uncompiled(words: Sequence[str]) -> AsyncIterator[None]:
     """
     command = [sys.executable, "-m", "bufgym", "relay", "demo", *words]
     process = await asyncio.create_subprocess_exec(*command, env={**os.environ, "NUMBA_DISABLE_JIT": "1"})
+
+    def end() -> None:
+        with contextlib.suppress(ProcessLookupError):  # it has ended by itself
+            process.terminate()
+
+    def end_both() -> None:
+        end()
+        loop.remove_signal_handler(signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    loop = asyncio.get_running_loop()
+    with contextlib.suppress(NotImplementedError):  # Windows
+        loop.add_signal_handler(signal.SIGTERM, end_both)
     try:
         yield
     finally:
-        with contextlib.suppress(ProcessLookupError):  # it has ended by itself
-            process.terminate()
+        with contextlib.suppress(NotImplementedError):
+            loop.remove_signal_handler(signal.SIGTERM)
+        end()
         await process.wait()
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
 import urllib.request
 from collections.abc import AsyncIterator
 from typing import Any
@@ -52,9 +54,13 @@ def test_the_page_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch
     run(story)
 
 
-def test_uncompiled_robots_are_seen_until_the_compiled_take_over() -> None:
+def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+        return int(free.getsockname()[1])
+
+
+def test_uncompiled_robots_are_seen_until_the_compiled_take_over() -> None:
+    port = free_port()
 
     async def story() -> None:
         topics: asyncio.Queue[str] = asyncio.Queue()
@@ -70,6 +76,41 @@ def test_uncompiled_robots_are_seen_until_the_compiled_take_over() -> None:
         socket.create_server(("127.0.0.1", port)).close()  # the place is free
 
     run(story)
+
+
+UNTIL_KILLED = """
+import asyncio, sys
+from bufgym.relay import demo
+
+async def show():
+    async with demo.uncompiled(["--robots", "1", "--port", sys.argv[1], "--no-browser"]):
+        await asyncio.sleep(60)
+
+asyncio.run(show())
+"""
+
+
+def test_who_is_told_to_end_leaves_no_robots_behind() -> None:
+    port = free_port()
+
+    def there() -> bool:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=5).close()
+        except OSError:
+            return False
+        return True
+
+    def wait_until(wanted: bool) -> None:
+        until_s = time.monotonic() + 30
+        while there() != wanted:
+            assert time.monotonic() < until_s
+            time.sleep(0.1)
+
+    with subprocess.Popen([sys.executable, "-c", UNTIL_KILLED, str(port)]) as process:
+        wait_until(True)
+        process.terminate()
+        assert process.wait(30) == -signal.SIGTERM
+    wait_until(False)
 
 
 def test_the_command_shows_them_while_another_process_compiles(
