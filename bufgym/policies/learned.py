@@ -12,10 +12,11 @@ A second scorer over the same fields, with hidden layers of its own, may decide 
 (``STILL``): thinning a queue that nothing leaves, for an unknown time, is a different task from keeping up with a slow
 link.
 
-An agent may leave to others what they do better, as can be told on board (``shortcuts``). Where V is straight and then
-flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and no plan is better, however long an
-interruption is. It does so on a steady link too, where motion is uneven: the queue is sent as it stands, there is no
-trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``).
+An agent may leave to others what they do better, as can be told on board (``shortcuts``). What scores highest goes with
+room too, where the link could not have sent it in time (``thinning``). The rest is for agents that see motion. Where V
+is straight and then flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and no plan is better,
+however long an interruption is. On a steady link the smallest motion gap goes: the queue is sent as it stands, there is
+no trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``).
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
@@ -56,6 +57,7 @@ from bufgym.policies.scoring import (
     unpack,
 )
 from bufgym.policies.small_queue import NONE, NUMBERS, packed, planned
+from bufgym.policies.thinning import MESSAGES, MOTION, spare, thinned_motion_gap
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 
@@ -69,28 +71,18 @@ TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
 STILL = 0.07
 """The link stands still while its service ratio (running mean of departures per arrival) is below this: from the first
 arrival of an interruption on (1/16), or 41 arrivals after a link that kept up has stopped."""
-FLOWS, FEW, STEADY = 0.18, 1, 0.01
-"""A link is steady while at least so many messages leave per arrival (or L is so small that the queue is soon sent
-all the same), and its rates over 0.1 s and 0.5 s differ from that over 2 s by no more than twice this share, and this
-share, of it."""
-_greedy_qoi = kernel(greedy_qoi)
+STEADY = 0.01
+"""A link is steady while its rates over 0.1 s and 0.5 s differ from that over 2 s by no more than twice this share, and
+this share, of it."""
+_greedy_qoi, _thinned_motion_gap = kernel(greedy_qoi), kernel(thinned_motion_gap)
 
 
 @kernel
-def steady(buffer: Buffer, arrival: Arrival) -> bool:
-    """Whether the link carries messages at one and the same rate, while the scene does not move evenly.
-
-    Where it does, the even spacing is best, and the scorer is nearer to that.
-    """
-    moved = arrival.x - buffer.dequeued_x
-    step = arrival.x - buffer.previous_x
-    if abs(step * (arrival.seq - buffer.dequeued_seq) - moved) <= STEADY * moved:
-        return False
+def steady(buffer: Buffer) -> bool:
+    """Whether the link carries messages at one and the same rate."""
     mean = buffer.long_rate_bytes_per_s
     near = abs(buffer.medium_rate_bytes_per_s - mean) <= STEADY * mean
-    level = near and abs(buffer.short_rate_bytes_per_s - mean) <= 2 * STEADY * mean
-    flows = buffer.service_ratio >= FLOWS or buffer.capacity <= FEW
-    return bool(level and mean > 0 and buffer.drained_us > 0 and flows)
+    return bool(near and abs(buffer.short_rate_bytes_per_s - mean) <= 2 * STEADY * mean and mean > 0)
 
 
 @kernel
@@ -98,10 +90,13 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The decision that scores highest."""
     s, L = len(buffer.slots), buffer.capacity
     still, end = buffer.service_ratio < STILL, len(buffer.parameters)
-    if buffer.parameters[0] > 0:
+    measured_in = int(buffer.parameters[0])
+    if measured_in == MOTION:
         end -= NUMBERS
-        if straight(buffer.v) or steady(buffer, arrival):
+        if straight(buffer.v):
             return _greedy_qoi(buffer, arrival, memory)
+        if not still and buffer.drained_us > 0 and steady(buffer):
+            return _thinned_motion_gap(buffer, arrival, memory)
         if still and buffer.drained_bytes == 0:
             plan = planned(buffer, arrival, buffer.parameters[end:])
             if plan != NONE:
@@ -127,6 +122,8 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         if dropped > best:
             best, decision = dropped, k if k < s else REJECT
     if has_space(buffer, arrival):
+        if measured_in > 0 and not still and spare(buffer, arrival, decision, measured_in):
+            return decision
         common = begin(scorer, KEEP, scratch)
         if score(scorer, KEEP, common, L, scratch) >= best:
             decision = ACCEPT
@@ -155,14 +152,15 @@ class Weights(ScorerWeights):
     still: Weights | None = None
     """Decides while the link stands still, from the same fields; None: these weights do."""
     shortcuts: bool = False
-    """Whether ``greedy-qoi`` and exact plans decide where they do better."""
+    """Whether others decide where they do better, and queues are thinned to the link: see the module's text."""
 
     def parameters(self) -> NDArray[np.float64]:
-        """As the policy reads them: whether there are shortcuts, this scorer, the one for a link that stands still,
-        the shortcuts' plans."""
+        """As the policy reads them: what the shortcuts measure gaps in (0: there are none), this scorer, the one for a
+        link that stands still, the shortcuts' plans."""
         scorers = [self] if self.still is None else [self, self.still]
-        plans = [packed()] if self.shortcuts else []
-        return np.concatenate([[float(self.shortcuts)], *(scorer.pack(scorer.mix) for scorer in scorers), *plans])
+        measured_in = self.shortcuts * (MOTION if "motion_merged" in self.fields else MESSAGES)
+        plans = [packed()] if measured_in == MOTION else []
+        return np.concatenate([[float(measured_in)], *(scorer.pack(scorer.mix) for scorer in scorers), *plans])
 
     def reading(self, fields: tuple[str, ...]) -> Weights:
         """The same decisions by weights that read these fields too: what is new counts nothing."""
