@@ -128,7 +128,7 @@ class Reproduction(FrameFigure):
             axes.axhline(0, color=".4", linewidth=0.8)
             axes.set_xticks(ticks, [text.replace(" ", "\n", 1) for text in TASKS.values()], fontsize=8)
             whose = "all runs" if scope == ACROSS else "policies at the same L and fade"
-            finish(axes, f"{recording}: {whose}", ylim=(-1, 0.6))
+            finish(axes, f"{recording}: {whose}", ylim=(-1, 0.4))
         for axes in panels[:, 0]:
             axes.set_ylabel("Spearman's correlation\n(lower is better)")
         legend_below(figure, 5, panels[0, 0])
