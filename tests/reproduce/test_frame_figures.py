@@ -169,6 +169,26 @@ def test_policies_are_ranked_by_their_means() -> None:
     assert afr_qoi_task.ranked(rows, "rmse_mm") == ["random", "afr"]
 
 
+def test_the_claims_of_qoi_and_task() -> None:
+    """Time tells failures a little better than motion, which is in motion's interval; overlap tells nothing."""
+    found = {"time": (-0.74, -0.8, -0.7), "motion": (-0.72, -0.76, -0.66), "overlap": (0.1, -0.1, 0.3)}
+    rows = Rows(
+        {"recording": "room", "scope": scope, "measure": measure, "task": task}
+        | dict(zip(("spearman", "low", "high"), numbers, strict=True))
+        for scope in (afr_qoi_task.ACROSS, afr_qoi_task.WITHIN)
+        for measure, numbers in found.items()
+        for task in ("map error", "tracking failure")
+    )
+    figure = afr_qoi_task.Reproduction()
+    object.__setattr__(figure, "about", lambda: "")
+    facts = figure.claims(rows)
+    assert facts["best"] and facts["ranking"].startswith("map error on room: time (-0.74 [-0.80, -0.70]); tracking")
+    assert not facts["stands"] and facts["wrong"] == "overlap on room" and (facts["right"], facts["asked"]) == (2, 3)
+    for row in rows.where(measure="time"):
+        row["spearman"] = -0.77  # beyond it
+    assert not figure.claims(rows)["best"]
+
+
 # -------------------- on the made-up room
 
 SMALL: dict[str, Any] = {"frames": 40, "capacities": (2,), "offsets": 2, "jobs": 1}
