@@ -42,5 +42,10 @@ def test_the_page_has_every_agent(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     monkeypatch.setattr(on_task, "PART_EPISODES", 2)
     monkeypatch.setitem(on_task.TESTED, "tracked", worth.coverage_of)  # seconds an episode less
     on_task.main(generations=2, seeds=1, capacity=2, episodes=2)
-    lines = [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()]
-    assert lines[2:] == [f"| {name}" for name in (*on_task.RIVALS, *(f"agent by {one}" for one in on_task.REWARDS))]
+    lines = [line.removesuffix(" |").split(" | ") for line in capsys.readouterr().out.splitlines()]
+    agents = [f"agent by {one}" for one in on_task.REWARDS]
+    assert [line[0] for line in lines[2:]] == [f"| {name}" for name in (*on_task.RIVALS, *agents)]
+    cells = {line[0].removeprefix("| "): line[-2:] for line in lines[2:]}
+    # Against itself nothing is said; against each other the two say the same, with the other sign.
+    assert cells["afr"][0].strip() == cells["agent by information"][1].strip() == ""
+    assert float(cells["afr"][1].split(" ")[0]) == -float(cells["agent by information"][0].split(" ")[0])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
 from bufgym.perception import mapping
 from bufgym.reproduce.correlation import spearman
-from bufgym.reproduce.figure import finish, legend_below
+from bufgym.reproduce.figure import heat_table
 from bufgym.reproduce.frame_runs import POLICIES, FrameFigure, Setting
 from bufgym.reproduce.rows import Rows
 
@@ -98,7 +98,7 @@ class Reproduction(FrameFigure):
         return f"{spearman(np.array(moved), np.array(won)):+.2f}"
 
     def size_inches(self, rows: Rows) -> tuple[float, float]:
-        return 3.2 * max(2, len(self.shown)), 3.4 + 3.0 * len(self.recordings)
+        return 13.0, 0.9 + 0.28 * len(self.policies) + 4.6 * len(self.recordings)
 
     @property
     def shown(self) -> list[str]:
@@ -106,44 +106,49 @@ class Reproduction(FrameFigure):
         return [name for name in SHOWN if name in self.policies] or [self.policies[0]]
 
     def draw(self, rows: Rows, figure: Any) -> None:
-        heights = [3.4, *[3.0] * len(self.recordings)]
+        heights = [0.9 + 0.28 * len(self.policies), *[4.6] * len(self.recordings)]
         above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
-        panels = above.subplots(1, 2 * len(self.recordings), squeeze=False)[0]
+        panels = above.subplots(1, 2 * len(self.recordings), squeeze=False, sharey=True)[0]
         for n, recording in enumerate(self.recordings):
-            for axes, title, some in (
-                (panels[2 * n], "the paper's alignment", rows.where(k=0)),
-                (panels[2 * n + 1], f"sweep of {self.offsets}", rows),
-            ):
-                for policy in self.policies:
-                    label, colour, marker = POLICIES[policy]
-                    means = [some.mean("rmse_mm", recording=recording, policy=policy, L=L) for L in self.capacities]
-                    axes.plot(self.capacities, means, marker=marker, color=colour, markersize=4, label=label)
-                axes.set_xticks(self.capacities)
-                finish(axes, f"{recording}: {title}", xlabel="queue size L")
-            panels[2 * n + 1].sharey(panels[2 * n])
-            panels[2 * n].autoscale(axis="y")
-        panels[0].set_ylabel("RMSE of the map, mm")
-        legend_below(above, len(self.policies), panels[0])
+            of_both = [self._errors(some.where(recording=recording)) for some in (rows.where(k=0), rows)]
+            least, most = np.min(of_both), np.max(of_both)
+            titles = ("the paper's alignment", f"mean of the {self.offsets} of the sweep")
+            for axes, errors, title in zip(panels[2 * n :], of_both, titles, strict=False):
+                labels = [POLICIES[policy][0] for policy in self.policies]
+                columns = [*map(str, self.capacities), "mean"]
+                heat_table(axes, errors, ".2f", labels, columns, vmin=least, vmax=most + 0.25 * (most - least))
+                axes.axvline(len(self.capacities) - 0.5, color="white", linewidth=4)
+                axes.set_title(f"{recording}: {title}", loc="left", fontsize=10)
+                axes.set_xlabel("RMSE of the map in mm, by queue size L", fontsize=9)
         for part, recording in zip(below, self.recordings, strict=True):
             self._maps(part, recording)
 
+    def _errors(self, rows: Rows) -> NDArray[np.float64]:
+        """mm[policies, L and their mean]."""
+        by_L = [[rows.mean("rmse_mm", policy=policy, L=L) for L in self.capacities] for policy in self.policies]
+        return np.column_stack([by_L, np.mean(by_L, axis=1)])
+
     def _maps(self, part: Any, recording: str) -> None:
-        """The maps of some policies from above, each point by its distance to the map of all frames."""
+        """The maps of some policies from above, each point by its distance to the map of all frames: with true poses,
+        and with those that tracking finds, up to where it breaks."""
         on, L = self.stage(recording), min(self.capacities)
-        every = on.reference.points()
         limit_mm = 20.0
-        panels = part.subplots(1, len(self.shown), squeeze=False, sharex=True, sharey=True)[0]
-        for axes, policy in zip(panels, self.shown, strict=True):
-            made = mapping.fuse(on.sequence, self.kept(Setting(recording, 0, L, policy)), on.grid).points()
-            # From the reference's points to the map: what the map lacks is far from it, and shows.
-            far_mm = 1e3 * mapping.distances(every, made)
+        panels = part.subplots(2, len(self.shown), squeeze=False, sharex=True, sharey=True)
+        plan = _plan(on.reference.points())
+        for line, poses in zip(panels, ("true poses", "tracked"), strict=True):
+            every = (on.reference if poses == "true poses" else on.tracked_reference).points()
             few = _some(len(every))
-            colours = {"c": np.minimum(far_mm[few], limit_mm), "cmap": "inferno_r", "vmin": 0, "vmax": limit_mm}
-            painted = axes.scatter(*_plan(every)[few].T, s=0.4, **colours)
-            axes.set_aspect("equal")
-            axes.set_axis_off()
-            axes.set_title(f"{recording}, {POLICIES[policy][0]}, L = {L}", fontsize=9, loc="left")
-        part.colorbar(painted, ax=list(panels), label="distance to this map, mm", shrink=0.8)
+            for axes, policy in zip(line, self.shown, strict=True):
+                kept = self.kept(Setting(recording, 0, L, policy))
+                made = on.map_of(kept) if poses == "true poses" else on.track_of(kept).model
+                # From the reference's points to the map: what the map lacks is far from it, and shows.
+                far_mm = np.minimum(1e3 * mapping.distances(every[few], made.points()), limit_mm)
+                painted = axes.scatter(*(every[few] @ plan).T, s=0.4, c=far_mm, cmap="inferno_r", vmin=0, vmax=limit_mm)
+                axes.set_aspect("equal")
+                axes.set_axis_off()
+                axes.set_title(f"{recording}, {POLICIES[policy][0]}, {poses}", fontsize=9, loc="left")
+        label = f"distance to this map, mm (L = {L})"
+        part.colorbar(painted, ax=panels, label=label, shrink=0.7, ticks=[0, 10, 20], format="%d")
 
 
 def _some(points: int) -> NDArray[np.int64]:
@@ -152,7 +157,7 @@ def _some(points: int) -> NDArray[np.int64]:
 
 
 def _plan(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """float64[points, 2]: seen along the direction in which they spread least."""
-    flat = points - points.mean(axis=0)
-    _, _, axes = np.linalg.svd(flat[_some(len(flat))[:2000]], full_matrices=False)
-    return np.asarray(flat @ axes[:2].T, np.float64)
+    """float64[3, 2]: the two directions in which they spread most, those of the plan."""
+    some = points[_some(len(points))[:2000]]
+    _, _, axes = np.linalg.svd(some - some.mean(axis=0), full_matrices=False)
+    return np.asarray(axes[:2].T, np.float64)

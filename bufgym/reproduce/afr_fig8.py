@@ -7,17 +7,20 @@ repeats one alignment ten times; here a run has the fade at each of ten places, 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bufgym.reproduce.figure import finish, legend_below
+from bufgym.reproduce.figure import finish, heat_table
 from bufgym.reproduce.frame_runs import POLICIES, FrameFigure
 from bufgym.reproduce.rows import Rows, table
 
 THIRD = 1 / 3
 """Of Drop Oldest's failures AFR may have at most so many, by our own yardstick."""
+COLUMNS = 4
+"""Of the small pictures of the camera's way."""
 
 
 @dataclass(frozen=True)
@@ -43,67 +46,84 @@ class Reproduction(FrameFigure):
         return lines[:-1]
 
     def claims(self, rows: Rows) -> dict[str, Any]:
-        main = self.recordings[-1]
-        shown = rows.where(recording=main)
-        facts: dict[str, Any] = {"about": self.about(), "main": main, "offsets": self.offsets}
-        rates = {policy: failures(shown, policy=policy) / len(shown.where(policy=policy)) for policy in self.policies}
-        facts |= dict.fromkeys(("oldest_rate", "afr_rate"), math.nan)  # of policies that were not run
-        facts |= dict.fromkeys(("large_count", "afr_count", "oldest_count", "learned_count"), "not run")
-        large = Rows(row for row in shown if row["L"] > 10)
-        facts["rates"] = ", ".join(f"{policy} {rate:.0%}" for policy, rate in rates.items())
-        counts = {policy: failures(shown, policy=policy) for policy in self.policies}
-        facts["counts"] = ", ".join(f"{policy} {count}" for policy, count in counts.items())
-        facts["runs"] = len(shown.where(policy=self.policies[0]))
+        broken = {
+            name: {policy: failures(rows, recording=name, policy=policy) for policy in self.policies}
+            for name in self.recordings
+        }
+        runs = len(rows.where(recording=self.recordings[0], policy=self.policies[0]))
+        facts: dict[str, Any] = {"about": self.about(), "offsets": self.offsets, "runs": runs}
+        facts |= dict.fromkeys(("oldest_rate", "afr_rate", "large_count", "third_count", "learned_count"), "not run")
+        facts["counts"] = "; ".join(
+            f"{name}: " + ", ".join(f"{POLICIES[policy][0]} {count}" for policy, count in counts.items())
+            for name, counts in broken.items()
+        )
+
+        def each(spec: str, policies: tuple[str, ...], of: int = 1) -> str:
+            """Of every recording, what breaks under these policies."""
+            return "; ".join(
+                f"{name} {' against '.join(format(counts[policy] / of, spec) for policy in policies)}"
+                for name, counts in broken.items()
+            )
+
+        def everywhere(rule: Callable[[dict[str, int]], bool]) -> bool:
+            return all(rule(counts) for counts in broken.values())
+
         if {"afr", "drop-oldest"} <= set(self.policies):
-            facts["oldest"] = 0.4 <= rates["drop-oldest"] <= 0.6
-            facts["oldest_rate"], facts["afr_rate"] = rates["drop-oldest"], rates["afr"]
-            # Where Drop Oldest never fails, AFR has nothing to improve.
-            tested = counts["drop-oldest"] > 0
-            facts["afr"] = rates["afr"] < 0.1 if tested else None
-            facts["third"] = counts["afr"] <= THIRD * counts["drop-oldest"] if tested else None
-            facts["large"] = failures(large, policy="afr") == 0 if tested and large else None
+            facts["oldest"] = everywhere(lambda counts: 0.4 <= counts["drop-oldest"] / runs <= 0.6)
+            facts["oldest_rate"], facts["afr_rate"] = each(".0%", ("drop-oldest",), runs), each(".0%", ("afr",), runs)
+            facts["third_count"] = each(".0f", ("afr", "drop-oldest"))
+            large = Rows(row for row in rows if row["L"] > 10)
             facts["large_count"] = failures(large, policy="afr")
-            facts["afr_count"], facts["oldest_count"] = counts["afr"], counts["drop-oldest"]
+            facts |= dict.fromkeys(("afr", "third", "large"))
+            if everywhere(lambda counts: counts["drop-oldest"] > 0):  # else there is nothing that AFR could improve
+                facts["afr"] = everywhere(lambda counts: counts["afr"] / runs < 0.1)
+                facts["third"] = everywhere(lambda counts: counts["afr"] <= THIRD * counts["drop-oldest"])
+                facts["large"] = failures(large, policy="afr") == 0 if large else None
         if {"afr", "learned-motion"} <= set(self.policies):
-            facts["learned"] = counts["learned-motion"] <= counts["afr"]
-            facts["learned_count"] = counts["learned-motion"]
+            facts["learned"] = everywhere(lambda counts: counts["learned-motion"] <= counts["afr"])
+            facts["learned_count"] = each(".0f", ("learned-motion", "afr"))
         return facts
 
     def size_inches(self, rows: Rows) -> tuple[float, float]:
-        return 11.0, 3.6 * len(self.recordings) + 0.8
+        return 13.0, (0.4 + 1.7 * math.ceil(len(self.policies) / COLUMNS)) * len(self.recordings)
 
     def draw(self, rows: Rows, figure: Any) -> None:
-        panels = figure.subplots(len(self.recordings), 2, squeeze=False, width_ratios=[1, 1.2])
-        for (left, right), recording in zip(panels, self.recordings, strict=True):
+        parts = figure.subfigures(len(self.recordings), 2, squeeze=False, width_ratios=[1, 1.7])
+        for (left, right), recording in zip(parts, self.recordings, strict=True):
             shown = rows.where(recording=recording)
-            ticks = np.arange(len(self.capacities))
-            width = 0.85 / len(self.policies)
-            for n, policy in enumerate(self.policies):
-                label, colour, _ = POLICIES[policy]
-                counts = [failures(shown, policy=policy, L=L) for L in self.capacities]
-                aside = ticks + (n - (len(self.policies) - 1) / 2) * width
-                left.bar(aside, counts, width, color=colour, label=label)
-                left.plot(aside, [0.0] * len(aside), "|", color=colour, markersize=5)  # so that 0 is seen, too
-            left.set_xticks(ticks, [str(L) for L in self.capacities])
-            finish(left, f"{recording}: tracking breaks", xlabel="queue size L", ylabel=f"runs of {self.offsets}")
-            left.set_ylim(0, 1.04 * self.offsets)
+            self._counts(left.subplots(), recording, shown)
             self._broken(right, recording, shown)
-        legend_below(figure, 4, panels[0][0])
 
-    def _broken(self, axes: Any, recording: str, shown: Rows) -> None:
-        """The camera's way from above, and where tracking broke along it."""
+    def _counts(self, axes: Any, recording: str, shown: Rows) -> None:
+        """A field for each policy and L: how many runs break."""
+        counts = np.array([[failures(shown, policy=policy, L=L) for L in self.capacities] for policy in self.policies])
+        labels = [POLICIES[policy][0] for policy in self.policies]
+        heat_table(axes, counts, "d", labels, list(map(str, self.capacities)), vmin=0, vmax=1.25 * self.offsets)
+        sums = axes.secondary_yaxis("right")
+        sums.set_yticks(range(len(labels)), [f"{line.sum()} of {line.size * self.offsets}" for line in counts])
+        sums.tick_params(length=0)
+        sums.spines[:].set_visible(False)
+        axes.set_title(f"{recording}: runs of {self.offsets} in which tracking breaks", loc="left", fontsize=10)
+        axes.set_xlabel("queue size L")
+
+    def _broken(self, part: Any, recording: str, shown: Rows) -> None:
+        """The camera's way from above, for each policy, and where tracking broke along it."""
         places = self.stage(recording).whole.poses[:, :3, 3]
         across, along = np.argsort(np.ptp(places, axis=0))[:0:-1]
-        axes.plot(places[:, across], places[:, along], color=".75", linewidth=1, zorder=1)
-        axes.plot(*places[0, [across, along]], ">", color=".4", markersize=7, zorder=1)
-        for policy in self.policies:
-            _, colour, marker = POLICIES[policy]
-            where = [row["failed_at"] for row in shown.where(policy=policy) if row["failed"]]
-            if where:
-                at = places[where]
-                axes.plot(at[:, across], at[:, along], marker, color=colour, alpha=0.7, markersize=6)
-        finish(axes, f"{recording}: where it broke, all L (the way begins at the triangle)")
-        axes.set(xlabel="m", ylabel="m", aspect="equal")
+        lines = math.ceil(len(self.policies) / COLUMNS)
+        panels = part.subplots(lines, COLUMNS, squeeze=False, sharex=True, sharey=True).ravel()
+        for axes, policy in zip(panels, self.policies, strict=False):
+            axes.plot(places[:, across], places[:, along], color=".75", linewidth=1, zorder=1)
+            axes.plot(*places[0, [across, along]], ">", color=".4", markersize=5, zorder=1)
+            at = places[[row["failed_at"] for row in shown.where(policy=policy) if row["failed"]]]
+            axes.plot(at[:, across], at[:, along], "o", color=POLICIES[policy][1], alpha=0.5, markersize=5, mew=0)
+            finish(axes, POLICIES[policy][0], aspect="equal")
+            axes.tick_params(labelsize=8)
+        for axes in panels[len(self.policies) :]:
+            axes.remove()
+        for axes in panels[::COLUMNS]:
+            axes.set_ylabel("m", fontsize=8)
+        part.suptitle(f"{recording}: where, all L (the way begins at the triangle)", x=0.02, ha="left", fontsize=10)
 
 
 def failures(rows: Rows, **where: object) -> int:

@@ -184,6 +184,20 @@ def finish(axes: Any, title: str = "", **settings: Any) -> None:
     axes.set_axisbelow(True)
 
 
+def heat_table(
+    axes: Any, numbers: Any, spec: str, lines: Sequence[str], columns: Sequence[str], **limits: float
+) -> None:
+    """A table of numbers, each on a field that is the darker the larger it is: ``vmin`` white, ``vmax`` darkest."""
+    axes.imshow(numbers, cmap="OrRd", aspect="auto", **limits)
+    for n, line in enumerate(numbers):
+        for k, number in enumerate(line):
+            axes.text(k, n, format(number, spec), ha="center", va="center", fontsize=9)
+    axes.set_xticks(range(len(columns)), columns)
+    axes.set_yticks(range(len(lines)), lines)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+
+
 def legend_below(figure: Any, columns: int, axes: Any = None) -> None:
     """One legend below all panels, of all of them or of ``axes`` alone."""
     entries = () if axes is None else axes.get_legend_handles_labels()

@@ -67,12 +67,12 @@ class Stage:
     @cached_property
     def reference(self) -> mapping.Map:
         """The map of all frames."""
-        return mapping.fuse(self.sequence, range(len(self.sequence)), self.grid)
+        return self.map_of(range(len(self.sequence)))
 
     @cached_property
     def tracked_reference(self) -> mapping.Map:
         """The map that tracking makes of all frames, drift included."""
-        return tracking.track(self.sequence, range(len(self.sequence)), self.grid, smooth=self.smooth).model
+        return self.track_of(range(len(self.sequence))).model
 
     @cached_property
     def smooth(self) -> Callable[[int], depth_frames.Depth]:
@@ -105,14 +105,22 @@ class Stage:
         one = self.episode(trace, k)
         return streams.received(orb.orbbuf_by(self.similar, one) if policy == IMAGES else policy, one, L)
 
+    def map_of(self, kept: Sequence[int]) -> mapping.Map:
+        """That of these frames with their true poses."""
+        return mapping.fuse(self.sequence, kept, self.grid)
+
+    def track_of(self, kept: Sequence[int]) -> tracking.Track:
+        """Along these frames, with the map that it made till it broke."""
+        return tracking.track(self.sequence, kept, self.grid, smooth=self.smooth)
+
     def mapped(self, kept: Sequence[int]) -> Row:
         """Error of the map of these frames with their true poses."""
-        return errors(mapping.error(mapping.fuse(self.sequence, kept, self.grid), self.reference))
+        return errors(mapping.error(self.map_of(kept), self.reference))
 
     def tracked(self, kept: Sequence[int]) -> Row:
         """Where tracking along these frames breaks, and how far the map that it made till then is from that which it
         makes of all frames: both drift alike, so what differs is due to the frames that are missing."""
-        track = tracking.track(self.sequence, kept, self.grid, smooth=self.smooth)
+        track = self.track_of(kept)
         found = errors(mapping.error(track.model, self.tracked_reference))
         row: Row = {"failed": track.failed, "failed_at": track.where}
         return row | {f"slam_{name}": number for name, number in found.items()}

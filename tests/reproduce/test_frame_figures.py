@@ -11,6 +11,7 @@ import pytest
 from bufgym.kernel import JIT
 from bufgym.reproduce import STORE, afr_fig7, afr_fig8, afr_overlap, afr_qoi_task, frame_tasks, run
 from bufgym.reproduce.correlation import spearman, spearman_over
+from bufgym.reproduce.figure import heat_table
 from bufgym.reproduce.frame_runs import POLICIES, FrameFigure, Setting
 from bufgym.reproduce.frame_tasks import Store, Task, carry_out
 from bufgym.reproduce.rows import Rows
@@ -90,12 +91,51 @@ def test_the_claims_of_fig8_count_failures() -> None:
     fig8 = afr_fig8.Reproduction(policies=policies, capacities=(5, 15))
     object.__setattr__(fig8, "about", lambda: "")
     facts = fig8.claims(rows)
-    assert facts["counts"] == "drop-oldest 6, afr 2, learned-motion 1"
+    assert facts["counts"] == "room: Drop Oldest 6, AFR 2, learned-motion 1"
+    assert (facts["oldest_rate"], facts["afr_rate"]) == ("room 30%", "room 10%")
+    assert (facts["third_count"], facts["learned_count"]) == ("room 2 against 6", "room 1 against 2")
     assert facts["third"] and facts["large"] and facts["learned"]
     assert not facts["oldest"] and not facts["afr"]  # 30 % of the runs, and 10 %
     assert afr_fig8.failures(rows, policy="afr", L=15) == 0
     rows[30]["failed"] = True  # AFR's first at L = 15
     assert not fig8.claims(rows)["large"] and not fig8.claims(rows)["third"]
+
+
+def test_a_claim_of_fig8_holds_on_every_recording_or_not(tmp_path: Path) -> None:
+    """Of ten runs Drop Oldest breaks 5 on both; AFR 0 in the room and 1 on 7-Scenes, the agent none and 2."""
+    broken = {("room", "drop-oldest"): 5, ("7-scenes", "drop-oldest"): 5, ("7-scenes", "afr"): 1}
+    broken["7-scenes", "learned-motion"] = 2
+    policies = ("drop-oldest", "afr", "learned-motion")
+    rows = Rows(
+        {"recording": r, "k": k, "L": 5, "policy": p, "failed": k < broken.get((r, p), 0), "failed_at": None}
+        for r in ("room", "7-scenes")
+        for p in policies
+        for k in range(10)
+    )
+    (tmp_path / "rgbd_7scenes").mkdir()
+    fig8 = afr_fig8.Reproduction(policies=policies, capacities=(5,), data=tmp_path)
+    object.__setattr__(fig8, "about", lambda: "")
+    facts = fig8.claims(rows)
+    assert facts["oldest"] and facts["third"]
+    assert not facts["afr"] and facts["afr_rate"] == "room 0%; 7-scenes 10%"
+    assert not facts["learned"] and facts["learned_count"] == "room 0 against 0; 7-scenes 2 against 1"
+    assert facts["large"] is None  # no L above 10
+
+
+def test_a_heat_table_shows_every_number() -> None:
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    axes = figure.subplots()
+    heat_table(axes, np.array([[1.0, 2.5], [0.25, 4.0]]), ".1f", ["AFR", "Random"], ["5", "10"], vmin=0, vmax=4)
+    assert [text.get_text() for text in axes.texts] == ["1.0", "2.5", "0.2", "4.0"]
+    assert [text.get_position() for text in axes.texts] == [(0, 0), (1, 0), (0, 1), (1, 1)]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["AFR", "Random"]
+    assert axes.images[0].norm(4.0) == 1
+
+
+def test_maps_are_seen_along_the_direction_in_which_they_spread_least() -> None:
+    """A plate of 4 x 2 x 0.1 m: its plan has x and y."""
+    plate = np.random.default_rng(0).uniform(-1, 1, (5000, 3)) * [2, 1, 0.05]
+    assert np.abs(afr_fig7._plan(plate)) == pytest.approx(np.eye(3)[:, :2], abs=0.05)
 
 
 def test_the_best_frames_in_hindsight() -> None:
@@ -127,6 +167,26 @@ def test_policies_are_ranked_by_their_means() -> None:
     rows = Rows({"policy": name, "coverage": c, "rmse_mm": mm} for name, some in runs.items() for c, mm in some)
     assert afr_qoi_task.ranked(rows, "coverage") == ["afr", "random"]
     assert afr_qoi_task.ranked(rows, "rmse_mm") == ["random", "afr"]
+
+
+def test_the_claims_of_qoi_and_task() -> None:
+    """Time tells failures a little better than motion, which is in motion's interval; overlap tells nothing."""
+    found = {"time": (-0.74, -0.8, -0.7), "motion": (-0.72, -0.76, -0.66), "overlap": (0.1, -0.1, 0.3)}
+    rows = Rows(
+        {"recording": "room", "scope": scope, "measure": measure, "task": task}
+        | dict(zip(("spearman", "low", "high"), numbers, strict=True))
+        for scope in (afr_qoi_task.ACROSS, afr_qoi_task.WITHIN)
+        for measure, numbers in found.items()
+        for task in ("map error", "tracking failure")
+    )
+    figure = afr_qoi_task.Reproduction()
+    object.__setattr__(figure, "about", lambda: "")
+    facts = figure.claims(rows)
+    assert facts["best"] and facts["ranking"].startswith("map error on room: time (-0.74 [-0.80, -0.70]); tracking")
+    assert not facts["stands"] and facts["wrong"] == "overlap on room" and (facts["right"], facts["asked"]) == (2, 3)
+    for row in rows.where(measure="time"):
+        row["spearman"] = -0.77  # beyond it
+    assert not figure.claims(rows)["best"]
 
 
 # -------------------- on the made-up room
