@@ -159,7 +159,7 @@ def test_a_small_queue_follows_its_plan_in_c_too(L, tmp_path):
     made = sum(len(episode.arrivals) for episode in episodes)
     assert output(driver(tmp_path, text), tmp_path / "calls").split() == ["0", str(made), "0"]
     if JIT:  # and it is the plan that decides
-        other = text.replace("#define BUFGYM_MEASURED_IN 1", "#define BUFGYM_MEASURED_IN 0")
+        other = text.replace("#define BUFGYM_SHORTCUTS 1", "#define BUFGYM_SHORTCUTS 0")
         assert output(driver(tmp_path, other), tmp_path / "calls").split()[2] != "0"
 
 

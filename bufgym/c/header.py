@@ -26,12 +26,11 @@ SUPPORTED = tuple(sorted(path.stem for path in _RULES.glob("*.h")))
 _HELPERS = {
     "bufgym_gaps_of(": "gaps.h",
     "bufgym_smallest_time_gap(": "time_gap.h",
-    "bufgym_smallest_motion_gap(": "motion_gap.h",
-    "bufgym_thinned_motion_gap(": "thinning.h",
+    "bufgym_spare(": "thinning.h",
     "bufgym_thin(": "thin.h",
 }
 """Parts that rules share, each before those that call it."""
-_LEARNED = (*("gaps.h", "motion_gap.h", "thinning.h"), *("features.h", "greedy.h", "small_queue.h", "scorer.h"))
+_LEARNED = (*("gaps.h", "thinning.h"), *("features.h", "greedy.h", "small_queue.h", "scorer.h"))
 """Parts of a learned agent."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
@@ -87,6 +86,9 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "MOTION": thinning.MOTION,
         "MESSAGES": thinning.MESSAGES,
         "WAITING": thinning.WAITING,
+        "SOON_US": repr(thinning.SOON_US),
+        "FLOWS": repr(learned.FLOWS),
+        "FEW": learned.FEW,
         "STEADY": repr(learned.STEADY),
         "STRAIGHT": int(straight(value.array)),
         "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
@@ -114,8 +116,8 @@ def _scorers(policy: Policy) -> dict[str, Any]:
     """What a learned policy's C is filled with: its scorers, their scratch and the fields."""
     parameters, begin, networks = np.array(policy.weights), 1, len(learned.Weights.NETWORKS)
     entries: list[str] = []
-    measured_in = int(parameters[0])
-    end = len(parameters) - (measured_in == thinning.MOTION) * small_queue.NUMBERS
+    thins, shortcuts = divmod(int(parameters[0]), 2)
+    end = len(parameters) - shortcuts * small_queue.NUMBERS
     text, inputs, units = "", 1, 1
     while begin < end:
         scorer = getattr(unpack, "py_func", unpack)(parameters, begin, networks)
@@ -131,7 +133,8 @@ def _scorers(policy: Policy) -> dict[str, Any]:
         begin = end_of(parameters, begin, networks)
     text += "/* The second one decides while the link stands still. */\n" if len(entries) > 1 else ""
     text += f"#define BUFGYM_SCORERS {len(entries)}\n"
-    text += f"#define BUFGYM_MEASURED_IN {measured_in}\n"
+    text += f"#define BUFGYM_SHORTCUTS {shortcuts}\n"
+    text += f"#define BUFGYM_THINS {thins} /* what gaps are measured in; 0: not at all */\n"
     text += f"static const struct bufgym_scorer bufgym_scorers[] = {{\n{''.join(entries)}}};\n"
     scratch = (
         "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"
@@ -143,7 +146,7 @@ def _scorers(policy: Policy) -> dict[str, Any]:
         "SCRATCH": scratch,
         "SLOT_FIELDS": _enum(learned.SLOT_NAMES),
         "CONTEXT_FIELDS": _enum(learned.CONTEXT_NAMES),
-        "PLANS": _array("int64_t", "bufgym_plans", small_queue.packed() if measured_in == thinning.MOTION else [0]),
+        "PLANS": _array("int64_t", "bufgym_plans", small_queue.packed() if shortcuts else [0]),
     }
 
 

@@ -57,24 +57,18 @@ def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return smallest_time_gap(buffer, arrival, s)
 
 
-@kernel
-def smallest_motion_gap(buffer: Buffer, arrival: Arrival) -> int:
-    """The slot that would leave the smallest merged motion gap, REJECT for the newcomer; of equals the oldest."""
+@register("min-motion-gap", source="as min-gap, on the robot's odometry", compile=True)
+def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A full queue drops what leaves the smallest merged motion gap (newcomer included, ties to the oldest)."""
     s = len(buffer.slots)
+    if has_space(buffer, arrival):
+        return ACCEPT
     victim, smallest = 0, np.inf
     for k in range(s + 1):
         before, after = motion_gaps(buffer, arrival, k)
         if before + after < smallest:
             victim, smallest = k, before + after
     return victim if victim < s else REJECT
-
-
-@register("min-motion-gap", source="as min-gap, on the robot's odometry", compile=True)
-def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """A full queue drops what leaves the smallest merged motion gap (newcomer included, ties to the oldest)."""
-    if has_space(buffer, arrival):
-        return ACCEPT
-    return smallest_motion_gap(buffer, arrival)
 
 
 @register(
