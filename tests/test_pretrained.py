@@ -17,6 +17,7 @@ from bufgym.scenario import Interruption, suites
 from bufgym.sim import run
 
 SHIPPED = files.shipped("agents", "agents/pretrained", "*.safetensors")
+NAMED = files.shipped("agents/named", "agents/pretrained/named", "*.safetensors")
 
 
 def test_there_are_two_one_without_odometry() -> None:
@@ -86,6 +87,12 @@ def test_learned_link_is_learned_motion_thinned_to_the_link(tmp_path: Path) -> N
         return float(run(policies.get(name), episodes, 10, scenario.value).batch.senders["delivered_gain"].sum())
 
     assert qoi_of("afr") < qoi_of("learned-motion") < qoi_of("learned-link")
+
+
+def test_learned_ppo_is_named_and_tells_how_it_was_made() -> None:
+    _, told = weights.read(NAMED["learned-ppo"])
+    assert told["training"].startswith("python train.py --suite lte-v1,sustained-v1 --steps 1000000")
+    assert "learned-ppo" in policies.names(named_only=True) and policies.get("learned-ppo").named_only
 
 
 def test_the_same_weights_serve_a_buffer_nobody_trained_them_for() -> None:
