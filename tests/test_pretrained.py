@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from bufgym import files, policies
@@ -10,10 +12,12 @@ from bufgym.benchmark.tasks.bound import best
 from bufgym.model import qoi
 from bufgym.oracle import integer, law
 from bufgym.policies import weights
+from bufgym.sb3 import export
 from bufgym.scenario import Interruption, suites
 from bufgym.sim import run
 
 SHIPPED = files.shipped("agents", "agents/pretrained", "*.safetensors")
+NAMED = files.shipped("agents/named", "agents/pretrained/named", "*.safetensors")
 
 
 def test_there_are_two_one_without_odometry() -> None:
@@ -68,6 +72,27 @@ def test_motion_is_worth_something_on_fading_links() -> None:
 
     assert regret("learned-motion") < regret("afr")
     assert regret("learned-motion") < regret("learned-time")
+
+
+def test_learned_link_is_learned_motion_thinned_to_the_link(tmp_path: Path) -> None:
+    """As ``bufgym export --thins`` makes it; on a link of a quarter of the demand it loses less."""
+    made = export(SHIPPED["learned-motion"], tmp_path / "made.safetensors", name="made", thins=True)
+    link = policies.get("learned-link")
+    assert policies.load(made).weights == link.weights and link.reads_rate and link.named_only
+    assert "learned-link" not in policies.names() and "learned-link" in policies.names(named_only=True)
+    scenario = suites.get("sustained-v1").settings("test")["time-quarter"].scenario
+    episodes = [draw(one, seed=1) for _, one in by_trace(scenario)]
+
+    def qoi_of(name: str) -> float:
+        return float(run(policies.get(name), episodes, 10, scenario.value).batch.senders["delivered_gain"].sum())
+
+    assert qoi_of("afr") < qoi_of("learned-motion") < qoi_of("learned-link")
+
+
+def test_learned_ppo_is_named_and_tells_how_it_was_made() -> None:
+    _, told = weights.read(NAMED["learned-ppo"])
+    assert told["training"].startswith("python train.py --suite lte-v1,sustained-v1 --steps 1000000")
+    assert "learned-ppo" in policies.names(named_only=True) and policies.get("learned-ppo").named_only
 
 
 def test_the_same_weights_serve_a_buffer_nobody_trained_them_for() -> None:

@@ -17,15 +17,20 @@ from bufgym.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value, straight
 from bufgym.observe.queue import ROUNDING, TINY
-from bufgym.policies import Policy, learned, small_queue
+from bufgym.policies import Policy, learned, small_queue, thinning
 from bufgym.policies.scoring import end_of, unpack
 
 _PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
 SUPPORTED = tuple(sorted(path.stem for path in _RULES.glob("*.h")))
 """Names of the rules that can be exported; learned agents for one queue can be as well."""
-_HELPERS = {"bufgym_gaps_of(": "gaps.h", "bufgym_smallest_time_gap(": "time_gap.h", "bufgym_thin(": "thin.h"}
+_HELPERS = {
+    "bufgym_gaps_of(": "gaps.h",
+    "bufgym_smallest_time_gap(": "time_gap.h",
+    "bufgym_spare(": "thinning.h",
+    "bufgym_thin(": "thin.h",
+}
 """Parts that rules share, each before those that call it."""
-_LEARNED = ("features.h", "greedy.h", "small_queue.h", "scorer.h")
+_LEARNED = (*("gaps.h", "thinning.h"), *("features.h", "greedy.h", "small_queue.h", "scorer.h"))
 """Parts of a learned agent."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
@@ -78,6 +83,10 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "TINY": repr(TINY),
         "ROUNDING": repr(ROUNDING),
         "STILL": repr(learned.STILL),
+        "MOTION": thinning.MOTION,
+        "MESSAGES": thinning.MESSAGES,
+        "WAITING": thinning.WAITING,
+        "SOON_US": repr(thinning.SOON_US),
         "FLOWS": repr(learned.FLOWS),
         "FEW": learned.FEW,
         "STEADY": repr(learned.STEADY),
@@ -107,7 +116,7 @@ def _scorers(policy: Policy) -> dict[str, Any]:
     """What a learned policy's C is filled with: its scorers, their scratch and the fields."""
     parameters, begin, networks = np.array(policy.weights), 1, len(learned.Weights.NETWORKS)
     entries: list[str] = []
-    shortcuts = bool(parameters[0])
+    thins, shortcuts = divmod(int(parameters[0]), 2)
     end = len(parameters) - shortcuts * small_queue.NUMBERS
     text, inputs, units = "", 1, 1
     while begin < end:
@@ -124,7 +133,8 @@ def _scorers(policy: Policy) -> dict[str, Any]:
         begin = end_of(parameters, begin, networks)
     text += "/* The second one decides while the link stands still. */\n" if len(entries) > 1 else ""
     text += f"#define BUFGYM_SCORERS {len(entries)}\n"
-    text += f"#define BUFGYM_SHORTCUTS {int(shortcuts)}\n"
+    text += f"#define BUFGYM_SHORTCUTS {shortcuts}\n"
+    text += f"#define BUFGYM_THINS {thins} /* what gaps are measured in; 0: not at all */\n"
     text += f"static const struct bufgym_scorer bufgym_scorers[] = {{\n{''.join(entries)}}};\n"
     scratch = (
         "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"

@@ -8,7 +8,7 @@ from bufgym.cli.options import Commands, command, count, refuse
 from bufgym.errors import BufgymError
 
 _FOR_C = ("capacity", "max_bytes", "value")
-_FOR_WEIGHTS = ("name", "about", "shortcuts")
+_FOR_WEIGHTS = ("name", "about", "shortcuts", "thins")
 
 
 def add(commands: Commands) -> None:
@@ -29,6 +29,9 @@ def add(commands: Commands) -> None:
         action="store_true",
         default=None,
         help="leave to greedy-qoi and exact plans what they do better",
+    )
+    weights.add_argument(
+        "--thins", action="store_true", default=None, help="drop with room too what the link could not send in time"
     )
     c = parser.add_argument_group(
         "C (--to c)",
@@ -52,7 +55,8 @@ def _as_weights(options: argparse.Namespace, out: str) -> object:
     refuse(options, _FOR_C, "belongs to --to c")
     if options.name is None:
         raise BufgymError("--name must be given: the policy's name")
-    return export(options.model, out, name=options.name, about=options.about or "", shortcuts=bool(options.shortcuts))
+    flags = {flag: bool(getattr(options, flag)) for flag in ("shortcuts", "thins")}
+    return export(options.model, out, name=options.name, about=options.about or "", **flags)
 
 
 def _as_c(options: argparse.Namespace, out: str) -> object:

@@ -18,6 +18,7 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     robofleet,
     sampling,
     schedulers,
+    thinning,
     webrtc,
 )
 from bufgym.policies.registry import ClientSettings, Policy, get, names, register, register_later, runs_compiled
@@ -55,7 +56,7 @@ def _load_shipped(name: str, path: Path) -> Policy:
     return weights.load_shipped(name, path)
 
 
-for _folder, _for_topics in (("", False), ("/topics", True)):
+for _folder, _rules in (("", {}), ("/topics", {"for_topics": True}), ("/named", {"named_only": True})):
     _shipped = files.shipped(f"agents{_folder}", f"agents/pretrained{_folder}", "*.safetensors")
     for _name, _path in _shipped.items():
-        register_later(_name, functools.partial(_load_shipped, _name, _path), for_topics=_for_topics)
+        register_later(_name, functools.partial(_load_shipped, _name, _path), **_rules)

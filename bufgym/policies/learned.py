@@ -17,6 +17,9 @@ flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and
 interruption is. It does so on a steady link too, where motion is uneven: the queue is sent as it stands, there is no
 trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``).
 
+An agent may also thin its queue to the link (``thins``): what scores highest goes with room too, where the link could
+not send it in time (``thinning``); on a steady link it is the smallest gap that goes.
+
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
 
@@ -56,6 +59,7 @@ from bufgym.policies.scoring import (
     unpack,
 )
 from bufgym.policies.small_queue import NONE, NUMBERS, packed, planned
+from bufgym.policies.thinning import MESSAGES, MOTION, smallest_gap, spare
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 
@@ -70,15 +74,23 @@ STILL = 0.07
 """The link stands still while its service ratio (running mean of departures per arrival) is below this: from the first
 arrival of an interruption on (1/16), or 41 arrivals after a link that kept up has stopped."""
 FLOWS, FEW, STEADY = 0.18, 1, 0.01
-"""A link is steady while at least so many messages leave per arrival (or L is so small that the queue is soon sent
-all the same), and its rates over 0.1 s and 0.5 s differ from that over 2 s by no more than twice this share, and this
-share, of it."""
+"""A link is steady while its rates over 0.1 s and 0.5 s differ from that over 2 s by no more than twice ``STEADY``, and
+``STEADY``, of it. A queue is soon sent where at least ``FLOWS`` messages leave per arrival, or L is ``FEW``."""
 _greedy_qoi = kernel(greedy_qoi)
 
 
 @kernel
-def steady(buffer: Buffer, arrival: Arrival) -> bool:
-    """Whether the link carries messages at one and the same rate, while the scene does not move evenly.
+def steady(buffer: Buffer) -> bool:
+    """Whether the link carries messages at one and the same rate."""
+    mean = buffer.long_rate_bytes_per_s
+    near = abs(buffer.medium_rate_bytes_per_s - mean) <= STEADY * mean
+    level = near and abs(buffer.short_rate_bytes_per_s - mean) <= 2 * STEADY * mean
+    return bool(level and mean > 0 and buffer.drained_us > 0)
+
+
+@kernel
+def no_trap(buffer: Buffer, arrival: Arrival) -> bool:
+    """Whether a queue on a steady link is soon sent, while the scene does not move evenly.
 
     Where it does, the even spacing is best, and the scorer is nearer to that.
     """
@@ -86,11 +98,7 @@ def steady(buffer: Buffer, arrival: Arrival) -> bool:
     step = arrival.x - buffer.previous_x
     if abs(step * (arrival.seq - buffer.dequeued_seq) - moved) <= STEADY * moved:
         return False
-    mean = buffer.long_rate_bytes_per_s
-    near = abs(buffer.medium_rate_bytes_per_s - mean) <= STEADY * mean
-    level = near and abs(buffer.short_rate_bytes_per_s - mean) <= 2 * STEADY * mean
-    flows = buffer.service_ratio >= FLOWS or buffer.capacity <= FEW
-    return bool(level and mean > 0 and buffer.drained_us > 0 and flows)
+    return bool(buffer.service_ratio >= FLOWS or buffer.capacity <= FEW)
 
 
 @kernel
@@ -98,14 +106,22 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The decision that scores highest."""
     s, L = len(buffer.slots), buffer.capacity
     still, end = buffer.service_ratio < STILL, len(buffer.parameters)
-    if buffer.parameters[0] > 0:
+    leaves, thins = buffer.parameters[0] % 2 == 1, int(buffer.parameters[0]) // 2
+    if leaves:
         end -= NUMBERS
-        if straight(buffer.v) or steady(buffer, arrival):
+        if straight(buffer.v):
             return _greedy_qoi(buffer, arrival, memory)
-        if still and buffer.drained_bytes == 0:
-            plan = planned(buffer, arrival, buffer.parameters[end:])
-            if plan != NONE:
-                return plan
+    if not still and steady(buffer):
+        if thins and has_space(buffer, arrival):
+            smallest = smallest_gap(buffer, arrival, thins)
+            if spare(buffer, arrival, smallest, thins):
+                return smallest
+        if leaves and no_trap(buffer, arrival):
+            return _greedy_qoi(buffer, arrival, memory)
+    if leaves and still and buffer.drained_bytes == 0:
+        plan = planned(buffer, arrival, buffer.parameters[end:])
+        if plan != NONE:
+            return plan
     at = end_of(buffer.parameters, 1, 2) if still else 1
     scorer = unpack(buffer.parameters, at if at < end else 1, 2)
     scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
@@ -127,6 +143,8 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         if dropped > best:
             best, decision = dropped, k if k < s else REJECT
     if has_space(buffer, arrival):
+        if thins and not still and spare(buffer, arrival, decision, thins):
+            return decision
         common = begin(scorer, KEEP, scratch)
         if score(scorer, KEEP, common, L, scratch) >= best:
             decision = ACCEPT
@@ -156,13 +174,17 @@ class Weights(ScorerWeights):
     """Decides while the link stands still, from the same fields; None: these weights do."""
     shortcuts: bool = False
     """Whether ``greedy-qoi`` and exact plans decide where they do better."""
+    thins: bool = False
+    """Whether the queue is thinned to the link."""
 
     def parameters(self) -> NDArray[np.float64]:
-        """As the policy reads them: whether there are shortcuts, this scorer, the one for a link that stands still,
-        the shortcuts' plans."""
+        """As the policy reads them: 1 for shortcuts plus twice what gaps are measured in where it thins, this scorer,
+        the one for a link that stands still, the shortcuts' plans."""
         scorers = [self] if self.still is None else [self, self.still]
         plans = [packed()] if self.shortcuts else []
-        return np.concatenate([[float(self.shortcuts)], *(scorer.pack(scorer.mix) for scorer in scorers), *plans])
+        measured_in = MOTION if "motion_merged" in self.fields else MESSAGES
+        own = [float(self.shortcuts + 2 * self.thins * measured_in)]
+        return np.concatenate([own, *(scorer.pack(scorer.mix) for scorer in scorers), *plans])
 
     def reading(self, fields: tuple[str, ...]) -> Weights:
         """The same decisions by weights that read these fields too: what is new counts nothing."""
@@ -187,7 +209,7 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
         work=(scratch, SLOTS),
         source=source,
         about=summary,
-        reads_rate=weights.shortcuts or not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields),
+        reads_rate=weights.shortcuts or weights.thins or not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields),
         compile=True,
     )
 

@@ -239,7 +239,8 @@ class Later(NamedTuple):
     make: Callable[[], Policy]
     """Makes it."""
     for_topics: bool
-    """As in ``Policy``."""
+    """As in ``Policy``, as the next."""
+    named_only: bool
 
 
 _REGISTRY: dict[str, Policy | Later] = {}
@@ -279,9 +280,11 @@ def _registration(
 register = _registration(Policy)
 
 
-def register_later(name: str, make: Callable[[], Policy], *, for_topics: bool = False) -> None:
+def register_later(
+    name: str, make: Callable[[], Policy], *, for_topics: bool = False, named_only: bool = False
+) -> None:
     """Register a policy that is made when it is first asked for; an entry of this name stays as it is."""
-    _REGISTRY.setdefault(name, Later(make, for_topics))
+    _REGISTRY.setdefault(name, Later(make, for_topics, named_only))
 
 
 def names(*, for_topics: bool | None = None, named_only: bool = False) -> Iterator[str]:
@@ -291,8 +294,7 @@ def names(*, for_topics: bool | None = None, named_only: bool = False) -> Iterat
     """
     chosen = []
     for name, entry in _REGISTRY.items():
-        apart = isinstance(entry, Policy) and entry.named_only
-        if apart == named_only and for_topics in (None, entry.for_topics):
+        if entry.named_only == named_only and for_topics in (None, entry.for_topics):
             chosen.append(name)
     return iter(chosen)
 
@@ -314,7 +316,7 @@ def get(spec: str | Policy | OnArrival) -> Policy:
     _, numbers = named_settings("policy", spec)
     entry = _REGISTRY[name]
     if isinstance(entry, Later):
-        entry = _REGISTRY[name] = entry.make()
+        entry = _REGISTRY[name] = replace(entry.make(), named_only=entry.named_only)
     return entry.with_parameters(**numbers)
 
 

@@ -52,7 +52,9 @@ MAX_WIDTH = 256
 """Units of a hidden layer at most."""
 KEY = "bufgym"
 """The entry of the header's metadata that holds the JSON text."""
-WRITTEN = ("format", "fields", "observation", "bufgym", "sha256", "shortcuts")
+FLAGS = ("shortcuts", "thins")
+"""What an agent for one queue may do besides scoring."""
+WRITTEN = ("format", "fields", "observation", "bufgym", "sha256", "shortcuts", "thins")
 """Metadata that ``save`` itself writes."""
 MIX = "drop.mix"
 """A tensor that a file may lack."""
@@ -119,8 +121,8 @@ def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any
         "bufgym": __version__,
         "sha256": _sha256(weights.fields, tensors),
     }
-    if isinstance(weights, Weights) and weights.shortcuts:
-        metadata["shortcuts"] = True
+    if isinstance(weights, Weights):
+        metadata |= {flag: True for flag in FLAGS if getattr(weights, flag)}
     try:
         text = json.dumps(metadata, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -192,7 +194,9 @@ def _parsed(path: StrPath, data: bytes) -> tuple[Weights | TopicWeights, dict[st
         rule = "fields and tensors have another one: the file was changed"
         raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
     weights = _weights(kind, metadata["fields"], tensors)
-    return replace(weights, shortcuts=True) if metadata.get("shortcuts") else weights, metadata
+    if isinstance(weights, Weights):
+        weights = replace(weights, shortcuts=metadata.get("shortcuts", False), thins=metadata.get("thins", False))
+    return weights, metadata
 
 
 def _weights(kind: Any, fields: Sequence[str], tensors: Tensors) -> Any:
@@ -233,10 +237,11 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
     name, about, fields = metadata["name"], metadata.get("about", ""), metadata.get("fields")
     if not name or not name.isprintable() or any(c in ":,= " for c in name):
         refuse("name", "must be non-empty, without spaces, ':', ',' or '='")
-    if not isinstance(metadata.get("shortcuts", False), bool):
-        refuse("shortcuts", "must be true or false")
-    if metadata.get("shortcuts") and kind is TopicWeights:
-        refuse("shortcuts", "is for one queue, not for several topics")
+    for flag in FLAGS:
+        if not isinstance(metadata.get(flag, False), bool):
+            refuse(flag, "must be true or false")
+        if metadata.get(flag) and kind is TopicWeights:
+            refuse(flag, "is for one queue, not for several topics")
     if not isinstance(about, str) or not about.isprintable():
         refuse("about", "must be one line of text")
     if metadata["observation"] != observation_hash(kind is TopicWeights, fields if isinstance(fields, list) else ()):

@@ -29,7 +29,7 @@ CHECKED = (4, 8, 16, 32)
 """L of the regrets that are noted in the file."""
 
 
-def export(model: StrPath, out: StrPath, *, name: str, about: str = "", shortcuts: bool = False) -> Path:
+def export(model: StrPath, out: StrPath, *, name: str, about: str = "", **flags: bool) -> Path:
     """Write the agent in ``model`` to ``out``, with what its run's folder says of its training.
 
     Args:
@@ -39,20 +39,23 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "", shortcut
         out: the file to write, .safetensors.
         name: the policy's name.
         about: a sentence: what it was trained for.
-        shortcuts: leave to others what they do better (``bufgym.policies.learned``).
+        flags: of an agent for one queue (``bufgym.policies.learned``): ``shortcuts=True``, leave to others what they do
+            better; ``thins=True``, thin the queue to the link. Those that it has already stay.
 
     Raises:
-        BufgymError: ``model`` is no agent that scores slots, ``out`` cannot be written, or ``shortcuts`` are asked for
+        BufgymError: ``model`` is no agent that scores slots, ``out`` cannot be written, or a flag is asked for
             with several topics.
     """
     path = Path(model)
     weights = files.read_any(path)[0] if path.suffix == ".safetensors" else weights_of(read_policy(path))
     notes = {"name": name, "about": about, **run_notes(path)}
-    if shortcuts and isinstance(weights, TopicWeights):
-        raise BufgymError(f"{path}: a scheduler for several topics: shortcuts are for one queue")
+    asked = [flag for flag in files.FLAGS if flags.get(flag)]
+    if asked and isinstance(weights, TopicWeights):
+        raise BufgymError(f"{path}: a scheduler for several topics: {asked[0]} is for one queue")
     if isinstance(weights, TopicWeights):
         return files.save(out, weights, {**notes, "weighted_qoi": topics_qoi(learned_topics.policy(name, weights))})
-    weights = replace(weights, shortcuts=shortcuts or weights.shortcuts)
+    shortcuts, thins = ("shortcuts" in asked or weights.shortcuts), ("thins" in asked or weights.thins)
+    weights = replace(weights, shortcuts=shortcuts, thins=thins)
     return files.save(out, weights, {**notes, "regret": regrets(learned.policy(name, weights))})
 
 

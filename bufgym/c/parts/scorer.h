@@ -71,29 +71,44 @@ static inline double bufgym_score(
     return common + own;
 }
 
-/* Whether the link carries messages at one and the same rate, while the scene does not move evenly. */
-static inline int bufgym_steady(const struct bufgym_queue *q, const struct bufgym_message *arrival)
+/* Whether the link carries messages at one and the same rate. */
+static inline int bufgym_steady(const struct bufgym_queue *q)
+{
+    const double mean = 1e6 * q->long_rate, medium = 1e6 * q->medium_rate, short_mean = 1e6 * q->short_rate;
+    return fabs(medium - mean) <= @STEADY@ * mean && fabs(short_mean - mean) <= 2 * @STEADY@ * mean && mean > 0.0
+        && q->drained_us > 0;
+}
+
+/* Whether a queue on a steady link is soon sent, while the scene does not move evenly. */
+static inline int bufgym_no_trap(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     const double moved = arrival->x - q->dequeued_x, step = arrival->x - q->previous_x;
-    const double mean = 1e6 * q->long_rate, medium = 1e6 * q->medium_rate, short_mean = 1e6 * q->short_rate;
     if (fabs(step * (double)(arrival->seq - q->dequeued_seq) - moved) <= @STEADY@ * moved)
         return 0;
-    return fabs(medium - mean) <= @STEADY@ * mean && fabs(short_mean - mean) <= 2 * @STEADY@ * mean && mean > 0.0
-        && q->drained_us > 0 && (q->service_ratio >= @FLOWS@ || BUFGYM_CAPACITY <= @FEW@);
+    return q->service_ratio >= @FLOWS@ || BUFGYM_CAPACITY <= @FEW@;
 }
 
 /* The decision that scores highest; ties go to the oldest message. */
 static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
-    const struct bufgym_scorer *scorer = &bufgym_scorers[q->service_ratio < @STILL@ ? BUFGYM_SCORERS - 1 : 0];
+    const int still = q->service_ratio < @STILL@;
+    const struct bufgym_scorer *scorer = &bufgym_scorers[still ? BUFGYM_SCORERS - 1 : 0];
     const int s = q->occupancy, L = BUFGYM_CAPACITY;
     double common, best = -HUGE_VAL;
     int i, k, decision = BUFGYM_REJECT;
-    if (BUFGYM_SHORTCUTS) {
-        const int nothing_leaves = q->service_ratio < @STILL@ && q->drained_bytes == 0;
-        const int plan = nothing_leaves ? bufgym_planned(q, arrival) : BUFGYM_NO_PLAN;
-        if (@STRAIGHT@ || bufgym_steady(q, arrival))
+    if (BUFGYM_SHORTCUTS && @STRAIGHT@)
+        return bufgym_greedy(q, arrival);
+    if (!still && bufgym_steady(q)) {
+        if (BUFGYM_THINS && bufgym_has_space(q, arrival)) {
+            const int smallest = bufgym_smallest_gap(q, arrival, BUFGYM_THINS);
+            if (bufgym_spare(q, arrival, smallest, BUFGYM_THINS))
+                return smallest;
+        }
+        if (BUFGYM_SHORTCUTS && bufgym_no_trap(q, arrival))
             return bufgym_greedy(q, arrival);
+    }
+    if (BUFGYM_SHORTCUTS && still && q->drained_bytes == 0) {
+        const int plan = bufgym_planned(q, arrival);
         if (plan != BUFGYM_NO_PLAN)
             return plan;
     }
@@ -110,6 +125,8 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
         }
     }
     if (bufgym_has_space(q, arrival)) {
+        if (BUFGYM_THINS && !still && bufgym_spare(q, arrival, decision, BUFGYM_THINS))
+            return decision;
         common = bufgym_begin(q, scorer, BUFGYM_KEEP);
         if (bufgym_score(q, scorer, BUFGYM_KEEP, common, L) >= best)
             decision = BUFGYM_ACCEPT;

@@ -1,0 +1,129 @@
+"""A queue with room is thinned to what the link can send, and no further."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cases import VALUES, cases, newcomer, queue_of, same
+from hypothesis import given, settings
+from thinning_cases import least_gap, spared
+
+from bufgym import policies
+from bufgym.kernel import JIT
+from bufgym.model import qoi
+from bufgym.model.buffer import ACCEPT, REJECT
+from bufgym.model.link import Link
+from bufgym.policies import Policy
+from bufgym.policies.thinning import MESSAGES, MOTION, send_us, spare
+from bufgym.scenario import Episode, messages
+from bufgym.sim import run
+from bufgym.sim.metrics import outcome, received
+from bufgym.traces import Trace
+
+THINNED = policies.get("thinned-motion-gap")
+V = qoi.exponential(0.618)
+
+
+def waiting(*frames, sent=0, now=8, rate_bytes_per_s=7500.0, **known):
+    """Frames of 1000 bytes at 30 Hz are queued, frame ``sent`` is in the socket, frame ``now`` arrives; x is the number
+    of the frame. At 7500 bytes/s the link sends one frame every four."""
+    buffer = queue_of(len(frames), 8)
+    for name, scale in (("arrival_us", 33_333), ("x", 1.0), ("seq", 1)):
+        buffer.slots[name] = scale * np.array(frames)
+    arrival = newcomer()
+    arrival["arrival_us"], arrival["x"], arrival["seq"], arrival["size_bytes"] = 33_333 * now, now, now, 1000
+    seen = {
+        "busy": 1,
+        "backlog_bytes": 1000 * len(frames),
+        "dequeued_arrival_us": 33_333 * sent,
+        "dequeued_x": float(sent),
+        "dequeued_seq": sent,
+        "previous_x": now - 1.0,
+        "short_rate_bytes_per_s": 0.0,
+        "medium_rate_bytes_per_s": rate_bytes_per_s,
+        "long_rate_bytes_per_s": rate_bytes_per_s / 2,
+    }
+    return buffer._replace(**seen | known), arrival
+
+
+def test_the_fastest_rate_of_late_says_how_long_a_message_takes():
+    assert send_us(*waiting(2, 5)) == pytest.approx(1e6 * 1000 / 7500)
+    assert send_us(*waiting(2, 5, rate_bytes_per_s=0.0)) == 0
+
+
+@pytest.mark.parametrize("measured_in", [MOTION, MESSAGES])
+def test_what_goes_leaves_no_gap_longer_than_the_link_sends(measured_in):
+    # Sent: 0; queued: 2, 5, 7; frame 8 comes. Without 2 a gap of 5 frames is left, without 5 one of 5, without 7 of 3.
+    # The link sends one frame every four.
+    spares = [spare(*waiting(2, 5, 7), victim, measured_in) for victim in (0, 1, 2, REJECT)]
+    assert spares == [False, False, True, True]  # without 8: from 7 to 9, which is expected
+    slower = [spare(*waiting(2, 5, 7, rate_bytes_per_s=5900.0), victim, measured_in) for victim in (0, 1)]
+    assert slower == [True, True]  # one in 5.08
+
+
+def test_the_link_never_waits_for_what_was_spared():
+    assert not spare(*waiting(5, 7), REJECT, MOTION)  # two wait: three are wanted
+    assert not spare(*waiting(2, 5, 7, busy=0), 2, MOTION)
+    assert not spare(*waiting(2, 5, 7, rate_bytes_per_s=0.0), 2, MOTION)
+    assert not spare(*waiting(2, 5, 7, dequeued_arrival_us=8 * 33_333), 2, MOTION)  # all at one time: no pace
+
+
+def test_a_long_queue_on_a_slow_link_is_kept_for_the_end_of_the_stream():
+    assert spare(*waiting(2, 5, 7, capacity=29), 2, MOTION)  # 29 x 1000 / 7500 = 3.87 s
+    assert not spare(*waiting(2, 5, 7, capacity=31), 2, MOTION)  # 4.13 s: over SOON_US
+
+
+def test_where_room_is_left_the_smallest_gap_goes_or_nothing():
+    decide = THINNED.on_arrival
+    memory = np.zeros(0)
+    assert decide(*waiting(2, 5, 7), memory) == REJECT  # leaves 2; the others leave 5, 5 and 3
+    assert decide(*waiting(1, 2, 7), memory) == 0
+    assert decide(*waiting(4, 8, 12, now=16, previous_x=12.0), memory) == ACCEPT  # as the link sends
+
+
+def episode(share, frames=600):
+    """Frames of 1000 bytes at 30 Hz over a steady link of this share of them."""
+    us = np.array([0, 10_000_000], np.int64)
+    link = Link(Trace("steady", us, (us * share * 0.03).astype(np.int64)), 0, 0)
+    at = np.arange(frames)
+    return Episode(messages(at * 33_333, np.full(frames, 1000), at.astype(float)), link)
+
+
+@pytest.mark.parametrize("share", [1 / 4.1, 1 / 5.1])
+def test_on_a_steady_link_the_server_gets_an_even_stream(share):
+    """As far apart as the link sends, though twenty would find room; what is queued at the end is not counted."""
+    frames = 3000
+    one = episode(share, frames)
+    streams = []
+    for name in ("thinned-motion-gap", "min-motion-gap"):
+        senders = run(policies.get(name), [one], 20, V)
+        x = received(senders, 0)["x"]
+        streams.append(x[(x > 0.05 * frames) & (x < 0.9 * frames)])
+    thinned, full = streams
+    assert set(np.diff(thinned)) == {np.floor(1 / share)}
+    assert np.diff(full).max() > np.diff(thinned).max()
+
+
+def test_a_link_that_keeps_up_loses_nothing():
+    assert outcome(run(THINNED, [episode(1.5)], 20, V), 0).delivered == 600
+
+
+@given(cases(max_messages=80), VALUES)
+@settings(max_examples=100 if JIT else 20)
+def test_decides_as_its_twin(case, v):
+    def on_arrival(buffer, arrival, memory):
+        victim = least_gap(buffer, arrival, "x")
+        room = len(buffer.slots) < buffer.capacity
+        room = room and buffer.backlog_bytes + arrival["size_bytes"] <= buffer.max_bytes
+        return ACCEPT if room and not spared(buffer, arrival, victim, "x") else victim
+
+    assert same(case.run(THINNED, v), case.run(Policy("twin", on_arrival, reads_rate=True), v))
+
+
+@given(cases(max_messages=60))
+@settings(max_examples=30 if JIT else 10)
+def test_a_queue_asked_only_when_full_is_never_thinned(case):
+    case = replace(case, decide_at="overflow")
+    assert same(case.run(THINNED, V), case.run(policies.get("min-motion-gap"), V))
