@@ -55,8 +55,14 @@ def _as_weights(options: argparse.Namespace, out: str) -> object:
     refuse(options, _FOR_C, "belongs to --to c")
     if options.name is None:
         raise BufgymError("--name must be given: the policy's name")
-    flags = {flag: bool(getattr(options, flag)) for flag in ("shortcuts", "thins")}
-    return export(options.model, out, name=options.name, about=options.about or "", **flags)
+    return export(
+        options.model,
+        out,
+        name=options.name,
+        about=options.about or "",
+        shortcuts=bool(options.shortcuts),
+        thins=bool(options.thins),
+    )
 
 
 def _as_c(options: argparse.Namespace, out: str) -> object:

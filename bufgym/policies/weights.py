@@ -54,7 +54,7 @@ KEY = "bufgym"
 """The entry of the header's metadata that holds the JSON text."""
 FLAGS = ("shortcuts", "thins")
 """What an agent for one queue may do besides scoring."""
-WRITTEN = ("format", "fields", "observation", "bufgym", "sha256", "shortcuts", "thins")
+WRITTEN = ("format", "fields", "observation", "bufgym", "sha256", *FLAGS)
 """Metadata that ``save`` itself writes."""
 MIX = "drop.mix"
 """A tensor that a file may lack."""

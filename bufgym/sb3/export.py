@@ -29,7 +29,9 @@ CHECKED = (4, 8, 16, 32)
 """L of the regrets that are noted in the file."""
 
 
-def export(model: StrPath, out: StrPath, *, name: str, about: str = "", **flags: bool) -> Path:
+def export(
+    model: StrPath, out: StrPath, *, name: str, about: str = "", shortcuts: bool = False, thins: bool = False
+) -> Path:
     """Write the agent in ``model`` to ``out``, with what its run's folder says of its training.
 
     Args:
@@ -39,23 +41,22 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "", **flags:
         out: the file to write, .safetensors.
         name: the policy's name.
         about: a sentence: what it was trained for.
-        flags: of an agent for one queue (``bufgym.policies.learned``): ``shortcuts=True``, leave to others what they do
-            better; ``thins=True``, thin the queue to the link. Those that it has already stay.
+        shortcuts: leave to others what they do better (``bufgym.policies.learned``).
+        thins: thin the queue to the link.
 
     Raises:
-        BufgymError: ``model`` is no agent that scores slots, ``out`` cannot be written, or a flag is asked for
-            with several topics.
+        BufgymError: ``model`` is no agent that scores slots, ``out`` cannot be written, or ``shortcuts`` or
+            ``thins`` are asked for with several topics.
     """
     path = Path(model)
     weights = files.read_any(path)[0] if path.suffix == ".safetensors" else weights_of(read_policy(path))
     notes = {"name": name, "about": about, **run_notes(path)}
-    asked = [flag for flag in files.FLAGS if flags.get(flag)]
-    if asked and isinstance(weights, TopicWeights):
-        raise BufgymError(f"{path}: a scheduler for several topics: {asked[0]} is for one queue")
+    if (shortcuts or thins) and isinstance(weights, TopicWeights):
+        asked = "shortcuts" if shortcuts else "thins"
+        raise BufgymError(f"{path}: a scheduler for several topics: {asked} is for one queue")
     if isinstance(weights, TopicWeights):
         return files.save(out, weights, {**notes, "weighted_qoi": topics_qoi(learned_topics.policy(name, weights))})
-    shortcuts, thins = ("shortcuts" in asked or weights.shortcuts), ("thins" in asked or weights.thins)
-    weights = replace(weights, shortcuts=shortcuts, thins=thins)
+    weights = replace(weights, shortcuts=shortcuts or weights.shortcuts, thins=thins or weights.thins)
     return files.save(out, weights, {**notes, "regret": regrets(learned.policy(name, weights))})
 
 
