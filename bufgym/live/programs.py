@@ -44,7 +44,7 @@ class Program:
         self._words, words = Pipe()
         self._failures, failures = Pipe(duplex=False)
         fork = multiprocessing.get_context("fork")
-        self._process = fork.Process(target=_run, args=(work, words, failures), daemon=True)
+        self._process = fork.Process(target=_run, args=(work, words, failures, os.getpid()), daemon=True)
         self._process.start()
         words.close()
         failures.close()
@@ -89,9 +89,10 @@ class Program:
         self._failures.close()
 
 
-def _run(work: Callable[[Connection], None], words: Connection, failures: Connection) -> None:
+def _run(work: Callable[[Connection], None], words: Connection, failures: Connection, parent: int) -> None:
+    """In the program. ``parent``: who began it; asked for here, it may have been killed already, and be another."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's, who ends us
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     os.environ["PYTHONWARNINGS"] = "ignore"
     try:
         work(words)

@@ -15,7 +15,6 @@ import pytest
 
 from bufgym import policies
 from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
 from bufgym.live.odometry import Odometry
 from bufgym.live.programs import LEAD_S, pose_stamp, programs, publish_in_time, received
 from bufgym.model import qoi
@@ -59,17 +58,21 @@ def test_a_program_is_spoken_to_and_may_be_silent() -> None:
 
 
 PARENT = """
-import multiprocessing, os, signal, threading
+import multiprocessing, os, signal, sys, threading, time
 from bufgym.live.programs import programs
+ours = signal.signal
+signal.signal = lambda *what: (time.sleep(float(sys.argv[1])), ours(*what))  # the program's first step
 with programs(idle=lambda parent: threading.Event().wait()):
     print(multiprocessing.active_children()[0].pid, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@pytest.mark.skipif(not JIT, reason="processes come and go alike: tested compiled")
-def test_no_program_outlives_a_parent_that_was_killed() -> None:
-    told = subprocess.run([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True, check=False, timeout=60)
+@pytest.mark.parametrize("begins_after_s", ["0", "1"])
+def test_no_program_outlives_a_parent_that_was_killed(begins_after_s: str) -> None:
+    """Nor where the parent was gone before the program had begun."""
+    words = [sys.executable, "-c", PARENT, begins_after_s]
+    told = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=False, timeout=60)
     pid, patience_s = int(told.stdout), time.monotonic() + 20
     while running(pid) and time.monotonic() < patience_s:
         time.sleep(0.1)
