@@ -17,7 +17,7 @@ from bufgym.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value, straight
 from bufgym.observe.queue import ROUNDING, TINY
-from bufgym.policies import Policy, learned, small_queue, thinning
+from bufgym.policies import Policy, gaps, learned, small_queue, thinning
 from bufgym.policies.scoring import end_of, unpack
 
 _PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
@@ -83,8 +83,8 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "TINY": repr(TINY),
         "ROUNDING": repr(ROUNDING),
         "STILL": repr(learned.STILL),
-        "MOTION": thinning.MOTION,
-        "MESSAGES": thinning.MESSAGES,
+        "MOTION": gaps.MOTION,
+        "MESSAGES": gaps.MESSAGES,
         "WAITING": thinning.WAITING,
         "SOON_US": repr(thinning.SOON_US),
         "FLOWS": repr(learned.FLOWS),

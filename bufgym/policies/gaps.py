@@ -11,7 +11,11 @@ import numpy as np
 from bufgym.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, has_space, loss, motion_gaps, time_gaps
 from bufgym.model.qoi import value
+from bufgym.observe.on_board import index_gaps
 from bufgym.policies.registry import Arrival, Memory, register
+
+MOTION, MESSAGES = 1, 2
+"""What a gap may be measured in."""
 
 
 @kernel
@@ -23,6 +27,26 @@ def smallest_time_gap(buffer: Buffer, arrival: Arrival, slots: int) -> int:
         if before + after < smallest:
             victim, smallest = k, float(before + after)
     return victim
+
+
+@kernel
+def gap_left(buffer: Buffer, arrival: Arrival, k: int, measured_in: int) -> float:
+    """The gap that is left if slot ``k`` goes (as many as are queued: the newcomer)."""
+    if measured_in == MESSAGES:
+        return index_gaps(buffer, arrival, k)[1]
+    before, after = motion_gaps(buffer, arrival, k)
+    return before + after
+
+
+@kernel
+def smallest_gap(buffer: Buffer, arrival: Arrival, measured_in: int) -> int:
+    """The slot that would leave the smallest gap, REJECT for the newcomer; of equals the oldest."""
+    victim, smallest = REJECT, np.inf
+    for k in range(len(buffer.slots) + 1):
+        left = gap_left(buffer, arrival, k, measured_in)
+        if left < smallest:
+            victim, smallest = k, left
+    return victim if victim < len(buffer.slots) else REJECT
 
 
 @register("min-gap", source="online checkpointing, smallest merged gap", compile=True)
@@ -60,15 +84,9 @@ def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 @register("min-motion-gap", source="as min-gap, on the robot's odometry", compile=True)
 def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged motion gap (newcomer included, ties to the oldest)."""
-    s = len(buffer.slots)
     if has_space(buffer, arrival):
         return ACCEPT
-    victim, smallest = 0, np.inf
-    for k in range(s + 1):
-        before, after = motion_gaps(buffer, arrival, k)
-        if before + after < smallest:
-            victim, smallest = k, before + after
-    return victim if victim < s else REJECT
+    return smallest_gap(buffer, arrival, MOTION)
 
 
 @register(

@@ -44,7 +44,7 @@ from bufgym.observe import (
     observe_on_board_slots,
     observe_slots,
 )
-from bufgym.policies.gaps import greedy_qoi
+from bufgym.policies.gaps import MESSAGES, MOTION, greedy_qoi, smallest_gap
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.scoring import (
     DROP,
@@ -59,7 +59,7 @@ from bufgym.policies.scoring import (
     unpack,
 )
 from bufgym.policies.small_queue import NONE, NUMBERS, packed, planned
-from bufgym.policies.thinning import MESSAGES, MOTION, smallest_gap, spare
+from bufgym.policies.thinning import spare
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 

@@ -10,11 +10,10 @@ small-link``).
 
 from __future__ import annotations
 
-import numpy as np
-
 from bufgym.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps
-from bufgym.observe.on_board import index_gaps, mean_bytes
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
+from bufgym.observe.on_board import mean_bytes
+from bufgym.policies.gaps import MESSAGES, MOTION, gap_left, smallest_gap
 from bufgym.policies.registry import Arrival, Memory, register
 
 WAITING = 3
@@ -22,8 +21,6 @@ WAITING = 3
 SOON_US = 4e6
 """A queue is thinned where all L would be sent within so long: else too much is given up that would be sent when the
 stream ends."""
-MOTION, MESSAGES = 1, 2
-"""What a gap may be measured in."""
 
 
 @kernel
@@ -32,26 +29,6 @@ def send_us(buffer: Buffer, arrival: Arrival) -> float:
     0 while there is no rate."""
     rate = max(buffer.short_rate_bytes_per_s, buffer.medium_rate_bytes_per_s, buffer.long_rate_bytes_per_s)
     return 1e6 * mean_bytes(buffer, arrival) / rate if rate > 0 else 0.0
-
-
-@kernel
-def gap_left(buffer: Buffer, arrival: Arrival, k: int, measured_in: int) -> float:
-    """The gap that is left if slot ``k`` goes (as many as are queued: the newcomer)."""
-    if measured_in == MESSAGES:
-        return index_gaps(buffer, arrival, k)[1]
-    before, after = motion_gaps(buffer, arrival, k)
-    return before + after
-
-
-@kernel
-def smallest_gap(buffer: Buffer, arrival: Arrival, measured_in: int) -> int:
-    """The slot that would leave the smallest gap, REJECT for the newcomer; of equals the oldest."""
-    victim, smallest = REJECT, np.inf
-    for k in range(len(buffer.slots) + 1):
-        left = gap_left(buffer, arrival, k, measured_in)
-        if left < smallest:
-            victim, smallest = k, left
-    return victim if victim < len(buffer.slots) else REJECT
 
 
 @kernel

@@ -16,7 +16,8 @@ from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
 from bufgym.policies import Policy
-from bufgym.policies.thinning import MESSAGES, MOTION, send_us, spare
+from bufgym.policies.gaps import MESSAGES, MOTION
+from bufgym.policies.thinning import send_us, spare
 from bufgym.scenario import Episode, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome, received
