@@ -102,9 +102,9 @@ def start_of(**changes: str) -> weights.Weights:
 
 
 @pytest.mark.parametrize("sees", ["motion", "time"])
-def test_the_shipped_agent_reads_more_and_decides_the_same(sees: str) -> None:
-    before = shipped(f"learned-{sees}")
-    made = fleet.widened(before, fleet.MORE[sees])
+def test_the_shipped_agents_scorers_read_more_and_decide_the_same(sees: str) -> None:
+    before = dataclasses.replace(shipped(f"learned-{sees}"), thins=False)
+    made = fleet.widened(shipped(f"learned-{sees}"), fleet.MORE[sees])
     assert made.fields == (*before.fields, *fleet.MORE[sees])
     part = fleet.training_parts("fleet-v1", SUITE.capacities, seed=0)[0]
     assert [cell.team_qoi(learned.policy("mine", made)) for cell in part] == [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 
@@ -11,8 +11,7 @@ from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.tasks.bound import best
 from bufgym.model import qoi
 from bufgym.oracle import integer, law
-from bufgym.policies import weights
-from bufgym.sb3 import export
+from bufgym.policies import learned, weights
 from bufgym.scenario import Interruption, suites
 from bufgym.sim import run
 
@@ -74,19 +73,26 @@ def test_motion_is_worth_something_on_fading_links() -> None:
     assert regret("learned-motion") < regret("learned-time")
 
 
-def test_learned_link_is_learned_motion_thinned_to_the_link(tmp_path: Path) -> None:
-    """As ``bufgym export --thins`` makes it; on a link of a quarter of the demand it loses less."""
-    made = export(SHIPPED["learned-motion"], tmp_path / "made.safetensors", name="made", thins=True)
-    link = policies.get("learned-link")
-    assert policies.load(made).weights == link.weights and link.reads_rate and link.named_only
-    assert "learned-link" not in policies.names() and "learned-link" in policies.names(named_only=True)
-    scenario = suites.get("sustained-v1").settings("test")["time-quarter"].scenario
-    episodes = [draw(one, seed=1) for _, one in by_trace(scenario)]
+@pytest.mark.parametrize("name", SHIPPED)
+def test_over_a_link_that_flows_it_is_worth_more_than_its_scorers_alone(name: str) -> None:
+    """On a link of a quarter of the demand, and over the fading links of generated-v1's validation."""
+    whole = weights.read(SHIPPED[name])[0]
+    assert whole.shortcuts and whole.thins
+    alone = learned.policy("alone", replace(whole, thins=False))
+    for suite, label in (("sustained-v1", "time-quarter"), ("generated-v1", "time-900kB")):
+        scenario = suites.get(suite).settings("validation")[label].scenario
+        episodes = [draw(one, seed=1) for _, one in by_trace(scenario)]
+        rivals = (policies.get("afr"), alone, policies.get(name))
+        reached = [run(one, episodes, 10, scenario.value).batch.senders["delivered_gain"].sum() for one in rivals]
+        assert reached[0] < reached[1] < reached[2]
 
-    def qoi_of(name: str) -> float:
-        return float(run(policies.get(name), episodes, 10, scenario.value).batch.senders["delivered_gain"].sum())
 
-    assert qoi_of("afr") < qoi_of("learned-motion") < qoi_of("learned-link")
+def test_where_v_is_straight_and_then_flat_both_lose_nothing_in_an_interruption() -> None:
+    scenario = Interruption(t_max=400, value=qoi.saturating(8))
+    for name in SHIPPED:
+        assert weights.read(SHIPPED[name])[1]["regret"]["saturating-8, L = 16"] == 0
+        senders = run(policies.get(name), [scenario.episode(200)], 16, scenario.value)
+        assert senders.batch.senders["delivered_gain"][0] == pytest.approx(integer(16, 200, scenario.value), rel=1e-12)
 
 
 def test_learned_ppo_is_named_and_tells_how_it_was_made() -> None:

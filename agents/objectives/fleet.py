@@ -21,7 +21,7 @@ from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.sweep import Sweep
 from bufgym.files import shipped
 from bufgym.policies import Policy, weights
-from bufgym.policies.learned import Network, Weights
+from bufgym.policies.learned import Weights
 from bufgym.scenario import FleetEpisode, FleetScenario, suites
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
@@ -48,22 +48,10 @@ def fleet_of(suite: str, split: str) -> FleetScenario:
 
 
 def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
-    """The same agent, which reads these fields as well but makes nothing of them yet."""
-    wide = Weights((*agent.fields, *more), _padded(agent.drop, len(more)), _padded(agent.accept, len(more)))
-    mix = np.zeros((len(wide.context), len(wide.slot)), np.float32)
-    if agent.mix is not None:
-        rows, columns = map(wide.context.index, agent.context), map(wide.slot.index, agent.slot)
-        mix[np.ix_(list(rows), list(columns))] = agent.mix
-    return replace(wide, mix=mix, still=widened(agent.still, more) if agent.still else None, shortcuts=agent.shortcuts)
-
-
-def _padded(network: Network, more: int) -> Network:
-    """With so many inputs more, all of no weight."""
-    layers = list(network.layers)
-    if layers:
-        weight, bias = layers[0]
-        layers[0] = np.pad(weight, ((0, more), (0, 0))), bias
-    return replace(network, skip=np.pad(network.skip, (0, more)), bias=network.bias.copy(), layers=tuple(layers))
+    """Its scorers alone, which read these fields as well but make nothing of them yet, and may mix all of them."""
+    still = agent.still and widened(agent.still, more)
+    mix = np.zeros((len(agent.context), len(agent.slot)), np.float32) if agent.mix is None else agent.mix
+    return replace(replace(agent, mix=mix, still=None, thins=False).reading(more), still=still)
 
 
 # --- episodes --------------------------------------------------------------------------------------------------------

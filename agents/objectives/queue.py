@@ -220,10 +220,13 @@ class QueueObjective(Objective):
         return suite_objectives(self.settings, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
 
     def start(self) -> Weights:
-        """The smallest merged gap goes, with a warm-up in both scorers; or what an earlier agent does."""
+        """The smallest merged gap goes, with a warm-up in both scorers; or what an earlier agent's scorers do.
+
+        They alone are searched on: where the agent thins to the link they would not be asked.
+        """
         settings, fields = self.settings, self.settings.observed
         if settings.start:
-            return weights.read(settings.start)[0].reading(fields)
+            return replace(weights.read(settings.start)[0].reading(fields), thins=False)
         first = start(fields, settings.hidden, np.random.default_rng(self.seed))
         if not self.warm_up:
             return first

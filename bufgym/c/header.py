@@ -17,7 +17,7 @@ from bufgym.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value, straight
 from bufgym.observe.queue import ROUNDING, TINY
-from bufgym.policies import Policy, gaps, learned, small_queue, thinning
+from bufgym.policies import Policy, gaps, learned, small_queue, target_gap, thinning
 from bufgym.policies.scoring import end_of, unpack
 
 _PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
@@ -27,11 +27,12 @@ _HELPERS = {
     "bufgym_gaps_of(": "gaps.h",
     "bufgym_smallest_time_gap(": "time_gap.h",
     "bufgym_spare(": "thinning.h",
+    "bufgym_approach(": "target_gap.h",
     "bufgym_thin(": "thin.h",
 }
 """Parts that rules share, each before those that call it."""
-_LEARNED = (*("gaps.h", "thinning.h"), *("features.h", "greedy.h", "small_queue.h", "scorer.h"))
-"""Parts of a learned agent."""
+_LEARNED = (*("gaps.h", "thinning.h", "target_gap.h"), *("features.h", "greedy.h", "small_queue.h", "scorer.h"))
+"""Parts of a learned agent; the target gap of one that thins alone."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
 """Of the calls in the header."""
@@ -60,7 +61,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     """
     check_limits(capacity, max_bytes)
     learns = policy.on_arrival is learned.on_arrival
-    body = "".join(map(_part, _LEARNED)) if learns else _rule(policy)
+    body = _scorer(policy) if learns else _rule(policy)
     if "bufgym_departure(" not in body:
         body += "\n" + _part("no_departure.h")
     unlimited = max_bytes is None
@@ -87,15 +88,34 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "MESSAGES": gaps.MESSAGES,
         "WAITING": thinning.WAITING,
         "SOON_US": repr(thinning.SOON_US),
+        "LINK_US": repr(target_gap.LINK_US),
+        "PACE_US": repr(target_gap.PACE_US),
+        "HORIZON_US": repr(target_gap.HORIZON_US),
+        "SHORT": repr(target_gap.SHORT),
+        "LONG": repr(target_gap.LONG),
+        "REST": repr(target_gap.REST),
+        "PACED": repr(target_gap.PACED),
+        "UNPACED": repr(1 - target_gap.PACED),
+        "NEAR": repr(target_gap.NEAR),
+        "DISCOUNT": repr(target_gap.DISCOUNT),
+        "LEAST": target_gap.LEAST,
+        "BURSTY": repr(target_gap.BURSTY),
+        "WITHIN": repr(target_gap.WITHIN),
         "FLOWS": repr(learned.FLOWS),
         "FEW": learned.FEW,
-        "STEADY": repr(learned.STEADY),
+        "STEADY_US": repr(thinning.HORIZON_US),
+        "STEADY": repr(thinning.STEADY),
         "STRAIGHT": int(straight(value.array)),
         "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
     }
     if learns:
         numbers |= _scorers(policy) | _plans(value)
     return _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
+
+
+def _scorer(policy: Policy) -> str:
+    """The C of a learned agent."""
+    return "".join(_part(part) for part in _LEARNED if part != "target_gap.h" or policy.memory)
 
 
 def _rule(policy: Policy) -> str:
@@ -116,7 +136,9 @@ def _scorers(policy: Policy) -> dict[str, Any]:
     """What a learned policy's C is filled with: its scorers, their scratch and the fields."""
     parameters, begin, networks = np.array(policy.weights), 1, len(learned.Weights.NETWORKS)
     entries: list[str] = []
-    thins, shortcuts = divmod(int(parameters[0]), 2)
+    flags = int(parameters[0])
+    shortcuts, thins = (int(flags & flag > 0) for flag in (learned.LEAVES, learned.THINS))
+    measured_in = "MOTION" if flags & learned.SEES_MOTION else "MESSAGES"
     end = len(parameters) - shortcuts * small_queue.NUMBERS
     text, inputs, units = "", 1, 1
     while begin < end:
@@ -134,7 +156,7 @@ def _scorers(policy: Policy) -> dict[str, Any]:
     text += "/* The second one decides while the link stands still. */\n" if len(entries) > 1 else ""
     text += f"#define BUFGYM_SCORERS {len(entries)}\n"
     text += f"#define BUFGYM_SHORTCUTS {shortcuts}\n"
-    text += f"#define BUFGYM_THINS {thins} /* what gaps are measured in; 0: not at all */\n"
+    text += f"#define BUFGYM_THINS {thins}\n#define BUFGYM_MEASURED_IN BUFGYM_{measured_in}\n"
     text += f"static const struct bufgym_scorer bufgym_scorers[] = {{\n{''.join(entries)}}};\n"
     scratch = (
         "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"

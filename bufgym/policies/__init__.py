@@ -18,7 +18,7 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     robofleet,
     sampling,
     schedulers,
-    thinning,
+    target_gap,
     webrtc,
 )
 from bufgym.policies.registry import ClientSettings, Policy, get, names, register, register_later, runs_compiled

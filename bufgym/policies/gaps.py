@@ -30,23 +30,34 @@ def smallest_time_gap(buffer: Buffer, arrival: Arrival, slots: int) -> int:
 
 
 @kernel
-def gap_left(buffer: Buffer, arrival: Arrival, k: int, measured_in: int) -> float:
-    """The gap that is left if slot ``k`` goes (as many as are queued: the newcomer)."""
+def gaps_of(buffer: Buffer, arrival: Arrival, k: int, measured_in: int) -> tuple[float, float]:
+    """The gap before slot ``k`` (as many as are queued: the newcomer), and the one that is left if it goes."""
     if measured_in == MESSAGES:
-        return index_gaps(buffer, arrival, k)[1]
+        return index_gaps(buffer, arrival, k)
     before, after = motion_gaps(buffer, arrival, k)
-    return before + after
+    return before, before + after
 
 
 @kernel
-def smallest_gap(buffer: Buffer, arrival: Arrival, measured_in: int) -> int:
-    """The slot that would leave the smallest gap, REJECT for the newcomer; of equals the oldest."""
-    victim, smallest = REJECT, np.inf
-    for k in range(len(buffer.slots) + 1):
-        left = gap_left(buffer, arrival, k, measured_in)
+def gap_left(buffer: Buffer, arrival: Arrival, victim: int, measured_in: int) -> float:
+    """The gap that is left if ``victim`` goes: a slot, or REJECT for the newcomer."""
+    return gaps_of(buffer, arrival, len(buffer.slots) if victim == REJECT else victim, measured_in)[1]
+
+
+@kernel
+def smallest_gap(buffer: Buffer, arrival: Arrival, measured_in: int, discount: float) -> int:
+    """The slot that would leave the smallest gap, REJECT for the newcomer; of equals the oldest.
+
+    That of slot k of s counts ``discount`` (1 - k / s) less.
+    """
+    s, victim, smallest = len(buffer.slots), REJECT, np.inf
+    for k in range(s + 1):
+        left = gaps_of(buffer, arrival, k, measured_in)[1]
+        if k < s:
+            left *= 1 - discount * (1 - k / s)
         if left < smallest:
             victim, smallest = k, left
-    return victim if victim < len(buffer.slots) else REJECT
+    return victim if victim < s else REJECT
 
 
 @register("min-gap", source="online checkpointing, smallest merged gap", compile=True)
@@ -86,7 +97,7 @@ def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged motion gap (newcomer included, ties to the oldest)."""
     if has_space(buffer, arrival):
         return ACCEPT
-    return smallest_gap(buffer, arrival, MOTION)
+    return smallest_gap(buffer, arrival, MOTION, 0.0)
 
 
 @register(

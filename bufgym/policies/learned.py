@@ -15,10 +15,13 @@ link.
 An agent may leave to others what they do better, as can be told on board (``shortcuts``). Where V is straight and then
 flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and no plan is better, however long an
 interruption is. It does so on a steady link too, where motion is uneven: the queue is sent as it stands, there is no
-trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``).
+trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``). Who
+does not read motion knows V only where the scene moves evenly: of messages.
 
-An agent may also thin its queue to the link (``thins``): what scores highest goes with room too, where the link could
-not send it in time (``thinning``); on a steady link it is the smallest gap that goes.
+An agent may also thin its queue to the link (``thins``), with room too: what to do over a link that flows is known
+better by ``target_gap`` than by any scorer so far, and on a steady one by ``thinning``. The scorers then decide while
+nothing has left yet, in bursts, in short queues and at the beginning of a stream. Gaps are measured in motion where the
+agent reads it, else in messages.
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
@@ -50,6 +53,7 @@ from bufgym.policies.scoring import (
     DROP,
     KEEP,
     Network,
+    Scorer,
     ScorerWeights,
     begin,
     divide,
@@ -59,7 +63,8 @@ from bufgym.policies.scoring import (
     unpack,
 )
 from bufgym.policies.small_queue import NONE, NUMBERS, packed, planned
-from bufgym.policies.thinning import spare
+from bufgym.policies.target_gap import REMEMBERED, approach, remember, target
+from bufgym.policies.thinning import STEADY, spare, steady
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 
@@ -73,57 +78,60 @@ TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
 STILL = 0.07
 """The link stands still while its service ratio (running mean of departures per arrival) is below this: from the first
 arrival of an interruption on (1/16), or 41 arrivals after a link that kept up has stopped."""
-FLOWS, FEW, STEADY = 0.18, 1, 0.01
-"""A link is steady while its rates over 0.1 s and 0.5 s differ from that over 2 s by no more than twice ``STEADY``, and
-``STEADY``, of it. A queue is soon sent where at least ``FLOWS`` messages leave per arrival, or L is ``FEW``."""
+FLOWS, FEW = 0.18, 3
+"""A queue is soon sent where at least ``FLOWS`` messages leave per arrival, or L is at most ``FEW``."""
+LEAVES, THINS, SEES_MOTION = 1, 2, 4
+"""What the first of an agent's numbers says of it."""
+OWN = len(REMEMBERED)
+"""Numbers of memory that come before the scratch, where an agent thins."""
 _greedy_qoi = kernel(greedy_qoi)
 
 
 @kernel
-def steady(buffer: Buffer) -> bool:
-    """Whether the link carries messages at one and the same rate."""
-    mean = buffer.long_rate_bytes_per_s
-    near = abs(buffer.medium_rate_bytes_per_s - mean) <= STEADY * mean
-    level = near and abs(buffer.short_rate_bytes_per_s - mean) <= 2 * STEADY * mean
-    return bool(level and mean > 0 and buffer.drained_us > 0)
-
-
-@kernel
-def no_trap(buffer: Buffer, arrival: Arrival) -> bool:
-    """Whether a queue on a steady link is soon sent, while the scene does not move evenly.
-
-    Where it does, the even spacing is best, and the scorer is nearer to that.
-    """
-    moved = arrival.x - buffer.dequeued_x
-    step = arrival.x - buffer.previous_x
-    if abs(step * (arrival.seq - buffer.dequeued_seq) - moved) <= STEADY * moved:
-        return False
-    return bool(buffer.service_ratio >= FLOWS or buffer.capacity <= FEW)
+def even(buffer: Buffer, arrival: Arrival) -> bool:
+    """Whether the scene moves evenly, from message to message."""
+    moved, step = arrival.x - buffer.dequeued_x, arrival.x - buffer.previous_x
+    return bool(abs(step * (arrival.seq - buffer.dequeued_seq) - moved) <= STEADY * moved)
 
 
 @kernel
 def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """The decision that scores highest."""
-    s, L = len(buffer.slots), buffer.capacity
-    still, end = buffer.service_ratio < STILL, len(buffer.parameters)
-    leaves, thins = buffer.parameters[0] % 2 == 1, int(buffer.parameters[0]) // 2
-    if leaves:
+    """The decision that scores highest, or that of what decides instead."""
+    flags, end, runs_evenly = int(buffer.parameters[0]), len(buffer.parameters), even(buffer, arrival)
+    thins, measured_in = flags & THINS, MOTION if flags & SEES_MOTION else MESSAGES
+    leaves = flags & LEAVES and (flags & SEES_MOTION or runs_evenly)
+    if flags & LEAVES:
         end -= NUMBERS
-        if straight(buffer.v):
-            return _greedy_qoi(buffer, arrival, memory)
-    if not still and steady(buffer):
+    if thins:
+        remember(buffer, arrival, memory, measured_in)
+    if leaves and straight(buffer.v):
+        return _greedy_qoi(buffer, arrival, memory)
+    if steady(buffer):
         if thins and has_space(buffer, arrival):
-            smallest = smallest_gap(buffer, arrival, thins)
-            if spare(buffer, arrival, smallest, thins):
+            smallest = smallest_gap(buffer, arrival, measured_in, 0.0)
+            if spare(buffer, arrival, smallest, measured_in):
                 return smallest
-        if leaves and no_trap(buffer, arrival):
+        # No trap for greed: the queue is soon sent. Where the scene moves evenly the scorer is nearer to even gaps.
+        if leaves and not runs_evenly and (buffer.service_ratio >= FLOWS or buffer.capacity <= FEW):
             return _greedy_qoi(buffer, arrival, memory)
+    elif thins:
+        g = target(buffer, arrival, memory, measured_in)
+        if g > 0:
+            return approach(buffer, arrival, g, measured_in)
+    still = buffer.service_ratio < STILL
     if leaves and still and buffer.drained_bytes == 0:
         plan = planned(buffer, arrival, buffer.parameters[end:])
         if plan != NONE:
             return plan
     at = end_of(buffer.parameters, 1, 2) if still else 1
     scorer = unpack(buffer.parameters, at if at < end else 1, 2)
+    return scored(buffer, arrival, scorer, measured_in if thins and not still else 0, memory[OWN:] if thins else memory)
+
+
+@kernel
+def scored(buffer: Buffer, arrival: Arrival, scorer: Scorer, measured_in: int, memory: Memory) -> int:
+    """The decision that scores highest, with room also where it can be spared (``measured_in`` not 0)."""
+    s, L = len(buffer.slots), buffer.capacity
     scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
     observe_context(buffer, arrival, scratch.context[:TABLE])
     for i in range(scorer.context):
@@ -143,7 +151,7 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         if dropped > best:
             best, decision = dropped, k if k < s else REJECT
     if has_space(buffer, arrival):
-        if thins and not still and spare(buffer, arrival, decision, thins):
+        if measured_in and spare(buffer, arrival, decision, measured_in):
             return decision
         common = begin(scorer, KEEP, scratch)
         if score(scorer, KEEP, common, L, scratch) >= best:
@@ -178,13 +186,12 @@ class Weights(ScorerWeights):
     """Whether the queue is thinned to the link."""
 
     def parameters(self) -> NDArray[np.float64]:
-        """As the policy reads them: 1 for shortcuts plus twice what gaps are measured in where it thins, this scorer,
-        the one for a link that stands still, the shortcuts' plans."""
+        """As the policy reads them: what it does (``LEAVES`` and so on, added up), this scorer, the one for a link that
+        stands still, the shortcuts' plans."""
         scorers = [self] if self.still is None else [self, self.still]
         plans = [packed()] if self.shortcuts else []
-        measured_in = MOTION if "motion_merged" in self.fields else MESSAGES
-        own = [float(self.shortcuts + 2 * self.thins * measured_in)]
-        return np.concatenate([own, *(scorer.pack(scorer.mix) for scorer in scorers), *plans])
+        flags = LEAVES * self.shortcuts + THINS * self.thins + SEES_MOTION * ("motion_merged" in self.fields)
+        return np.concatenate([[float(flags)], *(scorer.pack(scorer.mix) for scorer in scorers), *plans])
 
     def reading(self, fields: tuple[str, ...]) -> Weights:
         """The same decisions by weights that read these fields too: what is new counts nothing."""
@@ -206,6 +213,7 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
         name,
         on_arrival,
         weights=numbers,
+        memory=REMEMBERED if weights.thins else {},
         work=(scratch, SLOTS),
         source=source,
         about=summary,

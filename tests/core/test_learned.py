@@ -12,7 +12,8 @@ import pytest
 from cases import VALUES, cases, log, newcomer, queue_of, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from thinning_cases import least_gap, spared
+from target_cases import Seen, approached
+from thinning_cases import least_gap, level, spared
 from weight_cases import network
 
 from bufgym import files, policies
@@ -83,28 +84,30 @@ def score(net, f):
 def twin(whole):
     """A policy that decides by these weights: every candidate is scored, the best is searched for afterwards."""
 
+    seen = Seen()
+
     def on_arrival(buffer, arrival, memory):
-        rates = [getattr(buffer, f"{span}_rate_bytes_per_s") for span in ("short", "medium", "long")]
-        level = rates[2] > 0 and all(
-            abs(r - rates[2]) <= n / 100 * rates[2] for r, n in zip(rates, (2, 1), strict=False)
-        )
         still = buffer.service_ratio < 0.07
+        measured_in = "x" if "motion_merged" in whole.fields else "seq"
+        seen.remember(buffer, arrival, measured_in)
+        steps, moved = arrival.seq - buffer.dequeued_seq, arrival.x - buffer.dequeued_x
+        even = abs((arrival.x - buffer.previous_x) * steps - moved) <= moved / 100
+        shortcuts = whole.shortcuts and (even or measured_in == "x")
         v = buffer.v
         bends_once = v[0] == qoi.SATURATING or (v[0] == qoi.TABULATED and v[int(v[1]) + 3] == v[-1])
-        if whole.shortcuts and bends_once:
+        if shortcuts and bends_once:
             return policies.get("greedy-qoi").on_arrival(buffer, arrival, memory)
         room = len(buffer.slots) < buffer.capacity
         room = room and buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes
-        measured_in = "x" if "motion_merged" in whole.fields else "seq"
-        if not still and level and buffer.drained_us > 0:
+        if level(buffer):
             smallest = least_gap(buffer, arrival, measured_in)
             if whole.thins and room and spared(buffer, arrival, smallest, measured_in):
                 return smallest
-            steps, moved = arrival.seq - buffer.dequeued_seq, arrival.x - buffer.dequeued_x
-            uneven = abs((arrival.x - buffer.previous_x) * steps - moved) > moved / 100
-            if whole.shortcuts and uneven and (buffer.service_ratio >= 0.18 or buffer.capacity == 1):
+            if shortcuts and not even and (buffer.service_ratio >= 0.18 or buffer.capacity <= 3):
                 return policies.get("greedy-qoi").on_arrival(buffer, arrival, memory)
-        if whole.shortcuts and still and buffer.drained_bytes == 0:
+        elif whole.thins and (g := seen.target(buffer, arrival, measured_in)) is not None:
+            return approached(buffer, arrival, g, measured_in)
+        if shortcuts and still and buffer.drained_bytes == 0:
             plan = small_queue.planned(buffer, arrival, small_queue.packed())  # test_small_queue.py has its twin
             if plan != small_queue.NONE:
                 return plan
@@ -201,26 +204,12 @@ def test_where_greed_is_no_trap_it_loses_nothing():
     assert alone < 0.9999 * best
 
 
-def test_a_link_is_steady_while_its_rates_agree():
-    buffer = queue_of(0, 8)._replace(service_ratio=0.25, drained_us=1000, dequeued_x=0.0, previous_x=4.0)
-
-    def steady(short, medium, long, **known):
-        rates = {"short_rate_bytes_per_s": short, "medium_rate_bytes_per_s": medium, "long_rate_bytes_per_s": long}
-        return learned.steady(buffer._replace(**rates, **known))
-
-    assert steady(1e6, 1e6, 1e6) and steady(1.02e6, 0.99e6, 1e6)
-    assert not steady(1.03e6, 1e6, 1e6) and not steady(1e6, 0.98e6, 1e6)
-    assert not steady(0.0, 0.0, 0.0) and not steady(1e6, 1e6, 1e6, drained_us=0)
-
-
-def test_a_queue_that_is_soon_sent_is_no_trap_unless_motion_is_even():
-    buffer = queue_of(0, 8)._replace(service_ratio=0.25, dequeued_x=0.0, previous_x=4.0)
+def test_the_scene_moves_evenly_where_each_step_is_like_all_others():
+    buffer = queue_of(0, 8)._replace(dequeued_x=0.0, previous_x=4.0)
     uneven, even = newcomer(), newcomer()
     uneven["seq"], uneven["x"] = 4, 4.5  # half a step after three of more
     even["seq"], even["x"] = 4, 16 / 3
-    assert learned.no_trap(buffer, uneven) and not learned.no_trap(buffer, even)
-    assert not learned.no_trap(buffer._replace(service_ratio=0.1), uneven)
-    assert learned.no_trap(buffer._replace(service_ratio=0.1, capacity=1), uneven)  # one message is soon sent
+    assert learned.even(buffer, even) and not learned.even(buffer, uneven)
 
 
 @given(cases(), VALUES, weights())

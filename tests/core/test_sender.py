@@ -25,9 +25,11 @@ MS = 1_000
 
 
 POLICIES = {
-    p.name: p for p in (*map(policies.get, policies.names()), ANYTHING) if p.privileged is None and not any(p.work)
+    p.name: p
+    for p in (*map(policies.get, policies.names()), ANYTHING)
+    if p.privileged is None and not any(p.work) and p.name != "target-gap"
 }
-"""All but the learned ones, whose twin is in ``test_learned``."""
+"""All but the learned ones and ``target-gap``, whose twins are in ``test_learned`` and ``test_target_gap``."""
 
 
 def line(times_ms, *, capacity=2, after="loop", sizes=1_000, knots=((0, 0), (1_000 * MS, 1_000_000)), **limits):

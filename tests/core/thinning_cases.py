@@ -19,11 +19,25 @@ def gaps_left(buffer, arrival, measured_in):
     return list(map(sum, itertools.pairwise(steps)))
 
 
-def least_gap(buffer, arrival, measured_in):
-    """What leaves the smallest gap; of equals the oldest."""
-    gaps = gaps_left(buffer, arrival, measured_in)
+def least_gap(buffer, arrival, measured_in, discount=0.0):
+    """What leaves the smallest gap; of equals the oldest. Slot k of s counts ``discount`` (1 - k / s) less."""
+    *queued, newcomer = gaps_left(buffer, arrival, measured_in)
+    gaps = [gap * (1 - discount * (1 - k / len(queued))) for k, gap in enumerate(queued)] + [newcomer]
     k = gaps.index(min(gaps))
-    return k if k < len(buffer.slots) else REJECT
+    return k if k < len(queued) else REJECT
+
+
+def places(buffer, arrival):
+    """How many messages of mean size there is room for in all: L, or what B lets in."""
+    sizes = [message["size_bytes"] for message in buffer.slots] + [arrival["size_bytes"]]
+    return min(buffer.capacity, int(buffer.max_bytes / (sum(map(int, sizes)) / len(sizes))))
+
+
+def level(buffer):
+    """Whether the link is steady: the rates over 0.1 s and 0.5 s are that over 2 s, but for 2 % and 1 %."""
+    short, medium, long = (getattr(buffer, f"{span}_rate_bytes_per_s") for span in ("short", "medium", "long"))
+    near = abs(short - long) <= 0.02 * long and abs(medium - long) <= 0.01 * long
+    return bool(near and long > 0 and buffer.drained_us > 0)
 
 
 def spared(buffer, arrival, victim, measured_in):
@@ -36,5 +50,7 @@ def spared(buffer, arrival, victim, measured_in):
     send_us = 1e6 * mean_bytes / rate
     last = {"x": buffer.dequeued_x, "seq": buffer.dequeued_seq}[measured_in]
     left = gaps_left(buffer, arrival, measured_in)[s if victim == REJECT else victim]
-    soon = buffer.capacity * send_us <= SOON_US
-    return soon and left * elapsed_us <= float(arrival[measured_in] - last) * send_us
+    L = places(buffer, arrival)
+    soon = L * send_us <= SOON_US
+    room_us = 60e6 / (60e6 / send_us + L - s)  # a minute's messages, and those for which there is room
+    return soon and left * elapsed_us <= float(arrival[measured_in] - last) * room_us

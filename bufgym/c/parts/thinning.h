@@ -1,43 +1,80 @@
+/* Whether the link carries messages at one and the same rate. */
+static inline int bufgym_steady(const struct bufgym_queue *q)
+{
+    const double mean = 1e6 * q->long_rate, medium = 1e6 * q->medium_rate, short_mean = 1e6 * q->short_rate;
+    return fabs(medium - mean) <= @STEADY@ * mean && fabs(short_mean - mean) <= 2 * @STEADY@ * mean && mean > 0.0
+        && q->drained_us > 0;
+}
+
+/* Of the queued messages and the newcomer. */
+static inline double bufgym_mean_bytes(const struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    return (double)(q->backlog_bytes + arrival->size_bytes) / (q->occupancy + 1);
+}
+
+/* How many messages of mean size the queue can hold: L, or what B lets in. */
+static inline int bufgym_places(const struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    const double fit = (double)BUFGYM_MAX_BYTES / bufgym_mean_bytes(q, arrival);
+    return fit < BUFGYM_CAPACITY ? (int)fit : BUFGYM_CAPACITY;
+}
+
 /* Time in which the link sends a message of mean size, at the fastest of its rates of late, us; 0: there is no rate. */
 static inline double bufgym_send_us(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
-    const double mean_bytes = (double)(q->backlog_bytes + arrival->size_bytes) / (q->occupancy + 1);
     double rate = 1e6 * q->short_rate;
     rate = 1e6 * q->medium_rate > rate ? 1e6 * q->medium_rate : rate;
     rate = 1e6 * q->long_rate > rate ? 1e6 * q->long_rate : rate;
-    return rate > 0.0 ? 1e6 * mean_bytes / rate : 0.0;
+    return rate > 0.0 ? 1e6 * bufgym_mean_bytes(q, arrival) / rate : 0.0;
 }
 
 enum { BUFGYM_MOTION = @MOTION@, BUFGYM_MESSAGES = @MESSAGES@ };
 
-/* The gap that is left if slot k goes (q->occupancy: the newcomer), in motion or in messages. */
-static inline double bufgym_gap_left(
-    const struct bufgym_queue *q, const struct bufgym_message *arrival, int k, int measured_in)
+/* The gap before slot k (q->occupancy: the newcomer) and the one that is left if it goes, in motion or in messages. */
+static inline void bufgym_gap(
+    const struct bufgym_queue *q, const struct bufgym_message *arrival, int k, int measured_in, double *own, double *left)
 {
-    const struct bufgym_gaps gaps = bufgym_gaps_of(q, arrival, k);
-    const int64_t before = k > 0 ? q->slots[k - 1].seq : q->dequeued_seq;
-    int64_t after = k + 1 < q->occupancy ? q->slots[k + 1].seq : arrival->seq;
-    if (measured_in == BUFGYM_MOTION)
-        return gaps.before_x + gaps.after_x;
-    if (k == q->occupancy)
-        after = arrival->seq + 1;
-    return after > before ? (double)(after - before) : 0.0;
+    const int s = q->occupancy;
+    const int64_t before = k > 0 ? q->slots[k - 1].seq : q->dequeued_seq, at = k < s ? q->slots[k].seq : arrival->seq;
+    const int64_t after = k == s ? arrival->seq + 1 : k + 1 < s ? q->slots[k + 1].seq : arrival->seq;
+    if (measured_in == BUFGYM_MOTION) {
+        const struct bufgym_gaps gaps = bufgym_gaps_of(q, arrival, k);
+        *own = gaps.before_x;
+        *left = gaps.before_x + gaps.after_x;
+    } else {
+        *own = at > before ? (double)(at - before) : 0.0;
+        *left = after > before ? (double)(after - before) : 0.0;
+    }
 }
 
-/* The slot that would leave the smallest gap, BUFGYM_REJECT for the newcomer; of equals the oldest. */
-static inline int bufgym_smallest_gap(
-    const struct bufgym_queue *q, const struct bufgym_message *arrival, int measured_in)
+/* The gap that is left if `victim` goes: a slot, or BUFGYM_REJECT for the newcomer. */
+static inline double bufgym_gap_left(
+    const struct bufgym_queue *q, const struct bufgym_message *arrival, int victim, int measured_in)
 {
+    double own, left;
+    bufgym_gap(q, arrival, victim == BUFGYM_REJECT ? q->occupancy : victim, measured_in, &own, &left);
+    return left;
+}
+
+/* The slot that would leave the smallest gap, BUFGYM_REJECT for the newcomer; of equals the oldest. That of slot k of s
+   counts `discount` (1 - k / s) less. */
+static inline int bufgym_smallest_gap(
+    const struct bufgym_queue *q, const struct bufgym_message *arrival, int measured_in, double discount)
+{
+    const int s = q->occupancy;
     double smallest = HUGE_VAL;
     int k, victim = BUFGYM_REJECT;
-    for (k = 0; k <= q->occupancy; k++) {
-        const double left = bufgym_gap_left(q, arrival, k, measured_in);
+    for (k = 0; k <= s; k++) {
+        double own, left;
+        bufgym_gap(q, arrival, k, measured_in, &own, &left);
+        if (k < s)
+            left *= 1 - discount * (1 - (double)k / s);
         if (left < smallest) {
             smallest = left;
             victim = k;
         }
     }
-    return victim < q->occupancy ? victim : BUFGYM_REJECT;
+    return victim < s ? victim : BUFGYM_REJECT;
 }
 
 /* Whether a queue with room can spare `victim`: enough wait for the link, a full queue would soon be sent, and the
@@ -45,15 +82,16 @@ static inline int bufgym_smallest_gap(
 static inline int bufgym_spare(
     const struct bufgym_queue *q, const struct bufgym_message *arrival, int victim, int measured_in)
 {
-    const int s = q->occupancy;
+    const int s = q->occupancy, L = bufgym_places(q, arrival);
     const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
-    const double each_us = bufgym_send_us(q, arrival);
+    double each_us = bufgym_send_us(q, arrival);
     const double come =
         measured_in == BUFGYM_MOTION ? arrival->x - q->dequeued_x : (double)(arrival->seq - q->dequeued_seq);
-    if (s < @WAITING@ || q->busy == 0 || elapsed_us <= 0.0 || each_us <= 0.0)
+    if (BUFGYM_CAPACITY <= @WAITING@ || s < @WAITING@ || q->busy == 0 || elapsed_us <= 0.0 || each_us <= 0.0)
         return 0;
-    if (BUFGYM_CAPACITY * each_us > @SOON_US@)
+    if (L * each_us > @SOON_US@)
         return 0;
-    return bufgym_gap_left(q, arrival, victim == BUFGYM_REJECT ? s : victim, measured_in) * elapsed_us <= come * each_us;
+    each_us = @STEADY_US@ / (@STEADY_US@ / each_us + L - s);
+    return bufgym_gap_left(q, arrival, victim, measured_in) * elapsed_us <= come * each_us;
 }
 

@@ -1,0 +1,65 @@
+/* What is remembered: the link's rate (bytes/us), how long it has sent, motion or messages per us, the stream's age. */
+enum { BUFGYM_RATE, BUFGYM_SENT_US, BUFGYM_PACE, BUFGYM_SEEN_US };
+
+/* Renew the two long means. */
+static inline void
+bufgym_remember(struct bufgym_queue *q, const struct bufgym_message *arrival, int measured_in)
+{
+    double *memory = q->memory;
+    const double sent_us = (double)q->drained_us, us = (double)(arrival->arrival_us - q->previous_us);
+    if (q->evictions > 0)
+        return;
+    if (sent_us > 0.0) {
+        const double seen_us = memory[BUFGYM_SENT_US] < @LINK_US@ ? memory[BUFGYM_SENT_US] : @LINK_US@;
+        memory[BUFGYM_RATE] += ((double)q->drained_bytes - memory[BUFGYM_RATE] * sent_us) / (sent_us + seen_us);
+        memory[BUFGYM_SENT_US] += sent_us;
+    }
+    if (us > 0.0) {
+        const double step = measured_in == BUFGYM_MESSAGES ? 1.0 : arrival->x - q->previous_x;
+        const double seen_us = memory[BUFGYM_SEEN_US] < @PACE_US@ ? memory[BUFGYM_SEEN_US] : @PACE_US@;
+        memory[BUFGYM_PACE] += (step - memory[BUFGYM_PACE] * us) / (us + seen_us);
+        memory[BUFGYM_SEEN_US] += us;
+    }
+}
+
+/* The gap at which the link and the room that is left carry what comes within the horizon; 0 where it cannot be told. */
+static inline double
+bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival, int measured_in)
+{
+    const double *memory = q->memory;
+    const int L = bufgym_places(q, arrival);
+    const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
+    const double come =
+        measured_in == BUFGYM_MESSAGES ? (double)(arrival->seq - q->dequeued_seq) : arrival->x - q->dequeued_x;
+    double recent, r, m;
+    if (L < @LEAST@ || elapsed_us <= 0.0 || memory[BUFGYM_RATE] <= 0.0 || memory[BUFGYM_PACE] <= 0.0)
+        return 0.0;
+    if (q->period_square > @BURSTY@ * q->period_us * q->period_us)
+        return 0.0;
+    recent = @SHORT@ * (1e6 * q->short_rate) + @LONG@ * (1e6 * q->long_rate);
+    r = (recent / 1e6 + @REST@ * memory[BUFGYM_RATE]) / bufgym_mean_bytes(q, arrival);
+    if (L > r * memory[BUFGYM_SEEN_US])
+        return 0.0;
+    m = @UNPACED@ * come / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
+    return m * @HORIZON_US@ / (r * @HORIZON_US@ + L - q->occupancy);
+}
+
+/* The decision that brings the gaps to g. */
+static inline int bufgym_approach(
+    const struct bufgym_queue *q, const struct bufgym_message *arrival, double g, int measured_in)
+{
+    const int s = q->occupancy, room = bufgym_has_space(q, arrival);
+    double head, left;
+    int victim;
+    if (room && (s == 0 || q->busy == 0))
+        return BUFGYM_ACCEPT;
+    if (s > 0 && (double)q->left_bytes * 1e6 < @NEAR@ * q->period_us * (1e6 * q->short_rate)) {
+        bufgym_gap(q, arrival, 0, measured_in, &head, &left);
+        if (fabs(left - g) < fabs(head - g))
+            return 0;
+    }
+    victim = bufgym_smallest_gap(q, arrival, measured_in, @DISCOUNT@);
+    if (room && bufgym_gap_left(q, arrival, victim, measured_in) > @WITHIN@ * g)
+        return BUFGYM_ACCEPT;
+    return victim;
+}

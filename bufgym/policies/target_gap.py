@@ -1,0 +1,129 @@
+"""The target gap: how far apart messages should be sent, so that the link and the queue carry what is to come.
+
+    m <- motion per time: since the message dequeued last, and over ``PACE_US``
+    r <- messages per time that the link sends: its rates over 0.1 s and 2 s, and over ``LINK_US``
+    g <- m T / (r T + L - s)
+
+In the next T the scene moves on by m T, the link sends r T messages and the queue finds room for L - s more: g is their
+gap if it is even. It is wide where the queue is full, or the link slower than the scene moves.
+
+    soon <- whether the socket is free before ``NEAR`` more arrivals
+    if soon and the message behind the head lies nearer to g than the head: the head goes
+    elif the queue is full: what leaves the smallest gap goes, older ones rather
+    elif the smallest gap that can be left is at most g: it goes, though there is room
+
+The head waits for its turn until it is decided, as until then the link's rate may change. On a steady link, where g is
+known, the even spacing is made behind it (``thinning``).
+
+Where the future is not to be told from the past, none of this is done: bursts (an empty queue would leave the link
+idle), queues of fewer than ``LEAST`` messages, and streams that have not yet run for as long as the queue takes to be
+sent. What waits when a stream ends is sent as well, so a long queue must not be thinned for a future that may not come.
+"""
+
+from __future__ import annotations
+
+from bufgym.kernel import kernel
+from bufgym.model.buffer import ACCEPT, Buffer, has_space
+from bufgym.observe.on_board import mean_bytes
+from bufgym.policies.gaps import MESSAGES, MOTION, gap_left, gaps_of, smallest_gap
+from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.thinning import places, spare, steady
+
+HORIZON_US = 5e6
+"""T."""
+SHORT, LONG = 0.25, 0.25
+"""Weights of the link's rates over 0.1 s and 2 s in r; the rest is that of the rate over ``LINK_US``."""
+REST = 1 - SHORT - LONG
+LINK_US = 20e6
+PACED, PACE_US = 0.4, 15e6
+"""Weight in m of the mean motion over ``PACE_US``."""
+NEAR = 1.5
+"""Arrivals."""
+DISCOUNT = 0.165
+"""By how much less the gap left by the head counts than that left by the tail."""
+LEAST = 4
+"""L from which on the target is followed."""
+BURSTY = 1.5
+"""Arrivals come in bursts where the mean square of the time between them is over so many times its square."""
+WITHIN = 1.001
+"""A gap may be longer than g by rounding."""
+
+RATE, SENT_US, PACE, SEEN_US = range(4)
+REMEMBERED = {"rate": 0.0, "sent_us": 0.0, "pace": 0.0, "seen_us": 0.0}
+"""The policy's memory: the link's rate over ``LINK_US`` (bytes/us), how long it has sent, the motion (or messages) per
+us over ``PACE_US``, how long the stream has run."""
+
+
+@kernel
+def remember(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int) -> None:
+    """Renew the two long means; to be called at every arrival."""
+    if buffer.evictions > 0:
+        return
+    sent_us = float(buffer.drained_us)
+    if sent_us > 0:
+        memory[RATE] += (buffer.drained_bytes - memory[RATE] * sent_us) / (sent_us + min(LINK_US, memory[SENT_US]))
+        memory[SENT_US] += sent_us
+    us = float(arrival.arrival_us - buffer.previous_us)
+    if us > 0:
+        step = 1.0 if measured_in == MESSAGES else arrival.x - buffer.previous_x
+        memory[PACE] += (step - memory[PACE] * us) / (us + min(PACE_US, memory[SEEN_US]))
+        memory[SEEN_US] += us
+
+
+@kernel
+def link_rate(buffer: Buffer, memory: Memory) -> float:
+    """The rate that is expected, bytes/us."""
+    recent = SHORT * buffer.short_rate_bytes_per_s + LONG * buffer.long_rate_bytes_per_s
+    return float(recent / 1e6 + REST * memory[RATE])
+
+
+@kernel
+def target(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int) -> float:
+    """g, in motion or in messages; 0 where it cannot be told (see the module's text)."""
+    s, L = len(buffer.slots), places(buffer, arrival)
+    elapsed_us = float(arrival.arrival_us - buffer.dequeued_arrival_us)
+    if L < LEAST or len(buffer.topics) > 1 or elapsed_us <= 0 or memory[RATE] <= 0 or memory[PACE] <= 0:
+        return 0.0
+    if buffer.period_square > BURSTY * buffer.period_us * buffer.period_us:
+        return 0.0
+    r = link_rate(buffer, memory) / mean_bytes(buffer, arrival)
+    if L > r * memory[SEEN_US]:
+        return 0.0
+    come = float(arrival.seq - buffer.dequeued_seq) if measured_in == MESSAGES else arrival.x - buffer.dequeued_x
+    m = (1 - PACED) * come / elapsed_us + PACED * memory[PACE]
+    return float(m * HORIZON_US / (r * HORIZON_US + L - s))
+
+
+@kernel
+def approach(buffer: Buffer, arrival: Arrival, g: float, measured_in: int) -> int:
+    """The decision that brings the gaps to ``g``."""
+    s, room = len(buffer.slots), has_space(buffer, arrival)
+    if room and (s == 0 or not buffer.busy):
+        return ACCEPT
+    if s > 0 and buffer.left_bytes * 1e6 < NEAR * buffer.period_us * buffer.short_rate_bytes_per_s:
+        head, merged = gaps_of(buffer, arrival, 0, measured_in)
+        if abs(merged - g) < abs(head - g):
+            return 0
+    victim = smallest_gap(buffer, arrival, measured_in, DISCOUNT)
+    if room and gap_left(buffer, arrival, victim, measured_in) > WITHIN * g:
+        return ACCEPT
+    return victim
+
+
+@register(
+    "target-gap",
+    memory=REMEMBERED,
+    source="own rule: min-motion-gap, towards the gap that link and queue can carry",
+    reads_rate=True,
+    compile=True,
+)
+def target_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """Sends messages as far apart as the link's rate and the room that is left suggest; drops with room, too."""
+    remember(buffer, arrival, memory, MOTION)
+    g = target(buffer, arrival, memory, MOTION)
+    if g > 0 and not steady(buffer):
+        return approach(buffer, arrival, g, MOTION)
+    victim = smallest_gap(buffer, arrival, MOTION, 0.0)
+    if has_space(buffer, arrival) and not spare(buffer, arrival, victim, MOTION):
+        return ACCEPT
+    return victim

@@ -1,0 +1,75 @@
+"""The slow twin of ``bufgym.policies.target_gap``: it keeps all that it saw and takes its means anew each time.
+
+Gaps in ``x`` (motion) or ``seq`` (messages).
+"""
+
+from __future__ import annotations
+
+from thinning_cases import gaps_left, least_gap, places
+
+from bufgym.policies import ACCEPT, REJECT
+
+
+class Seen:
+    """What one policy has seen of one queue."""
+
+    def __init__(self):
+        self.sent, self.moved = [], []  # (bytes, us) and (x, us) of each arrival with any time in it
+
+    def remember(self, buffer, arrival, measured_in):
+        if buffer.evictions:
+            return
+        if buffer.drained_us > 0:
+            self.sent.append((float(buffer.drained_bytes), float(buffer.drained_us)))
+        if arrival["arrival_us"] > buffer.previous_us:
+            step = arrival["x"] - buffer.previous_x if measured_in == "x" else 1.0
+            self.moved.append((float(step), float(arrival["arrival_us"] - buffer.previous_us)))
+
+    @property
+    def seen_us(self):
+        return sum(us for _, us in self.moved)
+
+    def target(self, buffer, arrival, measured_in):
+        """g, or None where it cannot be told."""
+        L, s = places(buffer, arrival), len(buffer.slots)
+        elapsed_us = float(arrival["arrival_us"] - buffer.dequeued_arrival_us)
+        rate, pace = running_mean(self.sent, 20e6), running_mean(self.moved, 15e6)
+        if L < 4 or len(buffer.topics) > 1 or elapsed_us <= 0 or rate <= 0 or pace <= 0:
+            return None
+        if buffer.period_square > 1.5 * buffer.period_us * buffer.period_us:
+            return None
+        recent = (0.25 * buffer.short_rate_bytes_per_s + 0.25 * buffer.long_rate_bytes_per_s) / 1e6
+        r = (recent + 0.5 * rate) / ((buffer.backlog_bytes + arrival["size_bytes"]) / (s + 1))
+        if r * self.seen_us < L:
+            return None
+        last = {"x": buffer.dequeued_x, "seq": buffer.dequeued_seq}[measured_in]
+        m = 0.6 * float(arrival[measured_in] - last) / elapsed_us + 0.4 * pace
+        g = m * 5e6 / (r * 5e6 + L - s)
+        return g if g > 0 else None
+
+
+def running_mean(steps, window_us):
+    """Of amounts a us, each weighing its time beside all of the past, but no more of that than the window."""
+    mean = seen_us = 0.0
+    for amount, us in steps:
+        mean += (amount - mean * us) / (us + min(window_us, seen_us))
+        seen_us += us
+    return mean
+
+
+def approached(buffer, arrival, g, measured_in):
+    """The decision that brings the gaps to ``g``."""
+    s = len(buffer.slots)
+    room = s < buffer.capacity and buffer.backlog_bytes + arrival["size_bytes"] <= buffer.max_bytes
+    if room and (s == 0 or not buffer.busy):
+        return ACCEPT
+    left = gaps_left(buffer, arrival, measured_in)
+    free_soon = buffer.left_bytes * 1e6 < 1.5 * buffer.period_us * buffer.short_rate_bytes_per_s
+    if s and free_soon:
+        last = {"x": buffer.dequeued_x, "seq": buffer.dequeued_seq}[measured_in]
+        if abs(left[0] - g) < abs(float(buffer.slots[0][measured_in] - last) - g):
+            return 0
+    victim = least_gap(buffer, arrival, measured_in, discount=0.165)
+    if room and left[s if victim == REJECT else victim] > 1.001 * g:
+        return ACCEPT
+    return victim

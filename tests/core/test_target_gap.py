@@ -1,0 +1,169 @@
+"""Messages go out as far apart as the link and the room that is left can carry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cases import VALUES, cases, newcomer, queue_of, same
+from hypothesis import given, settings
+from target_cases import Seen, approached
+from thinning_cases import least_gap, level, spared
+
+from bufgym import policies
+from bufgym.benchmark.run import by_trace, draw
+from bufgym.kernel import JIT
+from bufgym.model import qoi
+from bufgym.model.buffer import ACCEPT, REJECT
+from bufgym.policies import Policy
+from bufgym.policies.gaps import MESSAGES, MOTION
+from bufgym.policies.target_gap import PACE, RATE, SEEN_US, SENT_US, approach, remember, target
+from bufgym.scenario import suites
+from bufgym.sim import run
+
+POLICY = policies.get("target-gap")
+V = qoi.exponential(0.618)
+
+
+def waiting(*frames, sent=0, now=8, **known):
+    """Frames of 1000 bytes at 30 Hz are queued, frame ``sent`` is in the socket, frame ``now`` arrives; x is twice the
+    number of the frame. The link sends one frame every four, the stream has run for 10 s."""
+    buffer = queue_of(len(frames), 8)
+    for name, scale in (("arrival_us", 33_333), ("x", 2.0), ("seq", 1)):
+        buffer.slots[name] = scale * np.array(frames)
+    arrival = newcomer()
+    arrival["arrival_us"], arrival["x"], arrival["seq"], arrival["size_bytes"] = 33_333 * now, 2.0 * now, now, 1000
+    seen = {
+        "busy": 1,
+        "left_bytes": 1000,
+        "backlog_bytes": 1000 * len(frames),
+        "dequeued_arrival_us": 33_333 * sent,
+        "dequeued_x": 2.0 * sent,
+        "dequeued_seq": sent,
+        "previous_us": 33_333 * (now - 1),
+        "previous_x": 2.0 * (now - 1),
+        "period_us": 33_333.0,
+        "period_square": 33_333.0**2,
+        "short_rate_bytes_per_s": 7500.0,
+        "medium_rate_bytes_per_s": 7500.0,
+        "long_rate_bytes_per_s": 7500.0,
+    }
+    return buffer._replace(**seen | known), arrival
+
+
+def remembered(rate=7500e-6, pace=2 / 33_333, seen_us=10e6):
+    memory = np.zeros(4)
+    memory[[RATE, SENT_US, PACE, SEEN_US]] = rate, seen_us, pace, seen_us
+    return memory
+
+
+def test_the_target_is_what_comes_divided_by_what_the_link_and_the_room_carry():
+    # In 5 s come 150 frames; the link sends 37.5, and three waiting leave room for 5: one in 150 / 42.5 = 3.53.
+    assert target(*waiting(2, 4, 6), remembered(), MOTION) == pytest.approx(2 * 3.53, rel=1e-3)
+    assert target(*waiting(2, 4, 6), remembered(pace=1 / 33_333), MESSAGES) == pytest.approx(3.53, rel=1e-3)
+    full = waiting(0, 1, 2, 3, 4, 5, 6, 7)
+    assert target(*full, remembered(), MOTION) == pytest.approx(2 * 4.0, rel=1e-3)  # no room: as the link sends
+    # Half the rate is that over 20 s, a quarter each that over 0.1 s and 2 s: 7500 x (0.5 + 0.25 + 0).
+    slow, arrival = waiting(0, 1, 2, 3, 4, 5, 6, 7, short_rate_bytes_per_s=0.0)
+    assert target(slow, arrival, remembered(), MOTION) == pytest.approx(2 * 4 / 0.75, rel=1e-3)
+    # Motion: 0.6 of what has come since the message dequeued last, 0.4 of the mean over 15 s.
+    assert target(*full, remembered(pace=0.5 / 33_333), MOTION) == pytest.approx(4 * (0.6 * 2 + 0.4 * 0.5), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"capacity": 3}, {"period_square": 1.6 * 33_333.0**2}, {"dequeued_arrival_us": 8 * 33_333}],
+    ids=["short queue", "bursts", "no time"],
+)
+def test_where_the_future_is_not_to_be_told_there_is_no_target(change):
+    assert target(*waiting(2, 4, **change), remembered(), MOTION) == 0
+
+
+def test_a_stream_must_have_run_for_as_long_as_the_queue_takes_to_be_sent():
+    # L = 8 at 7.5 a second: 1.07 s.
+    assert target(*waiting(2, 4), remembered(seen_us=1.06e6), MOTION) == 0
+    assert target(*waiting(2, 4), remembered(seen_us=1.07e6), MOTION) > 0
+    assert target(*waiting(2, 4), remembered(rate=0.0), MOTION) == 0
+    assert target(*waiting(2, 4), remembered(pace=0.0), MOTION) == 0
+
+
+def test_the_head_goes_when_its_turn_comes_and_the_next_lies_nearer_to_the_target():
+    near = {"left_bytes": 374}  # 1.5 arrivals of 250 bytes: before it is decided for good
+    assert approach(*waiting(3, 5, 8, now=12, **near), 9.0, MOTION) == 0  # gaps of 6 or 10: 10 is nearer to 9
+    assert approach(*waiting(3, 5, 8, now=12, **near), 7.9, MOTION) == ACCEPT
+    assert approach(*waiting(3, 5, 8, now=12, left_bytes=376), 9.0, MOTION) == ACCEPT  # not its turn yet
+    assert approach(*waiting(3, 5, 8, now=12, **near), 4.5, MESSAGES) == 0  # the same in messages: 3 or 5
+
+
+def test_with_room_goes_what_leaves_a_gap_no_longer_than_the_target():
+    # In x, 0 was sent, 4, 8 and 12 wait and 16 comes: each leaves 8, the newcomer 6, as 18 is expected after it.
+    # That of the head counts 8 x 0.835 = 6.68.
+    assert approach(*waiting(2, 4, 6), 6.0, MOTION) == REJECT
+    assert approach(*waiting(2, 4, 6), 5.9, MOTION) == ACCEPT
+    # With 14 behind 12 that leaves 4 (16 less 12), as does the newcomer: the older of both.
+    assert approach(*waiting(2, 4, 6, 7), 4.0, MOTION) == 3
+    assert approach(*waiting(4, 5, 6, now=12, sent=3), 4.0, MOTION) == 0
+
+
+def test_a_full_queue_drops_the_smallest_gap_older_ones_rather():
+    # Each leaves 4 frames, the head's count 3.34; the newcomer leaves 4 where it is frame 19, 2 where it is 17.
+    frames = (2, 4, 6, 8, 10, 12, 14, 16)
+    assert approach(*waiting(*frames, now=19), 1.0, MOTION) == 0
+    assert approach(*waiting(*frames, now=17), 1.0, MOTION) == REJECT
+
+
+def test_an_idle_or_empty_socket_takes_what_comes():
+    assert approach(*waiting(2, 4, 6, busy=0), 99.0, MOTION) == ACCEPT
+    assert approach(*waiting(), 99.0, MOTION) == ACCEPT
+
+
+def test_two_means_are_kept():
+    memory = np.zeros(4)
+    buffer, arrival = waiting(2, drained_bytes=500, drained_us=20_000)
+    remember(buffer, arrival, memory, MOTION)
+    assert memory.tolist() == [500 / 20_000, 20_000, 2 / 33_333, 33_333]
+    remember(buffer._replace(evictions=1), arrival, memory, MOTION)  # the same arrival once more
+    assert memory[SEEN_US] == 33_333
+    remember(buffer._replace(drained_bytes=0, drained_us=10_000), arrival, memory, MESSAGES)
+    assert memory[RATE] == pytest.approx(500 / 30_000) and memory[PACE] == pytest.approx(3 / 66_666)
+    long = np.array([1.0, 60e6, 1.0, 60e6])  # windows of 20 s and 15 s, however long it has run
+    remember(buffer._replace(drained_bytes=0, drained_us=20_000_000), arrival, long, MESSAGES)
+    assert long[RATE] == pytest.approx(0.5)
+    assert long[PACE] == pytest.approx((15e6 + 1) / (15e6 + 33_333))
+
+
+def twin():
+    """A policy that decides alike, of what it has seen."""
+    seen = Seen()
+
+    def on_arrival(buffer, arrival, memory):
+        seen.remember(buffer, arrival, "x")
+        g = seen.target(buffer, arrival, "x")
+        if g is not None and not level(buffer):
+            return approached(buffer, arrival, g, "x")
+        victim = least_gap(buffer, arrival, "x")
+        room = len(buffer.slots) < buffer.capacity
+        room = room and buffer.backlog_bytes + arrival["size_bytes"] <= buffer.max_bytes
+        return ACCEPT if room and not spared(buffer, arrival, victim, "x") else victim
+
+    return Policy("twin", on_arrival, reads_rate=True)
+
+
+@given(cases(max_messages=80), VALUES)
+@settings(max_examples=100 if JIT else 20)
+def test_decides_as_its_twin(case, v):
+    assert same(case.run(POLICY, v), case.run(twin(), v))
+    overflow = replace(case, decide_at="overflow")
+    assert same(overflow.run(POLICY, v), overflow.run(twin(), v))
+
+
+def test_over_fading_links_less_is_lost_than_by_the_smallest_gap_alone():
+    """The validation links of ``generated-v1``, 900 kB by time, L = 15: less than three quarters of AFR's regret."""
+    scenario = suites.get("generated-v1").settings("validation")["time-900kB"].scenario
+    episodes = [draw(link, seed=1) for _, link in by_trace(scenario)]
+
+    def total(name):
+        return float(run(policies.get(name), episodes, 15, scenario.value).batch.senders["delivered_gain"].sum())
+
+    assert total("afr") < total("min-motion-gap") < total("target-gap")
