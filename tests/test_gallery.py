@@ -49,8 +49,8 @@ def test_an_interruption_second_by_second() -> None:
 def test_what_the_readme_says_of_its_film() -> None:
     scenario = gallery.fading()
     oldest, learned = gallery.play(["drop-oldest", "learned-motion"], draw(scenario, 0), 8, scenario)
-    assert len(oldest.received) == len(learned.received) == 196
-    assert 3.0 < oldest.longest_gap_s < 3.2 and learned.longest_gap_s < 0.7
+    assert (len(oldest.received), len(learned.received)) == (196, 189)
+    assert 3.0 < oldest.longest_gap_s < 3.2 and learned.longest_gap_s < 0.6
     assert learned.h > oldest.h + 1
 
 

@@ -77,6 +77,8 @@ def test_cards_show_the_numbers_of_the_results() -> None:
     page = cards.page()
     motion = {suite: rest for suite, *rest in cards.scores(cards.CARDS["learned-motion"])}
     assert motion["interruption-v1"] == ["0.51 [0.47, 0.55]", "0.982 [0.980, 0.983]", "0.965 [0.962, 0.967]"]
+    shipped = {suite: (regret, score) for suite, regret, score in cards.board("learned-motion")}
+    assert shipped["interruption-v1"] == ("0.43", "0.984") and "| interruption-v1 | 0.43 | 0.984 |" in page
     assert set(motion) == {"interruption-v1", "lte-v1", "outage-v1", "sustained-v1", "lte-belgium-v1"}
     assert {name for name in policies.names() if name.startswith("learned-")} == set(cards.CARDS)
     assert "python train.py --suite topics-v1" in page

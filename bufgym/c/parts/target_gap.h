@@ -32,7 +32,9 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
     const double come =
         measured_in == BUFGYM_MESSAGES ? (double)(arrival->seq - q->dequeued_seq) : arrival->x - q->dequeued_x;
     double recent, r, m;
-    if (L < @LEAST@ || elapsed_us <= 0.0 || memory[BUFGYM_RATE] <= 0.0 || memory[BUFGYM_PACE] <= 0.0)
+    if (BUFGYM_CAPACITY < @LEAST@ || L < @LEAST@ || elapsed_us <= 0.0)
+        return 0.0;
+    if (memory[BUFGYM_RATE] <= 0.0 || memory[BUFGYM_PACE] <= 0.0)
         return 0.0;
     if (q->period_square > @BURSTY@ * q->period_us * q->period_us)
         return 0.0;
