@@ -100,6 +100,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "DISCOUNT": repr(target_gap.DISCOUNT),
         "LEAST": target_gap.LEAST,
         "BURSTY": repr(target_gap.BURSTY),
+        "LATE": repr(target_gap.LATE),
         "WITHIN": repr(target_gap.WITHIN),
         "FLOWS": repr(learned.FLOWS),
         "FEW": learned.FEW,

@@ -63,7 +63,7 @@ from bufgym.policies.scoring import (
     unpack,
 )
 from bufgym.policies.small_queue import NONE, NUMBERS, packed, planned
-from bufgym.policies.target_gap import REMEMBERED, approach, remember, target
+from bufgym.policies.target_gap import REMEMBERED, approach, bursty, remember, target
 from bufgym.policies.thinning import STEADY, spare, steady
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
@@ -98,12 +98,13 @@ def even(buffer: Buffer, arrival: Arrival) -> bool:
 def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The decision that scores highest, or that of what decides instead."""
     flags, end, runs_evenly = int(buffer.parameters[0]), len(buffer.parameters), even(buffer, arrival)
-    thins, measured_in = flags & THINS, MOTION if flags & SEES_MOTION else MESSAGES
+    thins, measured_in = bool(flags & THINS), MOTION if flags & SEES_MOTION else MESSAGES
     leaves = flags & LEAVES and (flags & SEES_MOTION or runs_evenly)
     if flags & LEAVES:
         end -= NUMBERS
     if thins:
         remember(buffer, arrival, memory, measured_in)
+        thins = not bursty(memory)
     if leaves and straight(buffer.v):
         return _greedy_qoi(buffer, arrival, memory)
     if steady(buffer):
@@ -125,7 +126,8 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
             return plan
     at = end_of(buffer.parameters, 1, 2) if still else 1
     scorer = unpack(buffer.parameters, at if at < end else 1, 2)
-    return scored(buffer, arrival, scorer, measured_in if thins and not still else 0, memory[OWN:] if thins else memory)
+    own = memory[OWN:] if flags & THINS else memory
+    return scored(buffer, arrival, scorer, measured_in if thins and not still else 0, own)
 
 
 @kernel

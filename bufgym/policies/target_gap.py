@@ -43,20 +43,21 @@ DISCOUNT = 0.165
 """By how much less the gap left by the head counts than that left by the tail."""
 LEAST = 4
 """L from which on the target is followed."""
-BURSTY = 1.5
-"""Arrivals come in bursts where the mean square of the time between them is over so many times its square."""
+BURSTY, LATE = 1.5, 1 / 32
+"""Arrivals come in bursts where the mean square of the time between them is over so many times its square: 2 for a
+Poisson process, 10 for bursts of ten. The newest weighs ``LATE`` in both means, so that no burst is all that counts."""
 WITHIN = 1.001
 """A gap may be longer than g by rounding."""
 
-RATE, SENT_US, PACE, SEEN_US = range(4)
-REMEMBERED = {"rate": 0.0, "sent_us": 0.0, "pace": 0.0, "seen_us": 0.0}
+RATE, SENT_US, PACE, SEEN_US, PERIOD, SQUARE = range(6)
+REMEMBERED = {"rate": 0.0, "sent_us": 0.0, "pace": 0.0, "seen_us": 0.0, "period": 0.0, "square": 0.0}
 """The policy's memory: the link's rate over ``LINK_US`` (bytes/us), how long it has sent, the motion (or messages) per
-us over ``PACE_US``, how long the stream has run."""
+us over ``PACE_US``, how long the stream has run, the mean time between arrivals and its mean square."""
 
 
 @kernel
 def remember(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int) -> None:
-    """Renew the two long means; to be called at every arrival."""
+    """Renew the long means; to be called at every arrival."""
     if buffer.evictions > 0:
         return
     sent_us = float(buffer.drained_us)
@@ -64,10 +65,19 @@ def remember(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int)
         memory[RATE] += (buffer.drained_bytes - memory[RATE] * sent_us) / (sent_us + min(LINK_US, memory[SENT_US]))
         memory[SENT_US] += sent_us
     us = float(arrival.arrival_us - buffer.previous_us)
+    weight = LATE if memory[PERIOD] > 0 else 1.0
+    memory[PERIOD] += weight * (us - memory[PERIOD])
+    memory[SQUARE] += weight * (us * us - memory[SQUARE])
     if us > 0:
         step = 1.0 if measured_in == MESSAGES else arrival.x - buffer.previous_x
         memory[PACE] += (step - memory[PACE] * us) / (us + min(PACE_US, memory[SEEN_US]))
         memory[SEEN_US] += us
+
+
+@kernel
+def bursty(memory: Memory) -> bool:
+    """Whether messages come in bursts."""
+    return bool(memory[SQUARE] > BURSTY * memory[PERIOD] * memory[PERIOD])
 
 
 @kernel
@@ -84,7 +94,7 @@ def target(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int) -
     elapsed_us = float(arrival.arrival_us - buffer.dequeued_arrival_us)
     if L < LEAST or len(buffer.topics) > 1 or elapsed_us <= 0 or memory[RATE] <= 0 or memory[PACE] <= 0:
         return 0.0
-    if buffer.period_square > BURSTY * buffer.period_us * buffer.period_us:
+    if bursty(memory):
         return 0.0
     r = link_rate(buffer, memory) / mean_bytes(buffer, arrival)
     if L > r * memory[SEEN_US]:
@@ -124,6 +134,6 @@ def target_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     if g > 0 and not steady(buffer):
         return approach(buffer, arrival, g, MOTION)
     victim = smallest_gap(buffer, arrival, MOTION, 0.0)
-    if has_space(buffer, arrival) and not spare(buffer, arrival, victim, MOTION):
+    if has_space(buffer, arrival) and (bursty(memory) or not spare(buffer, arrival, victim, MOTION)):
         return ACCEPT
     return victim

@@ -15,12 +15,14 @@ class Seen:
 
     def __init__(self):
         self.sent, self.moved = [], []  # (bytes, us) and (x, us) of each arrival with any time in it
+        self.periods = []  # us before each arrival
 
     def remember(self, buffer, arrival, measured_in):
         if buffer.evictions:
             return
         if buffer.drained_us > 0:
             self.sent.append((float(buffer.drained_bytes), float(buffer.drained_us)))
+        self.periods.append(float(arrival["arrival_us"] - buffer.previous_us))
         if arrival["arrival_us"] > buffer.previous_us:
             step = arrival["x"] - buffer.previous_x if measured_in == "x" else 1.0
             self.moved.append((float(step), float(arrival["arrival_us"] - buffer.previous_us)))
@@ -29,6 +31,11 @@ class Seen:
     def seen_us(self):
         return sum(us for _, us in self.moved)
 
+    @property
+    def bursty(self):
+        mean, square = faded(self.periods)
+        return square > 1.5 * mean * mean
+
     def target(self, buffer, arrival, measured_in):
         """g, or None where it cannot be told."""
         L, s = places(buffer, arrival), len(buffer.slots)
@@ -36,7 +43,7 @@ class Seen:
         rate, pace = running_mean(self.sent, 20e6), running_mean(self.moved, 15e6)
         if L < 4 or len(buffer.topics) > 1 or elapsed_us <= 0 or rate <= 0 or pace <= 0:
             return None
-        if buffer.period_square > 1.5 * buffer.period_us * buffer.period_us:
+        if self.bursty:
             return None
         recent = (0.25 * buffer.short_rate_bytes_per_s + 0.25 * buffer.long_rate_bytes_per_s) / 1e6
         r = (recent + 0.5 * rate) / ((buffer.backlog_bytes + arrival["size_bytes"]) / (s + 1))
@@ -46,6 +53,15 @@ class Seen:
         m = 0.6 * float(arrival[measured_in] - last) / elapsed_us + 0.4 * pace
         g = m * 5e6 / (r * 5e6 + L - s)
         return g if g > 0 else None
+
+
+def faded(periods):
+    """Means of the periods and of their squares, of which the newest weighs 1/32; the first that is not 0 all."""
+    mean = square = 0.0
+    for period in periods:
+        weight = 1 / 32 if mean > 0 else 1.0
+        mean, square = mean + weight * (period - mean), square + weight * (period * period - square)
+    return mean, square
 
 
 def running_mean(steps, window_us):

@@ -90,6 +90,7 @@ def twin(whole):
         still = buffer.service_ratio < 0.07
         measured_in = "x" if "motion_merged" in whole.fields else "seq"
         seen.remember(buffer, arrival, measured_in)
+        thins = whole.thins and not seen.bursty
         steps, moved = arrival.seq - buffer.dequeued_seq, arrival.x - buffer.dequeued_x
         even = abs((arrival.x - buffer.previous_x) * steps - moved) <= moved / 100
         shortcuts = whole.shortcuts and (even or measured_in == "x")
@@ -101,11 +102,11 @@ def twin(whole):
         room = room and buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes
         if level(buffer):
             smallest = least_gap(buffer, arrival, measured_in)
-            if whole.thins and room and spared(buffer, arrival, smallest, measured_in):
+            if thins and room and spared(buffer, arrival, smallest, measured_in):
                 return smallest
             if shortcuts and not even and (buffer.service_ratio >= 0.18 or buffer.capacity <= 3):
                 return policies.get("greedy-qoi").on_arrival(buffer, arrival, memory)
-        elif whole.thins and (g := seen.target(buffer, arrival, measured_in)) is not None:
+        elif thins and (g := seen.target(buffer, arrival, measured_in)) is not None:
             return approached(buffer, arrival, g, measured_in)
         if shortcuts and still and buffer.drained_bytes == 0:
             plan = small_queue.planned(buffer, arrival, small_queue.packed())  # test_small_queue.py has its twin
@@ -135,7 +136,7 @@ def twin(whole):
         choices.append((drop_score(L), REJECT))
         best = max(value for value, _ in choices)
         first = next(decision for value, decision in choices if value == best)
-        if room and whole.thins and not still and spared(buffer, arrival, first, measured_in):
+        if room and thins and not still and spared(buffer, arrival, first, measured_in):
             return first
         if room and score(made.accept, features(L)) >= best:
             return ACCEPT

@@ -18,7 +18,7 @@ from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.policies import Policy
 from bufgym.policies.gaps import MESSAGES, MOTION
-from bufgym.policies.target_gap import PACE, RATE, SEEN_US, SENT_US, approach, remember, target
+from bufgym.policies.target_gap import PACE, PERIOD, RATE, SEEN_US, SENT_US, SQUARE, approach, remember, target
 from bufgym.scenario import suites
 from bufgym.sim import run
 
@@ -44,7 +44,6 @@ def waiting(*frames, sent=0, now=8, **known):
         "previous_us": 33_333 * (now - 1),
         "previous_x": 2.0 * (now - 1),
         "period_us": 33_333.0,
-        "period_square": 33_333.0**2,
         "short_rate_bytes_per_s": 7500.0,
         "medium_rate_bytes_per_s": 7500.0,
         "long_rate_bytes_per_s": 7500.0,
@@ -52,9 +51,9 @@ def waiting(*frames, sent=0, now=8, **known):
     return buffer._replace(**seen | known), arrival
 
 
-def remembered(rate=7500e-6, pace=2 / 33_333, seen_us=10e6):
-    memory = np.zeros(4)
-    memory[[RATE, SENT_US, PACE, SEEN_US]] = rate, seen_us, pace, seen_us
+def remembered(rate=7500e-6, pace=2 / 33_333, seen_us=10e6, square=33_333.0**2):
+    memory = np.zeros(6)
+    memory[[RATE, SENT_US, PACE, SEEN_US, PERIOD, SQUARE]] = rate, seen_us, pace, seen_us, 33_333, square
     return memory
 
 
@@ -73,11 +72,16 @@ def test_the_target_is_what_comes_divided_by_what_the_link_and_the_room_carry():
 
 @pytest.mark.parametrize(
     "change",
-    [{"capacity": 3}, {"period_square": 1.6 * 33_333.0**2}, {"dequeued_arrival_us": 8 * 33_333}],
-    ids=["short queue", "bursts", "no time"],
+    [{"capacity": 3}, {"max_bytes": 3999}, {"dequeued_arrival_us": 8 * 33_333}],
+    ids=["short queue", "room for three", "no time"],
 )
 def test_where_the_future_is_not_to_be_told_there_is_no_target(change):
     assert target(*waiting(2, 4, **change), remembered(), MOTION) == 0
+
+
+def test_bursts_are_not_followed():
+    assert target(*waiting(2, 4), remembered(square=1.4 * 33_333.0**2), MOTION) > 0
+    assert target(*waiting(2, 4), remembered(square=1.6 * 33_333.0**2), MOTION) == 0
 
 
 def test_a_stream_must_have_run_for_as_long_as_the_queue_takes_to_be_sent():
@@ -118,18 +122,20 @@ def test_an_idle_or_empty_socket_takes_what_comes():
     assert approach(*waiting(), 99.0, MOTION) == ACCEPT
 
 
-def test_two_means_are_kept():
-    memory = np.zeros(4)
+def test_long_means_are_kept():
+    memory = np.zeros(6)
     buffer, arrival = waiting(2, drained_bytes=500, drained_us=20_000)
     remember(buffer, arrival, memory, MOTION)
-    assert memory.tolist() == [500 / 20_000, 20_000, 2 / 33_333, 33_333]
+    assert memory.tolist() == [500 / 20_000, 20_000, 2 / 33_333, 33_333, 33_333, 33_333**2]
     remember(buffer._replace(evictions=1), arrival, memory, MOTION)  # the same arrival once more
     assert memory[SEEN_US] == 33_333
     remember(buffer._replace(drained_bytes=0, drained_us=10_000), arrival, memory, MESSAGES)
     assert memory[RATE] == pytest.approx(500 / 30_000) and memory[PACE] == pytest.approx(3 / 66_666)
-    long = np.array([1.0, 60e6, 1.0, 60e6])  # windows of 20 s and 15 s, however long it has run
+    assert memory[PERIOD] == pytest.approx(33_333) and memory[SQUARE] == pytest.approx(33_333**2)
+    long = np.array([1.0, 60e6, 1.0, 60e6, 1.0, 1.0])  # windows of 20 s and 15 s, however long it has run
     remember(buffer._replace(drained_bytes=0, drained_us=20_000_000), arrival, long, MESSAGES)
     assert long[RATE] == pytest.approx(0.5)
+    assert long[PERIOD] == pytest.approx(1 + 33_332 / 32)  # the newest weighs 1/32
     assert long[PACE] == pytest.approx((15e6 + 1) / (15e6 + 33_333))
 
 
@@ -145,7 +151,7 @@ def twin():
         victim = least_gap(buffer, arrival, "x")
         room = len(buffer.slots) < buffer.capacity
         room = room and buffer.backlog_bytes + arrival["size_bytes"] <= buffer.max_bytes
-        return ACCEPT if room and not spared(buffer, arrival, victim, "x") else victim
+        return ACCEPT if room and (seen.bursty or not spared(buffer, arrival, victim, "x")) else victim
 
     return Policy("twin", on_arrival, reads_rate=True)
 

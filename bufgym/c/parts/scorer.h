@@ -94,7 +94,7 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
         return bufgym_greedy(q, arrival);
     if (bufgym_steady(q)) {
 #if BUFGYM_THINS
-        if (bufgym_has_space(q, arrival)) {
+        if (!bufgym_bursty(q) && bufgym_has_space(q, arrival)) {
             const int smallest = bufgym_smallest_gap(q, arrival, BUFGYM_MEASURED_IN, 0.0);
             if (bufgym_spare(q, arrival, smallest, BUFGYM_MEASURED_IN))
                 return smallest;
@@ -129,7 +129,7 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
     }
     if (bufgym_has_space(q, arrival)) {
 #if BUFGYM_THINS
-        if (!still && bufgym_spare(q, arrival, decision, BUFGYM_MEASURED_IN))
+        if (!still && !bufgym_bursty(q) && bufgym_spare(q, arrival, decision, BUFGYM_MEASURED_IN))
             return decision;
 #endif
         common = bufgym_begin(q, scorer, BUFGYM_KEEP);

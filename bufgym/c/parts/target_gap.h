@@ -1,12 +1,14 @@
-/* What is remembered: the link's rate (bytes/us), how long it has sent, motion or messages per us, the stream's age. */
-enum { BUFGYM_RATE, BUFGYM_SENT_US, BUFGYM_PACE, BUFGYM_SEEN_US };
+/* What is remembered: the link's rate (bytes/us), how long it has sent, motion or messages per us, the stream's age, the
+   mean time between arrivals and its mean square. */
+enum { BUFGYM_RATE, BUFGYM_SENT_US, BUFGYM_PACE, BUFGYM_SEEN_US, BUFGYM_PERIOD, BUFGYM_SQUARE };
 
-/* Renew the two long means. */
+/* Renew the long means. */
 static inline void
 bufgym_remember(struct bufgym_queue *q, const struct bufgym_message *arrival, int measured_in)
 {
     double *memory = q->memory;
     const double sent_us = (double)q->drained_us, us = (double)(arrival->arrival_us - q->previous_us);
+    const double weight = memory[BUFGYM_PERIOD] > 0.0 ? @LATE@ : 1.0;
     if (q->evictions > 0)
         return;
     if (sent_us > 0.0) {
@@ -14,12 +16,20 @@ bufgym_remember(struct bufgym_queue *q, const struct bufgym_message *arrival, in
         memory[BUFGYM_RATE] += ((double)q->drained_bytes - memory[BUFGYM_RATE] * sent_us) / (sent_us + seen_us);
         memory[BUFGYM_SENT_US] += sent_us;
     }
+    memory[BUFGYM_PERIOD] += weight * (us - memory[BUFGYM_PERIOD]);
+    memory[BUFGYM_SQUARE] += weight * (us * us - memory[BUFGYM_SQUARE]);
     if (us > 0.0) {
         const double step = measured_in == BUFGYM_MESSAGES ? 1.0 : arrival->x - q->previous_x;
         const double seen_us = memory[BUFGYM_SEEN_US] < @PACE_US@ ? memory[BUFGYM_SEEN_US] : @PACE_US@;
         memory[BUFGYM_PACE] += (step - memory[BUFGYM_PACE] * us) / (us + seen_us);
         memory[BUFGYM_SEEN_US] += us;
     }
+}
+
+/* Whether messages come in bursts. */
+static inline int bufgym_bursty(const struct bufgym_queue *q)
+{
+    return q->memory[BUFGYM_SQUARE] > @BURSTY@ * q->memory[BUFGYM_PERIOD] * q->memory[BUFGYM_PERIOD];
 }
 
 /* The gap at which the link and the room that is left carry what comes within the horizon; 0 where it cannot be told. */
@@ -36,7 +46,7 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
         return 0.0;
     if (memory[BUFGYM_RATE] <= 0.0 || memory[BUFGYM_PACE] <= 0.0)
         return 0.0;
-    if (q->period_square > @BURSTY@ * q->period_us * q->period_us)
+    if (bufgym_bursty(q))
         return 0.0;
     recent = @SHORT@ * (1e6 * q->short_rate) + @LONG@ * (1e6 * q->long_rate);
     r = (recent / 1e6 + @REST@ * memory[BUFGYM_RATE]) / bufgym_mean_bytes(q, arrival);

@@ -8,7 +8,7 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
     if (g > 0.0 && !bufgym_steady(q))
         return bufgym_approach(q, arrival, g, BUFGYM_MOTION);
     victim = bufgym_smallest_gap(q, arrival, BUFGYM_MOTION, 0.0);
-    if (bufgym_has_space(q, arrival) && !bufgym_spare(q, arrival, victim, BUFGYM_MOTION))
+    if (bufgym_has_space(q, arrival) && (bufgym_bursty(q) || !bufgym_spare(q, arrival, victim, BUFGYM_MOTION)))
         return BUFGYM_ACCEPT;
     return victim;
 }
