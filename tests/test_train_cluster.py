@@ -69,7 +69,7 @@ def test_a_cluster_gives_the_same_agents_bit_for_bit(backend: str, request: pyte
     installed(backend)
     local: Path = request.getfixturevalue("local")  # only where there is something to compare
     trained("cluster", 30_000, "--backend", backend)
-    trained("cluster", 60_000, "--backend", backend, "--resume", "True")
+    trained("cluster", 60_000, "--backend", backend, "--resume")
     assert fitness(local, 0) != fitness(local, 1)
     cluster = Path("runs/cluster")
     for seed in (0, 1):
