@@ -12,9 +12,13 @@ alone (their mean over T is exact and cheap), then that for all other links, fro
 
 from __future__ import annotations
 
+import functools
 import pickle
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +30,7 @@ from agents.objectives import OBJECTIVES
 from agents.objectives.objective import Objective, Vector, policy_of, to_vector, with_vector
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Settings
+from bufgym.benchmark.cluster import connected
 from bufgym.files import replaced
 from bufgym.policies import weights
 from bufgym.policies.learned import Weights
@@ -37,6 +42,61 @@ MEMORY = 10
 """Generations over which the strategy's mean is averaged, exponentially."""
 DIAGONAL = 100
 """From so many weights on, a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
+
+
+# --- how candidates are evaluated ------------------------------------------------------------------------------------
+
+Evaluate = Callable[[Sequence[Weights | TopicWeights], int, bool], list[tuple[float, int]]]
+"""(candidates, part of the training episodes, ``still``) -> (fitness, decisions) of each, in their order."""
+
+
+def evaluation_here(objective: Objective) -> Evaluate:
+    """In this process, one after the other."""
+
+    def evaluate(candidates: Sequence[Weights | TopicWeights], part: int, still: bool) -> list[tuple[float, int]]:
+        return [_evaluated(objective, candidate, part, still) for candidate in candidates]
+
+    return evaluate
+
+
+@contextmanager
+def evaluation(settings: Settings, folder: Path, seed: int, objective: Objective) -> Iterator[Evaluate]:
+    """Where the settings say: here, or on the cluster at ``settings.address``. ``objective``: of that seed."""
+    if settings.backend == "local":
+        yield evaluation_here(objective)
+        return
+    with connected(settings.backend, settings.address or None) as call_each:
+
+        def evaluate(candidates: Sequence[Weights | TopicWeights], part: int, still: bool) -> list[tuple[float, int]]:
+            calls = [(settings, folder, seed, candidate, part, still) for candidate in candidates]
+            return call_each(evaluated_on_a_worker, calls)
+
+        yield evaluate
+
+
+_ONE_AT_A_TIME = threading.Lock()
+"""Rollouts write to their objective's buffers, and a Dask worker may have several threads."""
+
+
+def evaluated_on_a_worker(
+    settings: Settings, folder: Path, seed: int, candidate: Weights | TopicWeights, part: int, still: bool
+) -> tuple[float, int]:
+    """The fitness and the decisions of one candidate. The episodes are drawn and bounded once a process."""
+    with _ONE_AT_A_TIME:
+        return _evaluated(_objective(settings, folder, seed), candidate, part, still)
+
+
+@functools.lru_cache(maxsize=32)  # several seeds, and runs one after the other, meet on one worker
+def _objective(settings: Settings, folder: Path, seed: int) -> Objective:
+    return OBJECTIVES[settings.kind](settings, folder, seed)
+
+
+def _evaluated(objective: Objective, candidate: Weights | TopicWeights, part: int, still: bool) -> tuple[float, int]:
+    fitness = objective.fitness(policy_of(objective.name, candidate), part, still)
+    return fitness, objective.decisions(part, still)
+
+
+# --- the search ------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -79,16 +139,14 @@ class Evolution:
         """The agent so far."""
         return self.weights(self.average)
 
-    def generation(self, objective: Objective) -> float:
+    def generation(self, evaluate: Evaluate) -> float:
         """Ask for candidates, try them and tell their fitness, once; the best fitness."""
         vectors = self.strategy.ask()
-        part = self.generations
-        fitness = [
-            objective.fitness(policy_of(objective.name, self.weights(vector)), part, self.still) for vector in vectors
-        ]
+        results = evaluate([self.weights(vector) for vector in vectors], self.generations, self.still)
+        fitness = [each for each, _ in results]
         self.strategy.tell(vectors, fitness)
         self.average = self.average + (self.strategy.mean - self.average) / MEMORY
-        self.steps += objective.decisions(part, self.still) * len(vectors)
+        self.steps += sum(decisions for _, decisions in results)
         self.generations += 1
         return float(np.min(fitness))
 
@@ -111,26 +169,27 @@ def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
     validations = Validations(home, objective.columns, objective.best, settings, state.steps)
     began = time.perf_counter() - state.seconds
     bar = seed_bar(settings.steps, state.steps, seed, line)
-    while True:
-        if validations.due(state.steps):
-            measures = objective.validate(policy_of(objective.name, state.agent))
-            if validations.add(state.steps, state.seconds, measures):
-                notes = {"name": objective.name, "suite": settings.suite, "seeds": [seed], "algo": settings.algo}
-                weights.save(home / MODEL, state.agent, notes)
-            report = objective.message.format(measures[-1])
-            bar.set_postfix_str(report, refresh=False)
-            if not sys.stderr.isatty():
-                print(f"seed {seed}: {state.steps:,} of {settings.steps:,} steps, {report}", flush=True)
-        if state.steps >= settings.steps:
-            break
-        if state.still and state.steps >= settings.warm_up:
-            # From what did best on validation, as a scorer of interruptions alone may come to fail elsewhere.
-            state = Evolution.around(weights.read(home / MODEL)[0], objective.sigma[False], seed, steps=state.steps)
-        fitness = state.generation(objective)
-        state.seconds = round(time.perf_counter() - began, 3)
-        curve.append(state.steps, state.seconds, fitness)
-        with replaced(checkpoint) as unfinished:
-            unfinished.write_bytes(pickle.dumps(state))
-        bar.update(state.steps - bar.n)
+    with evaluation(settings, folder, seed, objective) as evaluate:
+        while True:
+            if validations.due(state.steps):
+                measures = objective.validate(policy_of(objective.name, state.agent))
+                if validations.add(state.steps, state.seconds, measures):
+                    notes = {"name": objective.name, "suite": settings.suite, "seeds": [seed], "algo": settings.algo}
+                    weights.save(home / MODEL, state.agent, notes)
+                report = objective.message.format(measures[-1])
+                bar.set_postfix_str(report, refresh=False)
+                if not sys.stderr.isatty():
+                    print(f"seed {seed}: {state.steps:,} of {settings.steps:,} steps, {report}", flush=True)
+            if state.steps >= settings.steps:
+                break
+            if state.still and state.steps >= settings.warm_up:
+                # From what did best on validation, as a scorer of interruptions alone may come to fail elsewhere.
+                state = Evolution.around(weights.read(home / MODEL)[0], objective.sigma[False], seed, steps=state.steps)
+            fitness = state.generation(evaluate)
+            state.seconds = round(time.perf_counter() - began, 3)
+            curve.append(state.steps, state.seconds, fitness)
+            with replaced(checkpoint) as unfinished:
+                unfinished.write_bytes(pickle.dumps(state))
+            bar.update(state.steps - bar.n)
     bar.close()
     return Run(seed, home, state.seconds, curve.rows, validations.rows, MODEL, objective.best)

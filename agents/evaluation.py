@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from agents.mixed_env import MixedEnv, cells
@@ -152,10 +153,13 @@ class ValidationSets:
     """The fixed validation episodes of all suites; made once, read from the run's folder afterwards."""
 
     def __init__(self, settings: Settings, folder: Path, progress: bool = False) -> None:
-        self._sets = [
-            EvaluationSet(sweep_for(settings, suite, "validation"), folder / "validation" / suite, progress=progress)
-            for suite in settings.suites
-        ]
+        home = folder / "validation"
+        home.mkdir(parents=True, exist_ok=True)
+        with FileLock(home / ".lock"):  # all seeds come here at once, and a sweep's folder refuses a second process
+            self._sets = [
+                EvaluationSet(sweep_for(settings, suite, "validation"), home / suite, progress=progress)
+                for suite in settings.suites
+            ]
 
     def play(self, agent: Any, padded_slots: int) -> Verdict:
         """An agent's verdict, averaged over the suites."""

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.cma_es import Evolution
+from agents.cma_es import Evolution, evaluation_here
 from agents.objectives.objective import Objective, policy_of
 from agents.objectives.queue import start
 from agents.page import command, publish, table
@@ -107,7 +107,7 @@ def evolved(reward: str, L: int, seed: int, generations: int) -> Policy:
     task = Task(reward, L, seed)
     state = Evolution.around(task.start(), SIGMA, seed)
     for _ in range(generations):
-        state.generation(task)
+        state.generation(evaluation_here(task))
     return policy_of(task.name, state.agent)
 
 

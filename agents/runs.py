@@ -25,7 +25,7 @@ from bufgym.files import locked, replaced
 RUNS = Path("runs")
 MODEL = "model.safetensors"
 """The file that holds an agent as weights which bufgym runs without torch."""
-FREE = {"name", "resume", "steps", "checkpoint_every", "validate_every", "episodes", "seeds"}
+FREE = {"name", "resume", "steps", "checkpoint_every", "validate_every", "episodes", "seeds", "backend", "address"}
 """Settings that may differ between a run and its resumption."""
 
 Numbers = tuple[float, ...]

@@ -94,6 +94,11 @@ class Settings:
     """Go on from the run's last checkpoint."""
     seeds: Count = 1
     """Train this many agents, each in a process of its own."""
+    backend: Literal["local", "ray", "dask"] = "local"
+    """Where an evolution's candidates are evaluated: in the seed's process, or on a Ray or Dask cluster, with the same
+    result. Its workers must be able to import bufgym and agents."""
+    address: str = ""
+    """Of the cluster's head, such as tcp://host:8786; by default a cluster on this machine is begun and ended."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """The first seed."""
     steps: Count = 1_500_000
@@ -175,7 +180,7 @@ class Settings:
         words = [
             f"--{name.replace('_', '-')} {shlex.quote(str(value))}"
             for name, value in asdict(self).items()
-            if name not in ("name", "resume") and value != defaults[name]
+            if name not in ("name", "resume", "backend", "address") and value != defaults[name]
         ]
         return " ".join(["python train.py", *words])
 
@@ -196,6 +201,10 @@ class Settings:
             self._refuse("env", "a scheduler learns from a suite of topics (--suite topics-v1 --algo evolution)")
         if self.kind == "environment" and self.algo == "evolution":
             raise BufgymError("--algo evolution learns from a suite's episodes: name one (--suite)")
+        if self.backend != "local" and self.algo != "evolution":
+            self._refuse("backend", "a cluster evaluates the candidates of --algo evolution alone")
+        if self.address and self.backend == "local":
+            self._refuse("address", "is that of a cluster: name its kind (--backend ray or dask)")
         if self.kind in _ALONE:
             agent, algorithms = _ALONE[self.kind]
             if len(self.suites) > 1 or self.algo not in algorithms:

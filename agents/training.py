@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from agents.objectives.fleet import FleetObjective, fleet_of
 from agents.objectives.objective import policy_of as slot_policy_of
 from agents.runs import MODEL, Numbers, Run, Validations, each_seed
 from agents.settings import Settings
+from bufgym.benchmark.cluster import begun
 from bufgym.benchmark.rows import Row
 from bufgym.envs.fleet_vec import FleetVecEnv
 from bufgym.errors import BufgymError
@@ -40,10 +42,13 @@ from bufgym.sb3.networks import policy_of
 
 
 def train_all(settings: Settings, folder: Path) -> list[Run]:
-    """Train every seed, in processes of their own if there are several."""
+    """Train every seed, in processes of their own if there are several; with a cluster they share it."""
     if settings.kind == "queue":
         ValidationSets(settings, folder, progress=True)  # the clairvoyant's bounds are found once for all seeds
-    return each_seed(cma_es.train if settings.algo == "evolution" else train_seed, settings, folder)
+    if settings.backend == "local":
+        return each_seed(cma_es.train if settings.algo == "evolution" else train_seed, settings, folder)
+    with begun(settings.backend, settings.address or None) as address:
+        return each_seed(cma_es.train, replace(settings, address=address), folder)
 
 
 def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:

@@ -338,6 +338,9 @@ EVOLUTION = {"algo": "evolution", "suite": "interruption-v1"}
         ({**EVOLUTION, "fields": "rank"}, "fields = 'rank': must be rank, motion_merged, time_merged or index_merged"),
         ({**EVOLUTION, "fields": "rank,time_merged,colour"}, "fields = 'rank,time_merged,colour': must be"),
         ({**EVOLUTION, "suite": "sustained-v1", "warm_up": 9}, "warm_up = 9: needs a suite of interruptions"),
+        ({"backend": "no-such"}, "backend = 'no-such': must be one of local, ray, dask"),
+        ({"backend": "dask"}, "backend = 'dask': a cluster evaluates the candidates of --algo evolution alone"),
+        ({**EVOLUTION, "address": "host:1"}, "address = 'host:1': is that of a cluster: name its kind"),
         ({"resume": True}, "there is no run in"),
     ],
 )

@@ -207,7 +207,11 @@ class QueueObjective(Objective):
     def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
         super().__init__(settings, folder, seed)
         self.warm_up = settings.warm_up > 0
-        self._validation = ValidationSets(settings, folder)
+
+    @functools.cached_property
+    def _validation(self) -> ValidationSets:
+        """Made when asked for: what evaluates candidates elsewhere needs neither it nor the run's folder."""
+        return ValidationSets(self.settings, self.folder)
 
     @functools.cached_property
     def training(self) -> list[list[SuiteObjective]]:

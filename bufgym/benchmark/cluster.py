@@ -1,4 +1,8 @@
-"""Where a benchmark runs: processes or threads of this machine, or a Ray or Dask cluster, all through joblib."""
+"""Where a benchmark runs: processes or threads of this machine, or a Ray or Dask cluster, all through joblib.
+
+What works with a cluster for hours, as training does, calls it directly (``begun``, ``connected``): joblib's Ray
+backend makes new processes at every call, and those of several programs may wait for one another for ever.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import itertools
 import os
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from typing import Any
@@ -97,6 +101,76 @@ def _dask_client(address: str | None) -> Any:
     if address is not None:
         return distributed.Client(address)
     return distributed.Client(processes=True, threads_per_worker=1, dashboard_address=None)
+
+
+Call = Callable[..., Any]
+CallEach = Callable[[Call, Sequence[tuple[Any, ...]]], list[Any]]
+"""(function, arguments of each call) -> the results, in the order of the calls."""
+
+
+@contextmanager
+def begun(backend: str, address: str | None) -> Iterator[str]:
+    """The address of a ``ray`` or ``dask`` cluster: that one, or of one on this machine, which ends here.
+
+    Raises BufgymError: the library is missing, or nothing answers at the address.
+    """
+    with _client(backend, address) as client:
+        yield client.scheduler.address if backend == "dask" else client.get_runtime_context().gcs_address
+
+
+@contextmanager
+def connected(backend: str, address: str | None) -> Iterator[CallEach]:
+    """What calls a function on a ``ray`` or ``dask`` cluster, as often as wished. It must be importable there.
+
+    A Ray task and a Dask worker with one thread have a process to themselves, which keeps what the function caches.
+
+    Raises BufgymError: as ``begun``; the calls raise WorkerDiedError.
+    """
+    with _client(backend, address) as client:
+        if backend == "dask":
+            died: tuple[type[Exception], ...] = (_imported("distributed", "dask").KilledWorker,)
+
+            def call_each(function: Call, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+                # Not pure: a call with the same arguments is a call of its own.
+                futures = [client.submit(function, *own, pure=False) for own in arguments]
+                return list(client.gather(futures))
+
+        else:
+            died = (client.exceptions.WorkerCrashedError, client.exceptions.NodeDiedError)
+
+            def call_each(function: Call, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+                remote = client.remote(function)
+                return list(client.get([remote.remote(*own) for own in arguments]))
+
+        def each(function: Call, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+            try:
+                return call_each(function, arguments)
+            except died:
+                raise WorkerDiedError(f"{backend}: workers ended before their work did (out of memory?)") from None
+
+        yield each
+
+
+@contextmanager
+def _client(backend: str, address: str | None) -> Iterator[Any]:
+    """Dask's client, or the module ``ray`` while it is connected."""
+    library = _imported(*{"dask": ("distributed", "dask"), "ray": ("ray", "ray")}[backend])
+    try:
+        if backend == "dask":
+            client = _dask_client(address)
+        elif own := not library.is_initialized():
+            library.init(address=address, log_to_driver=False)
+    except OSError as error:  # Ray's ConnectionError is one, too
+        raise BufgymError(f"{backend}: no cluster at {address}: {' '.join(str(error).split())}") from None
+    if backend == "dask":
+        with client:
+            yield client
+        return
+    try:
+        yield library
+    finally:
+        if own:
+            library.shutdown()
 
 
 def _imported(module: str, extra: str) -> Any:
