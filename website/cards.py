@@ -32,8 +32,8 @@ CARDS = {
         decides="what to drop from one queue, of any L",
         sees="the queue, the clock, the socket, odometry and V",
         limits="trained on camera streams of one topic, with V exponential or saturating",
-        fails="With queues of one to three messages, frames of 20 MB and on a steady link of a tenth of the demand it may"
-        " have more regret than AFR, 2.2 times at worst ([stress-v1](stress.md)).",
+        fails="With queues of one to three messages, frames of 20 MB and on a steady link of a tenth of the demand it"
+        " may have more regret than AFR, 2.2 times at worst ([stress-v1](stress.md)).",
         rest="Where the link flows the rule `target-gap` decides, where V is straight and then flat `greedy-qoi`.",
     ),
     "learned-time": Card(
