@@ -34,12 +34,12 @@ CARDS = {
         limits="trained on camera streams of one topic, with V exponential or saturating",
         fails="With queues of one to three messages, frames of 20 MB and on a steady link of a tenth of the demand it"
         " may have more regret than AFR, 2.2 times at worst ([stress-v1](stress.md)).",
-        rest="Where the link flows the rule `target-gap` decides, where V is straight and then flat `greedy-qoi`.",
+        rest="Once something was sent the rule `target-gap` decides, where V is straight and then flat `greedy-qoi`.",
     ),
     "learned-time": Card(
         results="agents-time.md",
         decides="what to drop from one queue, of any L",
-        sees="the queue, the clock and the socket; no odometry, and V only where x counts messages",
+        sees="the queue, the clock and the socket; x and V only where each message moves the scene equally far",
         limits="trained on the same episodes as learned-motion",
         fails="In blackouts it has nearly twice the regret of `min-motion-gap`, which sees motion; with queues of one"
         " message up to four times that of AFR or Drop Oldest ([stress-v1](stress.md)).",

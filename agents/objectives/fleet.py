@@ -48,7 +48,7 @@ def fleet_of(suite: str, split: str) -> FleetScenario:
 
 
 def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
-    """Its scorers alone, which read these fields as well but make nothing of them yet, and may mix all of them."""
+    """Its scorers, which read these fields as well but make nothing of them yet, and may mix all; it thins nothing."""
     still = agent.still and widened(agent.still, more)
     mix = np.zeros((len(agent.context), len(agent.slot)), np.float32) if agent.mix is None else agent.mix
     return replace(replace(agent, mix=mix, still=None, thins=False).reading(more), still=still)

@@ -224,9 +224,9 @@ class QueueObjective(Objective):
         return suite_objectives(self.settings, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
 
     def start(self) -> Weights:
-        """The smallest merged gap goes, with a warm-up in both scorers; or what an earlier agent's scorers do.
+        """The smallest merged gap goes, with a warm-up in both scorers; or what an earlier agent does, thinning apart.
 
-        They alone are searched on: where the agent thins to the link they would not be asked.
+        Where that thins to the link its scorers would not be asked.
         """
         settings, fields = self.settings, self.settings.observed
         if settings.start:

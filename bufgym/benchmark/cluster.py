@@ -136,11 +136,12 @@ def connected(backend: str, address: str | None) -> Iterator[CallEach]:
                 return list(client.gather(futures))
 
         else:
-            died = (client.exceptions.WorkerCrashedError, client.exceptions.NodeDiedError)
+            errors = client.exceptions
+            died = (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError)
+            remote_of = functools.cache(client.remote)  # each one made is sent to the cluster again
 
             def call_each(function: Call, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-                remote = client.remote(function)
-                return list(client.get([remote.remote(*own) for own in arguments]))
+                return list(client.get([remote_of(function).remote(*own) for own in arguments]))
 
         def each(function: Call, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
             try:

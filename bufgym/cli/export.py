@@ -31,7 +31,10 @@ def add(commands: Commands) -> None:
         help="leave to greedy-qoi and exact plans what they do better",
     )
     weights.add_argument(
-        "--thins", action="store_true", default=None, help="drop with room too what the link could not send in time"
+        "--thins",
+        action="store_true",
+        default=None,
+        help="follow target-gap where it has a target, and thin the queue to a steady link",
     )
     c = parser.add_argument_group(
         "C (--to c)",

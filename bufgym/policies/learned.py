@@ -15,13 +15,14 @@ link.
 An agent may leave to others what they do better, as can be told on board (``shortcuts``). Where V is straight and then
 flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and no plan is better, however long an
 interruption is. It does so on a steady link too, where motion is uneven: the queue is sent as it stands, there is no
-trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``). Who
-does not read motion knows V only where the scene moves evenly: of messages.
+trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``). An
+agent that does not read motion takes these only where each message moves the scene equally far, as V of a number of
+messages is then known: x and V serve it for that alone.
 
-An agent may also thin its queue to the link (``thins``), with room too: what to do over a link that flows is known
-better by ``target_gap`` than by any scorer so far, and on a steady one by ``thinning``. The scorers then decide while
-nothing has left yet, in bursts, in short queues and at the beginning of a stream. Gaps are measured in motion where the
-agent reads it, else in messages.
+An agent may also thin its queue to the link (``thins``), with room too: once something has been sent, ``target_gap``
+knows better what to do than any scorer so far, and on a steady link ``thinning`` what to drop with room. The scorers
+decide where there is no target, and the rest on steady links. Gaps are measured in motion where the agent reads it,
+else in messages.
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """

@@ -5,19 +5,22 @@
     g <- m T / (r T + L - s)
 
 In the next T the scene moves on by m T, the link sends r T messages and the queue finds room for L - s more: g is their
-gap if it is even. It is wide where the queue is full, or the link slower than the scene moves.
+gap if it is even. It is wide where the queue is full, or the link sends few messages for the motion.
 
     soon <- whether the socket is free before ``NEAR`` more arrivals
-    if soon and the message behind the head lies nearer to g than the head: the head goes
+    if there is room, and the queue is empty or the socket idle: accept
+    elif soon and the message behind the head lies nearer to g than the head: the head goes
     elif the queue is full: what leaves the smallest gap goes, older ones rather
     elif the smallest gap that can be left is at most g: it goes, though there is room
+    else: accept
 
-The head waits for its turn until it is decided, as until then the link's rate may change. On a steady link, where g is
-known, the even spacing is made behind it (``thinning``).
+So the head is looked at once more when its turn comes: until then the link's rate may change. Blackouts in mid-stream
+are no exception. On a steady link, where g is known, the even spacing is made behind the head (``thinning``).
 
-Where the future is not to be told from the past, none of this is done: bursts (an empty queue would leave the link
-idle), queues of fewer than ``LEAST`` messages, and streams that have not yet run for as long as the queue takes to be
-sent. What waits when a stream ends is sent as well, so a long queue must not be thinned for a future that may not come.
+There is no target where the future is not to be told from the past: in bursts (an empty queue would leave the link
+idle; one long pause counts as one for some seconds), for queues of fewer than ``LEAST`` messages, before anything has
+been sent, and until the stream has run for as long as a full queue takes to be sent. Then the smallest gap goes, and
+``thinning`` says whether with room, too.
 """
 
 from __future__ import annotations
@@ -44,8 +47,9 @@ DISCOUNT = 0.165
 LEAST = 4
 """L from which on the target is followed."""
 BURSTY, LATE = 1.5, 1 / 32
-"""Arrivals come in bursts where the mean square of the time between them is over so many times its square: 2 for a
-Poisson process, 10 for bursts of ten. The newest weighs ``LATE`` in both means, so that no burst is all that counts."""
+"""Arrivals come in bursts where the mean square of the time between them is over so many times the square of its mean:
+2 for a Poisson process, 10 for bursts of ten. The newest time weighs ``LATE`` in both means, so that a whole burst does
+not look like an even stream."""
 WITHIN = 1.001
 """A gap may be longer than g by rounding."""
 

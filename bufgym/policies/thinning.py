@@ -1,4 +1,6 @@
-"""Thinning to a steady link: a queue with room drops what the link could not send in time anyway.
+"""Thinning to the link: a queue with room drops what the link could not send in time anyway.
+
+On a steady link this is all that is done with room; on others where there is no target yet (``target_gap``).
 
 Messages leave a slow link every so many arrivals. Where those queued lie closer together, the server gets a run of near
 neighbours, and later a hole as long as it took to send them. So a message goes at once, room or not, if its neighbours
@@ -24,10 +26,10 @@ SOON_US = 4e6
 """A queue is thinned where all L would be sent within so long: else too much is given up that would be sent when the
 stream ends."""
 HORIZON_US = 60e6
-"""Of a few tried on the train links of ``sustained-v1`` (20, 40, 80 s, without end) those of 40 to 80 s were best."""
+"""Of 20, 40 and 80 s and no end at all, tried on the train links of ``sustained-v1``, 40 and 80 s were best."""
 STEADY = 0.01
-"""A link is steady while its rates over 0.1 s and 0.5 s differ from that over 2 s by no more than twice ``STEADY``, and
-``STEADY``, of it."""
+"""A link is steady while its rate over 0.5 s differs from that over 2 s by at most this part of it, that over 0.1 s by
+at most twice as much."""
 
 
 @kernel
@@ -49,8 +51,8 @@ def send_us(buffer: Buffer, arrival: Arrival) -> float:
 
 @kernel
 def places(buffer: Buffer, arrival: Arrival) -> int:
-    """How many messages of mean size the queue can hold: L, or what B lets in."""
-    return int(min(buffer.capacity, buffer.max_bytes / mean_bytes(buffer, arrival)))
+    """How many messages of mean size the queue can hold: L, or what B lets in; no fewer than are queued."""
+    return max(int(min(buffer.capacity, buffer.max_bytes / mean_bytes(buffer, arrival))), len(buffer.slots))
 
 
 @kernel

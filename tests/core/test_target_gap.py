@@ -84,6 +84,14 @@ def test_bursts_are_not_followed():
     assert target(*waiting(2, 4), remembered(square=1.6 * 33_333.0**2), MOTION) == 0
 
 
+def test_a_large_newcomer_takes_no_place_from_those_that_wait():
+    # Under B of 9000 bytes eight of 1000 wait; with a newcomer of 28000 the mean is 4000, and two would fit.
+    buffer, arrival = waiting(0, 1, 2, 3, 4, 5, 6, 7, capacity=20, max_bytes=9000)
+    arrival["size_bytes"] = 28_000
+    g = target(buffer, arrival, remembered(), MOTION)
+    assert g == pytest.approx(2 * 4.0 * 4, rel=1e-3)  # as the link sends messages four times as large
+
+
 def test_a_stream_must_have_run_for_as_long_as_the_queue_takes_to_be_sent():
     # L = 8 at 7.5 a second: 1.07 s.
     assert target(*waiting(2, 4), remembered(seen_us=1.06e6), MOTION) == 0

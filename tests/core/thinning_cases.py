@@ -28,9 +28,9 @@ def least_gap(buffer, arrival, measured_in, discount=0.0):
 
 
 def places(buffer, arrival):
-    """How many messages of mean size there is room for in all: L, or what B lets in."""
+    """How many messages of mean size there is room for in all: L, or what B lets in; no fewer than are queued."""
     sizes = [message["size_bytes"] for message in buffer.slots] + [arrival["size_bytes"]]
-    return min(buffer.capacity, int(buffer.max_bytes / (sum(map(int, sizes)) / len(sizes))))
+    return max(len(buffer.slots), min(buffer.capacity, int(buffer.max_bytes / (sum(map(int, sizes)) / len(sizes)))))
 
 
 def level(buffer):

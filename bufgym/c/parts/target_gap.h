@@ -42,6 +42,7 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
     const double come =
         measured_in == BUFGYM_MESSAGES ? (double)(arrival->seq - q->dequeued_seq) : arrival->x - q->dequeued_x;
     double recent, r, m;
+    /* The first test is for compilers, which leave out then what a short queue never does. */
     if (BUFGYM_CAPACITY < @LEAST@ || L < @LEAST@ || elapsed_us <= 0.0)
         return 0.0;
     if (memory[BUFGYM_RATE] <= 0.0 || memory[BUFGYM_PACE] <= 0.0)

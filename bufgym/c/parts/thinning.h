@@ -12,11 +12,12 @@ static inline double bufgym_mean_bytes(const struct bufgym_queue *q, const struc
     return (double)(q->backlog_bytes + arrival->size_bytes) / (q->occupancy + 1);
 }
 
-/* How many messages of mean size the queue can hold: L, or what B lets in. */
+/* How many messages of mean size the queue can hold: L, or what B lets in; no fewer than are queued. */
 static inline int bufgym_places(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     const double fit = (double)BUFGYM_MAX_BYTES / bufgym_mean_bytes(q, arrival);
-    return fit < BUFGYM_CAPACITY ? (int)fit : BUFGYM_CAPACITY;
+    const int places = fit < BUFGYM_CAPACITY ? (int)fit : BUFGYM_CAPACITY;
+    return places > q->occupancy ? places : q->occupancy;
 }
 
 /* Time in which the link sends a message of mean size, at the fastest of its rates of late, us; 0: there is no rate. */
@@ -87,6 +88,7 @@ static inline int bufgym_spare(
     double each_us = bufgym_send_us(q, arrival);
     const double come =
         measured_in == BUFGYM_MOTION ? arrival->x - q->dequeued_x : (double)(arrival->seq - q->dequeued_seq);
+    /* The first test is for compilers, which see then that no such queue has room here. */
     if (BUFGYM_CAPACITY <= @WAITING@ || s < @WAITING@ || q->busy == 0 || elapsed_us <= 0.0 || each_us <= 0.0)
         return 0;
     if (L * each_us > @SOON_US@)
