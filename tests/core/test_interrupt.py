@@ -15,6 +15,8 @@ import pytest
 from bufgym.kernel import JIT, interruptible
 
 LONG = """
+import signal
+
 import numpy as np
 from bufgym import policies
 from bufgym.model import qoi
@@ -25,6 +27,7 @@ from bufgym.sim import run
 from bufgym.traces import Trace
 
 V = qoi.exponential()
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 
 
 def episode(n, bytes_per_s):
