@@ -51,7 +51,7 @@ def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
     """Its scorers, which read these fields as well but make nothing of them yet, and may mix all; it thins nothing."""
     still = agent.still and widened(agent.still, more)
     mix = np.zeros((len(agent.context), len(agent.slot)), np.float32) if agent.mix is None else agent.mix
-    return replace(replace(agent, mix=mix, still=None, thins=False).reading(more), still=still)
+    return replace(agent, mix=mix, still=still, thins=False).reading(more)
 
 
 # --- episodes --------------------------------------------------------------------------------------------------------

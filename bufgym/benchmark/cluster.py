@@ -87,11 +87,8 @@ def _connected(backend: str, address: str | None) -> Iterator[None]:
     joblib = _imported("joblib", "bench")
     with nullcontext() if backend != "dask" else _dask_client(address):
         if backend == "ray":
-            ray = _imported("ray", "ray")
-            register_ray = _imported("ray.util.joblib", "ray").register_ray
-            if not ray.is_initialized():
-                ray.init(address=address, log_to_driver=False)
-            register_ray()
+            _ray(address)
+            _imported("ray.util.joblib", "ray").register_ray()
         with joblib.parallel_config(backend=backend):
             yield
 
@@ -155,23 +152,23 @@ def connected(backend: str, address: str | None) -> Iterator[CallEach]:
 @contextmanager
 def _client(backend: str, address: str | None) -> Iterator[Any]:
     """Dask's client, or the module ``ray`` while it is connected."""
-    library = _imported(*{"dask": ("distributed", "dask"), "ray": ("ray", "ray")}[backend])
     try:
-        if backend == "dask":
-            client = _dask_client(address)
-        elif own := not library.is_initialized():
-            library.init(address=address, log_to_driver=False)
+        client, own = (_dask_client(address), True) if backend == "dask" else _ray(address)
     except OSError as error:  # Ray's ConnectionError is one, too
         raise BufgymError(f"{backend}: no cluster at {address}: {' '.join(str(error).split())}") from None
-    if backend == "dask":
-        with client:
-            yield client
-        return
     try:
-        yield library
+        yield client
     finally:
         if own:
-            library.shutdown()
+            (client.close if backend == "dask" else client.shutdown)()
+
+
+def _ray(address: str | None) -> tuple[Any, bool]:
+    """The module ``ray``, connected; whether it was not before."""
+    ray = _imported("ray", "ray")
+    if own := not ray.is_initialized():
+        ray.init(address=address, log_to_driver=False)
+    return ray, own
 
 
 def _imported(module: str, extra: str) -> Any:

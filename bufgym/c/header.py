@@ -33,6 +33,11 @@ _HELPERS = {
 """Parts that rules share, each before those that call it."""
 _LEARNED = (*("gaps.h", "thinning.h", "target_gap.h"), *("features.h", "greedy.h", "small_queue.h", "scorer.h"))
 """Parts of a learned agent; the target gap of one that thins alone."""
+_TARGET = (
+    *("HORIZON_US", "SHORT", "LONG", "REST", "LINK_US", "PACED", "PACE_US", "NEAR", "DISCOUNT"),
+    *("LEAST", "BURSTY", "LATE", "WITHIN"),
+)
+"""The numbers of ``target_gap`` that its C has."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
 """Of the calls in the header."""
@@ -61,7 +66,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     """
     check_limits(capacity, max_bytes)
     learns = policy.on_arrival is learned.on_arrival
-    body = _scorer(policy) if learns else _rule(policy)
+    body = _agent(policy) if learns else _rule(policy)
     if "bufgym_departure(" not in body:
         body += "\n" + _part("no_departure.h")
     unlimited = max_bytes is None
@@ -88,20 +93,8 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "MESSAGES": gaps.MESSAGES,
         "WAITING": thinning.WAITING,
         "SOON_US": repr(thinning.SOON_US),
-        "LINK_US": repr(target_gap.LINK_US),
-        "PACE_US": repr(target_gap.PACE_US),
-        "HORIZON_US": repr(target_gap.HORIZON_US),
-        "SHORT": repr(target_gap.SHORT),
-        "LONG": repr(target_gap.LONG),
-        "REST": repr(target_gap.REST),
-        "PACED": repr(target_gap.PACED),
+        **{name: repr(getattr(target_gap, name)) for name in _TARGET},
         "UNPACED": repr(1 - target_gap.PACED),
-        "NEAR": repr(target_gap.NEAR),
-        "DISCOUNT": repr(target_gap.DISCOUNT),
-        "LEAST": target_gap.LEAST,
-        "BURSTY": repr(target_gap.BURSTY),
-        "LATE": repr(target_gap.LATE),
-        "WITHIN": repr(target_gap.WITHIN),
         "FLOWS": repr(learned.FLOWS),
         "FEW": learned.FEW,
         "STEADY_US": repr(thinning.HORIZON_US),
@@ -114,7 +107,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     return _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
 
 
-def _scorer(policy: Policy) -> str:
+def _agent(policy: Policy) -> str:
     """The C of a learned agent."""
     return "".join(_part(part) for part in _LEARNED if part != "target_gap.h" or policy.memory)
 

@@ -158,6 +158,13 @@ class Buffer(NamedTuple):
 
 
 @kernel
+def running_mean(mean: float, amount: float, us: float, seen_us: float, window_us: float) -> float:
+    """``mean`` (of amounts per us) after ``us`` more, in which so much came: over about ``window_us``, or all
+    ``seen_us`` where that is less."""
+    return mean + (amount - mean * us) / (us + min(window_us, seen_us))
+
+
+@kernel
 def push(slots: NDArray[Any], i: int, first: int, occupancy: int, arrival: Any) -> int:
     """Put ``arrival`` behind the tail of row ``i``; return the head's index, which moves when the row is packed."""
     if first + occupancy == slots.shape[1]:

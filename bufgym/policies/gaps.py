@@ -30,6 +30,14 @@ def smallest_time_gap(buffer: Buffer, arrival: Arrival, slots: int) -> int:
 
 
 @kernel
+def come(buffer: Buffer, arrival: Arrival, measured_in: int) -> float:
+    """How far the scene has moved on, or how many messages have come, since the message dequeued last."""
+    if measured_in == MESSAGES:
+        return float(arrival.seq - buffer.dequeued_seq)
+    return float(arrival.x - buffer.dequeued_x)
+
+
+@kernel
 def gaps_of(buffer: Buffer, arrival: Arrival, k: int, measured_in: int) -> tuple[float, float]:
     """The gap before slot ``k`` (as many as are queued: the newcomer), and the one that is left if it goes."""
     if measured_in == MESSAGES:

@@ -21,7 +21,7 @@ import math
 import numpy as np
 
 from bufgym.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps, running_mean
 from bufgym.policies.futures import FUTURES, MEAN_S, Grid, Link, sample
 from bufgym.policies.gaps import min_motion_gap
 from bufgym.policies.hindsight import collect, divide, prepare, room, sweep
@@ -48,8 +48,7 @@ def remember(buffer: Buffer, arrival: Arrival, memory: Memory) -> None:
     memory[STEP] += (STEP_WEIGHT if memory[STEP] > 0 else 1.0) * (step - memory[STEP])
     us = buffer.drained_us
     if us > 0:
-        weight = us + min(MEAN_S * 1e6, memory[SEEN_US])
-        memory[MEAN] += (buffer.drained_bytes - memory[MEAN] * us) / weight
+        memory[MEAN] = running_mean(memory[MEAN], buffer.drained_bytes, us, memory[SEEN_US], MEAN_S * 1e6)
         memory[SEEN_US] += us
 
 

@@ -26,9 +26,9 @@ been sent, and until the stream has run for as long as a full queue takes to be 
 from __future__ import annotations
 
 from bufgym.kernel import kernel
-from bufgym.model.buffer import ACCEPT, Buffer, has_space
+from bufgym.model.buffer import ACCEPT, Buffer, has_space, running_mean
 from bufgym.observe.on_board import mean_bytes
-from bufgym.policies.gaps import MESSAGES, MOTION, gap_left, gaps_of, smallest_gap
+from bufgym.policies.gaps import MESSAGES, MOTION, come, gap_left, gaps_of, smallest_gap
 from bufgym.policies.registry import Arrival, Memory, register
 from bufgym.policies.thinning import places, spare, steady
 
@@ -66,7 +66,7 @@ def remember(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int)
         return
     sent_us = float(buffer.drained_us)
     if sent_us > 0:
-        memory[RATE] += (buffer.drained_bytes - memory[RATE] * sent_us) / (sent_us + min(LINK_US, memory[SENT_US]))
+        memory[RATE] = running_mean(memory[RATE], buffer.drained_bytes, sent_us, memory[SENT_US], LINK_US)
         memory[SENT_US] += sent_us
     us = float(arrival.arrival_us - buffer.previous_us)
     weight = LATE if memory[PERIOD] > 0 else 1.0
@@ -74,7 +74,7 @@ def remember(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int)
     memory[SQUARE] += weight * (us * us - memory[SQUARE])
     if us > 0:
         step = 1.0 if measured_in == MESSAGES else arrival.x - buffer.previous_x
-        memory[PACE] += (step - memory[PACE] * us) / (us + min(PACE_US, memory[SEEN_US]))
+        memory[PACE] = running_mean(memory[PACE], step, us, memory[SEEN_US], PACE_US)
         memory[SEEN_US] += us
 
 
@@ -103,8 +103,7 @@ def target(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int) -
     r = link_rate(buffer, memory) / mean_bytes(buffer, arrival)
     if L > r * memory[SEEN_US]:
         return 0.0
-    come = float(arrival.seq - buffer.dequeued_seq) if measured_in == MESSAGES else arrival.x - buffer.dequeued_x
-    m = (1 - PACED) * come / elapsed_us + PACED * memory[PACE]
+    m = (1 - PACED) * come(buffer, arrival, measured_in) / elapsed_us + PACED * memory[PACE]
     return float(m * HORIZON_US / (r * HORIZON_US + L - s))
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 from bufgym.kernel import kernel
 from bufgym.model.buffer import Buffer
 from bufgym.observe.on_board import mean_bytes
-from bufgym.policies.gaps import MESSAGES, gap_left
+from bufgym.policies.gaps import come, gap_left
 from bufgym.policies.registry import Arrival
 
 WAITING = 3
@@ -68,5 +68,5 @@ def spare(buffer: Buffer, arrival: Arrival, victim: int, measured_in: int) -> bo
     if each_us <= 0 or L * each_us > SOON_US:
         return False
     each_us = HORIZON_US / (HORIZON_US / each_us + L - s)
-    come = float(arrival.seq - buffer.dequeued_seq) if measured_in == MESSAGES else arrival.x - buffer.dequeued_x
-    return bool(gap_left(buffer, arrival, victim, measured_in) * elapsed_us <= come * each_us)
+    left = gap_left(buffer, arrival, victim, measured_in)
+    return bool(left * elapsed_us <= come(buffer, arrival, measured_in) * each_us)

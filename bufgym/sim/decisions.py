@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bufgym.kernel import at, kernel
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, push
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, push, running_mean
 from bufgym.sim import rules
 from bufgym.sim.socket import held_bytes, left_of
 from bufgym.sim.state import (
@@ -83,9 +83,9 @@ def measure_rate(batch: Batch, i: int) -> None:
     sender.drained_bytes, sender.drained_us = sent, us
     if us > 0:
         seen_us = sender.sending_us
-        sender.short_rate += (sent - sender.short_rate * us) / (us + min(_SHORT_US, seen_us))
-        sender.medium_rate += (sent - sender.medium_rate * us) / (us + min(_MEDIUM_US, seen_us))
-        sender.long_rate += (sent - sender.long_rate * us) / (us + min(_LONG_US, seen_us))
+        sender.short_rate = running_mean(sender.short_rate, sent, us, seen_us, _SHORT_US)
+        sender.medium_rate = running_mean(sender.medium_rate, sent, us, seen_us, _MEDIUM_US)
+        sender.long_rate = running_mean(sender.long_rate, sent, us, seen_us, _LONG_US)
     sender.sent_bytes, sender.sending_us = sent_bytes, sending_us
 
 

@@ -5,7 +5,7 @@ Gaps in ``x`` (motion) or ``seq`` (messages).
 
 from __future__ import annotations
 
-from thinning_cases import gaps_left, least_gap, places
+from thinning_cases import fits, gaps_left, least_gap, places
 
 from bufgym.policies import ACCEPT, REJECT
 
@@ -76,7 +76,7 @@ def running_mean(steps, window_us):
 def approached(buffer, arrival, g, measured_in):
     """The decision that brings the gaps to ``g``."""
     s = len(buffer.slots)
-    room = s < buffer.capacity and buffer.backlog_bytes + arrival["size_bytes"] <= buffer.max_bytes
+    room = fits(buffer, arrival)
     if room and (s == 0 or not buffer.busy):
         return ACCEPT
     left = gaps_left(buffer, arrival, measured_in)

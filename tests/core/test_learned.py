@@ -13,7 +13,7 @@ from cases import VALUES, cases, log, newcomer, queue_of, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from target_cases import Seen, approached
-from thinning_cases import least_gap, level, spared
+from thinning_cases import fits, least_gap, level, spared
 from weight_cases import network
 
 from bufgym import files, policies
@@ -98,8 +98,7 @@ def twin(whole):
         bends_once = v[0] == qoi.SATURATING or (v[0] == qoi.TABULATED and v[int(v[1]) + 3] == v[-1])
         if shortcuts and bends_once:
             return policies.get("greedy-qoi").on_arrival(buffer, arrival, memory)
-        room = len(buffer.slots) < buffer.capacity
-        room = room and buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes
+        room = fits(buffer, arrival)
         if level(buffer):
             smallest = least_gap(buffer, arrival, measured_in)
             if thins and room and spared(buffer, arrival, smallest, measured_in):

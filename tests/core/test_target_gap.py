@@ -9,7 +9,7 @@ import pytest
 from cases import VALUES, cases, newcomer, queue_of, same
 from hypothesis import given, settings
 from target_cases import Seen, approached
-from thinning_cases import least_gap, level, spared
+from thinning_cases import fits, least_gap, level, spared
 
 from bufgym import policies
 from bufgym.benchmark.run import by_trace, draw
@@ -157,9 +157,7 @@ def twin():
         if g is not None and not level(buffer):
             return approached(buffer, arrival, g, "x")
         victim = least_gap(buffer, arrival, "x")
-        room = len(buffer.slots) < buffer.capacity
-        room = room and buffer.backlog_bytes + arrival["size_bytes"] <= buffer.max_bytes
-        return ACCEPT if room and (seen.bursty or not spared(buffer, arrival, victim, "x")) else victim
+        return ACCEPT if fits(buffer, arrival) and (seen.bursty or not spared(buffer, arrival, victim, "x")) else victim
 
     return Policy("twin", on_arrival, reads_rate=True)
 

@@ -27,6 +27,11 @@ def least_gap(buffer, arrival, measured_in, discount=0.0):
     return k if k < len(queued) else REJECT
 
 
+def fits(buffer, arrival):
+    """Whether the newcomer fits as the queue is, by messages and by bytes."""
+    return len(buffer.slots) < buffer.capacity and buffer.backlog_bytes + arrival["size_bytes"] <= buffer.max_bytes
+
+
 def places(buffer, arrival):
     """How many messages of mean size there is room for in all: L, or what B lets in; no fewer than are queued."""
     sizes = [message["size_bytes"] for message in buffer.slots] + [arrival["size_bytes"]]

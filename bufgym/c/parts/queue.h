@@ -66,6 +66,12 @@ static const double bufgym_memory[@MEMORY_SIZE@] = {@MEMORY@};
 @VALUE_PART@
 /* --- the policy: @NAME@ --- */
 
+/* A running mean over about so much time, us, goes on by us microseconds in which so much came. */
+static inline void bufgym_average(double *mean, double amount, double us, double seen_us, double window_us)
+{
+    *mean += (amount - *mean * us) / (us + (seen_us < window_us ? seen_us : window_us));
+}
+
 /* Whether the newcomer fits as the queue is, by messages and by bytes. */
 static inline int bufgym_has_space(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
@@ -94,12 +100,6 @@ static inline void bufgym_evict(struct bufgym_queue *q, int k)
         q->slots[k].gain = bufgym_gain_behind(q, k, q->slots[k].x);
 }
 
-/* A running mean over about so much time, us, goes on by us microseconds in which so many bytes were sent. */
-static inline void bufgym_average(double *rate, int64_t sent, int64_t us, int64_t seen_us, int64_t window_us)
-{
-    *rate += ((double)sent - *rate * (double)us) / (double)(us + (seen_us < window_us ? seen_us : window_us));
-}
-
 /* How fast the link carried what left the socket since the arrival before. */
 static inline void bufgym_measure_rate(struct bufgym_queue *q)
 {
@@ -108,9 +108,10 @@ static inline void bufgym_measure_rate(struct bufgym_queue *q)
     q->drained_bytes = sent_bytes - q->sent_bytes;
     q->drained_us = sending_us - q->sending_us;
     if (q->drained_us > 0) {
-        bufgym_average(&q->short_rate, q->drained_bytes, q->drained_us, q->sending_us, 100000);
-        bufgym_average(&q->medium_rate, q->drained_bytes, q->drained_us, q->sending_us, 500000);
-        bufgym_average(&q->long_rate, q->drained_bytes, q->drained_us, q->sending_us, 2000000);
+        const double bytes = (double)q->drained_bytes, us = (double)q->drained_us, seen_us = (double)q->sending_us;
+        bufgym_average(&q->short_rate, bytes, us, seen_us, 1e5);
+        bufgym_average(&q->medium_rate, bytes, us, seen_us, 5e5);
+        bufgym_average(&q->long_rate, bytes, us, seen_us, 2e6);
     }
     q->sent_bytes = sent_bytes;
     q->sending_us = sending_us;

@@ -12,16 +12,14 @@ bufgym_remember(struct bufgym_queue *q, const struct bufgym_message *arrival, in
     if (q->evictions > 0)
         return;
     if (sent_us > 0.0) {
-        const double seen_us = memory[BUFGYM_SENT_US] < @LINK_US@ ? memory[BUFGYM_SENT_US] : @LINK_US@;
-        memory[BUFGYM_RATE] += ((double)q->drained_bytes - memory[BUFGYM_RATE] * sent_us) / (sent_us + seen_us);
+        bufgym_average(&memory[BUFGYM_RATE], (double)q->drained_bytes, sent_us, memory[BUFGYM_SENT_US], @LINK_US@);
         memory[BUFGYM_SENT_US] += sent_us;
     }
     memory[BUFGYM_PERIOD] += weight * (us - memory[BUFGYM_PERIOD]);
     memory[BUFGYM_SQUARE] += weight * (us * us - memory[BUFGYM_SQUARE]);
     if (us > 0.0) {
         const double step = measured_in == BUFGYM_MESSAGES ? 1.0 : arrival->x - q->previous_x;
-        const double seen_us = memory[BUFGYM_SEEN_US] < @PACE_US@ ? memory[BUFGYM_SEEN_US] : @PACE_US@;
-        memory[BUFGYM_PACE] += (step - memory[BUFGYM_PACE] * us) / (us + seen_us);
+        bufgym_average(&memory[BUFGYM_PACE], step, us, memory[BUFGYM_SEEN_US], @PACE_US@);
         memory[BUFGYM_SEEN_US] += us;
     }
 }
@@ -39,8 +37,6 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
     const double *memory = q->memory;
     const int L = bufgym_places(q, arrival);
     const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
-    const double come =
-        measured_in == BUFGYM_MESSAGES ? (double)(arrival->seq - q->dequeued_seq) : arrival->x - q->dequeued_x;
     double recent, r, m;
     /* The first test is for compilers, which leave out then what a short queue never does. */
     if (BUFGYM_CAPACITY < @LEAST@ || L < @LEAST@ || elapsed_us <= 0.0)
@@ -53,7 +49,7 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
     r = (recent / 1e6 + @REST@ * memory[BUFGYM_RATE]) / bufgym_mean_bytes(q, arrival);
     if (L > r * memory[BUFGYM_SEEN_US])
         return 0.0;
-    m = @UNPACED@ * come / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
+    m = @UNPACED@ * bufgym_come(q, arrival, measured_in) / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
     return m * @HORIZON_US@ / (r * @HORIZON_US@ + L - q->occupancy);
 }
 

@@ -31,6 +31,13 @@ static inline double bufgym_send_us(const struct bufgym_queue *q, const struct b
 
 enum { BUFGYM_MOTION = @MOTION@, BUFGYM_MESSAGES = @MESSAGES@ };
 
+/* How far the scene has moved on, or how many messages have come, since the message dequeued last. */
+static inline double
+bufgym_come(const struct bufgym_queue *q, const struct bufgym_message *arrival, int measured_in)
+{
+    return measured_in == BUFGYM_MESSAGES ? (double)(arrival->seq - q->dequeued_seq) : arrival->x - q->dequeued_x;
+}
+
 /* The gap before slot k (q->occupancy: the newcomer) and the one that is left if it goes, in motion or in messages. */
 static inline void bufgym_gap(
     const struct bufgym_queue *q, const struct bufgym_message *arrival, int k, int measured_in, double *own, double *left)
@@ -86,14 +93,13 @@ static inline int bufgym_spare(
     const int s = q->occupancy, L = bufgym_places(q, arrival);
     const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
     double each_us = bufgym_send_us(q, arrival);
-    const double come =
-        measured_in == BUFGYM_MOTION ? arrival->x - q->dequeued_x : (double)(arrival->seq - q->dequeued_seq);
     /* The first test is for compilers, which see then that no such queue has room here. */
     if (BUFGYM_CAPACITY <= @WAITING@ || s < @WAITING@ || q->busy == 0 || elapsed_us <= 0.0 || each_us <= 0.0)
         return 0;
     if (L * each_us > @SOON_US@)
         return 0;
     each_us = @STEADY_US@ / (@STEADY_US@ / each_us + L - s);
-    return bufgym_gap_left(q, arrival, victim, measured_in) * elapsed_us <= come * each_us;
+    return bufgym_gap_left(q, arrival, victim, measured_in) * elapsed_us
+        <= bufgym_come(q, arrival, measured_in) * each_us;
 }
 
