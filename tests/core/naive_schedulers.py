@@ -17,8 +17,6 @@ class Fifo:
         self.max_bytes = math.inf if max_bytes is None else max_bytes
         self.newest_sent, self.last_sent = {}, {}  # by topic: arrival time of the newest that was sent, and when
 
-    # --- drops
-
     def fits(self, queue, newcomer):
         same = [m for m in queue if m["topic"] == newcomer["topic"]]
         limit = self.topics[newcomer["topic"]].limit or math.inf
@@ -46,8 +44,6 @@ class Fifo:
             if new.no_drop or lowest <= new.priority:
                 return next(m for m in helpful if self.topics[m["topic"]].priority == lowest)
         return REJECT
-
-    # --- choices
 
     def choose(self, queue, now, in_flight, window):
         chosen = self.pick(queue, now, in_flight, window)

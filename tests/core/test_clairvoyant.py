@@ -37,9 +37,6 @@ def line(times, *, sizes=10, x=None, knots=((0, 0), (1_000, 1_000)), after="loop
     return Episode(messages(np.array(times), np.asarray(sizes), x), Link(trace(list(knots), after)), **decisions)
 
 
-# --- by hand ---------------------------------------------------------------------------------------------------------
-
-
 def test_by_hand():
     # L = 1. Message 0 crosses until 10. Of 1, 2 and 3, which arrive meanwhile, one can wait; the others are lost.
     plan = clairvoyant(line([0, 1, 2, 3]), 1, V)
@@ -89,9 +86,6 @@ def test_a_message_larger_than_the_buffer_takes_nobodys_place():
 def test_errors(capacity, max_bytes, message):
     with pytest.raises(BufgymError, match=message):
         clairvoyant(line([0]), capacity, V, max_bytes=max_bytes)
-
-
-# --- against every sequence of decisions -----------------------------------------------------------------------------
 
 
 @st.composite
@@ -205,8 +199,6 @@ def test_is_an_upper_bound_where_not_every_arrival_asks(case, v):
         assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
 
 
-# --- against the interruption's own truth ----------------------------------------------------------------------------
-
 LENGTHS = (1, 2, 3, 8, 9, 17, 18, 36, 71, 120) if JIT else (1, 2, 9, 17)
 INTERRUPTION = Interruption(t_max=max(LENGTHS))
 
@@ -219,9 +211,6 @@ def test_is_the_best_integer_solution_of_an_interruption(v):
             plan = clairvoyant(INTERRUPTION.episode(T), L, v)
             assert plan.qoi - 1 == pytest.approx(integer(L, T, v), abs=EXACT), (L, T)
             assert plan.certified
-
-
-# --- against the policies --------------------------------------------------------------------------------------------
 
 
 def no_policy_beats(episodes: list[Episode], L: int, v: qoi.Value, **limits) -> None:
@@ -267,9 +256,6 @@ def test_no_policy_beats_it_over_lte(cv):
     no_policy_beats(episodes, 8, lte.value)
 
 
-# --- how it depends on the link and the buffer -----------------------------------------------------------------------
-
-
 def equal_sizes(case: Case) -> Case:
     arrivals = case.episode.arrivals.copy()
     arrivals["size_bytes"] = 1_500
@@ -292,9 +278,6 @@ def test_a_faster_link_is_never_worse(case, v, scale):
     faster = trace([(us, scale * carried) for us, carried in case.knots], link.trace.after)
     quick = replace(case.episode, link=replace(link, trace=faster))
     assert clairvoyant(quick, case.capacity, v).qoi >= clairvoyant(case.episode, case.capacity, v).qoi - EXACT
-
-
-# --- the dynamic programme itself ------------------------------------------------------------------------------------
 
 
 @tries(1_000, 60)

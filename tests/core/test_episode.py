@@ -138,9 +138,6 @@ def test_senders_load_episodes_only(what: Any) -> None:
         Senders(1, 2, qoi.exponential(), max_messages=4).load(0, what)
 
 
-# --- 64 bits ---------------------------------------------------------------------------------------------------------
-
-
 def slow(after: str, carried: int = 1) -> Link:
     """So many bytes in 10^7 s, the longest trace there is."""
     return Link(Trace("slow", np.array([0, MAX_TIME_US]), np.array([0, carried]), after=after))  # type: ignore[arg-type]

@@ -33,9 +33,6 @@ def camera(spec, megabytes_per_s, count=300):
     return len(delivered(spec, np.arange(count) * 1e3 / 30, 230_000, 1e3 * megabytes_per_s))
 
 
-# --- Zenoh -----------------------------------------------------------------------------------------------------------
-
-
 def test_zenoh_a_lost_fragment_loses_the_message_and_the_others_cross_in_vain():
     # 200 bytes are 2 batches, with deadlines of 1 and 3 ms; 10 bytes cross in a ms. Message 0 goes: nothing is known of
     # the link. 1 at 5 ms: 150 bytes are ahead, 250 - 10 for its first batch is too much. 2 at 12 ms: 180 - 10 for the
@@ -78,9 +75,6 @@ def test_zenoh_is_near_the_real_one(megabytes_per_s, sent, real):
     assert abs(ours - real) <= 0.05 * sent + sent / 30
 
 
-# --- DDS over UDP ----------------------------------------------------------------------------------------------------
-
-
 def test_best_effort_packets_of_lost_messages_fill_the_queue():
     # 200 bytes each, room for 500, 10 bytes cross in a ms. 0 and 1 fit, 2 at 2 ms would make 580: 500 stay, of which
     # 380 are whole messages. 3 at 22 ms: 180 of those are left, but 300 with the lost ones; 500 fit exactly. 4 a ms
@@ -106,9 +100,6 @@ def test_large_messages_over_a_small_queue():
     assert camera("ros2-best-effort", 3) == 0
     assert camera("ros2-reliable-udp:depth=15", 3) <= 10  # one a second measures the link
     assert camera("ros2-reliable-udp:depth=15", 7) == camera("ros2-best-effort:queue_kb=1000", 7) == 300
-
-
-# --- WebRTC ----------------------------------------------------------------------------------------------------------
 
 
 def dropper(**state):

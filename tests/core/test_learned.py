@@ -68,9 +68,6 @@ def weights(draw):
     return replace(made, still=draw(st.sampled_from([None, other])), **flags)
 
 
-# --- the twin --------------------------------------------------------------------------------------------------------
-
-
 def score(net, f):
     """The formula of the module's text, number by number."""
     h = f
@@ -166,9 +163,6 @@ def test_the_twin_counts_as_one_does_by_hand():
     assert score(replace(net, layers=(*net.layers, second), out=np.float32([-3])), [3.0]) == 0.5
 
 
-# --- what is promised ------------------------------------------------------------------------------------------------
-
-
 def start(fields, seen):
     """No hidden layer: the smallest value of one field goes, and whatever finds room is accepted."""
     made = learned.random_weights(fields, (), np.random.default_rng(0))
@@ -244,9 +238,6 @@ def test_bytes_that_fit_exactly_are_room():
     assert (sender["peak_backlog_bytes"], sender["invalid"]) == (3 * size, 0)
     assert sender["evicted"] > 0
     assert len(log(senders)["dropped_us"]) == 10 - 3
-
-
-# --- from a trained agent --------------------------------------------------------------------------------------------
 
 
 def exported(*words):

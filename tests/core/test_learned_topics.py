@@ -47,9 +47,6 @@ def schedulers(draw):
     return random_weights(TopicWeights, fields, *widths, seed=draw(st.integers(0, 2**32)))
 
 
-# --- the twin --------------------------------------------------------------------------------------------------------
-
-
 def score(net, f):
     """skip f + b + w relu(W f + c)."""
     f = np.asarray(f, np.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from topic_cases import TWIN_V, TopicCase, choice, decision, topic_cases, unwanted
 
 from bufgym.kernel import JIT
@@ -44,10 +44,10 @@ def per(g, r):
 
 
 class Twin:
-    """The fields of one moment, from what the slow sender of ``naive_topics`` knows."""
+    """The fields of one moment, from what the slow sender of ``naive_sender`` knows."""
 
-    def __init__(self, case: TopicCase, sender, buffer, origin) -> None:
-        self.case, self.sender, self.buffer, self.origin = case, sender, buffer, origin
+    def __init__(self, case: TopicCase, sender, buffer) -> None:
+        self.case, self.sender, self.buffer = case, sender, buffer
         self.topics = case.topics
         self.top = max(topic.share for topic in self.topics) or 1.0
         self.newcomer = sender.newcomer
@@ -61,7 +61,7 @@ class Twin:
         sent, queued = self.sender.sent[lane], self.sender.queues[lane]
         if not sent and not queued:
             return 0.0
-        begin = sent[-1] if sent else self.origin[lane]
+        begin = sent[-1] if sent else self.sender.origin[lane]
         return max(last - begin[field], 0) / (len(queued) + 1)
 
     def last(self, lane, field):
@@ -164,20 +164,6 @@ class Twin:
         return made
 
 
-def with_origins(sender):
-    """{topic: the message that entered its empty queue last, before any was sent}, kept up to date by ``sender``."""
-    origin, enqueue = {}, sender.enqueue
-
-    def noting(message):
-        lane = message["topic"]
-        if not sender.sent[lane] and not sender.queues[lane]:
-            origin[lane] = message
-        enqueue(message)
-
-    sender.enqueue = noting
-    return origin
-
-
 def observed(batch, buffer, arriving):
     """Both observations, by the kernels; the places are full of rubbish before."""
     rows = np.full((len(SLOT_NAMES), buffer.capacity + 1), np.nan)
@@ -189,40 +175,21 @@ def observed(batch, buffer, arriving):
     return dict(zip(SLOT_NAMES, rows, strict=True)), dict(zip(CONTEXT_NAMES, context, strict=True))
 
 
-@pytest.mark.slow
-@given(topic_cases(min_topics=2))
-@settings(max_examples=50 if JIT else 10)
+@given(topic_cases(min_topics=2, max_messages=25))
 def test_every_field_is_its_twins(case):
-    senders, twin = case.senders(), case.twin()
-    batch, L = senders.batch, case.case.capacity
-    seen = named(batch)
-    origin, events = with_origins(twin), case.twin_events(twin)
-    event_name = next(events)
-    while True:
-        event = next_event(batch, None, 0)
-        assert NAMES[event] == event_name
-        if event == END:
-            break
-        sender = seen.senders[0]
-        if event in (DECISION, SEND):
-            buffer = python_view(seen, 0)
-            by_definition = Twin(case, twin, buffer, origin)
-            slots, context = observed(seen, buffer, event == DECISION)
-            for name, numbers in (by_definition.slots() | by_definition.context()).items():
-                kernels = (slots | context)[name]
-                np.testing.assert_allclose(kernels, numbers, rtol=1e-6, atol=1e-6, err_msg=f"{name} at a {event_name}")
-                assert ((kernels >= 0) & (kernels <= 1)).all(), name
-        answer = None
-        if event == DECISION:
-            answer = decision(seen.arrivals[0, sender.next].uniform, L)
-            decide(batch, 0, answer)
-        elif event == SEND:
-            answer = choice(twin.now, len(twin.slots()), len(twin.dequeued), L)
-            answer_send(batch, 0, answer)
-        elif event == DEQUEUE:
-            answer = unwanted(twin.now, len(twin.slots()))
-            answer_dequeue(batch, 0, answer)
-        event_name = events.send(answer)
+    def check(event, senders, twin):
+        if event not in ("decision", "send"):
+            return
+        seen = named(senders.batch)
+        buffer = python_view(seen, 0)
+        by_definition = Twin(case, twin, buffer)
+        slots, context = observed(seen, buffer, event == "decision")
+        for name, numbers in (by_definition.slots() | by_definition.context()).items():
+            kernels = (slots | context)[name]
+            np.testing.assert_allclose(kernels, numbers, rtol=1e-6, atol=1e-6, err_msg=f"{name} at a {event}")
+            assert ((kernels >= 0) & (kernels <= 1)).all(), name
+
+    case.beside_its_twin(check)
 
 
 def test_the_twin_knows_every_field():

@@ -49,9 +49,6 @@ def means(policy: Policy, L: int, probabilities: np.ndarray, v: qoi.Value = V) -
     return {"ratio": float(p @ (gained / best)), "qoi": float(p @ gained)}
 
 
-# --- the law of T ----------------------------------------------------------------------------------------------------
-
-
 def test_laws_by_hand():
     ln = math.log
     assert law(Interruption("fixed", t_max=3)).tolist() == [0, 0, 0, 1]
@@ -81,9 +78,6 @@ def test_laws_are_those_that_lengths_are_drawn_from(scenario):
     drawn = np.bincount([scenario.draw_length(rng) for _ in range(n)], minlength=len(p)) / n
     assert math.fsum(p) == pytest.approx(1, abs=1e-12)
     assert (np.abs(drawn - p) <= 4.5 * np.sqrt(p * (1 - p) / n)).all()
-
-
-# --- the optimum -----------------------------------------------------------------------------------------------------
 
 
 def test_by_hand():
@@ -194,9 +188,6 @@ def test_no_policy_beats_it_and_it_plays_as_it_promises(L, p, objective):
     assert means(made.policy(), L, p)[objective] == pytest.approx(made.value, abs=1e-12)
 
 
-# --- the policy ------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def made() -> OnlineOptimum:
     return online_optimum(3, uniform(3, 16), V)
@@ -256,9 +247,6 @@ def test_decisions(made):
 def test_another_capacity_is_an_error(made):
     with pytest.raises(BufgymError, match="online-optimum: made for L = 3, but the buffer has L = 2"):
         run(made.policy(), [Interruption().episode(5)], 2, V)
-
-
-# --- bad input -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

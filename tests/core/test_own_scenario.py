@@ -76,9 +76,6 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return "own_scenario_module"
 
 
-# --- scenarios --------------------------------------------------------------------------------------------------------
-
-
 class Steady:
     """Ten messages over a steady link."""
 
@@ -133,9 +130,6 @@ def test_a_spec_as_text_brings_its_own(module: str) -> None:
         scenario.get("missing_module:made")
 
 
-# --- links ------------------------------------------------------------------------------------------------------------
-
-
 def test_links_from_a_function_of_a_seed(module: str) -> None:
     uplink = Uplink(traces=[f"{module}:corridor:3-5", "lte-synthetic-0"])  # type: ignore[arg-type]
     assert [trace.name for trace in uplink.traces] == ["corridor-3", "corridor-4", "corridor-5", "lte-synthetic-0"]
@@ -147,9 +141,6 @@ def test_links_from_a_function_of_a_seed(module: str) -> None:
     ):
         with pytest.raises(BufgymError, match=message):
             Uplink(traces=text)  # type: ignore[arg-type]
-
-
-# --- V ----------------------------------------------------------------------------------------------------------------
 
 
 def test_a_function_as_v() -> None:
@@ -194,9 +185,6 @@ def test_a_configuration_of_a_stranger_imports_nothing(module: str, tmp_path: Pa
     file.write_text(topic)
     with pytest.raises(BufgymError, match="unknown kind"):
         read_client(file)
-
-
-# --- bufgym bench -----------------------------------------------------------------------------------------------------
 
 
 def test_bench_with_a_scenario_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -70,9 +70,6 @@ def stream(spec, n, period_us, capacity, *, size_bytes=1_000, bytes_per_s=1e6, x
     return run(policies.get(spec), [Episode(arrivals, Link(Trace.constant(bytes_per_s, 60)))], capacity, V)
 
 
-# --- online checkpointing --------------------------------------------------------------------------------------------
-
-
 @given(cases(max_messages=120), VALUES)
 def test_linear_with_alpha_1_is_afr(case, v):
     assert same(case.run(policies.get("linear-alpha:alpha=1"), v), case.run(policies.get("afr"), v))
@@ -164,9 +161,6 @@ def test_greedy_is_a_trap():
     assert interruption("greedy-qoi", 8, 40)[1] == pytest.approx(1 + 7 * V(2) + V(26) + V(1), abs=1e-12)
 
 
-# --- middleware ------------------------------------------------------------------------------------------------------
-
-
 def test_depths():
     assert interruption("ros-keep-last", 16, 30)[0] == list(range(21, 31))  # 10 by default
     assert interruption("ros-keep-last", 4, 30)[0] == [27, 28, 29, 30]  # no more than L
@@ -232,9 +226,6 @@ def test_rosbridge_drops_nothing():
     assert policies.get("rosbridge").unbounded and not policies.get("rosbridge").ranked
 
 
-# --- active queue management -----------------------------------------------------------------------------------------
-
-
 def test_codel_drops_ever_faster():
     # Two messages arrive for each that leaves: the one taken at k ms is k/2 ms old. At 10 ms that is the target of 5;
     # an interval later, at 110 ms, the first is dropped; from there on the gaps are 100 ms / sqrt(count).
@@ -292,8 +283,6 @@ def test_red_averages():
         (pytest.approx(average), count) for average, count in ((0.8, -1), (1.44, -1), (1.952, -1), (2.3616, 0))
     ]
 
-
-# --- references ------------------------------------------------------------------------------------------------------
 
 ROOT = Path(__file__).parents[2]
 KEYS = set(re.findall(r"^@\w+\{(\w+),", (ROOT / "docs/references.bib").read_text(encoding="utf-8"), re.M))

@@ -61,9 +61,6 @@ def test_the_links_rate_as_the_twin_measures_it(case):
     assert seen == twin
 
 
-# --- fields ----------------------------------------------------------------------------------------------------------
-
-
 def seen(**known):
     """The fields of an empty queue of L = 3 that a newcomer of 1000 bytes, 4 gaps on, meets each 10 ms."""
     arrival = newcomer()

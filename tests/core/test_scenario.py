@@ -23,9 +23,6 @@ FADING = trace([(0, 0), (500_000, 4_000_000), (900_000, 4_000_000), (1_000_000, 
 WALK = Motion("walk", np.array([0, 400_000, 1_000_000], np.int64), np.array([0.0, 0.0, 1.5]))
 
 
-# --- one interruption ------------------------------------------------------------------------------------------------
-
-
 @given(st.sampled_from(LAWS), st.integers(1, 50), st.integers(0, 100), st.floats(0, 200), st.integers(0, 2**32))
 def test_lengths_keep_their_bounds(law, t_min, more, mean, seed):
     drawn = Interruption(law=law, t_min=t_min, t_max=t_min + more, t_mean=t_min + mean)
@@ -80,9 +77,6 @@ def test_lengths_outside():
             Interruption(t_max=40).episode(T)
 
 
-# --- a stream over a link --------------------------------------------------------------------------------------------
-
-
 @given(st.floats(0, 1), st.floats(1, 200), st.floats(0, 3), st.booleans(), st.integers(0, 2**32))
 def test_uplink_draws_are_well_formed(jitter, rate_hz, size_cv, random_offset, seed):
     drawn = Uplink(
@@ -130,9 +124,6 @@ def test_scale():
     drawn = Uplink(traces=(STEADY,), scale=(0.5, 2.0), duration_s=0.1)
     seen = {drawn.draw(Streams.seeded(seed)).link.trace.total_bytes for seed in range(20)}
     assert seen == {2_500_000, 10_000_000}
-
-
-# --- chance ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -217,9 +208,6 @@ def test_uniform_draws():
     assert (episode_with_uniforms.arrivals["uniform"] != other.arrivals["uniform"]).all()
     assert (episode.arrivals["uniform"] == 0).all()  # the drawn episode itself is shared and stays as it was
     assert (episode_with_uniforms.arrivals["arrival_us"] == episode.arrivals["arrival_us"]).all()
-
-
-# --- errors ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -119,9 +119,6 @@ def test_on_one_queue_robofleet_keeps_one_slot(name, case):
     assert same(case.run(policies.get(name), V), case.run(policies.get("latest-only"), V))
 
 
-# --- the whole registry, with topics ---------------------------------------------------------------------------------
-
-
 def accounts(senders, topics):
     """For each topic, how many messages were transmitted, are being sent, are queued and were dropped; each is one."""
     sender, batch = np.asarray(senders.batch.senders)[0], senders.batch

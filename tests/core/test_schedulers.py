@@ -61,9 +61,6 @@ def topics(a=1.0, b=2.0, c=3.0, **more):
     return [*(Topic(name, **given) for name, given in rules.items()), Topic("N", no_drop=True, **more)]
 
 
-# --- what goes next --------------------------------------------------------------------------------------------------
-
-
 def test_fifo_takes_them_as_they_come():
     senders = played("fifo", "0 A, 1 C, 2 B, 3 A, 4 C, 5 N", topics())
     assert order(senders) == [0, 1, 2, 3, 4, 5]
@@ -105,9 +102,6 @@ def test_edf():
     assert order(played("edf", "0 A, 5 A, 10 B, 20 B, 35 C, 45 C", timed)) == [0, 4, 2, 5, 3, 1]
 
 
-# --- what makes room for a newcomer ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["fifo", "strict-priority", "age-greedy", "edf"])
 def test_the_common_drop_rule(name):
     # L = 3. 4 is of B: B's oldest, 2, goes, though A ranks lower.
@@ -141,8 +135,6 @@ def test_bytes():
     assert dropped(senders) == [2, 3, 1, 5]
     assert count(senders, "invalid") == 0
 
-
-# --- Robofleet -------------------------------------------------------------------------------------------------------
 
 ROBOFLEET = "0 A, 10 B, 20 A, 30 B, 40 N, 50 N"
 
@@ -209,9 +201,6 @@ def test_the_released_client_sleeps_until_an_arrival_or_a_pong():
     senders = played("robofleet-released", "0 A, 40 A", topics({"rate_limit_hz": 10.0}), blocked_ms=0)
     assert order(senders) == [0]
     assert count(senders, "occupancy") == 1
-
-
-# --- its rivals ------------------------------------------------------------------------------------------------------
 
 
 def test_native_ros_drops_the_oldest_of_each_queue():

@@ -29,45 +29,33 @@ from bufgym.model.link import FOREVER
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
 
-NAMES = {sim.DECISION: "decision", sim.DEPARTURE: "departure", sim.DEQUEUE: "dequeue", sim.SEND: "send", sim.END: "end"}
-
-
-# --- against the twin ------------------------------------------------------------------------------------------------
+pytestmark = pytest.mark.kernels
 
 
 @given(topic_cases())
 def test_agrees_with_twin_event_by_event(case):
-    senders, twin = case.senders(), case.twin()
-    batch, events, answer, expected = senders.batch, case.twin_events(twin), None, ""
-    while expected != "end":
-        expected, event = events.send(answer), sim.next_event(batch, None, 0)
-        assert NAMES[event] == expected
+    L = case.case.capacity
+
+    def check(event, senders, twin):
+        batch = senders.batch
         sim.credit(batch, 0, int(batch.senders[0]["now_us"]))
         agree(senders, twin)
         view = sim.python_view(sim.named(batch), 0)
         assert (view.window, view.in_flight) == (case.case.episode.window, len(twin.in_flight))
         assert (view.busy, view.left_bytes) == (int(bool(twin.socket)), twin.left_bytes())
-        answer = None
-        if expected == "decision":
+        if event == "decision":
             agree_on_gaps(senders, twin)
-            answer = decision(twin.newcomer["uniform"], case.case.capacity)
-            sim.decide(batch, 0, answer)
-        elif expected == "send":
-            masks = [sim.can_send(batch, 0, k) for k in range(-1, case.case.capacity + 1)]
-            assert masks == [False, *(twin.sendable(m) for m in twin.slots())] + [False] * (
-                len(masks) - 1 - view.slots.size
-            )
+        if event == "send":
+            can = [twin.sendable(m) for m in twin.slots()]
+            assert [sim.can_send(batch, 0, k) for k in range(-1, L + 1)] == [False, *can] + [False] * (L + 1 - len(can))
             assert sim.can_hold(batch, 0) == twin.may_hold()
-            answer = choice(twin.now, len(twin.slots()), len(twin.dequeued), case.case.capacity)
-            sim.answer_send(batch, 0, answer)
-        elif expected == "dequeue":
-            answer = unwanted(twin.now, len(twin.slots()))
-            sim.answer_dequeue(batch, 0, answer)
+
+    senders, twin = case.beside_its_twin(check)
     agree_on_log(senders, twin)
-    until = int(batch.senders[0]["now_us"]) + 5_000
-    sim.credit(batch, 0, until)
+    until = int(senders.batch.senders[0]["now_us"]) + 5_000
+    sim.credit(senders.batch, 0, until)
     for k in range(len(case.topics)):
-        sim.age_until(batch, 0, k, until)
+        sim.age_until(senders.batch, 0, k, until)
     agree(senders, twin, until, to_the_end=True)
 
 
@@ -148,16 +136,7 @@ def agree_on_log(senders, twin):
 
 @given(topic_cases(max_messages=150), st.booleans())
 def test_rollouts_agree_with_twin(case, compiled):
-    answers = {
-        "decision": lambda: decision(twin.newcomer["uniform"], case.case.capacity),
-        "send": lambda: choice(twin.now, len(twin.slots()), len(twin.dequeued), case.case.capacity),
-        "dequeue": lambda: unwanted(twin.now, len(twin.slots())),
-    }
-    twin, answer, event = case.twin(), None, ""
-    events = case.twin_events(twin)
-    while event != "end":
-        event = events.send(answer)
-        answer = answers[event]() if event in answers else None
+    twin = case.run_twin()
     senders = case.senders()
     senders.run(case.policy(compile=compiled))
     agree_on_log(senders, twin)
@@ -177,9 +156,6 @@ def test_the_same_inputs_make_the_same_run(case):
     for name in ("aged", "late", "invalid"):
         assert first.batch.senders[0][name] == again.batch.senders[0][name]
     assert (np.asarray(first.batch.topics) == np.asarray(again.batch.topics)).all()
-
-
-# --- whatever is decided ---------------------------------------------------------------------------------------------
 
 
 @given(topic_cases(), st.randoms(use_true_random=False))
@@ -285,9 +261,6 @@ def hold(case, senders):
         gain += rules.share * sum(v(x[b] - x[a]) for a, b in pairwise(kept))
     # What is retained is what everything kept would add if it were delivered.
     assert sender["retained_gain"] == pytest.approx(gain, abs=1e-9)
-
-
-# --- one topic without rules is a plain sender -----------------------------------------------------------------------
 
 
 def head(buffer, memory):

@@ -23,9 +23,6 @@ def path(tmp_path):
     return tmp_path / "small.safetensors"
 
 
-# --- there and back --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("kind", "widths"),
     [
@@ -137,9 +134,6 @@ def test_the_second_scorer_has_hidden_layers_of_its_own(path, widths, others):
     assert (again.parameters() == both.parameters()).all()
 
 
-# --- what is not written ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("about", "rule"),
     [
@@ -181,9 +175,6 @@ def test_weights_that_could_not_be_read_are_not_written(path):
     assert not path.exists()
     with pytest.raises(BufgymError, match="cannot be written"):
         weights.save(path / "no" / "folder", good, ABOUT)
-
-
-# --- the agents that come with bufgym --------------------------------------------------------------------------------
 
 
 def test_shipped_agents_are_read_when_they_are_asked_for(path, monkeypatch):

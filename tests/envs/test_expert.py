@@ -71,9 +71,6 @@ def check_values(env: SenderEnv, values: np.ndarray) -> None:
     assert (np.isnan(values[0]) == ~env.action_masks()).all()
 
 
-# --- the clairvoyant -------------------------------------------------------------------------------------------------
-
-
 def test_by_hand() -> None:
     # One byte a microsecond, 10 bytes a message, L = 1: while 0 crosses (until 10), 1, 2 and 3 arrive.
     episode = Episode(messages(np.array([0, 1, 2, 3]), 10), Link(trace([(0, 0), (1_000, 1_000)])))
@@ -205,9 +202,6 @@ def test_where_it_is_not_known_it_says_so(options: dict[str, Any], why: str) -> 
     env.reset(seed=0)
     with pytest.raises(BufgymError, match=why):
         expert.clairvoyant(env).values()
-
-
-# --- policies --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["afr", "random", "clairvoyant", "python"])

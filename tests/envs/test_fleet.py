@@ -287,9 +287,6 @@ def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
     assert bufgym.envs.FleetVecEnv is FleetVecEnv
 
 
-# --- robots as the rows of a batch -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("reward", ["team", "own"])
 def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
     cells, robots = 2, 3

@@ -49,9 +49,6 @@ def score(rows: list[dict[str, Any]], row: dict[str, Any]) -> float:
     return (row["qoi"] - base) / gap if gap > 1e-9 * row["clairvoyant"] else math.nan
 
 
-# --- suites ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def mixed(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A suite of two scenarios, each with a V of its own, on two traces."""
@@ -164,9 +161,6 @@ def test_suites_that_make_no_environment(arguments: dict[str, Any], says: str) -
         gym.make("bufgym/Suite-v0", **arguments)
 
 
-# --- what an episode was worth ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("T", "action", "h", "best", "score"),
     [
@@ -202,8 +196,6 @@ def test_no_bound_unless_asked_for_nor_of_topics() -> None:
     with pytest.raises(BufgymError, match="bound = True: the clairvoyant is known for one queue"):
         gym.make("bufgym/Topics-v0", bound=True)
 
-
-# --- arguments as text -----------------------------------------------------------------------------------------------
 
 TEXTS: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
     ("bufgym/Interruption-v0", {"value": "saturating:4"}, {"value": qoi.saturating(4)}),
@@ -259,9 +251,6 @@ def test_text_may_name_a_file(tmp_path: Path) -> None:
 def test_text_that_names_nothing(arguments: dict[str, Any], says: str) -> None:
     with pytest.raises((BufgymError, OSError), match=says):
         gym.make("bufgym/Uplink-v0", **arguments)
-
-
-# --- chance ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", [id for id in bufgym.ENVIRONMENTS if "Topics" not in id])

@@ -67,8 +67,6 @@ def terms_of(env_id: str) -> dict[str, float]:
     return EVERYWHERE if "Topics" in env_id else ONE_QUEUE
 
 
-# --- by hand ----------------------------------------------------------------------------------------------------------
-
 MB = 1_000_000
 
 
@@ -128,9 +126,6 @@ def test_a_step_tells_what_happened_in_it() -> None:
         (3.0, 6.5, [1, 3], [1, 3], 1, 0, True),
     ]
     assert total["spy"] == 2 + 3 + 4 + 4  # messages that have come by then
-
-
-# --- everywhere -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
@@ -239,8 +234,6 @@ def test_they_change_nothing_where_nobody_names_them() -> None:
     assert list(env.reset(seed=0)[1]["reward_terms"]) == ["delivered", "retained"]
 
 
-# --- as text ----------------------------------------------------------------------------------------------------------
-
 MODULE = """
 from bufgym.observe import field, reward_term
 
@@ -269,9 +262,6 @@ def test_a_spec_as_text_imports_what_it_names(tmp_path: Path, monkeypatch: pytes
     assert env.step(0)[1] == 6.0
     with pytest.raises(BufgymError, match="own_text_module:nothing: is not registered as a field"):
         SenderEnv(fields=["own_text_module:nothing"])
-
-
-# --- what is refused --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

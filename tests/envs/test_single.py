@@ -51,9 +51,6 @@ def seen(env: SenderEnv) -> tuple[Buffer, Any]:
     return getattr(view, "py_func", view)(batch, 0), batch.arrivals[0, batch.senders[0].next]
 
 
-# --- Gymnasium -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
 @pytest.mark.parametrize("observation", ["dict", "flat", "slots"])
 def test_gymnasium_finds_nothing_to_complain_about(env_id: str, observation: str) -> None:
@@ -116,9 +113,6 @@ def test_fields_choose_what_is_observed() -> None:
     assert same(few, {name: all_of_it[name] for name in few})
     assert env.observation_space["loss"].shape == (5,)
     assert env.observation_space["service_ratio"].shape == (1,)
-
-
-# --- rewards ---------------------------------------------------------------------------------------------------------
 
 
 def test_rewards_worked_by_hand() -> None:
@@ -229,9 +223,6 @@ def test_an_invalid_action_does_what_a_queue_does(variant: str) -> None:
     assert invalid > 5
 
 
-# --- observations ----------------------------------------------------------------------------------------------------
-
-
 def twin(buffer: Buffer, arrival: Any, V: qoi.Value) -> dict[str, list[float]]:
     """The observation once more, field by field from its definition."""
     gaps_us, gaps_x = getattr(time_gaps, "py_func", time_gaps), getattr(motion_gaps, "py_func", motion_gaps)
@@ -317,9 +308,6 @@ def test_observation_bounds_hold_where_nothing_moves_and_all_comes_at_once() -> 
         observation, _, ended, _, info = env.step(4)
     assert info["arrived"] == 9
     assert info["qoi"] == 1.0
-
-
-# --- wrong use -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

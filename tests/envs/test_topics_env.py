@@ -52,9 +52,6 @@ def copied(env: SenderEnv) -> Batch:
     return batch._replace(**{name: getattr(batch, name).copy() for name in batch._fields if name not in shared})
 
 
-# --- Gymnasium -------------------------------------------------------------------------------------------------------
-
-
 def test_spaces_of_the_example_client() -> None:
     env: Any = gym.make("bufgym/Topics-v0", duration_s=1.0).unwrapped
     assert env.action_space == gym.spaces.Discrete(34)
@@ -70,8 +67,6 @@ def test_fields_of_topics_need_topics() -> None:
     # The terms of topics have namesakes there, computed where they are named.
     assert [term.name for term in SenderEnv("lte", reward="age").rows.terms] == ["delivered", "retained", "age"]
 
-
-# --- by hand ---------------------------------------------------------------------------------------------------------
 
 V = qoi.saturating(4)
 THREE = (
@@ -202,9 +197,6 @@ def test_hold_until_an_ack() -> None:
     assert True in asked
 
 
-# --- random play -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_the_mask_is_what_does_not_count_as_imvalid_action(case: str) -> None:
     """Every action on a copy of the sender."""
@@ -315,9 +307,6 @@ def test_one_topic_is_the_largest_of_all() -> None:
     assert total == pytest.approx(-made.late)
 
 
-# --- the batch -------------------------------------------------------------------------------------------------------
-
-
 def test_given_episodes() -> None:
     env, envs = SenderEnv(BY_HAND, 3), SenderVectorEnv(2, BY_HAND, 3)
     first = env.reset(seed=0, options={"episode": three_topics()})[0]
@@ -342,9 +331,6 @@ def test_masked_ppo_learns_on_it() -> None:
     model.learn(512)
     assert len(model.ep_info_buffer) > 0
     assert (envs.envs.rows.senders.batch.senders["invalid"] == 0).all()
-
-
-# --- pictures --------------------------------------------------------------------------------------------------------
 
 
 def test_a_frame_of_text_has_a_lane_a_topic() -> None:
