@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from naive_queues import ACCEPT, REJECT
+from naive_sender import ACCEPT, REJECT
 
 
 class Fifo:

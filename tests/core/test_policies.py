@@ -11,7 +11,6 @@ from cases import newcomer, order, queue_of
 from policy_cases import V, drops, interruption, kept, stream, worst_ratio
 
 from bufgym import policies
-from bufgym.kernel import JIT
 from bufgym.policies import ACCEPT, REJECT, afr
 from bufgym.scenario import Interruption
 from bufgym.sim import Senders, run
@@ -85,7 +84,7 @@ def test_a_departure_moves_p(p, after):
     assert not policies.get("afr-paper").hears_departures
 
 
-L, T, RUNS = 4, 12, 6_000 if JIT else 400
+L, T, RUNS = 4, 12, 3_000
 
 
 @pytest.mark.parametrize(

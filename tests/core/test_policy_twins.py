@@ -43,7 +43,7 @@ SPECS = sorted({*twins(qoi.exponential()), *SETTINGS} - {*ALIASES, *(spec.partit
 
 
 @pytest.mark.parametrize("spec", [*(pytest.param(spec, marks=pytest.mark.kernels) for spec in SPECS), *ALIASES])
-@given(cases(max_messages=30), VALUES)
+@given(cases(), VALUES)
 def test_agrees_with_twin(spec, case, v):
     policy = ANYTHING if spec == "test-anything" else policies.get(spec)
     ours, twin = case.run(policy, v), case.run_twin(naive.policy(spec, v))
@@ -71,7 +71,7 @@ def test_the_built_in_policies_are_there():
 
 
 @pytest.mark.parametrize("name", ALL)
-@given(cases(max_messages=20), VALUES)
+@given(cases(max_messages=15), VALUES)
 def test_every_decision_is_possible_compiled_and_as_plain_python(name, case, v):
     policy = policies.get(name)
     assert policy.name == name and len(policy.summary) > 20
