@@ -36,36 +36,32 @@ class Link:
 
     def __init__(self, knots, after, offset_us=0):
         self.knots, self.after, self.offset_us = knots, after, offset_us
-
-    def pieces(self):
-        """(start us, bytes then, end us, bytes then) of every straight piece, for as long as the link carries any."""
-        pieces = [(*a, *b) for a, b in itertools.pairwise(self.knots)]
-        yield from pieces
-        duration, total = self.knots[-1]
-        if self.after == "loop":
-            for lap in itertools.count(1):
-                for t0, b0, t1, b1 in pieces:
-                    yield lap * duration + t0, lap * total + b0, lap * duration + t1, lap * total + b1
-        if self.after == "hold":
-            t0, b0, t1, b1 = pieces[-1]
-            for _ in itertools.count() if b1 > b0 else ():
-                t0, b0, t1, b1 = t1, b1, 2 * t1 - t0, 2 * b1 - b0
-                yield t0, b0, t1, b1
+        (from_us, from_bytes), (self.us, self.bytes) = knots[-2:]
+        self.rate = Fraction(self.bytes - from_bytes, self.us - from_us)  # of the last piece
 
     def bytes_by(self, t_us):
         """C at the sender's time t, a fraction."""
         t = t_us + self.offset_us
-        for t0, b0, t1, b1 in self.pieces():
+        laps, t = divmod(t, self.us) if self.after == "loop" else (0, t)
+        for (t0, b0), (t1, b1) in itertools.pairwise(self.knots):
             if t <= t1:
-                return b0 + Fraction((b1 - b0) * (t - t0), t1 - t0)
-        return Fraction(b1)  # it has stopped for good
+                return laps * self.bytes + b0 + Fraction((b1 - b0) * (t - t0), t1 - t0)
+        return self.bytes + (t - self.us) * self.rate * (self.after == "hold")
 
     def first_time(self, position):
         """The first whole microsecond at which that many bytes could have crossed; None for never."""
-        for t0, b0, t1, b1 in self.pieces():
+        if position > self.bytes and self.after == "hold" and self.rate:
+            return self.us + math.ceil((position - self.bytes) / self.rate) - self.offset_us
+        laps = max(0, math.ceil(position) - 1) // self.bytes if self.after == "loop" else 0
+        position -= laps * self.bytes
+        for (t0, b0), (t1, b1) in itertools.pairwise(self.knots):
             if position <= b1:
-                exact = t0 + Fraction((position - b0) * (t1 - t0), b1 - b0)
-                return math.ceil(exact) - self.offset_us
+                return (
+                    laps * self.us
+                    + t0
+                    + math.ceil(Fraction(position - b0) * (t1 - t0) / max(1, b1 - b0))
+                    - self.offset_us
+                )
         return None
 
 

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
-import numpy as np
 import pytest
-from cases import VALUES
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -85,18 +81,3 @@ def test_gaps_by_hand():
 def test_gain_of_a_newcomer_to_an_empty_buffer():
     assert arrival_gain(buffer([], [], dequeued_x=2.0), message(9, 3.0)) == 0.5
     assert arrival_gain(buffer([], [], dequeued=0), message(9, 3.0)) == 0  # the very first message is the 1 in H
-
-
-@given(VALUES, st.lists(st.integers(0, 9), min_size=3, max_size=9), st.integers(0, 9))
-def test_gaps_and_losses_agree_with_a_list(v, steps, back):
-    at = np.cumsum(steps).tolist()
-    previous = max(at[-2], at[-1] - back)
-    held = buffer(
-        at[1:-1], at[1:-1], v, dequeued_arrival_us=at[0], dequeued_x=at[0], previous_us=previous, previous_x=previous
-    )
-    newcomer = message(at[-1], at[-1])
-    gaps = [b - a for a, b in pairwise([*at, 2 * at[-1] - previous])]
-    for k in range(len(at) - 1):
-        assert time_gaps(held, newcomer, k) == motion_gaps(held, newcomer, k) == (gaps[k], gaps[k + 1])
-        lost = v(gaps[k]) + v(gaps[k + 1]) - v(gaps[k] + gaps[k + 1])
-        assert loss(held, newcomer, k) == pytest.approx(lost, abs=1e-12)

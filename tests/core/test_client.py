@@ -27,7 +27,6 @@ def client(*streams: Stream, **parameters: Any) -> Client:
     return Client(streams or (Stream(Topic("a"), 2, 100),), **{"traces": (LINK,), "duration_s": 2.0, **parameters})
 
 
-
 def test_streams_are_merged_in_order_of_time() -> None:
     """Every 0.5 s an "a", every second a "b"; of one moment the first topic comes first."""
     two = client(
@@ -124,7 +123,6 @@ def test_the_scenario_topics_is_the_example() -> None:
     named = scenario.get("topics")
     assert isinstance(named, Client) and named.streams == robofleet_example() and named.scale == 0.25
     assert [topic.name for topic in named.topics if topic.no_drop] == ["subscriptions"]
-
 
 
 def test_the_example_file_is_robofleets_example() -> None:

@@ -150,10 +150,7 @@ def test_on_one_queue_it_drops_its_oldest_first_in_first_out(case, v, whole):
 def test_a_score_by_hand():
     # relu(2 * 3 - 1, -4 * 3 + 1) = (5, 0); 10 * 5 + 100 * 0 + 7 * 3 + 0.5
     net = Network(
-        np.float32([7]),
-        np.float32([0.5]),
-        ((np.float32([[2, -4]]), np.float32([-1, 1])),),
-        np.float32([10, 100]),
+        np.float32([7]), np.float32([0.5]), ((np.float32([[2, -4]]), np.float32([-1, 1])),), np.float32([10, 100])
     )
     assert score(net, [3.0]) == 71.5
     assert score(replace(net, layers=(), out=np.zeros(0, np.float32)), [3.0]) == 21.5

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
-from fractions import Fraction
-
 import naive
 import numpy as np
 import pytest
@@ -16,10 +12,9 @@ from hypothesis import strategies as st
 from bufgym.errors import BufgymError
 from bufgym.model import link
 from bufgym.model.link import FOREVER, Knots, Link, position_at, segment, time_of
-from bufgym.scenario import Streams, Uplink
-from bufgym.sim.senders import Senders
 
 # 1000 bytes in the first 10 ms, nothing for 10 ms, then 3000 bytes in 10 ms: 0.1, 0 and 0.3 bytes a microsecond.
+pytestmark = pytest.mark.kernels
 KNOTS = [(0, 0), (10_000, 1_000), (20_000, 1_000), (30_000, 4_000)]
 
 
@@ -114,16 +109,6 @@ def test_traces_that_nobody_follows_make_room(monkeypatch):
     assert len(store.us) <= 2 * (4 + 200)
 
 
-def test_a_new_trace_for_every_episode_takes_no_more_memory(monkeypatch):
-    monkeypatch.setattr(link, "KEPT_KNOTS", 100)
-    scenario = Uplink(traces=(trace(KNOTS, "loop"),), duration_s=0.2)
-    senders = Senders(1, 2, scenario.value, max_messages=scenario.max_messages)
-    for k in range(1, 500):
-        one = replace(scenario, traces=(trace([(0, 0), (10_000, k), (30_000, 2 * k)], "loop"),))
-        senders.load(0, one.draw(Streams.seeded(k)))
-    assert len(senders.batch.knot_us) <= 200
-
-
 @pytest.mark.parametrize("name", ["offset_us", "propagation_us"])
 def test_errors(name):
     with pytest.raises(BufgymError, match=f"{name} = -1: must be a whole number from 0 to"):
@@ -144,31 +129,6 @@ def huge_traces(rng: np.random.Generator) -> list[tuple[int, int]]:
     return knots if len(knots) > 1 and knots[-1][1] > 0 else [(0, 0), (3, 7)]
 
 
-class Laps:
-    """As ``naive.Link``, without counting the laps one by one."""
-
-    def __init__(self, knots, after):
-        self.after, self.once = after, naive.Link(knots, "stop")
-        self.us, self.bytes = knots[-1]
-        (from_us, from_bytes), self.end = knots[-2:]
-        self.rate = Fraction(self.bytes - from_bytes, self.us - from_us)
-
-    def bytes_by(self, t_us):
-        if self.after == "loop":
-            laps, t_us = divmod(t_us, self.us)
-            return laps * self.bytes + self.once.bytes_by(t_us)
-        beyond = max(0, t_us - self.us) if self.after == "hold" else 0
-        return self.once.bytes_by(min(t_us, self.us)) + beyond * self.rate
-
-    def first_time(self, position):
-        if self.after == "loop":
-            laps = (position - 1) // self.bytes
-            return laps * self.us + self.once.first_time(position - laps * self.bytes)
-        if self.after == "hold" and position > self.bytes and self.rate:
-            return self.us + math.ceil((position - self.bytes) / self.rate)
-        return self.once.first_time(position)
-
-
 @pytest.mark.parametrize("after", ["loop", "hold", "stop"])
 def test_exact_wherever_the_result_is_below_2_to_the_62(after):
     """Random traces, times and positions of every size, against fractions: no product wraps around."""
@@ -176,7 +136,7 @@ def test_exact_wherever_the_result_is_below_2_to_the_62(after):
     for _ in range(300):
         knots = huge_traces(rng)
         carried, first_time = kernels(knots, after)
-        twin = Laps(knots, after)
+        twin = naive.Link(knots, after)
         for _ in range(10):
             t_us, position = (int(rng.integers(1, 2 ** int(rng.integers(1, 62)))) for _ in range(2))
             exact, at = int(twin.bytes_by(t_us)), twin.first_time(position)

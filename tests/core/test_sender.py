@@ -168,13 +168,7 @@ def head_dropper(on_dequeue, compiled=True):
     ("drops", "times_ms", "sizes", "logged", "h"),
     [
         # 0 goes out at 0 ms, 1 is dropped at 1 ms and 2 goes out, 3 is dropped at 2 ms. H = 1 + V(2) + V(2)
-        (
-            every_second,
-            [0, 0, 0, 0, 0],
-            1_000,
-            times({0: 0, 2: 1, 4: 2}, {0: 1, 2: 2, 4: 3}, {1: 1, 3: 2}),
-            2.5,
-        ),
+        (every_second, [0, 0, 0, 0, 0], 1_000, times({0: 0, 2: 1, 4: 2}, {0: 1, 2: 2, 4: 3}, {1: 1, 3: 2}), 2.5),
         # Message 0 takes 5 ms. By then 1 and 2 have waited for 5 and 4 ms: both go, 3 (1 ms) is taken. Message 4 finds
         # an idle link at 10 ms. H = 1 + V(3) + V(1)
         (

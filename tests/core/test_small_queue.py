@@ -10,7 +10,6 @@ import pytest
 from cases import newcomer, queue_of
 
 from bufgym import files, policies
-from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import REJECT
 from bufgym.oracle import law, online_optimum
@@ -40,7 +39,8 @@ def test_the_file_has_a_plan_for_each_base_and_length():
     assert any(math.isclose(b, 0.618) for b in BASES) and any(math.isclose(b, 0.9) for b in BASES)
 
 
-@pytest.mark.parametrize("number", range(0, len(LINES), 1 if JIT else 9))
+@pytest.mark.kernels
+@pytest.mark.parametrize("number", range(0, len(LINES), 5))
 def test_each_digit_is_what_is_evicted(number):
     base, L, digits = float(LINES[number][0]), int(LINES[number][1]), LINES[number][2]
     kept = list(range(1, L + 1))
@@ -52,7 +52,7 @@ def test_each_digit_is_what_is_evicted(number):
         del kept[int(digit)]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("L", "t_max"), [(1, 400), (2, 300), (3, 120), (4, 70)])
 @pytest.mark.parametrize("v", [qoi.exponential(0.618), qoi.exponential(0.9), qoi.saturating(8)], ids=str)
 def test_an_agent_with_shortcuts_loses_no_more_than_the_optimum(v, L, t_max):
@@ -61,6 +61,7 @@ def test_an_agent_with_shortcuts_loses_no_more_than_the_optimum(v, L, t_max):
     assert lengths.regrets(AGENT)[0] == pytest.approx(lengths.regrets(optimum)[0], abs=1e-12)
 
 
+@pytest.mark.kernels
 def test_a_plan_counts_steps_of_whatever_size():
     # 0.9^4.567 = 0.618: a scene that moves 4.567 at each arrival is that of the other base.
     step = math.log(0.618) / math.log(0.9)
@@ -69,6 +70,7 @@ def test_a_plan_counts_steps_of_whatever_size():
     assert asked([1, 2, 3, 4], 5, base=0.9, step=step) != NONE
 
 
+@pytest.mark.kernels
 def test_where_there_is_no_plan():
     assert asked([1, 2, 3, 4], 5) != NONE
     assert asked([1, 2, 3, 4, 5], 6) == NONE  # L = 5

@@ -60,11 +60,7 @@ def agree(senders, twin, until=None, to_the_end=False):
     assert sender["backlog_bytes"] == sum(m["bytes"] for m in twin.slots())
     assert sender["dequeued"] - sender["acked"] == len(twin.in_flight)
     assert sender["busy"] == len(twin.socket)
-    assert (sender["rejected"], sender["evicted"], sender["invalid"]) == (
-        twin.rejected,
-        twin.evicted,
-        twin.invalid,
-    )
+    assert (sender["rejected"], sender["evicted"], sender["invalid"]) == (twin.rejected, twin.evicted, twin.invalid)
     assert sender["retained_gain"] == pytest.approx(twin.retained_gain(), abs=1e-9)
     assert sender["delivered_gain"] == pytest.approx(twin.delivered_gain(until), abs=1e-9)
     for slot, message in zip(slots, twin.slots(), strict=True):
