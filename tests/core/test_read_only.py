@@ -39,13 +39,14 @@ WRITES = {
     "buffer.slots[0].size_bytes = 1": "the queue's bytes are not those of its messages",
     "buffer.topics[0].limit = 10**6": "a topic's rules are not as they were",
 }
-"""What a policy writes where anything is queued, and what is said of it."""
+"""What a policy writes, and what is said of it."""
 
 
 def writer(write: str, **options: Any) -> Policy:
     made: dict[str, Any] = {"__name__": __name__}
     accept = "return -2 if len(buffer.slots) < buffer.capacity else 0"
-    exec(f"def on_arrival(buffer, arrival, memory):\n if len(buffer.slots) > 0: {write}\n {accept}", made)
+    queued = "True" if write.startswith("arrival") else "len(buffer.slots) > 0"
+    exec(f"def on_arrival(buffer, arrival, memory):\n if {queued}: {write}\n {accept}", made)
     return Policy("test-writer", made["on_arrival"], **options)
 
 

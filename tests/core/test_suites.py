@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -46,8 +47,9 @@ def used(scenario: Interruption | Uplink) -> set[tuple[str, object]]:
     return {("content", each) for each in contents} | {("name", name) for name in names}
 
 
-def check(name: str, data: Path | None = None) -> None:
-    """What holds for every suite."""
+@pytest.mark.parametrize("name", [*EMBEDDED, *(pytest.param(name, marks=pytest.mark.nightly) for name in RECORDED)])
+def test_a_suite_builds_every_split_and_splits_share_nothing(name: str, request: pytest.FixtureRequest) -> None:
+    data = request.getfixturevalue("shared_data") if name in RECORDED else None
     suite = suites.get(name)
     assert suite.name == name and suite.about and name[-1].isdigit()
     assert len(set(suite.capacities)) == len(suite.capacities) and min(suite.capacities) >= 1
@@ -68,16 +70,6 @@ def check(name: str, data: Path | None = None) -> None:
     assert labels[0] == labels[1] == labels[2]
     for one, other in (("train", "validation"), ("train", "test"), ("validation", "test")):
         assert known[one] and not known[one] & known[other], (one, other)
-
-
-@pytest.mark.parametrize("name", EMBEDDED)
-def test_a_suite_builds_every_split_and_splits_share_nothing(name: str) -> None:
-    check(name)
-
-
-@pytest.mark.parametrize("name", RECORDED)
-def test_so_does_a_suite_over_recordings(name: str, shared_data: Path) -> None:
-    check(name, shared_data)
 
 
 def test_paper_numbers_and_capacities() -> None:
@@ -103,6 +95,7 @@ def test_paper_numbers_and_capacities() -> None:
         assert share == pytest.approx(0.5, rel=0.061)
 
 
+@pytest.mark.nightly
 def test_5g_uplinks_are_split_by_day_without_the_runs_that_failed(shared_data: Path) -> None:
     counts = {}
     for split, days in (("train", "123"), ("validation", "4"), ("test", "5")):
@@ -114,6 +107,7 @@ def test_5g_uplinks_are_split_by_day_without_the_runs_that_failed(shared_data: P
     assert counts == {"train": 24, "validation": 6, "test": 12}
 
 
+@pytest.mark.nightly
 def test_wifi_and_mmwave_uplinks_are_split_by_place(shared_data: Path) -> None:
     for split, place, spot in (("train", "loc2", "p1"), ("validation", "loc1", "p2"), ("test", "loc3", "p3")):
         wifi = scenarios("uplink-wifi-v1", split, shared_data)["motion-900kB"]
@@ -122,16 +116,6 @@ def test_wifi_and_mmwave_uplinks_are_split_by_place(shared_data: Path) -> None:
         assert isinstance(mmwave, Uplink)
         ways = {trace.name.rpartition("-")[0].split("_5g_")[1] for trace in mmwave.traces}
         assert ways > {f"away_{spot}", f"toward_{spot}"} and len(ways) == 3
-
-
-def test_generated_links_are_of_all_ways_of_moving() -> None:
-    for split, times in (("train", 4), ("validation", 1), ("test", 2)):
-        built = scenarios("generated-v1", split)
-        assert list(built) == ["time-230kB", "motion-230kB", "time-900kB", "motion-900kB"]
-        for scenario in built.values():
-            assert isinstance(scenario, Uplink) and all(trace.duration_us == 300_000_000 for trace in scenario.traces)
-            modes = [trace.name.rpartition("-")[0] for trace in scenario.traces]
-            assert modes == ["foot", "bicycle", "bus", "tram", "train", "car"] * times
 
 
 def test_stress_is_what_nobody_trained_on() -> None:
@@ -204,27 +188,17 @@ def fingerprint(name: str) -> str:
     return digest.hexdigest()[:16]
 
 
-def test_unknown_names_are_named() -> None:
+def test_what_is_unknown_or_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(BufgymError, match=r"unknown suite 'lte-v0'; known: interruption-v1, lte-v1"):
         suites.get("lte-v0")
     with pytest.raises(BufgymError, match=r"split = 'tests': must be one of train, validation, test"):
         suites.get("lte-v1").settings("tests")
-
-
-@pytest.mark.parametrize("name", RECORDED)
-def test_a_suite_without_its_recordings_says_what_it_needs(name: str, tmp_path: Path) -> None:
-    suite = suites.get(name)
-    with pytest.raises(
-        BufgymError, match=rf"suite {name} needs a folder of recordings \(--data DIR\) with \w+"
-    ) as told:
-        suite.settings("test")
-    assert suite.needs in str(told.value)
-    with pytest.raises(BufgymError) as told:
-        suite.settings("test", tmp_path / "nowhere")
-    assert str(tmp_path / "nowhere") in str(told.value)
-
-
-def test_a_missing_recording_is_named(tmp_path: Path) -> None:
+    for name in RECORDED:
+        told = rf"suite {name} needs a folder of recordings \(--data DIR\) with .*{re.escape(suites.get(name).needs)}"
+        with pytest.raises(BufgymError, match=told):
+            suites.get(name).settings("test")
+        with pytest.raises(BufgymError, match=str(tmp_path / "nowhere")):
+            suites.get(name).settings("test", tmp_path / "nowhere")
     (tmp_path / "mahimahi").mkdir()
     for k in range(5):
         with gzip.open(tmp_path / f"mahimahi/link-{k}.down.gz", "wt") as file:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import frame_cases
 import numpy as np
 import pytest
-from cases import newcomer, queue_of
+from cases import queue_of
 
 from bufgym import policies
 from bufgym.model import qoi
@@ -17,36 +18,22 @@ from bufgym.sim import run
 from bufgym.sim.metrics import outcome, received
 from bufgym.traces import Trace
 
+kernels = pytest.mark.kernels
 V = qoi.exponential(0.618)
 
 
-def waiting(*frames, sent=0, now=8, rate_bytes_per_s=7500.0, **known):
-    """Frames of 1000 bytes at 30 Hz are queued, frame ``sent`` is in the socket, frame ``now`` arrives; x is the number
-    of the frame. At 7500 bytes/s the link sends one frame every four."""
-    buffer = queue_of(len(frames), 8)
-    for name, scale in (("arrival_us", 33_333), ("x", 1.0), ("seq", 1)):
-        buffer.slots[name] = scale * np.array(frames)
-    arrival = newcomer()
-    arrival["arrival_us"], arrival["x"], arrival["seq"], arrival["size_bytes"] = 33_333 * now, now, now, 1000
-    seen = {
-        "busy": 1,
-        "backlog_bytes": 1000 * len(frames),
-        "dequeued_arrival_us": 33_333 * sent,
-        "dequeued_x": float(sent),
-        "dequeued_seq": sent,
-        "previous_x": now - 1.0,
-        "short_rate_bytes_per_s": 0.0,
-        "medium_rate_bytes_per_s": rate_bytes_per_s,
-        "long_rate_bytes_per_s": rate_bytes_per_s / 2,
-    }
-    return buffer._replace(**seen | known), arrival
+def waiting(*frames, rate_bytes_per_s=7500.0, **known):
+    rates = {"medium_rate_bytes_per_s": rate_bytes_per_s, "long_rate_bytes_per_s": rate_bytes_per_s / 2}
+    return frame_cases.waiting(*frames, **rates | known)
 
 
+@kernels
 def test_the_fastest_rate_of_late_says_how_long_a_message_takes():
     assert send_us(*waiting(2, 5)) == pytest.approx(1e6 * 1000 / 7500)
     assert send_us(*waiting(2, 5, rate_bytes_per_s=0.0)) == 0
 
 
+@kernels
 @pytest.mark.parametrize("measured_in", [MOTION, MESSAGES])
 def test_what_goes_leaves_no_gap_longer_than_the_link_sends(measured_in):
     # Sent: 0; queued: 2, 5, 7; frame 8 comes. Without 2 a gap of 5 frames is left, without 5 one of 5, without 7 of 3.
@@ -57,12 +44,14 @@ def test_what_goes_leaves_no_gap_longer_than_the_link_sends(measured_in):
     assert slower == [True, True]  # one in 5.08
 
 
+@kernels
 def test_the_room_that_is_left_is_to_be_filled_in_a_minute():
     # One frame in four is sent, 450 in a minute; with 26 places more 4 x 450 / 476 = 3.78.
     assert not spare(*waiting(1, 4, 8, now=12, capacity=29), 0, MESSAGES)  # leaves a gap of 4
     assert spare(*waiting(1, 4, 8, now=12, capacity=3), 0, MESSAGES)
 
 
+@kernels
 def test_the_link_never_waits_for_what_was_spared():
     assert not spare(*waiting(5, 7), REJECT, MOTION)  # two wait: three are wanted
     assert not spare(*waiting(2, 5, 7, busy=0), 2, MOTION)
@@ -70,11 +59,13 @@ def test_the_link_never_waits_for_what_was_spared():
     assert not spare(*waiting(2, 5, 7, dequeued_arrival_us=8 * 33_333), 2, MOTION)  # all at one time: no pace
 
 
+@kernels
 def test_a_long_queue_on_a_slow_link_is_kept_for_the_end_of_the_stream():
     assert spare(*waiting(2, 5, 7, capacity=29), 2, MOTION)  # 29 x 1000 / 7500 = 3.87 s
     assert not spare(*waiting(2, 5, 7, capacity=31), 2, MOTION)  # 4.13 s: over SOON_US
 
 
+@kernels
 def test_a_link_is_steady_while_its_rates_agree():
     buffer = queue_of(0, 8)._replace(drained_us=1000)
 
