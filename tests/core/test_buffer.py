@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from cases import queue_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -10,8 +11,6 @@ from bufgym.kernel import records
 from bufgym.model import qoi
 from bufgym.model.buffer import (
     MESSAGE,
-    TOPIC,
-    Buffer,
     arrival_gain,
     evict,
     loss,
@@ -20,6 +19,8 @@ from bufgym.model.buffer import (
     row_width,
     time_gaps,
 )
+
+pytestmark = pytest.mark.kernels
 
 
 @given(st.integers(1, 6), st.lists(st.one_of(st.none(), st.integers(-1, 5)), max_size=80))
@@ -47,18 +48,11 @@ def test_agrees_with_a_list(L, actions):
     assert (slots["seq"][0] == 0).all()
 
 
-def buffer(times_us, x, v=None, *, dequeued_arrival_us=0, dequeued_x=0.0, previous_us=0, previous_x=0.0, dequeued=1):
+def buffer(times_us, x, v=None, **known):
     """A buffer that holds messages with these arrival times and coordinates."""
-    slots = records(len(times_us), MESSAGE)
-    slots["arrival_us"], slots["x"] = times_us, x
-    others = dict.fromkeys(Buffer._fields, 0)
-    others.update(slots=slots, capacity=len(x), v=(v or qoi.exponential(0.5)).array, dequeued=dequeued)
-    others.update(
-        dequeued_arrival_us=dequeued_arrival_us, dequeued_x=dequeued_x, previous_us=previous_us, previous_x=previous_x
-    )
-    others.update(left_fraction=0.0, period_us=0.0, service_ratio=0.0, topics=records(1, TOPIC))
-    others.pop("parameters")
-    return Buffer(**others)
+    held = queue_of(len(x), len(x))._replace(**{"v": (v or qoi.exponential(0.5)).array, "dequeued": 1, **known})
+    held.slots["arrival_us"], held.slots["x"] = times_us, x
+    return held
 
 
 def message(us, x):
