@@ -36,34 +36,20 @@ class Sent(NamedTuple):
     due: int | None
 
 
+SETTINGS = {"max_bytes": None, "decide_at": "arrival", "window": 1, "ack_delay_us": 0, "propagation_us": 0}
+SETTINGS |= dict.fromkeys(("schedules", "drops_heads", "limit_at_send", "limit_since_sent", "flush_no_drop"), False)
+
+
 class Sender:
     """One sender, event by event; ``rules`` is a list, one each topic, or a single one for one queue."""
 
-    def __init__(
-        self,
-        link,
-        rules,
-        capacity,
-        *,
-        max_bytes=None,
-        decide_at="arrival",
-        window=1,
-        ack_delay_us=0,
-        propagation_us=0,
-        schedules=False,
-        drops_heads=False,
-        limit_at_send=False,
-        limit_since_sent=False,
-        flush_no_drop=False,
-    ):
-        self.link, self.capacity, self.decide_at = link, capacity, decide_at
+    def __init__(self, link, rules, capacity, **settings):
+        """``settings``: any of ``SETTINGS``."""
+        vars(self).update({**SETTINGS, **settings}, link=link, capacity=capacity)
         self.ask = lambda event: None  # who answers, to be set
         self.one_queue = isinstance(rules, Rules)
         self.rules = [rules] if self.one_queue else rules
-        self.max_bytes = math.inf if max_bytes is None else max_bytes
-        self.window, self.ack_delay_us, self.propagation_us = window, ack_delay_us, propagation_us
-        self.schedules, self.drops_heads = schedules, drops_heads
-        self.limit_at_send, self.limit_since_sent, self.flush_no_drop = limit_at_send, limit_since_sent, flush_no_drop
+        self.max_bytes = self.max_bytes or math.inf
         self.queues = [[] for _ in self.rules]
         self.arrived = [[] for _ in self.rules]  # all that came, kept or not
         self.kept = [[] for _ in self.rules]  # all that was ever enqueued

@@ -15,9 +15,9 @@ import bufgym
 from bufgym.envs import SenderEnv
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, motion_gaps, time_gaps
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
 from bufgym.model.link import Link
-from bufgym.observe import CONTEXT_FIELDS, FIELDS, SLOT_FIELDS
+from bufgym.observe import FIELDS
 from bufgym.scenario import Episode, Interruption, Scenario, Uplink, messages
 from bufgym.sim import named, python_view
 from bufgym.traces import Trace, drive_motion
@@ -222,77 +222,6 @@ def test_an_invalid_action_does_what_a_queue_does(options: dict[str, Any]) -> No
         assert reward == reward_there
         assert (info["invalid"], there["invalid"]) == (invalid, 0)
     assert invalid > 5
-
-
-def twin(buffer: Buffer, arrival: Any, V: qoi.Value) -> dict[str, list[float]]:
-    """The observation once more, field by field from its definition."""
-
-    def per(g: float, r: float) -> float:
-        return float(g / (g + r)) if g > 0 else 0.0
-
-    L, s = buffer.capacity, len(buffer.slots)
-    even_us, even_x = (
-        (arrival.arrival_us - buffer.dequeued_arrival_us) / (L + 1),
-        (arrival.x - buffer.dequeued_x) / (L + 1),
-    )
-    sizes = [*(slot.size_bytes for slot in buffer.slots), arrival.size_bytes]
-    fields: dict[str, list[float]] = {field.name: [] for field in SLOT_FIELDS}
-    for k in [*range(s), *[None] * (L - s), s]:
-        if k is None:
-            values = [0.0] * len(SLOT_FIELDS)
-        else:
-            (a_us, b_us), (a, b) = time_gaps(buffer, arrival, k), motion_gaps(buffer, arrival, k)
-            # Nothing is lost with the very first message of all: it has no gap before it yet.
-            first = buffer.dequeued == 0 and k == 0
-            values = [
-                1.0,
-                (k + 1) / (s + 1),
-                per(a_us, even_us),
-                per(a_us + b_us, 2 * even_us),
-                per(a, even_x),
-                per(a + b, 2 * even_x),
-                lost := 0.0 if first else V(a) + V(b) - V(a + b),
-                per(sizes[k], sum(sizes) / (s + 1)),
-                per(lost, max(2 * V(even_x) - V(2 * even_x), 1e-12)),
-            ]
-        for field, number in zip(SLOT_FIELDS, values, strict=True):
-            fields[field.name].append(number)
-    stalled_by = (L + 1) * buffer.period_us
-    context = [
-        s / L,
-        buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0,
-        per(arrival.arrival_us - buffer.previous_us, even_us),
-        per(arrival.x - buffer.previous_x, even_x),
-        float(buffer.busy),
-        buffer.left_fraction,
-        per(buffer.stalled_us, stalled_by),
-        per(buffer.departures, 1.0),
-        per(buffer.service_ratio, 1.0),
-        V(even_x),
-        (2 * V(even_x) - V(2 * even_x)) / V(even_x) if even_x > 0 else 0.0,
-    ]
-    return fields | {field.name: [number] for field, number in zip(CONTEXT_FIELDS, context, strict=True)}
-
-
-@kernels
-@pytest.mark.parametrize(("scenario", "options"), VARIANTS)
-def test_observation_equals_its_definition(scenario: str, options: dict[str, Any]) -> None:
-    env, rng = make(scenario, **options), np.random.default_rng(4)
-    compared = 0
-    for seed in (11, None, None):
-        observation, info = env.reset(seed=seed)
-        ended = not env.rows.senders.batch.senders["waiting"][0]
-        while not ended:
-            buffer, arrival = seen(env)
-            expected = twin(buffer, arrival, env.rows.scenario.value)
-            assert observation.keys() == expected.keys()
-            for name, numbers in expected.items():
-                np.testing.assert_allclose(observation[name], numbers, rtol=1e-6, atol=1e-6, err_msg=name)
-            compared += 1
-            # Keep the buffer long: accept where possible, else mostly evict.
-            action = 5 if info["action_mask"][5] else int(rng.choice(np.flatnonzero(info["action_mask"])))
-            observation, _, ended, _, info = env.step(action)
-    assert compared > 5
 
 
 @kernels

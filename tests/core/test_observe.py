@@ -1,4 +1,4 @@
-"""What is observed of several topics: event by event against its twin, written from the table of fields."""
+"""What is observed of one queue and of several topics: event by event against a twin, written from their tables."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from hypothesis import given
 from topic_cases import TWIN_V, TopicCase, topic_cases
 
 from bufgym.model.buffer import UNLIMITED_BYTES
+from bufgym.model.topics import Topic
 from bufgym.observe import (
     CONTEXT_FIELDS,
     FIELDS,
@@ -15,22 +16,15 @@ from bufgym.observe import (
     TOPIC_CONTEXT_FIELDS,
     TOPIC_FIELDS,
     TOPIC_SLOT_FIELDS,
+    observe_context,
+    observe_slots,
     observe_topic_context,
     observe_topic_slots,
 )
-from bufgym.sim import (
-    DECISION,
-    DEPARTURE,
-    DEQUEUE,
-    END,
-    SEND,
-    named,
-    python_view,
-)
+from bufgym.sim import named, python_view
 
 SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
 CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
-NAMES = {DECISION: "decision", DEPARTURE: "departure", DEQUEUE: "dequeue", SEND: "send", END: "end"}
 
 
 def per(g, r):
@@ -43,7 +37,7 @@ class Twin:
 
     def __init__(self, case: TopicCase, sender, buffer) -> None:
         self.case, self.sender, self.buffer = case, sender, buffer
-        self.topics = case.topics
+        self.topics = case.topics or (Topic("only"),)
         self.top = max(topic.share for topic in self.topics) or 1.0
         self.newcomer = sender.newcomer
         self.L = case.case.capacity
@@ -52,7 +46,12 @@ class Twin:
         return TWIN_V[self.topics[lane].value or self.case.v]
 
     def even(self, lane, field, last):
-        """The even spacing of a topic: from what was sent last (until then: kept first) to its arrival ``last``."""
+        """The even spacing of a topic: from what was sent last (until then: kept first) to its arrival ``last``.
+
+        One queue: that of L messages.
+        """
+        if self.sender.one_queue:
+            return (last - self.sender.reference()[field]) / (self.L + 1)
         sent, queued = self.sender.sent[lane], self.sender.queues[lane]
         if not sent and not queued:
             return 0.0
@@ -61,14 +60,16 @@ class Twin:
 
     def last(self, lane, field):
         """Of a topic's last arrival, the newcomer included."""
-        if self.newcomer is not None and self.newcomer["topic"] == lane:
+        if self.newcomer is not None and self.sender.lane(self.newcomer) == lane:
             return self.newcomer[field]
         arrived = self.sender.arrived[lane]
         return arrived[-1][field] if arrived else 0
 
     def gaps(self, m, field):
         """To what is kept before it on its topic, and to what follows; one more step where nothing does."""
-        lane, s = m["topic"], self.sender
+        lane, s = self.sender.lane(m), self.sender
+        if s.one_queue:
+            return s.gaps(m, field)
         before = s.kept_before(m) or m
         arrived, later = s.arrived[lane], [q for q in s.queues[lane] if q["seq"] > m["seq"]]
         step = arrived[-1][field] - arrived[-2][field] if len(arrived) > 1 else 0
@@ -85,19 +86,22 @@ class Twin:
     def gain(self, m):
         """V of what its delivery adds, weighted; the first of a topic is the 1 in its H."""
         before = self.sender.kept_before(m)
-        return 0.0 if before is None else self.topics[m["topic"]].share * self.v(m["topic"])(m["x"] - before["x"])
+        lane = self.sender.lane(m)
+        return 0.0 if before is None else self.topics[lane].share * self.v(lane)(m["x"] - before["x"])
 
     def candidate(self, m, k):
         """All slot fields of message ``m`` at place ``k``; the newcomer comes after all that are queued."""
-        s, lane, messages = self.sender, m["topic"], self.candidates()
+        s, lane, messages = self.sender, self.sender.lane(m), self.candidates()
         topic, v, queue = self.topics[lane], self.v(lane), s.queues[lane]
         (a_us, b_us), (a, b) = self.gaps(m, "us"), self.gaps(m, "x")
         even_us = self.even(lane, "us", self.last(lane, "us"))
         even_x = self.even(lane, "x", self.last(lane, "x"))
         lost = max(v(a) + v(b) - v(a + b), 0.0)
+        if s.one_queue and k == 0 and not s.sent[0]:
+            lost = 0.0  # the first message of all has no gap before it yet
         age = s.now - m["us"]
         gains = [self.gain(each) / self.top / each["bytes"] for each in messages]
-        of_newcomer = self.newcomer is not None and lane == self.newcomer["topic"]
+        of_newcomer = self.newcomer is not None and lane == s.lane(self.newcomer)
         return {
             "occupied": 1.0,
             "rank": 1.0 if m is self.newcomer else (k + 1) / (len(s.slots()) + 1),
@@ -149,7 +153,7 @@ class Twin:
             "in_flight": per(len(s.in_flight), self.case.case.episode.window),
         }
         if m is not None:
-            lane = m["topic"]
+            lane = s.lane(m)
             before, v = s.arrived[lane][-1:] or [m], self.v(lane)
             even_us, even_x = self.even(lane, "us", m["us"]), self.even(lane, "x", m["x"])
             made["arrival_time_gap"] = per(m["us"] - before[0]["us"], even_us)
@@ -165,25 +169,29 @@ def observed(batch, buffer, arriving):
     context = np.full(len(CONTEXT_NAMES), np.nan)
     sender = batch.senders[0]
     arrival = batch.arrivals[0, min(sender.next, sender.arrivals - 1)]
-    observe_topic_slots(buffer, arrival, arriving, rows)
-    observe_topic_context(buffer, arrival, arriving, context)
-    return dict(zip(SLOT_NAMES, rows, strict=True)), dict(zip(CONTEXT_NAMES, context, strict=True))
+    if sender.topics == 1:
+        rows, context = rows[: len(SLOT_FIELDS)], context[: len(CONTEXT_FIELDS)]
+        observe_slots(buffer, arrival, rows)
+        observe_context(buffer, arrival, context)
+    else:
+        observe_topic_slots(buffer, arrival, arriving, rows)
+        observe_topic_context(buffer, arrival, arriving, context)
+    return dict(zip(SLOT_NAMES, rows, strict=False)) | dict(zip(CONTEXT_NAMES, context, strict=False))
 
 
 @pytest.mark.kernels
-@given(topic_cases(min_topics=2, max_messages=25))
+@given(topic_cases(max_messages=25).filter(lambda case: len(case.topics) != 1))
 def test_every_field_is_its_twins(case):
     def check(event, senders, twin):
-        if event not in ("decision", "send"):
-            return
-        seen = named(senders.batch)
-        buffer = python_view(seen, 0)
-        by_definition = Twin(case, twin, buffer)
-        slots, context = observed(seen, buffer, event == "decision")
-        for name, numbers in (by_definition.slots() | by_definition.context()).items():
-            kernels = (slots | context)[name]
-            np.testing.assert_allclose(kernels, numbers, rtol=1e-6, atol=1e-6, err_msg=f"{name} at a {event}")
-            assert ((kernels >= 0) & (kernels <= 1)).all(), name
+        if event == "decision" or (event == "send" and case.topics):
+            seen = named(senders.batch)
+            buffer = python_view(seen, 0)
+            by_definition = Twin(case, twin, buffer)
+            by_definition = by_definition.slots() | by_definition.context()
+            for name, numbers in observed(seen, buffer, event == "decision").items():
+                what = f"{name} at a {event}"
+                np.testing.assert_allclose(numbers, by_definition[name], rtol=1e-6, atol=1e-6, err_msg=what)
+                assert ((numbers >= 0) & (numbers <= 1)).all(), name
 
     case.beside_its_twin(check)
 
