@@ -30,8 +30,7 @@ def an_archive(folder: Path) -> Path:
 
 
 def test_info_of_every_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    paths = [written(tmp_path, text, format) for format, text in SAMPLES.items()]
-    assert main(["trace", "info", *map(str, paths)]) == 0
+    assert main(["trace", "info", *(str(written(tmp_path, text, format)) for format, text in SAMPLES.items())]) == 0
     for format, block in zip(SAMPLES, capsys.readouterr().out.split("\n\n"), strict=True):
         assert block.startswith(f"{format}\n") and f"(format {format}, detected" in block
         for key in ("duration_s", "mean_KBps", "min_KBps", "max_KBps", "seconds_below_500KBps", "longest_run_below"):
@@ -75,37 +74,31 @@ def test_convert_states_what_was_lost(tmp_path: Path, capsys: pytest.CaptureFixt
     assert read_trace(back).time_us.tolist() == read_trace(up).time_us.tolist()
 
 
-def test_convert_many_into_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    first, second = written(tmp_path, "1\n", "a.up"), written(tmp_path, "2\n", "b.up")
-    assert "must be an existing folder" in failed(
-        ["trace", "convert", str(first), str(second), "--to", "csv", "--out", str(tmp_path / "out")], capsys
-    )
+def test_convert_many_into_a_folder_and_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = str(written(tmp_path, "1\n", "a.up")), str(written(tmp_path, "2\n", "b.up"))
+    convert, out = ["trace", "convert", first, "--out"], str(tmp_path / "out")
+    both = ["trace", "convert", first, second, "--to", "csv", "--out", out]
+    assert "must be an existing folder" in failed(both, capsys)
     (tmp_path / "out").mkdir()
-    assert main(["trace", "convert", str(first), str(second), "--to", "csv", "--out", str(tmp_path / "out")]) == 0
+    assert main(both) == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.up.csv", "b.up.csv"]
-    again = ["trace", "convert", str(first), "--to", "csv", "--out", str(tmp_path / "out")]
-    assert "a.up.csv is taken" in failed(again, capsys)
+    for words, says in (
+        ([out, "--to", "csv"], "a.up.csv is taken"),
+        ([str(tmp_path / "x.up")], "must be one of csv, mahimahi"),
+        (["x", "--to", "json"], "--to json: must be one of csv, mahimahi"),
+        ([first, "--to", "csv"], "must not be the file that is read"),
+    ):
+        assert says in failed([*convert, *words], capsys)
+    assert Path(first).read_text() == "1\n"
 
 
-def test_convert_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = str(written(tmp_path, "1\n", "a.csv"))
-    convert = ["trace", "convert", path, "--out"]
-    assert "must be one of csv, mahimahi" in failed([*convert, str(tmp_path / "x.up")], capsys)
-    assert "--to json: must be one of csv, mahimahi" in failed([*convert, "x", "--to", "json"], capsys)
-    assert "must not be the file that is read" in failed([*convert, path], capsys)
-    assert Path(path).read_text() == "1\n"
-
-
-@pytest.mark.parametrize("ending", [".png", ".svg"])
-def test_plot(tmp_path: Path, ending: str) -> None:
+def test_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
-    paths = [str(written(tmp_path, text, format)) for format, text in SAMPLES.items() if format in ("nyu", "mahimahi")]
-    out = tmp_path / f"picture{ending}"
-    assert main(["trace", "plot", *paths, "--out", str(out)]) == 0
-    assert out.read_bytes()[:4] in (b"\x89PNG", b"<?xm")
-
-
-def test_matplotlib_is_loaded_for_pictures_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert main(["trace", "validate", str(written(tmp_path, "1\n", "a.up"))]) == 0
+    paths = [str(written(tmp_path, SAMPLES[format], format)) for format in ("nyu", "mahimahi")]
+    for ending, magic in ((".png", b"\x89PNG"), (".svg", b"<?xm")):
+        out = tmp_path / f"picture{ending}"
+        assert main(["trace", "plot", *paths, "--out", str(out)]) == 0
+        assert out.read_bytes()[:4] == magic
+    for name in ("matplotlib", "matplotlib.figure"):  # loaded for pictures only
+        monkeypatch.setitem(sys.modules, name, None)
+    assert main(["trace", "validate", paths[0]]) == 0
