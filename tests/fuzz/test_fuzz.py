@@ -10,8 +10,10 @@ import io
 import json
 import os
 import random
+import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -35,6 +37,7 @@ from bufgym.scenario import Streams, Uplink, read_client
 from bufgym.sim.metrics import outcome
 from bufgym.sim.senders import run
 from bufgym.traces import FORMATS, Trace, load_motion, read_motion, read_trace, read_workload
+from bufgym.traces.datasets.unpack import unpack
 
 HERE = Path(__file__).parent
 pytestmark = pytest.mark.skipif(not hasattr(__import__("signal"), "SIGALRM"), reason="needs alarms")
@@ -107,6 +110,24 @@ def results(folder: Path) -> Kind:
     return [*files, ("board.csv", (",".join(leaderboard.COLUMNS) + rows).encode())], read
 
 
+def archives(folder: Path) -> Kind:
+    with zipfile.ZipFile(folder / "a.zip", "w", zipfile.ZIP_DEFLATED) as made:
+        made.writestr("two/three.txt", random.Random(1).randbytes(500))
+    with tarfile.open(folder / "a.tgz", "w:gz") as tar:
+        tar.add(folder / "a.zip", "one.zip")
+
+    def read(path: Path, uniform: random.Random) -> object:
+        try:
+            return unpack(path, folder / "out")
+        except BufgymError:
+            assert not (folder / "out").exists()  # all or nothing
+            raise
+        finally:
+            shutil.rmtree(folder / "out", ignore_errors=True)
+
+    return [(name, (folder / name).read_bytes()) for name in ("a.zip", "a.tgz")], read
+
+
 def links(folder: Path) -> Kind:
     """A file of each format, and the beginnings of recorded ones; some packed, and some of these changed after that."""
     files = [("lte.csv", text.encode()) for text in SAMPLES.values()]
@@ -151,7 +172,7 @@ def ended(path: Path, format: str | None, column: str | None = None) -> Trace:
     return trace
 
 
-@pytest.mark.parametrize("kind", [weights, poses, bags, toml, results, links])
+@pytest.mark.parametrize("kind", [weights, poses, bags, toml, results, archives, links])
 def test_broken_files(tmp_path: Path, kind: Callable[[Path], Kind]) -> None:
     files, read = kind(tmp_path)
     others, sound = [data for _, data in files], 0

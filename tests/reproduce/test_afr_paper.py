@@ -166,14 +166,6 @@ def test_a_worst_ratio_worked_by_hand() -> None:
     assert afr_theorems.worst_ratio(gaps) == pytest.approx(5 / 6)
 
 
-def test_the_grid_has_no_violation() -> None:
-    theorems = figure("afr-theorems", max_capacity=5, last_T=80)
-    rows = theorems.simulate()
-    facts = theorems.claims(rows)
-    assert all(facts[claim] for claim in ("theorem-1", "theorem-2", "theorem-3", "sharper", "even", "equal"))
-    assert facts["comparisons"] == 5 * sum(range(1, 81))
-
-
 @given(L=st.integers(1, 12), T=st.integers(1, 120), v=VALUES)
 def test_every_V_is_a_sum_of_extremes(L: int, T: int, v: Value) -> None:
     """V at whole numbers is sum of w_D min(d, D), w_D = the fall of V's slope at D, and H is linear in V."""

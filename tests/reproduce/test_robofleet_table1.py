@@ -71,15 +71,6 @@ def test_cdr_and_flatbuffer_by_hand() -> None:
     assert sizes("RobofleetStatus", topic="/s", status="on", location="lab")["robofleet"] == 120
 
 
-def test_a_table_has_its_larger_fields_last_as_flatc_has() -> None:
-    """Slots: metadata (absent), status, is_ok, battery_level, location; the single byte comes first, at 4 + 3."""
-    reader = Reader(encode("RobofleetStatus", content("RobofleetStatus"), "robofleet-bare"))
-    assert [reader.at(slot) and reader.at(slot) - reader.table.Pos for slot in range(5)] == [0, 8, 7, 12, 16]
-    # After where the vtable is: status, header and position_covariance, then the doubles.
-    reader = Reader(encode("NavSatFix", content("NavSatFix"), "robofleet-bare"))
-    assert [reader.at(slot) - reader.table.Pos for slot in range(1, 8)] == [8, 12, 20, 28, 36, 16, 7]
-
-
 def test_json_by_hand_and_read_back_with_infinity_as_null_and_bytes_two_ways() -> None:
     message = content("RobofleetStatus", status="on", location="lab") | {"battery_level": 1.0}
     spaced = '{"op": "publish", "topic": "/s", "msg": {"status": "on", "is_ok": true, "battery_level": 1.0, '

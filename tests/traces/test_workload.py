@@ -6,15 +6,13 @@ import gzip
 import math
 from pathlib import Path
 
-import gymnasium as gym
 import link_files
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bufgym import oracle, policies, scenario
-from bufgym import sim as sender
+from bufgym import policies, scenario
 from bufgym.benchmark import drops
 from bufgym.errors import BufgymError, TraceError
 from bufgym.traces import Motion, Trace, Workload, read_workload_csv, write_workload_csv
@@ -173,24 +171,6 @@ def test_the_drops_of_a_recording() -> None:
         list(drops.drops(chosen, scenario.Uplink(traces=(four_seconds_of_nothing(),)), [1], 1))
 
 
-@pytest.mark.kernels
-def test_the_link_takes_each_message_for_its_own_size() -> None:
-    """From 4 s on 10 bytes a ms: 1000 bytes take 100 ms, 3000 take 300."""
-    stream = uplink(recorded((1000, 3000, 1000, 1000)))
-    ran = sender.run(policies.get("drop-newest"), [stream.draw(scenario.Streams.seeded(0))], 3, stream.value)
-    assert np.asarray(ran.batch.log[0])["transmitted_us"].tolist() == [4_100_000, 4_400_000, 4_500_000, 4_600_000]
-
-
-@pytest.mark.kernels
-def test_the_clairvoyant_of_a_recording() -> None:
-    """L = 1: message 0 and one more. The last has moved on furthest: 1 + V(2). An upper bound where sizes differ."""
-    best = 2 - math.exp(-2)
-    for sizes, certified in (((1000, 1000, 1000, 1000), True), ((1000, 900, 1000, 1000), None)):
-        stream = uplink(recorded(sizes))
-        plan = oracle.clairvoyant(stream.draw(scenario.Streams.seeded(0)), 1, stream.value)
-        assert plan.qoi == pytest.approx(best) and plan.certified if certified else plan.qoi >= best - 1e-12
-
-
 def test_x_from_elsewhere_or_from_the_number() -> None:
     silent = Workload("w", np.array([0, 500_000, 1_000_000]), np.array([1, 1, 1]))
     motion = Motion("m", np.array([0, 1_000_000]), np.array([0.0, 3.0]))
@@ -201,14 +181,3 @@ def test_x_from_elsewhere_or_from_the_number() -> None:
         uplink(recorded(), motion=(motion,))
     with pytest.raises(BufgymError, match=r"w\.csv: no such file"):
         scenario.Uplink(traces=(four_seconds_of_nothing(),), workload="w.csv")
-
-
-@pytest.mark.kernels
-def test_an_environment_plays_a_recording() -> None:
-    """Accepting message 0 and rejecting the three others, with L = 1: actions 2 and 1. H = 1."""
-    env = gym.make("bufgym/Uplink-v0", scenario=uplink(recorded()), capacity=1)
-    env.reset(seed=0)
-    for action in (2, 1, 1, 1):
-        _, _, terminated, _, info = env.step(action)
-    assert terminated
-    assert (info["qoi"], info["arrived"], info["delivered"], info["dropped"]) == (1, 4, 1, 3)
