@@ -31,7 +31,6 @@ from bufgym.traces.generate import (
     steady,
     tunnel,
 )
-from bufgym.traces.generate.lte import LTE_MODES
 from bufgym.traces.generate.markov import MAX_OUTAGE_S, link_rates
 from bufgym.traces.generate.parameters import LINKS, PROBABILITIES
 from bufgym.traces.motion import Motion
@@ -67,6 +66,7 @@ def test_bytes_that_must_never_change() -> None:
         *(6621400, 6654152, 3027288, 2683391, 1422412, 1261835, 1853449),  # lowered from the seventh on, ...
         0,  # ... for here an outage begins
     ]
+    assert synthetic_lte(1, duration_s=1).duration_us == 1_000_000
     assert gilbert_elliott(1, 40, mean_good_s=2, mean_bad_s=1).total_bytes == 283_000_000
     assert roaming(1, 60).total_bytes == 227_808_750
     assert frame_sizes(np.array([0, 10**6, 2 * 10**6]), drive_motion(0, 10), 3).tolist() == [240183, 273977, 274993]
@@ -91,9 +91,7 @@ def test_links_never_run_backwards_and_a_longer_one_begins_as_the_shorter(seed: 
 
 
 def test_the_mean_is_the_one_asked_for() -> None:
-    made = [markov_link("bus", 1, 300, mean_bytes_per_s=7.5e6)]
-    made += [synthetic_lte(0, 300, 7.5e6, mode) for mode in LTE_MODES]
-    for trace in made:
+    for trace in (markov_link("bus", 1, 300, mean_bytes_per_s=7.5e6), synthetic_lte(0, 300, 7.5e6, "train")):
         assert abs(trace.total_bytes - 300 * 7.5e6) <= 150  # half a byte for each second
 
 
@@ -252,18 +250,10 @@ def test_detail_stays_while_the_camera_stands_still() -> None:
     sizes = frame_sizes(np.arange(600) * 33_333, still_then_turning(), 1, model)
     assert len(set(sizes[:300].tolist())) == 1
     assert len(set(sizes[301:].tolist())) > 250
+    assert sizes.dtype == np.int64
+    assert sizes.tolist() != frame_sizes(np.arange(600) * 33_333, still_then_turning(), 2, model).tolist()
     spread = [frame_sizes(np.array([0, 10_000_000, 20_000_000]), still_then_turning(), s, model)[2] for s in range(400)]
     assert abs(np.std(spread) / 230_000 - 0.12) < 0.015
-
-
-def test_frames_are_larger_in_motion_and_repeat_with_their_seed() -> None:
-    motion, arrival_us = drive_motion(1, 300), np.arange(9000) * 33_333
-    sizes = frame_sizes(arrival_us, motion, 5)
-    assert sizes.dtype == np.int64
-    assert sizes.tolist() == frame_sizes(arrival_us, motion, 5).tolist() != frame_sizes(arrival_us, motion, 6).tolist()
-    speed = np.diff(motion.at(arrival_us))
-    assert np.corrcoef(sizes[1:], speed)[0, 1] > 0.2
-    assert 0.4 * 230_000 <= sizes.min() and sizes.max() <= 2 * 230_000
 
 
 # -------------------- what is refused
@@ -275,12 +265,10 @@ def test_frames_are_larger_in_motion_and_repeat_with_their_seed() -> None:
         (lambda: markov_link("boat", 0), "mode = 'boat': must be one of bicycle, bus"),
         (lambda: synthetic_lte(-1), "seed = -1: must be >= 0"),
         (lambda: synthetic_lte(0, 0), "duration_s = 0: must be a whole number from 1"),
-        (lambda: synthetic_lte(0, 10, float("nan")), "mean_bytes_per_s = nan"),
         (lambda: synthetic_lte(0, mode="boat"), "mode = 'boat': must be one of walk, drive, train"),  # type: ignore[arg-type]
         (lambda: outage(1, 1, 5), "length_s = 1: must be above 0 and below period_s = 1"),
         (lambda: outage(2, 1, 5, repeats=0), "repeats = 0: must be >= 1"),
         (lambda: drive_motion(0, 0), "duration_s = 0: must be from 0.1"),
-        (lambda: markov_link("bus", -1), "seed = -1: must be >= 0"),
         (lambda: markov_link("bus", 0, 2.5), "duration_s = 2.5: must be a whole number"),  # type: ignore[arg-type]
         (lambda: markov_link("bus", 0, 10**7), "duration_s = 10000000: must be a number from 1 to 1e"),
         (lambda: markov_link("bus", 0, mean_bytes_per_s=float("nan")), "mean_bytes_per_s = nan"),
@@ -289,7 +277,6 @@ def test_frames_are_larger_in_motion_and_repeat_with_their_seed() -> None:
         (lambda: roaming(0, 0), "duration_s = 0: must be a number from 0.1"),
         (lambda: Corridor(access_points=0), "access_points = 0"),
         (lambda: steady(0), "bytes_per_s = 0: must be a number from 1"),
-        (lambda: ramp(-1, 5), "start_bytes_per_s = -1: must be a number from 0"),
         (lambda: tunnel(1e6, blackout_s=-1), "blackout_s = -1"),
         (lambda: tunnel(1e6, before_s=0, fade_s=0, recover_s=0, after_s=0), "no capacity at all"),
         (lambda: Driving(cruise_m_per_s=(2, 1)), r"cruise_m_per_s = \(2, 1\): must be in order"),

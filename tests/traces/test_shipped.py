@@ -10,7 +10,6 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from bufgym.cli import trace_generate
@@ -28,7 +27,6 @@ from bufgym.traces import (
     synthetic_lte,
     write_csv,
 )
-from bufgym.traces.generate.lte import LTE_MODES, MAX_FADE_S
 from bufgym.traces.generate.shipped import SHIPPED_LTE, shipped_calls, write_shipped
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -125,31 +123,6 @@ def test_the_commands_run_offline_from_what_the_wheel_holds(tmp_path: Path) -> N
     assert done.returncode == 0, done.stderr
     assert all(name in done.stdout.split("> trace info")[0] for name in shipped())
     assert (elsewhere / "bench" / "table.md").is_file()
-
-
-# -------------------- made-up LTE
-
-
-def test_lte_is_the_more_restless_the_faster() -> None:
-    """Spread lies in the range of the Belgium logs (variation 0.26-0.82); it and outages grow to train."""
-    spread, broken = [], []
-    for mode in LTE_MODES:
-        rates = np.concatenate([synthetic_lte(seed, 600, 1e7, mode).segments()[1] for seed in range(20)])
-        spread.append(rates.std() / rates.mean())
-        broken.append(float((rates < 0.25 * np.median(rates)).mean()))
-        centred = rates - rates.mean()
-        assert 0.5 < (centred[1:] * centred[:-1]).mean() / rates.var() < 0.9
-    assert 0.26 < spread[0] < spread[1] < spread[2] < 0.82
-    assert 0.01 < broken[0] < broken[1] < broken[2] < 0.20
-
-
-def test_lte_breakdowns_last_no_longer_than_stated() -> None:
-    assert (synthetic_lte(1, duration_s=1).duration_us, synthetic_lte(1, duration_s=1000).duration_us) == (10**6, 10**9)
-    rates = np.concatenate([synthetic_lte(seed, 1000, 1e7, "train").segments()[1] for seed in range(10)])
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], rates == 0, [0])).astype(int)))
-    lengths = np.sort(edges[1::2] - edges[::2])
-    # Two may follow each other at once, which happens about once in a thousand.
-    assert lengths[0] == 1 and lengths[-2] <= MAX_FADE_S
 
 
 # -------------------- the command
