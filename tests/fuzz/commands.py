@@ -66,7 +66,7 @@ def drawn(uniform: random.Random, parser: argparse.ArgumentParser) -> list[str]:
 
 
 def run(k: int, seed: str) -> None:
-    from limits import limited
+    from mutations import limited
 
     from bufgym import cli
 

@@ -1,10 +1,17 @@
-"""Sound files made unsound: how many, which, and how. The Hypothesis profile decides: more each night, and others."""
+"""Sound files made unsound: how many, which, and how; and limits of time and memory for what reads them.
+
+The Hypothesis profile decides: more each night, and others.
+"""
 
 from __future__ import annotations
 
 import os
 import random
+import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 NIGHTLY = os.environ.get("HYPOTHESIS_PROFILE") == "nightly"
 COUNT = 20_000 if NIGHTLY else 100
@@ -38,3 +45,34 @@ def mutated(uniform: random.Random, data: bytes, others: list[bytes]) -> bytes:
             case _:
                 mutant[at : at + 1] = uniform.choice([b"0", b"9", b"-", b".", b" ", b"\n", b",", b"e", b'"', b"}"])
     return bytes(mutant)
+
+
+MOST_BYTES = 2 * 10**9
+"""More than the process has when it begins."""
+MOST_S = 60
+"""An input, so that no busy machine is late."""
+
+
+def late(*_: object) -> None:
+    raise TimeoutError(f"more than {MOST_S} s")
+
+
+@contextmanager
+def limited() -> Iterator[None]:
+    """Fail what takes longer than MOST_S, and on Linux what takes more than MOST_BYTES."""
+    statm, address_space = Path("/proc/self/statm"), None
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(MOST_S)
+    if statm.exists():
+        import resource
+
+        address_space = resource.getrlimit(resource.RLIMIT_AS)
+        now = int(statm.read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (now + MOST_BYTES, address_space[1]))
+    try:
+        yield
+    finally:
+        if address_space is not None:
+            resource.setrlimit(resource.RLIMIT_AS, address_space)
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)

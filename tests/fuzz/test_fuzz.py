@@ -24,9 +24,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from limits import limited
 from link_files import HEADER, SAMPLES, written
-from mutations import COUNT, SEED, mutated
+from mutations import COUNT, SEED, limited, mutated
 
 from bufgym import policies
 from bufgym.benchmark import leaderboard, report

@@ -11,7 +11,6 @@ import pytest
 from bufgym.kernel import JIT
 from bufgym.reproduce import STORE, afr_fig7, afr_fig8, afr_overlap, afr_qoi_task, frame_tasks, run
 from bufgym.reproduce.correlation import spearman, spearman_over
-from bufgym.reproduce.figure import heat_table
 from bufgym.reproduce.frame_runs import POLICIES, FrameFigure, Setting
 from bufgym.reproduce.frame_tasks import Store, Task, carry_out
 from bufgym.reproduce.rows import Rows
@@ -113,16 +112,6 @@ def test_a_claim_of_fig8_holds_on_every_recording_or_not(tmp_path: Path) -> None
     assert not facts["afr"] and facts["afr_rate"] == "room 0%; 7-scenes 10%"
     assert not facts["learned"] and facts["learned_count"] == "room 0 against 0; 7-scenes 2 against 1"
     assert facts["large"] is None  # no L above 10
-
-
-def test_a_heat_table_shows_every_number() -> None:
-    figure = pytest.importorskip("matplotlib.figure").Figure()
-    axes = figure.subplots()
-    heat_table(axes, np.array([[1.0, 2.5], [0.25, 4.0]]), ".1f", ["AFR", "Random"], ["5", "10"], vmin=0, vmax=4)
-    assert [text.get_text() for text in axes.texts] == ["1.0", "2.5", "0.2", "4.0"]
-    assert [text.get_position() for text in axes.texts] == [(0, 0), (1, 0), (0, 1), (1, 1)]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["AFR", "Random"]
-    assert axes.images[0].norm(4.0) == 1
 
 
 def test_maps_are_seen_along_the_direction_in_which_they_spread_least() -> None:

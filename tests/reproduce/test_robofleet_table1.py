@@ -223,33 +223,19 @@ def test_the_fitted_messages_have_the_papers_bytes_as_ros_binary(beams: int) -> 
 
 
 def test_table1_stands_beside_the_papers() -> None:
+    """Its ratios are on the page of claims; here what the page does not say."""
     rows = Reproduction().simulate()
     ours = {(row["message"], row["encoding"]): row["bytes"] for row in rows}
     ratio = {(row["message"], row["encoding"]): row["ours_to_paper"] for row in rows}
     assert len(rows) == len(KINDS) * len(ENCODINGS)
-    assert ours["NavSatFix", "robofleet-bare"] == PAPER["NavSatFix"][1]
-    assert ours["LaserScan", "robofleet-bare"] == PAPER["LaserScan"][1] + 4
-    assert ours["CompressedImage", "robofleet-bare"] == PAPER["CompressedImage"][1] + 24
-    # The paper's picture: flatbuffers close to ROS binary for large messages, JSON several times as long.
-    for kind in ("LaserScan", "CompressedImage"):
-        assert float(ratio[kind, "robofleet"]) == pytest.approx(1, abs=0.011)
-        assert ours[kind, "json-numbers"] > 3.5 * ours[kind, "ros1"]
+    bare = [ours[kind, "robofleet-bare"] - PAPER[kind][1] for kind in ("NavSatFix", "LaserScan", "CompressedImage")]
+    assert bare == [0, 4, 24]
     # Bytes as a list of numbers is what the paper measured; base64 is not.
     assert float(ratio["CompressedImage", "json-numbers"]) == pytest.approx(1, abs=0.005)
     assert float(ratio["CompressedImage", "json"]) < 0.4
-    assert 1 < float(ratio["LaserScan", "json-numbers"]) < 1.25
-    assert 1 < float(ratio["NavSatFix", "json-numbers"]) < 1.35
-    assert ratio["PoseStamped", "json"] == ratio["LaserScan", "cdr"] is None
-    assert of_paper("PoseStamped", "ros1") is None
-    text = " ".join(run("robofleet-table1").split())
-    for said in (
-        "Not in the paper's table: PointCloud2, PoseStamped",
-        "with seq = 0 has 7,328 bytes, +0",
-        "cannot be of",
-    ):
-        assert said in text
+    assert ratio["PoseStamped", "json"] == ratio["LaserScan", "cdr"] is of_paper("PoseStamped", "ros1") is None
     # The share of beams without return that the text names has the paper's JSON; it names whole per cent.
-    share = float(text.split("json-numbers with ")[1].split("%")[0]) / 100
+    share = float(" ".join(run("robofleet-table1").split()).split("json-numbers with ")[1].split("%")[0]) / 100
     size = sizes("LaserScan", beams=1800, frame_id="l" * 8, no_return=share)["json-numbers"]
     assert size == pytest.approx(PAPER["LaserScan"][2], rel=0.01)
 

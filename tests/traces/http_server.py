@@ -35,8 +35,6 @@ class Site:
     """Answers to the next requests, instead of the file."""
     stall: int | None = None
     """Silent after so many bytes."""
-    drip_s: float = 0.0
-    """Pause after every 20 bytes."""
     length: int | None = None
     """Content-Length instead of the true one; -1: none."""
     chunked: bool = False
@@ -89,10 +87,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
             self.wfile.write(body[: site.stall])
             site.closing.wait(60)
         else:
-            step = 20 if site.drip_s else max(len(body), 1)
-            for at in range(0, len(body), step):
-                self.wfile.write(body[at : at + step])
-                site.closing.wait(site.drip_s)
+            self.wfile.write(body)
 
     def answer(self, code: int, headers: dict[str, str]) -> None:
         self.send_response(code)

@@ -45,6 +45,10 @@ def test_a_whole_file(site: Site, tmp_path: Path) -> None:
     said: list[str] = []
     assert get(site, tmp_path, note=said.append).path.read_bytes() == DATA
     assert "changed since it was fetched" in said[0]
+    done.path.unlink()
+    with pytest.raises(BufgymError, match=f"wrong checksum: sha256 is {SHA256}, must be {'0' * 64}; not kept"):
+        get(site, tmp_path, "0" * 64)
+    assert left(tmp_path) == []
 
 
 @pytest.mark.parametrize(
@@ -100,54 +104,34 @@ def test_what_does_not(site: Site, tmp_path: Path, settings: dict[str, Any], say
     assert len(site.asked) == attempts and "data.bin" not in left(tmp_path)
 
 
-def test_the_next_call_goes_on_where_the_last_gave_up(site: Site, tmp_path: Path) -> None:
-    site.cuts = [1000, 1000, 1000]
-    with pytest.raises(BufgymError, match="run the same command again to resume"):
-        get(site, tmp_path)
-    assert left(tmp_path) == [".data.bin.part", ".data.bin.part.json"]
-    assert get(site, tmp_path).path.read_bytes() == DATA
-    assert site.asked[-1] == "bytes=3000-" and left(tmp_path) == ["data.bin"]
-
-
 @pytest.mark.parametrize(
     ("etag", "data", "known", "notes"),
     [
+        ('"v1"', DATA, True, []),
         ('"v2"', bytes(250_000), False, []),
         ('"v2"', bytes(250_000), True, []),
         # The server changes the file and keeps its ETag: the sum tells.
         ('"v1"', DATA[::-1], True, ["data.bin: the parts do not fit together: fetching it again"]),
     ],
 )
-def test_a_file_that_changed_meanwhile_is_not_patched_together(
+def test_the_next_call_goes_on_unless_the_file_changed_meanwhile(
     site: Site, tmp_path: Path, etag: str, data: bytes, known: bool, notes: list[str]
 ) -> None:
     site.cuts = [1000] * 3
     with pytest.raises(BufgymError, match="run the same command again to resume"):
         get(site, tmp_path, None)
+    assert left(tmp_path) == [".data.bin.part", ".data.bin.part.json"]
     site.data, site.etag = data, etag
     said: list[str] = []
     done = get(site, tmp_path, hashlib.sha256(data).hexdigest() if known else None, note=said.append)
-    assert done.path.read_bytes() == data and said == notes
-
-
-def test_a_wrong_sum_keeps_nothing(site: Site, tmp_path: Path) -> None:
-    with pytest.raises(BufgymError, match=f"wrong checksum: sha256 is {SHA256}, must be {'0' * 64}; not kept"):
-        get(site, tmp_path, "0" * 64)
-    assert left(tmp_path) == []
+    assert done.path.read_bytes() == data and said == notes and left(tmp_path) == ["data.bin"]
+    assert "bytes=3000-" in site.asked
 
 
 def test_silence_ends_an_attempt(site: Site, tmp_path: Path) -> None:
     site.stall = 1000
     with pytest.raises(BufgymError, match=r"the server (fell silent|does not respond) \(gave up after 2 attempts\)"):
         get(site, tmp_path, patience=Patience(attempts=2, first_wait_s=0, silence_s=0.3))
-
-
-@pytest.mark.nightly
-def test_slow_bytes_are_waited_for(site: Site, tmp_path: Path) -> None:
-    """3 s in all, more than the 2 s of silence that are allowed."""
-    site.data, site.drip_s = DATA[:1000], 0.06
-    done = get(site, tmp_path, None, patience=Patience(attempts=3, first_wait_s=0, silence_s=2))
-    assert done.path.read_bytes() == DATA[:1000] and len(site.asked) == 1
 
 
 def test_addresses(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,14 +216,14 @@ def test_garbled_answers_end_in_a_file_or_our_error(tmp_path: Path, monkeypatch:
         client.sendall(raw)
 
     with speaking(talk) as address:
-        for _ in range(100):
+        for _ in range(300):
             downloading.discard(tmp_path / "part")
             try:
                 download(address, tmp_path / "part", None, Patience(attempts=2, first_wait_s=0))
             except BufgymError as error:
                 refused += 1
                 assert str(error).isprintable()
-    assert 10 < refused < 100
+    assert 30 < refused < 300
 
 
 ENDLESS = {

@@ -199,6 +199,11 @@ def test_the_command_lists_and_fetches(
     assert re.search("licence +not known", said.out) and re.search("please cite +nobody", said.out)
     assert "data.bin: 300,000 bytes of 300,000" in said.err
     assert (cache_folder() / "mine" / "data.bin").read_bytes() == DATA
+    screen = io.StringIO()
+    screen.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stderr", screen)
+    command("mine", "--to", str(cache_folder() / "again"))  # a terminal gets a bar
+    assert "data.bin" in screen.getvalue() and "300k" in screen.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -214,14 +219,3 @@ def test_the_command_says_what_is_wrong(command: Callable[..., None], words: lis
     with pytest.raises(BufgymError, match=says) as caught:
         command(*words)
     assert "\n" not in str(caught.value)
-
-
-def test_a_terminal_gets_a_bar(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("tqdm")
-    screen = io.StringIO()
-    screen.isatty = lambda: True  # type: ignore[method-assign]
-    monkeypatch.setattr(sys, "stderr", screen)
-    bars = trace_fetch._Bars()
-    get(site, tmp_path, watch=bars.watch)
-    bars.close()
-    assert "data.bin" in screen.getvalue() and "300k" in screen.getvalue()

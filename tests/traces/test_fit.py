@@ -118,6 +118,8 @@ def test_what_the_fit_refuses() -> None:
 
 
 def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory() -> None:
+    halves = held_out("one", [link_rates(KNOWN, 1, 600)], sets=9)
+    assert halves.parts == 2 and 0 < halves.distance < 1
     small = replace(KNOWN, recordings=5, seconds=1500)
     rows = recordings(small, first_seed=77)
     own = {row.name: row.p for row in compare(small, rows, sets=59)}
@@ -128,11 +130,6 @@ def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory()
         assert other[name] < 0.05
     twice = compare(small, [2 * row for row in rows], sets=59)
     assert {row.name: row.p for row in twice}["KS distance"] < 0.05
-
-
-def test_halves_of_a_single_recording_are_held_out() -> None:
-    halves = held_out("one", [link_rates(KNOWN, 1, 600)], sets=9)
-    assert halves.parts == 2 and 0 < halves.distance < 1
 
 
 # -------------------- the command

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
-import sys
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -30,29 +25,6 @@ from bufgym.traces import (
 from bufgym.traces.generate.shipped import SHIPPED_LTE, shipped_calls, write_shipped
 
 ROOT = Path(__file__).resolve().parents[2]
-
-OFFLINE = """
-import socket
-import sys
-
-def unplugged(*arguments, **options):
-    raise AssertionError("the network was asked")
-
-socket.socket.connect = socket.getaddrinfo = unplugged
-import bufgym
-from bufgym.cli import main
-
-assert bufgym.__file__.startswith(sys.argv[1]), bufgym.__file__
-for line in sys.stdin:
-    words = line.split()
-    print(">", *words, flush=True)
-    assert main(words) == 0, words
-"""
-COMMANDS = """list
-trace info lte-synthetic-0
-trace fetch --list
-trace generate link --mode tram --duration 60 -o tram.csv
-bench --seconds 1 --fps 10 --seeds 1 --capacity 2 --policies afr,drop-oldest --format csv --out bench"""
 
 
 def test_the_calls_that_are_stated_make_the_shipped_files_byte_for_byte(tmp_path: Path) -> None:
@@ -93,36 +65,6 @@ def test_shipped_names_and_loading(tmp_path: Path) -> None:
         load("drive-0")
     with pytest.raises(TraceError, match="must have 8 columns"):
         read_motion(names["lte-synthetic-0"])
-
-
-def test_importing_is_light() -> None:
-    """Readers must start at once: nothing heavy may come with them."""
-    heavy = ("numba", "scipy", "matplotlib", "gymnasium", "torch", "mcap", "rosbags")
-    code = (
-        "import sys, types; package = types.ModuleType('bufgym'); package.__path__ = ['bufgym'];"
-        "sys.modules['bufgym'] = package; import bufgym.traces;"
-        f"print([m for m in {heavy!r} if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-@pytest.mark.nightly
-def test_the_commands_run_offline_from_what_the_wheel_holds(tmp_path: Path) -> None:
-    """The files of the wheel lie where pip would put them, as pyproject.toml says."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
-    site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
-    for source, target in ({name: name for name in wheel["packages"]} | wheel["force-include"]).items():
-        shutil.copytree(ROOT / source, site / target, ignore=shutil.ignore_patterns("__pycache__", "*.nb[ic]"))
-    elsewhere.mkdir()
-    # Compiling in a new place would take a minute, and what is tested here is which files are there.
-    environment = {**os.environ, "PYTHONPATH": str(site), "NUMBA_DISABLE_JIT": "1", "PYTHONSAFEPATH": "1"}
-    command = [sys.executable, "-c", OFFLINE, str(site)]
-    done = subprocess.run(command, cwd=elsewhere, env=environment, input=COMMANDS, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert all(name in done.stdout.split("> trace info")[0] for name in shipped())
-    assert (elsewhere / "bench" / "table.md").is_file()
 
 
 # -------------------- the command
