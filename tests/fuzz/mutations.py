@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 NIGHTLY = os.environ.get("HYPOTHESIS_PROFILE") == "nightly"
-COUNT = 20_000 if NIGHTLY else 100
+COUNT = 10_000 if NIGHTLY else 100
 SEED = time.strftime("%Y%m%d") if NIGHTLY else "0"
 
 ABSURD = b"1e999 -1 nan Infinity 2019.12.16_13.40.04 , PK\x03\x04 \x1f\x8b\x08 null \x1b[31m".split(b" ")

@@ -1,6 +1,6 @@
 """Whatever comes in, it ends in a result or in one line: files of every kind, command lines, random episodes.
 
-A failure names the seed and the number of its input. Each night has 20,000 files of each kind and 2,000 command lines.
+A failure names the seed and the number of its input. Each night has 10,000 files of each kind and 1,000 command lines.
 """
 
 from __future__ import annotations
