@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bufgym.envs.observation import ObservationForm, Place
 from bufgym.envs.step import StepOutput
 from bufgym.errors import BufgymError
-from bufgym.kernel import at, compile_for, kernel, stretch
+from bufgym.kernel import at, compile_for, kernel, local, stretch
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
 from bufgym.observe import OwnField, OwnTerm
@@ -81,7 +81,7 @@ def write_slots(batch: Batch, function: Any, first: int, flat: NDArray[np.float3
     for i in range(len(batch.senders)):
         sender = batch.senders[i]
         if sender.waiting != NOTHING_WAITS:
-            buffer, arrival = view(batch, i), last_arrival(batch, i)
+            buffer, arrival = local(view(batch, i)), last_arrival(batch, i)
             for k in range(sender.occupancy):
                 flat[i, first + k] = function(buffer, arrival, k)
             flat[i, first + sender.occupancy : first + sender.capacity + 1] = 0.0
@@ -93,7 +93,7 @@ def write_context(batch: Batch, function: Any, first: int, flat: NDArray[np.floa
     """The same for a field of the context."""
     for i in range(len(batch.senders)):
         if batch.senders[i].waiting != NOTHING_WAITS:
-            flat[i, first] = function(view(batch, i), last_arrival(batch, i))
+            flat[i, first] = function(local(view(batch, i)), last_arrival(batch, i))
 
 
 def write_in_python(place: Place, buffer: Buffer, arrival: Any, arriving: bool, row: NDArray[np.float32]) -> None:

@@ -164,7 +164,7 @@ def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> 
         output.action_mask[i, :] = False
         output.action_mask[i, sender.capacity] = True
         return
-    buffer, entries = view(batch, i), sender.capacity + 1
+    buffer, entries = local(view(batch, i)), sender.capacity + 1
     if batch.several is not None:
         arriving = sender.waiting == ARRIVAL_WAITS
         # When the socket asks there is no newcomer: the last arrival fills the argument and is not read.
@@ -214,8 +214,9 @@ def advance(batch: Batch, i: int) -> None:
     settle_gains(batch, i, event == END)
 
 
+@direct
 @kernel
-def _step_rows(
+def step_rows(
     batch: Batch,
     rows: NDArray[np.int64],
     actions: NDArray[np.int64],
@@ -251,19 +252,6 @@ def _step_rows(
         write_observation(batch, i, sender.waiting == NOTHING_WAITS, output)
 
 
-@direct
-@kernel
-def step_rows(
-    batch: Batch,
-    rows: NDArray[np.int64],
-    actions: NDArray[np.int64],
-    rewarded: NDArray[np.float64],
-    output: StepOutput,
-) -> None:
-    """``_step_rows`` for callers in Python."""
-    _step_rows(local(batch), rows, actions, rewarded, local(output))
-
-
 # --- rows that share the link of a cell ------------------------------------------------------------------------------
 
 
@@ -293,8 +281,9 @@ def decisions_due(batch: Batch, shares: Shares, c: int) -> bool:
     return due
 
 
+@direct
 @kernel
-def _step_cells(
+def step_cells(
     batch: Batch,
     shares: Shares,
     cells: NDArray[np.int64],
@@ -327,17 +316,3 @@ def _step_cells(
             else:
                 write_rewards(batch, i, rewarded, output)
             write_observation(batch, i, ended, output)
-
-
-@direct
-@kernel
-def step_cells(
-    batch: Batch,
-    shares: Shares,
-    cells: NDArray[np.int64],
-    actions: NDArray[np.int64],
-    rewarded: NDArray[np.float64],
-    output: StepOutput,
-) -> None:
-    """``_step_cells`` for callers in Python."""
-    _step_cells(local(batch), local(shares), cells, actions, rewarded, local(output))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.step import action_of
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for, entry, located
+from bufgym.kernel import compile_for, entry, local, located
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.policies import Policy
 from bufgym.policies.registry import runs_compiled, signatures
@@ -142,7 +142,7 @@ def ask(
     """Put a policy's answer for each of ``rows`` into ``answers``. ``heard``: int64[n], departures it was told of."""
     for i in rows:
         sender = batch.senders[i]
-        buffer = view(batch, i)
+        buffer = local(view(batch, i))
         if hears_departures:
             for _ in range(sender.dequeued - heard[i]):
                 on_departure(buffer, memory[i])

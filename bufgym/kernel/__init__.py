@@ -7,7 +7,7 @@ check the compiled code against its own text.
 
 from bufgym.kernel.announce import compile_silently
 from bufgym.kernel.arrays import at, item, prefetch, records, stretch, table
-from bufgym.kernel.bundle import bundle, local
+from bufgym.kernel.bundle import BundleType, bundle, local
 from bufgym.kernel.cache import FOLDER, NotKeptError, only_kept
 from bufgym.kernel.compile import compile_for, direct, entry, interruptible, kernel, located
 from bufgym.kernel.switch import JIT
@@ -15,6 +15,7 @@ from bufgym.kernel.switch import JIT
 __all__ = [
     "FOLDER",
     "JIT",
+    "BundleType",
     "NotKeptError",
     "at",
     "bundle",

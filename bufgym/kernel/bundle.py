@@ -92,18 +92,33 @@ def _from_python(kind: BundleType, value: Any, c: Any) -> Any:
 
 
 def local(given: Bundle) -> Bundle:
-    """``given`` itself; in a compiled kernel, its fields among the local variables.
+    """``given`` itself; in a compiled kernel, a bundle whose fields are among the kernel's own variables.
 
-    A kernel that Python calls hands on ``local(batch)``. Else the compiler must expect any store to change the fields.
+    A kernel that makes a bundle hands on ``local(Bundle(...))``.
     """
     return given
+
+
+def _local_type(context: Any) -> Any:
+    def local_type(given: Any) -> Any:
+        if isinstance(given, BundleType):
+            return given
+        return BundleType(given.instance_class, tuple(cast(Any, types).unliteral(kind) for kind in given.types))
+
+    return local_type
 
 
 def _copied(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return cast(Any, cgutils).alloca_once_value(builder, builder.load(arguments[0]))
 
 
-_extending.type_callable(local)(lambda context: lambda given: given)
+def _stored(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    value = context.cast(builder, arguments[0], signature.args[0], signature.return_type.whole)
+    return cast(Any, cgutils).alloca_once_value(builder, value)
+
+
+_extending.type_callable(local)(_local_type)
 _extending.lower_builtin(local, BundleType)(_copied)
+_extending.lower_builtin(local, cast(Any, types).NamedTuple)(_stored)
 _extending.lower_getattr_generic(BundleType)(_field)
 _extending.unbox(BundleType)(_from_python)

@@ -15,7 +15,7 @@ from numba import types
 from numba.core import codegen, compiler, ir, ir_utils, untyped_passes
 from numba.core.compiler_machinery import FunctionPass, register_pass
 
-from bufgym.kernel.bundle import BundleType
+from bufgym.kernel.bundle import BundleType, local
 
 PART = "part"
 """Marks a part among the code that is kept on disk."""
@@ -107,6 +107,40 @@ class _NoneFields(_Pass):  # type: ignore[misc]
         return changed
 
 
+@cast(Any, register_pass)(mutates_CFG=False, analysis_only=False)
+class _LocalBundles(_Pass):  # type: ignore[misc]
+    """Puts the fields of bundles that come from Python among the kernel's own variables.
+
+    Left where they are, they would have to be read again after every store, which might have changed them.
+    """
+
+    _name = "bufgym_local_bundles"
+
+    def __init__(self) -> None:
+        super().__init__()
+
+    def run_pass(self, state: Any) -> bool:
+        """Change the code of one kernel in place; whether anything was changed."""
+        changed = False
+        block = state.func_ir.blocks[min(state.func_ir.blocks)]
+        for place in reversed(range(len(block.body))):
+            statement = block.body[place]
+            source = getattr(statement, "value", None)
+            if not (isinstance(source, ir.Arg) and isinstance(state.args[source.index], BundleType)):
+                continue
+            loc, scope, made = statement.loc, statement.target.scope, cast(Any, ir)
+            given, function = (made.Var(scope, f"$bundle{source.index}.{k}", loc) for k in range(2))
+            values = source, made.Global("local", local, loc), made.Expr.call(function, [given], (), loc)
+            targets = given, function, statement.target
+            block.body[place : place + 1] = [
+                made.Assign(value, target, loc) for value, target in zip(values, targets, strict=True)
+            ]
+            for value, target in zip(values, targets, strict=True):
+                state.func_ir._definitions[target.name] = [value]
+            changed = True
+        return changed
+
+
 class Typing:
     """Numba's typing context, which remembers the result of each operation on numbers."""
 
@@ -138,6 +172,7 @@ class WholeCompiler(_Compiler):  # type: ignore[misc]
     """Compiler of the kernels that Python calls."""
 
     library: Any = WholeLibrary
+    is_whole = True
 
     def __init__(
         self, typing: Any, target: Any, library: Any, arguments: Any, result: Any, flags: Any, names: Any
@@ -151,6 +186,8 @@ class WholeCompiler(_Compiler):  # type: ignore[misc]
         """Numba's own passes, with ``_NoneFields`` before all that look at types."""
         (passes,) = super().define_pipelines()
         passes.add_pass_after(_NoneFields, untyped_passes.IRProcessing)
+        if self.is_whole:
+            passes.add_pass_after(_LocalBundles, _NoneFields)
         passes.finalize()
         return [passes]
 
@@ -159,3 +196,4 @@ class PartCompiler(WholeCompiler):
     """Compiler of the kernels that go into others."""
 
     library = PartLibrary
+    is_whole = False

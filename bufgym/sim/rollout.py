@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for, interruptible, kernel, local
+from bufgym.kernel import compile_for, interruptible, local
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
 from bufgym.policies.registry import Policy, runs_compiled, signatures
@@ -28,8 +28,7 @@ _SHORT = 200_000
 """Arrivals times numbers that a policy reads at each: a rollout below that takes no more than some milliseconds."""
 
 
-@kernel
-def _rollout(
+def rollout(
     batch: Batch,
     shares: Shares | None,
     memory: NDArray[np.float64],
@@ -50,7 +49,7 @@ def _rollout(
             if event == END or (event == DEPARTURE and not hears_departures):
                 continue
             i = sender_of(shares, c)
-            buffer = view(batch, i)
+            buffer = local(view(batch, i))
             if event == DECISION:
                 decide(batch, i, on_arrival(buffer, arrival_of(batch, i), memory[i]))
                 again = batch.senders[i].waiting == ARRIVAL_WAITS  # B has no room yet: the same DECISION is due again
@@ -62,20 +61,6 @@ def _rollout(
                 on_departure(buffer, memory[i])
     for i in range(len(batch.senders)):
         credit(batch, i, FOREVER)
-
-
-def rollout(
-    batch: Batch,
-    shares: Shares | None,
-    memory: NDArray[np.float64],
-    on_arrival: Any,
-    on_departure: Any,
-    on_dequeue: Any,
-    on_send: Any,
-    hears_departures: bool,
-) -> None:
-    """``_rollout`` for callers in Python."""
-    _rollout(local(batch), shares, memory, on_arrival, on_departure, on_dequeue, on_send, hears_departures)
 
 
 @functools.cache
