@@ -65,11 +65,7 @@ def test_the_best_of_n_seeds_is_chosen_by_validation_and_shown_on_the_test(
 
     monkeypatch.setattr(ablation, "tested", lambda settings, model: [tested[model.parent.name]])
     rows = ablation.more_seeds(run)[2:]
-    assert rows == [
-        "| best of 1 | 0.600 | 0.677 |",
-        "| best of 2 | 0.533 | 0.570 |",
-        "| best of 3 | 0.500 | 0.580 |",
-    ]
+    assert rows == ["| best of 1 | 0.600 | 0.677 |", "| best of 2 | 0.533 | 0.570 |", "| best of 3 | 0.500 | 0.580 |"]
 
 
 def test_a_table_has_the_mean_of_the_seeds_and_their_range() -> None:

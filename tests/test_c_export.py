@@ -109,10 +109,7 @@ def every_field() -> Policy:
     return learned.policy("every-field", Weights(NAMES, network(7, 5), network(7, 5), mix=mix, still=still))
 
 
-AGENTS = {
-    **{name: policies.get(name) for name in ("learned-motion", "learned-time")},
-    "every-field": every_field(),
-}
+AGENTS = {**{name: policies.get(name) for name in ("learned-motion", "learned-time")}, "every-field": every_field()}
 
 
 # --- the same decisions ----------------------------------------------------------------------------------------------

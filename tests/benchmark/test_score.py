@@ -81,12 +81,7 @@ def test_scores_by_hand() -> None:
     assert overall.improvement.value == pytest.approx((1 / 2 + 3 / 4) / 2)
     assert overall.cells == 2
     assert [(s.policy, s.ranked) for s in made.standings] == [("mine", True), ("afr", True), ("drop-oldest", True)]
-    assert [(c.capacity, c.policy) for c in made.cells[:4]] == [
-        (2, "afr"),
-        (2, "drop-oldest"),
-        (2, "mine"),
-        (4, "afr"),
-    ]
+    assert [(c.capacity, c.policy) for c in made.cells[:4]] == [(2, "afr"), (2, "drop-oldest"), (2, "mine"), (4, "afr")]
 
 
 def test_the_scale_is_fixed_at_both_ends_and_open_beyond() -> None:
@@ -268,10 +263,7 @@ def test_all_capacities_of_a_scenario_share_their_draws() -> None:
 
 
 def test_neither_order_nor_company_matters() -> None:
-    rows = [
-        *rows_of(**noisy(20), traces=["b", "a"] * 10),
-        *rows_of(**noisy(15, seed=1), scenario="wifi"),
-    ]
+    rows = [*rows_of(**noisy(20), traces=["b", "a"] * 10), *rows_of(**noisy(15, seed=1), scenario="wifi")]
     made = score.scores(rows)
     shuffled = random.Random(0).sample(rows, len(rows))
     assert score.scores(shuffled) == made

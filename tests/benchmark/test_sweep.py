@@ -57,8 +57,7 @@ def test_in_this_process_the_rows_are_those_of_the_experiment(tmp_path: Path, ba
 
 
 @pytest.mark.parametrize(
-    "backend",
-    ["loky", pytest.param("dask", marks=pytest.mark.slow), pytest.param("ray", marks=pytest.mark.slow)],
+    "backend", ["loky", pytest.param("dask", marks=pytest.mark.slow), pytest.param("ray", marks=pytest.mark.slow)]
 )
 def test_so_are_they_from_other_processes_which_know_a_users_policy(
     tmp_path: Path, backend: str, mine: Path, expected: str

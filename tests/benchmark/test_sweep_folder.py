@@ -208,8 +208,7 @@ def test_a_suites_episodes_cannot_be_changed(words: list[object], capsys: pytest
 
 
 @pytest.mark.parametrize(
-    "words",
-    [["--jobs", 2], ["--split", "train"], ["--data", "."], ["--backend", "dask"], ["--address", "host:1"]],
+    "words", [["--jobs", 2], ["--split", "train"], ["--data", "."], ["--backend", "dask"], ["--address", "host:1"]]
 )
 def test_options_of_a_suite_need_one(words: list[object], capsys: pytest.CaptureFixture[str]) -> None:
     fails(["bench", *words], f"{words[0]} needs --suite", capsys)

@@ -80,14 +80,7 @@ def test_the_drawn_capacity_carries_the_messages() -> None:
 
 def test_the_episode_shown_is_the_one_that_costs_drop_oldest_most_at_the_middle_capacity() -> None:
     def row(policy: str, capacity: int, seed: int, regret: float | None) -> dict[str, Any]:
-        return {
-            "policy": policy,
-            "capacity": capacity,
-            "seed": seed,
-            "regret": regret,
-            "scenario": "s",
-            "trace": "t",
-        }
+        return {"policy": policy, "capacity": capacity, "seed": seed, "regret": regret, "scenario": "s", "trace": "t"}
 
     rows = [
         row("drop-oldest", 2, 0, 0.9),
