@@ -12,13 +12,8 @@ import pytest
 from bufgym import errors
 
 PYPROJECT = Path(__file__).resolve().parent.parent / "pyproject.toml"
-REQUIRES = [
-    "numpy>=2.1",
-    'matplotlib; extra == "plot"',
-    'mcap<2,>=1.2; extra == "ros"',
-    'flatbuffers; extra == "robofleet"',
-    'bufgym[ros]; extra == "robofleet"',
-]
+REQUIRES = ["numpy>=2.1", 'matplotlib; extra == "plot"', 'mcap<2,>=1.2; extra == "ros"']
+REQUIRES += ['flatbuffers; extra == "robofleet"', 'bufgym[ros]; extra == "robofleet"']
 
 
 def test_a_hint_names_the_packages_of_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -29,10 +24,7 @@ def test_a_hint_names_the_packages_of_an_extra(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_source_tree_that_was_never_installed_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> list[str]:
-        raise importlib.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(importlib.metadata, "requires", missing)
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: importlib.metadata.distribution("no-such-name"))
     assert errors.install("plot") == 'pip install -e ".[plot]"'
 
 

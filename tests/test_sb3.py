@@ -363,7 +363,7 @@ def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
     flat = untrained(PPO, "MlpPolicy", flat_env())
     recurrent = RecurrentPPO("MultiInputLstmPolicy", uplink, batch_size=16, n_steps=8)
     for model, fields, says in (
-        (pole, ["rank"], r"model policy: action space Discrete\(2\): must be Discrete\(L \+ 2\)"),
+        (pole, ["rank"], r"action space Discrete\(2\): must be Discrete\(L \+ 2\)"),
         (flat, ["colour"], "which is no field"),
         (flat, ["rank"], "must be the 4 of rank for L = 3"),
         (recurrent, None, "recurrent"),
