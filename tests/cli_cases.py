@@ -8,6 +8,9 @@ import pytest
 
 from bufgym.cli import main
 
+Capsys = pytest.CaptureFixture[str]
+Patch = pytest.MonkeyPatch
+
 FAR_OFF = """
 from bufgym.policies import make_room, register
 @register("far-off", on_send=lambda buffer, memory: 999, for_topics={})

@@ -49,9 +49,6 @@ def mixed_rows(rows: int = 4, slots: int = 7) -> mixed_env.MixedEnv:
     return env
 
 
-# --- rows of different L side by side --------------------------------------------------------------------------------
-
-
 def test_padded_slots_are_empty_and_masked() -> None:
     env = mixed_rows()
     for _ in range(6):  # as many arrivals as any episode has fill both kinds of buffer
@@ -128,9 +125,6 @@ def test_mistakes_are_named() -> None:
         mixed_env.MixedEnv(MIXED, [1, 1], padded_slots=2)
 
 
-# --- networks --------------------------------------------------------------------------------------------------------
-
-
 def scorer_of(env: mixed_env.MixedEnv, masked: bool = True) -> tuple[SlotExtractor, SlotScorer]:
     torch.manual_seed(0)
     features = SlotExtractor(env.single_observation_space)
@@ -172,9 +166,6 @@ def test_leaving_empty_slots_out_changes_no_score_that_counts() -> None:
     theirs[masks].sum().backward()
     for a, b in zip(packed.score.parameters(), full.score.parameters(), strict=True):
         assert torch.allclose(a.grad, b.grad, atol=1e-4)  # type: ignore[arg-type]
-
-
-# --- double DQN ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -227,9 +218,6 @@ def test_targets_choose_by_one_network_and_value_by_the_other(dqn: Any, monkeypa
     dqn.train(1, batch_size=2)
     # Huber's slope is 1 beyond 1, halved by the mean over two rows: Q(0) moves from 0 towards 3 by 1/2; Q(2) = 1 stays.
     assert online.detach().numpy() == pytest.approx(np.array([[0.5, 2.0, 1.0]]))
-
-
-# --- evaluation sets -------------------------------------------------------------------------------------------------
 
 
 def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: Path) -> None:

@@ -59,13 +59,13 @@ int main(int words, char **files)
 """
 
 
-def compiled(folder, compiler, standard, source, text):
+def compiled(folder, compiler, standard, source, text, *flags):
     """The program of this source and this header; skips where there is no compiler."""
     if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is not installed")
     (folder / "policy.h").write_text(text, encoding="utf-8")
     program = folder / "program"
-    words = [compiler, f"-std={standard}", *FLAGS, "-I", folder, source, "-o", program, "-lm"]
+    words = [compiler, f"-std={standard}", *FLAGS, *flags, "-I", folder, source, "-o", program, "-lm"]
     done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return program
@@ -81,10 +81,10 @@ def output(program, *words, text=""):
     return subprocess.run([program, *words], input=text, capture_output=True, text=True, check=True).stdout
 
 
-def driver(folder, text):
+def driver(folder, text, *flags):
     """``DRIVER`` with this header."""
     (folder / "driver.c").write_text(DRIVER, encoding="utf-8")
-    return compiled(folder, "gcc", "c99", folder / "driver.c", text)
+    return compiled(folder, "gcc", "c99", folder / "driver.c", text, *flags)
 
 
 def every_field() -> Policy:
@@ -110,32 +110,29 @@ def every_field() -> Policy:
 AGENTS = {**{name: policies.get(name) for name in ("learned-motion", "learned-time")}, "every-field": every_field()}
 
 
-# --- the same decisions ----------------------------------------------------------------------------------------------
-
-
-def play_in_c(folder, policy, L, episodes, value=EXPONENTIAL, B=None, text=None):
+def play_in_c(folder, policy, L, episodes, value=EXPONENTIAL, B=None, text=None, flags=("-O0",)):
     """(parity, decisions, how many differ) of a recorded run that is played again in C."""
     calls = recorded(policy, episodes, L, value, B)
     assert calls.dtype == CALL
     calls.tofile(folder / "calls")
-    program = driver(folder, text or header(policy, L, value, B))
+    program = driver(folder, text or header(policy, L, value, B), *flags)
     return tuple(map(int, output(program, folder / "calls").split()))
 
 
-def check(folder, policy, decisions, settings=SETTINGS):
+def check(folder, policy, decisions, settings=SETTINGS, flags=()):
     """Play so many decisions of each of the settings in C."""
-    for k, (L, value, B) in enumerate(settings if JIT else SETTINGS[3:]):
+    for k, (L, value, B) in enumerate(settings):
         rng = np.random.default_rng(k)
         n = 1_000 if JIT else 40
-        episodes = [random_episode(rng, n, B) for _ in range(max(2, decisions // n) if JIT else 2)]
-        parity, made, differ = play_in_c(folder, policy, L, episodes, value, B)
+        episodes = [random_episode(rng, n, B) for _ in range(decisions // n if JIT else 2)]
+        parity, made, differ = play_in_c(folder, policy, L, episodes, value, B, flags=flags)
         assert (parity, differ) == (0, 0), (L, value.name, B, made)
         assert made >= n * len(episodes)
 
 
 @pytest.mark.parametrize("name", [*SUPPORTED, *AGENTS])
 def test_it_decides_in_c_as_in_python(name, tmp_path):
-    check(tmp_path, AGENTS.get(name) or policies.get(name), 2_000, SETTINGS[2:])
+    check(tmp_path, AGENTS.get(name) or policies.get(name), 2_000, SETTINGS[3:], ["-O0"])
 
 
 @pytest.mark.nightly
@@ -215,9 +212,6 @@ int main(void)
     assert output(program) == "-2:0 -2:0 0:40 0:40 -1:101 1 90"
 
 
-# --- the robot -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["afr", "learned-motion"])
 def test_the_robot_delivers_what_the_simulator_says(name, tmp_path):
     """8 MB/s but for a standstill from second 4 to 8; 230 kB frames at 30 Hz."""
@@ -237,9 +231,6 @@ def test_the_robot_delivers_what_the_simulator_says(name, tmp_path):
     if frames == 360:
         assert output(robot) == "\n".join(lines) + "\n"  # what it makes up by itself
     assert (REPO / "examples" / "robot.cpp").read_text(encoding="utf-8").count("\n") <= 75
-
-
-# --- the command -----------------------------------------------------------------------------------------------------
 
 
 def test_the_command_writes_the_header(tmp_path, capsys):

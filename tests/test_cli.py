@@ -91,9 +91,6 @@ def test_ctrl_c_and_a_reader_that_left(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert process.returncode == 141
 
 
-# -------------------- the other commands
-
-
 def test_trace_info(trace: str, capsys: Capsys) -> None:
     first, second = shown(["trace", "info", trace, "lte-synthetic-0"], capsys).split("\n\n")
     assert first.startswith("link\n") and "format csv, detected" in first and second.startswith("lte-synthetic-0\n")

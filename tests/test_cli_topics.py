@@ -6,14 +6,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli_cases import FAR_OFF, fails, shown
+from cli_cases import FAR_OFF, Capsys, Patch, fails, shown
 
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.tasks.topics import ROWS
 from bufgym.policies import registry
 
-Capsys = pytest.CaptureFixture[str]
 CONFIG = """
 duration_s = 2
 [[topic]]
@@ -74,8 +73,8 @@ def test_all_policies_by_default_with_a_word_on_the_unbounded(config: str, capsy
     assert "rosbridge has no rank: its queue is unbounded." in text
 
 
-def test_decisions_of_a_users_policy_that_cannot_be_carried_out_are_told(
-    config: str, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+def test_invalid_decisions_of_a_users_policy_are_told(
+    config: str, tmp_path: Path, capsys: Capsys, monkeypatch: Patch
 ) -> None:
     """Each of the 2 s x (10 + 2) messages/s is sent by such a decision, whatever its topic."""
     monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
@@ -91,53 +90,40 @@ def test_decisions_of_a_users_policy_that_cannot_be_carried_out_are_told(
 @pytest.mark.parametrize(
     ("options", "naming"),
     [
-        ("--window 0", "window = 0: n_T must be"),
-        ("--window x", "'x'"),
-        ("--consumers 0", "consumers = 0"),
-        ("--suite nope", "unknown suite 'nope'"),
-        ("--suite fleet-v1", "suite fleet-v1 is not one of topics: bufgym bench --suite fleet-v1"),
-        ("--policies clairvoyant", "policy clairvoyant: it plans with a queue of its own"),
-        ("--split dev", "split = 'dev'"),
-        ("--policies nope", "unknown policy 'nope'"),
-        ("--policies fifo fifo", "'fifo' is given more than once"),
-        ("--policies robofleet robofleet", "'robofleet' is given more than once"),
-        ("--capacity 0", "0: must be"),
-        ("--seeds 1001", "seeds = 1001"),
-        *((f"--{name} 2", f"--{name} needs --config") for name in ("trace", "motion", "scale")),
-        ("--by-topic afr", "--by-topic afr: not among the policies that run"),
-        ("--out rows.txt", "rows.txt: rows are written to .csv or .parquet files"),
-        ("--out no-such-folder/rows.csv", "no-such-folder/rows.csv: no folder"),
-        ("--config no-such.toml", "error: no-such.toml: no such file\n"),
-        ("--config x.toml --suite topics-v1", "--suite cannot go with --config"),
-        ("--config x.toml --split test", "--split cannot go with --config"),
-        ("--config x.toml --jobs 2", "--jobs cannot go with --config"),
-        ("--config x.toml --out folder", "folder: with --config rows are written to .csv or .parquet files"),
+        ("topics --window x", "'x'"),
+        ("topics --consumers 0", "consumers = 0"),
+        ("topics --suite nope", "unknown suite 'nope'"),
+        ("topics --suite fleet-v1", "suite fleet-v1 is not one of topics: bufgym bench --suite fleet-v1"),
+        ("topics --policies clairvoyant", "policy clairvoyant: it plans with a queue of its own"),
+        ("topics --split dev", "split = 'dev'"),
+        ("topics --policies nope", "unknown policy 'nope'"),
+        ("topics --policies robofleet robofleet", "'robofleet' is given more than once"),
+        *((f"topics --{name} 2", f"--{name} needs --config") for name in ("trace", "motion", "scale")),
+        ("topics --by-topic afr", "--by-topic afr: not among the policies that run"),
+        ("topics --out rows.txt", "rows.txt: rows are written to .csv or .parquet files"),
+        ("topics --out no-such-folder/rows.csv", "no-such-folder/rows.csv: no folder"),
+        ("topics --config no-such.toml", "error: no-such.toml: no such file\n"),
+        ("topics --config x.toml --suite topics-v1", "--suite cannot go with --config"),
+        ("topics --config x.toml --split test", "--split cannot go with --config"),
+        ("topics --config x.toml --jobs 2", "--jobs cannot go with --config"),
+        ("topics --config x.toml --out folder", "folder: with --config rows are written to .csv or .parquet files"),
+        ("fleet --policies clairvoyant", "it plans with a link of its own, which no robot in a cell has"),
+        ("fleet --suite lte-v1", "suite lte-v1 is not one of fleet: bufgym bench --suite lte-v1"),
+        ("fleet --robots 0", "must be a whole number >= 1"),
+        ("fleet --robots 257", "robots = 257: must be a whole number from 1 to 256"),
+        ("fleet --seeds 1001", "seeds = 1001: must lie between 1 and 1000"),
     ],
 )
 def test_bad_options(options: str, naming: str, capsys: Capsys) -> None:
-    fails(["topics", *options.split()], naming, capsys)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "naming"),
-    [
-        ("priority = 20", "priority = -1", "mine.toml: topic 'pose': priority = -1: must be a number >= 0"),
-        ("priority = 20", "priorty = 20", "mine.toml: topic 'pose': unknown key 'priorty'"),
-        ("rate_hz = 10", "rate_hz = 0", "mine.toml: topic 'pose': rate_hz = 0: must be a number > 0"),
-        ("duration_s", "window = 0\nduration_s", "mine.toml: window = 0: n_T must be a whole number"),
-        ("[[topic]]", "[[topics]]", "mine.toml: unknown key 'topics'"),
-        ("duration_s = 2", "duration_s = ", "mine.toml: Invalid value"),
-    ],
-)
-def test_bad_configurations(config: str, old: str, new: str, naming: str, capsys: Capsys) -> None:
-    Path(config).write_text(CONFIG.replace(old, new))
-    fails(["topics", "--config", config, "--seeds", 1], naming, capsys)
+    fails(options.split(), naming, capsys)
 
 
 def test_what_is_wrong_on_the_command_line_is_not_the_files_fault(
-    config: str, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+    config: str, capsys: Capsys, monkeypatch: Patch
 ) -> None:
     fails(["topics", "--config", config, "--trace", "lte-synthetic-0", "--window", 0], "error: window = 0", capsys)
     fails(["topics", "--config", config, "--trace", "none.csv"], "none.csv", capsys)
+    Path(config).write_text(f"window = 0\n{CONFIG}")
+    fails(["topics", "--config", config], "mine.toml: window = 0: n_T must be a whole number", capsys)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     fails(["topics", "--out", "rows.parquet"], "Parquet files need pyarrow", capsys)

@@ -6,12 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli_cases import fails, shown
+from cli_cases import Capsys, fails, shown
 
 from bufgym.cli import main
-from bufgym.traces import MotionSettings
-
-Capsys = pytest.CaptureFixture[str]
 
 # A message a second; nothing crosses for 4 s, then 10 kB/s.
 WORKLOAD = """time_s,bytes,topic,x
@@ -31,7 +28,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-BENCH = ["bench", "--workload", "w.csv", "--trace", "outage.csv", "--capacity", "1"]
+W = "--workload w.csv --trace outage.csv"
+BENCH = ["bench", *W.split(), "--capacity", "1"]
 
 
 def test_bench_of_a_recording(here: Path, capsys: Capsys) -> None:
@@ -77,37 +75,24 @@ def test_one_topic_and_some_seeds(here: Path, capsys: Capsys) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("--fps 30", "--fps cannot go with --workload: a recording has its own"),
-        ("--topics /lidar", "no topic '/lidar'; it has: /camera, /odom"),
-        ("--odom /odom", "odom = '/odom': needs a recording, which this is not"),
-        ("--fov-deg 70", "--fov-deg needs --odom or --motion"),
-        ("--bridge-gaps", "--bridge-gaps needs --odom"),
-        ("--interruption", "cannot go with --interruption"),
-        ("--suite lte-v1", "cannot go with --suite"),
+        (f"{W} --fps 30", "--fps cannot go with --workload: a recording has its own"),
+        (f"{W} --topics /lidar", "no topic '/lidar'; it has: /camera, /odom"),
+        (f"{W} --odom /odom", "odom = '/odom': needs a recording, which this is not"),
+        (f"{W} --fov-deg 70", "--fov-deg needs --odom or --motion"),
+        (f"{W} --bridge-gaps", "--bridge-gaps needs --odom"),
+        (f"{W} --interruption", "cannot go with --interruption"),
+        (f"{W} --suite lte-v1", "cannot go with --suite"),
+        (f"{W} --motion drive-0", "workload 'w' has an x of its own"),
         ("--workload nothing.mcap", "nothing.mcap: no such file"),
-        ("--motion drive-0", "workload 'w' has an x of its own"),
-    ],
-)
-def test_what_does_not_go_together(here: Path, capsys: Capsys, words: str, says: str) -> None:
-    fails([*BENCH, "--policies", "drop-oldest", *words.split()], says, capsys)
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        *(
-            (words, f"{words.split()[0]} needs --workload")
-            for words in ("--drops d.csv", "--topics /a", "--bridge-gaps")
-        ),
+        ("--drops d.csv", "--drops needs --workload"),
+        ("--topics /a", "--topics needs --workload"),
+        ("--bridge-gaps", "--bridge-gaps needs --workload"),
         ("--fov-deg 70", "--fov-deg needs --motion, or --workload with --odom"),
         ("--motion drive-0 --fov-deg 70", "--fov-deg cannot go with drive-0, which holds finished coordinates"),
     ],
 )
-def test_options_of_a_recording_without_one(words: str, says: str, capsys: Capsys) -> None:
+def test_what_does_not_go_together(here: Path, capsys: Capsys, words: str, says: str) -> None:
     fails(["bench", "--policies", "drop-oldest", *words.split()], says, capsys)
-
-
-# --- bufgym trace from-bag -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -151,25 +136,12 @@ def test_a_bag_becomes_a_csv_that_plays_the_same(drive: Path, capsys: Capsys) ->
     assert one.partition("\n\n")[2] == other.partition("\n\n")[2]
 
 
-@pytest.mark.parametrize("command", ["bench", "trace from-bag", "trace from-poses"])
-def test_the_help_tells_the_defaults(command: str, capsys: Capsys) -> None:
-    with pytest.raises(SystemExit):
-        main([*command.split(), "--help"])
-    text, given = " ".join(capsys.readouterr().out.split()), MotionSettings()
-    defaults = {"fov-deg DEG": given.fov_deg, "scene-scale-m M": given.scene_scale_m, "max-gap-s S": given.max_gap_s}
-    for option, default in defaults.items():
-        # The last mention explains it; the usage line comes first.
-        assert text.rpartition(f"--{option}")[2].partition("default: ")[2].startswith(f"{default:g})")
-
-
 def test_gaps_are_told(drive: Path, capsys: Capsys) -> None:
     words = ["trace", "from-bag", drive, "--odom", "/odom", "--max-gap-s", "0.9"]
     fails(words, "/odom has 2 gaps of more than 0.9 s without a pose, the longest 1.0 s", capsys)
     text = shown([*words, "--bridge-gaps"], capsys)
     assert "note: 2 gaps without a pose, the longest 1.0 s: motion taken as even" in text
 
-
-# --- bufgym trace from-poses, and trajectories as --motion -----------------------------------------------------------
 
 # 1 m, then 90 degrees, then nothing for 5 s.
 TUM = "0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 1 0 0 0 0 0.70710678 0.70710678\n7 1 0 0 0 0 0.70710678 0.70710678\n"

@@ -96,9 +96,6 @@ def test_weights_are_a_vector_and_back() -> None:
     assert (changed.accept.layers[0][0] == weights.accept.layers[0][0]).all()
 
 
-# --- the objective ---------------------------------------------------------------------------------------------------
-
-
 SHORT = Cell("short", Interruption(t_max=40), 5)
 
 
@@ -161,9 +158,6 @@ def test_a_part_is_measured_by_what_the_rivals_reach_on_all_parts() -> None:
     assert suite.decisions_of() == suite.decisions_of(0) + suite.decisions_of(1)
 
 
-# --- two scorers -----------------------------------------------------------------------------------------------------
-
-
 def test_the_scorer_of_a_still_link_is_stateed_alone_with_its_own_hidden_layer() -> None:
     still = queue.start(MOTION, 6, np.random.default_rng(0))
     whole = replace(queue.start(MOTION, 0, np.random.default_rng(0)), still=still)
@@ -176,9 +170,6 @@ def test_the_scorer_of_a_still_link_is_stateed_alone_with_its_own_hidden_layer()
     second = Evolution.around(agent, 0.3, seed=0)
     again = second.weights(np.arange(len(to_vector(whole)), dtype=float))
     assert again.still is agent.still and again.drop.skip[2] == 2
-
-
-# --- runs ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_run_leaves_an_agent_goes_on_after_a_kill_and_repeats(capsys: pytest.CaptureFixture[str]) -> None:

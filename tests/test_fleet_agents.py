@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from train_cases import columns
 
 import train
-from agents import cma_es, training
+from agents import training
 from agents.objectives import fleet
 from agents.objectives.objective import to_vector
-from agents.runs import prepare
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
@@ -54,9 +52,6 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
 
 
-# --- where candidates are tried --------------------------------------------------------------------------------------
-
-
 def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
     robots = by_trace(fleet.fleet_of("fleet-v1", "validation"))[0][1]
     robots = dataclasses.replace(robots, uplink=dataclasses.replace(robots.uplink, duration_s=2.0))
@@ -82,9 +77,6 @@ def test_samples_go_once_round_the_training_links() -> None:
     first, same, another = (parts[0][0].episodes[0] for parts in (made, again, other))
     assert first.link.offset_us == same.link.offset_us != another.link.offset_us
     assert first.robots == 2 and len(first.arrivals[0]) == 30
-
-
-# --- where they begin ------------------------------------------------------------------------------------------------
 
 
 def start_of(**changes: str) -> weights.Weights:
@@ -117,9 +109,6 @@ def test_fields_of_ones_own_begin_with_greed() -> None:
     assert made.drop.skip.tolist() == pytest.approx([-0.4, -10, 0])
 
 
-# --- training --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.nightly
 def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: pytest.CaptureFixture[str]) -> None:
     train.main(TINY)
@@ -139,19 +128,6 @@ def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: py
     links = enumerate(by_trace(fleet.fleet_of("fleet-v1", "test")))
     again = [row for k, (_, link) in links for row in run([agent], link, SUITE.capacities, [1000 * k])]
     assert [row["qoi"] for row in again] == mine
-
-
-def test_a_run_that_goes_on_ends_like_one_that_never_stopped() -> None:
-    few = dataclasses.replace(TINY, steps=3_000, validate_every=1_500)
-    ends = []
-    for runs in ([{"name": "whole"}], [{"name": "cut", "steps": 1_500}, {"name": "cut", "resume": True}]):
-        for changes in runs:
-            settings = dataclasses.replace(few, **changes)  # type: ignore[arg-type]
-            folder = prepare(settings)
-            cma_es.train(settings, folder, 0)
-        memory = weights.read(folder / "seed-0" / "model.safetensors")[0].parameters()
-        ends.append((columns(folder / "seed-0" / "validation.csv", "steps", "gain"), memory.tolist()))
-    assert ends[0] == ends[1]
 
 
 @pytest.mark.nightly

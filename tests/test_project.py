@@ -11,24 +11,22 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 REPO = Path(__file__).resolve().parent.parent
 
-# -------------------- (a) import order
-
-ROOMS = """
+_ROOMS = """
     errors files modules kernel traces model observe policies scenario sim oracle live perception c envs expert sb3
     benchmark ros1 ros2 relay reproduce gallery cli __main__
-""".split()
+"""
+ROOMS = _ROOMS.split()
 """The rooms of the house, top to bottom. Each imports only from itself and from rooms above it."""
 
-TRAINING = """
+_TRAINING = """
     agents.settings agents.runs agents.mixed_env agents.evaluation agents.held_out agents.figure
     agents.objectives.objective agents.objectives.queue agents.objectives.topics agents.objectives.fleet
     agents.objectives agents.cma_es agents.callbacks agents.dqn agents.training agents.page agents.report agents.goals
     agents.scheduling agents.on_task agents.ablation agents.small_queue train
-""".split()
+"""
+TRAINING = _TRAINING.split()
 """The modules that drive training, top to bottom. Each imports only bufgym and modules above it."""
 
 OUTSIDE = {"agents", "train", "tests", "website"}
@@ -87,8 +85,6 @@ def test_each_module_of_training_imports_only_what_is_above_it() -> None:
     assert not faults, "\n".join(faults)
 
 
-# -------------------- (b) paths
-
 HOMES = ["home", "root", "Users", "work", "workspace", "workspaces", "builds"]
 """Top folders where people and build machines keep checkouts: a path into one holds on one machine only."""
 
@@ -118,9 +114,6 @@ def test_no_text_file_holds_a_path_of_one_machine() -> None:
     assert not found, "\n".join(found)
 
 
-# -------------------- (c) version
-
-
 def test_one_version_everywhere() -> None:
     import bufgym  # here, so that a package that is broken fails this test alone
 
@@ -134,8 +127,6 @@ def test_one_version_everywhere() -> None:
         return  # run from the source tree alone
     assert installed == version
 
-
-# -------------------- (d) light import
 
 HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "matplotlib", "scipy", "pandas", "pyarrow", "cv2", "rvl")
 

@@ -249,8 +249,6 @@ def test_maskable_ppo_learns_from_it() -> None:
     assert 0 <= float(mean) <= 20  # type: ignore[arg-type]
 
 
-# --- trained models as policies --------------------------------------------------------------------------------------
-
 WORLD: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 1_000_000}
 FIELDS = ("rank", "motion_merged", "occupied", "occupancy")
 

@@ -54,9 +54,6 @@ def episodes_of(count: int = 2, **more: Any) -> topics.ClientEpisodes:
     return topics.ClientEpisodes(client(**more), 6, count, np.random.default_rng(1))
 
 
-# --- weights as a vector ---------------------------------------------------------------------------------------------
-
-
 def test_weights_are_a_vector_and_back() -> None:
     c, n = len(topics.CONTEXT), len(topics.FIELDS)
     begin = topics.start()
@@ -82,9 +79,6 @@ def test_it_begins_greedy() -> None:
     assert batch.senders["invalid"][0] == 0
     assert topic_outcomes(senders, 0)[2].lost == 0
     assert batch.senders["rejected"][0] + batch.senders["evicted"][0] > 5
-
-
-# --- episodes --------------------------------------------------------------------------------------------------------
 
 
 def by_metrics(policy: policies.Policy, of: topics.ClientEpisodes) -> tuple[float, float, float, int]:
@@ -152,9 +146,6 @@ def test_a_suite_has_episodes_of_each_setting() -> None:
     assert rivals[0] == rivals[1] != rivals[2]
 
 
-# --- runs ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Episodes of seconds instead of minutes."""
@@ -196,16 +187,6 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(
     # A validation that was not yet in a checkpoint is made, and written down, once more.
     tables = [columns(folder / "seed-2" / "validation.csv", "steps", "fitness") for folder in (whole, killed)]
     assert list(dict.fromkeys(tables[1])) == tables[0]
-
-
-@pytest.mark.nightly
-def test_seeds_repeat_themselves_and_differ(short_episodes: None) -> None:
-    agents = []
-    for name, seed in (("a", 2), ("b", 2), ("c", 3)):
-        Path(name).mkdir()
-        cma_es.train(dataclasses.replace(TINY, steps=1_500), Path(name), seed)
-        agents.append(pickle.loads(Path(name, f"seed-{seed}", "evolution.pkl").read_bytes()).average)
-    assert (agents[0] == agents[1]).all() and (agents[0] != agents[2]).any()
 
 
 @pytest.mark.nightly

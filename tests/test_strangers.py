@@ -31,9 +31,6 @@ EXAMPLE = REPO / "examples" / "client.toml"
 Capsys = pytest.CaptureFixture[str]
 
 
-# -------------------- configurations
-
-
 @pytest.mark.parametrize(
     ("text", "rule"),
     [
@@ -68,9 +65,6 @@ def test_devices_and_fifos_are_refused(tmp_path: Path, command: str, capsys: Cap
     os.mkfifo(tmp_path / "fifo")
     for path in ("/dev/zero", str(tmp_path / "fifo")):
         fails([*command.split(), path], path, capsys)
-
-
-# -------------------- results
 
 
 def test_a_row_is_not_believed_its_interval(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,9 +163,6 @@ def test_weights_whose_metadata_are_null(tmp_path: Path) -> None:
         policies.load(path)
 
 
-# -------------------- what reaches the terminal
-
-
 def test_what_is_printable_stays_and_all_else_is_written_out() -> None:
     assert printable("lte 4 \N{MULTIPLICATION SIGN} caf\N{LATIN SMALL LETTER E WITH ACUTE}") == "lte 4 × café"
     assert printable("a\nb\x1b[31m\x07\x9b\u202e\ud800\x00") == r"a\nb\x1b[31m\x07\x9b\u202e\ud800\x00"
@@ -226,9 +217,6 @@ def test_output_that_is_closed_or_full() -> None:
         with open("/dev/full", "wb") as full:
             done = ran("list rewards", stdout=full, stderr=subprocess.PIPE)
         assert done.returncode == 2 and done.stderr.count(b"\n") == 1 and b"Traceback" not in done.stderr
-
-
-# -------------------- numbers without bounds
 
 
 @pytest.mark.parametrize("command", ["bench", "topics", "fleet", "tune lte-v1"])

@@ -175,9 +175,6 @@ def test_episodes_are_scored_between_drop_oldest_and_the_clairvoyant() -> None:
     assert np.isnan(entries["rosbridge"]["score"]) and entries["afr"]["minus_agent"] == 0
 
 
-# --- on a suite ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.nightly
 @pytest.mark.parametrize("algo", training.ALGORITHMS)
 def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,10 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from bufgym.benchmark.sweep import Sweep
-from bufgym.cli import main
 
 THREE = ("afr", "random", "drop-oldest")
 TINY = Sweep("interruption-v1", THREE, capacities=(2, 4), seeds=3)
@@ -32,13 +29,6 @@ def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
     """Every file's content and time."""
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
-
-
-def fails(words: list[object], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """The command ends with code 2 and one line that says this."""
-    assert main([str(word) for word in words]) == 2
-    error = capsys.readouterr().err
-    assert told in error and error.startswith("bufgym: error: ") and error.count("\n") == 1
 
 
 def interrupt(*_: object) -> None:
