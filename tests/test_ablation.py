@@ -57,9 +57,3 @@ def test_the_best_of_n_seeds_is_chosen_by_validation_and_shown_on_the_test(
     monkeypatch.setattr(ablation, "tested", lambda settings, model: [tested[model.parent.name]])
     rows = ["| best of 1 | 0.600 | 0.677 |", "| best of 2 | 0.533 | 0.570 |", "| best of 3 | 0.500 | 0.580 |"]
     assert ablation.more_seeds(run)[2:] == rows
-
-
-def test_a_table_has_the_mean_of_the_seeds_and_their_range() -> None:
-    measured = {"everything": [[0.5, 0.6, 0.4, 0.9], [0.7, 0.6, 0.4, 0.5]]}
-    row = ablation.variants_table(measured, {"everything": 130}, ablation.SUITES.split(","))[-1]
-    assert row == "| everything | 130 | 0.60 | 0.60 | 0.40 | 0.70 | 0.575 (0.550-0.600) |"

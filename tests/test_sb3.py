@@ -240,15 +240,6 @@ def test_infos_of_every_step_on_request() -> None:
     assert infos[0]["action_mask"].shape == (10,)
 
 
-def test_maskable_ppo_learns_from_it() -> None:
-    envs = make_vec_env("bufgym/Interruption-v0", 4, seed=0, **SMALL["bufgym/Interruption-v0"])
-    model = MaskablePPO("MultiInputPolicy", envs, n_steps=32, batch_size=128, n_epochs=1, seed=0, device="cpu")
-    model.learn(256)
-    assert model.num_timesteps == 256 and model.ep_info_buffer
-    mean, _ = evaluate_policy(model, envs, n_eval_episodes=4)
-    assert 0 <= float(mean) <= 20  # type: ignore[arg-type]
-
-
 WORLD: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 1_000_000}
 FIELDS = ("rank", "motion_merged", "occupied", "occupancy")
 
@@ -302,6 +293,7 @@ def test_networks_learn_from_other_forms(form: str, network: str, fields: Any) -
     envs = make_vec_env("bufgym/Uplink-v0", 2, seed=0, observation=form, info="mask", fields=fields, **WORLD)
     model = MaskablePPO(network, envs, n_steps=16, batch_size=32, n_epochs=1, seed=0, device="cpu").learn(32)
     assert model.num_timesteps == 32
+    assert isinstance(evaluate_policy(model, envs, n_eval_episodes=2)[0], float)
     model = untrained(MaskablePPO, network, envs, 6)
     assert repr(reached(as_policy(model, fields=fields))) == repr(reached_in_env(model, form, fields))
 

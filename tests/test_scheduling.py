@@ -105,14 +105,6 @@ def test_reached_is_what_the_metrics_say() -> None:
     assert of.decisions == sum(len(episode.arrivals) for episode in of.episodes)
 
 
-def test_fitness_of_the_rival_itself() -> None:
-    """As much QoI as itself: -1; 1 - 0.9 of age too much, three times: 0.3; no age is 1.5 times its own."""
-    of, rival = episodes_of(), policies.get(topics.RIVAL)
-    of.rival = of.reached(rival)
-    for twice in ([of], [of, of]):
-        assert topics.mean_fitness(rival, twice) == pytest.approx(-1 + 3 * (1 - 0.9) + of.rival[3])
-
-
 @pytest.mark.parametrize(
     ("reached", "expected"),
     [

@@ -12,7 +12,7 @@ from summary_cases import exactly
 
 from bufgym import policies
 from bufgym.benchmark.rows import Row, read_rows
-from bufgym.benchmark.run import draw, run
+from bufgym.benchmark.run import run
 from bufgym.benchmark.summary import Summary, plain
 from bufgym.benchmark.sweep import Sweep
 from bufgym.benchmark.tasks import TASKS
@@ -88,16 +88,6 @@ def test_fleet_v1_is_lte_v1_with_sixteen_robots(split: str) -> None:
         assert fleet == FleetScenario(16, replace(alone, traces=(alone.traces[k],)))
         assert shard.seeds == tuple(1000 * k + s for s in range(5))
     assert k + 1 == len(alone.traces)
-
-
-def test_robots_of_an_episode_tick_together_and_move_each_on_its_own() -> None:
-    fleet = Sweep("fleet-v1", (), changes={"robots": 4}).setting("motion", 1).scenario
-    episode, again = (draw(fleet, 1000) for _ in range(2))
-    assert episode.ticks_together and episode.robots == 4
-    assert all((a == b).all() for a, b in zip(episode.arrivals, again.arrivals, strict=True))
-    assert len({float(arrivals["x"][-1]) for arrivals in episode.arrivals}) == 4
-    # The first robot's stream is the one that the seed stands for in the benchmark of one robot.
-    assert (episode.arrivals[0]["x"] == draw(fleet.uplink, 1000).arrivals["x"]).all()
 
 
 def made(policy: str, *teams: tuple[float, ...], capacity: int = 4, scenario: str = "s") -> list[Row]:

@@ -106,12 +106,6 @@ def test_names_are_shown_as_they_are_written(folder: Path) -> None:
     assert lane["y"] == ["&lt;b&gt;", "afr"]
 
 
-def test_regret_against_the_outage_goes_by_its_length(folder: Path) -> None:
-    panel = figures(report.write(folder).read_text(encoding="utf-8"))["outages"]["exponential:0.618\n4"][0]
-    curves = {trace["name"]: trace for trace in panel["data"] if "name" in trace}
-    assert curves["afr"]["x"] == [5.0, 20.0] and curves["afr"]["y"] == [0.1, 0.1]
-
-
 def test_what_a_run_does_not_have_has_no_chart(tmp_path: Path) -> None:
     """One capacity, no outage of known length, no record of memory, no timeline."""
     kept = [row for row in inputs.read(make(tmp_path / "a")).rows if row["capacity"] == 2 and row["scenario"] == "good"]

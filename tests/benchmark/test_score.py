@@ -120,14 +120,6 @@ def test_interquartile_mean_by_hand(values: list[float], mean: float) -> None:
     assert score.interquartile_mean(values) == pytest.approx(mean, nan_ok=True)
 
 
-def test_interquartile_mean_is_scipys() -> None:
-    stats = pytest.importorskip("scipy.stats")
-    rng = np.random.default_rng(0)
-    for n in range(1, 40):
-        x = rng.normal(size=n).round(1)
-        assert score.interquartile_mean(x) == pytest.approx(stats.trim_mean(x, 0.25))
-
-
 def test_the_interquartile_mean_of_traces_by_hand() -> None:
     """Base 0 and clairvoyant 10 an episode: scores of the traces a..d are 0.1, 0.2, 0.4 and 0.9, of e 0/0.
 

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from summary_cases import exactly
 
-from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.summary import Quantity, Run, Summary, plain, summarise
 from bufgym.benchmark.table import score
@@ -87,12 +86,3 @@ def test_unranked_policies_come_last() -> None:
 def test_runs_that_cannot_be_summed_up(numbers: dict[Run, list[float]], options: dict[str, Any], message: str) -> None:
     with pytest.raises(BufgymError, match=message):
         summary(numbers, **options)
-
-
-def test_an_interval_as_text() -> None:
-    found = summary(runs({"base": [2, 2], "mine": [3, 3]}), unranked=[])
-    assert found.standings["mine"]["over"] == Interval(1.5, 1.5, 1.5)
-    assert plain(found, {"s": "a story"}).splitlines()[2:4] == [
-        "s: a story, L = 4",
-        "mine    3.000  1.500 [1.500, 1.500]         2",
-    ]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from bufgym import policies
 from bufgym.benchmark import run, sweep
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.sweep import Sweep
-from bufgym.cli import main
 from bufgym.cli.options import load_policies
 from bufgym.scenario import suites
 
@@ -106,46 +104,6 @@ def test_the_baseline_is_always_there_and_the_suite_fills_what_is_open(small: Sw
     assert (plan.specs, plan.capacities, plan.seeds) == (("afr", "drop-oldest"), (2, 3), 2)
     assert Sweep("small-v1", ("drop-oldest", "afr")).checked().specs == ("drop-oldest", "afr")
     assert plan.checked() == plan
-
-
-KILLED = {
-    "lte-v1": (24, ["bench", "--suite", "lte-v1", "--policies", "afr,mine", "--capacity", 5]),
-    "topics-v1": (18, ["topics", "--split", "validation", "--policies", "mine", "--window", 2]),
-    "fleet-v1": (12, ["fleet", "--policies", "mine", "--capacity", 5, "--robots", 2]),
-}
-"""How many shards a suite of each kind has, and its command."""
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("suite", KILLED)
-def test_a_run_that_was_killed_goes_on_where_it_was(
-    suite: str, tmp_path: Path, mine: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shards, words = KILLED[suite]
-    words = [*words, "--seeds", 1, "--format", "csv", "--policy-file", mine]
-    killed, whole = tmp_path / "killed", tmp_path / "whole"
-    process = bufgym(*words, "--jobs", 2, "--out", killed, TEST_SLEEP_S="0.4")
-    while len(list(killed.glob("parts/*.csv"))) < 3:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.02)
-    process.kill()
-    process.communicate()  # once the workers, who hold the pipes too, have ended
-    kept = contents(killed / "parts")
-    assert 3 <= len(kept) < shards and not (killed / "rows.csv").exists()
-
-    alone = [str(word) for word in (*words, "--backend", "sequential", "--out")]
-    with monkeypatch.context() as patch:
-        patch.setattr(sweep.shutil, "rmtree", lambda *_, **__: None)  # the parts stay, to be looked at
-        assert main([*alone, str(killed)]) == 0
-    after = contents(killed / "parts")
-    assert len([name for name in after if not name.startswith(".")]) == shards
-    assert all(after[name] == was for name, was in kept.items()), "a finished shard was touched"
-    assert main([*alone, str(whole)]) == 0
-    names = {path.name for path in whole.iterdir()}
-    assert names == {"manifest.json", "rows.csv"} | ({"timeline.json"} if suite == "lte-v1" else set())
-    assert all((killed / name).read_bytes() == (whole / name).read_bytes() for name in names - {"manifest.json"})
-    assert main([*alone, str(killed)]) == 0
-    assert not (killed / "parts").exists()
 
 
 def test_a_second_call_runs_nothing(tmp_path: Path, small: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
