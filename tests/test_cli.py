@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_cases import fails, shown
+from cli_cases import Capsys, fails, shown
 
 from bufgym import __version__, cli, policies, reproduce, scenario, traces
 from bufgym.benchmark import perf
 from bufgym.benchmark.run import run
 from bufgym.cli import main
 from bufgym.traces.generate.shipped import shipped_calls
-
-Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.fixture

@@ -8,15 +8,13 @@ from pathlib import Path
 
 import gymnasium as gym
 import pytest
-from cli_cases import fails, shown
+from cli_cases import Capsys, fails, shown
 
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.cli import main, split_policies
 from bufgym.kernel import JIT
 from bufgym.policies import registry
-
-Capsys = pytest.CaptureFixture[str]
 
 QUICK = ["--seconds", "1", "--fps", "10", "--seeds", "2", "--capacity", "2"]
 """A benchmark of a few messages."""

@@ -73,7 +73,7 @@ def test_all_policies_by_default_with_a_word_on_the_unbounded(config: str, capsy
     assert "rosbridge has no rank: its queue is unbounded." in text
 
 
-def test_invalid_decisions_of_a_users_policy_are_told(
+def test_decisions_that_cannot_be_carried_out_are_told(
     config: str, tmp_path: Path, capsys: Capsys, monkeypatch: Patch
 ) -> None:
     """Each of the 2 s x (10 + 2) messages/s is sent by such a decision, whatever its topic."""

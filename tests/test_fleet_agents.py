@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import train_cases  # noqa: F401  (it skips without the extra)
 
 import train
 from agents import training
@@ -42,14 +42,13 @@ PPO = dataclasses.replace(TINY, algo="maskable-ppo", **SMALL)  # type: ignore[ar
 
 
 @pytest.fixture(autouse=True)
-def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder of its own; a small suite, and only what takes no time of the rest."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(suites.SUITES, "fleet-v1", SUITE)
     monkeypatch.setattr(fleet, "EPISODE_S", 1.0)
     monkeypatch.setattr(fleet, "VALIDATION_EPISODES", 1)
     monkeypatch.setattr(FleetTask, "default_policies", lambda self, suite: ["afr", "drop-oldest"])
-    yield
 
 
 def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:

@@ -214,7 +214,7 @@ AFTER = {"docs/guide/truth.md": "assert round(best.value, 5) == 0.98311", "docs/
 ELSEWHERE = {
     "docs/guide/on-a-robot.md": "tests/live/test_ros1.py, test_ros2.py",
     "docs/guide/own-policy.md": "above, by a command",
-    "docs/guide/yours-to-change.md": "tests/test_examples.py",
+    "docs/guide/yours-to-change.md": "below",
     "docs/fleet.md": "it trains for minutes; what it imports is looked at above",
 }
 """Page -> what runs its programs."""
@@ -257,3 +257,31 @@ def test_the_table_of_the_readme_is_what_its_command_prints(capsys: pytest.Captu
     command, table = block.findall(texts()["README.md"])[0]
     assert main(command.split()[1:]) == 0
     assert capsys.readouterr().out.strip() == table.strip()
+
+
+EXAMPLES = [
+    path
+    for path in sorted((REPO / "examples").glob("*.py"))
+    if all(part in path.read_text(encoding="utf-8") for part in ("def main(", '"--steps"', '"--seeds"'))
+]
+"""Those that take ``--steps`` and ``--seeds``; the others have tests of their own."""
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_the_example_runs(path: Path) -> None:
+    """A process of its own: examples register fields, rewards and scenarios."""
+    command, where = (
+        [sys.executable, str(path), "--steps", "40", "--seeds", "1"],
+        os.environ | {"PYTHONPATH": str(REPO)},
+    )
+    done = subprocess.run(command, cwd=path.parent, env=where, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip()
+
+
+def test_the_guide_shows_what_the_examples_do() -> None:
+    section = (REPO / "docs" / "guide" / "yours-to-change.md").read_text(encoding="utf-8")
+    text = "\n".join(path.read_text(encoding="utf-8") for path in EXAMPLES)
+    blocks = [block.split("```")[0] for block in section.split("```python\n")[1:]]
+    assert len(blocks) == 5 and all(block in text for block in blocks)

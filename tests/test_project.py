@@ -1,4 +1,4 @@
-"""The house rules: rooms import only from rooms above, paths are relative, importing bufgym stays cheap."""
+"""The house rules: rooms import only from rooms above, paths are relative, importing stays cheap, hints name extras."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
+
+from bufgym import errors
 
 REPO = Path(__file__).resolve().parent.parent
 
@@ -154,3 +158,30 @@ def test_sb3_without_its_extra_names_it() -> None:
     )
     told = output_of(program)
     assert told.startswith("bufgym.sb3 needs ") and "stable-baselines3" in told.partition("pip install ")[2]
+
+
+REQUIRES = ["numpy>=2.1", 'matplotlib; extra == "plot"', 'mcap<2,>=1.2; extra == "ros"']
+REQUIRES += ['flatbuffers; extra == "robofleet"', 'bufgym[ros]; extra == "robofleet"']
+
+
+def test_a_hint_names_the_packages_of_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: REQUIRES)
+    assert errors.install("plot") == "pip install matplotlib"
+    # What a shell would take for a redirection is quoted, and an extra of bufgym's own is written out.
+    assert errors.install("robofleet") == 'pip install flatbuffers "mcap<2,>=1.2"'
+
+
+def test_a_source_tree_that_was_never_installed_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: importlib.metadata.distribution("no-such-name"))
+    assert errors.install("plot") == 'pip install -e ".[plot]"'
+
+
+def test_every_hint_names_an_extra_that_there_is() -> None:
+    extras = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    named = set()
+    for path in sorted((REPO / "bufgym").rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        named |= set(re.findall(r"""install\(['"](\w+)['"]\)""", text))
+        # No package index knows bufgym: a hint that names it would not work.
+        assert not re.search(r"""pip install ["']?bufgym""", text), path
+    assert {"plot", "train", "fleet", "ros"} <= named <= set(extras)

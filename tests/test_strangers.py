@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_cases import fails, shown
+from cli_cases import Capsys, fails, shown
 
 sys.path.insert(0, str(Path(__file__).parent / "traces"))
 import bag_cases as cases
@@ -25,10 +25,6 @@ from bufgym.errors import BufgymError, TraceError, printable
 from bufgym.scenario import read_client
 
 REPO = Path(__file__).resolve().parents[1]
-EXAMPLE = REPO / "examples" / "client.toml"
-
-
-Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
+import re
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -114,3 +117,19 @@ def test_offline_learns_from_a_data_set(tmp_path: Path, capsys: pytest.CaptureFi
     seen[0, [0, 1, offline["L"]]] = 1.0  # slots 0 and 1, and the newcomer
     valid = offline["scored"](offline["new_network"](settings), seen)[0] > -1e5
     assert valid.tolist() == [True, True, *[False] * 6, True, True]
+
+
+MISSING = [name for name in ("ray", "tree", "ormsgpack", "torch", "pettingzoo") if not importlib.util.find_spec(name)]
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(bool(MISSING), reason=f"the extra [rllib] is not installed: {', '.join(MISSING)} missing")
+def test_the_example_learns_two_iterations() -> None:
+    small = ["--robots", "2", "--iterations", "2", "--ticks", "400", "--seconds", "3"]
+    command = [sys.executable, "examples/fleet_rllib.py", *small]
+    done = subprocess.run(command, cwd=EXAMPLES.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    returns = re.findall(r"iteration \d: [1-9]\d* episodes, return ([\d.]+)", done.stdout)
+    assert len(returns) == 2, done.stdout
+    # The sum over two robots of H - 1, where V <= 1 and 90 frames arrive.
+    assert all(0 < float(total) < 2 * 90 for total in returns)

@@ -1,4 +1,4 @@
-"""What the tests of sweeps and their folders share."""
+"""What the tests of the benchmark share."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.sweep import Sweep
 
 THREE = ("afr", "random", "drop-oldest")
@@ -34,3 +37,8 @@ def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
 def interrupt(*_: object) -> None:
     """Ctrl-C in the middle of what it takes the place of."""
     raise KeyboardInterrupt
+
+
+def exactly(x: float) -> Interval:
+    """Of a statistic that every episode agrees on."""
+    return Interval(pytest.approx(x), pytest.approx(x), pytest.approx(x))

@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 from cli_cases import shown
-from summary_cases import exactly
+from sweep_cases import exactly
 
 from bufgym import policies
 from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.run import run
 from bufgym.benchmark.summary import Summary, plain
-from bufgym.benchmark.sweep import Sweep
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.fleet import ROWS
 from bufgym.errors import BufgymError
@@ -76,18 +75,6 @@ def test_every_policy_and_capacity_meets_the_same_episodes(monkeypatch: pytest.M
     # One episode at a time: the same rows, each once.
     monkeypatch.setattr("bufgym.benchmark.run._BATCH_MESSAGES", 1)
     assert sorted(map(repr, run(chosen, fleet, [2, 4], 2))) == sorted(map(repr, rows))
-
-
-@pytest.mark.parametrize("split", suites.SPLITS)
-def test_fleet_v1_is_lte_v1_with_sixteen_robots(split: str) -> None:
-    """Each robot alone would meet what lte-v1's motion setting has: traces, motions, streams, V."""
-    alone = suites.get("lte-v1").settings(split)["motion"].scenario
-    sweep = Sweep("fleet-v1", (), split).checked()
-    for k, shard in enumerate(sweep.shards()):
-        fleet = sweep.setting(shard.label, shard.trace).scenario
-        assert fleet == FleetScenario(16, replace(alone, traces=(alone.traces[k],)))
-        assert shard.seeds == tuple(1000 * k + s for s in range(5))
-    assert k + 1 == len(alone.traces)
 
 
 def made(policy: str, *teams: tuple[float, ...], capacity: int = 4, scenario: str = "s") -> list[Row]:

@@ -1,4 +1,4 @@
-"""The speed report at tiny sizes, and a policy as the player of an environment."""
+"""The speed report at tiny sizes, a policy as the player of an environment, and what is compiled beforehand."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark import perf, perf_peers, perf_profile, perf_queue
 from bufgym.benchmark.run import draw, run
+from bufgym.benchmark.warmup import PARTS
+from bufgym.cli import main
 from bufgym.errors import BufgymError
 from bufgym.expert import Player
+from bufgym.kernel import FOLDER, JIT
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import run as run_senders
@@ -148,3 +151,13 @@ def test_a_player_refuses_a_decision_that_means_nothing() -> None:
     for name, why in (("codel", "drops at dequeue"), ("rosbridge", "has an unbounded queue")):
         with pytest.raises(BufgymError, match=f"policy {name} {why}"):
             Player(policies.get(name))
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(not JIT, reason="nothing is compiled")
+def test_each_part_is_named_and_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["warmup"]) == 0
+    told = capsys.readouterr()
+    text = told.out + told.err
+    assert all(f"{k}/{len(PARTS)} {name}" in text for k, name in enumerate(PARTS, 1))
+    assert FOLDER in text

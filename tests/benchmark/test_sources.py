@@ -108,6 +108,7 @@ def test_a_trained_model_goes_by_its_stem(module: str, capsys: pytest.CaptureFix
     assert {row["policy"] for row in read_rows(Path("kept/rows.csv"))} == {"slots", "drop-oldest"}
 
 
+@pytest.mark.nightly
 def test_workers_load_them_too_and_the_folder_knows_their_version(
     module: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

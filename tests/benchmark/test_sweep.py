@@ -164,6 +164,7 @@ def test_an_error_in_one_shard_loses_no_finished_rows(
     assert repr(rows) == repr(sweep.run_sweep(small, tmp_path / "whole", backend="sequential", form="csv"))
 
 
+@pytest.mark.nightly
 def test_a_mistake_in_a_users_policy_is_shown_where_it_is_even_from_other_processes(tmp_path: Path, mine: Path) -> None:
     words = ["--policies", "mine", "--policy-file", mine, "--capacity", "2,5", "--seeds", "1", "--jobs", "2"]
     failed = finished("bench", "--suite", "interruption-v1", *words, "--out", tmp_path, TEST_FAIL="1")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from summary_cases import exactly
+from sweep_cases import exactly
 
 from bufgym import policies
 from bufgym.benchmark.rows import Row
