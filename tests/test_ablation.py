@@ -6,8 +6,8 @@ import dataclasses
 import json
 from pathlib import Path
 
-import pytest
 import train_cases  # noqa: F401  (it skips without the extra)
+from cli_cases import Patch
 
 from agents import ablation
 from agents.settings import MOTION, Settings
@@ -47,9 +47,7 @@ def test_learning_shows_the_best_so_far_at_each_moment(tmp_path: Path) -> None:
     assert text == "python train.py --suite interruption-v1 --algo dqn --seeds 3 --name mine"
 
 
-def test_the_best_of_n_seeds_is_chosen_by_validation_and_shown_on_the_test(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_best_of_n_seeds_is_chosen_by_validation_and_shown_on_the_test(tmp_path: Path, monkeypatch: Patch) -> None:
     """Validation says 0.5, 0.6, 0.7, the test 0.58, 0.55, 0.9: of two, seed 0 is chosen twice and seed 1 once."""
     validations = {s: f"0,0,0,0,0,1.5\n1,1,0,0,0,{over}\n" for s, over in enumerate((0.5, 0.6, 0.7))}
     run = run_of(tmp_path, "mine", "evolution", validations)

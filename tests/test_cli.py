@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_cases import Capsys, fails, shown
+from cli_cases import Capsys, Patch, fails, shown
 
 from bufgym import __version__, cli, policies, reproduce, scenario, traces
 from bufgym.benchmark import perf
@@ -71,7 +71,7 @@ def test_bad_commands(command: str, naming: str, capsys: Capsys) -> None:
     fails(command.split(), naming, capsys)
 
 
-def test_ctrl_c_and_a_reader_that_left(monkeypatch: pytest.MonkeyPatch, capsys: Capsys, tmp_path: Path) -> None:
+def test_ctrl_c_and_a_reader_that_left(monkeypatch: Patch, capsys: Capsys, tmp_path: Path) -> None:
     def interrupt(*_: Any, **__: Any) -> str:
         raise KeyboardInterrupt
 
@@ -96,7 +96,7 @@ def test_trace_info(trace: str, capsys: Capsys) -> None:
     assert ["duration_s", "3"] in lines and ["seconds_below_500KBps", "1"] in lines
 
 
-def test_trace_plot(trace: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
+def test_trace_plot(trace: str, tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "picture.png"
     shown(["trace", "plot", trace, "lte-synthetic-1", "--out", out], capsys)
@@ -105,7 +105,7 @@ def test_trace_plot(trace: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     fails(["trace", "plot", trace, "--out", "x.png"], "pip install matplotlib", capsys)
 
 
-def test_reproduce_lists_and_dispatches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
+def test_reproduce_lists_and_dispatches(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     monkeypatch.setattr(reproduce, "FIGURES", {"one": "the first", "two": "the second"})
     monkeypatch.setattr(reproduce, "run", lambda name, out: f"{name} in {out.name}")
     assert "the second" in shown(["reproduce"], capsys)
@@ -113,7 +113,7 @@ def test_reproduce_lists_and_dispatches(tmp_path: Path, monkeypatch: pytest.Monk
     assert shown(["reproduce", "all", "--out", tmp_path / "o"], capsys) == "one in o\n\ntwo in o\n"
 
 
-def test_perf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
+def test_perf(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     # tests/benchmark measures; here it is the command alone.
     monkeypatch.setattr(perf, "measure", lambda sizes: [perf.Figure("rollout, afr", 2.5e7, "arrivals/s", 2e7, "what")])
     target = tmp_path / "perf.json"
@@ -131,9 +131,7 @@ def test_play_ends_where_bench_does(capsys: Capsys) -> None:
     )
 
 
-def test_play_stops_after_so_many_decisions_and_colours_a_terminal_alone(
-    monkeypatch: pytest.MonkeyPatch, capsys: Capsys
-) -> None:
+def test_play_stops_after_so_many_decisions_and_colours_a_terminal_alone(monkeypatch: Patch, capsys: Capsys) -> None:
     words = ["play", "--speed", "0", "--steps", "2"]
     text = shown(words, capsys)
     assert "decision 2" in text and "decision 3" not in text and "stopped after 2 decisions" in text

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cli_cases import Capsys, Patch
 from train_cases import KilledError, columns
 
 import train
@@ -34,7 +35,7 @@ TINY = Settings(suite="topics-v1", algo="evolution", name="tiny", steps=4_000, v
 
 
 @pytest.fixture(autouse=True)
-def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
@@ -139,7 +140,7 @@ def test_a_suite_has_episodes_of_each_setting() -> None:
 
 
 @pytest.fixture
-def short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_episodes(monkeypatch: Patch) -> None:
     """Episodes of seconds instead of minutes."""
 
     def client_episodes(
@@ -152,9 +153,7 @@ def short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("after", [pytest.param(after, marks=pytest.mark.nightly) for after in (5, 50, 60)] + [20])
-def test_a_killed_run_goes_on_as_if_nothing_had_been(
-    after: int, short_episodes: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_run_goes_on_as_if_nothing_had_been(after: int, short_episodes: None, monkeypatch: Patch) -> None:
     """Killed after so many fitnesses: in the first generation, and in later ones."""
     whole, killed = Path("whole"), Path("killed")
     whole.mkdir(), killed.mkdir()
@@ -182,9 +181,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(
 
 
 @pytest.mark.nightly
-def test_a_run_leaves_an_agent_and_a_table(
-    short_episodes: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_leaves_an_agent_and_a_table(short_episodes: None, monkeypatch: Patch, capsys: Capsys) -> None:
     """Through ``train.main``; the test split as few seconds of one setting on one link."""
     suite = suites.get("topics-v1")
 

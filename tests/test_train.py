@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cli_cases import Capsys, Patch
 from train_cases import KilledError, columns
 
 import train
@@ -33,7 +34,7 @@ SUITE = dataclasses.replace(TINY, **ON_SUITE)
 
 
 @pytest.fixture(autouse=True)
-def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
@@ -43,9 +44,7 @@ def curve_of(folder: Path) -> list[float]:
 
 
 @pytest.mark.parametrize("env", ["bufgym/Uplink-v0", pytest.param("bufgym/Interruption-v0", marks=pytest.mark.nightly)])
-def test_a_run_leaves_its_results(
-    env: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_leaves_its_results(env: str, capsys: Capsys, monkeypatch: Patch) -> None:
     pictures: list[dict[str, Any]] = []
 
     def draw(*args: Any, **kwargs: Any) -> None:
@@ -82,7 +81,7 @@ def test_a_run_leaves_its_results(
     assert "drop-oldest" in printed and "agent (seed 0)" in printed
 
 
-def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: Patch) -> None:
     folder = runs.prepare(TINY)
     row = Curve._on_rollout_end
 
@@ -163,7 +162,7 @@ def test_episodes_are_scored_between_drop_oldest_and_the_clairvoyant() -> None:
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("algo", training.ALGORITHMS)
-def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -> None:
     train.main(dataclasses.replace(SUITE, algo=algo))
     folder = Path("runs/tiny")
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
@@ -210,7 +209,7 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(algo: str) -> None:
 
 
 @pytest.mark.nightly
-def test_a_suites_run_goes_on_with_its_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_suites_run_goes_on_with_its_best_so_far(monkeypatch: Patch) -> None:
     """The second validation was the best: its agent is kept, not the last one."""
     verdicts = iter([0.9, 0.1, 0.7, 0.5, 0.6])
     monkeypatch.setattr(ValidationSets, "play", lambda self, agent, slots: Verdict(0.5, 0.0, next(verdicts)))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cli_cases import Capsys, Patch
 
 from bufgym.benchmark import leaderboard
 from bufgym.kernel import JIT
@@ -28,7 +29,7 @@ def example(name: str) -> dict[str, Any]:
     return runpy.run_path(str(EXAMPLES / name))
 
 
-def test_ppo_trains_and_tests_on_the_benchmarks_episodes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_ppo_trains_and_tests_on_the_benchmarks_episodes(capsys: Capsys) -> None:
     ppo = example("ppo.py")
     tiny = {"num_envs": 4, "num_steps": 8, "steps": 96, "minibatch": 16, "width": 8, "epochs": 1, "duration_s": 4.0}
     result = ppo["main"](ppo["Settings"](**tiny, capacity=2, test_seeds=2))
@@ -54,9 +55,7 @@ def test_ppos_advantages_by_hand() -> None:
 
 
 @pytest.mark.nightly
-def test_a_model_of_stable_baselines3_gets_a_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_model_of_stable_baselines3_gets_a_row(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
     small = (
         "--suite interruption-v1 --capacity 4 --steps 512 --num-envs 4 --out mine -- --seeds 3 --capacity 4 --jobs 1"
@@ -81,7 +80,7 @@ def test_a_moment_is_missed_more_than_half_a_view_from_what_arrived() -> None:
 
 
 @pytest.mark.nightly
-def test_views_missed_are_told_by_policy(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_views_missed_are_told_by_policy(monkeypatch: Patch, capsys: Capsys) -> None:
     monkeypatch.setattr(sys, "argv", ["x", "--policies", "clairvoyant,afr", "--seeds", "1", "--seconds", "3"])
     example("view_missed.py")["main"]()
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
@@ -90,7 +89,7 @@ def test_views_missed_are_told_by_policy(monkeypatch: pytest.MonkeyPatch, capsys
 
 
 @pytest.mark.nightly
-def test_imitation_learns_from_the_clairvoyant(capsys: pytest.CaptureFixture[str]) -> None:
+def test_imitation_learns_from_the_clairvoyant(capsys: Capsys) -> None:
     """Seconds are enough to pass AFR on short episodes; a network that learned nothing is below Drop Oldest."""
     pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
     imitation = example("imitation.py")
@@ -103,7 +102,7 @@ def test_imitation_learns_from_the_clairvoyant(capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.nightly
-def test_offline_learns_from_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_offline_learns_from_a_data_set(tmp_path: Path, capsys: Capsys) -> None:
     """A clone of AFR is far above a network that learned nothing; CQL runs, and its values keep to the masks."""
     for package in ("d3rlpy", "minari", "sb3_contrib"):
         pytest.importorskip(package, reason="the extra [offline] is not installed")

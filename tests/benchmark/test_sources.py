@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from cli_cases import fails, shown
+from cli_cases import Capsys, Patch, fails, shown
 
 from bufgym import policies
 from bufgym.benchmark import sources
@@ -53,7 +53,7 @@ ONE = ["--interruption", "--law", "fixed", "--t-max", "12", "--capacity", "3", "
 
 
 @pytest.fixture
-def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def module(tmp_path: Path, monkeypatch: Patch) -> str:
     """A module of policies in the current folder; its name differs from test to test, as Python imports one once."""
     name = "m" + re.sub(r"\W", "_", tmp_path.name)
     (tmp_path / f"{name}.py").write_text(MODULE)
@@ -71,7 +71,7 @@ def rows_of(text: str) -> dict[str, str]:
     return table
 
 
-def test_functions_makers_and_policies_of_a_module(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_functions_makers_and_policies_of_a_module(module: str, capsys: Capsys) -> None:
     words = [f"{module}:{name}" for name in ("newest", "made", "whole", "every_other")]
     chosen = ",".join([*words, "every:every=3", "drop-oldest"])
     table = rows_of(shown(["bench", *ONE, "--policies", chosen], capsys))
@@ -81,7 +81,7 @@ def test_functions_makers_and_policies_of_a_module(module: str, capsys: pytest.C
     shown(["play", "--policies", f"{module}:newest", "--env", "Interruption-v0", "--speed", "0"], capsys)
 
 
-def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: Capsys) -> None:
     shutil.copy(SHIPPED, "own.safetensors")
     table = rows_of(shown(["bench", *ONE, "--policies", "own.safetensors,learned-time"], capsys))
     assert table["own"] == table["learned-time"]
@@ -92,7 +92,7 @@ def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: pytest.Cap
 
 
 @pytest.mark.nightly
-def test_a_trained_model_goes_by_its_stem(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_trained_model_goes_by_its_stem(module: str, capsys: Capsys) -> None:
     """A slot network decides as its exported weights do."""
     contrib = pytest.importorskip("sb3_contrib")
     from bufgym.sb3 import SlotPolicy, make_vec_env
@@ -109,9 +109,7 @@ def test_a_trained_model_goes_by_its_stem(module: str, capsys: pytest.CaptureFix
 
 
 @pytest.mark.nightly
-def test_workers_load_them_too_and_the_folder_knows_their_version(
-    module: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_workers_load_them_too_and_the_folder_knows_their_version(module: str, capsys: Capsys) -> None:
     pytest.importorskip("joblib")
     shutil.copy(SHIPPED, "own.safetensors")
     suite = "--suite interruption-v1 --capacity 3 --seeds 1 --format csv --jobs 2 --out kept"
@@ -138,7 +136,7 @@ def test_workers_load_them_too_and_the_folder_knows_their_version(
         ("boom", f"line {LINES.index('    return 1 // 0') + 1}: ZeroDivisionError"),
     ],
 )
-def test_what_a_module_cannot_give(module: str, name: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_module_cannot_give(module: str, name: str, says: str, capsys: Capsys) -> None:
     fails(["bench", *ONE, "--policies", f"{module}:{name}"], says, capsys)
 
 
@@ -154,7 +152,7 @@ def test_what_a_module_cannot_give(module: str, name: str, says: str, capsys: py
         ("afr:policy", "'policy' is not of the form parameter=number"),
     ],
 )
-def test_what_cannot_be_loaded(module: str, word: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_loaded(module: str, word: str, says: str, capsys: Capsys) -> None:
     if word.endswith(".zip"):
         pytest.importorskip("stable_baselines3")
     Path("broken.zip").write_text("no zip")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli_cases import Patch
 from sweep_cases import THREE, TINY, bufgym, contents, interrupt
 
 from bufgym import policies
@@ -87,9 +88,7 @@ def test_each_trace_has_seeds_of_its_own(tmp_path: Path, small: Sweep) -> None:
     assert repr(rows) == repr(wanted) and len(rows) == 2 * 2 * 2 * 3 * 2
 
 
-def test_many_seeds_are_several_shards_and_the_same_rows(
-    tmp_path: Path, small: Sweep, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_seeds_are_several_shards_and_the_same_rows(tmp_path: Path, small: Sweep, monkeypatch: Patch) -> None:
     plan = Sweep(small.suite, small.specs, seeds=5)
     whole = sweep.run_sweep(plan, tmp_path / "whole", backend="sequential")
     monkeypatch.setattr(sweep, "_SEEDS_PER_SHARD", 2)
@@ -106,7 +105,7 @@ def test_the_baseline_is_always_there_and_the_suite_fills_what_is_open(small: Sw
     assert plan.checked() == plan
 
 
-def test_a_second_call_runs_nothing(tmp_path: Path, small: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_call_runs_nothing(tmp_path: Path, small: Sweep, monkeypatch: Patch) -> None:
     rows = sweep.run_sweep(small, tmp_path, backend="sequential", form="csv")
     before = contents(tmp_path)
     monkeypatch.setattr(sweep, "run_shard", None)
@@ -115,7 +114,7 @@ def test_a_second_call_runs_nothing(tmp_path: Path, small: Sweep, monkeypatch: p
     assert contents(tmp_path) == before
 
 
-def test_parts_alone_say_the_format_too(tmp_path: Path, small: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_alone_say_the_format_too(tmp_path: Path, small: Sweep, monkeypatch: Patch) -> None:
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(sweep, "_read", interrupt)
         sweep.run_sweep(small, tmp_path, backend="sequential", form="csv")
@@ -136,7 +135,7 @@ def test_what_is_missing_of_a_finished_folder_is_made_anew(tmp_path: Path, small
 
 @pytest.mark.parametrize("backend", ["sequential", "threading"])
 def test_an_error_in_one_shard_loses_no_finished_rows(
-    tmp_path: Path, small: Sweep, backend: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small: Sweep, backend: str, monkeypatch: Patch
 ) -> None:
     """The second shard fails while the first one runs, which is finished and kept; no shard is begun afterwards."""
     right, begun, failed = sweep.run_shard, [], threading.Event()
@@ -169,4 +168,4 @@ def test_a_mistake_in_a_users_policy_is_shown_where_it_is_even_from_other_proces
     words = ["--policies", "mine", "--policy-file", mine, "--capacity", "2,5", "--seeds", "1", "--jobs", "2"]
     failed = finished("bench", "--suite", "interruption-v1", *words, "--out", tmp_path, TEST_FAIL="1")
     assert failed.returncode == 2 and failed.stderr.count("\n") == 1
-    assert f"{mine}, line 10: ArithmeticError: on purpose" in failed.stderr
+    assert f"{mine}, line 8: ArithmeticError: on purpose" in failed.stderr

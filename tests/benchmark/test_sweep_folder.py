@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_cases import fails, shown
+from cli_cases import Capsys, Patch, fails, shown
 from sweep_cases import TINY, contents, interrupt
 
 from bufgym.benchmark import sweep
@@ -50,7 +50,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_so_does_another_version_or_another_policy_file(
-    tmp_path: Path, small: Sweep, mine: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small: Sweep, mine: Path, monkeypatch: Patch
 ) -> None:
     load_policies(str(mine))
     plan = Sweep("small-v1", ("mine",), policy_file=str(mine))
@@ -67,7 +67,7 @@ def test_so_does_another_version_or_another_policy_file(
     assert contents(tmp_path / "out") == before
 
 
-def test_so_do_other_recordings_of_the_same_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_so_do_other_recordings_of_the_same_names(tmp_path: Path, monkeypatch: Patch) -> None:
     def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
         assert data is not None
         trace = Trace.steps([(1.0, float((data / "rate").read_text()))], name="link")
@@ -96,7 +96,7 @@ def test_rows_without_a_manifest_are_left_alone(tmp_path: Path, small: Sweep, na
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])
 def test_a_broken_part_is_named_and_made_anew_once_deleted(
-    tmp_path: Path, small: Sweep, form: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small: Sweep, form: str, monkeypatch: Patch
 ) -> None:
     if form == "parquet":
         pytest.importorskip("pyarrow")
@@ -151,7 +151,7 @@ def test_a_bad_sweep_ends_before_anything_is_written(
     [("ray", "ray", "ray"), ("dask", "distributed", "dask"), ("loky", "joblib", "bench")],
 )
 def test_a_backend_that_is_not_installed_names_the_extra(
-    tmp_path: Path, small: Sweep, backend: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small: Sweep, backend: str, module: str, extra: str, monkeypatch: Patch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)  # importing it now fails
     with pytest.raises(BufgymError, match=re.escape(f"{module} is missing: {install(extra)}")):
@@ -162,19 +162,17 @@ QUEUE_ALONE = ("--trace link.csv", "--motion none", "--fps 10", "--seconds 5", "
 
 
 @pytest.mark.parametrize("words", [*QUEUE_ALONE, "--value saturating:2", "--interruption", "--decide-at overflow"])
-def test_a_suites_episodes_cannot_be_changed(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_suites_episodes_cannot_be_changed(words: str, capsys: Capsys) -> None:
     told = fails(["bench", "--suite", "lte-v1", *words.split()], "cannot go with --suite", capsys)
     assert words.split()[0] in told
 
 
 @pytest.mark.parametrize("words", ["--jobs 2", "--split train", "--data .", "--backend dask", "--address host:1"])
-def test_options_of_a_suite_need_one(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_of_a_suite_need_one(words: str, capsys: Capsys) -> None:
     fails(["bench", *words.split()], f"{words.split()[0]} needs --suite", capsys)
 
 
-def test_the_command_line_prints_scores_and_the_report_reads_them(
-    tmp_path: Path, small: Sweep, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_line_prints_scores_and_the_report_reads_them(tmp_path: Path, small: Sweep, capsys: Capsys) -> None:
     pytest.importorskip("jinja2")
     pytest.importorskip("plotly")
     out = tmp_path / "a folder"
@@ -190,7 +188,7 @@ def test_the_command_line_prints_scores_and_the_report_reads_them(
 
 
 def test_without_a_folder_nothing_is_left_behind(
-    tmp_path: Path, small: Sweep, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, small: Sweep, monkeypatch: Patch, capsys: Capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
     words = "bench --suite small-v1 --policies afr --backend sequential"
