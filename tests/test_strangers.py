@@ -221,6 +221,7 @@ def test_a_hundred_million_episodes_are_refused(command: str, capsys: Capsys) ->
     fails([*command.split(), "--seeds", "100000000"], told, capsys)
 
 
+@pytest.mark.nightly
 def test_four_months_of_two_packets_are_drawn_in_windows(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "long"

@@ -46,16 +46,15 @@ def expected() -> str:
     return repr(rows)
 
 
-@pytest.mark.parametrize("backend", ["sequential", "threading"])
-def test_in_this_process_the_rows_are_those_of_the_experiment(tmp_path: Path, backend: str, expected: str) -> None:
+@pytest.mark.parametrize("backend", ["sequential", "threading", "loky"])
+def test_the_rows_are_those_of_the_experiment(tmp_path: Path, backend: str, expected: str) -> None:
     rows = sweep.run_sweep(TINY, tmp_path, jobs=2, backend=backend, form="csv")
     assert repr(rows) == rows_in(tmp_path) == expected
     assert sorted(path.name for path in tmp_path.iterdir()) == ["manifest.json", "rows.csv", "timeline.json"]
 
 
-@pytest.mark.parametrize(
-    "backend", ["loky", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("dask", "ray"))]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("backend", ["loky", "dask", "ray"])
 def test_so_are_they_from_other_processes_which_know_a_users_policy(
     tmp_path: Path, backend: str, mine: Path, expected: str
 ) -> None:
