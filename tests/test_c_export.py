@@ -234,19 +234,14 @@ def test_the_robot_delivers_what_the_simulator_says(name, tmp_path):
 
 
 def test_the_command_writes_the_header(tmp_path, capsys):
-    out = tmp_path / "policy.h"
+    out, agent = tmp_path / "policy.h", REPO / "agents" / "pretrained" / "learned-time.safetensors"
     words = ["even-reject:beta=1.25", "--to", "c", "--out", out, "--capacity", 6, "--value", "saturating:4"]
     assert shown(["export", *words], capsys) == f"wrote {out}\n"
     text = out.read_text(encoding="utf-8")
     assert_equal(text, header(policies.get("even-reject:beta=1.25"), 6, qoi.saturating(4)))
     assert "#define BUFGYM_CAPACITY 6 " in text and "bufgym_parameters[] = {\n    1.25\n}" in text and "@" not in text
-
-
-def test_an_agent_in_a_file_is_exported(tmp_path, capsys):
-    agent = REPO / "agents" / "pretrained" / "learned-time.safetensors"
-    shown(["export", agent, tmp_path / "policy.h", "--to", "c"], capsys)
-    text = (tmp_path / "policy.h").read_text(encoding="utf-8")
-    assert_equal(text, header(policies.get("learned-time"), 16, EXPONENTIAL))
+    shown(["export", agent, out, "--to", "c"], capsys)
+    assert_equal(out.read_text(encoding="utf-8"), header(policies.get("learned-time"), 16, EXPONENTIAL))
 
 
 @pytest.mark.parametrize(

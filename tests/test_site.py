@@ -20,33 +20,28 @@ from website import policies as policy_page
 REPO = Path(__file__).resolve().parent.parent
 
 
-def test_every_environment_has_a_page_with_its_history() -> None:
+def test_every_environment_has_a_page_that_names_all_that_it_observes() -> None:
     assert set(environments.HISTORY) == {*bufgym.ENVIRONMENTS, *bufgym.ON_TASKS, environments.FLEET}
-    for id, history in environments.HISTORY.items():
-        assert id.endswith(history[0].name)
-
-
-@pytest.mark.parametrize("id", bufgym.ENVIRONMENTS)
-def test_an_environments_page_names_all_that_it_observes(id: str) -> None:
-    page = environments.page(id)
-    fields = FIELDS + (TOPIC_FIELDS if "Topics" in id else ())
-    assert all(f"| `{field.name}` | {field.per} " in page for field in fields)
-    assert f"gallery/{environments.slug(id)}.webp" in page
+    assert all(id.endswith(history[0].name) for id, history in environments.HISTORY.items())
+    for id in bufgym.ENVIRONMENTS:
+        page, fields = environments.page(id), FIELDS + (TOPIC_FIELDS if "Topics" in id else ())
+        assert all(f"| `{field.name}` | {field.per} " in page for field in fields)
+        assert f"gallery/{environments.slug(id)}.webp" in page
+    assert "| `t_max` | `400` | " in environments.page("bufgym/Interruption-v0")
 
 
 def test_pages_have_all_of_their_registry(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "| `t_max` | `400` | " in environments.page("bufgym/Interruption-v0")
     assert all(f"| `{name}` |" in suites.page() for name in SUITES)
     assert commands.page().count("```text\nusage: bufgym") == len(re.findall(r"^###? ", commands.page(), re.MULTILINE))
     assert {name for name in policies.names() if name.startswith("learned-")} == set(cards.CARDS)
+    shipped = {suite: numbers for suite, *numbers in cards.board("learned-motion")}
+    assert shipped and all(f"| {suite} | {' | '.join(numbers)} |" in cards.page() for suite, numbers in shipped.items())
     monkeypatch.setattr(policy_page, "picture", lambda policy: "")
     names = [*policies.names(), *policies.names(named_only=True)]
     assert sorted(re.findall(r"^### (.*)$", policy_page.page(), re.MULTILINE)) == sorted(names)
-
-
-def test_a_card_shows_the_numbers_of_the_results() -> None:
-    shipped = {suite: (regret, score) for suite, regret, score in cards.board("learned-motion")}
-    assert shipped and all(f"| {suite} | {' | '.join(numbers)} |" in cards.page() for suite, numbers in shipped.items())
+    listed = set(re.findall(r'<a id="([^"]+)">', papers.page()))
+    for name in policies.names():
+        assert set(re.findall(r"papers\.md#(\w+)", markdown.cited(policies.get(name).source))) <= listed, name
 
 
 def test_a_picture_of_a_policy_shows_what_it_keeps() -> None:
@@ -63,12 +58,6 @@ def test_columns_of_numbers_stand_to_the_right() -> None:
         "| afr | 0.30 [0.28, 0.33] | 5, 10 |",
         "| min\\|gap | 0.52 | none |",
     ]
-
-
-def test_every_paper_that_a_policy_names_is_in_the_list() -> None:
-    listed = set(re.findall(r'<a id="([^"]+)">', papers.page()))
-    for name in policies.names():
-        assert set(re.findall(r"papers\.md#(\w+)", markdown.cited(policies.get(name).source))) <= listed, name
 
 
 @pytest.mark.nightly

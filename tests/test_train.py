@@ -264,6 +264,7 @@ EVOLUTION = {"algo": "evolution", "suite": "interruption-v1"}
         ({"hidden": 257}, "hidden = 257: must lie in 0..256"),
         ({"suite": "no-such"}, "unknown suite 'no-such'"),
         ({"suite": "lte-v1", "capacities": "0"}, "capacities = '0': must be whole numbers >= 1"),
+        ({"suite": "lte-v1", "capacities": "5,5"}, "capacities = '5,5'"),
         ({"suite": "lte-v1", "capacities": "5,x"}, "capacities = '5,x': must be whole numbers such as"),
         ({"suite": "lte-belgium-v1"}, "needs a folder of recordings"),
         ({"suite": "lte-belgium-v1", "data": "no-such"}, "no-such"),
