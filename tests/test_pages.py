@@ -154,7 +154,8 @@ def test_links_and_pictures_lead_somewhere() -> None:
 RUN = {
     r"bufgym bench --policies learned-motion,afr": "--seconds 2 --seeds 1",
     r"bufgym bench --policy-file mine\.py --policies every-other.*": "--seconds 2 --seeds 1",
-    r"bufgym bench (--scenario-file|--workload nav2).*": "--seeds 1",
+    r"bufgym bench --scenario-file .*": "--seeds 1",
+    r"bufgym topics --policy-file .*": "--config examples/client.toml --trace lte-synthetic-0 --seeds 1",
     r"bufgym dataset make --kind mixed .*": "--episodes 3 --option duration_s=2.0",
     r"bufgym dataset make --suite lte-v1 .*": "--episodes 2 --out data",
     r"bufgym topics --config \S+": "--seeds 1 --policies robofleet",
@@ -231,7 +232,8 @@ def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: pytest.Monk
             pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     program = "\n".join([textwrap.dedent(BEFORE.get(block.page, "")), block.text, AFTER.get(block.page, "")])
-    exec(compile(program, block.page, "exec"), {})
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
+    exec(compile(program, block.page, "exec"), {"__name__": "page"})
 
 
 @pytest.mark.nightly
