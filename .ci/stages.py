@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -27,6 +27,8 @@ SKIPPED = 77
 NO_TESTS = 5
 """Exit code of pytest where no test was chosen."""
 MINUTE = 60
+NIGHT_S = 120.0 * MINUTE
+"""A night is over after so long, whatever is left to do."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,7 @@ def carry_out(stage: Stage, log: Path | None) -> Result:
     seconds = time.monotonic() - begun
     tests = remark(stage.report) if stage.report and stage.report.exists() else ""
     if code is None:
-        return Result(stage, "TOO SLOW", seconds, f"killed after {stage.limit_s:.0f} s")
+        return Result(stage, "TOO SLOW", seconds, f"killed after {stage.limit_s:g} s")
     if code == SKIPPED:
         return Result(stage, "skipped", seconds, last_line(log))
     if code == 0 or (stage.report and code == NO_TESTS):
@@ -249,9 +251,11 @@ def main(tier: str, arguments: list[str]) -> int:
         (folder / "coverage").unlink(missing_ok=True)
     stages = {"check": lambda _: check(), "test": test, "nightly": nightly}[tier](arguments)
     results: list[Result] = []
+    begun = time.monotonic()
     for stage in stages:
         log = folder / f"{stage.name.replace(' ', '-')}.log" if goes_on else None
-        result = carry_out(stage, log)
+        left_s = round(max(0.0, NIGHT_S - (time.monotonic() - begun)))
+        result = carry_out(replace(stage, limit_s=min(stage.limit_s, left_s)), log)
         results.append(result)
         if goes_on:
             print(f"{result.outcome} in {result.seconds:.0f} s {result.remark}", flush=True)
