@@ -127,7 +127,6 @@ def nightly(arguments: list[str]) -> list[Stage]:
     """All the rest: what takes too long for a commit, or needs many examples."""
     folder = REPO / "build" / "nightly"
     many = {"HYPOTHESIS_PROFILE": "nightly"}
-    fuzz = {**many, "BUFGYM_FUZZ": "20000", "BUFGYM_FUZZ_SEED": time.strftime("%Y%m%d")}
     cov = {**many, **measured(folder)}
     add = [*COVERAGE, "--cov-append", *arguments]
     servers = ["tests/relay", "tests/live"]
@@ -135,7 +134,7 @@ def nightly(arguments: list[str]) -> list[Stage]:
     # Of the tests for the night, those of kernels alone run uncompiled: clusters, trainings and kills gain nothing.
     plain = ["-m", "kernels or not nightly", *others, *arguments]
     report = [PYTHON, "-m", "coverage", "report", "--skip-covered", "--include=bufgym/*"]
-    mutants = REPO / ".ci" / "mutants"
+    sample = [".ci/mutants", "--sample=150", "--minutes=15", f"--seed={time.strftime('%Y%m%d')}"]
     make = ["make", "--no-print-directory"]
     return [
         *check(),
@@ -144,11 +143,9 @@ def nightly(arguments: list[str]) -> list[Stage]:
         pytest("servers", folder, *servers, *add, environment=cov, limit_s=15 * MINUTE),
         Stage("coverage", report, environment=measured(folder)),
         pytest("all uncompiled", folder, *plain, compiled=False, environment=many, limit_s=40 * MINUTE),
-        pytest("fuzz", folder, "tests/fuzz", *arguments, environment=fuzz, limit_s=15 * MINUTE),
+        pytest("fuzz", folder, "tests/fuzz", *arguments, environment=many, limit_s=15 * MINUTE),
         Stage("claims", [*make, "claims"], limit_s=15 * MINUTE),
-        Stage(
-            "mutants", [PYTHON, str(mutants)], 20 * MINUTE, unless="" if mutants.exists() else ".ci/mutants is not here"
-        ),
+        Stage("mutants", [PYTHON, *sample], limit_s=25 * MINUTE),
         Stage("dist", [*make, "dist"], limit_s=5 * MINUTE),
         Stage("sdist", [PYTHON, ".ci/sdist.py"], limit_s=10 * MINUTE),
         *(Stage(f"install {python}", [".ci/install-matrix", python], limit_s=10 * MINUTE) for python in PYTHONS),
