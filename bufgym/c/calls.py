@@ -88,7 +88,7 @@ def _compiled_record() -> Any:
     arrives, departs, _, _ = (numba.types.FunctionType(signature) for signature in signatures())
     memory = numba.types.Array(numba.types.float64, 2, "C")
     calls = numba.types.Array(numba.from_dtype(CALL), 1, "C")
-    signature = numba.types.int64(batch_type(), memory, arrives, departs, numba.types.boolean, calls)
+    signature = numba.types.int64(batch_type(several=False), memory, arrives, departs, numba.types.boolean, calls)
     return compile_for(signature, _record)
 
 

@@ -285,18 +285,18 @@ def _compiled(what: str, name: str, kind: str, function: Callable[..., float]) -
 
 
 @functools.cache
-def _writer(per: str) -> Any:
+def _writer(per: str, several: bool) -> Any:
     types = _types()
     function = cast(Any, numba.types).FunctionType(types[per])
-    signature = numba.types.void(batch_type(), function, numba.types.int64, types["flat"])
+    signature = numba.types.void(batch_type(several), function, numba.types.int64, types["flat"])
     return compile_for(signature, write_slots if per == "slot" else write_context)
 
 
 @functools.cache
-def _term_writer() -> Any:
+def _term_writer(several: bool) -> Any:
     types = _types()
     signature = numba.types.void(
-        batch_type(),
+        batch_type(several),
         types["marks"],
         types["flags"],
         types["table"],
@@ -309,10 +309,14 @@ def _term_writer() -> Any:
 
 
 def _compiled_field(field: OwnField) -> Callable[..., None]:
-    function, write = _compiled("field", field.name, field.per, field.function), _writer(field.per)
-    return lambda batch, first, flat: write(batch, function, first, flat)
+    function = _compiled("field", field.name, field.per, field.function)
+    return lambda batch, first, flat: _writer(field.per, bool(batch.several))(batch, function, first, flat)
 
 
 def _compiled_term(term: OwnTerm) -> Callable[..., None]:
-    function, write = _compiled("reward term", term.name, "term", term.function), _term_writer()
-    return lambda batch, marks, ended, memory, *rest: write(batch, marks, ended, memory, function, *rest)
+    function = _compiled("reward term", term.name, "term", term.function)
+
+    def write(batch: Batch, marks: Any, ended: Any, memory: Any, *rest: Any) -> None:
+        _term_writer(bool(batch.several))(batch, marks, ended, memory, function, *rest)
+
+    return write

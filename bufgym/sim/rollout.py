@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for, interruptible
+from bufgym.kernel import compile_for, interruptible, kernel, local
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
 from bufgym.policies.registry import Policy, runs_compiled, signatures
@@ -28,7 +28,8 @@ _SHORT = 200_000
 """Arrivals times numbers that a policy reads at each: a rollout below that takes no more than some milliseconds."""
 
 
-def rollout(
+@kernel
+def _rollout(
     batch: Batch,
     shares: Shares | None,
     memory: NDArray[np.float64],
@@ -63,16 +64,31 @@ def rollout(
         credit(batch, i, FOREVER)
 
 
+def rollout(
+    batch: Batch,
+    shares: Shares | None,
+    memory: NDArray[np.float64],
+    on_arrival: Any,
+    on_departure: Any,
+    on_dequeue: Any,
+    on_send: Any,
+    hears_departures: bool,
+) -> None:
+    """``_rollout`` for callers in Python."""
+    _rollout(local(batch), shares, memory, on_arrival, on_departure, on_dequeue, on_send, hears_departures)
+
+
 @functools.cache
-def compiled_rollout(shared: bool) -> Any:
+def compiled_rollout(shared: bool, several: bool) -> Any:
     """``rollout`` compiled once for every policy (policies arrive as values of one function type).
 
-    ``shared``: for the cells of a shared link; else for senders with links of their own.
+    ``shared``: for the cells of a shared link; else for senders with links of their own. ``several``: for several
+    topics; else for one queue.
     """
     functions = tuple(numba.types.FunctionType(signature) for signature in signatures())
     memory = numba.types.Array(numba.types.float64, 2, "C")
     shares = shares_type() if shared else numba.types.none
-    return compile_for(numba.types.void(batch_type(), shares, memory, *functions, numba.types.boolean), rollout)
+    return compile_for(numba.types.void(batch_type(several), shares, memory, *functions, numba.types.boolean), rollout)
 
 
 _view = getattr(view, "py_func", view)
@@ -139,7 +155,7 @@ def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], p
     if not runs_compiled(policy):
         python_rollout(batch, shares, memory, policy)
         return
-    compiled = compiled_rollout(shares is not None)
+    compiled = compiled_rollout(shares is not None, bool(batch.several))
     arguments = batch, shares, memory, *policy.compiled, policy.hears_departures
     # What it may do at each arrival grows with what it remembers and reads.
     if batch.senders["arrivals"].sum() * (memory.shape[1] + len(batch.parameters)) < _SHORT:
