@@ -185,6 +185,10 @@ def six(): pass
 '''
 
 
+def test_the_sdist_runs_tests_that_there_are() -> None:
+    assert all((REPO / name).exists() for name in script("sdist").TESTS)
+
+
 def test_functions_that_are_compiled_are_found() -> None:
     assert [found.name for found in script("kernel_lines").kernels(KERNELS)] == ["one", "two", "three", "six"]
 
