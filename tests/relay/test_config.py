@@ -18,7 +18,8 @@ ANY_EMAIL = '[[rules]]\nemail = "a@x.org"\n'
 
 def test_the_example_says_what_the_defaults_are(capsys: pytest.CaptureFixture[str]) -> None:
     example, default = load(REPO / "examples/relay.toml"), Config()
-    for name in "host port no_drop policies robofleet origins limits store audit recording".split():
+    names = ["host", "port", "no_drop", "policies", "robofleet", "origins", "limits", "store", "audit", "recording"]
+    for name in names:
         assert getattr(example, name) == getattr(default, name), name
     assert example.folder == REPO / "examples" / "relay"
     assert len(example.rules) == 5 and default.rules == ()

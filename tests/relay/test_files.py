@@ -34,9 +34,9 @@ async def test_what_a_rule_allows_is_recorded(tmp_path: Path) -> None:
     assert bag.size_bytes.tolist() == [*range(1_000, 1_040), 2]
 
 
-def recorder(folder: Path, payloads: list[bytes], rotation: Rotation = Rotation(bytes=10**6)) -> Recorder:
+def recorder(folder: Path, payloads: list[bytes], file_bytes: int = 10**6) -> Recorder:
     """One that has written these, of encoding json and jpeg in turn, and has not been closed."""
-    one = Recorder.of(settings(folder=folder, rules=(RECORD,), recording=rotation))
+    one = Recorder.of(settings(folder=folder, rules=(RECORD,), recording=Rotation(bytes=file_bytes, files=3)))
     assert one is not None
     for k, payload in enumerate(payloads):
         one(Message(f"/robots/{'ab'[k % 2]}", payload, ("json", "jpeg")[k % 2], seq=k))
@@ -44,7 +44,7 @@ def recorder(folder: Path, payloads: list[bytes], rotation: Rotation = Rotation(
 
 
 def test_recordings_take_turns(tmp_path: Path) -> None:
-    recorder(tmp_path, [bytes(1_000)] * 50, Rotation(bytes=10_000, files=3)).close()
+    recorder(tmp_path, [bytes(1_000)] * 50, 10_000).close()
     files = sorted((tmp_path / FOLDER).glob("*.mcap"))
     assert len(files) == 3 and all(file.stat().st_size < 13_000 for file in files)
     assert sum(len(bags.read_bag(file).size_bytes) for file in files) < 50
