@@ -10,10 +10,10 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from loop_cases import beside, until
 from relay_cases import relay, settings
 
 from bufgym.errors import BufgymError
@@ -35,16 +35,19 @@ class Node:
 
     def __init__(self) -> None:
         self.heard: list[str] = []
-        self.publish: Callable[[str], None]
 
-    def _take(self, text: Any) -> None:
+    def hear(self, text: Any) -> None:
         self.heard.append(text.data)
 
-    @staticmethod
-    def _posed(odometry: Any) -> Any:
-        odometry.header.frame_id = "map"
+    def publish(self, text: str) -> None:
+        from nav_msgs.msg import Odometry
+        from std_msgs.msg import String
+
+        said, odometry = String(), Odometry()
+        said.data, odometry.header.frame_id = text, "map"
         odometry.pose.pose.position.x, odometry.pose.pose.orientation.w = 3.0, 1.0
-        return odometry
+        self.texts.publish(said)
+        self.poses.publish(odometry)
 
 
 class Node1(Node):
@@ -61,14 +64,9 @@ class Node1(Node):
         from std_msgs.msg import String
 
         rospy.init_node("node", disable_signals=True, disable_rosout=True)
-        texts, poses = rospy.Publisher("chatter", String, queue_size=9), rospy.Publisher("odom", Odometry, queue_size=9)
-        rospy.Subscriber("speech", String, self._take)
-
-        def publish(text: str) -> None:
-            texts.publish(text)
-            poses.publish(self._posed(Odometry()))
-
-        self.publish = publish
+        self.texts = rospy.Publisher("chatter", String, queue_size=9)
+        self.poses = rospy.Publisher("odom", Odometry, queue_size=9)
+        rospy.Subscriber("speech", String, self.hear)
 
 
 class Node2(Node):
@@ -81,15 +79,9 @@ class Node2(Node):
 
         rclpy.init(args=[])
         node = rclpy.create_node("node")
-        texts, poses = node.create_publisher(String, "chatter", 9), node.create_publisher(Odometry, "odom", 9)
-        node.create_subscription(String, "speech", self._take, 9)
+        self.texts, self.poses = node.create_publisher(String, "chatter", 9), node.create_publisher(Odometry, "odom", 9)
+        node.create_subscription(String, "speech", self.hear, 9)
         threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
-
-        def publish(text: str) -> None:
-            texts.publish(String(data=text))
-            poses.publish(self._posed(Odometry()))
-
-        self.publish = publish
 
 
 async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
@@ -98,9 +90,6 @@ async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
     came: list[Message] = []
     location: list[Any] = []
     sent: list[str] = []
-
-    def take_status(message: Message) -> None:
-        location.append(json.loads(bytes(message.payload))["location"])
 
     async def publish() -> None:
         while True:
@@ -124,24 +113,19 @@ async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
         robot = await asyncio.create_subprocess_exec(sys.executable, "-m", "bufgym", *words, stdout=sys.stderr)
         viewer = Session(url, "viewer", say=lambda text: print(text, file=sys.stderr))
         viewer.subscribe("^/robots/r/chatter$", came.append)
-        viewer.subscribe("^/robots/r/status$", take_status)
-        tasks = [asyncio.create_task(work) for work in (viewer.run(), publish())]
+        viewer.subscribe("^/robots/r/status$", lambda one: location.append(json.loads(bytes(one.payload))["location"]))
         try:
-            while len(came) < 10 or not any(location):
-                await asyncio.sleep(0.01)
-            # What is no message, of no type that is here, or not for this robot's ROS, stops nothing.
-            await command("/robots/r/to/speech", b"\0\1\0\0\xff\xff\xff\xff", TEXT)
-            await command("/robots/r/to/speech", b"", "no_such_msgs/msg/B")
-            await command("/robots/r/to/private", cdr("secret"), TEXT)
-            for text in COMMANDS:
-                await command("/robots/r/to/speech", cdr(text), TEXT)
-            while len(node.heard) < len(COMMANDS):
-                await asyncio.sleep(0.01)
-            assert robot.returncode is None
+            async with beside(viewer.run(), publish()):
+                await until(lambda: len(came) >= 10 and any(location))
+                # What is no message, of no type that is here, or not for this robot's ROS, stops nothing.
+                await command("/robots/r/to/speech", b"\0\1\0\0\xff\xff\xff\xff", TEXT)
+                await command("/robots/r/to/speech", b"", "no_such_msgs/msg/B")
+                await command("/robots/r/to/private", cdr("secret"), TEXT)
+                for text in COMMANDS:
+                    await command("/robots/r/to/speech", cdr(text), TEXT)
+                await until(lambda: len(node.heard) >= len(COMMANDS))
+                assert robot.returncode is None
         finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
             robot.terminate()
             await robot.wait()
     return {
@@ -155,5 +139,5 @@ async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
 if __name__ == "__main__":
     version, folder = sys.argv[1:]
     node = {"1": Node1, "2": Node2}[version](folder)
-    print(json.dumps(asyncio.run(asyncio.wait_for(story(node, version, Path(folder)), 100))), flush=True)
+    print(json.dumps(asyncio.run(story(node, version, Path(folder)))), flush=True)
     os._exit(0)
