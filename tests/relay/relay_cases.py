@@ -6,7 +6,9 @@ import asyncio
 import contextlib
 import socket
 import ssl
+import sys
 from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -133,6 +135,23 @@ async def relay(config: Config | None = None) -> AsyncIterator[Server]:
         yield server
     finally:
         await server.close()
+
+
+@contextlib.asynccontextmanager
+async def process(port: int, folder: Path, table: str = "") -> AsyncIterator[Any]:
+    """A relay in a process of its own; it is killed in the end, without warning."""
+    config = folder / "relay.toml"
+    rule = '[[rules]]\naddress = "127.0.0.1"\nsend = true\nreceive = true\n'
+    config.write_text(f'port = {port}\nfolder = "held"\npolicies = ["drop-oldest"]\n{rule}{table}')
+    words = ["-um", "bufgym", "relay", "serve", "--config", str(config)]
+    one = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=asyncio.subprocess.PIPE)
+    try:
+        assert one.stdout is not None and b"http" in await one.stdout.readline()
+        yield one
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            one.kill()
+        await one.wait()
 
 
 class Corner:

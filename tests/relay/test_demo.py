@@ -69,17 +69,6 @@ async def test_the_uncompiled_robots_are_a_process_as_long_as_the_block(
     assert told.read_text() == "1 -m bufgym relay demo --robots 1\nended\n"
 
 
-@pytest.mark.nightly
-async def test_uncompiled_robots_are_seen_until_the_compiled_take_over() -> None:
-    port = free_port("127.0.0.1")
-    topics: asyncio.Queue[str] = asyncio.Queue()
-    viewer = Session(f"ws://127.0.0.1:{port}", "viewer")
-    viewer.subscribe("^/robots/", lambda message: topics.put_nowait(message.topic))
-    async with demo.uncompiled(["--robots", "1", "--port", str(port), "--no-browser"]), beside(viewer.run()):
-        assert (await topics.get()).startswith("/robots/robot-1/")
-    socket.create_server(("127.0.0.1", port)).close()  # the place is free
-
-
 UNTIL_KILLED = """
 import asyncio, sys
 from bufgym.relay import demo
@@ -94,19 +83,23 @@ asyncio.run(show())
 
 @pytest.mark.nightly
 async def test_who_is_told_to_end_leaves_no_robots_behind() -> None:
-    port = free_port("127.0.0.1")
+    """Robots are seen until the program that shows them is told to end; then their place is free."""
+    port, topics = free_port("127.0.0.1"), asyncio.Queue[str]()
+    process = await asyncio.create_subprocess_exec(sys.executable, "-c", UNTIL_KILLED, str(port))
+    viewer = Session(f"ws://127.0.0.1:{port}", "viewer")
+    viewer.subscribe("^/robots/", lambda message: topics.put_nowait(message.topic))
+    async with beside(viewer.run()):
+        assert (await topics.get()).startswith("/robots/robot-1/")
+        process.terminate()
+        assert await process.wait() == -signal.SIGTERM
 
-    def there() -> bool:
+    def free() -> bool:
         with contextlib.suppress(OSError):
-            socket.create_connection(("127.0.0.1", port)).close()
+            socket.create_server(("127.0.0.1", port)).close()
             return True
         return False
 
-    process = await asyncio.create_subprocess_exec(sys.executable, "-c", UNTIL_KILLED, str(port))
-    await until(there)
-    process.terminate()
-    assert await process.wait() == -signal.SIGTERM
-    await until(lambda: not there())
+    await until(free)
 
 
 def test_the_command_shows_them_while_another_process_compiles(
@@ -148,13 +141,6 @@ def test_what_is_not_kept_another_process_compiles(monkeypatch: pytest.MonkeyPat
     with pytest.raises(BufgymError, match="policy afr: stopped while it was compiled"):
         policies.compiled(registry.get("afr"))
     assert asked == 2 * [[sys.executable, "-m", "bufgym.relay.policies", "afr"]]
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", ["drop-oldest", "my-own"])
-def test_that_process_knows_what_comes_with_bufgym(name: str) -> None:
-    done = subprocess.run([sys.executable, "-m", "bufgym.relay.policies", name], capture_output=True, check=False)
-    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def test_the_commands_name_what_is_wrong(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

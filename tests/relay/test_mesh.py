@@ -7,14 +7,13 @@ import contextlib
 import ipaddress
 import itertools
 import json
-import sys
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from relay_cases import Client, client, nothing, relay, settings
+from relay_cases import Client, client, nothing, process, relay, settings
 
 from bufgym.live.sockets import free_port
 from bufgym.relay.config import Mesh, Rule
@@ -203,40 +202,23 @@ async def test_with_certificates_only_relays_of_the_authority_share(tmp_path: Pa
 
 
 @pytest.mark.nightly
-async def test_a_killed_relay_takes_nothing_but_its_own() -> None:
+async def test_a_killed_relay_takes_nothing_but_its_own(tmp_path: Path) -> None:
     """Robots at the first, a viewer at the third; the second, which introduced them to each other, is killed."""
-    second, odometry = address(), "/robots/a/odom"
-    process = await asyncio.create_subprocess_exec(sys.executable, __file__, second, stdout=asyncio.subprocess.PIPE)
-    assert process.stdout is not None
-    try:
-        port = int(await process.stdout.readline())
-        async with (
-            meshed(address(), second) as a,
-            meshed(address(), second) as c,
-            client(a.port, name="robot") as robot,
-            client(c.port) as viewer,
-            client(port) as other,
-        ):
-            await viewer.subscribe("odom$", policy="drop-oldest", capacity=100)
+    second, port, odometry = address(), free_port("127.0.0.1"), "/robots/a/odom"
+    async with (
+        process(port, tmp_path, f'[mesh]\nlisten = "{second}"\n') as killed,
+        meshed(address(), second) as a,
+        meshed(address(), second) as c,
+        client(a.port, name="robot") as robot,
+        client(c.port) as viewer,
+    ):
+        async with client(port) as other:
+            await viewer.subscribe("odom$", capacity=100)
             await other.subscribe("odom$")
             await found(odometry, robot, viewer, other)
-            for k in range(40):
-                if k == 10:
-                    process.kill()
-                    await process.wait()
-                await robot.put(odometry, str(k).encode(), seq=k)
-                assert (await viewer.next()).seq == k
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
-
-
-async def _alone(listen: str) -> None:
-    async with meshed(listen) as server:
-        print(server.port, flush=True)
-        await asyncio.Event().wait()
-
-
-if __name__ == "__main__":
-    asyncio.run(_alone(sys.argv[1]))
+        for k in range(40):
+            if k == 10:
+                killed.kill()
+                await killed.wait()
+            await robot.put(odometry, str(k).encode(), seq=k)
+            assert (await viewer.next()).seq == k

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
+import json
 import os
 import random
+import re
 import shutil
-import sys
-from collections.abc import AsyncIterator
+import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 from loop_cases import beside, until
-from relay_cases import Client, Corner, client, nothing, relay, settings
-from websockets.exceptions import WebSocketException
+from relay_cases import Corner, client, nothing, process, relay, settings
 
+from bufgym.errors import BufgymError
 from bufgym.live.sockets import free_port
+from bufgym.relay import session
 from bufgym.relay.config import Rule, Store
-from bufgym.relay.wire import Message
+from bufgym.relay.session import Session
 
 CONFIG = settings(store=Store(window=2, messages=4))
 KILLS = int(os.environ.get("BUFGYM_KILLS", "2"))
@@ -29,7 +31,7 @@ COMMAND = "/robots/a/command"
 async def test_acks_end_to_end(corner: Corner) -> None:
     """The relay acks what it holds; when all receivers have acked, the sender is told."""
     async with corner.client() as operator, corner.client(session="a") as robot:
-        (session,) = [each for key, each in corner.hub.store.sessions.items() if key == (corner.address, "a")]
+        held = corner.hub.store.sessions[corner.address, "a"]
         await operator.command(1, corner.command)
         refused = await operator.next()
         assert (refused["code"], refused["seq"]) == ("no_receiver", 1)
@@ -37,10 +39,10 @@ async def test_acks_end_to_end(corner: Corner) -> None:
         await operator.command(1, corner.command)  # a refused number was not used
         assert await operator.next() == {"op": "ack", "seq": 1}
         await robot.came(1, b"1")
-        assert session.held == 1
+        assert held.held == 1
         await robot.say("ack", seq=1)
         assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 0}
-        assert session.held == 0
+        assert held.held == 0
         await operator.command(3, corner.command)
         assert (await operator.next())["code"] == "out_of_order"
         await operator.command(1, corner.command)  # it was taken: it is acked again, and not sent again
@@ -183,101 +185,40 @@ async def test_what_is_acked_is_on_the_disk(tmp_path: Path) -> None:
 # --- the relay is killed ---------------------------------------------------------------------------------------------
 
 
-class End:
-    """A client that connects again and again, in one session."""
-
-    def __init__(self, port: int, session: str) -> None:
-        self.port, self.session = port, session
-        self.received = self.acked = 0
-        self.back_s: list[float] = []
-
-    async def run(self) -> None:
-        loop, lost_s = asyncio.get_running_loop(), None
-        while True:
-            with contextlib.suppress(OSError, WebSocketException, TimeoutError):
-                hello = {"session": self.session, "received": self.received, "acked": self.acked}
-                async with client(self.port, **hello) as one:
-                    if lost_s is not None:
-                        self.back_s.append(loop.time() - lost_s)
-                    lost_s = None
-                    await self.talk(one)
-            lost_s = lost_s or loop.time()
-            await asyncio.sleep(0.05)
-
-    async def talk(self, one: Client) -> None:
-        raise NotImplementedError
-
-
-class Sender(End):
-    """Five commands unanswered at most, numbered from 1."""
-
-    async def talk(self, one: Client) -> None:
-        self.acked = sent = one.welcome["received"]
-        while True:
-            while sent < self.acked + 5:
-                sent += 1
-                await one.command(sent, COMMAND)
-            said = await one.next()
-            if said["op"] == "ack":
-                self.acked = max(self.acked, said["seq"])
-            elif said["op"] == "refused":
-                assert said["code"] in ("no_receiver", "store_full", "out_of_order"), said
-                sent = self.acked
-                await asyncio.sleep(0.01)
-
-
-class Receiver(End):
-    def __init__(self, port: int, session: str) -> None:
-        super().__init__(port, session)
-        self.took: list[int] = []
-
-    async def talk(self, one: Client) -> None:
-        await one.say("subscribe", id="c", topic="command$", durable=True)
-        while True:
-            message = await one.next()
-            if isinstance(message, Message) and message.seq > self.received:
-                self.received = message.seq
-                self.took.append(int(bytes(message.payload)))
-                await one.say("ack", seq=message.seq)
-
-
-@contextlib.asynccontextmanager
-async def process(port: int, folder: Path) -> AsyncIterator[Any]:
-    """A relay in a process of its own; it is killed in the end, without warning."""
-    config = folder / "relay.toml"
-    config.write_text(
-        f'port = {port}\nfolder = "held"\npolicies = ["skip-pending"]\n'
-        '[[rules]]\naddress = "127.0.0.1"\nsend = true\nreceive = true\n'
-    )
-    words = ["-um", "bufgym", "relay", "serve", "--config", str(config)]
-    one = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=asyncio.subprocess.PIPE)
-    try:
-        assert one.stdout is not None and b"http" in await one.stdout.readline()
-        yield one
-    finally:
-        one.kill()
-        await one.wait()
-
-
 @pytest.mark.nightly
-async def test_exactly_once_though_the_relay_is_killed(tmp_path: Path) -> None:
-    """Under load, again and again. ``BUFGYM_KILLS`` says how often."""
-    port, uniform = free_port("127.0.0.1"), random.Random(0)
-    receiver = Receiver(port, "robot")
-    senders = [Sender(port, f"operator-{k}") for k in range(2)]
-    async with beside(receiver.run()), contextlib.AsyncExitStack() as stack:
-        async with beside(*(sender.run() for sender in senders)):
+async def test_exactly_once_though_the_relay_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two senders with five commands unanswered each; the relay is killed under load, ``BUFGYM_KILLS`` times."""
+    monkeypatch.setattr(session, "RETRY_S", 0.05)
+    port, uniform, took, back_s = free_port("127.0.0.1"), random.Random(0), list[list[int]](), list[float]()
+    url = f"ws://127.0.0.1:{port}"
+    receiver = Session(url, "robot")
+    receiver.subscribe("command$", lambda one: took.append(json.loads(bytes(one.payload))), durable=True)
+    senders, acked = [Session(url, f"operator-{k}") for k in range(2)], set[tuple[int, int]]()
+
+    async def send(k: int, first: int) -> None:
+        """Every fifth number; one that nobody receives yet is sent again."""
+        for number in itertools.count(first, 5):
+            while (k, number) not in acked:
+                try:
+                    await senders[k].command(COMMAND, [k, number])
+                    acked.add((k, number))
+                except BufgymError as error:
+                    assert re.search("no_receiver|store_full", str(error))
+                    await asyncio.sleep(0.01)
+
+    async with beside(*(one.run() for one in (receiver, *senders))), contextlib.AsyncExitStack() as stack:
+        async with beside(*(send(k, first) for k in range(2) for first in range(5))):
             for kill in range(KILLS + 1):
+                began_s = time.monotonic()
                 await stack.enter_async_context(process(port, tmp_path))
-                taken = len(receiver.took)
-                await until(lambda taken=taken: len(receiver.took) >= taken + 100)
+                await receiver.ready.wait()
+                back_s.append(time.monotonic() - began_s)
+                taken = len(took)
+                await until(lambda taken=taken: len(took) >= taken + 100)
                 if kill < KILLS:
                     await asyncio.sleep(uniform.uniform(0.0, 0.3))
                     await stack.aclose()
         # What was acked to the senders arrives, and the rest of what they sent may.
-        await until(lambda: len(receiver.took) >= sum(sender.acked for sender in senders))
-    for k in range(1, max(receiver.took) + 1):
-        times = sum(k <= sender.acked for sender in senders)
-        assert times <= receiver.took.count(k) <= len(senders), k
-    print(f"{len(receiver.took)} commands, {KILLS} kills, back in {[round(s, 2) for s in receiver.back_s]} s")
-    assert len(receiver.back_s) >= KILLS
+        await until(lambda: acked <= {(k, number) for k, number in took})
+    assert len({(k, number) for k, number in took}) == len(took), "one came twice"
+    print(f"{len(took)} commands, {KILLS} kills, the receiver is back after {[round(s, 2) for s in back_s[1:]]} s")
