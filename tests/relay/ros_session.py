@@ -1,4 +1,4 @@
-"""A robot of ROS at a relay, for test_relay_ros.py: prints what came each way. Needs rospy and rosmaster, or rclpy.
+"""A robot of ROS at a relay, for test_robot.py: prints what came each way. Needs rospy and rosmaster, or rclpy.
 
 node --/chatter, /odom--> ``bufgym relay robot`` --> relay --> viewer; viewer --/robots/r/to/speech--> node
 """
@@ -30,71 +30,55 @@ def cdr(text: str) -> bytes:
     return b"\0\1\0\0" + (len(text) + 1).to_bytes(4, "little") + text.encode() + b"\0"
 
 
-class Node:
-    """What both versions have: it publishes texts and one pose, and hears."""
+def node_1(folder: str, hear: Any) -> list[Any]:
+    """A node of ROS 1 with its master: its publishers of texts and of poses."""
+    from rosmaster.master import Master
 
-    def __init__(self) -> None:
-        self.heard: list[str] = []
+    master = Master(0)
+    master.start()
+    port = master.master_node.server.socket.getsockname()[1]
+    os.environ.update(ROS_MASTER_URI=f"http://127.0.0.1:{port}", ROS_IP="127.0.0.1", ROS_LOG_DIR=folder)
+    import rospy
+    from nav_msgs.msg import Odometry
+    from std_msgs.msg import String
 
-    def hear(self, text: Any) -> None:
-        self.heard.append(text.data)
-
-    def publish(self, text: str) -> None:
-        from nav_msgs.msg import Odometry
-        from std_msgs.msg import String
-
-        said, odometry = String(), Odometry()
-        said.data, odometry.header.frame_id = text, "map"
-        odometry.pose.pose.position.x, odometry.pose.pose.orientation.w = 3.0, 1.0
-        self.texts.publish(said)
-        self.poses.publish(odometry)
+    rospy.init_node("node", disable_signals=True, disable_rosout=True)
+    rospy.Subscriber("speech", String, hear)
+    return [rospy.Publisher(topic, kind, queue_size=9) for topic, kind in (("chatter", String), ("odom", Odometry))]
 
 
-class Node1(Node):
-    def __init__(self, folder: str) -> None:
-        super().__init__()
-        from rosmaster.master import Master
+def node_2(folder: str, hear: Any) -> list[Any]:
+    """The same of ROS 2, in a domain of its own: two may run at a time."""
+    os.environ["ROS_DOMAIN_ID"] = str(20 + os.getpid() % 80)
+    import rclpy
+    from nav_msgs.msg import Odometry
+    from std_msgs.msg import String
 
-        master = Master(0)
-        master.start()
-        port = master.master_node.server.socket.getsockname()[1]
-        os.environ.update(ROS_MASTER_URI=f"http://127.0.0.1:{port}", ROS_IP="127.0.0.1", ROS_LOG_DIR=folder)
-        import rospy
-        from nav_msgs.msg import Odometry
-        from std_msgs.msg import String
-
-        rospy.init_node("node", disable_signals=True, disable_rosout=True)
-        self.texts = rospy.Publisher("chatter", String, queue_size=9)
-        self.poses = rospy.Publisher("odom", Odometry, queue_size=9)
-        rospy.Subscriber("speech", String, self.hear)
+    rclpy.init(args=[])
+    node = rclpy.create_node("node")
+    node.create_subscription(String, "speech", hear, 9)
+    threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
+    return [node.create_publisher(kind, topic, 9) for topic, kind in (("chatter", String), ("odom", Odometry))]
 
 
-class Node2(Node):
-    def __init__(self, folder: str) -> None:
-        super().__init__()
-        os.environ["ROS_DOMAIN_ID"] = str(20 + os.getpid() % 80)  # another for each run: two may run at a time
-        import rclpy
-        from nav_msgs.msg import Odometry
-        from std_msgs.msg import String
-
-        rclpy.init(args=[])
-        node = rclpy.create_node("node")
-        self.texts, self.poses = node.create_publisher(String, "chatter", 9), node.create_publisher(Odometry, "odom", 9)
-        node.create_subscription(String, "speech", self.hear, 9)
-        threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
-
-
-async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
+async def story(version: str, folder: Path) -> dict[str, Any]:
     config = folder / "client.toml"
     config.write_text(CONFIG)
-    came: list[Message] = []
-    location: list[Any] = []
-    sent: list[str] = []
+    came, location, sent, heard = list[Message](), list[Any](), list[str](), list[str]()
+    make = {"1": node_1, "2": node_2}[version]
+    texts, poses = make(str(folder), lambda text: heard.append(text.data))
 
     async def publish() -> None:
+        from nav_msgs.msg import Odometry
+        from std_msgs.msg import String
+
+        text, pose = String(), Odometry()
+        pose.header.frame_id, pose.pose.pose.position.x, pose.pose.pose.orientation.w = "map", 3.0, 1.0
         while True:
-            sent.append(f"text {len(sent):06}")  # 12 bytes with the 0: DDS fills up to a multiple of 4
-            node.publish(sent[-1])
+            text.data = f"text {len(sent):06}"  # 12 bytes with the 0: DDS fills up to a multiple of 4
+            sent.append(text.data)
+            texts.publish(text)
+            poses.publish(pose)
             await asyncio.sleep(0.05)
 
     async def command(*what: Any) -> None:
@@ -123,7 +107,7 @@ async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
                 await command("/robots/r/to/private", cdr("secret"), TEXT)
                 for text in COMMANDS:
                     await command("/robots/r/to/speech", cdr(text), TEXT)
-                await until(lambda: len(node.heard) >= len(COMMANDS))
+                await until(lambda: len(heard) >= len(COMMANDS))
                 assert robot.returncode is None
         finally:
             robot.terminate()
@@ -131,13 +115,11 @@ async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
     return {
         "exact": all(bytes(message.payload) in {cdr(text) for text in sent} for message in came),
         "kinds": sorted({(message.encoding, message.type) for message in came}),
-        "heard": node.heard,
+        "heard": heard,
         "location": next(filter(None, location)),
     }
 
 
 if __name__ == "__main__":
-    version, folder = sys.argv[1:]
-    node = {"1": Node1, "2": Node2}[version](folder)
-    print(json.dumps(asyncio.run(story(node, version, Path(folder)))), flush=True)
+    print(json.dumps(asyncio.run(story(sys.argv[1], Path(sys.argv[2])))), flush=True)
     os._exit(0)
