@@ -85,16 +85,6 @@ def test_no_program_outlives_a_parent_that_was_killed(begins_after_s: str) -> No
         pytest.fail("it is still there")
 
 
-def test_a_program_ends_with_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Asked once a second whose child it is."""
-    slept: list[float] = []
-    monkeypatch.setattr(live.time, "sleep", slept.append)
-    monkeypatch.setattr(live.os, "getppid", lambda: 7 if len(slept) < 3 else 1)
-    monkeypatch.setattr(live.os, "_exit", lambda code: slept.append(-code))
-    live._end_with(7)
-    assert slept == [1.0, 1.0, 1.0, -1]
-
-
 def test_each_frame_comes_in_time_after_a_pose_that_says_its_x(monkeypatch: pytest.MonkeyPatch) -> None:
     """A pose 10 ms before its frame, or at once where that has passed; a call takes 1 ms."""
     odometry, done, now_s = Odometry(), list[tuple[Any, ...]](), 100.0

@@ -21,12 +21,10 @@ from bufgym.live import PolicyQueue, replay, shaped
 from bufgym.live.log import Record
 from bufgym.live.runs import Run, orders, save, table
 from bufgym.live.shaped import ShapedLink
-from bufgym.live.validate import play, validate
+from bufgym.live.validate import over, play, validate
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, Uplink, messages
-from bufgym.sim import run
-from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
 
 V = qoi.exponential(0.618)
@@ -44,38 +42,18 @@ async def live(episode: Episode, policy: str = "afr", capacity: int = 8, **setti
     return await play(policies.get(policy), episode, capacity, V, **{"speed": 2.0, **settings})
 
 
-@compiled
-@pytest.mark.nightly
-@pytest.mark.parametrize("transport", OVER_TCP)
-async def test_on_sockets_as_in_the_simulator(transport: str, request: pytest.FixtureRequest) -> None:
-    """Wide margins: on a quiet machine counts agree within 1 and QoI within 0.5 %."""
-    records: list[Record] = []
-    came = await live(fade(), transport=transport, port=meeting_port(transport, request), log=records)
-    simulated = outcome(run(policies.get("afr"), [fade()], 8, V), 0)
-    assert in_order(came)
-    assert [message.seq for message in came] == sorted({message.seq for message in came})
-    assert len(came) == pytest.approx(simulated.delivered, rel=0.15)
-    assert V.information([message.x for message in came]) == pytest.approx(simulated.qoi, rel=0.08)
-    told(records, came)
-
-
-def told(records: list[Record], came: list[Any]) -> None:
-    """The log tells exactly what came, and the simulator makes the same of it."""
-    played = replay(records)
-    assert played.differences == ()
-    assert played.outcome.delivered == len(came)
-    assert played.outcome.qoi == V.information([message.x for message in came])
-
-
 @pytest.mark.parametrize("transport", OVER_TCP)
 async def test_the_log_tells_what_came(transport: str, request: pytest.FixtureRequest) -> None:
-    """Half a second of frames of 20 kB, at four times the speed, with three messages in the socket at a time."""
+    """And the simulator makes the same of it. Half a second at four times the speed, three messages on their way."""
     slow, records = fade(15, size_bytes=20_000), list[Record]()
     episode = Episode(slow.arrivals, slow.link, window=3)
     port = meeting_port(transport, request)
     came = await live(episode, transport=transport, port=port, log=records, speed=4.0)
     assert in_order(came)
-    told(records, came)
+    played = replay(records)
+    assert played.differences == ()
+    assert played.outcome.delivered == len(came)
+    assert played.outcome.qoi == V.information([message.x for message in came])
 
 
 async def test_what_comes_too_late_is_not_awaited() -> None:
@@ -143,13 +121,16 @@ async def test_nothing_is_compiled_while_the_episodes_time_runs(monkeypatch: pyt
 
 @compiled
 @pytest.mark.nightly
-def test_validation_holds_both_side_by_side() -> None:
-    scenario = Uplink(traces=(fade().link.trace,), duration_s=3.0, random_offset=False, propagation_us=0, value=V)
+def test_live_as_in_the_simulator() -> None:
+    """Wide margins: on a quiet machine counts agree within 1 and QoI within 0.5 %."""
+    scenario = Uplink(traces=(fade().link.trace,), duration_s=5.0, random_offset=False, propagation_us=0, value=V)
     chosen = [policies.get(name) for name in ("drop-oldest", "random")]
-    runs = validate(chosen, scenario, 4, speed=3.0)
-    assert [one.policy for one in runs] == ["drop-oldest", "random"]
+    plays = {transport: over(transport) for transport in OVER_TCP if transport != "mqtt"}  # which wants a broker's port
+    runs = validate(chosen, scenario, 4, speed=2.0, plays=plays)
+    assert [one.policy for one in runs] == ["drop-oldest"] * len(plays) + ["random"] * len(plays)
     for one in runs:
-        assert one.live_qoi == pytest.approx(one.simulated_qoi, rel=0.1)
+        assert one.live_qoi == pytest.approx(one.simulated_qoi, rel=0.15)
+        assert one.live_delivered == pytest.approx(one.simulated_delivered, rel=0.2)
         assert 0 <= one.simulated_regret < 1
 
 

@@ -113,20 +113,15 @@ SHARED = "a secret of thirty-two bytes and more"
         {"algorithm": "HS256", "key": SHARED},
         {"algorithm": "none"},
         {"key": ec.generate_private_key(ec.SECP256R1())},
+        *("", "a.b.c", "." * 3, "x" * 20_000, "e30.e30.", "\u0000"),
     ],
-    ids=str,
+    ids=lambda claims: str(claims)[:30],
 )
-async def test_what_is_no_proof(claims: dict[str, Any], issuer: Issuer) -> None:
+async def test_what_is_no_proof(claims: dict[str, Any] | str, issuer: Issuer) -> None:
     verifier = identity.Verifier(issuer.tokens)
     assert (await verifier.email(issuer.token()))[0] == "anna@x.org"
     with pytest.raises(BufgymError, match="token"):
-        await verifier.email(issuer.token(**claims))
-
-
-@pytest.mark.parametrize("token", ["", "a.b.c", "." * 3, "x" * 20_000, "e30.e30.", "\u0000"], ids=range(6))
-async def test_what_is_no_token(token: str, issuer: Issuer) -> None:
-    with pytest.raises(BufgymError, match="token"):
-        await identity.Verifier(issuer.tokens).email(token)
+        await verifier.email(claims if isinstance(claims, str) else issuer.token(**claims))
 
 
 async def test_the_keys_come_over_http_no_more_often_than_they_may(issuer: Issuer) -> None:

@@ -113,20 +113,13 @@ def test_it_shows_the_robots(browser: Any, port: int, scheme: str, width: int) -
 
 
 @pytest.mark.nightly
-def test_a_viewer_chooses_the_policy(browser: Any, port: int) -> None:
+def test_a_viewer_chooses_the_policy_and_plays_a_recording(browser: Any, port: int) -> None:
     shown = Page(browser, port)
-    shown.until("document.querySelector('#policy').value === 'drop-oldest'")
+    cards = "document.querySelectorAll('.card').length === 2"
+    shown.until(f"{cards} && document.querySelector('#policy').value === 'drop-oldest'")
     shown.page.select_option("#policy", "drop-newest")
     shown.until("document.querySelector('#told').textContent === ''")
     assert shown.page.input_value("#policy") == "drop-newest"
-    shown.close()
-
-
-@pytest.mark.nightly
-def test_a_recording_is_played(browser: Any, port: int) -> None:
-    shown = Page(browser, port)
-    cards = "document.querySelectorAll('.card').length === 2"
-    shown.until(cards)
     shown.page.click("#recordings")
     shown.page.click("#files li button")
     shown.until(f"{cards} && document.querySelector('#clock').textContent !== ''")

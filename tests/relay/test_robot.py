@@ -87,16 +87,10 @@ def test_a_queue_told_by_hand() -> None:
     h = 1 + 0.5 + 0.875
     assert state["topics"]["a"] == {"put": 5, "left": 3, "dropped": 2, "age_s": 0.25, "qoi": round(h / 3, 3)}
     assert state["topics"]["b"]["age_s"] is None and state["qoi"] == round(h / 3, 3)
-
-
-def test_a_new_queue_counts_on() -> None:
-    monitor = Monitor([Topic("a")], clock=lambda: 0.0)
-    for number, policy in enumerate(("afr", "drop-oldest")):
-        monitor(number, {"event": "settings", "policy": policy, "capacity": 2})
-        monitor(number, {"event": "put", "seq": 0, "x": 0.0, "topic": 0, "size_bytes": 1})
-        monitor(number, {"event": "dequeued", "seq": 0})
-        monitor(number, {"event": "gone", "seq": 0})
-    assert monitor.state()["policy"] == "drop-oldest" and monitor.state()["left"] == 2
+    monitor(1, {"event": "settings", "policy": "drop-oldest", "capacity": 2})  # another queue counts on
+    for event in ({"event": "put", "x": 0.0, "topic": 0, "size_bytes": 1}, {"event": "dequeued"}, {"event": "gone"}):
+        monitor(1, {"seq": 0, **event})
+    assert monitor.state()["policy"] == "drop-oldest" and monitor.state()["left"] == 4
 
 
 # --- messages of ROS -------------------------------------------------------------------------------------------------
