@@ -42,7 +42,7 @@ test: $(READY)
 
 # For the night: 100,000 broken files of each kind, 10,000 command lines, 1,000,000 episodes, 200 kills, others every day.
 fuzz: $(READY)
-	BUFGYM_FUZZ=100000 BUFGYM_FUZZ_SEED=$$(date +%Y%m%d) HYPOTHESIS_PROFILE=thorough $(PYTEST) tests/fuzz $(PYTEST_ARGS)
+	BUFGYM_FUZZ=100000 BUFGYM_FUZZ_SEED=$$(date +%Y%m%d) HYPOTHESIS_PROFILE=nightly $(PYTEST) tests/fuzz $(PYTEST_ARGS)
 
 # For the night: every figure, and what came out beside the page as it stands.
 claims: $(READY)

@@ -1,4 +1,4 @@
-"""Where machine code is kept: a folder for exactly this state of the package's sources."""
+"""Where machine code is kept: a file for each kernel, set of argument types, and state of all that it calls."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import atexit
 import contextlib
 import hashlib
 import os
+import pickle
 import shutil
 import sys
 import tempfile
@@ -15,30 +16,16 @@ from pathlib import Path
 from typing import Any, cast
 
 import numba
-from numba.core import caching
+from numba.core import compiler, serialize
+
+from bufgym.files import replaced
+from bufgym.kernel.closure import TOOLS, closure, told_types
+from bufgym.kernel.parts import PART, PartLibrary, set_environments
 
 JIT = not cast(Any, numba.config).DISABLE_JIT
 """False where compilation is off and every kernel runs as its Python source."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-
-
-def _sources() -> dict[Path, bytes]:
-    """Every source that compiled code rests on: those with kernels, the modules whose names they import, and this."""
-    texts = {path.relative_to(_PACKAGE): path.read_bytes() for path in sorted(_PACKAGE.rglob("*.py"))}
-    sources = {
-        path: text for path, text in texts.items() if b"bufgym.kernel import" in text or path.parts[0] == "kernel"
-    }
-    for text in list(sources.values()):
-        for line in text.decode().split("\nfrom bufgym")[1:]:
-            module, names = line.split(" import ", 1)
-            place = Path(*module.split("."))
-            names = names[1 : names.index(")")] if names.startswith("(") else names.split("\n", 1)[0]
-            files = [place / f"{name.strip()}.py" for name in names.split(",")]
-            for file in (place.with_suffix(".py") if place.name else place, place / "__init__.py", *files):
-                if file in texts:
-                    sources[file] = texts[file]
-    return sources
 
 
 def _writable(folder: Path) -> bool:
@@ -62,75 +49,108 @@ def _temporary_folder() -> Path:
 
 
 def _cache_folder() -> str:
-    """A folder for machine code that is valid for exactly this state of the package's sources.
-
-    Numba renews a cached kernel when its own file changes but not when a kernel that it calls does. One folder for
-    each state of all the sources keeps a stale callee from living on inside its caller.
-    """
+    """Folder for machine code: in ``NUMBA_CACHE_DIR``, beside the package, or in the user's cache."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     if os.environ.get("NUMBA_CACHE_DIR"):
         parent = Path(os.environ["NUMBA_CACHE_DIR"])
     else:
         places = _PACKAGE / "__pycache__", Path(home) / "bufgym"
         parent = next((place for place in places if _writable(place)), None) or _temporary_folder()
-    state = hashlib.sha256(b"".join(source for _, source in sorted(_sources().items())))
-    folder = parent / f"kernels-{state.hexdigest()[:12]}"
-    if not folder.exists():
-        # Earlier states are useless, but a running process may still be writing into the latest ones.
-        for old in sorted(parent.glob("kernels-*"), key=lambda path: path.stat().st_mtime)[:-8]:
-            shutil.rmtree(old, ignore_errors=True)
-    return str(folder)
-
-
-class CodeFiles(caching.IndexDataCacheFile):
-    """Machine code on disk: a file for each signature, named by all that it depends on.
-
-    So processes that compile side by side never write into the same one, as Numba's numbered files let them. Damaged
-    files are compiled anew; where none can be kept, none is.
-    """
-
-    def load(self, key: Any) -> Any:
-        """The code compiled for ``key``; None if there is none."""
-        try:
-            return cast(Any, self)._load_data(self._file(key))
-        except Exception:  # a file cut short ends in many kinds of error
-            return None
-
-    def save(self, key: Any, data: Any) -> None:
-        """Keep the code compiled for ``key``."""
-        with contextlib.suppress(OSError):
-            cast(Any, self)._save_data(self._file(key), data)
-
-    def _file(self, key: Any) -> str:
-        files = cast(Any, self)
-        depends_on = repr((files._version, files._source_stamp, key))
-        return f"{files._index_name.removesuffix('.nbi')}-{hashlib.sha256(depends_on.encode()).hexdigest()[:16]}.nbc"
+    return str(parent / "kernels")
 
 
 FOLDER = _cache_folder() if JIT else ""
 """Where machine code is kept; empty where nothing is compiled."""
 
+_KEPT_VERSIONS = 16
+"""Files kept of one kernel: one for each set of argument types and each state of its sources."""
 
-class Code(caching.FunctionCache):
-    """One kernel's machine code on disk, as it is compiled for its ``role``."""
+
+class Code:
+    """Machine code of one kernel on disk, a file for each set of argument types.
+
+    A file is named by everything that its code depends on (see ``closure``). Processes that compile side by side
+    therefore never write different code into one file, and code of an earlier source is never found. A damaged file
+    is compiled anew. Where no file can be written, nothing is kept.
+    """
 
     def __init__(self, function: Any, role: str) -> None:
-        config = cast(Any, numba.config)
-        before, config.CACHE_DIR = config.CACHE_DIR, FOLDER or config.CACHE_DIR  # read here only
-        try:
-            cast(Any, super()).__init__(function)
-        finally:
-            config.CACHE_DIR = before
-        cache = cast(Any, self)
-        name, stamp = f"{cache._impl.filename_base}-{role}", cache._impl.locator.get_source_stamp()
-        cache._cache_file = cast(Any, CodeFiles)(cache._cache_path, name, stamp)
+        self._function, self._role = function, role
+        self._closure = ""
+        name = f"{function.__module__}.{function.__qualname__}-{role}"
+        self._name = "".join(letter if letter.isalnum() or letter in "._-" else "_" for letter in name)[-150:]
+
+    @property
+    def cache_path(self) -> str:
+        """Folder of the files."""
+        return FOLDER
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """What is kept of it; None if nothing is."""
-        kept = cast(Any, super()).load_overload(signature, target)
-        if kept is None and _ONLY_KEPT.get():
-            raise NotKeptError
-        return kept
+        """Code compiled for the types of ``signature``, or None if there is none."""
+        target.refresh()
+        try:
+            kept = pickle.loads(self._file(signature, target.codegen()).read_bytes())
+            return _rebuilt(target, *kept)
+        except Exception:  # a file that is missing, or cut short, which ends in many kinds of error
+            if _ONLY_KEPT.get():
+                raise NotKeptError from None
+            return None
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """Keep the code that was compiled for the types of ``signature``."""
+        if not isinstance(result.library, PartLibrary):
+            set_environments(result)
+        if result.lifted or result.library.has_dynamic_globals:  # it holds addresses of this process
+            return
+        file = self._file(signature, result.codegen)
+        with contextlib.suppress(OSError):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with replaced(file) as part:
+                part.write_bytes(cast(Any, serialize).dumps(result._reduce()))
+            versions = sorted(file.parent.glob(f"{self._name}-*.nbc"), key=lambda path: path.stat().st_mtime)
+            for old in versions[:-_KEPT_VERSIONS]:
+                old.unlink(missing_ok=True)
+
+    def _file(self, signature: Any, generator: Any) -> Path:
+        if not self._closure:  # now, as the module's later functions did not exist when it was decorated
+            self._closure = closure(self._function)
+        depends_on = repr((TOOLS, self._closure, told_types(signature), generator.magic_tuple()))
+        return Path(FOLDER, f"{self._name}-{hashlib.sha256(depends_on.encode()).hexdigest()[:20]}.nbc")
+
+
+def _rebuilt(
+    target: Any,
+    library: Any,
+    description: Any,
+    environment: Any,
+    signature: Any,
+    objectmode: bool,
+    lifted: Any,
+    annotation: str,
+    reload: Any,
+    environments: Any,
+) -> Any:
+    """Compile result from what ``CompileResult._reduce`` gave."""
+    for function in reload:
+        function()
+    code = PartLibrary.read(target, library) if library[1] == PART else target.codegen().unserialize_library(library)
+    entry = target.get_executable(code, description, environment)
+    for known in environments:
+        code.codegen.set_env(known.env_name, known)
+    return cast(Any, compiler).compile_result(
+        target_context=target,
+        typing_context=target.typing_context,
+        library=code,
+        environment=environment,
+        entry_point=entry,
+        fndesc=description,
+        type_annotation=annotation,
+        signature=signature,
+        objectmode=objectmode,
+        lifted=lifted,
+        reload_init=reload,
+        referenced_envs=environments,
+    )
 
 
 class NotKeptError(Exception):

@@ -10,10 +10,12 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import types
+from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
 from bufgym.kernel.cache import JIT, Code
+from bufgym.kernel.parts import PartCompiler
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Result = TypeVar("Result")
@@ -35,7 +37,7 @@ class _Kernel(CPUDispatcher):
     @functools.cached_property
     def inlined(self) -> Any:
         """What goes into other kernels."""
-        return _dispatcher(CPUDispatcher, cast(Any, self).py_func, "inlined", **_INLINED)
+        return _dispatcher(CPUDispatcher, cast(Any, self).py_func, "inlined", PartCompiler, **_INLINED)
 
     @property
     def _numba_type_(self) -> Any:
@@ -43,9 +45,9 @@ class _Kernel(CPUDispatcher):
         return cast(Any, numba).types.Dispatcher(self.inlined)
 
 
-def _dispatcher(kind: Any, function: Callable[..., Any], role: str, **options: bool) -> Any:
+def _dispatcher(kind: Any, function: Callable[..., Any], role: str, compiler: Any = Compiler, **options: bool) -> Any:
     """Numba's compiler of ``function``, which keeps its code on disk by ``role``."""
-    dispatcher = kind(function, targetoptions={**_OPTIONS, **options})
+    dispatcher = kind(function, targetoptions={**_OPTIONS, **options}, pipeline_class=compiler)
     dispatcher._cache = Code(function, role)
     return dispatcher
 

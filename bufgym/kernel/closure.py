@@ -1,0 +1,114 @@
+"""Everything that the machine code of a kernel depends on, as one hash.
+
+The *closure* of a kernel is its own code, the kernels that it calls, theirs, and every constant that any of them reads.
+Comments, docstrings and line numbers are not part of it, nor is anything that no kernel calls.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+
+import llvmlite
+import numba
+import numpy as np
+
+_HERE = Path(__file__).parent
+TOOLS = (
+    sys.implementation.cache_tag,
+    numba.__version__,
+    llvmlite.__version__,
+    np.__version__,
+    hashlib.sha256(
+        b"".join((_HERE / f"{name}.py").read_bytes() for name in ("arrays", "compile", "parts"))
+    ).hexdigest(),
+)
+"""Versions of all that translates kernels, with the sources of this package that take part."""
+
+
+def closure(function: Any) -> str:
+    """Hash of ``function``'s closure: equal where its machine code is, for equal types of its arguments."""
+    told: dict[int, str] = {}
+    waiting = [function]
+    while waiting:
+        one = waiting.pop()
+        if id(one) not in told:
+            parts = [one.__module__, one.__qualname__, *_code(one.__code__)]
+            for name, value in _read(one):
+                parts.append(f"{name} = {_told(value, waiting)}")
+            told[id(one)] = "\n".join(parts)
+    return hashlib.sha256("\n\n".join(sorted(told.values())).encode()).hexdigest()
+
+
+def told_types(types: Any) -> str:
+    """``types``, a signature or several types, in words that name the fields of every tuple too."""
+    found = [repr(types)]
+    waiting = list(getattr(types, "args", types))
+    while waiting:
+        kind = waiting.pop()
+        fields = getattr(kind, "instance_class", None)
+        if fields is not None:
+            found.append(f"{fields.__qualname__}{fields._fields}")
+        waiting += getattr(kind, "types", ())
+    return "\n".join(found)
+
+
+def _code(code: CodeType) -> Iterator[str]:
+    """Instructions, names and constants of ``code``, without its docstring and line numbers."""
+    yield code.co_code.hex()
+    yield repr((code.co_argcount, code.co_kwonlyargcount, code.co_flags, code.co_names, code.co_varnames))
+    yield code.co_exceptiontable.hex()
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _code(constant)
+        elif not isinstance(constant, str):  # no kernel computes with text: it is the docstring, or an error's message
+            yield _told(constant, [])
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    """Names of globals and attributes that ``code`` and the functions inside it read."""
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+def _read(function: FunctionType) -> Iterator[tuple[str, Any]]:
+    """(name, value) of all that ``function`` reads from outside: globals, enclosing scopes, default arguments."""
+    names = sorted(set(_names(function.__code__)))
+    for name in names:
+        if name in function.__globals__:
+            value = function.__globals__[name]
+            yield name, value
+            if isinstance(value, ModuleType):
+                yield from ((f"{name}.{part}", getattr(value, part)) for part in names if hasattr(value, part))
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        yield name, cell.cell_contents
+    yield "defaults", (function.__defaults__, tuple(sorted((function.__kwdefaults__ or {}).items())))
+
+
+def _told(value: Any, waiting: list[Any]) -> str:
+    """``value`` in words that are equal for equal values in every process; functions go to ``waiting`` as well."""
+    function = getattr(value, "py_func", value)
+    if isinstance(function, FunctionType):
+        if hasattr(value, "py_func"):
+            waiting.append(function)
+        return f"{function.__module__}.{function.__qualname__}"
+    if isinstance(value, np.ndarray):
+        return f"array {value.dtype.descr} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
+    if isinstance(value, tuple | list):
+        return f"{type(value).__qualname__}({', '.join(_told(entry, waiting) for entry in value)})"
+    if isinstance(value, frozenset | set):
+        return f"set({sorted(_told(entry, waiting) for entry in value)})"
+    if isinstance(value, type):
+        fields = getattr(value, "_fields", ()), tuple(getattr(value, "_field_defaults", {}).items())
+        return f"{value.__module__}.{value.__qualname__} {_told(fields, waiting)}"
+    if isinstance(value, ModuleType):
+        return value.__name__
+    if hasattr(value, "__qualname__"):
+        return f"{getattr(value, '__module__', '')}.{value.__qualname__}"
+    return f"{type(value).__qualname__} {value!r}"
