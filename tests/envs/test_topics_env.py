@@ -155,7 +155,7 @@ def test_hold_waits_for_the_next_arrival_and_an_invalid_choice_sends_the_oldest(
     assert (waiting(env), info["invalid"]) == (ARRIVAL_WAITS, 0)
     env.step(4)
     assert waiting(env) == SOCKET_WAITS  # asked anew: 0 and 1 are queued
-    shared = ("v", "parameters")  # read-only arrays
+    shared = ("v", "parameters", "several")  # read-only
     for action, invalid, goes in ((4, 1, 0), (2, 1, 0), (1, 0, 1), (0, 0, 0)):
         batch = env.rows.senders.batch
         batch = batch._replace(**{name: getattr(batch, name).copy() for name in batch._fields if name not in shared})

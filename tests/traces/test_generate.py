@@ -49,9 +49,6 @@ FLAT = LinkParameters(1, 1000, (1e6,) * len(PROBABILITIES), 0.0, 0.0, 10.0, 0.0,
 OUTAGES = OutageParameters(20, 0.5, 4.0, 60.0, 1.0, 2.0, 2.0, (0.0,) * 5)
 
 
-# -------------------- seeds
-
-
 @pytest.mark.parametrize("kind", SEEDED)
 def test_a_seed_is_a_trace(kind: str) -> None:
     make = SEEDED[kind]
@@ -75,9 +72,6 @@ def test_bytes_that_must_never_change() -> None:
 KNOWN = LinkParameters(
     1, 1000, tuple(1e6 * k for k in range(1, 12)), 0.2, 0.4, 50.0, 0.3, replace(OUTAGES, long_gap_s=4.0, shoulder=0.5)
 )
-
-
-# -------------------- fitted links
 
 
 @given(seed=st.integers(0, 2**32), seconds=st.integers(1, 400), mode=st.sampled_from(MODES))
@@ -137,9 +131,6 @@ def test_the_first_second_of_a_link_carries_something() -> None:
     assert all(markov_link("worst", seed, 1, links={"worst": worst}).total_bytes > 0 for seed in range(20))
 
 
-# -------------------- by rule
-
-
 def test_robofleets_ramp() -> None:
     """12.5 to 0.5 MB/s in 15 s: 6.5 MB/s in the mean; half-way, after 7.5 s, (12.5 + 6.5) / 2 x 7.5 = 71.25 MB."""
     trace = ramp(100e6 / 8, 4e6 / 8)
@@ -182,9 +173,6 @@ def test_tunnel() -> None:
     assert rates == pytest.approx([10e6 / 60, 0.0, 0.0, 10e6 / 40], abs=5)
 
 
-# -------------------- two states, access points
-
-
 def test_gilbert_elliotts_share_of_bad_time() -> None:
     """2 s bad in 22 s is 1/11. In 20,000 s there are some 900 cycles: a standard deviation of about 0.004."""
     trace = gilbert_elliott(7, 20_000, good_bytes_per_s=1e7, bad_bytes_per_s=1e6)
@@ -210,9 +198,6 @@ def test_each_hand_over_costs_its_gap() -> None:
     assert (rates == 0).sum() == 20
     assert np.flatnonzero(rates == 0).min() > 400  # past the middle: the other one must be 8 dB better
     assert (roaming(0, 80, replace(corridor, gap_s=0.0)).segments()[1] > 0).all()
-
-
-# -------------------- motion and frames
 
 
 def still_then_turning() -> Motion:
@@ -251,9 +236,6 @@ def test_detail_stays_while_the_camera_stands_still() -> None:
     assert sizes.tolist() != frame_sizes(np.arange(600) * 33_333, still_then_turning(), 2, model).tolist()
     spread = [frame_sizes(np.array([0, 10_000_000, 20_000_000]), still_then_turning(), s, model)[2] for s in range(400)]
     assert abs(np.std(spread) / 230_000 - 0.12) < 0.015
-
-
-# -------------------- what is refused
 
 
 @pytest.mark.parametrize(

@@ -135,9 +135,6 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
         write_motion_csv(motion, tmp_path)
 
 
-# -------------------- poses to motion
-
-
 def about(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
     half = math.radians(degrees) / 2
     return np.array([*(math.sin(half) * np.array(axis) / np.linalg.norm(axis)), math.cos(half)])
@@ -232,9 +229,6 @@ def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, fl
     ]
     computed = quaternions(np.array([matrix]))[0]
     assert min(np.abs(computed - expected).max(), np.abs(computed + expected).max()) < 1e-12
-
-
-# -------------------- real ones
 
 
 # Coordinate gained a second: the desks are hand-held sweeps, xyz is mostly translation, 360 a turning robot.

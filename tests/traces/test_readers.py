@@ -153,9 +153,6 @@ def test_runs_of_a_list_with_and_without_times(tmp_path: Path) -> None:
         read_trace(path, column="run 4")
 
 
-# ---------------------------------------------------------------- the command
-
-
 def failed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """What the command said on stderr, in its one line, when it ended with 2."""
     assert main(arguments) == 2

@@ -31,10 +31,7 @@ ROUNDING = 0.051
 # How far a data set's rule may put them apart: rates in KB/s, min and max and mean relative to theirs, and s.
 #   solis_wifi: the table takes each line as 1 s, we go by the times in the file, which jitter.
 #   sabre: whole kbit/s, cut off, so up to 0.125 KB/s less.
-LOOSER = {
-    "solis_wifi": (0.0, 0.01, 4e-3, 0.6),
-    "belgium_4g sabre": (0.125, 0.0, 0.0, 0.0),
-}
+LOOSER = {"solis_wifi": (0.0, 0.01, 4e-3, 0.6), "belgium_4g sabre": (0.125, 0.0, 0.0, 0.0)}
 # Two Solis files whose only zeros are lines with the same time as the next one.
 LEAST_WITHOUT_LINES_OF_NO_LENGTH = {"wifi_cafe_231115-154511": 45.0, "wifi_restr_231115-134450": 42.5}
 

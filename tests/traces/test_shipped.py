@@ -67,9 +67,6 @@ def test_shipped_names_and_loading(tmp_path: Path) -> None:
         read_motion(names["lte-synthetic-0"])
 
 
-# -------------------- the command
-
-
 def generate(*arguments: str) -> None:
     parser = Parser(prog="bufgym trace")
     trace_generate.add(parser.add_subparsers(required=True))

@@ -158,9 +158,6 @@ def test_scaling_keeps_order_and_describe_keeps_its_bounds(rows: list[tuple[int,
     assert summary["seconds_below_500KBps"] <= summary["duration_s"] + 1e-9
 
 
-# -------------------- written
-
-
 def test_csv_is_exact(tmp_path: Path) -> None:
     trace = Trace.from_intervals([1, 999_999, 1_234_567, 2_000_000], [0, 10**12, 7, 0], name="odd")
     write_csv(trace, tmp_path / "odd.csv")

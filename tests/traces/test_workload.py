@@ -126,9 +126,6 @@ def test_names_that_a_csv_file_cannot_hold(tmp_path: Path) -> None:
         write_workload_csv(Workload("w", np.array([0]), np.array([1])), tmp_path / "nowhere" / "w.csv")
 
 
-# --- played over a link ----------------------------------------------------------------------------------------------
-
-
 def four_seconds_of_nothing() -> Trace:
     return Trace("outage", np.array([0, 4_000_000, 5_000_000]), np.array([0, 0, 10_000]), "hold")
 
