@@ -87,6 +87,7 @@ def sums(link: float, reward: dict[str, float], action: int) -> dict[str, float]
     return total
 
 
+@pytest.mark.kernels
 def test_terms_that_come_with_bufgym_by_hand() -> None:
     # At 1 MB/s every message goes at once: each takes 1 s and half a second to the server, 1.5, 2.5, 3.5, 4.5 s.
     # Until 2.5 s the age is t (3.125 s^2), then t - 1 until the last arrival at 3 s (1.5 to 2.0: 0.875 s^2).
@@ -105,6 +106,7 @@ def test_terms_that_come_with_bufgym_by_hand() -> None:
     assert math.ceil(total["dropped"]) == -1
 
 
+@pytest.mark.kernels
 def test_a_step_tells_what_happened_in_it() -> None:
     steps: list[tuple[float, ...]] = []
 

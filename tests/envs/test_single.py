@@ -254,6 +254,19 @@ def test_a_given_episode_is_played() -> None:
     assert [env.step(4)[2] for _ in range(3)] == [False, False, True]
 
 
+@pytest.mark.parametrize(
+    ("info", "always"),
+    [("full", {"action_mask", "qoi", "invalid", "reward_terms"}), ("mask", {"action_mask"}), ("none", set())],
+)
+def test_info_is_built_as_far_as_asked(info: str, always: set[str]) -> None:
+    """T = 2, all accepted: the second step delivers 0, 1, 2, 3 and ends the episode."""
+    env = SenderEnv("interruption", 4, law="fixed", t_max=2, info=info)
+    assert env.reset(seed=0)[1].keys() == env.step(5)[4].keys() == always
+    last, summary = env.step(5)[4], {"arrived": 4, "delivered": 4, "dropped": 0, "invalid": 0}
+    assert last.keys() == always | summary.keys() | {"qoi"}
+    assert {name: last[name] for name in summary} == summary and last["qoi"] == pytest.approx(1 + 3 * (1 - 0.618))
+
+
 def test_a_reset_rewards_nothing() -> None:
     _, info = make().reset(seed=0)
     assert info["reward_terms"] == {"delivered": 0.0, "retained": 0.0}
