@@ -17,7 +17,6 @@ from bufgym.reproduce import afr_fig2, afr_fig4, afr_fig5, afr_fig9, afr_theorem
 from bufgym.scenario import Interruption
 from bufgym.sim import NEVER
 
-
 # Typed from the paper's figure: (T, dropped, r, c, p) with L = 8, the state after the decision.
 FIG4 = [
     (8, None, 1, 0, 0),

@@ -18,7 +18,6 @@ from bufgym.reproduce.robofleet_table1 import PAPER
 from bufgym.scenario import Stream
 from bufgym.traces import Trace
 
-
 TEN_HZ = Stream(Topic("scan"), 10, 12_500, jitter=0, encodings={"ros": 12_500, "json": 37_500})
 """12.5 ms over 1 MB/s, 37.5 ms as JSON."""
 DROPOUT = Trace.steps([(1.05, 1e6), (1, 0), (20, 1e6)], after="hold")
