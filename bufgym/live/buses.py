@@ -24,6 +24,8 @@ from bufgym.live.sockets import DEAD_AFTER_S, small_buffers
 ROOT: Final = "bufgym"
 MQTT_PORT: Final = 1883
 """Of a broker, by its standard."""
+CONNECT_S: Final = 1.0
+"""For a receiver of Zenoh's to answer."""
 
 
 # --- Zenoh ------------------------------------------------------------------------------------------------------------
@@ -43,7 +45,7 @@ class ZenohBus:
             "scouting/gossip/enabled": False,
             "listen/endpoints": [] if name else [f"tcp/{host}:{port}"],
             "connect/endpoints": [f"tcp/{host}:{port}"] if name else [],
-            "connect/timeout_ms": 1000,
+            "connect/timeout_ms": round(CONNECT_S * 1000),
             "connect/exit_on_failure": True,
             "transport/shared_memory/enabled": False,  # it would carry bodies past the link, on one machine
             "transport/link/tx/lease": round(DEAD_AFTER_S * 1000),

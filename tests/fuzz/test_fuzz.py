@@ -202,8 +202,6 @@ def test_command_lines() -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-# -------------------- texts, JSON and bytes that Hypothesis makes up
-
 SCALARS = st.none() | st.booleans() | st.integers(-5, 10**20) | st.floats() | st.text(max_size=3)
 KEYS = st.sampled_from(["duration_ms", "bandwidth_kbps", "x"])
 JSON = st.recursive(SCALARS, lambda s: st.lists(s, max_size=3) | st.dictionaries(KEYS, s, max_size=3), max_leaves=12)
@@ -231,8 +229,6 @@ def test_anything_ends_well(
         except BufgymError as error:
             assert str(error).isprintable()
 
-
-# -------------------- episodes
 
 STEPS = st.lists(
     st.tuples(st.sampled_from([0.01, 0.3, 2]), st.sampled_from([0, 0, 1, 3e3, 1e5])), min_size=1, max_size=5

@@ -73,9 +73,6 @@ def test_what_arrives_over_a_slow_link() -> None:
     assert kept[0] == kept[1] != kept[2]
 
 
-# -------------------- views
-
-
 def test_shares_of_a_view_that_were_seen_before() -> None:
     """1 m to the right is 10 of 40 pixels, a quarter of the view; 5 m leave nothing in common."""
     seen = seen_shares(Wall([0, 1, 5]))
@@ -105,9 +102,6 @@ def test_information_and_coverage_count_what_is_new() -> None:
     assert Coverage(Wall([0, 1, 0]), least_views=2).cells == 40 * 30
     with pytest.raises(BufgymError, match=r"wall: no cell of 0\.1 m was seen by 3 of its frames"):
         Coverage(Wall([0, 0]))
-
-
-# -------------------- ORBBuf by images
 
 
 @pytest.mark.kernels

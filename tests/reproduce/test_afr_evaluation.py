@@ -27,9 +27,6 @@ SHIPPED: dict[str, Any] = {
 """A small run that needs no folder of recordings."""
 
 
-# -------------------- the setup
-
-
 def test_a_setting_for_each_size_and_camera(tmp_path: Path) -> None:
     """60 frames last 2 s: 2 MB/s on average of 30 x 200 kB; the 6 MB/s later do not count."""
     path = tmp_path / "link.csv"
@@ -49,9 +46,6 @@ def test_a_setting_for_each_size_and_camera(tmp_path: Path) -> None:
     assert len({float(e.arrivals["x"][-1]) for e in episodes}) == 3
 
 
-# -------------------- the size of a frame
-
-
 def test_frames_kept_are_counted_by_the_second_of_their_arrival(tmp_path: Path) -> None:
     path = tmp_path / "wide.csv"
     write_csv(Trace.constant(1e8, 30.0, name="wide"), path)
@@ -59,9 +53,6 @@ def test_frames_kept_are_counted_by_the_second_of_their_arrival(tmp_path: Path) 
     rows = size.simulate()
     assert set(rows.column("dropped")) == {0} and not size.claims(rows)["recalculations"]
     assert all(abs(row[f"kept_in_second_{s}"] - 30) <= 1 for row in rows for s in (21, 23))
-
-
-# -------------------- Fig. 6
 
 
 def test_fig6_names_the_seconds_under_500_KB_per_s(tmp_path: Path) -> None:
@@ -79,9 +70,6 @@ def test_fig6_names_the_seconds_under_500_KB_per_s(tmp_path: Path) -> None:
     assert not facts["overload"]
 
 
-# -------------------- Fig. 7
-
-
 def test_fig7_counts_regret_against_the_best() -> None:
     fig7 = figure("afr-fig7-qoi", **SHIPPED, size_bytes=500_000, runs=2)
     rows = fig7.simulate()
@@ -90,9 +78,6 @@ def test_fig7_counts_regret_against_the_best() -> None:
         assert row["H"] <= row["H_clairvoyant"] * (1 + 1e-12)
         assert row["regret"] == pytest.approx(1 - row["H"] / row["H_clairvoyant"])
     assert rows == fig7.simulate() and len({row["H_clairvoyant"] for row in rows if row["camera"] != "time"}) == 4
-
-
-# -------------------- Fig. 8
 
 
 def test_fig8_counts_runs_whose_longest_gap_exceeds_the_threshold() -> None:
@@ -105,9 +90,6 @@ def test_fig8_counts_runs_whose_longest_gap_exceeds_the_threshold() -> None:
     assert afr_fig8_gap.failures(rows, between, policy="drop-oldest") == 50
     assert afr_fig8_gap.failures(rows, gaps[-1], policy="drop-oldest") == 0  # exceeds, not reaches
     assert afr_fig8_gap.failures(rows, gaps[0] - 1e-9, policy="drop-oldest", L=3) == 100
-
-
-# -------------------- without recordings, and mistakes
 
 
 def test_without_the_folder_the_message_says_what_it_needs(tmp_path: Path) -> None:

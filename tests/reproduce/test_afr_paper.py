@@ -17,8 +17,6 @@ from bufgym.reproduce import afr_fig2, afr_fig4, afr_fig5, afr_fig9, afr_theorem
 from bufgym.scenario import Interruption
 from bufgym.sim import NEVER
 
-# -------------------- Fig. 4
-
 # Typed from the paper's figure: (T, dropped, r, c, p) with L = 8, the state after the decision.
 FIG4 = [
     (8, None, 1, 0, 0),
@@ -50,9 +48,6 @@ def test_fig4_step_by_step(policy: str) -> None:
     for T in (8, 9, 13, 16, 17, 18):
         (gaps,) = afr_theorems.gaps_of(policy, 8, [T])
         assert tuple(np.cumsum(gaps)[:-1]) == steps[T - 1].kept
-
-
-# -------------------- Fig. 5
 
 
 @pytest.mark.parametrize(("policy", "mean"), [("afr", 0.98598), ("drop-oldest", 0.47050)])
@@ -87,9 +82,6 @@ def test_fig5_random_is_repeatable_and_batched_in_any_size(monkeypatch: pytest.M
     assert whole.tolist() == parts.tolist()
 
 
-# -------------------- Eq. 9
-
-
 @pytest.mark.parametrize(("L", "T"), [(1, 4), (3, 9), (8, 20)])
 def test_random_keeps_each_message_as_eq_9_says(L: int, T: int) -> None:
     """P{i kept at T} = (L / (L + 1))^min(T - i + 1, T - L): it survives each of the full arrivals that it meets."""
@@ -104,9 +96,6 @@ def test_random_keeps_each_message_as_eq_9_says(L: int, T: int) -> None:
         standard_error = math.sqrt(expected * (1 - expected) / runs)
         # 4.5 standard errors: the seed is fixed, so it can't fail by chance later
         assert abs(kept[i] - expected) < 4.5 * standard_error, (i, kept[i], expected)
-
-
-# -------------------- Theorems 1-3
 
 
 @st.composite
@@ -185,9 +174,6 @@ def test_theorems_can_fail() -> None:
         assert afr_theorems.worst_ratio(oldest) < afr_theorems.bound(L)
 
 
-# -------------------- AFR against Random
-
-
 def all_outcomes(L: int, T: int) -> dict[tuple[int, ...], float]:
     """Messages kept by Random -> probability, by trying every drop."""
     outcomes = {tuple(range(1, min(L, T) + 1)): 1.0}
@@ -224,9 +210,6 @@ def test_random_is_ahead_of_afr_at_L_1_alone() -> None:
     assert rows[0]["violations"] > 0
 
 
-# -------------------- Fig. 1 to 3
-
-
 def test_fig1_shows_what_is_received() -> None:
     fig1 = figure("afr-fig1")
     rows = fig1.simulate()
@@ -243,9 +226,6 @@ def test_fig2_views_overlap_by_hand() -> None:
     assert motions["wall"].new(1) == pytest.approx(1 - 0.618)
     # 2 x 1.5 m x tan 30 degrees = 1.732 m of wall, of which 0.15 m are new.
     assert motions["corridor"].new(1) == pytest.approx(0.15 / 1.7320508)
-
-
-# -------------------- Fig. 9
 
 
 @pytest.mark.parametrize("name", ["afr", "drop-oldest", "random", "orbbuf"])

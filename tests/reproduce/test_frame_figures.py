@@ -23,9 +23,6 @@ def task(kept: tuple[int, ...], kind: Any = "map") -> Task:
     return Task(kind, "room", None, 40, kept, "afr", LINK)
 
 
-# -------------------- tasks
-
-
 def test_a_task_is_known_by_what_is_asked() -> None:
     assert task((0, 3)).key == task((0, 3))._replace(data="elsewhere", policy="random").key
     others = [task((0, 4)), task((0, 3), "track"), task((0, 3))._replace(frames=41), task((0, 3), "kept")]
@@ -51,9 +48,6 @@ def test_what_is_finished_is_not_done_again(tmp_path: Path, monkeypatch: pytest.
     assert asked[2:] == [task((0, 5, 6)).key]
     assert again[task((0, 1))] == {"rmse_mm": 2.0}
     assert Store(path)[task((0, 5, 6))] == {"rmse_mm": 3.0}  # also behind the line that was cut short
-
-
-# -------------------- numbers
 
 
 def test_spearman() -> None:
@@ -164,8 +158,6 @@ def test_the_claims_of_qoi_and_task() -> None:
         row["spearman"] = -0.77  # beyond it
     assert not figure.claims(rows)["best"]
 
-
-# -------------------- on the made-up room
 
 SMALL: dict[str, Any] = {"frames": 40, "capacities": (2,), "offsets": 2, "jobs": 1}
 

@@ -18,8 +18,6 @@ from bufgym.reproduce.robofleet_table1 import PAPER
 from bufgym.scenario import Stream
 from bufgym.traces import Trace
 
-# --- worked by hand --------------------------------------------------------------------------------------------------
-
 TEN_HZ = Stream(Topic("scan"), 10, 12_500, jitter=0, encodings={"ros": 12_500, "json": 37_500})
 """12.5 ms over 1 MB/s, 37.5 ms as JSON."""
 DROPOUT = Trace.steps([(1.05, 1e6), (1, 0), (20, 1e6)], after="hold")
@@ -102,9 +100,6 @@ def test_what_became_of_messages_is_told_apart() -> None:
     assert length_for((1, 2), (math.inf, math.inf)) == "none"
 
 
-# --- sizes -----------------------------------------------------------------------------------------------------------
-
-
 def test_sizes_are_table1s() -> None:
     assert {kind: sizes for kind, sizes in PAPER.items() if kind in BYTES} == {
         kind: sizes for kind, sizes in BYTES.items() if kind in PAPER
@@ -123,8 +118,6 @@ def test_sizes_are_table1s() -> None:
     scan = stream("LaserScan", 10, priority=3)
     assert (scan.size_bytes, scan.encodings, scan.topic.priority) == (7_328, {"ros": 7_260, "json": 28_000}, 3)
 
-
-# --- the paper's claims ----------------------------------------------------------------------------------------------
 
 Options = dict[str, Any]
 ONE_KIND: Options = {"dropouts_s": (5,), "links_mbit_per_s": (50,), "kinds": ("LaserScan",), "runs": 1}
@@ -222,9 +215,6 @@ def test_the_same_seeds_make_the_same_rows() -> None:
     assert rows == again
     first, second = rows.where(sender="robofleet")
     assert first["latency_ms"] != second["latency_ms"]  # jitter
-
-
-# --- options ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,6 @@ from bufgym.reproduce.robofleet_table1 import PAPER, Reproduction, fitted, of_pa
 HEADER = 4 + 8 + 4  # seq, stamp, length of frame_id
 
 
-# --- counted by hand -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("frame_id", ["", "map", "a/longer/frame"])
 def test_ros1_sizes_are_the_sums_of_their_fields(frame_id: str) -> None:
     header = HEADER + len(frame_id)
@@ -88,9 +85,6 @@ def test_json_by_hand_and_read_back_with_infinity_as_null_and_bytes_two_ways() -
     image = content("CompressedImage", data_bytes=1000)
     data = [json.loads(encode("CompressedImage", image, e))["msg"]["data"] for e in ("json", "json-numbers")]
     assert base64.b64decode(data[0]) == image["data"].tobytes() and data[1] == image["data"].tolist()
-
-
-# --- decoded again ---------------------------------------------------------------------------------------------------
 
 
 def same(ours: Any, theirs: Any) -> None:
@@ -211,9 +205,6 @@ def test_the_seed_decides_the_content_and_a_jpeg_has_its_markers_and_no_other() 
     assert {data[i + 1] for i in range(2, len(data) - 3) if data[i] == 0xFF} == {0}
 
 
-# --- beside the paper ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("beams", [1786, 1800, 1802])
 def test_the_fitted_messages_have_the_papers_bytes_as_ros_binary(beams: int) -> None:
     for kind, message in fitted(beams).items():
@@ -238,9 +229,6 @@ def test_table1_stands_beside_the_papers() -> None:
     share = float(" ".join(run("robofleet-table1").split()).split("json-numbers with ")[1].split("%")[0]) / 100
     size = sizes("LaserScan", beams=1800, frame_id="l" * 8, no_return=share)["json-numbers"]
     assert size == pytest.approx(PAPER["LaserScan"][2], rel=0.01)
-
-
-# --- bad input -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -277,8 +265,7 @@ def test_unknown_encodings_and_beams_that_cannot_make_the_papers_size_are_refuse
 
 
 @pytest.mark.parametrize(
-    ("library", "encoding", "extra"),
-    [("rosbags.typesys", "cdr", "ros"), ("flatbuffers", "robofleet", "robofleet")],
+    ("library", "encoding", "extra"), [("rosbags.typesys", "cdr", "ros"), ("flatbuffers", "robofleet", "robofleet")]
 )
 def test_without_the_library_the_extra_is_named(
     library: str, encoding: str, extra: str, monkeypatch: pytest.MonkeyPatch

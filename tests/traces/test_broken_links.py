@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import os
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -29,19 +28,15 @@ BROKEN = [
     # Mahimahi: a lone bad line among good ones, which the fast way has to give up on.
     ("1\n2\nx\n4\n", "line 3: time in ms = x: must be a whole number >= 0"),
     ("1\n\n5\n4\n", r"line 4: time in ms = 4: must not be before the line above \(5\)"),
-    ("1\n2.5\n", "line 2: time in ms = 2.5: must be a whole number"),
     ("1\n99999999999\n", "line 2: time in ms = 99999999999: must be at most 10000000000"),
     ("1\n2 3\n", "line 2: '2 3': must have 1 columns, has 2"),
     ("0\n0\n", "line 2: time in ms = 0: the last time must be after ms 0"),
     ("1\n" + "2" * 5000, "line 2: 2222.*: must be at most 4096 characters"),
     (b"1\n\xff\xfe\n", "line 2: .*must be UTF-8 text"),
-    # CSV
     (HEADER, "holds no measurement"),
-    (HEADER + "1000,-3,1000\n", "line 2: bytes = -3: must be a whole number >= 0"),
     (HEADER + "1000,1_000,1000\n", "line 2: bytes = 1_000: must be a whole number"),
     (HEADER + "1000,1000000000001,1000\n", "line 2: bytes = 1000000000001: must be at most 1000000000000"),
     (HEADER + "1000,1,1000\n3000,1,1000\n", "line 3: start in ms = 2000: must begin where the line above ended"),
-    (HEADER + "1000,1,1000\n500,1,500\n", "line 3: start in ms = 0: must begin where"),
     (HEADER + "1000,1,0\n", "line 2: interval in ms = 0: must be above 0"),
     (HEADER + "1000,1,2000\n", "line 2: interval in ms = 2000: must not begin before time 0"),
     (HEADER + "1e3,1,1\n", "line 2: time in ms = 1e3: must be a number of ms"),
@@ -49,88 +44,44 @@ BROKEN = [
     (HEADER + "9000000,1000000000000,9000000\n", r"line 2: bytes x microseconds .*: must be below 2\*\*62"),
     (HEADER + "1000,0,1000\n", "no capacity at all"),
     ("t,bytes\n1,2\n", "line 1: t,bytes: must fit a known format"),
-    # Mbit/s
     ("0 1\n1 nan\n", "line 2: Mbit/s = nan: must be a finite number"),
     ("0 1\n1 -2\n", r"line 2: Mbit/s = -2: must be from 0 to 1e\+06"),
-    ("0 1\n2 1\n1 1\n", r"line 3: time in s = 1: must not be before the line above \(2\)"),
-    ("0 1\n1e8 1\n", r"line 2: time in s = 1e8: must be from 0 to 1e\+07"),
     ("0 1e6\n100 1\n", "line 1: bytes = 12500000000000: must be at most 1000000000000"),
     ("0 1\n", "line 1: '0 1': must have a second line"),
-    # Belgium
     ("1 1 51 3 1 1\n2 2 91 3 1 1\n", "line 2: latitude = 91: must be from -90 to 90"),
-    ("1 1 51 3 1 1\n2 2 51 3 1.5 1\n", "line 2: bytes = 1.5: must be a whole number"),
-    # Rates under a header
     ("time_s,bytes_per_s\n", "is empty: must hold a line for each sample"),
-    ("time_s,bytes_per_s\n0,1\n", "line 2: 0,1: must have a second line"),
-    ("time_s,bytes_per_s\n0,1\n1,-1\n", "line 3: bytes_per_s = -1: must be from 0 to"),
     ("time_s,bytes_per_s\n0,1\n86401,1\n", "line 3: time in s = 86401: must be at most 86400 s after the line above"),
-    # UCC
-    (UCC_HEADER, "holds no measurement"),
-    (UCC_HEADER + "2019.12.16_13.40.04,0,-,20,D\n", "line 2: DL_bitrate = -: must be a finite number"),
     (UCC_HEADER + "2019.13.16_13.40.04,0,1,20,D\n", "line 2: Timestamp = 2019.13.16_13.40.04: must be a time"),
-    (UCC_HEADER + "2019.12.16_13.40.04,0,1\n", "line 2: .*: must have 5 columns, has 3"),
     (UCC_HEADER + f"{DAY}.04,0,1,1,D\n{DAY}.10,0,1,1,D\n", f"line 3: Timestamp = {DAY}.10: must be at most 5 s after"),
-    # NYU-METS
     ("1,Mbits/sec\n1,MBytes/sec\n", "line 2: unit = MBytes/sec: must be one of bits/sec, Kbits/sec"),
     ("1,Mbits/sec\n1e4,Gbits/sec\n", r"line 2: Gbits/sec = 1e4: must be from 0 to 1000"),
-    ("1,Mbits/sec\n1\n", "line 2: 1: must have 2 columns, has 1"),
-    # Sabre
     ("[", r"line 1: .*: must be JSON"),
     ("[3", "line 1: 3: must be an object"),
     ('[{"duration_ms": 1, "bandwidth_kbps": 1}', "line 1: must be ',', for a list"),
     ("[]", "holds no measurement"),
-    ("[\n3]", "line 2: 3: must be an object with duration_ms"),
     ('[\n{"duration_ms": true}]', "line 2: .*true.*: duration_ms must be a number"),
-    ('[{"duration_ms": ' + "[" * 900 + "]" * 900 + "}]", "line 1: .*(must be JSON|duration_ms must be a number)"),
-    ('[{"duration_ms": 1, "bandwidth_kbps": 1}\n{}]', r"line 2: {}]: must be ',', for a list of objects"),
     ('[{"duration_ms": 1, "bandwidth_kbps": 1}]\n5', "line 2: 5: must be nothing after the list"),
     ('[{"duration_ms": 0, "bandwidth_kbps": 1}]', "line 1: duration_ms = 0: must be above 0"),
-    ('[\n\n{"duration_ms": 1, "bandwidth_kbps": -1}]', "line 3: bandwidth_kbps = -1: must be from 0"),
     ('[{"duration_ms": NaN}]', "line 1: must be JSON .NaN is not a finite number"),
-    ('[{"duration_ms": ' + "9" * 5000 + "}]", "line 1: must be JSON .Exceeds the limit"),
     ("[" * 100_000, "line 1: must be JSON .nested too deep"),
-    ('[\n{"duration_ms": 1,}]', "line 2: .*: must be JSON"),
-    (b'[\n{"\xff": 1}]', "line 2: .*: must be UTF-8 text"),
-    # nuttcp
     ("nuttcp-t: v8.1.4: error from server\n", "line 1: .*error from server.*: must be a run that succeeded"),
     (NUTTCP + "1.0000 MB / 1.00 sec = 83.886 Mbps\n", "line 2: Mbps = 83.886: must be MB / sec, 8.389"),
     (NUTTCP + "1.0000 MB / 0.00 sec = 8.3886 Mbps\n", "line 2: sec = 0.00: must be from 0.01 to 3600"),
     (NUTTCP + "1e300 MB / 1.00 sec = 8.3886 Mbps\n", "line 2: .*: must be an interval, MB / sec = Mbps, or a remark"),
-    (NUTTCP + "9999999.0 MB / 1.00 sec = 8.3886 Mbps\n", "line 2: MB = 9999999.0: must be from 0 to 953674"),
-    # iperf3
-    ("{}", "must be an object with a list of intervals"),
     ('{"intervals": []}', "holds no measurement"),
     ('{"intervals": [], "error": "unable to connect"}', "error = 'unable to connect': must be a run that succeeded"),
     ('{"intervals": [3]}', "line 1: 3: must hold sum, an object"),
     ('{"intervals": [\n{"sum": {"start": 0, "end": 1}}]}', "line 2: .*: must hold bytes, a whole number"),
-    (summed('0, "end": 1, "bytes": 1.5'), "line 1: 1.5: must hold bytes, a whole number"),
     (summed('0, "end": 1, "bytes": -5'), "line 1: bytes = -5: must be at least 0"),
-    (summed('0, "end": true, "bytes": 5'), "line 1: True: must hold end, a number"),
     (summed('0, "end": 0, "bytes": 5'), "line 1: end = 0.*: must be after its start"),
-    (summed('0, "end": 1e9, "bytes": 5'), "line 1: end = 1000000000.0: must be from 0 to"),
-    (summed('NaN, "end": 1, "bytes": 5'), "line 1: (start = nan: must be|must be JSON)"),
-    (
-        summed('0, "end": 1, "bytes": 5}},\n{"sum": {"start": 2, "end": 3, "bytes": 5'),
-        "line 2: start = 2.0: must begin",
-    ),
-    # Lists of runs
+    (summed('0, "end": 1, "bytes": 5}},\n{"sum": {"start": 2, "end": 3, "bytes": 5'), "line 2: start = 2.0: must"),
     ("####\n", "has no run 1: must be one of none"),
-    ("Run 2\n1,2\n", "has no run 1: must be one of run 2"),
-    ("Run 1\n", "run 1 must have a line of Mbit/s"),
     ("Run 1\n1,2\nRun 1\n1,2\n", "line 3: Run = 1: must be from 1 to 16, and no run's above"),
-    ("Run 17\n1,2\n", "line 1: Run = 17: must be from 1 to 16"),
     ("####\n1,2\n", "line 2: 1,2: must come under a heading, Run 1"),
-    ("Run 1\n1,x\n", "line 2: Mbit/s = x: must be a finite number"),
-    ("Run 1\n1\n", "line 2: 1: must have a second line"),
     ("Run 1\n0,1\n5,5,5\n", "line 3: samples = 3: must be as many as times in the line above .2."),
     ("Run 1\n0,1\n5,5\n3,4\n", "line 4: run 1 must have one line, or pairs of them"),
-    ("Run 1\n1,0\n5,5\n", "line 3: time in s = 0: must not be before the line above"),
-    # None of them
     ("", "is empty"),
     ("hello\n", "line 1: hello: must fit a known format"),
-    (b"\x00\x01", "line 1: .*must fit a known format"),
-    (b"\x80\x81\n", "line 1: .*must be UTF-8 text"),
-    ("7" * 5000, "line 1: 777.*: must be at most 4096 characters"),
 ]
 
 
@@ -152,17 +103,16 @@ def test_what_is_no_file(tmp_path: Path) -> None:
             read_trace(path, format="mahimahi")
 
 
-@pytest.mark.parametrize("text", ["\n".join(map(str, range(3000))), HEADER + "1000,1,1000\n" * 999])
-def test_damaged_gzip(tmp_path: Path, text: str) -> None:
-    packed = gzip.compress(text.encode())
-    for broken, format in ((packed[:-9], "mahimahi"), (packed[:5], None)):
-        with pytest.raises(TraceError, match=r"lte.csv, line \d+: gzip data damaged or cut off"):
-            read_trace(written(tmp_path, broken), format=format)
+def test_damaged_gzip(tmp_path: Path) -> None:
+    for text in ("\n".join(map(str, range(3000))), HEADER + "1000,1,1000\n" * 999):
+        packed = gzip.compress(text.encode())
+        for broken, format in ((packed[:-9], "mahimahi"), (packed[:5], None)):
+            with pytest.raises(TraceError, match=r"lte.csv, line \d+: gzip data damaged or cut off"):
+                read_trace(written(tmp_path, broken), format=format)
 
 
 LIMITS = [
     (text_files, "MAX_TEXT_BYTES", 30, "1\n" * 500, "more than 30 bytes of text"),
-    (text_files, "MAX_TEXT_BYTES", 30, HEADER + "1,1,1\n" + "2,1,1\n" * 90, "more than 30 bytes of text"),
     (text_files, "MAX_LINES", 3, HEADER + "1,1,1\n2,1,1\n3,1,1\n", "line 4: more than 3 .*must be fewer"),
     (text_files, "MAX_LINES", 30, "\n" * 40, "line 31: more than 30 .*must be fewer"),
     (mahimahi, "_CHUNK_BYTES", 1000, "\n".join(map(str, range(4321))) + "\n4l\n5000", "line 4322: time in ms = 4l"),
@@ -170,13 +120,11 @@ LIMITS = [
 ]
 
 
-@pytest.mark.parametrize(("module", "limit", "value", "text", "says"), LIMITS, ids=range(len(LIMITS)))
-def test_reading_stops_at_each_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: ModuleType, limit: str, value: int, text: str, says: str
-) -> None:
-    monkeypatch.setattr(module, limit, value)
-    with pytest.raises(TraceError, match=says):
-        read_trace(written(tmp_path, gzip.compress(text.encode())))
+def test_reading_stops_at_each_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, limit, value, text, says in LIMITS:
+        with monkeypatch.context() as patch, pytest.raises(TraceError, match=says):
+            patch.setattr(module, limit, value)
+            read_trace(written(tmp_path, gzip.compress(text.encode())))
 
 
 def test_mahimahi_limits_odd_lines_but_not_bare_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,9 +132,7 @@ def test_mahimahi_limits_odd_lines_but_not_bare_ones(tmp_path: Path, monkeypatch
     monkeypatch.setattr(mahimahi, "_CHUNK_BYTES", 64)
     for end in ("\n", "\r\n"):
         assert read_trace(written(tmp_path, f"7{end}" * 100)).total_bytes == 150_000
-    with pytest.raises(
-        TraceError, match=r"line \d+: more than 50 lines so far in blocks that are not all bare numbers"
-    ):
+    with pytest.raises(TraceError, match=r"line \d+: more than 50 lines so far in blocks that are not all bare"):
         read_trace(written(tmp_path, "7\n" + "\n" * 200))
 
 

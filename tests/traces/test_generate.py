@@ -37,47 +37,36 @@ from bufgym.traces.motion import Motion
 from bufgym.traces.trace import Trace
 
 MODES = ("bicycle", "bus", "car", "foot", "train", "tram")
-SEEDED: dict[str, Callable[[int], Trace]] = {
-    "link": lambda seed: markov_link("tram", seed, 120),
-    "gilbert-elliott": lambda seed: gilbert_elliott(seed, 120),
-    "roaming": lambda seed: roaming(seed, 120),
-    "lte": lambda seed: synthetic_lte(seed, 120),
-}
+SEEDED: tuple[Callable[[int], Trace], ...] = (
+    lambda seed: markov_link("tram", seed, 120),
+    lambda seed: gilbert_elliott(seed, 120),
+    lambda seed: roaming(seed, 120),
+    lambda seed: synthetic_lte(seed, 120),
+)
 
 # 8 Mbit/s = 1 MB/s everywhere outside outages, nothing inside.
 FLAT = LinkParameters(1, 1000, (1e6,) * len(PROBABILITIES), 0.0, 0.0, 10.0, 0.0, None)
 OUTAGES = OutageParameters(20, 0.5, 4.0, 60.0, 1.0, 2.0, 2.0, (0.0,) * 5)
+RATES = tuple(1e6 * k for k in range(1, 12))
+KNOWN = LinkParameters(1, 1000, RATES, 0.2, 0.4, 50.0, 0.3, replace(OUTAGES, long_gap_s=4.0, shoulder=0.5))
 
 
-# -------------------- seeds
-
-
-@pytest.mark.parametrize("kind", SEEDED)
-def test_a_seed_is_a_trace(kind: str) -> None:
-    make = SEEDED[kind]
-    assert make(5) == make(5)
-    assert make(5).cumulative_bytes.tolist() != make(6).cumulative_bytes.tolist()
+def test_a_seed_is_a_trace() -> None:
+    for make in SEEDED:
+        assert make(5) == make(5)
+        assert make(5).cumulative_bytes.tolist() != make(6).cumulative_bytes.tolist()
 
 
 def test_bytes_that_must_never_change() -> None:
     """Results are quoted on seeds: a generator that changes is a new generator, under a new name."""
     link = markov_link("known", 2, 12, links={"known": KNOWN})
-    assert np.diff(link.cumulative_bytes).tolist()[4:] == [
-        *(6621400, 6654152, 3027288, 2683391, 1422412, 1261835, 1853449),  # lowered from the seventh on, ...
-        0,  # ... for here an outage begins
-    ]
+    # Lowered from the seventh on, for then an outage begins.
+    lowered = [6621400, 6654152, 3027288, 2683391, 1422412, 1261835, 1853449, 0]
+    assert np.diff(link.cumulative_bytes).tolist()[4:] == lowered
     assert synthetic_lte(1, duration_s=1).duration_us == 1_000_000
     assert gilbert_elliott(1, 40, mean_good_s=2, mean_bad_s=1).total_bytes == 283_000_000
     assert roaming(1, 60).total_bytes == 227_808_750
     assert frame_sizes(np.array([0, 10**6, 2 * 10**6]), drive_motion(0, 10), 3).tolist() == [240183, 273977, 274993]
-
-
-KNOWN = LinkParameters(
-    1, 1000, tuple(1e6 * k for k in range(1, 12)), 0.2, 0.4, 50.0, 0.3, replace(OUTAGES, long_gap_s=4.0, shoulder=0.5)
-)
-
-
-# -------------------- fitted links
 
 
 @given(seed=st.integers(0, 2**32), seconds=st.integers(1, 400), mode=st.sampled_from(MODES))
@@ -130,14 +119,9 @@ def test_rates_beside_outages_are_lowered() -> None:
     start = int(np.argmax(rates == 0))
     assert rates[start - 6 : start].tolist() == [1e6, 5e5, 5e5, 5e5, 5e5, 5e5]
     assert link_rates(replace(lowered, outages=replace(OUTAGES, shoulder=0.1)), 1, 2000)[start - 1] == 0.3e6
-
-
-def test_the_first_second_of_a_link_carries_something() -> None:
+    # Yet the first second of a link carries something.
     worst = replace(FLAT, outages=replace(OUTAGES, long_gap_s=1.0, short_gap_s=1.0, shoulder=0.5))
     assert all(markov_link("worst", seed, 1, links={"worst": worst}).total_bytes > 0 for seed in range(20))
-
-
-# -------------------- by rule
 
 
 def test_robofleets_ramp() -> None:
@@ -151,10 +135,7 @@ def test_robofleets_ramp() -> None:
     assert np.diff(up.cumulative_bytes).tolist() == np.diff(down.cumulative_bytes).tolist()[::-1]
 
 
-AFTER = st.sampled_from(["hold", "stop"])
-
-
-@given(start=st.floats(0, 1e9), end=st.floats(1, 1e9), seconds=st.floats(0.001, 50), after=AFTER)
+@given(st.floats(0, 1e9), st.floats(1, 1e9), st.floats(0.001, 50), st.sampled_from(["hold", "stop"]))
 def test_a_ramp_carries_its_area(start: float, end: float, seconds: float, after: str) -> None:
     trace = ramp(start, end, seconds, after)  # type: ignore[arg-type]
     area = (start + end) / 2 * trace.duration_us / 1e6
@@ -170,19 +151,13 @@ def test_steady_link_outages_and_a_tunnel_with_sharp_ends() -> None:
     assert outage(3, 1, 8e6, outage_bytes_per_s=1e5).total_bytes == 16_100_000
     trace = tunnel(1e6, before_s=1, fade_s=0, blackout_s=2, recover_s=0, after_s=0)
     assert (trace.duration_us, trace.total_bytes) == (3_000_000, 1_000_000)
-
-
-def test_tunnel() -> None:
-    """20 s + 20 s at 10 MB/s, 3 s and 2 s at half of it in the mean, 10 s of nothing."""
+    # 20 s + 20 s at 10 MB/s, 3 s and 2 s at half of it in the mean, 10 s of nothing.
     trace = tunnel(10e6)
     assert (trace.duration_us, trace.total_bytes) == (55_000_000, 400_000_000 + 25_000_000)
     assert trace.seconds_below(1.0) == 10.0
     # The last tenth of 3 s: a sixtieth of the rate, in whole bytes.
     rates = trace.rate_bytes_per_s([22_950_000, 23_000_000, 32_999_999, 33_000_000])
     assert rates == pytest.approx([10e6 / 60, 0.0, 0.0, 10e6 / 40], abs=5)
-
-
-# -------------------- two states, access points
 
 
 def test_gilbert_elliotts_share_of_bad_time() -> None:
@@ -212,9 +187,6 @@ def test_each_hand_over_costs_its_gap() -> None:
     assert (roaming(0, 80, replace(corridor, gap_s=0.0)).segments()[1] > 0).all()
 
 
-# -------------------- motion and frames
-
-
 def still_then_turning() -> Motion:
     """10 s at rest, 10 s at 0.75 views a second (45 degrees/s)."""
     return Motion("m", np.array([0, 10_000_000, 20_000_000]), np.array([0.0, 0.0, 7.5]))
@@ -239,7 +211,6 @@ def test_frames_without_chance_follow_motion_alone() -> None:
     sizes = frame_sizes(np.arange(20) * 1_000_000, still_then_turning(), 0, model)
     assert sizes.tolist() == [100_000] * 11 + [150_000] * 9
     assert frame_sizes(np.zeros(0, np.int64), still_then_turning(), 0).tolist() == []
-    assert len(frame_sizes(np.array([5]), still_then_turning(), 0)) == 1
 
 
 def test_detail_stays_while_the_camera_stands_still() -> None:
@@ -247,13 +218,9 @@ def test_detail_stays_while_the_camera_stands_still() -> None:
     sizes = frame_sizes(np.arange(600) * 33_333, still_then_turning(), 1, model)
     assert len(set(sizes[:300].tolist())) == 1
     assert len(set(sizes[301:].tolist())) > 250
-    assert sizes.dtype == np.int64
     assert sizes.tolist() != frame_sizes(np.arange(600) * 33_333, still_then_turning(), 2, model).tolist()
     spread = [frame_sizes(np.array([0, 10_000_000, 20_000_000]), still_then_turning(), s, model)[2] for s in range(400)]
     assert abs(np.std(spread) / 230_000 - 0.12) < 0.015
-
-
-# -------------------- what is refused
 
 
 @pytest.mark.parametrize(
@@ -261,20 +228,11 @@ def test_detail_stays_while_the_camera_stands_still() -> None:
     [
         (lambda: markov_link("boat", 0), "mode = 'boat': must be one of bicycle, bus"),
         (lambda: synthetic_lte(-1), "seed = -1: must be >= 0"),
-        (lambda: synthetic_lte(0, 0), "duration_s = 0: must be a whole number from 1"),
-        (lambda: synthetic_lte(0, mode="boat"), "mode = 'boat': must be one of walk, drive, train"),  # type: ignore[arg-type]
         (lambda: outage(1, 1, 5), "length_s = 1: must be above 0 and below period_s = 1"),
-        (lambda: outage(2, 1, 5, repeats=0), "repeats = 0: must be >= 1"),
-        (lambda: drive_motion(0, 0), "duration_s = 0: must be from 0.1"),
         (lambda: markov_link("bus", 0, 2.5), "duration_s = 2.5: must be a whole number"),  # type: ignore[arg-type]
-        (lambda: markov_link("bus", 0, 10**7), "duration_s = 10000000: must be a number from 1 to 1e"),
         (lambda: markov_link("bus", 0, mean_bytes_per_s=float("nan")), "mean_bytes_per_s = nan"),
         (lambda: gilbert_elliott(0, bad_bytes_per_s=2e7), "bad_bytes_per_s = 20000000.0: must be at most good"),
-        (lambda: gilbert_elliott(0, mean_bad_s=0.01), "mean_bad_s = 0.01: must be a number from 0.1"),
-        (lambda: roaming(0, 0), "duration_s = 0: must be a number from 0.1"),
-        (lambda: Corridor(access_points=0), "access_points = 0"),
         (lambda: steady(0), "bytes_per_s = 0: must be a number from 1"),
-        (lambda: tunnel(1e6, blackout_s=-1), "blackout_s = -1"),
         (lambda: tunnel(1e6, before_s=0, fade_s=0, recover_s=0, after_s=0), "no capacity at all"),
         (lambda: Driving(cruise_m_per_s=(2, 1)), r"cruise_m_per_s = \(2, 1\): must be in order"),
         (lambda: Driving(turn_chance=0.8), "at most 1 together"),
@@ -296,23 +254,16 @@ def with_stay(value: str) -> str:
     return text.replace(f'"level_stay_s": {share}', f'"level_stay_s": {value}')
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
+def test_broken_parameter_files(tmp_path: Path) -> None:
+    file = tmp_path / "links.json"
+    for text, says in (
         ("{", "must be JSON"),
         ("[]", 'must be an object with "modes"'),
         ('{"modes": {"bus": {"seconds": 5}}}', "mode 'bus': must be an object with fast_memory"),
-        ("\ufeffnonsense", "must be JSON"),
         ("[" * 100_000, "must be JSON"),
         (" " * (2**20 + 1), "must be at most 1048576 bytes"),
-        *(
-            (value, "mode '.*': level_stay_s = ")
-            for value in ("null", "true", '"5"', "NaN", "-1", "1e400", "[1]", "{}")
-        ),
-    ],
-)
-def test_broken_parameter_files(text: str, says: str, tmp_path: Path) -> None:
-    file = tmp_path / "links.json"
-    file.write_text(with_stay(text) if "level_stay_s" in says else text, encoding="utf-8")
-    with pytest.raises(TraceError, match=f"links.json.*{says}"):
-        read_links(file)
+        *((with_stay(value), "mode '.*': level_stay_s = ") for value in ("null", "true", '"5"', "NaN", "-1", "1e400")),
+    ):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(TraceError, match=f"links.json.*{says}"):
+            read_links(file)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -35,11 +34,10 @@ KITTI_TIMES = "0.000000e+00\n1.000000e+00\n2.000000e+00\n"
 REPEATED = TUM.replace("101 1", "101 9 9 9 0 0 0 1\n101 1")
 """Of two poses with one time the last counts."""
 UPRIGHT = [0.0, 0, 0, 1]
+PATHS = [("tum", TUM), ("tum", REPEATED), ("euroc", EUROC), ("euroc", EUROC_CSV), ("kitti", KITTI)]
 
 
-@pytest.mark.parametrize(
-    ("format", "text"), [("tum", TUM), ("tum", REPEATED), ("euroc", EUROC), ("euroc", EUROC_CSV), ("kitti", KITTI)]
-)
+@pytest.mark.parametrize(("format", "text"), PATHS)
 def test_one_path_in_each_format(tmp_path: Path, format: str, text: str) -> None:
     path = written(tmp_path, text, "path.txt")
     written(tmp_path, KITTI_TIMES, "path_times.txt")
@@ -56,7 +54,6 @@ def test_one_path_in_each_format(tmp_path: Path, format: str, text: str) -> None
 
 
 def test_times_in_ns_are_exact(tmp_path: Path) -> None:
-    """As a float, 1403636580863555584 ns is known to 256 ns only."""
     lines = [f"14036365808635{k:05d} 0 0 0 1 0 0 0" for k in (0, 1000, 2999, 55584)]
     poses = read_poses(written(tmp_path, "# timestamp[ns] px py pz qw qx qy qz\n" + "\n".join(lines), "path.txt"))
     assert poses.time_us.tolist() == [0, 1, 2, 55]
@@ -72,8 +69,6 @@ def test_kitti_times_from_elsewhere(tmp_path: Path) -> None:
         ("0\n1\n", r"00.txt, line 3: must have a time, but .*times.txt has no more"),
         (KITTI_TIMES + "3\n", "holds more times than .*00.txt has poses"),
         ("0\n2\n1\n", r"00.txt, line 3: time in s = 1: must not be before the line above"),
-        ("0\n1 1\n2\n", "times.txt, line 2: '1 1': must have 1 columns, has 2"),
-        ("0\n-1\n2\n", "times.txt, line 2: time in s = -1"),
     ):
         times.write_text(text)
         with pytest.raises(TraceError, match=says):
@@ -83,28 +78,15 @@ def test_kitti_times_from_elsewhere(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("# only this\n", "path.txt: is empty"),
         ("0 0 0 0 0 0 0 1\n", "holds 1 samples: must hold at least 2"),
-        ("0 0 0 0 0 0 0\n", "path.txt, line 1: '0 0 0 0 0 0 0': must have 8 columns, has 7"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 0\n", "line 2: norm of the quaternion = 0: must be 1 within 1 %"),
-        ("0 0 0 0 0 0 0 1.02\n", "line 1: norm of the quaternion = 1.02"),
-        ("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n", "line 2: tx = nan: must be a finite number"),
         ("0 0 0 1e8 0 0 0 1\n", "line 1: tz = 1e8: must be from -1e\\+07 to 1e\\+07"),
-        ("5 0 0 0 0 0 0 1\n4 0 0 0 0 0 0 1\n", "line 2: time in s = 4: must not be before the line above"),
         ("0 0 0 0 0 0 0 1\n2e7 0 0 0 0 0 0 1\n", "line 2: time in s = 2e7: must be at most 10000000 s after"),
-        ("-1 0 0 0 0 0 0 1\n", "line 1: time in s = -1"),
         ("t_s,motion\n0,0\n1,2\n2,1.5\n", "line 4: motion = 1.5: must not be below the line above"),
-        ("t_s,motion\n0,0\n1,-2\n", "line 3: motion = -2: must be from 0"),
-        ("t_s,motion\n0,0\n1\n", "line 3: 1: must have 2 columns, has 1"),
-        ("t_s,motion\n0,0\n", "holds 1 samples"),
         ("#timestamp [ns] ...\n1 0 0 0 1 0 0\n", r"line 2: '1 0 0 0 1 0 0': must have 8 columns \(or the 17 of"),
-        ("#timestamp [ns] ...\n1 0 0 0 0 0 0 0\n", "line 2: norm of the quaternion = 0"),
-        ("#timestamp [ns] ...\n1e99 0 0 0 1 0 0 0\n", "line 2: time in ns = 1e99: must be from 0 to 1e[+]20"),
-        ("1,0,0,0,1,0,x,0\n", "line 1: qy = x: must be a finite number"),
         ("1 0 0 0 0 1 0 0 0 0 2 0\n", "must be a rotation within 1 %"),
         # A reflection: orthogonal, but no rotation.
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "must be a rotation within 1 %"),
-        ("1 0 0 1e9 0 1 0 0 0 0 1 0\n", "line 1: number 4 = 1e9: must be from -1e[+]07 to 1e[+]07"),
         # Nanoseconds without EuRoC's header could be anybody's: not guessed.
         ("1403636579763555584 0 0 0 0 0 0 1\n", "line 1: time in s = 1403636579763555584: must be from 0 to"),
     ],
@@ -133,9 +115,6 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
     assert again.coordinate.tolist() == motion.coordinate.tolist()
     with pytest.raises(TraceError, match="cannot be written"):
         write_motion_csv(motion, tmp_path)
-
-
-# -------------------- poses to motion
 
 
 def about(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
@@ -179,23 +158,18 @@ def test_gaps_are_reported_and_past_the_end_the_total_is_carried_on() -> None:
     assert motion.at([0, 5, 10, 20, 25, 45]).tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 3.5]
 
 
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        *(
-            (lambda name=name, value=value: MotionSettings(**{name: value}), f"{name} = {value}: must be a finite")
-            for name in ("fov_deg", "scene_scale_m", "rate_hz", "max_gap_s")
-            for value in (0.0, float("nan"))
-        ),
-        (lambda: Motion("m", np.array([0, 0]), np.array([0.0, 1.0])), "must increase at index 1"),
-        (lambda: Motion("m", np.array([0, 1, 2]), np.array([0.0, 1.0, 0.5])), "must not decrease at index 2"),
-        (lambda: Motion("m", np.array([0, 1]), np.array([0.0, float("nan")])), "finite"),
-        (lambda: Motion("m", np.array([0, 1]), np.array([0.0, 1.0])).at(-1), "time_us = -1: must be >= 0"),
-    ],
-)
-def test_broken_arguments(make: Callable[[], object], says: str) -> None:
-    with pytest.raises(BufgymError, match=says):
-        make()
+def test_broken_arguments() -> None:
+    time_us = np.array([0, 1, 2])
+    for x, says in (([0.0, 1.0, 0.5], "must not decrease at index 2"), ([0.0, math.nan, 1], "finite")):
+        with pytest.raises(BufgymError, match=says):
+            Motion("m", time_us, np.array(x))
+    with pytest.raises(BufgymError, match="must increase at index 1"):
+        Motion("m", np.array([0, 0]), np.array([0.0, 1.0]))
+    with pytest.raises(BufgymError, match="time_us = -1: must be >= 0"):
+        Motion("m", time_us, np.array([0.0, 1.0, 1.0])).at(-1)
+    for name in ("fov_deg", "scene_scale_m", "rate_hz", "max_gap_s"):
+        with pytest.raises(BufgymError, match=f"{name} = 0.0: must be a finite"):
+            MotionSettings(**{name: 0.0})
 
 
 def test_slerp_turns_evenly_and_the_short_way() -> None:
@@ -234,21 +208,13 @@ def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, fl
     assert min(np.abs(computed - expected).max(), np.abs(computed + expected).max()) < 1e-12
 
 
-# -------------------- real ones
-
-
-# Coordinate gained a second: the desks are hand-held sweeps, xyz is mostly translation, 360 a turning robot.
-TUM_PER_S = {"freiburg1_desk": 0.81, "freiburg1_desk2": 1.00, "freiburg1_rpy": 1.15, "freiburg1_xyz": 0.44}
-TUM_PER_S |= {"freiburg2_desk": 0.27, "freiburg2_pioneer_360": 0.42}
-
-
 @pytest.mark.nightly
-@pytest.mark.parametrize("name", TUM_PER_S)
-def test_real_tum(shared_data: Path, name: str) -> None:
-    motion = read_motion(shared_data / "tum_rgbd" / f"{name}.groundtruth.txt.gz")
-    assert motion.total / motion.duration_us * 1e6 == pytest.approx(TUM_PER_S[name], abs=0.006)
-    # The README of the data tells of a gap of 12 s in freiburg2_desk.
-    assert motion.longest_gap_s == pytest.approx(12.0 if name == "freiburg2_desk" else 0.0, abs=0.1)
+def test_real_tum(shared_data: Path) -> None:
+    """Coordinate gained a second: a hand-held sweep, one with a gap of 12 s by its README, and a turning robot."""
+    for name, per_s in (("freiburg1_desk", 0.81), ("freiburg2_desk", 0.27), ("freiburg2_pioneer_360", 0.42)):
+        motion = read_motion(shared_data / "tum_rgbd" / f"{name}.groundtruth.txt.gz")
+        assert motion.total / motion.duration_us * 1e6 == pytest.approx(per_s, abs=0.006)
+        assert motion.longest_gap_s == pytest.approx(12.0 if name == "freiburg2_desk" else 0.0, abs=0.1)
 
 
 def test_real_kitti(shared_data: Path) -> None:

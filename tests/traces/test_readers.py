@@ -16,16 +16,10 @@ from bufgym.errors import BufgymError
 from bufgym.traces import detect_format, read_trace
 from bufgym.traces.formats import mahimahi
 
-SABRE = """[
-    {"duration_ms": 725, "bandwidth_kbps": 36014, "latency_ms": 20},
-    {"duration_ms": 1000.5, "bandwidth_kbps": 16, "latency_ms": 20}
-]"""
-NUTTCP = """Start time: 1730498381814
-[2024-11-01T14:59:42.722595-0700] nuttcp-t: v8.1.4: socket
+NUTTCP = """[2024-11-01T14:59:42.722595-0700] nuttcp-t: v8.1.4: socket
 [2024-11-01T14:59:42.724539-0700]     3.1250 MB /   0.50 sec =   52.4220 Mbps     0 retrans   2599 KB-cwnd
 [2024-11-01T14:59:42.724540-0700]     0.0000 MB /   0.49 sec =    0.0000 Mbps     2 retrans      1 KB-cwnd
 [2024-11-01T14:59:43.702696-0700]     0.0625 MB /   0.50 sec =    1.0486 Mbps     0 retrans      1 KB-cwnd
-[2024-11-01T15:01:42.809697-0700]
 [2024-11-01T15:01:42.809794-0700] nuttcp-r: 3.1875 MB in 1.50 real seconds = 2176.00 KB/sec = 17.8258 Mbps
 End time: 1730498502868
 """
@@ -56,12 +50,12 @@ BY_HAND = [
     # 0.5 Mbit/s is 62,500 B/s, 43.3 Kbit/s is 5412.5 and rounds to even, 1e-5 Gbit/s is 1250.
     (
         "nyu",
-        "0.5,Mbits/sec\n0,bits/sec\n43.3,Kbits/sec\n0.00001,Gbits/sec\n16,bits/sec\n",
-        [(0, 0), (S, 62_500), (2 * S, 62_500), (3 * S, 67_912), (4 * S, 69_162), (5 * S, 69_164)],
+        SAMPLES["nyu"] + "0.00001,Gbits/sec\n",
+        [(0, 0), (S, 62_500), (2 * S, 62_500), (3 * S, 67_912), (4 * S, 69_162)],
     ),
-    # 36,014 kbit/s for 725 ms are 26,110,150 bits: 3,263,768.75 bytes; 16 kbit/s for 1000.5 ms are 2001.
-    ("sabre", SABRE, [(0, 0), (725_000, 3_263_769), (1_725_500, 3_265_770)]),
-    ("sabre", "".join(SABRE.split()), [(0, 0), (725_000, 3_263_769), (1_725_500, 3_265_770)]),
+    # 36,014 kbit/s for 725 ms are 26,110,150 bits: 3,263,768.75 bytes; 16 kbit/s for 1 s are 2000.
+    ("sabre", SAMPLES["sabre"], [(0, 0), (725_000, 3_263_769), (1_725_000, 3_265_769)]),
+    ("sabre", "".join(SAMPLES["sabre"].split()), [(0, 0), (725_000, 3_263_769), (1_725_000, 3_265_769)]),
     # 3.125 MB are 3.125 * 2**20 = 3,276,800 bytes; 0.0625 MB are 65,536. Intervals follow each other, whatever their
     # stamps; the closing line is left out.
     ("nuttcp", NUTTCP, [(0, 0), (500_000, 3_276_800), (990_000, 3_276_800), (1_490_000, 3_342_336)]),
@@ -84,14 +78,9 @@ def test_same_trace_by_any_packing(tmp_path: Path, format: str) -> None:
     plain = written(tmp_path, text)
     expected = read_trace(plain, format=format)
     assert detect_format(plain) == format and f"{format}, requested" in expected.source
-    dressed = {
-        "gzip": gzip.compress(text.encode()),
-        "Windows": text.replace("\n", "\r\n").encode(),
-        "byte order mark": b"\xef\xbb\xbf" + text.encode(),
-        "blank lines": ("\n" + text.replace("\n", " \n\n")).encode(),
-        "no last line end": text.rstrip("\n").encode(),
-    }
-    for packed in dressed.values():
+    # With Windows' ends of lines, a byte order mark, blank lines, and no end of the last line; and packed.
+    dressed = (text.replace("\n", "\r\n"), "\ufeff" + text, "\n" + text.replace("\n", " \n\n"), text.rstrip("\n"))
+    for packed in (gzip.compress(text.encode()), *dressed):
         assert read_trace(written(tmp_path, packed)) == expected
 
 
@@ -125,11 +114,6 @@ def test_ucc_columns(tmp_path: Path) -> None:
         read_trace(written(tmp_path, "1\n"), column="DL_bitrate")
 
 
-def test_json_in_a_single_long_line(tmp_path: Path) -> None:
-    trace = read_trace(written(tmp_path, "[" + ", ".join(['{"duration_ms": 1000, "bandwidth_kbps": 8}'] * 500) + "]"))
-    assert trace.duration_us == 500_000_000 and trace.total_bytes == 500_000
-
-
 def test_speed_tests_say_what_was_measured_and_by_whom(tmp_path: Path) -> None:
     assert read_trace(written(tmp_path, NUTTCP, "uplink.out")).source.endswith("detected, 3 intervals)")
     assert read_trace(written(tmp_path, IPERF3)).source.endswith("(format iperf3, detected, measured by the receiver)")
@@ -139,9 +123,8 @@ def test_speed_tests_say_what_was_measured_and_by_whom(tmp_path: Path) -> None:
 
 def test_runs_of_a_list_with_and_without_times(tmp_path: Path) -> None:
     # 8 Mbit/s are 1 MB/s: 100 kB in the 0.1 s of a sample.
-    path = written(
-        tmp_path, "\n####\nRun 1\n8,16.0,0\n###\nRun 3\n0.5,1.5\n8,4\n0.1,-2\n7,7\nRun 2\n80,80\n", "walk.list"
-    )
+    text = "\n####\nRun 1\n8,16.0,0\n###\nRun 3\n0.5,1.5\n8,4\n0.1,-2\n7,7\nRun 2\n80,80\n"
+    path = written(tmp_path, text, "walk.list")
     first = read_trace(path)
     assert knots(first) == [(0, 0), (100_000, 100_000), (200_000, 300_000), (300_000, 300_000)]
     assert first.source.endswith("(format runs, detected, run 1 of 3, a sample each 0.1 s)")
@@ -151,9 +134,6 @@ def test_runs_of_a_list_with_and_without_times(tmp_path: Path) -> None:
     assert read_trace(path, column="run 2").total_bytes == 2_000_000
     with pytest.raises(BufgymError, match="has no run 4: must be one of run 1, run 3, run 2"):
         read_trace(path, column="run 4")
-
-
-# ---------------------------------------------------------------- the command
 
 
 def failed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -176,18 +156,13 @@ def test_info_of_every_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main(["trace", "info", *(str(written(tmp_path, text, format)) for format, text in SAMPLES.items())]) == 0
     for format, block in zip(SAMPLES, capsys.readouterr().out.split("\n\n"), strict=True):
         assert block.startswith(f"{format}\n") and f"(format {format}, detected" in block
-        for key in ("duration_s", "mean_KBps", "min_KBps", "max_KBps", "seconds_below_500KBps", "longest_run_below"):
-            assert f"\n  {key}" in block
-
-
-def test_info_by_format_and_column_out_of_a_zip(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # By format and column, out of a zip.
     member = f"{an_archive(tmp_path)}:ucc.csv"
     assert main(["trace", "info", member, "--format", "ucc", "--column", "UL_bitrate"]) == 0
     out = capsys.readouterr().out
     assert "(format ucc, requested, column UL_bitrate," in out
     # 20 and 8 kbit/s are 2.5 and 1 KB/s.
     assert ["mean_KBps", "1.75"] in [line.split() for line in out.splitlines()]
-    assert "--format" not in failed(["trace", "info", member, "--column", "Speed"], capsys)
 
 
 def test_validate_tells_sound_files_from_broken_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -199,10 +174,8 @@ def test_validate_tells_sound_files_from_broken_ones(tmp_path: Path, capsys: pyt
     assert ended.value.code == 1
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[:-1]] == ["OK", "error", "error", "OK", "OK"]  # a zip's members, too
-    assert lines[-1] == "3 of 5 files are sound"
-    assert "sound.up (format mahimahi, detected): 0.0 s, mean 1500.0 KB/s" in lines[0]
+    assert lines[-1] == "3 of 5 files are sound" and "a/nyu.csv (format nyu, detected): 3.0 s" in lines[4]
     assert "broken.up, line 2: time in ms = x: must be a whole number" in lines[1]
-    assert "a/nyu.csv (format nyu, detected): 3.0 s" in lines[4]
 
 
 def test_convert_states_what_was_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -238,10 +211,8 @@ def test_convert_many_into_a_folder_and_refusals(tmp_path: Path, capsys: pytest.
 def test_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     paths = [str(written(tmp_path, SAMPLES[format], format)) for format in ("nyu", "mahimahi")]
-    for ending, magic in ((".png", b"\x89PNG"), (".svg", b"<?xm")):
-        out = tmp_path / f"picture{ending}"
-        assert main(["trace", "plot", *paths, "--out", str(out)]) == 0
-        assert out.read_bytes()[:4] == magic
+    assert main(["trace", "plot", *paths, "--out", str(tmp_path / "picture.png")]) == 0
+    assert (tmp_path / "picture.png").read_bytes()[:4] == b"\x89PNG"
     for name in ("matplotlib", "matplotlib.figure"):  # loaded for pictures only
         monkeypatch.setitem(sys.modules, name, None)
     assert main(["trace", "validate", paths[0]]) == 0

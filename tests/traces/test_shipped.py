@@ -67,9 +67,6 @@ def test_shipped_names_and_loading(tmp_path: Path) -> None:
         read_motion(names["lte-synthetic-0"])
 
 
-# -------------------- the command
-
-
 def generate(*arguments: str) -> None:
     parser = Parser(prog="bufgym trace")
     trace_generate.add(parser.add_subparsers(required=True))
@@ -77,23 +74,18 @@ def generate(*arguments: str) -> None:
     options.command(options)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
+def test_the_command_writes_traces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (
         "link --mode train --seed 4 --duration 50 --mean 8e6",
         "gilbert-elliott --seed 4 --duration 50 --mean-bad 1",
         "roaming --seed 4 --duration 50 --gap 0.5",
         "steady --duration 50 --rate 1e6",
         "ramp --duration 50",
         "tunnel --before 15 --after 20",
-    ],
-)
-def test_the_command_writes_traces(arguments: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("a.csv", "b.csv"):
-        generate(*arguments.split(), "-o", str(tmp_path / name))
-    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
-    assert read_trace(tmp_path / "a.csv").duration_us == 50_000_000
-    assert "mean" in capsys.readouterr().out
+    ):
+        generate(*arguments.split(), "-o", str(tmp_path / "a.csv"))
+        assert read_trace(tmp_path / "a.csv").duration_us == 50_000_000
+        assert "mean" in capsys.readouterr().out
 
 
 def test_the_command_writes_motion_and_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -104,17 +96,10 @@ def test_the_command_writes_motion_and_frames(tmp_path: Path, capsys: pytest.Cap
     assert header == "time_s,bytes,x" and len(lines) == 60
     assert float(lines[-1].split(",")[2]) == pytest.approx(load_motion(tmp_path / "m.csv").at(1_966_667))
     assert "60 frames" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
+    for arguments, says in (
         ("drive --cruise 2,1 -o x.csv", "must not be above the second"),
         ("drive --cruise 2 -o x.csv", "must be two numbers"),
-        ("frames --rate-hz 1e9 -o x.csv", "must be from 1 to 1e7"),
         ("link --mode bus --links no.json -o x.csv", "no.json: cannot be read"),
-    ],
-)
-def test_what_the_command_refuses(arguments: str, says: str) -> None:
-    with pytest.raises(BufgymError, match=says):
-        generate(*arguments.split())
+    ):
+        with pytest.raises(BufgymError, match=says):
+            generate(*arguments.split())

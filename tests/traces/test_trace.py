@@ -20,18 +20,14 @@ from bufgym.traces.formats import writers
 STORY = Trace("story", np.array([0, 2_000_000, 3_000_000, 4_000_000]), np.array([0, 2_000_000, 2_000_000, 2_300_000]))
 
 
-def test_totals_mean_and_rates() -> None:
-    assert (STORY.duration_us, STORY.total_bytes, STORY.mean_bytes_per_s) == (4_000_000, 2_300_000, 575_000.0)
-    # The rate at a knot is that of the segment which begins there.
-    times = [0, 1_999_999, 2_000_000, 3_000_000, 3_999_999]
-    assert STORY.rate_bytes_per_s(times).tolist() == [1e6, 1e6, 0.0, 3e5, 3e5]
-
-
 @pytest.mark.parametrize(("after", "rate"), [("loop", 1e6), ("hold", 3e5), ("stop", 0.0)])
 def test_after_the_end(after: Any, rate: float) -> None:
     trace = Trace("story", STORY.time_us, STORY.cumulative_bytes, after)
     assert trace.rate_bytes_per_s(4_000_000) == rate
     assert trace.rate_bytes_per_s(9_000_000 if after == "loop" else 99_000_000) == rate
+    # The rate at a knot is that of the segment which begins there.
+    times = [0, 1_999_999, 2_000_000, 3_000_000, 3_999_999]
+    assert trace.rate_bytes_per_s(times).tolist() == [1e6, 1e6, 0.0, 3e5, 3e5]
 
 
 @pytest.mark.parametrize(
@@ -39,10 +35,7 @@ def test_after_the_end(after: Any, rate: float) -> None:
     [
         (STORY, (4.0, 575.0, 0.0, 1000.0, 2.0, 2.0)),
         # Three samples of 1 s and a stray one of 0.1 s without a byte, which the minimum alone leaves out.
-        (
-            Trace.from_intervals([10**6, 10**5, 10**6, 10**6], [600_000, 0, 700_000, 800_000]),
-            (3.1, 677.4, 600, 800, 0.1, 0.1),
-        ),
+        (Trace.steps([(1, 6e5), (0.1, 0), (1, 7e5), (1, 8e5)]), (3.1, 677.4, 600, 800, 0.1, 0.1)),
         # A packet of 1500 bytes in the first ms of every 10 ms, for 2.5 s: whole seconds count, at 150 KB/s.
         (Trace.from_intervals([1000, 9000] * 250, [1500, 0] * 250), (2.0, 150.0, 150.0, 150.0, 2.0, 2.0)),
     ],
@@ -50,9 +43,6 @@ def test_after_the_end(after: Any, rate: float) -> None:
 def test_describe(trace: Trace, expected: tuple[float, ...]) -> None:
     keys = ("duration_s", "mean_KBps", "min_KBps", "max_KBps", "seconds_below_500KBps", "longest_run_below_500KBps_s")
     assert describe(trace) == pytest.approx(dict(zip(keys, expected, strict=True)), abs=0.05)
-
-
-def test_seconds_below_is_strict() -> None:
     assert (STORY.seconds_below(300_000), STORY.seconds_below(300_001)) == (1.0, 2.0)
     assert STORY.seconds_below(700_000, window_us=4_000_000) == 4.0
 
@@ -81,9 +71,6 @@ def test_arrays_are_read_only_copies() -> None:
         assert array.tolist() == [0, 10]
         with pytest.raises(ValueError, match="read-only"):
             array[1] = 5
-
-
-def test_the_least_and_the_most_that_is_allowed() -> None:
     Trace("edge", [0, 2**31], [0, 2**31 - 1])  # type: ignore[arg-type]  # what integer interpolation can hold
     assert Trace.constant(0, 2, after="hold").total_bytes == Trace.constant(0, 2, after="stop").total_bytes == 0
 
@@ -98,15 +85,10 @@ def bad(time_us: list[Any], cumulative: list[Any]) -> Callable[[], object]:
         (bad([0], [0]), "1 knots: must be at least 2"),
         (bad([0, 1, 2], [0, 1]), "3 times for 2 byte counts"),
         (bad([5, 6], [0, 1]), r"first knot \(5 us, 0 bytes\): must be \(0, 0\)"),
-        (bad([0, 1], [3, 4]), r"first knot \(0 us, 3 bytes\)"),
         (bad([0, 2, 2], [0, 1, 2]), r"time_us\[2\] = 2 after 2: must increase"),
         (bad([0, 1, 2], [0, 5, 4]), r"cumulative_bytes\[2\] = 4 after 5: must not decrease"),
-        (bad([0, 1], [0, -1]), r"cumulative_bytes\[1\] = -1"),
         (bad([0.0, float("nan")], [0, 1]), r"time_us\[1\] = nan: must be a whole number"),
-        (bad([0, 1], [0.0, float("inf")]), r"cumulative_bytes\[1\] = inf"),
-        (bad([0, 1], [0.0, 0.5]), r"cumulative_bytes\[1\] = 0.5"),
         (bad([0, 1], [0, 2**63]), "below 2"),
-        (bad([0, 1], [0, 2**70]), "holds object values"),
         (bad([False, True], [0, 1]), "holds bool values"),
         (bad([[0, 1]], [0, 1]), "has 2 dimensions"),
         (bad([0, 2**62], [0, 1]), "both must be below"),
@@ -114,20 +96,15 @@ def bad(time_us: list[Any], cumulative: list[Any]) -> Callable[[], object]:
         (bad([0, 1], [0, 0]), "no capacity at all"),
         (lambda: Trace("a", STORY.time_us, STORY.time_us, "again"), "after = 'again': must be one of loop"),  # type: ignore[arg-type]
         (lambda: STORY.scaled(float("nan")), "factor = nan"),
-        (lambda: STORY.scaled(-1), "factor = -1"),
         (lambda: STORY.scaled(1e13), "would pass 2"),
         (lambda: STORY.scaled(0), "no capacity"),
         (lambda: STORY.rate_bytes_per_s(-1), "time_us = -1: must be >= 0"),
         (lambda: STORY.samples(0), "window_us = 0: must be >= 1"),
         (lambda: Trace.constant(-1, 5), "step 0 has -1 bytes/s"),
-        (lambda: Trace.constant(1, 0), "step 0 lasts 0 s"),
-        (lambda: Trace.steps([]), "1 knots"),
         (lambda: Trace.steps([(1, 1), (float("inf"), 1)]), "step 1 lasts inf s"),
         (lambda: Trace.constant(1, 1.1e7), "beyond 10000000 s"),
-        (lambda: Trace.constant(1e300, 1), "below 2"),
         (lambda: Trace.from_intervals([1, 0], [1, 1]), r"interval_us\[1\] = 0: must be >= 1"),
         (lambda: Trace.from_intervals([1, 1], [1, -4]), r"bytes_in_interval\[1\] = -4: must be >= 0"),
-        (lambda: Trace.from_intervals([1, 1], [2**62, 2**62]), "sum of bytes_in_interval"),
     ],
 )
 def test_broken_traces_and_arguments(make: Callable[[], object], says: str) -> None:
@@ -135,19 +112,7 @@ def test_broken_traces_and_arguments(make: Callable[[], object], says: str) -> N
         make()
 
 
-def test_where_names_file_line_value_and_rule() -> None:
-    message = where("lte.csv", 12, -3, "must be a whole number >= 0", field="bytes")
-    assert message == "lte.csv, line 12: bytes = -3: must be a whole number >= 0"
-    assert where("lte.csv", None, None, "is empty") == "lte.csv: is empty"
-    assert where("a", 1, "\x00", "must be text") == "a, line 1: '\\x00': must be text"
-    assert len(where("a", 1, "9" * 5000, "must be short")) < 100
-    assert issubclass(TraceError, BufgymError) and issubclass(BufgymError, ValueError)
-
-
-ROWS = st.lists(st.tuples(st.integers(1, 10**7), st.integers(0, 10**9)), min_size=1, max_size=30)
-
-
-@given(ROWS, st.floats(1e-6, 1e3))
+@given(st.lists(st.tuples(st.integers(1, 10**7), st.integers(0, 10**9)), min_size=1, max_size=30), st.floats(1e-6, 1e3))
 def test_scaling_keeps_order_and_describe_keeps_its_bounds(rows: list[tuple[int, int]], factor: float) -> None:
     trace = Trace.from_intervals([r[0] for r in rows], [r[1] for r in rows], after="stop")
     scaled = trace.scaled(factor)
@@ -158,7 +123,11 @@ def test_scaling_keeps_order_and_describe_keeps_its_bounds(rows: list[tuple[int,
     assert summary["seconds_below_500KBps"] <= summary["duration_s"] + 1e-9
 
 
-# -------------------- written
+def test_where_names_file_line_value_and_rule() -> None:
+    message = where("lte.csv", 12, -3, "must be a whole number >= 0", field="bytes")
+    assert message == "lte.csv, line 12: bytes = -3: must be a whole number >= 0"
+    assert where("a", 1, "\x00", "must be text") == "a, line 1: '\\x00': must be text"
+    assert len(where("a", 1, "9" * 5000, "must be short")) < 100
 
 
 def test_csv_is_exact(tmp_path: Path) -> None:
@@ -173,15 +142,10 @@ def test_csv_is_exact(tmp_path: Path) -> None:
         # 1000 B/ms for 4 ms, then nothing for 3: the 1500 bytes of a packet are through after 1.5 and 3 ms, so at ms 2
         # and 3. 1000 bytes are left over, and ms 7 needs a packet to tell how long the trace lasts. The trace has 3500
         # bytes after 3.5 ms and 4000 after 4, the copy 3000 up to 6 ms and 4500 at 7.
-        (
-            Trace.from_intervals([4_000, 3_000], [4_000, 0]),
-            "2\n3\n7\n",
-            "total +500 bytes, at most 1000 bytes off at any",
-        ),
+        (Trace.from_intervals([4_000, 3_000], [4_000, 0]), "2\n3\n7\n", "total +500 bytes, at most 1000 bytes off"),
         (Trace.from_intervals([1_250], [1_500]), "2\n", "duration +0.75 ms"),
         # Nothing is one packet at the end.
         (Trace("silence", np.array([0, 9_000]), np.array([0, 0]), "hold"), "9\n", "total +1500 bytes"),
-        (Trace("silence", np.array([0, 9_000]), np.array([0, 0]), "stop"), "9\n", "total +1500 bytes"),
     ],
 )
 def test_mahimahi_by_hand(tmp_path: Path, trace: Trace, text: str, lost: str) -> None:
