@@ -68,7 +68,6 @@ def afr(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 
 @register("afr-paper", memory=MEMORY, source="AFR [wang2022afr], Sec. IV-A, Algorithm 1 (literal text)", compile=True)
-@register("afr-paper", memory=MEMORY, source="AFR [wang2022afr], Sec. IV-A, Algorithm 1 (literal text)", compile=True)
 def afr_paper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Adaptive Frame Rate by the letter of the paper: s/L < 2/3, p not moved at departures."""
     r, c, p = memory[R], memory[C], memory[P]

@@ -1,0 +1,184 @@
+"""Behaviour that small bugs, planted at random (``.ci/mutants``), were free to change. Numbers worked by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cases import newcomer, queue_of, trace
+
+from bufgym import policies
+from bufgym.errors import BufgymError
+from bufgym.model import qoi
+from bufgym.model.buffer import UNLIMITED_BYTES
+from bufgym.model.link import Link
+from bufgym.oracle import beam, programme
+from bufgym.policies import ACCEPT, REJECT, aqm, webrtc
+from bufgym.scenario import Episode, messages
+from bufgym.sim import NEVER, Senders, audit
+
+pytestmark = pytest.mark.kernels
+
+V = qoi.exponential(0.5)
+"""V(1) = 1/2, V(2) = 3/4, V(3) = 7/8."""
+
+
+# --- what a finished run is checked for -------------------------------------------------------------------------------
+
+
+def finished() -> tuple[Senders, Episode]:
+    """L = 2, a byte a us for 20 us, messages of 10 bytes: 0 and 2 are sent, 3 not all, 4 and 5 wait, 1 is dropped."""
+    episode = Episode(messages(np.array([0, 1, 2, 3, 15, 25]), 10), Link(trace([(0, 0), (20, 20)], "stop")))
+    senders = Senders(1, 2, V, max_messages=6)
+    senders.load(0, episode)
+    senders.run(policies.get("drop-oldest"))
+    return senders, episode
+
+
+def add(table, field, k, amount):
+    """A policy that adds to a field of the k-th entry; for the sender's only one k is 0."""
+
+    def write(batch):
+        rows = np.asarray(getattr(batch, table))
+        (rows if table == "senders" else rows[0])[field][k] += amount
+
+    return f"{table} {k}: {field} {amount:+g}", write
+
+
+def put(field, k, us):
+    """A policy that writes a time into the log."""
+
+    def write(batch):
+        np.asarray(batch.log)[0][field][k] = us
+
+    return f"log {k}: {field} = {us}", write
+
+
+def repeat(batch):
+    batch.slots[0, 3] = batch.slots[0, 2]
+
+
+MESSAGE_FIELDS = ("seq", "arrival_us", "size_bytes", "topic", "x", "uniform")
+RULES = ("priority", "weight", "period_us", "limit", "no_drop", "deadline_us", "v_start")
+FORGERIES = [
+    *[(audit._ARRIVAL, *add("arrivals", field, k, 1)) for field in MESSAGE_FIELDS for k in (0, 5)],
+    *[(audit._QUEUED, *add("slots", field, k, 1)) for field in MESSAGE_FIELDS for k in (2, 3)],
+    *[(audit._QUEUED, *add("slots", "seq", k, amount)) for k, amount in ((2, -100), (3, 100))],
+    *[(audit._QUEUED, *put(field, k, 40)) for field in ("dequeued_us", "dropped_us") for k in (4, 5)],
+    (audit._QUEUED, "one message twice", repeat),
+    *[(audit._BYTES, *add("senders", "backlog_bytes", 0, amount)) for amount in (1, -1)],
+    (audit._LOG, *put("dropped_us", 0, 7)),  # was sent
+    (audit._LOG, *put("dropped_us", 1, NEVER)),  # was not sent either
+    (audit._LOG, *put("dequeued_us", 2, 1)),  # came at 2
+    *[
+        (audit._LOG, *add("senders", field, 0, amount))
+        for field in ("dequeued", "evicted", "rejected", "next")
+        for amount in (1, -1)
+    ],
+    *[(audit._TOPIC, *add("topics", field, 0, 1)) for field in RULES],
+    *[(audit._QOI, *add("senders", "delivered_gain", 0, amount)) for amount in (1e-6, -1e-6)],
+    (0, *add("senders", "delivered_gain", 0, 1e-10)),  # rounding
+]
+
+
+@pytest.mark.parametrize(("finding", "write"), [pytest.param(n, w, id=name) for n, name, w in FORGERIES])
+def test_a_run_is_searched_for_everything_a_policy_may_not_write(finding, write):
+    senders, episode = finished()
+    rules = np.array(senders.batch.topics[0]).view(np.recarray)
+    assert audit._touched(senders.batch, 0, episode.arrivals, rules) == 0
+    write(senders.batch)
+    assert audit._touched(senders.batch, 0, episode.arrivals, rules) == finding
+
+
+# --- the clairvoyant's beam ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("capacity", "max_bytes", "width", "plan"),
+    [
+        (2, UNLIMITED_BYTES, 4, [0, 1, 2]),
+        (1, UNLIMITED_BYTES, 4, [0, 2]),  # while 0 crosses until 10, one can wait: V(2)
+        (3, 20, 4, [0, 1, 2]),
+        (3, 19, 4, [0, 2]),
+        (2, UNLIMITED_BYTES, 1, [0, 1, 2]),  # of the ways to send 2 the best one is remembered, not the last
+    ],
+)
+def test_a_beam_keeps_to_the_room(capacity, max_bytes, width, plan):
+    """Three messages of 10 bytes arrive at bytes 0, 1 and 2 of the link."""
+    c, size, far = np.arange(3), np.full(3, 10), np.full(3, 100)
+    p = programme.new_problem(c, size, far, np.zeros(3, np.int64), np.arange(3.0), V.array, 2**62, 1)
+    room = programme.Room(capacity, max_bytes, np.zeros((2, 200)), np.zeros((2, 4)))
+    work = np.empty(3, np.int64)
+    length, gain = beam.search(p, room, beam.new_states(3, width), work)
+    assert work[:length][::-1].tolist() == plan
+    assert gain == {2: 0.75, 3: 1.0}[length]
+
+
+# --- policies --------------------------------------------------------------------------------------------------------
+
+
+def test_red_counts_from_the_first_arrival_above_the_threshold():
+    """Average 4 of L = 8, min_th 1/4, max_th 3/4, max_p 0.1: p_b = 0.05, and 0.05 / (1 - 0.05 count) in all."""
+    red = policies.get("red")
+    memory = red.new_memory()[0]
+    memory[:] = 0.0, 5.0
+    assert aqm.red(queue_of(0, 8, red.parameter_array), newcomer(), memory) == ACCEPT  # below: the count starts anew
+    draws = (0.0501, ACCEPT), (0.0527, ACCEPT), (0.0555, REJECT), (0.0527, ACCEPT), (0.0555, REJECT)
+    for uniform, decision in draws:
+        memory[0] = 4.0
+        assert aqm.red(queue_of(4, 8, red.parameter_array), newcomer(uniform), memory) == decision
+
+
+def test_webrtc_starts_a_new_pattern_when_the_bucket_gets_too_full_and_not_while_it_is():
+    """1 byte/us: the bucket holds 500 kB, and 40 ms leak 40 kB."""
+    memory = policies.get("webrtc-frame-dropper").new_memory()[0]
+    for level, count, above in ((600_000, 0, 1), (600_000, 3, 1), (540_000, 3, 1), (539_000, 3, 0), (541_000, 0, 1)):
+        memory[[webrtc.TARGET, webrtc.LEVEL, webrtc.COUNT]] = 1.0, level, 3.0
+        webrtc.leak(memory, 40_000.0)
+        assert (memory[webrtc.LEVEL], memory[webrtc.COUNT], memory[webrtc.ABOVE]) == (level - 40_000, count, above)
+
+
+SETTINGS = {
+    "codel": {"target_ms": 5, "interval_ms": 100},  # RFC 8289
+    "red": {"min_th": 1 / 4, "max_th": 3 / 4, "max_p": 0.1, "weight": 0.2},
+    "linear-alpha": {"alpha": 1.302},
+    "zenoh-drop": {
+        "batch_size": 65_535,
+        "queue_size": 2,
+        "so_sndbuf": 2**17,
+        "wait_before_drop": 1_000,
+        "max_wait_before_drop_fragments": 50_000,
+        "rate_memory_s": 1,
+    },
+    "ros2-best-effort": {"queue_kb": 200, "rate_memory_s": 1},
+    "ros2-reliable-udp": {"queue_kb": 200, "depth": 10, "rate_memory_s": 1},
+    "even-reject": {"beta": 1.3},
+    "paced-motion-gap": {"pace": 0.7, "discount": 0.35},
+    "ros-keep-last": {"depth": 10},
+    "lifespan": {"lifespan_s": 0.5},
+    "time-filter": {"separation_s": 0.1},
+    "foxglove-sdk": {"depth": 1024},
+    "foxglove-backlog": {"limit_mb": 10},
+    "decimate": {"every": 3},
+    "keyframe": {"step": 0.05},
+    "planner": {"budget_us": 200, "standstill_s": 1},
+}
+BEGINNINGS = {
+    **{name: {"r": 1} for name in ("afr", "afr-paper", "linear-alpha")},
+    **{name: {"bytes_per_us": 1e6} for name in ("zenoh-drop", "ros2-best-effort", "ros2-reliable-udp")},
+    "webrtc-frame-dropper": {"bytes_per_us": 1e6},
+    "red": {"count": -1},
+}
+
+
+def test_policies_start_with_the_published_settings_and_an_empty_memory():
+    names = [name for named in (False, True) for name in policies.names(named_only=named)]
+    built_in = [policy for policy in map(policies.get, names) if policy.on_arrival.__module__.startswith("bufgym.")]
+    assert {policy.name: dict(policy.parameters) for policy in built_in if policy.parameters} == SETTINGS
+    memories = {policy.name: {key: number for key, number in policy.memory.items() if number} for policy in built_in}
+    assert {name: memory for name, memory in memories.items() if memory} == BEGINNINGS
+
+
+@pytest.mark.parametrize("every", [0, -1, -0.5, float("nan"), float("inf")])
+def test_settings_are_numbers_above_0(every):
+    with pytest.raises(BufgymError, match=r"policy decimate: every = .*: must be a number > 0"):
+        policies.get("decimate").with_parameters(every=every)
