@@ -17,27 +17,10 @@ from bufgym.reproduce import afr_fig2, afr_fig4, afr_fig5, afr_fig9, afr_theorem
 from bufgym.scenario import Interruption
 from bufgym.sim import NEVER
 
-<<<<<<< HEAD
-# Typed from the paper's figure: (T, dropped, r, c, p) with L = 8, the state after the decision.
-FIG4 = [
-    (8, None, 1, 0, 0),
-    (9, 1, 1, 0, 1),
-    (10, 3, 1, 0, 2),
-    (11, 5, 1, 0, 3),
-    (12, 7, 1, 0, 4),
-    (13, 9, 1, 0, 5),
-    (14, 11, 1, 0, 6),
-    (15, 13, 1, 0, 7),
-    (16, 15, 2, 0, 0),  # the pass is over: r doubles
-    (17, 17, 2, 1, 0),  # rejected by the counter
-    (18, 2, 2, 0, 1),
-]
-=======
 # Typed from the paper's figure: (T, dropped, r, c, p) with L = 8, the state after the decision. At T = 16 the pass is
 # over and r doubles; 17 is rejected by the counter.
 FIG4 = [(8, None, 1, 0, 0), *((8 + p, 2 * p - 1, 1, 0, p) for p in range(1, 8)), (16, 15, 2, 0, 0), (17, 17, 2, 1, 0)]
 FIG4 += [(18, 2, 2, 0, 1)]
->>>>>>> h-files
 
 
 @pytest.mark.kernels
