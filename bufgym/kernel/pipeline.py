@@ -184,7 +184,7 @@ class WholeCompiler(_Compiler):  # type: ignore[misc]
         self.state.library.enable_object_caching()
 
     def compile_extra(self, function: Any) -> Any:
-        """Compile ``function``; garbage is collected afterwards: searched for meanwhile, it costs a sixth of the time."""
+        """Compile ``function``. Garbage is collected afterwards: a search among all these objects takes long."""
         collects = gc.isenabled()
         gc.disable()
         try:
