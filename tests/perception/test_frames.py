@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import frame_cases
 import numpy as np
@@ -13,7 +14,6 @@ import pytest
 from bufgym.errors import BufgymError
 from bufgym.perception.extra import library
 from bufgym.perception.frames import Camera, encoded_bytes, open_sequence
-from bufgym.traces.poses import quaternions, rotations
 
 LAYOUTS = {"tum": frame_cases.tum, "7-scenes": frame_cases.seven_scenes, "packed": frame_cases.packed}
 
@@ -27,9 +27,7 @@ LAYOUTS = {"tum": frame_cases.tum, "7-scenes": frame_cases.seven_scenes, "packed
         ("packed", [0, 33_333], [1.0, 1.5], [0.0, 0.5]),
     ],
 )
-def test_every_layout_is_recognised(
-    layout: str, time_us: list[int], metres: list[float], x_m: list[float], tmp_path: Path
-) -> None:
+def test_every_layout_is_recognised(layout: str, time_us: Any, metres: Any, x_m: Any, tmp_path: Path) -> None:
     sequence = open_sequence(LAYOUTS[layout](tmp_path / "desk"))
     camera = sequence.camera
     assert (sequence.name, len(sequence), sequence.poses.shape) == ("desk", 2, (2, 4, 4))
@@ -58,7 +56,6 @@ CHANGES: dict[str, Callable[[bytes], bytes | None]] = {
     "gone": lambda data: None,
     "cut": lambda data: data[:-20],
     "small": lambda data: frame_cases.png(1000, shape=(240, 320)),
-    "8 bits": lambda data: frame_cases.png(100, np.uint8),
     "text": lambda data: b"1 2 3",
     "outside": lambda data: data.replace(b"depth/0", b"../0"),
 }
@@ -70,23 +67,16 @@ CHANGES: dict[str, Callable[[bytes], bytes | None]] = {
         ("tum", "depth/1.png", "gone", "no such file"),
         ("tum", "depth/1.png", "cut", "truncated or damaged"),
         ("tum", "depth/1.png", "small", "size = '320 x 240': must be 640 x 480"),
-        ("tum", "depth/1.png", "8 bits", "16 bits a pixel"),
-        ("tum", "rgb.txt", "gone", "no such file"),
-        ("tum", "rgb.txt", "text", "must have 2 columns, has 3"),
         ("tum", "groundtruth.txt", "text", "must have 8 columns, has 3"),
-        ("7-scenes", "frame-000001.depth.png", "gone", "no such file"),
         ("7-scenes", "frame-000001.depth.png", "text", "must be a PNG or JPEG image"),
         ("7-scenes", "frame-000001.pose.txt", "text", "must be a 4x4 matrix"),
-        ("packed", "poses_camera_to_world.txt", "gone", "no such file"),
         ("packed", "poses_camera_to_world.txt", "text", "line 1: '1 2 3': must be a 4x4 matrix"),
         ("packed", "depth_320x240_mm.zip", "cut", "truncated, or no zip archive"),
         ("packed", "gray_320x240.zip", "gone", "no such file"),
         ("tum", "depth.txt", "outside", "line 2: file = ../0.png: must be a path inside the folder"),
     ],
 )
-def test_what_is_broken_is_one_error_with_file_and_rule(
-    layout: str, file: str, change: str, rule: str, tmp_path: Path
-) -> None:
+def test_what_is_broken_is_one_error(layout: str, file: str, change: str, rule: str, tmp_path: Path) -> None:
     folder = LAYOUTS[layout](tmp_path / "desk")
     changed = CHANGES[change]((folder / file).read_bytes())
     (folder / file).unlink()
@@ -101,11 +91,14 @@ def test_what_is_broken_is_one_error_with_file_and_rule(
     assert Path(file).name in message and rule in message and "\n" not in message
 
 
-def test_a_folder_that_holds_no_recording(tmp_path: Path) -> None:
+def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(BufgymError, match=r"depth\.txt \(TUM\)"):
         open_sequence(tmp_path)
     with pytest.raises(BufgymError, match="no such folder"):
         open_sequence(tmp_path / "desk")
+    monkeypatch.setitem(sys.modules, "rvl", None)
+    with pytest.raises(BufgymError, match=r"bufgym\.perception needs rvl: pip install .*(rvl|perception)"):
+        library("rvl")
 
 
 def test_reduced_frames_are_every_second_pixel() -> None:
@@ -119,10 +112,8 @@ def test_reduced_frames_are_every_second_pixel() -> None:
 
 
 def test_rvl_as_worked_by_hand_and_back() -> None:
-    """Two empty pixels, then 5, 6, 4 mm: runs 2 and 3, differences +5, +1, -2 as 10, 2, 3, a nibble each (the third bit
-    says that more follows): 2, 3, 10 as 010 with that bit and then 1, 2, 3. Six nibbles in one word, the first on top,
-    after a word with the number of pixels.
-    """
+    """Two empty pixels, then 5, 6, 4 mm: runs 2 and 3, differences +5, +1, -2 as 10, 2, 3, a nibble each (a bit says
+    that more follows): 2, 3, 10 as 010 with that bit and then 1, 2, 3; after a word with the number of pixels."""
     rvl = library("rvl")
     depth_mm = np.array([0, 0, 5, 6, 4], np.uint16)
     packed = rvl.compress(depth_mm)
@@ -139,23 +130,3 @@ def test_a_frames_size_is_its_depth_and_its_picture() -> None:
     assert encoded_bytes(np.zeros((480, 640), np.float32), grey) - picture < 32
     # Half a frame is doubled before.
     assert encoded_bytes(np.full((240, 320), 1.5, np.float32), grey[::2, ::2]) == wall
-
-
-def test_rotations_are_the_inverse_of_quaternions() -> None:
-    rng = np.random.default_rng(0)
-    quaternion = rng.normal(size=(50, 4))
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    back = quaternions(rotations(quaternion))
-    assert np.abs(np.sum(back * quaternion, axis=1)) == pytest.approx(np.ones(50))
-
-
-def test_without_the_extra_the_error_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rvl", None)
-    with pytest.raises(BufgymError, match=r"bufgym\.perception needs rvl: pip install .*(rvl|perception)"):
-        library("rvl")
-
-
-def test_the_recorded_frames_are_as_long_as_the_papers(shared_data: Path) -> None:
-    sequence = open_sequence(shared_data / "rgbd_7scenes")
-    assert len(sequence) == 1000
-    assert 150_000 < np.mean([sequence.size_bytes(k) for k in range(0, 1000, 250)]) < 240_000

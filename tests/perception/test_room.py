@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import frame_cases  # noqa: F401  skips where the extra is absent
@@ -11,7 +10,6 @@ import pytest
 
 from bufgym.errors import BufgymError
 from bufgym.perception import rays
-from bufgym.perception.frames import encoded_bytes
 from bufgym.perception.mapping import grid_of
 from bufgym.perception.rays import BASELINE_M
 from bufgym.perception.room import FREE_M, Room, Scene, room
@@ -36,13 +34,9 @@ def test_a_wall_ahead_is_three_metres_away_in_every_pixel() -> None:
     assert depth[8:17] == pytest.approx(np.full((9, 32), 3.0))
     # The topmost row looks up by 240 / 585: the ceiling, 1 m above, is 585 / 240 = 2.4375 m away.
     assert depth[0] == pytest.approx(np.full(32, 2.4375))
-
-
-def test_a_ball_and_a_turned_box_ahead() -> None:
-    """The ball's nearest point is its radius before its centre; a box turned by 45 degrees shows its edge."""
-    ball = scene([4.5, 2, 1, 0.25, 0, 0, 0, 0], balls=1)
+    # A ball's nearest point is its radius before its centre; a box turned by 45 degrees shows its edge.
+    ball, turn = scene([4.5, 2, 1, 0.25, 0, 0, 0, 0], balls=1), np.pi / 4
     assert ball.true_depth(0)[12, 16] == pytest.approx(1.25)
-    turn = np.pi / 4
     box = scene([4.5, 2, 1, 0.5, 0.5, 0.5, np.cos(turn), np.sin(turn)])
     assert box.true_depth(0)[12, 16] == pytest.approx(1.5 - np.sqrt(0.5))
 
@@ -70,8 +64,7 @@ def test_what_the_projector_does_not_reach_is_missing() -> None:
 def test_a_seed_gives_the_same_frames_and_another_seed_others() -> None:
     first, again, other = (room(seed, frames=3).reduced(SMALL) for seed in (7, 7, 8))
     for k in (2, 0):
-        assert first.depth(k).tobytes() == again.depth(k).tobytes()
-        assert first.grey(k).tobytes() == again.grey(k).tobytes()
+        assert (first.depth(k) == again.depth(k)).all() and (first.grey(k) == again.grey(k)).all()
     assert first.depth(0).tobytes() != other.depth(0).tobytes()
     assert first.depth(0).tobytes() != first.depth(1).tobytes()  # noise is drawn for every frame
     whole, half = first, first.reduced(2)
@@ -92,11 +85,6 @@ def test_what_is_seen_is_the_same_without_bounds(seed: int, monkeypatch: pytest.
     for k, (depth, grey) in zip(frames, bounded, strict=True):
         everything = made.rendered(k)
         assert depth.tobytes() == everything[0].tobytes() and grey.tobytes() == everything[1].tobytes()
-
-
-def test_a_frames_size_is_that_of_both_pictures_at_once() -> None:
-    made = room(0, frames=2)
-    assert made.reduced(4).size_bytes(1) == made.size_bytes(1) == encoded_bytes(made.depth(1), made.image(1))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -124,14 +112,8 @@ def test_a_given_trajectory_lies_in_the_middle_of_a_room_that_holds_it() -> None
     assert grid_of(made.reduced(SMALL)).shape > (20, 20, 20)
 
 
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        (lambda: room(0, frames=1), "frames = 1, rate_hz = 30"),
-        (lambda: room(-1), "seed = -1"),
-        (lambda: room(0, frames=2).reduced(SMALL).depth(2), "frame 2: must be from 0 to 1"),
-    ],
-)
-def test_errors(make: Callable[[], object], says: str) -> None:
-    with pytest.raises(BufgymError, match=says):
-        make()
+def test_errors() -> None:
+    with pytest.raises(BufgymError, match="frames = 1, rate_hz = 30"):
+        room(0, frames=1)
+    with pytest.raises(BufgymError, match="frame 2: must be from 0 to 1"):
+        room(0, frames=2).reduced(SMALL).depth(2)

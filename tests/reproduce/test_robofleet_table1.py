@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("rosbags", reason="extra ros")
 pytest.importorskip("flatbuffers", reason="extra robofleet")
 
-from flatbuffers import number_types as fbtypes
+from flatbuffers.number_types import Float32Flags
 from flatbuffers.table import Table
 
 from bufgym.errors import BufgymError, install
@@ -103,98 +103,32 @@ def same(ours: Any, theirs: Any) -> None:
         assert ours == theirs
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_ros_reads_what_was_written(kind: str) -> None:
-    message, type_name = content(kind, seed=3), KINDS[kind][0]
-    same(message, stores()["ros1"].deserialize_ros1(encode(kind, message, "ros1"), type_name))
-    same(message, stores()["cdr"].deserialize_cdr(encode(kind, message, "cdr"), type_name))
-
-
-class Reader:
-    """A table by its slots, as the code generated from Robofleet's schema reads it."""
-
-    def __init__(self, data: bytes, position: int | None = None) -> None:
-        if position is None:
-            position = int(np.frombuffer(data, "<u4", 1)[0])
-        self.data, self.table = data, Table(bytearray(data), position)
-
-    def at(self, slot: int) -> int:
-        offset = self.table.Offset(4 + 2 * slot)
-        return self.table.Pos + offset if offset else 0
-
-    def number(self, slot: int, dtype: str) -> Any:
-        return self.table.Get(FLAGS[dtype], self.at(slot)) if self.at(slot) else 0
-
-    def text(self, slot: int) -> str:
-        return self.table.String(self.at(slot)).decode()
-
-    def inside(self, slot: int) -> Reader:
-        return Reader(self.data, self.table.Indirect(self.at(slot)))
-
-    def numbers(self, slot: int, dtype: str) -> Any:
-        offset = self.at(slot) - self.table.Pos
-        return np.frombuffer(self.data, dtype, self.table.VectorLen(offset), self.table.Vector(offset))
-
-    def tables(self, slot: int) -> list[Reader]:
-        offset = self.at(slot) - self.table.Pos
-        first = self.table.Vector(offset)
-        return [Reader(self.data, self.table.Indirect(first + 4 * i)) for i in range(self.table.VectorLen(offset))]
-
-
-FLAGS = {"f4": fbtypes.Float32Flags, "f8": fbtypes.Float64Flags, "u4": fbtypes.Uint32Flags, "b": fbtypes.BoolFlags}
-FLAGS |= {"i1": fbtypes.Int8Flags, "u1": fbtypes.Uint8Flags, "u2": fbtypes.Uint16Flags}
-
-
-def read(kind: str, message: dict[str, Any]) -> Reader:
-    """The flatbuffer of a message, whose metadata and header are those of the released slots."""
-    reader = Reader(encode(kind, message, "robofleet", "/a/topic"))
-    metadata = reader.inside(0)
-    assert (metadata.text(0), metadata.text(1)) == (KINDS[kind][0].replace("/msg/", "/"), "/a/topic")
-    header, stamp = reader.inside(1), message["header"]["stamp"]
-    assert (header.number(1, "u4"), header.text(3)) == (message["header"]["seq"], message["header"]["frame_id"])
-    assert np.frombuffer(reader.data, "<u4", 2, header.at(2)).tolist() == [stamp["sec"], stamp["nanosec"]]
-    return reader
+def test_ros_reads_what_was_written() -> None:
+    for kind, (type_name, *_) in KINDS.items():
+        message = content(kind, seed=3)
+        same(message, stores()["ros1"].deserialize_ros1(encode(kind, message, "ros1"), type_name))
+        same(message, stores()["cdr"].deserialize_cdr(encode(kind, message, "cdr"), type_name))
 
 
 def test_flatbuffers_read_by_the_released_slots() -> None:
+    """Of a scan, by the library's own table: metadata 0, header 1, numbers from 2 on, ranges 9."""
     scan = content("LaserScan", beams=37, intensities=5, no_return=0.5, seed=1)
-    reader = read("LaserScan", scan)
+    data = encode("LaserScan", scan, "robofleet", "/a/topic")
+    table = Table(bytearray(data), int(np.frombuffer(data, "<u4", 1)[0]))
+
+    def text(outer: int, slot: int) -> str:
+        inner = Table(table.Bytes, table.Indirect(table.Pos + table.Offset(4 + 2 * outer)))
+        return inner.String(inner.Pos + inner.Offset(4 + 2 * slot)).decode()
+
+    assert (text(0, 0), text(0, 1)) == ("sensor_msgs/LaserScan", "/a/topic")
+    assert text(1, 3) == scan["header"]["frame_id"]
     names = ("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min", "range_max")
-    assert [reader.number(slot, "f4") for slot in range(2, 9)] == [scan[name] for name in names]
-    np.testing.assert_array_equal(reader.numbers(9, "<f4"), scan["ranges"])
-    np.testing.assert_array_equal(reader.numbers(10, "<f4"), scan["intensities"])
-
-    fix = content("NavSatFix") | {"status": {"status": -1, "service": 8}}
-    reader = read("NavSatFix", fix)
-    assert (reader.inside(2).number(1, "i1"), reader.inside(2).number(2, "u2"), reader.number(7, "u1")) == (-1, 8, 2)
-    assert [reader.number(k, "f8") for k in (3, 4, 5)] == [fix[name] for name in ("latitude", "longitude", "altitude")]
-    np.testing.assert_array_equal(reader.numbers(6, "<f8"), fix["position_covariance"])
-
-    cloud = content("PointCloud2", points=7, point_step=18)
-    reader = read("PointCloud2", cloud)
-    assert [reader.number(slot, "u4") for slot in (2, 3, 6, 7)] == [1, 7, 18, 7 * 18]
-    fields = [(f.text(1), f.number(2, "u4"), f.number(3, "u1")) for f in reader.tables(4)]
-    assert fields == [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7)]
-    assert not reader.number(5, "b") and reader.number(9, "b")
-    np.testing.assert_array_equal(reader.numbers(8, "u1"), cloud["data"])
-
-    image = content("CompressedImage", data_bytes=99)
-    reader = read("CompressedImage", image)
-    assert reader.text(2) == "jpeg"
-    np.testing.assert_array_equal(reader.numbers(3, "u1"), image["data"])
-
-    odometry = content("Odometry")
-    reader = read("Odometry", odometry)
-    assert reader.text(2) == "base_link"
-    for slot, name, inner, axes in ((3, "pose", ("position", "orientation"), "xyzw"), (4, "twist", ("linear",), "xyz")):
-        table = reader.inside(slot)
-        np.testing.assert_array_equal(table.numbers(2, "<f8"), odometry[name]["covariance"])
-        for part, field in enumerate(inner, start=1):
-            values = odometry[name][name][field]
-            for i, axis in enumerate(axes[: len(values)], start=1):
-                assert table.inside(1).inside(part).number(i, "f8") == values[axis]
-    pose = content("PoseStamped")
-    assert read("PoseStamped", pose).inside(2).inside(1).number(1, "f8") == pose["pose"]["position"]["x"]
+    for slot, name in enumerate(names, start=2):
+        assert table.Get(Float32Flags, table.Pos + table.Offset(4 + 2 * slot)) == scan[name]
+    for slot, name in ((9, "ranges"), (10, "intensities")):
+        offset = table.Offset(4 + 2 * slot)
+        numbers = np.frombuffer(data, "<f4", table.VectorLen(offset), table.Vector(offset))
+        np.testing.assert_array_equal(numbers, scan[name])
 
 
 def test_the_seed_decides_the_content_and_a_jpeg_has_its_markers_and_no_other() -> None:
@@ -231,48 +165,29 @@ def test_table1_stands_beside_the_papers() -> None:
     assert size == pytest.approx(PAPER["LaserScan"][2], rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("kind", "parameters", "rule"),
-    [
+def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind, parameters, rule in (
         ("Laser", {}, "unknown kind of message 'Laser'; known: LaserScan, NavSatFix"),
         ("LaserScan", {"rays": 3}, "LaserScan: no parameter 'rays'; it has: beams, intensities"),
-        ("LaserScan", {"beams": -1}, "beams = -1: must be a whole number from 0"),
         ("LaserScan", {"beams": 2.5}, "beams = 2.5: must be a whole number"),
-        ("LaserScan", {"intensities": True}, "intensities = True: must be a whole number"),
-        ("LaserScan", {"no_return": 1.5}, "no_return = 1.5: must be from 0 to 1"),
         ("LaserScan", {"no_return": math.nan}, "no_return = nan: must be from 0 to 1"),
         ("CompressedImage", {"data_bytes": 3}, "data_bytes = 3: must be a whole number from 4"),
-        ("CompressedImage", {"data_bytes": 10**10}, "data_bytes = 10000000000: must be"),
         ("CompressedImage", {"format": 7}, "format = 7: must be a text"),
         ("PointCloud2", {"point_step": 12}, "point_step = 12: must be a whole number from 16"),
-        ("PointCloud2", {"points": 10**9}, "points = 1000000000: must be"),
         ("PoseStamped", {"frame_id": "grün"}, "frame_id = 'grün': must be a text of at most 255 ASCII letters"),
         ("Odometry", {"seed": -1}, "seed = -1: must be a whole number >= 0"),
-        ("NavSatFix", {"topic": None}, "topic = None: must be a text"),
-    ],
-)
-def test_unusable_parameters_are_refused(kind: str, parameters: dict[str, Any], rule: str) -> None:
-    with pytest.raises(BufgymError, match=re.escape(rule)):
-        sizes(kind, **parameters)
-
-
-def test_unknown_encodings_and_beams_that_cannot_make_the_papers_size_are_refused() -> None:
+    ):
+        with pytest.raises(BufgymError, match=re.escape(rule)):
+            sizes(kind, **parameters)
     with pytest.raises(BufgymError, match="unknown encoding 'xml'; known: ros1, cdr, robofleet"):
         encode("PoseStamped", content("PoseStamped"), "xml")
     for beams in (1785, 1803):
         with pytest.raises(BufgymError, match=f"beams = {beams}: 7260 bytes would need a frame_id of"):
             Reproduction(beams=beams).simulate()
-
-
-@pytest.mark.parametrize(
-    ("library", "encoding", "extra"), [("rosbags.typesys", "cdr", "ros"), ("flatbuffers", "robofleet", "robofleet")]
-)
-def test_without_the_library_the_extra_is_named(
-    library: str, encoding: str, extra: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
     stores.cache_clear()
-    monkeypatch.setitem(sys.modules, library, None)  # None there makes the import fail
-    with pytest.raises(BufgymError, match=re.escape(f"needs {library}: {install(extra)}")):
-        encode("PoseStamped", content("PoseStamped"), encoding)
-    assert len(encode("PoseStamped", content("PoseStamped"), "json")) > 0  # which needs neither
+    for library, encoding, extra in (("rosbags.typesys", "cdr", "ros"), ("flatbuffers", "robofleet", "robofleet")):
+        monkeypatch.setitem(sys.modules, library, None)  # None there makes the import fail
+        with pytest.raises(BufgymError, match=re.escape(f"needs {library}: {install(extra)}")):
+            encode("PoseStamped", content("PoseStamped"), encoding)
+        assert len(encode("PoseStamped", content("PoseStamped"), "json")) > 0  # which needs neither
     assert "flatbuffers" not in vars(encodings) and "rosbags" not in vars(encodings)

@@ -15,7 +15,7 @@ from link_files import written
 from bufgym.errors import BufgymError, TraceError
 from bufgym.traces import Motion, MotionSettings, Poses, motion_from_poses, read_motion, write_motion_csv
 from bufgym.traces.formats.trajectories import detect_pose_format, read_poses
-from bufgym.traces.poses import angles, quaternions, slerp
+from bufgym.traces.poses import angles, quaternions, rotations, slerp
 
 # 1 m forward in the first second, then a turn of 90 degrees about z in the next: 1 / 2 m = 0.5; 90 / 60 degrees = 1.5.
 H = math.sqrt(0.5)
@@ -205,6 +205,7 @@ def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, fl
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
     computed = quaternions(np.array([matrix]))[0]
+    assert rotations(expected[None])[0] == pytest.approx(np.array(matrix))
     assert min(np.abs(computed - expected).max(), np.abs(computed + expected).max()) < 1e-12
 
 
