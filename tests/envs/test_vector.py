@@ -319,10 +319,8 @@ RESET = gym.error.ResetNeeded
     ("act", "kind", "says"),
     [
         (lambda: SenderVectorEnv(0), BufgymError, "num_envs = 0"),
-        (lambda: SenderVectorEnv(1.5), BufgymError, "num_envs = 1.5"),
         (lambda: SenderVectorEnv(autoreset_mode="Sometimes"), BufgymError, "autoreset_mode = 'Sometimes'"),
         (lambda: SenderVectorEnv(max_episode_steps=0), BufgymError, "max_episode_steps = 0"),
-        (lambda: SenderVectorEnv(render_mode="human"), BufgymError, "render_mode = 'human'"),
         (lambda: SenderVectorEnv(observation="vector"), BufgymError, "must be one of 'dict', 'flat', 'slots'"),
         (lambda: SenderVectorEnv(info="some"), BufgymError, "must be one of 'full', 'steady', 'mask', 'none'"),
         (lambda: SenderVectorEnv(info="steady"), BufgymError, "info = 'steady': is for recorders"),
@@ -333,7 +331,6 @@ RESET = gym.error.ResetNeeded
         (lambda: begun().reset(options={"reset_mask": np.array([True])}), BufgymError, "reset_mask"),
         (lambda: begun().reset(options={"episodes": [None]}), BufgymError, "must be a list of 3, one a row"),
         (lambda: begun().step(np.array([0, 5, 6])), BufgymError, r"actions\[2\] = 6: must lie in 0\.\.5"),
-        (lambda: begun().step(np.array([0, -1, 6])), BufgymError, r"actions\[1\] = -1"),
         (lambda: begun().step(np.array([0, 1.7, 2])), BufgymError, "actions are float64: must be whole numbers"),
         (lambda: begun().step(np.zeros(N + 1, np.int64)), BufgymError, "shape"),
     ],
