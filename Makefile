@@ -10,20 +10,25 @@ READY := $(VENV)/.ready
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 # Two workers side by side, each with one thread: more only make them wait for one another.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+STAGES := $(BIN)/python .ci/stages.py
 
 .DEFAULT_GOAL := help
-.PHONY: help train test fuzz claims docs gallery tutorials dist install-matrix format clean
+.PHONY: help train check test nightly fuzz claims docs gallery tutorials dist install-matrix format clean
 
 help:
 	@echo "make train    set up if needed, then train an agent        (ARGS=... go to train.py)"
-	@echo "make test     set up if needed, then check everything      (PYTEST_ARGS=... go to pytest)"
-	@echo "make fuzz     set up if needed, then feed it broken files, command lines and random episodes (nightly)"
-	@echo "make claims   set up if needed, then test every claim of the papers (nightly; DATA=folder of recordings)"
+	@echo "make check    set up if needed, then check format, lint, types and workflows"
+	@echo "make test     the same, then the tests that protect a commit: compiled, and kernels as plain Python"
+	@echo "                                                           (PYTEST_ARGS=... go to pytest)"
+	@echo "make nightly  everything else, up to two hours: all tests with many examples, soak and kills, fuzz, claims,"
+	@echo "              mutants, coverage, sdist, install-matrix; goes on after a failure, logs in build/nightly"
+	@echo "make fuzz     set up if needed, then feed it broken files, command lines and random episodes"
+	@echo "make claims   set up if needed, then test every claim of the papers (DATA=folder of recordings)"
 	@echo "make docs     set up if needed, then build the site to build/site"
 	@echo "make gallery  set up if needed, then draw the films and the interactive page in docs/ again"
 	@echo "make tutorials    set up if needed, then run the tutorials and draw their pictures again"
 	@echo "make dist     set up if needed, then build and check wheel and sdist in dist/"
-	@echo "make install-matrix    install the wheel for each Python, with the newest and oldest dependencies (nightly)"
+	@echo "make install-matrix    install the wheel for each Python, with the newest and oldest dependencies"
 	@echo "make format   set up if needed, then format and fix what can be fixed"
 	@echo "make clean    remove caches and build products; keeps .venv and results"
 	@echo ""
@@ -32,19 +37,21 @@ help:
 train: $(READY)
 	$(BIN)/python train.py $(ARGS)
 
-# Format, lint, types; then the tests compiled, and once more as plain Python.
+# The three tiers. What each one runs stands in .ci/stages.py.
+check: $(READY)
+	$(STAGES) check
+
 test: $(READY)
-	$(BIN)/ruff format --check .
-	$(BIN)/ruff check .
-	$(BIN)/mypy
-	NUMBA_DISABLE_JIT=0 $(PYTEST) $(PYTEST_ARGS)
-	NUMBA_DISABLE_JIT=1 $(PYTEST) -m "not slow" $(PYTEST_ARGS)
+	$(STAGES) test $(PYTEST_ARGS)
 
-# For the night: 100,000 broken files of each kind, 10,000 command lines, 1,000,000 episodes, 200 kills, others every day.
+nightly: $(READY)
+	$(STAGES) nightly $(PYTEST_ARGS)
+
+# Broken files, command lines and random episodes: others every day.
 fuzz: $(READY)
-	BUFGYM_FUZZ=100000 BUFGYM_FUZZ_SEED=$$(date +%Y%m%d) HYPOTHESIS_PROFILE=nightly $(PYTEST) tests/fuzz $(PYTEST_ARGS)
+	HYPOTHESIS_PROFILE=nightly $(PYTEST) tests/fuzz $(PYTEST_ARGS)
 
-# For the night: every figure, and what came out beside the page as it stands.
+# Every figure, and what came out beside the page as it stands.
 claims: $(READY)
 	mkdir -p build
 	$(BIN)/python -m bufgym reproduce --claims build/claims.md $(if $(DATA),--data $(DATA))
@@ -69,7 +76,7 @@ dist: $(READY)
 	$(BIN)/python -m build
 	$(BIN)/python -m twine check --strict dist/*
 
-# For the night: every Python that is here, each with the newest dependencies and with the oldest that pyproject allows.
+# Every Python that is here, each with the newest dependencies and with the oldest that pyproject allows.
 install-matrix: dist
 	.ci/install-matrix
 
@@ -81,10 +88,11 @@ clean:
 	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find bufgym agents tests -name __pycache__ -prune -exec rm -rf {} +
 
+# Byte code is made when a module is first imported: making it for all takes half the time of an installation.
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "bufgym needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) --version 2>&1 || true)." >&2; \
 	  echo "Name another one: make PYTHON=python3.11 ..." >&2; exit 1; }
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
-	$(PIP) install --quiet -c constraints.txt -e ".[dev]"
+	$(PIP) install --quiet --no-compile -c constraints.txt -e ".[dev]"
 	@touch $@

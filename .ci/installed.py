@@ -9,14 +9,18 @@ import tomllib
 
 
 def oldest(pyproject: str) -> list[str]:
-    """Each dependency at the lowest version that the file allows."""
+    """Each dependency of this Python at the lowest version that the file allows."""
     with open(pyproject, "rb") as file:
         dependencies = tomllib.load(file)["project"]["dependencies"]
-    found = [re.fullmatch(r"([\w-]+)>=([\d.]+).*", dependency) for dependency in dependencies]
-    without = [dependency for dependency, match in zip(dependencies, found, strict=True) if match is None]
-    if without:
-        raise SystemExit(f"{pyproject}: no lowest version: {', '.join(without)}")
-    return [f"{match[1]}=={match[2]}" for match in found if match]
+    lowest = []
+    for dependency in dependencies:
+        match = re.fullmatch(r"([\w-]+)>=([\d.]+)[^;]*(?:; python_version(<|>=)'3\.(\d+)')?", dependency)
+        if match is None:
+            raise SystemExit(f"{pyproject}: no lowest version: {dependency}")
+        name, version, relation, minor = match.groups()
+        if relation is None or (sys.version_info.minor < int(minor)) == (relation == "<"):
+            lowest.append(f"{name}=={version}")
+    return lowest
 
 
 def check() -> None:

@@ -6,12 +6,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli_cases import fails
+from cli_cases import FAR_OFF, Capsys, Patch, fails, shown
 
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.tasks.topics import ROWS
-from bufgym.cli import main
+from bufgym.policies import registry
 
 CONFIG = """
 duration_s = 2
@@ -36,80 +36,52 @@ def config(tmp_path: Path) -> str:
     return str(path)
 
 
-QUICK = ["--trace", "lte-synthetic-0", "--seeds", "2", "--policies", "fifo,edf"]
-
-
-def test_a_client_of_ones_own(config: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_client_of_ones_own(config: str, tmp_path: Path, capsys: Capsys) -> None:
     out = tmp_path / "rows.csv"
-    options = ["--capacity", "2,4", "--window", "3", "--by-topic", "edf", "--out", str(out)]
-    assert main(["topics", "--config", config, "--scale", "0.01", *QUICK, *options]) == 0
-    shown = capsys.readouterr().out
-    assert f"The client of {config}." in shown
-    assert "2 episodes of 2 s; n_T = 3, acks 40 ms after a message is transmitted, 1 consumer." in shown
-    assert "mine: 2 topics over lte-synthetic-0 x 0.01, L = 2\n" in shown and "mean of these 2\n" in shown
-    assert "age, priority 20 (s)" in shown
-    assert "edf, topic by topic: means over episodes" in shown and "\ncommands " in shown
-    assert f"24 rows in {out}" in shown
+    words = (
+        "--scale 0.01 --trace lte-synthetic-0 --seeds 2 --policies fifo,edf --capacity 2,4 --window 3 --by-topic edf"
+    )
+    text = shown(["topics", "--config", config, *words.split(), "--out", out], capsys)
+    assert f"The client of {config}." in text
+    assert "2 episodes of 2 s; n_T = 3, acks 40 ms after a message is transmitted, 1 consumer." in text
+    assert "mine: 2 topics over lte-synthetic-0 x 0.01, L = 2\n" in text and "mean of these 2\n" in text
+    assert "age, priority 20 (s)" in text
+    assert "edf, topic by topic: means over episodes" in text and "\ncommands " in text
+    assert f"24 rows in {out}" in text
     rows = read_rows(out, ROWS)
     # The baseline runs whether named or not.
     assert [row["policy"] for row in rows[:12:4]] == ["fifo", "edf", "robofleet"]
     assert {row["capacity"] for row in rows} == {2, 4} and {row["window"] for row in rows} == {3}
 
 
-@pytest.mark.slow  # where nothing is compiled
-def test_the_suite_runs_by_default(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["topics", "--split", "validation", "--seeds", "1", "--policies", "robofleet", "--consumers", "2"]) == 0
-    shown = capsys.readouterr().out
-    assert shown.startswith("Suite topics-v1, validation: ")
-    assert "18 episodes of 60 s; n_T = 1 and 5, " in shown and "2 consumers" in shown
-    assert "Not the suite as it is: consumers = 2." in shown
-    for label in ("scarce", "half", "ample"):
-        assert f"\n{label}: Robofleet's example client" in shown
-    lines = [line.split() for line in shown.splitlines() if line.startswith("robofleet ")]
+@pytest.mark.nightly
+def test_the_suite_runs_by_default(capsys: Capsys) -> None:
+    words = "topics --split validation --seeds 1 --policies robofleet --consumers 2"
+    text = shown(words.split(), capsys)
+    assert text.startswith("Suite topics-v1, validation: ")
+    assert "18 episodes of 60 s; n_T = 1 and 5, " in text and "2 consumers" in text
+    assert "Not the suite as it is: consumers = 2." in text
+    assert all(f"\n{label}: Robofleet's example client" in text for label in ("scarce", "half", "ample"))
+    lines = [line.split() for line in text.splitlines() if line.startswith("robofleet ")]
     assert len(lines) == 7 and all(line[2:5] == ["1.000", "[1.000,", "1.000]"] and line[5] == "0" for line in lines)
 
 
-def test_all_policies_by_default_with_a_word_on_the_unbounded(config: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["topics", "--config", config, "--trace", "lte-synthetic-0", "--seeds", "1", "--motion", "none"]) == 0
-    shown = capsys.readouterr().out
-    for name in [*policies.names(for_topics=True), "drop-oldest", "rosbridge"]:
-        assert f"\n{name} " in shown
-    assert "rosbridge has no rank: its queue is unbounded." in shown
-
-
-def test_a_users_policy_file(config: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    mine = tmp_path / "mine.py"
-    mine.write_text(
-        "from bufgym.policies import ACCEPT, register\n"
-        "@register('my-own')\n"
-        "def my_own(buffer, arrival, memory):\n"
-        "    return ACCEPT if len(buffer.slots) < buffer.capacity else 0\n"
-    )
-    chosen = ["--seeds", "1", "--policies", "my-own", "--policy-file", str(mine)]
-    try:
-        assert main(["topics", "--config", config, "--trace", "lte-synthetic-0", *chosen]) == 0
-        assert "\nmy-own " in capsys.readouterr().out
-    finally:
-        policies.registry._REGISTRY.pop("my-own", None)
+def test_all_policies_by_default_with_a_word_on_the_unbounded(config: str, capsys: Capsys) -> None:
+    words = ["topics", "--config", config, "--trace", "lte-synthetic-0", "--seeds", "1", "--motion", "none"]
+    text = shown(words, capsys)
+    assert all(f"\n{name} " in text for name in [*policies.names(for_topics=True), "drop-oldest", "rosbridge"])
+    assert "rosbridge has no rank: its queue is unbounded." in text
 
 
 def test_decisions_that_cannot_be_carried_out_are_told(
-    config: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    config: str, tmp_path: Path, capsys: Capsys, monkeypatch: Patch
 ) -> None:
     """Each of the 2 s x (10 + 2) messages/s is sent by such a decision, whatever its topic."""
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     mine = tmp_path / "mine.py"
-    mine.write_text(
-        "from bufgym.policies import make_room, register\n"
-        "@register('far-off', on_send=lambda buffer, memory: 999, for_topics=True)\n"
-        "def far_off(buffer, arrival, memory):\n"
-        "    return make_room(buffer, arrival)\n"
-    )
-    chosen = ["--seeds", "1", "--policies", "far-off", "--policy-file", str(mine)]
-    try:
-        assert main(["topics", "--config", config, "--trace", "lte-synthetic-0", *chosen]) == 0
-        told = capsys.readouterr().out
-    finally:
-        policies.registry._REGISTRY.pop("far-off", None)
+    mine.write_text(FAR_OFF.format(True))
+    chosen = ["--seeds", "1", "--policies", "far-off", "--policy-file", mine]
+    told = shown(["topics", "--config", config, "--trace", "lte-synthetic-0", *chosen], capsys)
     assert told.count("invalid") == 1 and "\nnote: far-off gave 24 invalid decisions\n" in told
     # Nor do the intervals of a single episode look as if they were known.
     assert "1 episode of 2 s" in told and "1.000 [–]" in told and "1.000 [1.000" not in told
@@ -118,60 +90,35 @@ def test_decisions_that_cannot_be_carried_out_are_told(
 @pytest.mark.parametrize(
     ("options", "naming"),
     [
-        (["--window", "0"], "window = 0: n_T must be"),
-        (["--window", "x"], "'x'"),
-        (["--consumers", "0"], "consumers = 0"),
-        (["--suite", "nope"], "unknown suite 'nope'"),
-        (["--suite", "fleet-v1"], "suite fleet-v1 is not one of topics: bufgym bench --suite fleet-v1"),
-        (["--policies", "clairvoyant"], "policy clairvoyant: it plans with a queue of its own"),
-        (["--split", "dev"], "split = 'dev'"),
-        (["--policies", "nope"], "unknown policy 'nope'"),
-        (["--policies", "fifo", "fifo"], "'fifo' is given more than once"),
-        (["--policies", "robofleet", "robofleet"], "'robofleet' is given more than once"),
-        (["--capacity", "0"], "0: must be"),
-        (["--seeds", "1001"], "seeds = 1001"),
-        (["--trace", "x.csv"], "--trace needs --config"),
-        (["--motion", "none"], "--motion needs --config"),
-        (["--scale", "2"], "--scale needs --config"),
-        (["--by-topic", "afr"], "--by-topic afr: not among the policies that run"),
-        (["--out", "rows.txt"], "rows.txt: rows are written to .csv or .parquet files"),
-        (["--out", "no-such-folder/rows.csv"], "no-such-folder/rows.csv: no folder"),
-        (["--config", "no-such.toml"], "error: no-such.toml: no such file\n"),
-        (["--config", "x.toml", "--suite", "topics-v1"], "--suite cannot go with --config"),
-        (["--config", "x.toml", "--split", "test"], "--split cannot go with --config"),
-        (["--config", "x.toml", "--jobs", "2"], "--jobs cannot go with --config"),
-        (["--config", "x.toml", "--out", "folder"], "folder: with --config rows are written to .csv or .parquet files"),
+        ("topics --window x", "'x'"),
+        ("topics --consumers 0", "consumers = 0"),
+        ("topics --suite fleet-v1", "suite fleet-v1 is not one of topics: bufgym bench --suite fleet-v1"),
+        ("topics --policies clairvoyant", "policy clairvoyant: it plans with a queue of its own"),
+        *((f"topics --{name} 2", f"--{name} needs --config") for name in ("trace", "motion", "scale")),
+        ("topics --by-topic afr", "--by-topic afr: not among the policies that run"),
+        ("topics --out rows.txt", "rows.txt: rows are written to .csv or .parquet files"),
+        ("topics --out no-such-folder/rows.csv", "no-such-folder/rows.csv: no folder"),
+        ("topics --config no-such.toml", "error: no-such.toml: no such file\n"),
+        ("topics --config x.toml --suite topics-v1", "--suite cannot go with --config"),
+        ("topics --config x.toml --split test", "--split cannot go with --config"),
+        ("topics --config x.toml --jobs 2", "--jobs cannot go with --config"),
+        ("topics --config x.toml --out folder", "folder: with --config rows are written to .csv or .parquet files"),
+        ("fleet --policies clairvoyant", "it plans with a link of its own, which no robot in a cell has"),
+        ("fleet --suite lte-v1", "suite lte-v1 is not one of fleet: bufgym bench --suite lte-v1"),
+        ("fleet --robots 0", "must be a whole number >= 1"),
+        ("fleet --robots 257", "robots = 257: must be a whole number from 1 to 256"),
     ],
 )
-def test_bad_options(options: list[str], naming: str, capsys: pytest.CaptureFixture[str]) -> None:
-    fails(["topics", *options], naming, capsys)
+def test_bad_options(options: str, naming: str, capsys: Capsys) -> None:
+    fails(options.split(), naming, capsys)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "naming"),
-    [
-        ("priority = 20", "priority = -1", "mine.toml: topic 'pose': priority = -1: must be a number >= 0"),
-        ("priority = 20", "priorty = 20", "mine.toml: topic 'pose': unknown key 'priorty'"),
-        ("rate_hz = 10", "rate_hz = 0", "mine.toml: topic 'pose': rate_hz = 0: must be a number > 0"),
-        ("duration_s", "window = 0\nduration_s", "mine.toml: window = 0: n_T must be a whole number"),
-        ("[[topic]]", "[[topics]]", "mine.toml: unknown key 'topics'"),
-        ("duration_s = 2", "duration_s = ", "mine.toml: Invalid value"),
-    ],
-)
-def test_bad_configurations(config: str, old: str, new: str, naming: str, capsys: pytest.CaptureFixture[str]) -> None:
-    Path(config).write_text(CONFIG.replace(old, new))
-    fails(["topics", "--config", config, *QUICK], naming, capsys)
-
-
-def test_a_window_given_on_the_command_line_is_not_the_files_fault(
-    config: str, capsys: pytest.CaptureFixture[str]
+def test_what_is_wrong_on_the_command_line_is_not_the_files_fault(
+    config: str, capsys: Capsys, monkeypatch: Patch
 ) -> None:
-    fails(["topics", "--config", config, *QUICK, "--window", "0"], "error: window = 0", capsys)
-    fails(["topics", "--config", config, *QUICK, "--trace", "none.csv"], "none.csv", capsys)
-
-
-def test_without_pyarrow_parquet_is_refused_before_the_work(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    fails(["topics", "--config", config, "--trace", "lte-synthetic-0", "--window", 0], "error: window = 0", capsys)
+    fails(["topics", "--config", config, "--trace", "none.csv"], "none.csv", capsys)
+    Path(config).write_text(f"window = 0\n{CONFIG}")
+    fails(["topics", "--config", config], "mine.toml: window = 0: n_T must be a whole number", capsys)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     fails(["topics", "--out", "rows.parquet"], "Parquet files need pyarrow", capsys)

@@ -2,46 +2,36 @@
 
 from __future__ import annotations
 
-import csv
-import dataclasses
 import pickle
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from train_cases import columns
 
-for extra in ("sb3_contrib", "tqdm", "tensorboard", "cma"):
-    pytest.importorskip(extra, reason="the extra [train] is not installed")
-
-import train  # noqa: E402  (these need the extra)
-from agents import training  # noqa: E402
-from agents.cma_es import Evolution  # noqa: E402
-from agents.mixed_env import Cell, cells  # noqa: E402
-from agents.objectives import queue  # noqa: E402
-from agents.objectives.objective import to_vector, with_vector  # noqa: E402
-from agents.runs import MODEL, prepare  # noqa: E402
-from agents.settings import LINK, MOTION, SEES, TIME, Settings  # noqa: E402
-from bufgym import policies  # noqa: E402
-from bufgym.errors import BufgymError  # noqa: E402
-from bufgym.model.qoi import exponential  # noqa: E402
-from bufgym.oracle import integer, law  # noqa: E402
-from bufgym.oracle.lengths import EveryLength  # noqa: E402
-from bufgym.policies import learned, weights  # noqa: E402
-from bufgym.scenario import Interruption, Streams, Uplink  # noqa: E402
-from bufgym.sim import run  # noqa: E402
-from bufgym.sim.metrics import outcome  # noqa: E402
-from bufgym.traces import Trace  # noqa: E402
+import train
+from agents import training
+from agents.cma_es import Evolution
+from agents.mixed_env import Cell, cells
+from agents.objectives import queue
+from agents.objectives.objective import to_vector, with_vector
+from agents.runs import MODEL, prepare
+from agents.settings import LINK, MOTION, SEES, TIME, Settings
+from bufgym import policies
+from bufgym.errors import BufgymError
+from bufgym.model.qoi import exponential
+from bufgym.oracle import integer, law
+from bufgym.oracle.lengths import EveryLength
+from bufgym.policies import learned, weights
+from bufgym.scenario import Interruption, Streams, Uplink
+from bufgym.sim import run
+from bufgym.sim.metrics import outcome
+from bufgym.traces import Trace
 
 TINY = Settings(
-    suite="interruption-v1",
-    capacities="4",
-    algo="evolution",
-    name="tiny",
-    steps=60_000,
-    validate_every=20_000,
-    validation_episodes=30,
-    test_seeds=25,
+    **{"suite": "interruption-v1", "capacities": "4", "algo": "evolution", "name": "tiny", "steps": 60_000},
+    **{"validate_every": 20_000, "validation_episodes": 30, "test_seeds": 25},
 )
 
 
@@ -59,34 +49,31 @@ def test_it_begins_with_the_smallest_merged_gap(sees: str, like: str) -> None:
     assert lengths.regrets(learned.policy("first", weights)) == lengths.regrets(policies.get(like))
 
 
+def agent(seed: int = 1) -> weights.Weights:
+    """An agent with a scorer of still links."""
+    rng = np.random.default_rng(seed)
+    return replace(queue.start(MOTION, 3, rng), still=queue.start(MOTION, 2, rng))
+
+
 def test_an_agent_that_reads_more_decides_the_same_at_first() -> None:
     """New inputs are zeros in every layer, in the mixing and in the scorer of still links."""
-    rng = np.random.default_rng(1)
-    old = replace(queue.start(MOTION, 3, rng), still=queue.start(MOTION, 2, rng))
-    old = with_vector(old, rng.normal(size=len(to_vector(old))))
+    old = with_vector(agent(), np.random.default_rng(2).normal(size=len(to_vector(agent()))))
     new = old.reading(LINK)
     assert new.fields == LINK and new.still is not None and new.still.fields == LINK
     assert new.mix is not None and new.mix.shape == (len(new.context), len(new.slot)) == (10, 5)
-    slow = Trace(
-        "slow", np.array([0, 1_000_000, 3_000_000, 10_000_000]), np.array([0, 3_000_000, 3_500_000, 20_000_000])
-    )
+    slow = Trace.steps([(1.0, 3_000_000), (2.0, 250_000), (7.0, 2_357_000)])
     episode = Uplink(traces=(slow,), duration_s=20).draw(Streams.seeded(3))
-    before, after = (
-        run(learned.policy("mine", weights), [episode], 8, exponential(0.9)).batch.log for weights in (old, new)
-    )
+    before, after = (run(learned.policy("mine", one), [episode], 8, exponential(0.9)).batch.log for one in (old, new))
     assert (before == after).all()
 
 
 def test_it_goes_on_from_a_file(tmp_path: Path) -> None:
     """What is evolved on other links keeps the scorer of links that stand still, and begins no worse than the file."""
-    rng = np.random.default_rng(1)
-    old = replace(queue.start(MOTION, 3, rng), still=queue.start(MOTION, 2, rng))
-    file = weights.save(tmp_path / "old.safetensors", old, {"name": "old"})
+    file = weights.save(tmp_path / "old.safetensors", agent(), {"name": "old"})
     settings = replace(TINY, suite="lte-v1", start=str(file), sees="link", steps=1, name="on", test_seeds=1).checked()
     begun = queue.QueueObjective(settings, tmp_path, 0).start()
-    assert begun.fields == LINK and len(to_vector(begun)) > len(to_vector(old))
-    state = Evolution.around(begun, 0.3, 0)
-    moved = state.weights(to_vector(begun) + 1)
+    assert begun.fields == LINK and len(to_vector(begun)) > len(to_vector(agent()))
+    moved = Evolution.around(begun, 0.3, 0).weights(to_vector(begun) + 1)
     assert moved.still is not None and begun.still is not None
     assert (moved.still.drop.flat() == begun.still.drop.flat()).all() and (moved.drop.flat() != begun.drop.flat()).any()
     for broken in ({"warm_up": 10}, {"algo": "ppo"}, {"suite": "topics-v1"}):
@@ -109,9 +96,6 @@ def test_weights_are_a_vector_and_back() -> None:
     assert (changed.accept.layers[0][0] == weights.accept.layers[0][0]).all()
 
 
-# --- the objective ---------------------------------------------------------------------------------------------------
-
-
 SHORT = Cell("short", Interruption(t_max=40), 5)
 
 
@@ -127,7 +111,6 @@ def test_one_run_through_the_longest_interruption_is_a_run_through_each(name: st
     assert lengths.regrets(policy)[0] == pytest.approx(1 - share @ qoi / (share @ best), abs=1e-12)
 
 
-@pytest.mark.slow
 def test_sampled_episodes_take_traces_in_turn_and_stay_the_same() -> None:
     given = cells("sustained-v1", "train", (5, 10))
     sampled = queue.sampled_regrets(given[:4], seed=3, episodes=8)
@@ -152,7 +135,6 @@ def test_a_suite_is_measured_by_the_better_of_afr_and_drop_oldest() -> None:
     assert suite.decisions_of() == suite.decisions == 2 * 42
 
 
-@pytest.mark.slow
 def test_interruptions_side_by_side_are_what_each_is_alone() -> None:
     """Cells with V and L of their own, again and again."""
     given = cells("interruption-v1", "train", (1, 4, 9))[:6]
@@ -162,7 +144,6 @@ def test_interruptions_side_by_side_are_what_each_is_alone() -> None:
         assert together.regrets(policies.get(name)).tolist() == alone
 
 
-@pytest.mark.slow
 def test_a_part_is_measured_by_what_the_rivals_reach_on_all_parts() -> None:
     """Two parts with one cell each, of the same L and V: each part's regret over the mean of both rivals'."""
     cell = cells("sustained-v1", "train", (10,))[1]
@@ -177,12 +158,9 @@ def test_a_part_is_measured_by_what_the_rivals_reach_on_all_parts() -> None:
     assert suite.decisions_of() == suite.decisions_of(0) + suite.decisions_of(1)
 
 
-# --- two scorers -----------------------------------------------------------------------------------------------------
-
-
 def test_the_scorer_of_a_still_link_is_stateed_alone_with_its_own_hidden_layer() -> None:
     still = queue.start(MOTION, 6, np.random.default_rng(0))
-    whole = dataclasses.replace(queue.start(MOTION, 0, np.random.default_rng(0)), still=still)
+    whole = replace(queue.start(MOTION, 0, np.random.default_rng(0)), still=still)
     first = Evolution.around(whole, 2.0, seed=0, still=True)
     vector = np.arange(len(to_vector(still)), dtype=float)
     agent = first.weights(vector)
@@ -194,36 +172,31 @@ def test_the_scorer_of_a_still_link_is_stateed_alone_with_its_own_hidden_layer()
     assert again.still is agent.still and again.drop.skip[2] == 2
 
 
-# --- runs ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_leaves_an_agent_goes_on_after_a_kill_and_repeats(capsys: pytest.CaptureFixture[str]) -> None:
-    train.main(TINY)
+    few = replace(TINY, steps=38_000, validate_every=19_000, validation_episodes=6, test_seeds=2)
+    train.main(few)
     home = Path("runs/tiny/seed-0")
     whole, notes = weights.read(home / MODEL)
     assert (notes["algo"], notes["suite"]) == ("evolution", "interruption-v1")
     assert "agent (evolution)" in capsys.readouterr().out
     assert Path("runs/tiny/model.safetensors").read_bytes() == (home / MODEL).read_bytes()
-    with (home / "validation.csv").open(newline="", encoding="utf-8") as file:
-        rows = [{name: float(number) for name, number in row.items()} for row in csv.DictReader(file)]
-    assert rows[0]["steps"] == 0 and rows[-1]["steps"] >= TINY.steps
-    assert all(0 <= row["regret"] < 1 for row in rows)
-
+    rows = columns(home / "validation.csv", "steps", "regret")
+    assert rows[0][0] == 0 and rows[-1][0] >= few.steps and all(0 <= regret < 1 for _, regret in rows)
     # Half of the steps, then the rest: the same agent to the last bit.
-    half = dataclasses.replace(TINY, name="half", steps=TINY.steps // 2)
+    half = replace(few, name="half", steps=few.steps // 2)
     folder = prepare(half)
     training.train_all(half, folder)
-    rest = dataclasses.replace(half, steps=TINY.steps, resume=True)
+    rest = replace(half, steps=few.steps, resume=True)
     training.train_all(rest, prepare(rest))
     again, _ = weights.read(folder / "seed-0" / MODEL)
     assert (again.parameters() == whole.parameters()).all()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_warm_up_learns_a_second_scorer_first() -> None:
     few = {"capacities": "25", "validation_episodes": 200, "steps": 100_000, "warm_up": 20_000, "still_hidden": 2}
-    both = dataclasses.replace(TINY, suite="interruption-v1,sustained-v1", name="warm", **few)
+    both = replace(TINY, suite="interruption-v1,sustained-v1", name="warm", **few)
     (run,) = training.train_all(both, prepare(both))
     state = pickle.loads((run.folder / "evolution.pkl").read_bytes())
     agent, first = state.agent, queue.start(MOTION, 2, np.random.default_rng(0))
@@ -232,14 +205,12 @@ def test_a_warm_up_learns_a_second_scorer_first() -> None:
         assert (to_vector(mean) != to_vector(begin)).any()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_several_suites_at_once_have_a_table_each(capsys: pytest.CaptureFixture[str]) -> None:
     few = {"capacities": "25", "test_seeds": 1, "validation_episodes": 200, "steps": 200_000}
-    both = dataclasses.replace(TINY, suite="interruption-v1,sustained-v1", name="both", sees="time", hidden=0, **few)
+    both = replace(TINY, suite="interruption-v1,sustained-v1", name="both", sees="time", hidden=0, **few)
     train.main(both)
     printed = capsys.readouterr().out
-    for suite in both.suites:
-        assert f"\n{suite}\n" in printed
-        assert Path(f"runs/both/{suite}/rows.csv").exists()
+    assert all(f"\n{suite}\n" in printed and Path(f"runs/both/{suite}/rows.csv").exists() for suite in both.suites)
     agent, notes = weights.read("runs/both/model.safetensors")
     assert agent.fields == TIME and agent.mix is not None and notes["suite"] == both.suite

@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import train_cases  # noqa: F401  (it skips without the extra)
 
-for extra in ("sb3_contrib", "tqdm", "tensorboard", "cma"):
-    pytest.importorskip(extra, reason="the extra [train] is not installed")
-
-import train  # noqa: E402  (these need the extra)
-from agents import cma_es, training  # noqa: E402
-from agents.objectives import fleet  # noqa: E402
-from agents.objectives.objective import to_vector  # noqa: E402
-from agents.runs import prepare  # noqa: E402
-from agents.settings import Settings  # noqa: E402
-from bufgym import policies  # noqa: E402
-from bufgym.benchmark.rows import read_rows  # noqa: E402
-from bufgym.benchmark.run import by_trace, draw, run  # noqa: E402
-from bufgym.benchmark.tasks import TASKS, FleetTask  # noqa: E402
-from bufgym.policies import learned, weights  # noqa: E402
-from bufgym.scenario import suites  # noqa: E402
-from bufgym.scenario.suites import Setting  # noqa: E402
+import train
+from agents import training
+from agents.objectives import fleet
+from agents.objectives.objective import to_vector
+from agents.settings import Settings
+from bufgym import policies
+from bufgym.benchmark.rows import read_rows
+from bufgym.benchmark.run import by_trace, draw, run
+from bufgym.benchmark.tasks import TASKS, FleetTask
+from bufgym.policies import learned, weights
+from bufgym.scenario import suites
+from bufgym.scenario.suites import Setting
 
 FLEET_V1 = suites.get("fleet-v1")
 
@@ -41,27 +37,18 @@ SUITE = dataclasses.replace(FLEET_V1, build=two_robots, capacities=(3, 4))
 TASK = TASKS["fleet"]
 
 TINY = Settings(suite="fleet-v1", algo="evolution", name="tiny", steps=12_000, validate_every=6_000, test_seeds=1)
-PPO = dataclasses.replace(
-    TINY, algo="maskable-ppo", num_envs=4, n_steps=32, batch_size=64, width=8, epochs=1, steps=256, validate_every=128
-)
+SMALL = {"num_envs": 4, "n_steps": 32, "batch_size": 64, "width": 8, "epochs": 1, "steps": 256, "validate_every": 128}
+PPO = dataclasses.replace(TINY, algo="maskable-ppo", **SMALL)  # type: ignore[arg-type]
 
 
 @pytest.fixture(autouse=True)
-def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder of its own; a small suite, and only what takes no time of the rest."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(suites.SUITES, "fleet-v1", SUITE)
     monkeypatch.setattr(fleet, "EPISODE_S", 1.0)
     monkeypatch.setattr(fleet, "VALIDATION_EPISODES", 1)
     monkeypatch.setattr(FleetTask, "default_policies", lambda self, suite: ["afr", "drop-oldest"])
-    yield
-
-
-def shipped(name: str = "learned-motion") -> weights.Weights:
-    return weights.read(Path(__file__).parents[1] / f"agents/pretrained/{name}.safetensors")[0]
-
-
-# --- where candidates are tried --------------------------------------------------------------------------------------
 
 
 def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
@@ -78,22 +65,17 @@ def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
     assert cell.decisions == 2 * 2 * 60
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_samples_go_once_round_the_training_links() -> None:
     """The same episodes at each L; every seed has episodes of its own."""
-    parts = fleet.training_parts("fleet-v1", SUITE.capacities, seed=3)
-    assert [[cell.fleet.senders.capacity for cell in part] for part in parts] == [[3, 4]] * fleet.PARTS
-    assert all(part[0].episodes is part[1].episodes for part in parts)
-    links = [episode.link.trace.name for part in parts for episode in part[0].episodes]
+    made, again, other = (fleet.training_parts("fleet-v1", SUITE.capacities, seed) for seed in (3, 3, 4))
+    assert [[cell.fleet.senders.capacity for cell in part] for part in made] == [[3, 4]] * fleet.PARTS
+    assert all(part[0].episodes is part[1].episodes for part in made)
+    links = [episode.link.trace.name for part in made for episode in part[0].episodes]
     assert len(links) == len(set(links)) == 24 and all("validation" not in name for name in links)
-    first, again, other = (
-        fleet.training_parts("fleet-v1", SUITE.capacities, seed)[0][0].episodes[0] for seed in (3, 3, 4)
-    )
-    assert first.link.offset_us == again.link.offset_us != other.link.offset_us
+    first, same, another = (parts[0][0].episodes[0] for parts in (made, again, other))
+    assert first.link.offset_us == same.link.offset_us != another.link.offset_us
     assert first.robots == 2 and len(first.arrivals[0]) == 30
-
-
-# --- where they begin ------------------------------------------------------------------------------------------------
 
 
 def start_of(**changes: str) -> weights.Weights:
@@ -103,18 +85,17 @@ def start_of(**changes: str) -> weights.Weights:
 
 @pytest.mark.parametrize("sees", ["motion", "time"])
 def test_the_shipped_agents_scorers_read_more_and_decide_the_same(sees: str) -> None:
-    before = dataclasses.replace(shipped(f"learned-{sees}"), thins=False)
-    made = fleet.widened(shipped(f"learned-{sees}"), fleet.MORE[sees])
+    file = Path(__file__).parents[1] / f"agents/pretrained/learned-{sees}.safetensors"
+    shipped = weights.read(file)[0]
+    before = dataclasses.replace(shipped, thins=False)
+    made = fleet.widened(shipped, fleet.MORE[sees])
     assert made.fields == (*before.fields, *fleet.MORE[sees])
-    part = fleet.training_parts("fleet-v1", SUITE.capacities, seed=0)[0]
-    assert [cell.team_qoi(learned.policy("mine", made)) for cell in part] == [
-        cell.team_qoi(learned.policy("shipped", before)) for cell in part
-    ]
-    if sees == "time":
-        assert not [name for name in made.fields if "motion" in name]
-    # What it reads now can be searched.
+    cells = fleet.training_parts("fleet-v1", SUITE.capacities, seed=0)[0]
+    mine, theirs = learned.policy("mine", made), learned.policy("shipped", before)
+    assert [cell.team_qoi(mine) for cell in cells] == [cell.team_qoi(theirs) for cell in cells]
+    assert sees == "motion" or not [name for name in made.fields if "motion" in name]
+    # What it reads now can be searched. Evolution begins there, but less ready to accept.
     assert len(to_vector(made)) > len(to_vector(before))
-    # Evolution begins there, but less ready to accept.
     first = start_of(sees=sees)
     assert first.accept.bias[0] == made.accept.bias[0] - fleet.THRIFT
     first.accept.bias[:] = made.accept.bias
@@ -127,33 +108,14 @@ def test_fields_of_ones_own_begin_with_greed() -> None:
     assert made.drop.skip.tolist() == pytest.approx([-0.4, -10, 0])
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"suite": "fleet-v1,lte-v1"}, "suite fleet-v1,lte-v1: a fleet's agent learns from one suite alone"),
-        ({"algo": "dqn"}, "a fleet's agent learns from one suite alone, by --algo evolution or maskable-ppo"),
-        ({"algo": "maskable-ppo", "network": "plain"}, "network = 'plain': a fleet's agent scores slots"),
-        ({"capacities": "5,x"}, "capacities = '5,x'"),
-        ({"seeds": 0}, "seeds = 0: must be >= 1"),
-        ({"fields": "left"}, "fields = 'left'"),
-    ],
-)
-def test_mistakes_are_told(change: dict[str, object], message: str) -> None:
-    with pytest.raises(SystemExit, match=message):
-        train.main(dataclasses.replace(TINY, **change))
-
-
-# --- training --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: pytest.CaptureFixture[str]) -> None:
     train.main(TINY)
     printed = capsys.readouterr().out
     folder = Path("runs/tiny")
     rows = read_rows(folder / "rows.csv", TASK.layout)
-    names = {"agent (seed 0)", "afr", "drop-oldest"}
-    assert {row["policy"] for row in rows} == names and len(rows) == 12 * 2 * 2 * 3  # links, robots, L, policies
+    assert {row["policy"] for row in rows} == {"agent (seed 0)", "afr", "drop-oldest"}
+    assert len(rows) == 12 * 2 * 2 * 3  # links, robots, L, policies
     assert (folder / "results.txt").read_text() in printed and "best on validation: seed 0" in printed
     validations = np.loadtxt(folder / "seed-0" / "validation.csv", delimiter=",", skiprows=1)
     assert validations[0, 0] == 0 and validations[-1, 0] >= TINY.steps and len(validations) >= 3
@@ -167,23 +129,7 @@ def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: py
     assert [row["qoi"] for row in again] == mine
 
 
-@pytest.mark.slow
-def test_a_run_that_goes_on_ends_like_one_that_never_stopped() -> None:
-    def validations(arguments: Settings) -> list[list[str]]:
-        folder = prepare(arguments)
-        cma_es.train(arguments, folder, 0)
-        lines = (folder / "seed-0" / "validation.csv").read_text().splitlines()[1:]
-        return [[cell for k, cell in enumerate(line.split(",")) if k != 1] for line in lines]  # all but the seconds
-
-    whole = validations(dataclasses.replace(TINY, name="whole"))
-    validations(dataclasses.replace(TINY, name="cut", steps=6_000))
-    assert validations(dataclasses.replace(TINY, name="cut", resume=True)) == whole
-    agents = [Path(f"runs/{name}/seed-0/model.safetensors") for name in ("whole", "cut")]
-    memories = [weights.read(agent)[0].parameters() for agent in agents]
-    assert (memories[0] == memories[1]).all()
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ppo_shares_weights_over_robots_and_its_agent_needs_no_torch() -> None:
     env = training.training_env(PPO)
     assert env.num_envs == 4 and env.envs.rows.capacity == 4  # two cells of two robots, at the middle L
@@ -193,7 +139,8 @@ def test_ppo_shares_weights_over_robots_and_its_agent_needs_no_torch() -> None:
     assert {row["capacity"] for row in rows if row["policy"] == "agent (seed 0)"} == {3, 4}
     agent, noted = weights.read(folder / "model.safetensors")
     assert agent.widths == (8, 8) and noted["algo"] == "maskable-ppo"
-    before = (folder / "seed-0" / "validation.csv").read_text().splitlines()
+    table = folder / "seed-0" / "validation.csv"
+    before = table.read_text().splitlines()
     train.main(dataclasses.replace(PPO, resume=True, steps=512))
-    after = (folder / "seed-0" / "validation.csv").read_text().splitlines()
+    after = table.read_text().splitlines()
     assert after[: len(before)] == before and after[-1].split(",")[0] == "512"

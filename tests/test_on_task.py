@@ -38,6 +38,7 @@ def test_a_task_is_the_mean_of_its_reward() -> None:
     assert trained_on.isdisjoint({trace.name for trace in worth.mapping().traces[-on_task.TEST_LINKS :]})
 
 
+@pytest.mark.nightly
 def test_the_page_has_every_agent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(on_task, "PART_EPISODES", 2)
     monkeypatch.setitem(on_task.TESTED, "tracked", worth.coverage_of)  # seconds an episode less

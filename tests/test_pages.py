@@ -1,258 +1,195 @@
-"""All that README and site tell users to type: each command is one of the parser's, each program runs.
-
-A command runs here with the settings in ``RUN``, or ``PARSED`` says why it is only parsed and what tests it.
-"""
+"""What README and site tell users to type is there: commands, programs, imports, links and pictures."""
 
 from __future__ import annotations
 
 import argparse
 import ast
 import functools
-import glob
-import gzip
 import importlib.util
+import os
 import re
-import shutil
+import shlex
+import subprocess
+import sys
 import textwrap
-import zipfile
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import page_cases
 import pytest
-from page_cases import REPO, Block, blocks, commands, words
 
 from agents.settings import Settings
 from bufgym import cli
 from bufgym.cli import main
 from bufgym.policies import registry
+from website import pages
+from website import policies as policy_page
 
-# -------------------- commands: as they stand
+REPO = Path(__file__).resolve().parent.parent
+WRITTEN = [
+    *("README.md", "CONTRIBUTING.md", "SECURITY.md", "agents/pretrained/README.md", "traces/README.md"),
+    *(path.relative_to(REPO).as_posix() for path in sorted((REPO / "docs").rglob("*.md"))),
+]
+"""Pages that are files. (The changelog names commands of its day.)"""
 
-RUN = {
-    r"bufgym bench --policies learned-motion,afr|bufgym bench --policy-file mine\.py --policies every-other.*": (
-        "--seconds 2 --seeds 1"
-    ),
-    r"bufgym bench (--scenario-file|--workload (frames|nav2)|--policies ppo\.zip).*": "--seeds 1",
-    r"bufgym dataset make --kind mixed .*": "--episodes 3 --option duration_s=2.0",
-    r"bufgym dataset make --suite lte-v1 .*": "--episodes 2 --out data",
-    # In this process: another's, made for a test before, may have been begun in another folder.
-    r"bufgym fleet --robots 1 .*": "--seeds 1 --jobs 1",
-    r"bufgym topics --config \S+ --trace .*": "--seeds 1",
-    r"bufgym topics --config \S+": "--seeds 1 --policies robofleet",
-    r"bufgym (--help|list \w+|export runs/motion/.*|gallery|trace fetch --list|trace from-bag drive\.mcap)": "",
-    r"bufgym trace generate .*": "-o made.csv",
-    r"bufgym trace (convert|info|plot|validate) .*": "",
-}
-"""Pattern of a whole command -> the settings behind it that make it short."""
-
-PARSED = {
-    r"bufgym( (bench|export|leaderboard|report|reproduce|topics|tune|validate|trace( fetch| fit| from-bag)?))?": "",
-    r"bufgym (bench --suite|topics --config)": "a name",
-    r".*\bNAME\b.*": "a pattern",
-    r"bufgym bench --suite .*": "minutes on all cores; tests/benchmark/test_sweep_folder.py runs small ones",
-    r"bufgym validate .*": "minutes; tests/benchmark/test_leaderboard.py",
-    r"bufgym (fleet|topics) --suite .*": "minutes; tests/benchmark/test_fleet_task.py, test_topics_task.py",
-    r"bufgym fleet --robots (4|64) .*": "as with one robot",
-    r"bufgym report results/lte": "tests/benchmark/test_report_folder.py",
-    r"bufgym gallery .*": "tests/test_gallery.py; the first one by test_readme.py",
-    r"bufgym live .*": "sockets; tests/live/test_command.py",
-    r"bufgym ros2 .*": "needs ROS 2; tests/live/test_ros2.py",
-    r"bufgym relay .*": "a server, and who connects to it; tests/relay",
-    r"bufgym export .* --to c .*": "compiles for 40 s; tests/test_c_export.py",
-    r"bufgym reproduce (afr-fig9|small-link)": "tests/reproduce/test_reproduce.py",
-    r"bufgym reproduce afr-(fig7 afr-fig8|qoi-task|overlap) --data DIR": "minutes to an hour; test_frame_figures.py",
-    r"bufgym reproduce robofleet-fig[3-7] --live": "a minute and more; tests/live/test_figures_live.py",
-    r"bufgym trace fit .*": "needs recordings; tests/traces/test_fit.py",
-    r"bufgym (perf( --peers| --profile| --queue)?|warmup)": "tests/benchmark/test_perf_and_play.py, test_warmup.py",
-    r"bufgym (topics --policy-file|play|bench --policies .*seeds) .*": "tests/test_readme.py",
-    r"bufgym bench --workload (drive\.mcap .*|FILE\.mcap)": "tests/test_cli_workload.py",
-    r"bufgym bench .*(my-agent.zip|every-second|drive\.csv).*": "the tutorial before it makes its files; test_site.py",
-    r"python3? (-m bufgym\.ros1|examples/ros[12]/fade\.py).*": "needs ROS; tests/live/test_ros1.py, test_ros2.py",
-    r"python train\.py .*": "minutes to hours; tests/test_train.py",
-    r"python tests/relay/(engines|load)\.py.*": "measures, for a minute; what it drives: tests/relay",
-    r"python -m agents\..*": "needs a run's folder; tests/test_agents.py, test_scheduling.py, test_ablation.py",
-    r"python examples/view_missed\.py": "tests/test_training_examples.py",
-    r"bufgym trace fetch tum-rgbd-desk": "downloads 0.4 GB; tests/traces/test_fetch.py",
-    r"python examples/trackers\.py.*": "needs small_gicp; tests/perception/test_trackers.py",
-    r"python -m pytest .*": "a test",
-    r"make .*": "a rule of the Makefile",
-    r"pip install .*|python3 -m venv .*|pre-commit install|source \.venv/bin/activate": "set-up; .ci/install-matrix",
-}
-"""Pattern of a whole command -> why it does not run here, and what tests it."""
+TUTORIALS = sorted((REPO / "docs" / "tutorials").glob("*.py"))
 
 
-def entry(table: dict[str, str], line: str) -> str | None:
-    """What the first pattern that fits the command leads to."""
-    return next((words for pattern, words in table.items() if re.fullmatch(pattern, plain(line))), None)
+class Block(NamedTuple):
+    """A fenced block."""
+
+    page: str
+    language: str
+    text: str
 
 
-def plain(line: str) -> str:
-    """A command without the folder of its program."""
-    return re.sub(r"^\.venv/bin/", "", line)
-
-
-def command_parsers() -> dict[str, argparse.ArgumentParser]:
-    """``"trace fit"`` -> its parser."""
-    found: dict[str, argparse.ArgumentParser] = {}
-
-    def add(parser: argparse.ArgumentParser, before: str) -> None:
-        found[before.strip()] = parser
-        for action in parser._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                for name, child in action.choices.items():
-                    add(child, f"{before} {name}")
-
-    add(cli._parser(), "")
+@cache
+def texts() -> dict[str, str]:
+    """Page -> Markdown: files, pages that the site makes of the code, and the text of the tutorials."""
+    found = {name: (REPO / name).read_text(encoding="utf-8") for name in WRITTEN}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(policy_page, "picture", lambda policy: "")
+        found |= {f"site:{name}": text for name, text in pages.made().items()}
+    for path in TUTORIALS:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        found[f"docs/tutorials/{path.name}"] = "\n".join(line[2:] for line in lines if line.startswith("# "))
     return found
 
 
+@cache
+def blocks() -> tuple[Block, ...]:
+    """Every fenced block of every page."""
+    fence = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+    return tuple(Block(page, *found) for page, whole in texts().items() for found in fence.findall(whole))
+
+
+@cache
+def commands() -> list[str]:
+    """Every command of a block or between backticks, without its comment and its program's folder."""
+    found = [
+        line.partition("  #")[0].strip()
+        for block in blocks()
+        if block.language in ("", "bash", "sh")
+        for line in re.sub(r" *\\\n\s*", " ", block.text).splitlines()
+    ]
+    for whole in texts().values():
+        prose = re.sub(r"^```.*?^```$", "", whole, flags=re.MULTILINE | re.DOTALL)
+        found += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", prose)]
+    plain = dict.fromkeys(re.sub(r"^\.venv/bin/", "", line) for line in found)
+    return [line for line in plain if line.split(" ")[0] in ("bufgym", "python", "python3", "make")]
+
+
+def command_names(parser: argparse.ArgumentParser, before: str = "") -> set[str]:
+    """``trace fit`` and all others."""
+    groups = [action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    under = (command_names(child, f"{before} {name}".strip()) for group in groups for name, child in group.items())
+    return {before}.union(*under)
+
+
 def test_the_parser_takes_each_command() -> None:
-    found, parser = command_parsers(), cli._parser()
-    said = [words(line)[1:] for line in commands() if plain(line).startswith("bufgym")]
-    assert len(said) > 350
-    for command in said:
-        if " ".join(command) not in found and command != ["--help"]:
+    parser = cli._parser()
+    names = command_names(parser)
+    told = [shlex.split(line)[1:] for line in commands() if line.startswith("bufgym")]
+    assert len(told) > 350
+    for command in told:
+        if " ".join(command) not in names and command != ["--help"]:
             parser.parse_args([*command, *(["x"] if command[-1] in ("--suite", "--config") else [])])
 
 
-def test_python_is_given_what_it_takes() -> None:
+def test_python_and_make_are_given_what_they_take() -> None:
     tyro = pytest.importorskip("tyro", reason="the extra train is not installed")
-    for line in [line for line in commands() if plain(line).startswith("python")]:
-        program, *settings = words(line)[1:]
-        if program == "-m" and settings[0].startswith("agents."):
+    rules = re.findall(r"^([\w-]+):", (REPO / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    for line in [line for line in commands() if not line.startswith("bufgym")]:
+        tool, program, *settings = shlex.split(line)
+        if tool == "make":
+            assert program in rules, line
+        elif program == "-m" and settings[0].startswith("agents."):
             page = importlib.import_module(settings.pop(0)).main
             # The same settings for a function that does nothing.
             assert not settings or tyro.cli(functools.wraps(page)(lambda *given, **named: "taken"), args=settings)
         elif program == "-m" and settings[0] != "pytest":
-            assert importlib.util.find_spec(settings[0]) is not None
+            assert importlib.util.find_spec(settings[0]) is not None, line
         elif program == "train.py" and settings != ["--help"]:
             assert tyro.cli(Settings, args=settings).algo
         else:
-            assert (REPO / (settings[-1] if program == "-m" else program)).is_file()
+            assert (REPO / (settings[-1] if program == "-m" else program)).is_file(), line
 
 
-def test_every_rule_of_make_is_in_the_makefile() -> None:
-    rules = set(re.findall(r"^([\w-]+):", (REPO / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    told = {words(line)[1] for line in commands() if line.startswith("make ")}
-    assert {"train", "test", "docs"} <= told <= rules
+def test_what_the_programs_import_is_there() -> None:
+    programs = [block for block in blocks() if block.language == "python"]
+    programs += [Block(path.name, "python", path.read_text(encoding="utf-8")) for path in TUTORIALS]
+    for page, _, text in programs:
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith(("bufgym", "agents")):
+                for name in node.names:
+                    assert _is_there(str(node.module), name.name), (page, node.module, name.name)
+            elif isinstance(node, ast.Import):
+                named = [name.name for name in node.names if name.name.startswith(("bufgym", "agents"))]
+                assert all(importlib.util.find_spec(name) for name in named), (page, named)
 
 
-def test_each_command_runs_here_or_says_why_not() -> None:
-    unknown = [line for line in commands() if entry(RUN, line) is None and entry(PARSED, line) is None]
-    assert not unknown, "put them into RUN, or into PARSED with the reason"
-    told = [plain(line) for line in commands()]
-    assert all(any(re.fullmatch(pattern, line) for line in told) for pattern in [*RUN, *PARSED])
+def _is_there(module: str, name: str) -> bool:
+    if module == "bufgym.ros2":  # it needs ROS 2
+        return importlib.util.find_spec(module) is not None
+    return hasattr(importlib.import_module(module), name) or importlib.util.find_spec(f"{module}.{name}") is not None
 
 
-def test_a_block_without_a_language_holds_commands() -> None:
-    for block in blocks():
-        assert block.language in ("", "python", "text"), (block.page, block.language)
-        if not block.language:
-            lines = re.sub(r" *\\\n\s*", " ", block.text).splitlines()
-            assert all(line.split(" ")[0] in page_cases.PROGRAMS for line in lines), (block.page, block.text)
+def test_links_and_pictures_lead_somewhere() -> None:
+    """A page is a file or one that the site makes; an anchor is a title of some page."""
+    menu = re.findall(r"[\w/-]+\.md", (REPO / "mkdocs.yml").read_text(encoding="utf-8"))
+    titles = [title for text in texts().values() for title in re.findall(r"^#+ (.*)$", text, re.MULTILINE)]
+    anchors = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+    for page, text in texts().items():
+        if page.startswith("site:"):
+            continue  # the site's build follows its links
+        for target in re.findall(r"\]\(([^)]+)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL)):
+            path, _, anchor = target.partition("#")
+            if not target.startswith("http"):
+                there = ((REPO / page).parent / path).resolve()
+                made = there in [REPO / "docs" / name for name in menu] or there.with_suffix(".py") in TUTORIALS
+                assert not path or there.exists() or made, (page, target)
+                assert not anchor or anchor in anchors or 'id="' in text, (page, target)
 
 
-def test_every_picture_stands_beside_the_command_that_makes_it() -> None:
-    """Named in the paragraph behind it, or before the page's first section where one command makes all of them."""
-    pictures = 0
-    for page, text in page_cases.texts().items():
-        for found in re.finditer(r"!\[[^\]]*\]\([^)]+\)", text):
-            caption = " ".join(text[found.end() :].strip(") \n").split("\n\n")[:2])
-            said = re.findall(r"`([^`]+)`", caption) + re.findall(r"Made by `([^`]+)`", text.partition("\n## ")[0])
-            # Those of the tutorials: website/tutorials.py says so of all.
-            made = any(" ".join(command.split()) in commands() for command in said)
-            assert made or page.startswith("docs/tutorials/"), (page, found[0])
-            pictures += 1
-    assert pictures > 30
+RUN = {
+    r"bufgym bench --policies learned-motion,afr": "--seconds 2 --seeds 1",
+    r"bufgym bench --policy-file mine\.py --policies every-other.*": "--seconds 2 --seeds 1",
+    r"bufgym bench --scenario-file .*": "--seeds 1",
+    r"bufgym topics --policy-file .*": "--config examples/client.toml --trace lte-synthetic-0 --seeds 1",
+    r"bufgym dataset make --kind mixed .*": "--episodes 3 --option duration_s=2.0",
+    r"bufgym dataset make --suite lte-v1 .*": "--episodes 2 --out data",
+    r"bufgym topics --config \S+": "--seeds 1 --policies robofleet",
+    r"bufgym (--help|list \w+|gallery|trace fetch --list)": "",
+    r"bufgym trace generate .*": "-o made.csv",
+    r"bufgym play --policies .*": "--speed 0 --steps 20",
+}
+"""Pattern of a whole command -> the settings behind it that make it short. Others have tests of their own."""
 
 
-# -------------------- commands: run
+def settings_of(line: str) -> str | None:
+    return next((more for pattern, more in RUN.items() if re.fullmatch(pattern, line)), None)
 
 
-@pytest.fixture
-def folder(given: Path, tmp_path: Path) -> Path:
-    """What the pages' commands read; each has its own."""
-    return shutil.copytree(given, tmp_path / "pages")
-
-
-@pytest.fixture(scope="module")
-def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What they read, stand-ins for recordings included."""
-    there = tmp_path_factory.mktemp("pages")
-    for name in ("examples", "traces"):
-        shutil.copytree(REPO / name, there / name)
-    link, recording = there / "traces" / "lte-synthetic-0.csv", there / "5G-production-dataset.zip"
-    for name in ("uplink.csv", "tram.csv", "report_tram_0002.csv"):
-        shutil.copy(link, there / name)
-    with zipfile.ZipFile(recording, "w") as archive:
-        archive.write(link, "B_2019.12.16_11.49.59.csv")
-    opportunities = "".join(f"{k}\n" for k in range(1, 20_001))  # 1.5 MB/s for 20 s
-    (there / "mahimahi").mkdir()
-    for name in ("TMobile-LTE-short.up.gz", "Verizon-EVDO-driving.up.gz", "mahimahi/ATT-LTE-driving.up.gz"):
-        with gzip.open(there / name, "wt") as file:
-            file.write(opportunities)
-    frames = [f"{k / 30:.6f},900000,{k / 100}\n" for k in range(90)]
-    (there / "frames.csv").write_text("".join(["time_s,bytes,x\n", *frames]))
+@pytest.mark.nightly
+@pytest.mark.parametrize("line", [line for line in commands() if settings_of(line) is not None])
+def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    """In a folder with the guide's programs and the repository's examples and traces."""
     for block in blocks():
         named = re.match(r"# (\w+\.py)\n", block.text) if block.language == "python" else None
         if named and block.page.startswith("docs/guide"):
-            (there / named[1]).write_text(block.text)
-    (fleet,) = [block.text for block in blocks() if "register_later(" in block.text]
-    (there / "fleet_agent.py").write_text(fleet)
-    shipped = str(REPO / "agents" / "pretrained" / "learned-motion.safetensors")
-    for name, file in {"own": "mine", "motion": "runs/motion/model", "fleet": "runs/fleet/model"}.items():
-        (there / file).parent.mkdir(parents=True, exist_ok=True)
-        assert main(["export", shipped, str(there / f"{file}.safetensors"), "--name", name]) == 0
-    return there
-
-
-def _recorded(there: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """drive.mcap, and the same as nav2_turtlebot.mcap with transforms."""
-    pytest.importorskip("rosbags", reason="recordings need the extra 'ros'")
-    monkeypatch.syspath_prepend(str(REPO / "tests" / "traces"))
-    bag_cases = importlib.import_module("bag_cases")
-    transforms = [(k * 100, "/tf", "std_msgs/msg/String", bag_cases.text("moved")) for k in range(20)]
-    bag_cases.write_mcap(there / "drive.mcap", bag_cases.drive())
-    bag_cases.write_mcap(there / "nav2_turtlebot.mcap", sorted(bag_cases.drive() + transforms))
-
-
-def _untrained(there: Path) -> None:
-    """ppo.zip"""
-    pytest.importorskip("sb3_contrib", reason="the extra train is not installed")
-    from sb3_contrib import MaskablePPO
-
-    from bufgym.sb3 import SlotPolicy, make_vec_env
-
-    MaskablePPO(SlotPolicy, make_vec_env("bufgym/Uplink-v0", 2, capacity=8), n_steps=8).save(there / "ppo.zip")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("line", [line for line in commands() if entry(RUN, line) is not None])
-def test_the_command_runs(
-    line: str, given: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(folder)
+            (tmp_path / named[1]).write_text(block.text)
+    for name in ("examples", "traces"):
+        (tmp_path / name).symlink_to(REPO / name)
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
-    monkeypatch.syspath_prepend(str(folder))
-    for package, needed in {"minari": "dataset make", "matplotlib": "trace plot", "mcap": "live"}.items():
-        if needed in line:
-            pytest.importorskip(package)
-    if ".mcap" in line:
-        _recorded(folder, monkeypatch)
-    if "ppo.zip" in line:
-        _untrained(folder)
-    said = words(line)[1:]
-    said = [name for word in said for name in (sorted(glob.glob(word)) if "*" in word else [word])]
-    assert {path.name for path in given.iterdir()} <= {path.name for path in Path.cwd().iterdir()}
+    if "dataset make" in line:
+        pytest.importorskip("minari")
     try:
-        assert main([*said, *words(entry(RUN, line) or "")]) == 0
+        assert main([*shlex.split(line)[1:], *shlex.split(settings_of(line) or "")]) == 0
     except SystemExit as end:  # --help
         assert end.code == 0
     assert capsys.readouterr().out.strip()
 
-
-# -------------------- programs
 
 BEFORE = {
     "docs/guide/experts.md": """
@@ -277,42 +214,76 @@ AFTER = {"docs/guide/truth.md": "assert round(best.value, 5) == 0.98311", "docs/
 
 ELSEWHERE = {
     "docs/guide/on-a-robot.md": "tests/live/test_ros1.py, test_ros2.py",
-    "docs/guide/own-policy.md": "tests/test_readme.py and above, by a command",
-    "docs/guide/yours-to-change.md": "tests/test_examples.py",
-    "docs/index.md": "tests/test_readme.py",
+    "docs/guide/own-policy.md": "above, by a command",
+    "docs/guide/yours-to-change.md": "below",
+    "docs/fleet.md": "it trains for minutes; what it imports is looked at above",
 }
 """Page -> what runs its programs."""
 
-NAMED = [block for block in blocks() if block.language == "python" and block.page not in ELSEWHERE]
-PROGRAMS = [
-    block for block in NAMED if not re.match(r"# urgent\.py", block.text) and "register_later" not in block.text
-]
-LONG = {"docs/fleet.md": "settings = "}
-"""Page -> where the part of its program begins that takes minutes: only what it imports and names is looked at."""
+PROGRAMS = [block for block in blocks() if block.language == "python" and block.page not in ELSEWHERE]
 
 
-def test_pages_whose_programs_run_elsewhere_have_some() -> None:
-    assert set(ELSEWHERE) == {b.page for b in blocks() if b.language == "python" and b.page in ELSEWHERE}
-    assert {*BEFORE, *AFTER} <= {block.page for block in PROGRAMS}
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("block", PROGRAMS, ids=[f"{block.page}-{k}" for k, block in enumerate(PROGRAMS)])
 def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for package in ("sb3_contrib", "cma", "pettingzoo", "mcap", "cv2"):
-        needs = {
-            "cma": "agents.objectives",
-            "pettingzoo": "parallel_env",
-            "mcap": ".mcap",
-            "cv2": "bufgym.perception",
-        }.get(package, package)
-        if needs in block.text:
+    needed = {"sb3_contrib": "sb3_contrib", "cma": "agents.objectives", "pettingzoo": "parallel_env"}
+    for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym.perception"}).items():
+        if sign in block.text:
             pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
-    said, begins, rest = block.text.partition(LONG.get(block.page, "\0"))
-    program = "\n".join([textwrap.dedent(BEFORE.get(block.page, "")), said, AFTER.get(block.page, "")])
-    named: dict[str, Any] = {}
-    exec(compile(program, block.page, "exec"), named)
-    for node in ast.walk(ast.parse(begins + rest if begins else "")):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in named:
-            getattr(named[node.value.id], node.attr)
+    program = "\n".join([textwrap.dedent(BEFORE.get(block.page, "")), block.text, AFTER.get(block.page, "")])
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
+    exec(compile(program, block.page, "exec"), {"__name__": "page"})
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("source", TUTORIALS, ids=lambda source: source.stem)
+def test_each_tutorial_runs_and_ends_with_its_picture(source: Path, tmp_path: Path) -> None:
+    """A process of its own: tutorials register policies, scenarios and fields."""
+    text = source.read_text(encoding="utf-8")
+    for package in ("matplotlib", "sb3_contrib", "pettingzoo"):
+        if package == "matplotlib" or package in text.lower():
+            pytest.importorskip(package)
+    last = re.findall(r"^# !\[[^\]]+\]\((.+)\)$", text, re.MULTILINE)[-1]
+    where = os.environ | {"PYTHONPATH": str(REPO)}
+    command = [sys.executable, str(source)]
+    done = subprocess.run(command, cwd=tmp_path, env=where, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / last).stat().st_size > 5000
+    assert (source.parent / last).exists()
+
+
+@pytest.mark.nightly
+def test_the_table_of_the_readme_is_what_its_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
+    block = re.compile(r"```\n(bufgym bench --policies [^\n]*)\n```\n\n```text\n(.*?)```", re.DOTALL)
+    command, table = block.findall(texts()["README.md"])[0]
+    assert main(command.split()[1:]) == 0
+    assert capsys.readouterr().out.strip() == table.strip()
+
+
+EXAMPLES = [
+    path
+    for path in sorted((REPO / "examples").glob("*.py"))
+    if all(part in path.read_text(encoding="utf-8") for part in ("def main(", '"--steps"', '"--seeds"'))
+]
+"""Those that take ``--steps`` and ``--seeds``; the others have tests of their own."""
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_the_example_runs(path: Path) -> None:
+    """A process of its own: examples register fields, rewards and scenarios."""
+    command, where = (
+        [sys.executable, str(path), "--steps", "40", "--seeds", "1"],
+        os.environ | {"PYTHONPATH": str(REPO)},
+    )
+    done = subprocess.run(command, cwd=path.parent, env=where, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip()
+
+
+def test_the_guide_shows_what_the_examples_do() -> None:
+    section = (REPO / "docs" / "guide" / "yours-to-change.md").read_text(encoding="utf-8")
+    text = "\n".join(path.read_text(encoding="utf-8") for path in EXAMPLES)
+    blocks = [block.split("```")[0] for block in section.split("```python\n")[1:]]
+    assert len(blocks) == 5 and all(block in text for block in blocks)

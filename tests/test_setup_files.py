@@ -1,10 +1,13 @@
-"""Container, hooks and workflow name what is there: rules of the Makefile, Pythons that are supported, programs."""
+"""Container, hooks, workflows and stages name what is there: rules of the Makefile, supported Pythons, programs."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shlex
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -14,9 +17,25 @@ import pytest
 from bufgym import cli
 
 REPO = Path(__file__).resolve().parent.parent
+if not (REPO / ".github").is_dir():
+    pytest.skip("an sdist has no workflows", allow_module_level=True)
 PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-RULES = re.findall(r"^([\w-]+):", (REPO / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+MAKEFILE = (REPO / "Makefile").read_text(encoding="utf-8")
+RULES = set(re.findall(r"^([\w.$()/-]+):", MAKEFILE.replace("$(READY)", ".venv/.ready"), re.MULTILINE))
 PYTHONS = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
+WORKFLOWS = sorted(path.name for path in (REPO / ".github" / "workflows").iterdir())
+
+
+def script(name: str) -> Any:
+    """A program of `.ci`, as a module."""
+    spec = importlib.util.spec_from_file_location(name, REPO / ".ci" / f"{name}.py")
+    assert spec and spec.loader
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+stages = script("stages")
 
 
 def read_yaml(name: str) -> Any:
@@ -27,38 +46,154 @@ def read_yaml(name: str) -> Any:
 def test_the_container_runs_rules_and_commands_that_there_are() -> None:
     text = (REPO / "Dockerfile").read_text(encoding="utf-8")
     lines = re.sub(r"\\\n\s*", " ", re.sub(r"^#.*\n", "", text, flags=re.MULTILINE)).splitlines()
-    said = {
-        word: [line.partition(" ")[2] for line in lines if line.startswith(word)] for word in ("FROM", "RUN", "CMD")
-    }
-    assert sum(map(len, said.values())) + len(["WORKDIR", "COPY"]) == len(lines)
-    assert re.fullmatch(r"python:(3\.\d+)-slim", said["FROM"][0])[1] in PYTHONS  # type: ignore[index]
-    setup, warmup = (shlex.split(part) for part in said["RUN"][-1].split("&&"))
-    # The first is the rule that all others need.
-    assert setup == ["make", ".venv/.ready"] and "READY := $(VENV)/.ready" in (REPO / "Makefile").read_text()
+    setup, warmup = (shlex.split(part) for part in lines[-2].removeprefix("RUN ").split("&&"))
+    assert setup == ["make", ".venv/.ready"]
     assert warmup[0] == ".venv/bin/bufgym" and cli._parser().parse_args(warmup[1:]).command
-    told = re.findall(r"\bmake (\w+)", text) + re.findall(r'"make", "(\w+)"', said["CMD"][0])
-    assert {"train", "test"} <= set(told) <= set(RULES)
+    told = re.findall(r"\bmake (\w+)", text) + re.findall(r'"make", "(\w+)"', lines[-1])
+    assert {"train", "test"} <= set(told) <= RULES
+    assert re.fullmatch(r"FROM python:(3\.\d+)-slim", lines[0])[1] in PYTHONS  # type: ignore[index]
     left_out = (REPO / ".dockerignore").read_text(encoding="utf-8").split()
-    assert not {"bufgym", "agents", "traces", "tests", "docs", "Makefile", "pyproject.toml"} & set(left_out)
+    assert not {"bufgym", "agents", "traces", "tests", "docs", ".ci", "Makefile", "pyproject.toml"} & set(left_out)
 
 
-def test_the_workflow_tries_every_python_that_is_supported() -> None:
-    workflow = read_yaml(".github/workflows/test.yml")
-    (job,) = workflow["jobs"].values()
-    assert job["strategy"]["matrix"]["python"] == PYTHONS
-    (script,) = [step["run"] for step in job["steps"] if "run" in step]
-    assert os.access(REPO / script, os.X_OK)
-    assert f"${{PYTHONS:-{' '.join(PYTHONS)}}}" in (REPO / ".ci" / "install-matrix").read_text(encoding="utf-8")
-    assert (
-        f"Python >= {PYTHONS[0]}" in (REPO / "Makefile").read_text() and PROJECT["requires-python"] == f">={PYTHONS[0]}"
-    )
+@pytest.mark.parametrize("name", WORKFLOWS)
+def test_workflows_run_rules_and_scripts_that_there_are(name: str) -> None:
+    for job in read_yaml(f".github/workflows/{name}")["jobs"].values():
+        for step in job.get("steps", []):
+            program, *words = shlex.split(step.get("run", "").splitlines()[0]) if "run" in step else ("",)
+            if program == "make":
+                assert words[0] in RULES
+            elif program.startswith(".ci/"):
+                assert os.access(REPO / program, os.X_OK) and {*words} <= RULES
+            elif program == ".venv/bin/python":
+                assert all((REPO / word).exists() for word in words if word.startswith("tests/"))
 
 
-def test_the_hooks_run_what_make_test_runs() -> None:
+def test_every_supported_python_is_tried() -> None:
+    matrix = read_yaml(".github/workflows/test.yml")["jobs"]["test"]["strategy"]["matrix"]["python"]
+    assert matrix == PYTHONS
+    for name in ("nightly.yml", "release.yml"):
+        assert set(PYTHONS) <= set(re.findall(r"^ +(3\.\d+)$", (REPO / ".github/workflows" / name).read_text(), re.M))
+    assert set(PYTHONS) <= set(stages.PYTHONS)
+    assert PROJECT["requires-python"] == f">={PYTHONS[0]}"
+
+
+def test_hooks_run_what_make_check_runs() -> None:
     (local,) = read_yaml(".pre-commit-config.yaml")["repos"]
     assert local["repo"] == "local"  # nothing is fetched from elsewhere
-    tested = (REPO / "Makefile").read_text(encoding="utf-8")
+    checked = {(Path(stage.command[0]).name, *stage.command[1:2]) for stage in stages.check()}
     for hook in local["hooks"]:
         program, *words = hook["entry"].split()
-        assert hook["language"] == "system" and program.startswith(".venv/bin/")
-        assert " ".join([program.replace(".venv/bin", "$(BIN)"), *words[:1]]) in tested
+        assert program.startswith(".venv/bin/") and (Path(program).name, *words[:1]) in checked
+
+
+@pytest.mark.parametrize("tier", ["check", "test", "nightly"])
+def test_stages_name_programs_and_rules_that_there_are(tier: str) -> None:
+    made = stages.check() if tier == "check" else getattr(stages, tier)([])
+    assert len({stage.name for stage in made}) == len(made)
+    for stage in made:
+        if stage.command[0] == "make":
+            assert stage.command[-1] in RULES
+        elif not stage.unless:
+            assert os.access(REPO / stage.command[0], os.X_OK)
+
+
+# -------------------- stages
+
+
+def run(stage: Any, log: Path | None = None) -> tuple[str, str]:
+    result = stages.carry_out(stage, log)
+    return result.outcome, result.remark
+
+
+def program(text: str, **others: Any) -> Any:
+    return stages.Stage("tale", [sys.executable, "-c", text], **others)
+
+
+@pytest.mark.parametrize(
+    "text, came_of_it",
+    [
+        ("print('all well')", ("passed", "all well")),
+        ("print('it broke\\n'); exit(3)", ("FAILED", "it broke")),
+        ("print('no Python 2'); exit(77)", ("skipped", "no Python 2")),
+        ("import os; os.abort()", ("FAILED", "exit code -6")),
+    ],
+)
+def test_a_stage_says_what_came_of_it(tmp_path: Path, text: str, came_of_it: tuple[str, str]) -> None:
+    assert run(program(text), tmp_path / "log") == came_of_it
+
+
+def test_a_stage_beyond_its_limit_is_killed_with_all_that_it_started(tmp_path: Path) -> None:
+    held = tmp_path / "held"
+    child = f"open({str(held)!r}, 'w'); import time; time.sleep(60)"
+    text = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
+    assert run(program(text, limit_s=0.5), tmp_path / "log") == ("TOO SLOW", "killed after 0.5 s")
+    alive = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
+    assert str(held) not in alive
+
+
+def test_pytest_stages_name_the_failed_test_and_the_slowest(tmp_path: Path) -> None:
+    (tmp_path / "test_tale.py").write_text("def test_good(): pass\ndef test_bad(): assert False\n")
+    stage = stages.pytest("tale", tmp_path, str(tmp_path / "test_tale.py"), "-n", "0", f"--rootdir={tmp_path}")
+    result = stages.carry_out(stage, tmp_path / "log")
+    assert (result.outcome, result.remark) == ("FAILED", "2 tests, 0 skipped, 1 failed: test_tale.py::test_bad")
+    rows = stages.table([result]).splitlines()
+    assert rows[0].startswith("tale          FAILED") and {row.split()[-1] for row in rows[-2:]} == {
+        "test_tale.py::test_good",
+        "test_tale.py::test_bad",
+    }
+
+
+@pytest.mark.parametrize("tier, ran", [("test", ["one"]), ("nightly", ["one", "two"])])
+def test_the_night_goes_on_after_a_failure_and_a_commit_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tier: str, ran: list[str]
+) -> None:
+    monkeypatch.setattr(stages, "REPO", tmp_path)
+    two = [stages.Stage(name, [sys.executable, "-c", f"exit({code})"]) for name, code in (("one", 1), ("two", 0))]
+    monkeypatch.setattr(stages, tier, lambda arguments: two)
+    assert stages.main(tier, []) == 1
+    summary = (tmp_path / "build" / tier / "summary.txt").read_text().splitlines()[1:-1]
+    assert [line.split()[0] for line in summary] == ran
+
+
+def test_a_night_ends_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages, "REPO", tmp_path)
+    monkeypatch.setattr(stages, "NIGHT_S", 0.0)
+    monkeypatch.setattr(stages, "nightly", lambda arguments: [program("import time; time.sleep(60)")])
+    assert stages.main("nightly", []) == 1
+    assert "tale          TOO SLOW" in (tmp_path / "build" / "nightly" / "summary.txt").read_text()
+
+
+# -------------------- lines of kernels
+
+KERNELS = '''
+@kernel
+def one(k):
+    """Says what it does."""
+    return k
+
+@register("two", compile=True, on_departure=three)
+def two(buffer): return 0
+
+def three(buffer): pass
+
+@register("four")
+def four(buffer): return 0
+
+five = compile_for(signature, six)
+def six(): pass
+'''
+
+
+def test_the_sdist_runs_tests_that_there_are() -> None:
+    assert all((REPO / name).exists() for name in script("sdist").TESTS)
+
+
+def test_functions_that_are_compiled_are_found() -> None:
+    assert [found.name for found in script("kernel_lines").kernels(KERNELS)] == ["one", "two", "three", "six"]
+
+
+def test_the_oldest_dependencies_are_those_of_this_python() -> None:
+    oldest = script("installed").oldest(str(REPO / "pyproject.toml"))
+    names = [line.partition("==")[0] for line in oldest]
+    assert sorted(set(names)) == sorted(names) and {"numpy", "numba", "gymnasium"} < set(names)

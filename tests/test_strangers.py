@@ -7,32 +7,24 @@ import json
 import os
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
+from cli_cases import Capsys, fails, shown
 
 sys.path.insert(0, str(Path(__file__).parent / "traces"))
 import bag_cases as cases
 
 from bufgym import policies, traces
 from bufgym.benchmark import folder, leaderboard, manifest, tuned
+from bufgym.benchmark.tasks import TASKS
 from bufgym.cli import main
 from bufgym.errors import BufgymError, TraceError, printable
 from bufgym.scenario import read_client
 
 REPO = Path(__file__).resolve().parents[1]
-EXAMPLE = REPO / "examples" / "client.toml"
-
-
-def said(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line on stderr; exit code 2."""
-    assert main(arguments) == 2
-    message = capsys.readouterr().err
-    assert message.startswith("bufgym: error: ") and message.count("\n") == 1 and message[:-1].isprintable()
-    return message
-
-
-# -------------------- configurations
 
 
 @pytest.mark.parametrize(
@@ -65,14 +57,10 @@ def test_numbers_of_any_size_are_read_or_refused(tmp_path: Path, key: str, numbe
 
 
 @pytest.mark.parametrize("command", ["topics --config", "trace info", "trace from-bag", "report", "bench --workload"])
-def test_devices_and_fifos_are_refused(tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    fifo = tmp_path / "fifo"
-    os.mkfifo(fifo)
-    for path in ("/dev/zero", str(fifo)):
-        assert path in said([*command.split(), path], capsys)
-
-
-# -------------------- results
+def test_devices_and_fifos_are_refused(tmp_path: Path, command: str, capsys: Capsys) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for path in ("/dev/zero", str(tmp_path / "fifo")):
+        fails([*command.split(), path], path, capsys)
 
 
 def test_a_row_is_not_believed_its_interval(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,61 +75,50 @@ def test_a_row_is_not_believed_its_interval(monkeypatch: pytest.MonkeyPatch) -> 
             leaderboard.validate(forged)
 
 
-def a_board(**changes: str) -> list[dict[str, str]]:
-    row = dict(
-        zip(leaderboard.COLUMNS, ["lte-v1", "afr", "1", "3", "score", "0.5", "0.4", "0.6", "0.1", "x"], strict=True)
-    )
-    return [{**row, **changes}]
+CELLS = ["lte-v1", "afr", "1", "3", "score", "0.5", "0.4", "0.6", "0.1", "x"]
+ROW = dict(zip(leaderboard.COLUMNS, CELLS, strict=True))
 
 
 @pytest.mark.parametrize(
-    ("changes", "rule"),
+    ("data", "rule"),
     [
         ({"rank": "first"}, "line 2: rank = first: must be a number"),
         ({"suite": "no-such"}, "line 2: suite = no-such: must be a suite"),
         ({"quantity": "luck"}, "line 2: quantity = luck: must be one of"),
         ({"value": "0.5,0.6"}, "line 2: value = 0.5,0.6: must be a number"),
         ({"command": "x" * 200_000}, "must be CSV: field larger"),
+        *((data, "board.csv") for data in (b"\xff\xfe\x00", b"a,b\n1,2\n", b"", b"\x00" * 50)),
     ],
 )
-def test_a_leaderboard_that_was_tampered_with(
-    tmp_path: Path, changes: dict[str, str], rule: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_leaderboard_that_was_tampered_with(tmp_path: Path, data: Any, rule: str, capsys: Capsys) -> None:
     path = tmp_path / "board.csv"
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, leaderboard.COLUMNS)
-        writer.writeheader()
-        writer.writerows(a_board(**changes))
-    assert rule in said(["validate", "lte-v1/afr", "--file", str(path)], capsys)
-
-
-@pytest.mark.parametrize("data", [None, b"\xff\xfe\x00", b"a,b\n1,2\n", b"", b"\x00" * 50])
-def test_a_leaderboard_that_is_none(tmp_path: Path, data: bytes | None, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "board.csv"
-    if data is not None:
+    fails(["validate", "lte-v1/afr", "--file", path], "board.csv", capsys)
+    if isinstance(data, bytes):
         path.write_bytes(data)
-    assert "board.csv" in said(["validate", "lte-v1/afr", "--file", str(path)], capsys)
+    else:
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, leaderboard.COLUMNS)
+            writer.writeheader()
+            writer.writerow(ROW | data)
+    fails(["validate", "lte-v1/afr", "--file", path], rule, capsys)
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "rows.csv", "timeline.json"])
-@pytest.mark.parametrize("data", [None, b"\xff", b"[" * 100_000, b"{}", b'{"format": 2}', b"1e999", b"9" * 5000])
-def test_a_report_of_files_that_are_none(
-    tmp_path: Path, name: str, data: bytes | None, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_run(tmp_path)
-    (tmp_path / name).unlink() if data is None else (tmp_path / name).write_bytes(data)
-    if (name, data) == ("timeline.json", None):
-        folder.read(tmp_path)  # not every run has one
-        return
-    assert str(tmp_path) in said(["report", str(tmp_path)], capsys)
-
-
-@pytest.mark.parametrize("name", ["manifest.json", "rows.csv", "timeline.json"])
-def test_a_fifo_in_a_run_s_folder_is_refused(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "data", [None, "fifo", b"\xff", b"[" * 100_000, b"{}", b'{"format": 2}', b"1e999", b"9" * 5000]
+)
+def test_a_report_of_files_that_are_none(tmp_path: Path, name: str, data: Any, capsys: Capsys) -> None:
     write_run(tmp_path)
     (tmp_path / name).unlink()
-    os.mkfifo(tmp_path / name)
-    assert f"{name}: must be a regular file" in said(["report", str(tmp_path)], capsys)
+    if data == "fifo":
+        os.mkfifo(tmp_path / name)
+    elif data:
+        (tmp_path / name).write_bytes(data)
+    elif name == "timeline.json":
+        folder.read(tmp_path)  # not every run has one
+        return
+    told = f"{name}: must be a regular file" if data == "fifo" else str(tmp_path)
+    fails(["report", tmp_path], told, capsys)
 
 
 def test_settings_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,17 +138,13 @@ def test_settings_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: p
 
 def write_run(out: Path) -> None:
     """A folder as ``bufgym bench --suite`` writes it, as far as it is read before a page is made."""
-    from bufgym.benchmark.tasks import TASKS
-
-    entries = {name: "x" for name in ("suite", "split", "about", "episodes", "bufgym", "command")}
-    entries |= {"format": manifest.FORMAT, "task": "queue", "unranked": {}, "scenarios": {"a": {}}, "changes": {}}
-    (out / "manifest.json").write_text(json.dumps(entries))
+    entries = dict.fromkeys(("suite", "split", "about", "episodes", "bufgym", "command"), "x")
+    more = {"format": manifest.FORMAT, "task": "queue", "unranked": {}, "scenarios": {"a": {}}, "changes": {}}
     needed = TASKS["queue"].needed
+    (out / "manifest.json").write_text(json.dumps(entries | more))
     (out / "rows.csv").write_text(",".join(needed) + "\n" + ",".join("1" for _ in needed) + "\n")
-    (out / "timeline.json").write_text(
-        '{"scenario": "a", "capacity": 1, "arrival_s": [0], "x": [0], "rate": {"t_s": [], "bytes_per_s": []},'
-        ' "policies": {}}'
-    )
+    line = {"scenario": "a", "capacity": 1, "arrival_s": [0], "x": [0], "rate": {"t_s": [], "bytes_per_s": []}}
+    (out / "timeline.json").write_text(json.dumps({**line, "policies": {}}))
 
 
 def test_weights_whose_metadata_are_null(tmp_path: Path) -> None:
@@ -180,9 +153,6 @@ def test_weights_whose_metadata_are_null(tmp_path: Path) -> None:
     path.write_bytes(len(header).to_bytes(8, "little") + header)
     with pytest.raises(BufgymError, match=r"has no metadata of bufgym's|no safetensors file"):
         policies.load(path)
-
-
-# -------------------- what reaches the terminal
 
 
 def test_what_is_printable_stays_and_all_else_is_written_out() -> None:
@@ -195,9 +165,7 @@ def test_what_is_printable_stays_and_all_else_is_written_out() -> None:
 FORGED = "x\nOK     all.csv: 9 s, mean 9 KB\x1b[2K\x1b[31m/s"
 
 
-def test_a_member_s_name_forges_no_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import zipfile
-
+def test_a_member_s_name_forges_no_line(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "two.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(FORGED, "1\n2\n")
@@ -205,52 +173,51 @@ def test_a_member_s_name_forges_no_line(tmp_path: Path, capsys: pytest.CaptureFi
     with pytest.raises(SystemExit):
         main(["trace", "validate", str(path)])
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 3 and all(line.isprintable() for line in lines)
-    assert [line.split()[0] for line in lines] == ["OK", "error", "1"]
-    assert main(["trace", "info", f"{path}:{FORGED}"]) == 0
-    assert all(line.isprintable() for line in capsys.readouterr().out.splitlines())
-
-
-def test_a_topic_s_name_forges_no_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = cases.write_mcap(tmp_path / "t.mcap", [(0, FORGED, "type\x1b[0m", b"1"), (1, "/t", "x", b"1")])
-    assert main(["trace", "from-bag", str(path)]) == 0
-    lines = capsys.readouterr().out.splitlines()
     assert all(line.isprintable() for line in lines)
-    assert not any(line.startswith("OK") for line in lines)
-    assert "no topic" in said(["trace", "from-bag", str(path), "--topics", "\x1b[31m"], capsys)
+    assert [line.split()[0] for line in lines] == ["OK", "error", "1"]
+    assert all(line.isprintable() for line in shown(["trace", "info", f"{path}:{FORGED}"], capsys).splitlines())
 
 
-def ran(arguments: list[str], **options: object) -> subprocess.CompletedProcess[bytes]:
-    environment = {**os.environ, "PYTHONPATH": str(REPO), **options.pop("env", {})}
-    return subprocess.run([sys.executable, "-m", "bufgym", *arguments], cwd=REPO, env=environment, **options)
+def test_a_topic_s_name_forges_no_line(tmp_path: Path, capsys: Capsys) -> None:
+    path = cases.write_mcap(tmp_path / "t.mcap", [(0, FORGED, "type\x1b[0m", b"1"), (1, "/t", "x", b"1")])
+    lines = shown(["trace", "from-bag", path], capsys).splitlines()
+    assert all(line.isprintable() and not line.startswith("OK") for line in lines)
+    fails(["trace", "from-bag", path, "--topics", "\x1b[31m"], "no topic", capsys)
 
 
-def test_output_of_another_encoding_closed_or_full() -> None:
-    for encoding in ("ascii", "latin-1"):
-        done = ran(["list", "rewards"], env={"PYTHONIOENCODING": encoding}, capture_output=True)
-        assert done.returncode == 0 and done.stderr == b""
-        done.stdout.decode(encoding)
-    done = ran(["trace", "info", "\u2013.csv"], env={"PYTHONIOENCODING": "ascii"}, capture_output=True)
+def ran(words: str, encoding: str = "utf-8", **options: Any) -> subprocess.CompletedProcess[bytes]:
+    """The command in a process of its own; by default its output is kept."""
+    options = options or {"capture_output": True}
+    where = {**os.environ, "PYTHONPATH": str(REPO), "PYTHONIOENCODING": encoding}
+    return subprocess.run([sys.executable, "-m", "bufgym", *words.split()], cwd=REPO, env=where, **options)
+
+
+def test_output_of_another_encoding() -> None:
+    done = ran("list rewards", "ascii")
+    assert done.returncode == 0 and done.stderr == b"" and done.stdout.isascii()
+    done = ran("trace info \u2013.csv", "ascii")
     assert done.returncode == 2 and rb"\u2013.csv" in done.stderr and done.stderr.count(b"\n") == 1
+
+
+@pytest.mark.nightly
+def test_output_that_is_closed_or_full() -> None:
     shell = f"{sys.executable} -m bufgym"
     for command, code in ((f"{shell} list rewards >&-", 0), (f"{shell} trace info nowhere >&- 2>&-", 2)):
         done = subprocess.run(["sh", "-c", command], cwd=REPO, capture_output=True)
         assert (done.returncode, done.stdout, done.stderr) == (code, b"", b"")
     if Path("/dev/full").exists():
         with open("/dev/full", "wb") as full:
-            done = ran(["list", "rewards"], stdout=full, stderr=subprocess.PIPE)
+            done = ran("list rewards", stdout=full, stderr=subprocess.PIPE)
         assert done.returncode == 2 and done.stderr.count(b"\n") == 1 and b"Traceback" not in done.stderr
 
 
-# -------------------- numbers without bounds
+@pytest.mark.parametrize("command", ["bench", "topics", "fleet", "tune lte-v1"])
+def test_a_hundred_million_episodes_are_refused(command: str, capsys: Capsys) -> None:
+    told = "argument --seeds: 100000000: must be at most 100000"
+    fails([*command.split(), "--seeds", "100000000"], told, capsys)
 
 
-def test_a_hundred_million_episodes_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ("bench", "topics", "fleet", "tune lte-v1"):
-        message = said([*command.split(), "--seeds", "100000000"], capsys)
-        assert "argument --seeds: 100000000: must be at most 100000" in message
-
-
+@pytest.mark.nightly
 def test_four_months_of_two_packets_are_drawn_in_windows(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "long"

@@ -6,8 +6,6 @@ import csv
 import importlib.util
 import subprocess
 import sys
-import textwrap
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -24,8 +22,8 @@ from bufgym.errors import BufgymError  # noqa: E402
 
 REPO = Path(__file__).resolve().parent.parent
 LIBRARY = {"dask": "distributed", "ray": "ray"}
-FEW = {"suite": "interruption-v1", "capacities": "4", "algo": "evolution", "validate_every": 20_000}
-FEW |= {"validation_episodes": 30, "test_seeds": 25, "seeds": 2}
+FEW = {"suite": "interruption-v1", "capacities": "4", "algo": "evolution", "validate_every": 19_000}
+FEW |= {"validation_episodes": 6, "test_seeds": 2, "seeds": 2}
 
 
 @pytest.fixture(autouse=True)
@@ -33,17 +31,12 @@ def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.chdir(tmp_path)
 
 
-def installed(backend: str) -> None:
-    if importlib.util.find_spec(LIBRARY[backend]) is None:
-        pytest.skip(f"{LIBRARY[backend]} is not installed")
-
-
 def trained(name: str, steps: int, *more: str) -> None:
     """A command of its own, as cluster libraries begin processes and threads that outlive a test."""
     options = [(f"--{key.replace('_', '-')}", str(value)) for key, value in FEW.items()]
     words = [word for pair in options for word in pair]
     command = [sys.executable, str(REPO / "train.py"), *words, "--name", name, "--steps", str(steps), *more]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
@@ -58,48 +51,26 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run's folder without a cluster."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.chdir(tmp_path_factory.mktemp("local"))
-        trained("local", 60_000)
+        trained("local", 38_000)
         return Path("runs/local").resolve()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("backend", ["dask", "ray"])
 def test_a_cluster_gives_the_same_agents_bit_for_bit(backend: str, request: pytest.FixtureRequest) -> None:
     """Two seeds; on the cluster half of the steps, and then the rest."""
-    installed(backend)
+    if importlib.util.find_spec(LIBRARY[backend]) is None:
+        pytest.skip(f"{LIBRARY[backend]} is not installed")
     local: Path = request.getfixturevalue("local")  # only where there is something to compare
-    trained("cluster", 30_000, "--backend", backend)
-    trained("cluster", 60_000, "--backend", backend, "--resume")
+    trained("cluster", 19_000, "--backend", backend)
+    trained("cluster", 38_000, "--backend", backend, "--resume")
     assert fitness(local, 0) != fitness(local, 1)
     cluster = Path("runs/cluster")
     for seed in (0, 1):
-        assert fitness(cluster, seed) == fitness(local, seed) != []
+        assert fitness(cluster, seed) == fitness(local, seed) and len(fitness(local, seed)) > 1
         one, other = (load_file(folder / f"seed-{seed}" / MODEL) for folder in (local, cluster))
         assert one.keys() == other.keys()
         assert all(one[key].tobytes() == other[key].tobytes() for key in one)
-
-
-def calls_in_order(backend: str, words: Sequence[str]) -> None:
-    with cluster.begun(backend, None) as address, cluster.connected(backend, address) as call_each:
-        assert call_each(textwrap.indent, [(word, "- ") for word in words]) == [f"- {word}" for word in words]
-        assert call_each(textwrap.indent, []) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", ["dask", "ray"])
-def test_results_come_in_the_order_of_the_calls(backend: str) -> None:
-    installed(backend)
-    # A file, as processes that a cluster begins import the program that began it.
-    code = f"""
-import sys
-sys.path[:0] = [{str(REPO / "tests")!r}, {str(REPO)!r}]
-import test_train_cluster
-if __name__ == "__main__":
-    test_train_cluster.calls_in_order({backend!r}, ["g", "b", "g", "i"])
-"""
-    Path("calls.py").write_text(code, encoding="utf-8")
-    done = subprocess.run([sys.executable, "calls.py"], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("backend", ["dask", "ray"])

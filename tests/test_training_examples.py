@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import importlib.util
+import re
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from cli_cases import Capsys, Patch
 
 from bufgym.benchmark import leaderboard
 from bufgym.kernel import JIT
@@ -25,7 +29,7 @@ def example(name: str) -> dict[str, Any]:
     return runpy.run_path(str(EXAMPLES / name))
 
 
-def test_ppo_trains_and_tests_on_the_benchmarks_episodes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_ppo_trains_and_tests_on_the_benchmarks_episodes(capsys: Capsys) -> None:
     ppo = example("ppo.py")
     tiny = {"num_envs": 4, "num_steps": 8, "steps": 96, "minibatch": 16, "width": 8, "epochs": 1, "duration_s": 4.0}
     result = ppo["main"](ppo["Settings"](**tiny, capacity=2, test_seeds=2))
@@ -50,42 +54,42 @@ def test_ppos_advantages_by_hand() -> None:
     assert advantages.tolist() == [[1.125, 0.0], [0.5, 0.5]]
 
 
-def test_a_model_of_stable_baselines3_gets_a_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.nightly
+def test_a_model_of_stable_baselines3_gets_a_row(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
-    small = ["--suite", "interruption-v1", "--capacity", "4", "--steps", "512", "--num-envs", "4", "--out", "mine"]
+    small = (
+        "--suite interruption-v1 --capacity 4 --steps 512 --num-envs 4 --out mine -- --seeds 3 --capacity 4 --jobs 1"
+    )
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["x", *small, "--", "--seeds", "3", "--capacity", "4", "--jobs", "1"])
+    monkeypatch.setattr(sys, "argv", ["x", *small.split()])
     example("sb3_to_leaderboard.py")["main"]()
     board = leaderboard.read(Path("mine/leaderboard.csv"))
     assert {entry.policy for entry in board.values()} == {"mine/model.zip", "afr", "drop-oldest"}
     row = board["interruption-v1/mine/model.zip"]
     assert row.values["score"].value <= 1 and row.rank in (1, 2, 3)
-    assert f"`{row.command}`" in capsys.readouterr().out
     assert row.command == "bufgym bench --suite interruption-v1 --policies mine/model.zip"
+    assert f"`{row.command}`" in capsys.readouterr().out
 
 
-def test_a_moment_is_missed_more_than_half_a_view_from_what_arrived(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_moment_is_missed_more_than_half_a_view_from_what_arrived() -> None:
     """Frames 0 and 3 arrived, at 0 and 2: those at 0.5 and 1.6 are near one, that at 1 is not, nor that at 2.6."""
     view = example("view_missed.py")
     x, arrived = np.array([0.0, 0.5, 1.0, 1.6, 2.0, 2.6]), np.array([1, 0, 0, 0, 1, 0], bool)
     assert view["missed"](x, arrived, 0.5) == 2 / 6
     assert view["missed"](x, np.zeros(6, bool), 0.5) == 1
+
+
+@pytest.mark.nightly
+def test_views_missed_are_told_by_policy(monkeypatch: Patch, capsys: Capsys) -> None:
     monkeypatch.setattr(sys, "argv", ["x", "--policies", "clairvoyant,afr", "--seeds", "1", "--seconds", "3"])
-    view["main"]()
+    example("view_missed.py")["main"]()
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert lines[0][:2] == ["policy", "score"] and {line[0] for line in lines[1:4]} == {
-        "clairvoyant",
-        "afr",
-        "drop-oldest",
-    }
-    assert lines[1][:2] == ["clairvoyant", "1.000"]
+    assert lines[0][:2] == ["policy", "score"] and lines[1][:2] == ["clairvoyant", "1.000"]
+    assert {line[0] for line in lines[1:4]} == {"clairvoyant", "afr", "drop-oldest"}
 
 
-def test_imitation_learns_from_the_clairvoyant(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.nightly
+def test_imitation_learns_from_the_clairvoyant(capsys: Capsys) -> None:
     """Seconds are enough to pass AFR on short episodes; a network that learned nothing is below Drop Oldest."""
     pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
     imitation = example("imitation.py")
@@ -97,7 +101,8 @@ def test_imitation_learns_from_the_clairvoyant(capsys: pytest.CaptureFixture[str
     assert "round 3: 8,640 states" in shown and "score of imitation: 0." in shown
 
 
-def test_offline_learns_from_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.nightly
+def test_offline_learns_from_a_data_set(tmp_path: Path, capsys: Capsys) -> None:
     """A clone of AFR is far above a network that learned nothing; CQL runs, and its values keep to the masks."""
     for package in ("d3rlpy", "minari", "sb3_contrib"):
         pytest.importorskip(package, reason="the extra [offline] is not installed")
@@ -111,3 +116,19 @@ def test_offline_learns_from_a_data_set(tmp_path: Path, capsys: pytest.CaptureFi
     seen[0, [0, 1, offline["L"]]] = 1.0  # slots 0 and 1, and the newcomer
     valid = offline["scored"](offline["new_network"](settings), seen)[0] > -1e5
     assert valid.tolist() == [True, True, *[False] * 6, True, True]
+
+
+MISSING = [name for name in ("ray", "tree", "ormsgpack", "torch", "pettingzoo") if not importlib.util.find_spec(name)]
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(bool(MISSING), reason=f"the extra [rllib] is not installed: {', '.join(MISSING)} missing")
+def test_the_example_learns_two_iterations() -> None:
+    small = ["--robots", "2", "--iterations", "2", "--ticks", "400", "--seconds", "3"]
+    command = [sys.executable, "examples/fleet_rllib.py", *small]
+    done = subprocess.run(command, cwd=EXAMPLES.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    returns = re.findall(r"iteration \d: [1-9]\d* episodes, return ([\d.]+)", done.stdout)
+    assert len(returns) == 2, done.stdout
+    # The sum over two robots of H - 1, where V <= 1 and 90 frames arrive.
+    assert all(0 < float(total) < 2 * 90 for total in returns)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from bufgym import policies, scenario
+from bufgym import kernel, policies, scenario
 from bufgym.benchmark.run import run
 from bufgym.envs import FleetVecEnv, SenderVectorEnv
 from bufgym.scenario import FleetScenario, Interruption
@@ -50,10 +51,18 @@ def _fleets() -> None:
 
 
 PARTS: dict[str, Callable[[], None]] = {
-    "environments": _environments,
-    "the clairvoyant": _bound,
     "policies of one queue": _policies,
+    "environments": _environments,
     "policies of several topics": _schedulers,
+    "the clairvoyant": _bound,
     "fleets": _fleets,
 }
 """What each compiles -> what does it."""
+
+
+def compile_part(what: str) -> float:
+    """Compile one of ``PARTS``; the time that it took, s."""
+    kernel.compile_silently()
+    began_s = time.perf_counter()
+    PARTS[what]()
+    return time.perf_counter() - began_s

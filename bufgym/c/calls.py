@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import at, compile_for, kernel, records
+from bufgym.kernel import at, compile_for, kernel, local, records
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy, signatures
@@ -67,7 +67,7 @@ def _record(
                     calls, n, SENT, at(batch.log, i, place).transmitted_us, at(batch.arrivals, i, place).size_bytes
                 )
                 sent += 1
-            buffer = view(batch, i)
+            buffer = local(view(batch, i))
             if event == DECISION:
                 arrival = arrival_of(batch, i)
                 decision = on_arrival(buffer, arrival, memory[i])
@@ -88,7 +88,7 @@ def _compiled_record() -> Any:
     arrives, departs, _, _ = (numba.types.FunctionType(signature) for signature in signatures())
     memory = numba.types.Array(numba.types.float64, 2, "C")
     calls = numba.types.Array(numba.from_dtype(CALL), 1, "C")
-    signature = numba.types.int64(batch_type(), memory, arrives, departs, numba.types.boolean, calls)
+    signature = numba.types.int64(batch_type(several=False), memory, arrives, departs, numba.types.boolean, calls)
     return compile_for(signature, _record)
 
 

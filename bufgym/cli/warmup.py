@@ -13,6 +13,8 @@ def add(commands: Commands) -> None:
 
 def _warmup(options: argparse.Namespace) -> None:
     import time
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from multiprocessing import get_context
 
     from bufgym import kernel
     from bufgym.benchmark import warmup
@@ -20,11 +22,11 @@ def _warmup(options: argparse.Namespace) -> None:
     if not kernel.JIT:
         print("compilation is off (NUMBA_DISABLE_JIT): nothing to do")
         return
-    kernel.compile_silently()
     began_s = time.perf_counter()
-    for number, (what, work) in enumerate(warmup.PARTS.items(), 1):
-        print(f"{number}/{len(warmup.PARTS)} {what} ...", end=" ", flush=True)
-        part_began_s = time.perf_counter()
-        work()
-        print(f"{time.perf_counter() - part_began_s:.1f} s", flush=True)
+    print(f"compiling {len(warmup.PARTS)} parts: {', '.join(warmup.PARTS)}", flush=True)
+    # A process for each core. What two of them need is compiled by both; the code is the same.
+    with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
+        parts = {processes.submit(warmup.compile_part, what): what for what in warmup.PARTS}
+        for number, part in enumerate(as_completed(parts), 1):
+            print(f"{number}/{len(parts)} {parts[part]}: {part.result():.1f} s", flush=True)
     print(f"ready after {time.perf_counter() - began_s:.0f} s; compiled code is in {kernel.FOLDER}")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bufgym.envs.observation import ObservationForm, Place
 from bufgym.envs.step import StepOutput
 from bufgym.errors import BufgymError
-from bufgym.kernel import at, compile_for, kernel, stretch
+from bufgym.kernel import at, compile_for, kernel, local, stretch
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
 from bufgym.observe import OwnField, OwnTerm
@@ -81,7 +81,7 @@ def write_slots(batch: Batch, function: Any, first: int, flat: NDArray[np.float3
     for i in range(len(batch.senders)):
         sender = batch.senders[i]
         if sender.waiting != NOTHING_WAITS:
-            buffer, arrival = view(batch, i), last_arrival(batch, i)
+            buffer, arrival = local(view(batch, i)), last_arrival(batch, i)
             for k in range(sender.occupancy):
                 flat[i, first + k] = function(buffer, arrival, k)
             flat[i, first + sender.occupancy : first + sender.capacity + 1] = 0.0
@@ -93,7 +93,7 @@ def write_context(batch: Batch, function: Any, first: int, flat: NDArray[np.floa
     """The same for a field of the context."""
     for i in range(len(batch.senders)):
         if batch.senders[i].waiting != NOTHING_WAITS:
-            flat[i, first] = function(view(batch, i), last_arrival(batch, i))
+            flat[i, first] = function(local(view(batch, i)), last_arrival(batch, i))
 
 
 def write_in_python(place: Place, buffer: Buffer, arrival: Any, arriving: bool, row: NDArray[np.float32]) -> None:
@@ -285,18 +285,18 @@ def _compiled(what: str, name: str, kind: str, function: Callable[..., float]) -
 
 
 @functools.cache
-def _writer(per: str) -> Any:
+def _writer(per: str, several: bool) -> Any:
     types = _types()
     function = cast(Any, numba.types).FunctionType(types[per])
-    signature = numba.types.void(batch_type(), function, numba.types.int64, types["flat"])
+    signature = numba.types.void(batch_type(several), function, numba.types.int64, types["flat"])
     return compile_for(signature, write_slots if per == "slot" else write_context)
 
 
 @functools.cache
-def _term_writer() -> Any:
+def _term_writer(several: bool) -> Any:
     types = _types()
     signature = numba.types.void(
-        batch_type(),
+        batch_type(several),
         types["marks"],
         types["flags"],
         types["table"],
@@ -309,10 +309,14 @@ def _term_writer() -> Any:
 
 
 def _compiled_field(field: OwnField) -> Callable[..., None]:
-    function, write = _compiled("field", field.name, field.per, field.function), _writer(field.per)
-    return lambda batch, first, flat: write(batch, function, first, flat)
+    function = _compiled("field", field.name, field.per, field.function)
+    return lambda batch, first, flat: _writer(field.per, bool(batch.several))(batch, function, first, flat)
 
 
 def _compiled_term(term: OwnTerm) -> Callable[..., None]:
-    function, write = _compiled("reward term", term.name, "term", term.function), _term_writer()
-    return lambda batch, marks, ended, memory, *rest: write(batch, marks, ended, memory, function, *rest)
+    function = _compiled("reward term", term.name, "term", term.function)
+
+    def write(batch: Batch, marks: Any, ended: Any, memory: Any, *rest: Any) -> None:
+        _term_writer(bool(batch.several))(batch, marks, ended, memory, function, *rest)
+
+    return write

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import direct, kernel, prefetch, stretch, table
+from bufgym.kernel import bundle, direct, kernel, local, prefetch, stretch, table
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.link import FOREVER
 from bufgym.observe import (
@@ -66,6 +66,7 @@ _AHEAD = 8
 """Rows to prefetch ahead: far enough for memory to answer in time, near enough for the answer to be in cache still."""
 
 
+@bundle
 class StepOutput(NamedTuple):
     """What a step hands out of n rows; the kernels write these arrays in place.
 
@@ -114,7 +115,7 @@ def settle_gains(batch: Batch, i: int, ended: bool) -> None:
     if ended:
         # Messages that a dead link never carried were not retained after all.
         sender.retained_gain = sender.delivered_gain
-    if sender.topics > 1:
+    if batch.several is not None:
         for topic in range(sender.topics):
             age_until(batch, i, topic, until_us)
 
@@ -127,7 +128,7 @@ def write_rewards(batch: Batch, i: int, rewarded: NDArray[np.float64], output: S
     terms[i, RETAINED] = sender.retained_gain - rewarded[i, RETAINED]
     rewarded[i, DELIVERED] = sender.delivered_gain
     rewarded[i, RETAINED] = sender.retained_gain
-    if sender.topics > 1:
+    if batch.several is not None:
         weight = 0.0
         for topic in range(sender.topics):
             weight += batch.topics[i, topic].weight
@@ -144,7 +145,7 @@ def delivered_qoi(batch: Batch, i: int) -> float:
     sender = batch.senders[i]
     # The 1 in H = 1 + sum of V, of each topic of which anything was received.
     ones = 1.0 if sender.credited > 0 else 0.0
-    if sender.topics > 1:
+    if batch.several is not None:
         ones = 0.0
         for topic in range(sender.topics):
             if batch.topics[i, topic].received > 0:
@@ -163,8 +164,8 @@ def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> 
         output.action_mask[i, :] = False
         output.action_mask[i, sender.capacity] = True
         return
-    buffer, entries = view(batch, i), sender.capacity + 1
-    if sender.topics > 1:
+    buffer, entries = local(view(batch, i)), sender.capacity + 1
+    if batch.several is not None:
         arriving = sender.waiting == ARRIVAL_WAITS
         # When the socket asks there is no newcomer: the last arrival fills the argument and is not read.
         arrival = batch.arrivals[i, min(sender.next, sender.arrivals - 1)]
@@ -183,18 +184,18 @@ def write_mask(batch: Batch, i: int, action_mask: NDArray[np.int8]) -> None:
     """Write which actions are valid for row ``i``, which waits for a decision."""
     sender = batch.senders[i]
     capacity = sender.capacity
-    if sender.waiting == SOCKET_WAITS:
-        for k in range(capacity):
-            action_mask[i, k] = can_send(batch, i, k)
-        action_mask[i, capacity] = can_hold(batch, i)
-        action_mask[i, capacity + 1] = False
-        return
-    if sender.topics == 1:
+    if batch.several is None:
         # The same as below, only faster.
         action_mask[i, : sender.occupancy] = True
         action_mask[i, sender.occupancy : capacity] = False
         action_mask[i, capacity] = True
     else:
+        if sender.waiting == SOCKET_WAITS:
+            for k in range(capacity):
+                action_mask[i, k] = can_send(batch, i, k)
+            action_mask[i, capacity] = can_hold(batch, i)
+            action_mask[i, capacity + 1] = False
+            return
         for k in range(capacity):
             action_mask[i, k] = can_evict(batch, i, k)
         action_mask[i, capacity] = can_reject(batch, i)
@@ -239,7 +240,7 @@ def step_rows(
         asks = sender.waiting
         if not begins and asks == ARRIVAL_WAITS:
             decide(batch, i, decision_of(actions[i], sender.capacity))
-        elif not begins and asks == SOCKET_WAITS:
+        if batch.several is not None and not begins and asks == SOCKET_WAITS:
             answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
         if begins or asks != NOTHING_WAITS:
             advance(batch, i)

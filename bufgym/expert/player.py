@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.step import action_of
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for, entry, located
+from bufgym.kernel import compile_for, entry, local, located
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.policies import Policy
 from bufgym.policies.registry import runs_compiled, signatures
@@ -87,7 +87,9 @@ class Player:
         batch = senders.batch._replace(parameters=self._parameters)
         on_arrival, on_departure, _, on_send = self._functions
         hears, answers = self.policy.hears_departures, actions.copy()
-        compiled_ask()(batch, self._memory, self._heard, rows, on_arrival, on_departure, on_send, hears, answers)
+        compiled_ask(bool(batch.several))(
+            batch, self._memory, self._heard, rows, on_arrival, on_departure, on_send, hears, answers
+        )
         dropped = rows[waiting[rows] == ARRIVAL_WAITS]
         actions[dropped] = self._all_drops(answers[dropped], senders.capacity)
         for i in rows[waiting[rows] == SOCKET_WAITS].tolist():
@@ -140,7 +142,7 @@ def ask(
     """Put a policy's answer for each of ``rows`` into ``answers``. ``heard``: int64[n], departures it was told of."""
     for i in rows:
         sender = batch.senders[i]
-        buffer = view(batch, i)
+        buffer = local(view(batch, i))
         if hears_departures:
             for _ in range(sender.dequeued - heard[i]):
                 on_departure(buffer, memory[i])
@@ -152,10 +154,10 @@ def ask(
 
 
 @functools.cache
-def compiled_ask() -> Any:
+def compiled_ask(several: bool) -> Any:
     """``ask`` compiled once for every policy, as the rollout is: its code."""
     on_arrival, on_departure, _, on_send = map(numba.types.FunctionType, signatures())
     types = numba.types
     numbers, memory = types.Array(types.int64, 1, "C"), types.Array(types.float64, 2, "C")
-    kinds = batch_type(), memory, numbers, numbers, on_arrival, on_departure, on_send, types.boolean, numbers
+    kinds = batch_type(several), memory, numbers, numbers, on_arrival, on_departure, on_send, types.boolean, numbers
     return entry(compile_for(types.void(*kinds), ask))

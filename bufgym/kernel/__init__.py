@@ -7,14 +7,18 @@ check the compiled code against its own text.
 
 from bufgym.kernel.announce import compile_silently
 from bufgym.kernel.arrays import at, item, prefetch, records, stretch, table
-from bufgym.kernel.cache import FOLDER, JIT, NotKeptError, only_kept
+from bufgym.kernel.bundle import BundleType, bundle, local
+from bufgym.kernel.cache import FOLDER, NotKeptError, only_kept
 from bufgym.kernel.compile import compile_for, direct, entry, interruptible, kernel, located
+from bufgym.kernel.switch import JIT
 
 __all__ = [
     "FOLDER",
     "JIT",
+    "BundleType",
     "NotKeptError",
     "at",
+    "bundle",
     "compile_for",
     "compile_silently",
     "direct",
@@ -22,6 +26,7 @@ __all__ = [
     "interruptible",
     "item",
     "kernel",
+    "local",
     "located",
     "only_kept",
     "prefetch",

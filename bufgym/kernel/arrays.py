@@ -14,7 +14,7 @@ import numba.extending
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel.cache import JIT
+from bufgym.kernel.switch import JIT
 
 
 def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:

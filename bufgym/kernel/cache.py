@@ -15,15 +15,12 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, cast
 
-import numba
 from numba.core import compiler, serialize
 
 from bufgym.files import replaced
 from bufgym.kernel.closure import TOOLS, closure, told_types
-from bufgym.kernel.parts import PART, PartLibrary, set_environments
-
-JIT = not cast(Any, numba.config).DISABLE_JIT
-"""False where compilation is off and every kernel runs as its Python source."""
+from bufgym.kernel.pipeline import PART, PartLibrary, set_environments
+from bufgym.kernel.switch import JIT
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 

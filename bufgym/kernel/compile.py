@@ -10,12 +10,12 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import types
-from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
-from bufgym.kernel.cache import JIT, Code
-from bufgym.kernel.parts import PartCompiler
+from bufgym.kernel.cache import Code
+from bufgym.kernel.pipeline import PartCompiler, WholeCompiler
+from bufgym.kernel.switch import JIT
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Result = TypeVar("Result")
@@ -45,7 +45,9 @@ class _Kernel(CPUDispatcher):
         return cast(Any, numba).types.Dispatcher(self.inlined)
 
 
-def _dispatcher(kind: Any, function: Callable[..., Any], role: str, compiler: Any = Compiler, **options: bool) -> Any:
+def _dispatcher(
+    kind: Any, function: Callable[..., Any], role: str, compiler: Any = WholeCompiler, **options: bool
+) -> Any:
     """Numba's compiler of ``function``, which keeps its code on disk by ``role``."""
     dispatcher = kind(function, targetoptions={**_OPTIONS, **options}, pipeline_class=compiler)
     dispatcher._cache = Code(function, role)
@@ -85,23 +87,23 @@ def entry(compiled: Any) -> Any:
 
 
 class _Direct:
-    """A kernel whose calls all have arguments of the types of the first."""
+    """A kernel whose first argument is a batch: calls with equal ``batch.several`` have arguments of equal types."""
 
     def __init__(self, compiled: Any) -> None:
         self.__doc__, self.py_func = compiled.__doc__, compiled.py_func
         self._compiled = compiled
-        self._entry: Any = None
+        self._entries: dict[Any, Any] = {}
 
-    def __call__(self, *arguments: Any) -> Any:
-        if self._entry is None:
-            signature = tuple(cast(Any, numba).typeof(argument) for argument in arguments)
-            self._compiled.compile(signature)
-            self._entry = entry(self._compiled)
-        return self._entry(*arguments)
+    def __call__(self, batch: Any, *arguments: Any) -> Any:
+        found = self._entries.get(batch.several)
+        if found is None:
+            kinds = tuple(cast(Any, numba).typeof(argument) for argument in (batch, *arguments))
+            found = self._entries[batch.several] = self._compiled.compile(kinds)
+        return found(batch, *arguments)
 
 
 def direct(compiled: Function) -> Function:
-    """A ``kernel`` that Python calls for every step by its ``entry``, always with the types of the first call."""
+    """A ``kernel`` over a batch that Python calls for every step, without a look at the types of its arguments."""
     return cast(Function, _Direct(compiled)) if JIT else compiled
 
 

@@ -64,7 +64,7 @@ class Row:
         self.memory = policy.new_memory(1, self.senders.capacity)
         self._use(self.senders.batch, room)
         self._functions = tuple(map(located, signatures(), policy.compiled)) if runs_compiled(policy) else None
-        self._rollout: Any = entry(compiled_rollout(False)) if self._functions else None
+        self._rollout: Any = entry(compiled_rollout(False, bool(self.batch.several))) if self._functions else None
 
     def _use(self, batch: Batch, room: int) -> None:
         """Go on with these arrays, of which the messages that have not come yet are free."""

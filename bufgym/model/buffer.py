@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import item, kernel
+from bufgym.kernel import bundle, item, kernel
 from bufgym.model.documented import documented
 from bufgym.model.qoi import merging_loss, value
 
@@ -82,6 +82,7 @@ def check_limits(capacity: int, max_bytes: int | None) -> None:
         raise BufgymError(f"max_bytes = {max_bytes!r}: B must be a whole number >= 1, or None for no limit")
 
 
+@bundle
 @documented
 class Buffer(NamedTuple):
     """All that a policy may see: what the robot knows on board when a message arrives. Do not write to it.

@@ -77,6 +77,9 @@ def information(v: NDArray[np.float64], x: NDArray[np.float64]) -> float:
     return 1.0 + gained
 
 
+_value = getattr(value, "py_func", value)  # plain Python: one number is not worth compiling it
+
+
 @dataclass(frozen=True)
 class Value:
     """A concave V with V(0) = 0, non-decreasing, at most 1: made by ``exponential``, ``saturating``, ``tabulated``.
@@ -92,7 +95,7 @@ class Value:
     def __call__(self, d: float) -> float:
         if not d >= 0:
             raise BufgymError(f"V({d}): a distance must be a number >= 0")
-        return float(value(self.array, float(d)))
+        return float(_value(self.array, float(d)))
 
     def information(self, x: Sequence[float] | NDArray[np.float64]) -> float:
         """H of messages received with these coordinates, which must be finite and must not decrease (Eq. 2)."""

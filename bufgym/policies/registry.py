@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for
+from bufgym.kernel import BundleType, compile_for
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.checks import changed, check_name, named_settings
 from bufgym.modules import first_line
@@ -215,9 +215,7 @@ def view_type() -> Any:
         "topics": numba.types.Array(numba.from_dtype(TOPIC), 1, "C"),
         **{name: real for name, kind in get_type_hints(Buffer).items() if kind is float},
     }
-    return cast(Any, numba.types).NamedTuple(
-        tuple(types.get(name, numba.types.int64) for name in Buffer._fields), Buffer
-    )
+    return BundleType(Buffer, tuple(types.get(name, numba.types.int64) for name in Buffer._fields))
 
 
 @functools.cache

@@ -8,7 +8,7 @@ import json
 import ssl
 import time
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -34,11 +34,12 @@ def _unauthorized(why: str) -> RefusedError:
 class Verifier:
     """Checks tokens of one issuer; its keys may change at any time."""
 
-    def __init__(self, tokens: Tokens) -> None:
+    def __init__(self, tokens: Tokens, clock: Callable[[], float] = time.monotonic) -> None:
         with needs("jwt"):
             import jwt
         self._jwt: Any = jwt
         self._tokens = tokens
+        self._clock = clock
         self._keys: Mapping[str | None, Any] = {}
         self._fetched_s = -1e9
         self._fetching = asyncio.Lock()
@@ -75,9 +76,9 @@ class Verifier:
 
     async def _key(self, kid: str | None) -> Any:
         async with self._fetching:
-            age_s = time.monotonic() - self._fetched_s
+            age_s = self._clock() - self._fetched_s
             if age_s > KEYS_AGE_S or (kid not in self._keys and age_s > AGAIN_S):
-                self._fetched_s = time.monotonic()
+                self._fetched_s = self._clock()
                 try:
                     self._keys = self._parsed(await asyncio.to_thread(self._text))
                 except (OSError, BufgymError, ValueError, RecursionError) as error:

@@ -102,7 +102,7 @@ class Others:
         if self._sending is not None:
             self._sending.cancel()
             self._hub.leave(self)
-        self._room.release(10**6)  # none waits any more
+        self._room.release(1_000)  # none waits any more; a million would take a second
         if self._zenoh is not None:
             await asyncio.to_thread(self._zenoh.close)
 

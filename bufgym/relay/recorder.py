@@ -68,7 +68,8 @@ class Recorder:
         files = sorted(self.folder.glob("*.mcap"))
         for path in files[: max(0, len(files) + 1 - self._rotation.files)]:
             path.unlink()
-        path = self.folder / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{time.time_ns() % 10**9:09}.mcap"
+        now_s, now_ns = divmod(time.time_ns(), 10**9)  # one time: names are in the order of their files
+        path = self.folder / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime(now_s))}-{now_ns:09}.mcap"
         self._file = path.open("xb")
         # Chunks would be lost with the process.
         self._writer = Writer(self._file, use_chunking=False)

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 _PING_S: Final = 20.0
 _PONG_S: Final = 60.0
 """A pong waits behind the message that is under way, which on a slow link takes long."""
+TICK_S: Final = 1.0
+"""Between two times at which the relay tells how it is, and forgets what is over."""
 _QUIET: Final = logging.getLogger("bufgym.relay.websockets")
 """What strangers do wrong is in the audit log, not in tracebacks."""
 _QUIET.setLevel(logging.CRITICAL + 1)
@@ -269,7 +271,7 @@ class Server:
 
     async def _tick(self) -> None:
         while True:
-            await asyncio.sleep(1.0)
+            await asyncio.sleep(TICK_S)
             self.hub.tick()
 
 

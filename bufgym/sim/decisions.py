@@ -47,7 +47,7 @@ def arrive(batch: Batch, i: int) -> int:
             measure_rate(batch, i)
     else:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
-    if sender.limit_at_send == 0 and rules.too_soon(batch, i, arrival.topic):
+    if batch.several is not None and sender.limit_at_send == 0 and rules.too_soon(batch, i, arrival.topic):
         at(batch.log, i, sender.next).limited = 1
         decision = REJECT
     else:
@@ -108,7 +108,7 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
     sender = batch.senders[i]
     if not 0 <= k < sender.occupancy:
         return False
-    if sender.topics == 1:
+    if batch.several is None:
         return True
     topic = at(batch.slots, i, sender.first + k).topic
     arriving = at(batch.arrivals, i, sender.next).topic
@@ -123,6 +123,8 @@ def can_reject(batch: Batch, i: int) -> bool:
 
     Its rate limit comes first: what comes too soon is dropped even on a no_drop topic.
     """
+    if batch.several is None:
+        return True
     sender = batch.senders[i]
     topic, limited = at(batch.arrivals, i, sender.next).topic, at(batch.log, i, sender.next).limited == 1
     return limited or not rules.no_drop(batch, i, topic) or (not has_room(batch, i) and rules.refuge(batch, i) < 0)
@@ -145,7 +147,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     else:
         enqueue = has_room(batch, i)
         valid = decision == ACCEPT and enqueue
-        if not enqueue and rules.no_drop(batch, i, arrival.topic):
+        if batch.several is not None and not enqueue and rules.no_drop(batch, i, arrival.topic):
             victim = rules.refuge(batch, i)
             enqueue = victim >= 0
     if not valid:
@@ -167,7 +169,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     else:
         at(batch.log, i, sender.next).dropped_us = sender.now_us
         sender.rejected += 1
-    if sender.topics > 1:
+    if batch.several is not None:
         rules.arrived_on_topic(batch, i, arrival, enqueue)
     sender.previous_us, sender.previous_x = arrival.arrival_us, arrival.x
     sender.departures = 0
@@ -184,7 +186,7 @@ def remove(batch: Batch, i: int, k: int) -> None:
     sender.backlog_bytes -= gone.size_bytes
     sender.retained_gain -= gone.gain
     at(batch.log, i, place_of(batch, i, gone)).dropped_us = sender.now_us
-    if sender.topics > 1:
+    if batch.several is not None:
         at(batch.topics, i, gone.topic).queued -= 1
     j = rules.kept_after(batch, i, k, gone.topic)
     if j < sender.occupancy:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for, interruptible
+from bufgym.kernel import compile_for, interruptible, local
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
 from bufgym.policies.registry import Policy, runs_compiled, signatures
@@ -49,7 +49,7 @@ def rollout(
             if event == END or (event == DEPARTURE and not hears_departures):
                 continue
             i = sender_of(shares, c)
-            buffer = view(batch, i)
+            buffer = local(view(batch, i))
             if event == DECISION:
                 decide(batch, i, on_arrival(buffer, arrival_of(batch, i), memory[i]))
                 again = batch.senders[i].waiting == ARRIVAL_WAITS  # B has no room yet: the same DECISION is due again
@@ -64,15 +64,16 @@ def rollout(
 
 
 @functools.cache
-def compiled_rollout(shared: bool) -> Any:
+def compiled_rollout(shared: bool, several: bool) -> Any:
     """``rollout`` compiled once for every policy (policies arrive as values of one function type).
 
-    ``shared``: for the cells of a shared link; else for senders with links of their own.
+    ``shared``: for the cells of a shared link; else for senders with links of their own. ``several``: for several
+    topics; else for one queue.
     """
     functions = tuple(numba.types.FunctionType(signature) for signature in signatures())
     memory = numba.types.Array(numba.types.float64, 2, "C")
     shares = shares_type() if shared else numba.types.none
-    return compile_for(numba.types.void(batch_type(), shares, memory, *functions, numba.types.boolean), rollout)
+    return compile_for(numba.types.void(batch_type(several), shares, memory, *functions, numba.types.boolean), rollout)
 
 
 _view = getattr(view, "py_func", view)
@@ -139,7 +140,7 @@ def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], p
     if not runs_compiled(policy):
         python_rollout(batch, shares, memory, policy)
         return
-    compiled = compiled_rollout(shares is not None)
+    compiled = compiled_rollout(shares is not None, bool(batch.several))
     arguments = batch, shares, memory, *policy.compiled, policy.hears_departures
     # What it may do at each arrival grows with what it remembers and reads.
     if batch.senders["arrivals"].sum() * (memory.shape[1] + len(batch.parameters)) < _SHORT:

@@ -22,7 +22,7 @@ def kept_before(batch: Batch, i: int, k: int, topic: int) -> int:
     """The slot before slot ``k`` on the same topic, -1 where there is none."""
     sender = batch.senders[i]
     j = k - 1
-    if sender.topics > 1:
+    if batch.several is not None:
         while j >= 0 and at(batch.slots, i, sender.first + j).topic != topic:
             j -= 1
     return j
@@ -33,7 +33,7 @@ def kept_after(batch: Batch, i: int, k: int, topic: int) -> int:
     """The slot after slot ``k`` on the same topic, the occupancy where there is none."""
     sender = batch.senders[i]
     j = k + 1
-    if sender.topics > 1:
+    if batch.several is not None:
         while j < sender.occupancy and at(batch.slots, i, sender.first + j).topic != topic:
             j += 1
     return j
@@ -43,7 +43,7 @@ def kept_after(batch: Batch, i: int, k: int, topic: int) -> int:
 def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
     """Weight times V of the gap from what is kept before slot ``k`` on its topic to ``x``; 0 for its first message."""
     sender = batch.senders[i]
-    if sender.topics == 1:  # in slot -1 lies the message dequeued last
+    if batch.several is None:  # in slot -1 lies the message dequeued last
         if k == 0 and sender.dequeued == 0:
             return 0.0
         return value(batch.v[sender.v_start :], x - at(batch.slots, i, sender.first + k - 1).x)
@@ -123,7 +123,7 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
 def too_soon(batch: Batch, i: int, topic: int) -> bool:
     """Whether the arrival at hand comes sooner after the last one kept (or sent) than its topic's rate limit allows."""
     sender = batch.senders[i]
-    if sender.topics == 1:
+    if batch.several is None:
         return False
     rules = at(batch.topics, i, topic)
     if sender.limit_since_sent == 1:
@@ -134,7 +134,7 @@ def too_soon(batch: Batch, i: int, topic: int) -> bool:
 @kernel
 def at_limit(batch: Batch, i: int, topic: int) -> bool:
     """Whether as many messages of this topic are queued as may be."""
-    if batch.senders[i].topics == 1:
+    if batch.several is None:
         return False
     rules = at(batch.topics, i, topic)
     return bool(rules.queued >= rules.limit)
@@ -143,7 +143,9 @@ def at_limit(batch: Batch, i: int, topic: int) -> bool:
 @kernel
 def no_drop(batch: Batch, i: int, topic: int) -> bool:
     """Whether messages of this topic may not be dropped."""
-    return bool(batch.senders[i].topics > 1 and at(batch.topics, i, topic).no_drop == 1)
+    if batch.several is None:
+        return False
+    return bool(at(batch.topics, i, topic).no_drop == 1)
 
 
 @kernel
@@ -184,7 +186,7 @@ def sendable(batch: Batch, i: int, k: int) -> bool:
     """
     sender = batch.senders[i]
     full = sender.dequeued - sender.acked >= sender.window
-    if sender.topics == 1:
+    if batch.several is None:
         return not full
     rules = at(batch.topics, i, at(batch.slots, i, sender.first + k).topic)
     if full and not (sender.flush_no_drop == 1 and rules.no_drop == 1):

@@ -16,7 +16,7 @@ def may_dequeue(batch: Batch, i: int) -> bool:
         return False
     if sender.dequeued - sender.acked < sender.window:
         return True
-    if sender.flush_no_drop == 1:
+    if batch.several is not None and sender.flush_no_drop == 1:
         for k in range(sender.occupancy):
             if sendable(batch, i, k):
                 return True
@@ -50,7 +50,7 @@ def dequeue(batch: Batch, i: int, k: int) -> None:
     sender.socket, sender.chosen = UNASKED, 0
     entry = at(batch.log, i, place)
     entry.dequeued_us, entry.gain = sender.now_us, head.gain
-    if sender.topics > 1:
+    if batch.several is not None:
         dequeued_on_topic(batch, i, head)
 
 
@@ -133,5 +133,5 @@ def credit(batch: Batch, i: int, until_us: int) -> None:
             break
         sender.delivered_gain += entry.gain
         sender.credited += 1
-        if sender.topics > 1:
+        if batch.several is not None:
             received_on_topic(batch, i, at(batch.arrivals, i, seq), received_us)

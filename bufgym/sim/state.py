@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import kernel, records
+from bufgym.kernel import bundle, kernel, records
 from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC, row_width
 from bufgym.model.documented import documented
 from bufgym.model.link import FOREVER
@@ -153,6 +153,7 @@ NOT_YET = FOREVER - 1
 """The arrival time of a message that a live row still waits for: the row stops there."""
 
 
+@bundle
 @documented
 class Batch(NamedTuple):
     """The arrays of n senders, changed in place by the kernels. A snapshot is a copy of them."""
@@ -177,6 +178,8 @@ class Batch(NamedTuple):
     """TOPIC[n, topics]: the rules and the past of each topic; one row for a single queue."""
     parameters: NDArray[np.float64] = NO_PARAMETERS
     """float64[parameters], read-only: those of the policy at hand, which ``view`` shows it."""
+    several: bool | None = None
+    """True where messages have several topics; None for one queue, whose kernels know no topics."""
 
 
 def new_batch(n: int, capacity: int, messages: int, topics: int, v: NDArray[np.float64]) -> Batch:
@@ -191,6 +194,7 @@ def new_batch(n: int, capacity: int, messages: int, topics: int, v: NDArray[np.f
         np.zeros(0, np.int64),
         v,
         records((n, topics), TOPIC),
+        several=True if topics > 1 else None,
     )
 
 
@@ -201,11 +205,12 @@ def place_of(batch: Batch, i: int, message: Any) -> int:
 
 
 @functools.cache
-def batch_type() -> Any:
-    """Numba's type of a ``Batch``."""
-    return cast(Any, numba).typeof(new_batch(1, 1, 1, 1, exponential().array))
+def batch_type(several: bool) -> Any:
+    """Numba's type of a ``Batch`` of one queue each, or of several topics."""
+    return cast(Any, numba).typeof(new_batch(1, 1, 1, 2 if several else 1, exponential().array))
 
 
 def named(batch: Batch) -> Batch:
     """The same memory, as records whose fields read as attributes in plain Python too."""
-    return Batch(*(cast(Any, a.view(np.recarray) if a.dtype.names else a) for a in batch))
+    tables = ("senders", "slots", "arrivals", "log", "topics")
+    return batch._replace(**{name: getattr(batch, name).view(np.recarray) for name in tables})

@@ -123,7 +123,7 @@ def offer(batch: Batch, shares: Shares | None, i: int) -> int:
             if sender.ask_at_send == 1:
                 sender.waiting = SOCKET_WAITS
                 return SEND
-            if sender.limit_at_send == 1 or sender.flush_no_drop == 1:
+            if batch.several is not None and (sender.limit_at_send == 1 or sender.flush_no_drop == 1):
                 choose(batch, i, oldest_sendable(batch, i))
         if sender.socket != HELD:
             dequeue(batch, i, sender.chosen)

@@ -25,7 +25,7 @@ def view(batch: Batch, i: int) -> Buffer:
             # a scheduler holds the first of all back
             oldest = at(batch.slots, i, first)
             dequeued_arrival_us, dequeued_x, dequeued_seq = oldest.arrival_us, oldest.x, oldest.seq
-    if sender.topics > 1 and sender.waiting == ARRIVAL_WAITS:
+    if batch.several is not None and sender.waiting == ARRIVAL_WAITS:
         # gaps are those of the newcomer's topic
         arrival = at(batch.arrivals, i, sender.next)
         topic = at(batch.topics, i, arrival.topic)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -31,21 +30,19 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Sweep:
 
 
 @pytest.fixture
-def mine(tmp_path: Path) -> Iterator[Path]:
-    """A policy file: ``mine`` may sleep and may fail, as the environment says."""
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A policy file: ``mine`` may fail, as the environment says."""
     path = tmp_path / "mine.py"
     path.write_text(
-        "import os, time\n"
+        "import os\n"
         "from bufgym.policies import ACCEPT, REJECT, register\n"
         "@register('mine', memory={'seen': 0})\n"
         "def mine(buffer, arrival, memory):\n"
         "    'Every other one.'\n"
-        "    if memory[0] == 0:\n"
-        "        time.sleep(float(os.environ.get('TEST_SLEEP_S', 0)))\n"
         "    memory[0] += 1\n"
         "    if os.environ.get('TEST_FAIL') and len(buffer.slots) == 2:\n"
         "        raise ArithmeticError('on purpose')\n"
         "    return ACCEPT if memory[0] % 2 and len(buffer.slots) < buffer.capacity else REJECT\n"
     )
-    yield path
-    policies.registry._REGISTRY.pop("mine", None)
+    monkeypatch.setattr(policies.registry, "_REGISTRY", dict(policies.registry._REGISTRY))
+    return path

@@ -1,4 +1,4 @@
-"""What the tests of sweeps and their folders share."""
+"""What the tests of the benchmark share."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.sweep import Sweep
-from bufgym.cli import main
 
 THREE = ("afr", "random", "drop-oldest")
 TINY = Sweep("interruption-v1", THREE, capacities=(2, 4), seeds=3)
@@ -34,13 +34,11 @@ def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
     return {str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
 
 
-def fails(words: list[object], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """The command ends with code 2 and one line that says this."""
-    assert main([str(word) for word in words]) == 2
-    error = capsys.readouterr().err
-    assert told in error and error.startswith("bufgym: error: ") and error.count("\n") == 1
-
-
 def interrupt(*_: object) -> None:
     """Ctrl-C in the middle of what it takes the place of."""
     raise KeyboardInterrupt
+
+
+def exactly(x: float) -> Interval:
+    """Of a statistic that every episode agrees on."""
+    return Interval(pytest.approx(x), pytest.approx(x), pytest.approx(x))

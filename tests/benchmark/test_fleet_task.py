@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from summary_cases import exactly
+from cli_cases import shown
+from sweep_cases import exactly
 
 from bufgym import policies
 from bufgym.benchmark.rows import Row, read_rows
-from bufgym.benchmark.run import draw, run
+from bufgym.benchmark.run import run
 from bufgym.benchmark.summary import Summary, plain
-from bufgym.benchmark.sweep import Sweep
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.fleet import ROWS
-from bufgym.cli import main
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.scenario import FleetScenario, Uplink, suites
@@ -76,40 +75,6 @@ def test_every_policy_and_capacity_meets_the_same_episodes(monkeypatch: pytest.M
     # One episode at a time: the same rows, each once.
     monkeypatch.setattr("bufgym.benchmark.run._BATCH_MESSAGES", 1)
     assert sorted(map(repr, run(chosen, fleet, [2, 4], 2))) == sorted(map(repr, rows))
-
-
-# -------------------- fleet-v1
-
-
-@pytest.mark.parametrize("split", suites.SPLITS)
-def test_fleet_v1_is_lte_v1_with_sixteen_robots(split: str) -> None:
-    """Each robot alone would meet what lte-v1's motion setting has: traces, motions, streams, V."""
-    alone = suites.get("lte-v1").settings(split)["motion"].scenario
-    sweep = Sweep("fleet-v1", (), split).checked()
-    for k, shard in enumerate(sweep.shards()):
-        fleet = sweep.setting(shard.label, shard.trace).scenario
-        assert fleet == FleetScenario(16, replace(alone, traces=(alone.traces[k],)))
-        assert shard.seeds == tuple(1000 * k + s for s in range(5))
-    assert k + 1 == len(alone.traces)
-
-
-def test_robots_of_an_episode_tick_together_and_move_each_on_its_own() -> None:
-    fleet = Sweep("fleet-v1", (), changes={"robots": 4}).setting("motion", 1).scenario
-    episode, again = (draw(fleet, 1000) for _ in range(2))
-    assert episode.ticks_together and episode.robots == 4
-    assert all((a == b).all() for a, b in zip(episode.arrivals, again.arrivals, strict=True))
-    assert len({float(arrivals["x"][-1]) for arrivals in episode.arrivals}) == 4
-    # The first robot's stream is the one that the seed stands for in the benchmark of one robot.
-    assert (episode.arrivals[0]["x"] == draw(fleet.uplink, 1000).arrivals["x"]).all()
-
-
-def test_who_runs_by_default() -> None:
-    names = TASK.default_policies("fleet-v1")
-    assert {"afr", "drop-oldest", "learned-motion"} <= set(names) and len(set(names)) == len(names)
-    assert not {"clairvoyant", "rosbridge", "robofleet"} & set(names)
-
-
-# -------------------- the summary
 
 
 def made(policy: str, *teams: tuple[float, ...], capacity: int = 4, scenario: str = "s") -> list[Row]:
@@ -184,63 +149,15 @@ def test_the_table_as_text() -> None:
     assert lines[4].split() == ["afr", "5.000", "–", "–", "–", "4.000", "0.9400"]
 
 
-# -------------------- the command
-
-
-@pytest.mark.slow
-def test_decisions_that_cannot_be_carried_out_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    mine = tmp_path / "mine.py"
-    mine.write_text(
-        "from bufgym.policies import ACCEPT, register\n"
-        "@register('far-off', on_send=lambda buffer, memory: 999)\n"
-        "def far_off(buffer, arrival, memory):\n"
-        "    return ACCEPT if len(buffer.slots) < buffer.capacity else 0\n"
-    )
-    out = tmp_path / "rows.csv"
-    options = ["--robots", "1", "--seeds", "1", "--capacity", "3", "--split", "validation", "--out", str(out)]
-    try:
-        assert main(["fleet", "--jobs", "1", "--policies", "far-off", "--policy-file", str(mine), *options]) == 0
-    finally:
-        policies.registry._REGISTRY.pop("far-off", None)
-    told = capsys.readouterr().out
-    invalid = sum(row["invalid"] for row in read_rows(out, ROWS) if row["policy"] == "far-off")
-    assert invalid > 0 and f"note: far-off gave {invalid} invalid decisions\n" in told
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_command_prints_a_table_and_writes_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """AFR runs, named or not."""
     out = tmp_path / "rows.csv"
-    options = ["--robots", "2", "--seeds", "1", "--capacity", "3", "--split", "validation", "--out", str(out)]
-    assert main(["fleet", "--policies", "drop-oldest,min-gap", "--jobs", "1", *options]) == 0
-    shown = capsys.readouterr().out
-    assert "6 episodes of 60 s on 6 links, 2 robots in a cell." in shown
-    assert "Not the suite as it is: robots = 2." in shown
-    assert ", L = 3\n" in shown and "mean of these" not in shown and f"36 rows in {out}" in shown
+    options = "--robots 2 --seeds 1 --capacity 3 --split validation --policies drop-oldest,min-gap --jobs 1"
+    text = shown(["fleet", *options.split(), "--out", out], capsys)
+    assert "6 episodes of 60 s on 6 links, 2 robots in a cell." in text
+    assert "Not the suite as it is: robots = 2." in text
+    assert ", L = 3\n" in text and "mean of these" not in text and f"36 rows in {out}" in text
     rows = read_rows(out, ROWS)
-    # AFR runs, named or not.
     assert len(rows) == 6 * 2 * 3 and {row["policy"] for row in rows} == {"drop-oldest", "min-gap", "afr"}
-    assert plain(summary(rows)).splitlines()[3:] == shown.splitlines()[7:10]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            ["--policies", "clairvoyant"],
-            "policy clairvoyant: it plans with a link of its own, which no robot in a cell has",
-        ),
-        (["--policies", "afr", "afr"], "'afr' is given more than once"),
-        (["--suite", "lte-v1"], "suite lte-v1 is not one of fleet: bufgym bench --suite lte-v1"),
-        (["--split", "dev"], "split = 'dev': must be one of train, validation, test"),
-        (["--robots", "0"], "must be a whole number >= 1"),
-        (["--robots", "257"], "robots = 257: must be a whole number from 1 to 256"),
-        (["--seeds", "1001"], "seeds = 1001: must lie between 1 and 1000"),
-        (["--capacity", "5,5"], "5 is given more than once"),
-        (["--out", "rows.txt"], "rows are written to .csv or .parquet files"),
-        (["--out", "nowhere/rows.csv"], "no folder to write this file to"),
-    ],
-)
-def test_mistakes_end_in_one_line(options: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fleet", *options]) == 2
-    shown = capsys.readouterr()
-    assert shown.out == "" and message in shown.err and shown.err.count("\n") == 1
+    assert plain(summary(rows)).splitlines()[3:] == text.splitlines()[7:10]

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli_cases import fails, shown
 
 from bufgym import policies
 from bufgym.benchmark import leaderboard
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.leaderboard import Entry
-from bufgym.cli import main
 from bufgym.errors import BufgymError
 from bufgym.scenario import Interruption, suites
 from bufgym.scenario.suites import Setting, Suite
@@ -39,32 +39,22 @@ def made(path: Path) -> list[Entry]:
 
 
 def test_a_file_says_who_is_first_and_how_to_see_it_again(tiny: None, tmp_path: Path) -> None:
-    entries = made(tmp_path / "board.csv")
-    assert {e.policy: e.rank for e in entries} == {
-        "min-gap": 1,
-        "afr": 2,
-        "drop-oldest": 3,
-        "clairvoyant": 0,
-        "rosbridge": 0,
-    }
-    by_name = {e.policy: e for e in entries}
+    by_name = {entry.policy: entry for entry in made(tmp_path / "board.csv")}
+    ranks = {"min-gap": 1, "afr": 2, "drop-oldest": 3, "clairvoyant": 0, "rosbridge": 0}
+    assert {name: entry.rank for name, entry in by_name.items()} == ranks
     score = {name: entry.values["score"].value for name, entry in by_name.items()}
     assert score["drop-oldest"] == 0 and score["clairvoyant"] == 1 and math.isnan(score["rosbridge"])
     assert by_name["afr"].command == "bufgym bench --suite tiny-v1 --policies afr"
     again = leaderboard.read(tmp_path / "board.csv")
-    assert list(again) == [e.name for e in entries]
-    assert again["tiny-v1/afr"] == by_name["afr"]
+    assert list(again) == [entry.name for entry in by_name.values()] and again["tiny-v1/afr"] == by_name["afr"]
     text = (tmp_path / "board.md").read_text()
-    assert (
-        "## tiny-v1" in text and "| 1 | min-gap |" in text and "`bufgym bench --suite tiny-v1 --policies afr`" in text
-    )
+    assert "## tiny-v1" in text and "| 1 | min-gap |" in text and f"`{by_name['afr'].command}`" in text
 
 
 def test_a_row_is_run_again_and_one_that_has_changed_is_refused(tiny: None, tmp_path: Path, capsys: Any) -> None:
     path = tmp_path / "board.csv"
     made(path)
-    assert main(["validate", "tiny-v1/afr", "--file", str(path), "--jobs", "1"]) == 0
-    assert "tiny-v1/afr: holds" in capsys.readouterr().out
+    assert "tiny-v1/afr: holds" in shown(["validate", "tiny-v1/afr", "--file", path, "--jobs", 1], capsys)
     entry = leaderboard.find(path, "tiny-v1/afr")
     again = leaderboard.validate(entry, jobs=1)
     assert replace(again, rank=entry.rank) == entry  # the very same numbers, in smaller company
@@ -74,21 +64,16 @@ def test_a_row_is_run_again_and_one_that_has_changed_is_refused(tiny: None, tmp_
 
 
 def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "board.csv"
-    path.write_text("suite,policy\na,b\n")
-    with pytest.raises(BufgymError, match=r"board\.csv.*must have the columns"):
-        leaderboard.read(path)
+    path, board = tmp_path / "board.csv", REPO / "docs" / "leaderboard.csv"
     leaderboard.write([], path)
     with path.open("a") as file:
         file.write("lte-v1,p,1,1,score,many,1,1,0.1.0,c\n")
     with pytest.raises(BufgymError, match=r"board\.csv.*many.*must be a number"):
         leaderboard.read(path)
-    assert main(["validate", "lte-v1/nobody", "--file", str(REPO / "docs" / "leaderboard.csv")]) == 2
-    assert "no row 'lte-v1/nobody'" in capsys.readouterr().err
+    fails(["validate", "lte-v1/nobody", "--file", board], "no row 'lte-v1/nobody'", capsys)
     monkeypatch.chdir(tmp_path)
-    assert main(["validate", "lte-v1/afr"]) == 2
-    assert "docs/leaderboard.csv is that of bufgym's repository" in capsys.readouterr().err
-    assert main(["leaderboard", "no-suite", "--file", str(path)]) == 2
+    fails(["validate", "lte-v1/afr"], "docs/leaderboard.csv is that of bufgym's repository", capsys)
+    fails(["leaderboard", "no-suite", "--file", path], "no-suite", capsys)
     with pytest.raises(BufgymError, match=r"written to a \.csv file"):
         leaderboard.write([], tmp_path / "board.txt")
 
@@ -102,7 +87,7 @@ def test_the_published_rows_are_of_known_suites_and_policies() -> None:
     assert {suites.get(entry.suite).kind for entry in entries.values()} == {"queue", "topics", "fleet"}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_published_row_holds() -> None:
     entry = leaderboard.find(REPO / "docs" / "leaderboard.csv", "sustained-v1/min-motion-gap")
     assert leaderboard.validate(entry, jobs=1).values["score"] == pytest.approx(entry.values["score"], abs=1e-12)

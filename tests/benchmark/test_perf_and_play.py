@@ -1,4 +1,4 @@
-"""The speed report at tiny sizes, and a policy as the player of an environment."""
+"""The speed report at tiny sizes, a policy as the player of an environment, and what is compiled beforehand."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark import perf, perf_peers, perf_profile, perf_queue
 from bufgym.benchmark.run import draw, run
+from bufgym.benchmark.warmup import PARTS
+from bufgym.cli import main
 from bufgym.errors import BufgymError
 from bufgym.expert import Player
+from bufgym.kernel import FOLDER, JIT
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import run as run_senders
@@ -78,23 +81,18 @@ def test_a_peer_stands_beside_the_native_batch_of_the_same_run() -> None:
 
 
 def test_recorded_actions_are_possible_when_played_again() -> None:
-    envs: Any = gym.make_vec(
-        "bufgym/Interruption-v0", 4, vectorization_mode="vector_entry_point", capacity=2, law="fixed", t_max=6
-    )
+    given: dict[str, Any] = {"capacity": 2, "law": "fixed", "t_max": 6, "vectorization_mode": "vector_entry_point"}
+    envs: Any = gym.make_vec("bufgym/Interruption-v0", 4, **given)
     actions, decisions = perf.record(envs, 14)
-    # 6 decisions and a reset, twice.
-    assert decisions == 4 * 12
+    assert decisions == 4 * 12  # 6 decisions and a reset, twice
     envs.reset(seed=perf.SEED)
-    for row in actions:
-        _, _, _, _, info = envs.step(row)
-        assert not info["invalid"].any()
+    assert not any(envs.step(row)[4]["invalid"].any() for row in actions)
 
 
 def test_random_actions_are_those_of_the_mask() -> None:
     mask = np.array([[False, True, False], [True, True, True]])
-    drawn = [perf.random_actions(mask, np.random.default_rng(seed)) for seed in range(40)]
-    assert {int(d[0]) for d in drawn} == {1}
-    assert {int(d[1]) for d in drawn} == {0, 1, 2}
+    drawn = np.array([perf.random_actions(mask, np.random.default_rng(seed)) for seed in range(40)])
+    assert [set(column) for column in drawn.T] == [{1}, {0, 1, 2}]
 
 
 @pytest.mark.parametrize(("number", "text"), [(3.14159e6, "3.14 M"), (120_000, "120 k"), (57.31, "57.3"), (2e9, "2 G")])
@@ -102,28 +100,27 @@ def test_human(number: float, text: str) -> None:
     assert perf.human(number) == text
 
 
-@pytest.mark.parametrize("name", PLAYABLE)
-@pytest.mark.parametrize(
-    "scenario",
-    [
-        Interruption(t_max=40),
-        Uplink(traces=(Trace.steps([(1.0, 900_000), (0.7, 0)], name="t"),), rate_hz=20, duration_s=5),
-    ],
-    ids=["interruption", "uplink"],
-)
-def test_a_player_in_the_environment_does_what_the_benchmark_does(name: str, scenario: Any) -> None:
-    policy = policies.get(name)
-    env: Any = gym.make("bufgym/Uplink-v0", scenario=scenario, capacity=3).unwrapped
-    player = Player(policy)
-    for row in run([policy], scenario, [3], 2):
-        env.reset(options={"episode": draw(scenario, row["seed"])})
-        ended, info = False, {}
-        while not ended:
-            _, _, ended, _, info = env.step(player.action(env.rows.senders))
-        assert info["delivered"] == row["delivered"]
-        assert info["qoi"] == pytest.approx(row["qoi"])
+GAPPY = Uplink(traces=(Trace.steps([(1.0, 900_000), (0.7, 0)], name="t"),), rate_hz=20, duration_s=5)
+
+
+def played(env: Any, player: Player, episode: Any) -> dict[str, Any]:
+    """The last info of an episode in the environment."""
+    env.reset(options={"episode": episode})
+    ended, info = False, {}
+    while not ended:
+        _, _, ended, _, info = env.step(player.action(env.rows.senders))
     with pytest.raises(BufgymError, match="no decision is due"):
         player.action(env.rows.senders)
+    return info
+
+
+@pytest.mark.parametrize("name", PLAYABLE)
+@pytest.mark.parametrize("scenario", [Interruption(t_max=40), GAPPY], ids=["interruption", "uplink"])
+def test_a_player_in_the_environment_does_what_the_benchmark_does(name: str, scenario: Any) -> None:
+    env: Any = gym.make("bufgym/Uplink-v0", scenario=scenario, capacity=3).unwrapped
+    for row in run([policies.get(name)], scenario, [3], 2):
+        info = played(env, Player(policies.get(name)), draw(scenario, row["seed"]))
+        assert (info["delivered"], info["qoi"]) == (row["delivered"], pytest.approx(row["qoi"]))
 
 
 @pytest.mark.parametrize("name", ["robofleet", "edf", "drop-oldest"])
@@ -131,13 +128,8 @@ def test_a_player_of_topics_reaches_what_its_policy_reaches(name: str) -> None:
     """At arrivals and at a free socket: the same deliveries and the same weighted QoI as a rollout's."""
     client = replace(scenarios.get("topics"), duration_s=2.0)
     episode, policy = draw(client, 3), policies.get(name)
-    rolled = run_senders(policy, [episode], 6, client.value, topics=client.topics)
-    env: Any = gym.make("bufgym/Topics-v0", scenario=client, capacity=6).unwrapped
-    env.reset(options={"episode": episode})
-    player, ended, info = Player(policy), False, {}
-    while not ended:
-        _, _, ended, _, info = env.step(player.action(env.rows.senders))
-    reached = outcome(rolled, 0)
+    reached = outcome(run_senders(policy, [episode], 6, client.value, topics=client.topics), 0)
+    info = played(gym.make("bufgym/Topics-v0", scenario=client, capacity=6).unwrapped, Player(policy), episode)
     assert info["qoi"] == pytest.approx(reached.qoi)
     assert (info["delivered"], info["invalid"]) == (reached.delivered, reached.invalid)
 
@@ -145,19 +137,25 @@ def test_a_player_of_topics_reaches_what_its_policy_reaches(name: str) -> None:
 def test_a_player_refuses_a_decision_that_means_nothing() -> None:
     env: Any = gym.make("bufgym/Interruption-v0", capacity=3).unwrapped
     env.reset(seed=0)
-    with pytest.raises(BufgymError, match="policy odd: decision 3"):
-        Player(Policy("odd", lambda buffer, arrival, memory: 3)).action(env.rows.senders)
-    with pytest.raises(BufgymError, match="policy odd: on_arrival returned None: must be a whole number"):
-        Player(Policy("odd", lambda buffer, arrival, memory: None)).action(env.rows.senders)
+    for decision, says in ((3, "decision 3"), (None, "on_arrival returned None: must be a whole number")):
+        with pytest.raises(BufgymError, match=f"policy odd: {says}"):
+            Player(Policy("odd", lambda buffer, arrival, memory: decision)).action(env.rows.senders)  # noqa: B023
     env = gym.make("bufgym/Topics-v0", capacity=3).unwrapped
     env.reset(seed=0)
     env.step(4)  # accept: now the socket asks
     with pytest.raises(BufgymError, match="policy odd: sends slot 3"):
         odd = Policy("odd", policies.get("fifo").on_arrival, on_send=lambda buffer, memory: 3)
         Player(odd).action(env.rows.senders)
+    for name, why in (("codel", "drops at dequeue"), ("rosbridge", "has an unbounded queue")):
+        with pytest.raises(BufgymError, match=f"policy {name} {why}"):
+            Player(policies.get(name))
 
 
-@pytest.mark.parametrize(("name", "why"), [("codel", "drops at dequeue"), ("rosbridge", "has an unbounded queue")])
-def test_what_an_environment_cannot_ask_is_said(name: str, why: str) -> None:
-    with pytest.raises(BufgymError, match=f"policy {name} {why}"):
-        Player(policies.get(name))
+@pytest.mark.nightly
+@pytest.mark.skipif(not JIT, reason="nothing is compiled")
+def test_each_part_is_named_and_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["warmup"]) == 0
+    told = capsys.readouterr()
+    text = told.out + told.err
+    assert all(f"{k}/{len(PARTS)} {name}" in text for k, name in enumerate(PARTS, 1))
+    assert FOLDER in text

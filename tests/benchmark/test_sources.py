@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sweep_cases import fails
+from cli_cases import Capsys, Patch, fails, shown
 
 from bufgym import policies
 from bufgym.benchmark import sources
 from bufgym.benchmark.rows import read_rows
-from bufgym.cli import main
 from bufgym.errors import BufgymError
 from bufgym.policies import registry
 
@@ -55,45 +53,46 @@ ONE = ["--interruption", "--law", "fixed", "--t-max", "12", "--capacity", "3", "
 
 
 @pytest.fixture
-def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def module(tmp_path: Path, monkeypatch: Patch) -> str:
     """A module of policies in the current folder; its name differs from test to test, as Python imports one once."""
-    name = "m" + tmp_path.name.replace("-", "_").replace("[", "_").replace("]", "_")
+    name = "m" + re.sub(r"\W", "_", tmp_path.name)
     (tmp_path / f"{name}.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
-    before = dict(registry._REGISTRY)
-    yield name
-    registry._REGISTRY.clear()
-    registry._REGISTRY.update(before)
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
+    return name
 
 
-def rows_of(capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+def rows_of(text: str) -> dict[str, str]:
     """The table's lines by policy, without the name; those that a note calls the same have the same line."""
-    lines = capsys.readouterr().out.split("\n")
+    lines = text.split("\n")
     table = {line.split()[0]: line.split(maxsplit=1)[1] for line in lines if len(line.split()) > 5}
-    for names, first in re.findall(r"^note: (.*): the same rows here as (.*)$", "\n".join(lines), re.MULTILINE):
+    for names, first in re.findall(r"^note: (.*): the same rows here as (.*)$", text, re.MULTILINE):
         table |= dict.fromkeys(names.split(", "), table[first])
     return table
 
 
-def test_functions_makers_and_policies_of_a_module(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_functions_makers_and_policies_of_a_module(module: str, capsys: Capsys) -> None:
     words = [f"{module}:{name}" for name in ("newest", "made", "whole", "every_other")]
-    assert main(["bench", *ONE, "--policies", ",".join([*words, "every:every=3", "drop-oldest"])]) == 0
-    table = rows_of(capsys)
+    chosen = ",".join([*words, "every:every=3", "drop-oldest"])
+    table = rows_of(shown(["bench", *ONE, "--policies", chosen], capsys))
     assert table["newest"] == table["made-here"] == table["whole"] == table["drop-oldest"]
     assert table["every"] != table["every:every=3"]
     assert sources.load(f"{module}:makes_a_function") == "newest"  # as there is already
-    assert main(["play", "--policies", f"{module}:newest", "--env", "Interruption-v0", "--speed", "0"]) == 0
+    shown(["play", "--policies", f"{module}:newest", "--env", "Interruption-v0", "--speed", "0"], capsys)
 
 
-def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: Capsys) -> None:
     shutil.copy(SHIPPED, "own.safetensors")
-    assert main(["bench", *ONE, "--policies", "own.safetensors,learned-time"]) == 0
-    table = rows_of(capsys)
+    table = rows_of(shown(["bench", *ONE, "--policies", "own.safetensors,learned-time"], capsys))
     assert table["own"] == table["learned-time"]
+    Path("a").mkdir()
+    shutil.copy(SHIPPED, "a/own.safetensors")
+    told = "own.safetensors: there is a policy named 'own' already"
+    fails(["bench", *ONE, "--policies", "own.safetensors,a/own.safetensors"], told, capsys)
 
 
-@pytest.mark.slow
-def test_a_trained_model_goes_by_its_stem(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.nightly
+def test_a_trained_model_goes_by_its_stem(module: str, capsys: Capsys) -> None:
     """A slot network decides as its exported weights do."""
     contrib = pytest.importorskip("sb3_contrib")
     from bufgym.sb3 import SlotPolicy, make_vec_env
@@ -102,52 +101,39 @@ def test_a_trained_model_goes_by_its_stem(module: str, capsys: pytest.CaptureFix
     envs = make_vec_env("bufgym/Interruption-v0", 2, capacity=3, t_max=20)
     contrib.MaskablePPO(SlotPolicy, envs, n_steps=8, batch_size=16, seed=1, device="cpu").save("slots.zip")
     export("slots.zip", "exported.safetensors", name="exported")
-    assert main(["bench", *ONE, "--policies", "slots.zip", "exported.safetensors"]) == 0
-    table = rows_of(capsys)
+    table = rows_of(shown(["bench", *ONE, "--policies", "slots.zip", "exported.safetensors"], capsys))
     assert table["slots"] == table["exported"]
     suite = ["--suite", "interruption-v1", "--capacity", "2", "--seeds", "1", "--jobs", "2", "--out", "kept"]
-    assert main(["bench", *suite, "--policies", "slots.zip", "--format", "csv"]) == 0
+    shown(["bench", *suite, "--policies", "slots.zip", "--format", "csv"], capsys)
     assert {row["policy"] for row in read_rows(Path("kept/rows.csv"))} == {"slots", "drop-oldest"}
 
 
-def test_workers_load_them_too_and_the_folder_knows_their_version(
-    module: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.nightly
+def test_workers_load_them_too_and_the_folder_knows_their_version(module: str, capsys: Capsys) -> None:
     pytest.importorskip("joblib")
     shutil.copy(SHIPPED, "own.safetensors")
-    words = ["bench", "--suite", "interruption-v1", "--capacity", "3", "--seeds", "1", "--format", "csv"]
-    words += ["--policies", f"own.safetensors,{module}:newest", "--jobs", "2", "--out", "kept"]
-    assert main(words) == 0
+    suite = "--suite interruption-v1 --capacity 3 --seeds 1 --format csv --jobs 2 --out kept"
+    words = ["bench", *suite.split(), "--policies", f"own.safetensors,{module}:newest"]
+    shown(words, capsys)
     found = read_rows(Path("kept/rows.csv"))
     by_policy = {name: [row["qoi"] for row in found if row["policy"] == name] for name in ("newest", "drop-oldest")}
     assert by_policy["newest"] == by_policy["drop-oldest"] and len(found) == 9
     held = json.loads(Path("kept/manifest.json").read_text())
     assert held["policies"] == ["own", "newest", "drop-oldest"] and len(held["sources"]) == 2
     assert f"--policies own.safetensors,{module}:newest" in held["command"]
-    capsys.readouterr()
-    assert main(words) == 0  # the same again
+    shown(words, capsys)  # the same again
     with Path(f"{module}.py").open("a") as file:
         file.write("# changed\n")
-    capsys.readouterr()
     fails(words, "sources is", capsys)
-
-
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [
-        ("number", "must be a policy, a function (buffer, arrival, memory), or one without arguments"),
-        ("nothing", "has no nothing"),
-        ("afr", "there is a policy named 'afr' already"),
-        ("boom", f"line {LINES.index('    return 1 // 0') + 1}: ZeroDivisionError"),
-    ],
-)
-def test_what_a_module_cannot_give(module: str, name: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
-    fails(["bench", *ONE, "--policies", f"{module}:{name}"], says, capsys)
 
 
 @pytest.mark.parametrize(
     ("word", "says"),
     [
+        ("{}:number", "must be a policy, a function (buffer, arrival, memory), or one without arguments"),
+        ("{}:nothing", "has no nothing"),
+        ("{}:afr", "there is a policy named 'afr' already"),
+        ("{}:boom", f"line {LINES.index('    return 1 // 0') + 1}: ZeroDivisionError"),
         ("nowhere.zip", "nowhere.zip: no such file"),
         ("nowhere.safetensors", "nowhere.safetensors: no such file"),
         ("broken.zip", "broken.zip: no model of stable-baselines3"),
@@ -157,21 +143,13 @@ def test_what_a_module_cannot_give(module: str, name: str, says: str, capsys: py
         ("afr:policy", "'policy' is not of the form parameter=number"),
     ],
 )
-def test_what_cannot_be_loaded(module: str, word: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_loaded(module: str, word: str, says: str, capsys: Capsys) -> None:
     if word.endswith(".zip"):
         pytest.importorskip("stable_baselines3")
     Path("broken.zip").write_text("no zip")
     Path("broken.py").write_text("1 // 0\n")
     Path("needy.py").write_text("import a_module_not_there\n")
-    fails(["bench", *ONE, "--policies", word], says, capsys)
-
-
-def test_two_files_of_one_name(module: str, capsys: pytest.CaptureFixture[str]) -> None:
-    for folder in ("a", "b"):
-        Path(folder).mkdir()
-        shutil.copy(SHIPPED, f"{folder}/twice.safetensors")
-    both = "a/twice.safetensors,b/twice.safetensors"
-    fails(["bench", *ONE, "--policies", both], "b/twice.safetensors: there is a policy named 'twice' already", capsys)
+    fails(["bench", *ONE, "--policies", word.format(module)], says, capsys)
 
 
 @pytest.mark.parametrize("word", ["os:system", "mine.zip", "mine.safetensors"])

@@ -1,4 +1,4 @@
-"""The summary that topics and fleets share: intervals over episodes, means over cells, what does not fit together."""
+"""The summary that topics and fleets share, by hand; by how much a policy beats another live and in the simulator."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import pytest
-from summary_cases import exactly
+from sweep_cases import exactly
 
-from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.episodes import Numbers
+from bufgym.benchmark.live_runs import margins
 from bufgym.benchmark.summary import Quantity, Run, Summary, plain, summarise
 from bufgym.benchmark.table import score
 from bufgym.errors import BufgymError
+from bufgym.live.runs import Run as LiveRun
 
 QUANTITIES = (
     Quantity("mean", "mean", score, "of H", interval=False),
@@ -89,10 +90,37 @@ def test_runs_that_cannot_be_summed_up(numbers: dict[Run, list[float]], options:
         summary(numbers, **options)
 
 
-def test_an_interval_as_text() -> None:
-    found = summary(runs({"base": [2, 2], "mine": [3, 3]}), unranked=[])
-    assert found.standings["mine"]["over"] == Interval(1.5, 1.5, 1.5)
-    assert plain(found, {"s": "a story"}).splitlines()[2:4] == [
-        "s: a story, L = 4",
-        "mine    3.000  1.500 [1.500, 1.500]         2",
-    ]
+def one(policy: str, seed: int, live: float, simulated: float, transport: str = "tcp") -> LiveRun:
+    return LiveRun(policy, "a", seed, 1, 1, live, simulated, 5.0, transport)
+
+
+AFR = [one("afr", 0, 4.0, 4.0), one("afr", 1, 3.0, 3.0)]
+
+
+def test_margins_by_hand() -> None:
+    """Of 10 in all, 0.1 + 0.2 are won live and 0.2 + 0.2 in the simulator; an episode is drawn twice, or each once."""
+    [margin] = margins([*AFR, one("random", 0, 4.1, 4.2), one("random", 1, 3.2, 3.2)])
+    assert (margin.policy, margin.reference, margin.episodes) == ("random", "afr", 2)
+    assert margin.live == pytest.approx((0.03, 0.02, 0.04))
+    assert margin.simulated == pytest.approx((0.04, 0.04, 0.04))
+    assert margin.share == pytest.approx((0.75, 0.5, 1.0))
+    assert str(margin) == (
+        "random against afr, 2 episodes: regret lower by 3.00 % [2.00, 4.00] live, 4.00 % [4.00, 4.00] simulated: "
+        "75.0 % [50.0, 100.0] of the simulator's margin is there live."
+    )
+
+
+def test_an_episode_over_two_transports_is_one() -> None:
+    again = [one(policy, seed, 4.5, 4.5, "ros1") for policy in ("afr", "random") for seed in (0, 1)]
+    [margin] = margins([*AFR, one("random", 0, 4.1, 4.2), one("random", 1, 3.2, 3.2), *again])
+    assert margin.episodes == 2 and margin.live.value == pytest.approx(0.3 / 20)
+
+
+def test_nothing_is_said_of_a_single_episode_or_without_the_reference() -> None:
+    assert margins([AFR[0], one("random", 0, 4.1, 4.2)]) == []
+    assert margins([one("random", 0, 4.1, 4.2), one("random", 1, 4.1, 4.2)]) == []
+
+
+def test_there_is_no_share_of_nothing() -> None:
+    [margin] = margins([*AFR, one("random", 0, 4.1, 4.0), one("random", 1, 3.2, 3.0)])
+    assert str(margin).endswith("[2.00, 4.00] live, 0.000 % [0.000, 0.000] simulated.")

@@ -5,26 +5,22 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sweep_cases import TINY, contents, fails, interrupt
+from cli_cases import Capsys, Patch, fails, shown
+from sweep_cases import TINY, contents, interrupt
 
 from bufgym.benchmark import sweep
 from bufgym.benchmark.rows import read_rows, write_rows
 from bufgym.benchmark.sweep import Sweep
-from bufgym.cli import main
 from bufgym.cli.options import load_policies
 from bufgym.errors import BufgymError, install
 from bufgym.scenario import Uplink, suites
 from bufgym.traces import Trace
 
 pytest.importorskip("joblib", reason="a sweep needs joblib")
-
-
-# -------------------- never mixed
 
 
 @pytest.mark.parametrize(
@@ -38,16 +34,23 @@ pytest.importorskip("joblib", reason="a sweep needs joblib")
         ({"suite": "lte-v1"}, "suite"),
     ],
 )
-def test_another_sweep_needs_another_folder(tmp_path: Path, change: dict[str, Any], key: str) -> None:
-    sweep.run_sweep(TINY, tmp_path, backend="sequential")
-    before = contents(tmp_path)
+def test_another_sweep_needs_another_folder(finished: Path, change: dict[str, Any], key: str) -> None:
+    before = contents(finished)
     with pytest.raises(BufgymError, match=rf"manifest\.json: {key} is .*, but this run has .*choose another --out"):
-        sweep.run_sweep(Sweep(**{**vars(TINY), **change}), tmp_path, backend="sequential")
-    assert contents(tmp_path) == before
+        sweep.run_sweep(Sweep(**{**vars(TINY), **change}), finished, backend="sequential")
+    assert contents(finished) == before
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of ``TINY``; nobody writes there."""
+    folder = tmp_path_factory.mktemp("finished")
+    sweep.run_sweep(TINY, folder, backend="sequential")
+    return folder
 
 
 def test_so_does_another_version_or_another_policy_file(
-    tmp_path: Path, small: Sweep, mine: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small: Sweep, mine: Path, monkeypatch: Patch
 ) -> None:
     load_policies(str(mine))
     plan = Sweep("small-v1", ("mine",), policy_file=str(mine))
@@ -64,7 +67,7 @@ def test_so_does_another_version_or_another_policy_file(
     assert contents(tmp_path / "out") == before
 
 
-def test_so_do_other_recordings_of_the_same_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_so_do_other_recordings_of_the_same_names(tmp_path: Path, monkeypatch: Patch) -> None:
     def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
         assert data is not None
         trace = Trace.steps([(1.0, float((data / "rate").read_text()))], name="link")
@@ -91,58 +94,29 @@ def test_rows_without_a_manifest_are_left_alone(tmp_path: Path, small: Sweep, na
     assert list(contents(tmp_path)) == [name]
 
 
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        (lambda text: text[: len(text) // 2], "must be JSON"),
-        (lambda text: "[]", "must be a JSON object"),
-        (lambda text: text.replace('"format": 2', '"format": 99'), "format = 99: must be 2"),
-        (lambda text: text.replace('"suite"', '"sweet"'), "no suite"),
-        (lambda text: text.replace('"seeds": 2', '"seeds": Infinity'), "Infinity: numbers must be finite"),
-    ],
-)
-def test_a_broken_manifest_is_named(tmp_path: Path, small: Sweep, change: Callable[[str], str], told: str) -> None:
-    sweep.run_sweep(small, tmp_path, backend="sequential")
-    file = tmp_path / "manifest.json"
-    text = file.read_text()
-    file.write_text(change(text))
-    assert file.read_text() != text
-    before = contents(tmp_path)
-    with pytest.raises(BufgymError, match=rf"manifest\.json.*{told}"):
-        sweep.run_sweep(small, tmp_path, backend="sequential")
-    assert contents(tmp_path) == before
-
-
 @pytest.mark.parametrize("form", ["csv", "parquet"])
-@pytest.mark.parametrize("harm", ["cut", "empty", "fewer", "columns", "noise"])
 def test_a_broken_part_is_named_and_made_anew_once_deleted(
-    tmp_path: Path, small: Sweep, form: str, harm: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small: Sweep, form: str, monkeypatch: Patch
 ) -> None:
     if form == "parquet":
         pytest.importorskip("pyarrow")
-    whole = sweep.run_sweep(small, tmp_path / "whole", backend="sequential", form=form)
     out = tmp_path / "out"
+    whole = sweep.run_sweep(small, tmp_path / "whole", backend="sequential", form=form)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(sweep, "_read", interrupt)  # all parts are there, but not yet their sum
         sweep.run_sweep(small, out, backend="sequential", form=form)
     part = out / "parts" / f"one-1-1000.{form}"
     rows, content = read_rows(part), part.read_bytes()
-    if harm == "fewer":
-        write_rows(rows[:-1], part)
-    elif harm == "columns":
-        write_rows([{name: row[name] for name in row if name != "qoi"} for row in rows], part)
-    else:
-        part.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "noise": b"\xff\x00" * 99}[harm])
-    before = contents(out)
-    with pytest.raises(BufgymError, match=rf"one-1-1000\.{form}.*; delete this file and run the command again"):
-        sweep.run_sweep(small, out, backend="sequential", form=form)
-    assert contents(out) == before
+    without = [{name: row[name] for name in row if name != "qoi"} for row in rows]
+    for harm in (content[: len(content) // 2], b"", b"\xff\x00" * 99, rows[:-1], without):
+        part.write_bytes(harm) if isinstance(harm, bytes) else write_rows(harm, part)
+        before = contents(out)
+        with pytest.raises(BufgymError, match=rf"one-1-1000\.{form}.*; delete this file and run the command again"):
+            sweep.run_sweep(small, out, backend="sequential", form=form)
+        assert contents(out) == before
     part.unlink()
     assert repr(sweep.run_sweep(small, out, backend="sequential", form=form)) == repr(whole)
     assert (out / f"rows.{form}").read_bytes() == (tmp_path / "whole" / f"rows.{form}").read_bytes()
-
-
-# -------------------- mistakes
 
 
 @pytest.mark.parametrize(
@@ -158,20 +132,17 @@ def test_a_broken_part_is_named_and_made_anew_once_deleted(
         ({"capacities": (0,)}, r"capacities = \[0\]"),
         ({"capacities": (2, 2)}, r"capacities = \[2, 2\]: .* no two alike"),
         ({"suite": "mahimahi-v1"}, r"needs a folder of recordings \(--data DIR\)"),
+        ({"jobs": 0}, "jobs = 0:"),
+        ({"jobs": -2}, "jobs = -2:"),
+        ({"backend": "sloky"}, "backend = 'sloky': must be one of loky"),
     ],
 )
 def test_a_bad_sweep_ends_before_anything_is_written(
     tmp_path: Path, small: Sweep, change: dict[str, Any], told: str
 ) -> None:
+    where = {name: change.pop(name) for name in ("jobs", "backend") if name in change}
     with pytest.raises(BufgymError, match=told):
-        sweep.run_sweep(Sweep(**{**vars(small), **change}), tmp_path / "out", backend="sequential")
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(("jobs", "backend"), [(0, "loky"), (-2, "loky"), (1, "sloky")])
-def test_so_do_a_bad_backend_and_number_of_jobs(tmp_path: Path, small: Sweep, jobs: int, backend: str) -> None:
-    with pytest.raises(BufgymError, match="backend = 'sloky': must be one of loky" if jobs == 1 else f"jobs = {jobs}:"):
-        sweep.run_sweep(small, tmp_path / "out", jobs=jobs, backend=backend)
+        sweep.run_sweep(Sweep(**{**vars(small), **change}), tmp_path / "out", **where)
     assert not (tmp_path / "out").exists()
 
 
@@ -180,82 +151,45 @@ def test_so_do_a_bad_backend_and_number_of_jobs(tmp_path: Path, small: Sweep, jo
     [("ray", "ray", "ray"), ("dask", "distributed", "dask"), ("loky", "joblib", "bench")],
 )
 def test_a_backend_that_is_not_installed_names_the_extra(
-    tmp_path: Path, small: Sweep, backend: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small: Sweep, backend: str, module: str, extra: str, monkeypatch: Patch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)  # importing it now fails
     with pytest.raises(BufgymError, match=re.escape(f"{module} is missing: {install(extra)}")):
         sweep.run_sweep(small, tmp_path, jobs=2, backend=backend)
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--trace", "link.csv"],
-        ["--motion", "none"],
-        ["--fps", 10],
-        ["--seconds", 5],
-        ["--max-bytes", 1000],
-        ["--value", "saturating:2"],
-        ["--t-max", 5],
-        ["--interruption"],
-        ["--decide-at", "overflow"],
-    ],
-)
-def test_a_suites_episodes_cannot_be_changed(words: list[object], capsys: pytest.CaptureFixture[str]) -> None:
-    fails(["bench", "--suite", "lte-v1", *words], "cannot go with --suite", capsys)
-    assert main(["bench", "--suite", "lte-v1", *map(str, words)]) == 2
-    assert str(words[0]) in capsys.readouterr().err
+QUEUE_ALONE = ("--trace link.csv", "--motion none", "--fps 10", "--seconds 5", "--max-bytes 1000", "--t-max 5")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [["--jobs", 2], ["--split", "train"], ["--data", "."], ["--backend", "dask"], ["--address", "host:1"]],
-)
-def test_options_of_a_suite_need_one(words: list[object], capsys: pytest.CaptureFixture[str]) -> None:
-    fails(["bench", *words], f"{words[0]} needs --suite", capsys)
+@pytest.mark.parametrize("words", [*QUEUE_ALONE, "--value saturating:2", "--interruption", "--decide-at overflow"])
+def test_a_suites_episodes_cannot_be_changed(words: str, capsys: Capsys) -> None:
+    told = fails(["bench", "--suite", "lte-v1", *words.split()], "cannot go with --suite", capsys)
+    assert words.split()[0] in told
 
 
-# -------------------- what the command line makes of it
+@pytest.mark.parametrize("words", ["--jobs 2", "--split train", "--data .", "--backend dask", "--address host:1"])
+def test_options_of_a_suite_need_one(words: str, capsys: Capsys) -> None:
+    fails(["bench", *words.split()], f"{words.split()[0]} needs --suite", capsys)
 
 
-def test_the_command_line_prints_scores_and_the_report_reads_them(
-    tmp_path: Path, small: Sweep, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_line_prints_scores_and_the_report_reads_them(tmp_path: Path, small: Sweep, capsys: Capsys) -> None:
     pytest.importorskip("jinja2")
     pytest.importorskip("plotly")
     out = tmp_path / "a folder"
-    words = ["bench", "--suite", "small-v1", "--policies", "afr,random", "--backend", "sequential", "--out", str(out)]
-    assert main(words) == 0
-    said = capsys.readouterr().out
+    words = ["bench", "--suite", "small-v1", "--policies", "afr,random", "--backend", "sequential", "--out", out]
+    said = shown(words, capsys)
     assert "afr" in said and "drop-oldest" in said and f"48 rows in {out}; bufgym report" in said
     command = json.loads((out / "manifest.json").read_text())["command"]
     assert command == f"bufgym bench --suite small-v1 --policies afr,random --out '{out}'"
-    assert main(["report", str(out), "--markdown"]) == 0
-    tables = capsys.readouterr().out
+    tables = shown(["report", out, "--markdown"], capsys)
     assert command in tables and "| drop-oldest |" in tables
-    assert main(["report", str(out)]) == 0
-    page = Path(capsys.readouterr().out.strip().removeprefix("wrote ")).read_text()
+    page = Path(shown(["report", out], capsys).strip().removeprefix("wrote ")).read_text()
     assert page.startswith("<!") and "drop-oldest" in page and "small-v1" in page
 
 
 def test_without_a_folder_nothing_is_left_behind(
-    tmp_path: Path, small: Sweep, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, small: Sweep, monkeypatch: Patch, capsys: Capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["bench", "--suite", "small-v1", "--policies", "afr", "--backend", "sequential"]) == 0
-    assert "drop-oldest" in capsys.readouterr().out and not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("form", ["csv", "parquet"])
-@pytest.mark.parametrize("harm", ["cut", "noise", "empty"])
-def test_a_report_of_broken_rows_names_the_file(
-    tmp_path: Path, small: Sweep, form: str, harm: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    if form == "parquet":
-        pytest.importorskip("pyarrow")
-    sweep.run_sweep(small, tmp_path, backend="sequential", form=form)
-    path = tmp_path / f"rows.{form}"
-    content = path.read_bytes()
-    path.write_bytes({"cut": content[: len(content) // 2], "noise": b"\xff\x00" * 99, "empty": b""}[harm])
-    fails(["report", tmp_path, "--markdown"], str(path), capsys)
-    fails(["report", tmp_path], str(path), capsys)
+    words = "bench --suite small-v1 --policies afr --backend sequential"
+    assert "drop-oldest" in shown(words.split(), capsys) and not list(tmp_path.iterdir())

@@ -28,22 +28,16 @@ STOPS = replace(GAPPY, traces=(Trace.steps([(2.0, 300_000), (2.0, 20_000)], name
 
 
 @pytest.mark.parametrize("scenario", [GAPPY, STOPS, Interruption(t_max=30, value=qoi.saturating(4))])
-@pytest.mark.parametrize("seed", [0, 1003])
-def test_every_message_is_accounted_for_as_in_the_rows(scenario: Any, seed: int) -> None:
-    rows = run.run(CHOSEN, scenario, [3], [seed], label="here")
+def test_every_message_is_accounted_for_as_in_the_rows(scenario: Any) -> None:
+    rows = run.run(CHOSEN, scenario, [3], [1003], label="here")
     made = timeline(CHOSEN, scenario, rows[0])
     assert json.loads(json.dumps(made, allow_nan=False)) == made
-    assert {key: made[key] for key in ("scenario", "capacity", "seed")} == {
-        "scenario": "here",
-        "capacity": 3,
-        "seed": seed,
-    }
+    assert (made["scenario"], made["capacity"], made["seed"]) == ("here", 3, 1003)
     assert list(made["policies"]) == [policy.name for policy in CHOSEN]
     messages = len(made["arrival_s"])
     for row in rows:
         lane = made["policies"][row["policy"]]
-        received = [k for k, _, _ in lane["received"]]
-        dropped = [k for k, _ in lane["dropped"]]
+        received, dropped = [k for k, _, _ in lane["received"]], [k for k, _ in lane["dropped"]]
         assert not set(received) & set(dropped)
         assert len(set(received)) == len(received) == row["delivered"] and len(dropped) == row["dropped"]
         left = messages - len(received) - len(dropped)
@@ -56,11 +50,7 @@ def test_every_message_is_accounted_for_as_in_the_rows(scenario: Any, seed: int)
         assert lane["qoi"] == pytest.approx(1 + gains if x else 0.0)
         assert all(made["arrival_s"][k] <= dequeued <= transmitted for k, dequeued, transmitted in lane["received"])
         assert all(made["arrival_s"][k] <= when for k, when in lane["dropped"])
-
-
-def test_something_is_left_where_the_link_stops() -> None:
-    rows = run.run(CHOSEN, STOPS, [3], [0])
-    assert any(row["in_transmission"] and row["buffered"] for row in rows)
+    assert scenario is not STOPS or any(row["in_transmission"] and row["buffered"] for row in rows)
 
 
 def test_the_drawn_capacity_carries_the_messages() -> None:
@@ -79,24 +69,9 @@ def test_the_drawn_capacity_carries_the_messages() -> None:
 
 
 def test_the_episode_shown_is_the_one_that_costs_drop_oldest_most_at_the_middle_capacity() -> None:
-    def row(policy: str, capacity: int, seed: int, regret: float | None) -> dict[str, Any]:
-        return {
-            "policy": policy,
-            "capacity": capacity,
-            "seed": seed,
-            "regret": regret,
-            "scenario": "s",
-            "trace": "t",
-        }
-
-    rows = [
-        row("drop-oldest", 2, 0, 0.9),
-        row("drop-oldest", 4, 0, 0.2),
-        row("drop-oldest", 4, 1, 0.3),
-        row("drop-oldest", 4, 2, None),
-        row("afr", 4, 3, 0.8),
-        row("drop-oldest", 8, 0, 0.7),
-    ]
-    assert choose(rows) == rows[2]
-    assert choose(list(reversed(rows))) == rows[2]
-    assert choose([row("drop-oldest", 4, 2, None)]) is None
+    given = [("drop-oldest", 2, 0, 0.9), ("drop-oldest", 4, 0, 0.2), ("drop-oldest", 4, 1, 0.3)]
+    given += [("drop-oldest", 4, 2, None), ("afr", 4, 3, 0.8), ("drop-oldest", 8, 0, 0.7)]
+    names = ("policy", "capacity", "seed", "regret")
+    rows = [dict(zip(names, cells, strict=True), scenario="s", trace="t") for cells in given]
+    assert choose(rows) == choose(rows[::-1]) == rows[2]
+    assert choose(rows[3:4]) is None

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
-from summary_cases import exactly
+from sweep_cases import exactly
 
 from bufgym import policies
-from bufgym.benchmark.rows import Row, read_rows, write_rows
+from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
 from bufgym.benchmark.summary import Summary, plain
 from bufgym.benchmark.sweep import Sweep
@@ -115,24 +114,6 @@ def test_every_policy_and_capacity_meets_the_same_episodes() -> None:
     ]
 
 
-def test_many_seeds_run_in_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = run([policies.get("fifo")], replace(CLIENT, random_offset=True), [4], 5)
-    monkeypatch.setattr("bufgym.benchmark.run._BATCH_MESSAGES", 12)
-    assert repr(run([policies.get("fifo")], replace(CLIENT, random_offset=True), [4], 5)) == repr(whole)
-
-
-@pytest.mark.parametrize("ending", ["csv", "parquet"])
-def test_rows_come_back_to_the_last_bit(tmp_path: Path, ending: str) -> None:
-    if ending == "parquet":
-        pytest.importorskip("pyarrow")
-    # Under L = 2 with two consumers some counts are no whole numbers, and maps have no deadline.
-    rows = run([policies.get(name) for name in ("ros-native", "fifo")], replace(CLIENT, consumers=2), [2], 1)
-    assert any(row["delivered"] % 1 for row in rows)
-    path = write_rows(rows, tmp_path / f"rows.{ending}", ROWS)
-    assert [repr(row) for row in read_rows(path, ROWS)] == [repr(row) for row in rows]
-    assert read_rows(write_rows([], path, ROWS), ROWS) == []
-
-
 def test_a_suites_episodes_are_its_own() -> None:
     sweep = Sweep("topics-v1", (), "validation", seeds=2, changes={"window": 5}).checked()
     labels = ("scarce", "scarce-window-5", "half", "half-window-5", "ample", "ample-window-5")
@@ -141,20 +122,6 @@ def test_a_suites_episodes_are_its_own() -> None:
     assert {(client.window, len(client.traces)) for client in clients} == {(5, 1)}
     # No two traces of a scenario share a draw.
     assert [shard.seeds for shard in sweep.shards() if shard.label == "half"][:2] == [(0, 1), (1000, 1001)]
-
-
-def test_who_runs_by_default() -> None:
-    names = TASK.default_policies("topics-v1")
-    assert {"robofleet", "robofleet-released", "ros-native", "rosbridge", "drop-oldest", "fifo", "edf"} <= set(names)
-    assert "afr" not in names and len(set(names)) == len(names)
-
-
-def test_a_policy_that_plans_for_one_queue_is_refused() -> None:
-    with pytest.raises(BufgymError, match="policy clairvoyant: it plans with a queue of its own"):
-        run([policies.get("fifo"), policies.get("clairvoyant")], CLIENT, [4], 1)
-
-
-# -------------------- the summary
 
 
 def made(policy: str, seed: int, weighted_qoi: float, scenario: str = "s", **first: Any) -> list[Row]:

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli_cases import fails, shown
 
 from bufgym import policies
 from bufgym.benchmark import tune, tuned
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tune import Choice
-from bufgym.cli import tune as tune_command
-from bufgym.cli.options import Parser
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, suites
@@ -48,15 +47,9 @@ def splits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str
 default_policies = TASKS["queue"].default_policies
 
 
-def cli(*words: str) -> None:
-    """``bufgym tune ...``."""
-    parser = Parser(prog="bufgym")
-    tune_command.add(parser.add_subparsers(required=True))
-    options = parser.parse_args(["tune", *words])
-    options.command(options)
-
-
-# --- the search ------------------------------------------------------------------------------------------------------
+def cli(words: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """``bufgym tune ... --jobs 1``"""
+    return shown(["tune", *words.split(), "--jobs", 1], capsys)
 
 
 def test_the_best_setting_of_a_suite_worked_out_by_hand(splits: list[str]) -> None:
@@ -72,14 +65,11 @@ def test_the_best_setting_of_a_suite_worked_out_by_hand(splits: list[str]) -> No
     assert set(splits) == {"validation"}
 
 
-def test_a_default_that_is_best_is_kept() -> None:
+def test_the_default_is_kept_where_it_is_best_and_on_ties() -> None:
+    """T = 12 at 30 Hz is over after 0.4 s: lifespans of 0.5 s (the default) and more are one and the same."""
     (choice,) = tune.tune("tiny-nine", ["decimate"], jobs=1)
     assert choice.default.score.value == pytest.approx(1)
     assert choice.chosen is choice.best is choice.default
-
-
-def test_the_default_is_kept_on_ties() -> None:
-    """T = 12 at 30 Hz is over after 0.4 s: lifespans of 0.5 s (the default) and more are one and the same."""
     (choice,) = tune.tune("tiny-twelve", ["lifespan"], jobs=1)
     same = [tried for tried in choice.tried if tried.score.value == pytest.approx(choice.default.score.value)]
     assert {tried.spec for tried in same} >= {"lifespan", "lifespan:lifespan_s=1", "lifespan:lifespan_s=20"}
@@ -111,21 +101,14 @@ def test_what_cannot_be_tuned(suite: str, names: list[str], more: dict[str, Any]
 
 
 def test_every_built_in_policy_with_parameters_is_tuned_or_says_why_not() -> None:
+    """A grid begins with the default and repeats nothing."""
     built_in = [policies.get(name) for name in policies.names()]
     with_parameters = {p.name for p in built_in if p.parameters and p.on_arrival.__module__.startswith("bufgym.")}
-    assert with_parameters == set(tune.GRIDS) | set(tune.FIXED)
-    assert not set(tune.GRIDS) & set(tune.FIXED)
-
-
-@pytest.mark.parametrize("name", tune.GRIDS)
-def test_a_grid_begins_with_the_default_and_repeats_nothing(name: str) -> None:
-    specs = tune.settings(name)
-    assert specs[0] == name
-    parameters = [tuple(policies.get(spec).parameters.items()) for spec in specs]
-    assert len(set(parameters)) == len(specs) > 1
-
-
-# --- the comparison, on rows made by hand ----------------------------------------------------------------------------
+    assert with_parameters == set(tune.GRIDS) ^ set(tune.FIXED)
+    for name in tune.GRIDS:
+        specs = tune.settings(name)
+        parameters = {tuple(policies.get(spec).parameters.items()) for spec in specs}
+        assert specs[0] == name and len(parameters) == len(specs) > 1
 
 
 def compared(base: Sequence[float], default: Sequence[float], other: Sequence[float], best: float) -> Choice:
@@ -158,42 +141,26 @@ def test_a_gain_that_may_be_chance_is_none() -> None:
 def test_where_no_cell_is_discriminative_regrets_are_compared() -> None:
     """Drop Oldest loses 0.5 %: no scores. Of 200, the default gets 180 and the other setting 190."""
     choice = compared([199, 199], [180, 180], [190, 190], 200)
-    assert math.isnan(choice.best.score.value)
+    assert math.isnan(choice.best.score.value) and choice.chosen.spec == "p:a=1"
     assert [tried.regret.value for tried in choice.tried] == pytest.approx([0.1, 0.05])
-    assert choice.chosen.spec == "p:a=1"
     assert choice.chosen.gain == pytest.approx((0.05, 0.05, 0.05))
     assert compared([199, 199], [190, 190], [180, 180], 200).chosen.spec == "p"
 
 
-# --- what was found --------------------------------------------------------------------------------------------------
-
-
 def test_the_command_writes_what_bench_then_reads(capsys: pytest.CaptureFixture[str]) -> None:
-    cli("tiny-twelve", "--policies", "decimate,lifespan", "--jobs", "1", "--seeds", "3", "--write")
-    shown = capsys.readouterr().out
-    assert "best, chosen" in shown and "default, best, chosen" in shown
+    text = cli("tiny-twelve --policies decimate,lifespan --seeds 3", capsys)
+    assert "best, chosen" in text and "default, best, chosen" in text and not tuned.FILE.exists()
+    fails(["tune", "tiny-twelve", "--split", "test", "--write"], "never chosen on test episodes", capsys)
+    assert not tuned.FILE.exists()
+    cli("tiny-twelve --policies decimate,lifespan --seeds 3 --write", capsys)
     entry = tuned.read()["tiny-twelve"]["decimate"]
-    assert entry["setting"] == "decimate:every=4"
+    assert entry["setting"] == "decimate:every=4" and entry["split"] == "validation"
     assert entry["score"] == pytest.approx(1) and entry["score"] > entry["default_score"]
-    assert entry["split"] == "validation"
     assert entry["command"] == "bufgym tune tiny-twelve --policies decimate,lifespan --seeds 3 --write"
-    assert tuned.tuned("tiny-twelve") == ["decimate:every=4"]  # lifespan stays at its default
+    # A second suite leaves the first alone; lifespan stays at its default.
+    cli("tiny-nine --policies decimate --write", capsys)
+    assert [tuned.tuned(name) for name in (*LENGTHS, "lte-v1")] == [["decimate:every=4"], [], []]
     assert default_policies("tiny-twelve") == [*policies.names(for_topics=False), "decimate:every=4"]
-
-
-def test_a_second_suite_leaves_the_first_alone() -> None:
-    cli("tiny-twelve", "--policies", "decimate", "--jobs", "1", "--write")
-    cli("tiny-nine", "--policies", "decimate", "--jobs", "1", "--write")
-    assert [tuned.tuned(name) for name in LENGTHS] == [["decimate:every=4"], []]
-    assert tuned.tuned("lte-v1") == []
-
-
-def test_nothing_is_written_unasked() -> None:
-    cli("tiny-twelve", "--policies", "decimate", "--jobs", "1")
-    assert not tuned.FILE.exists()
-    with pytest.raises(BufgymError, match="never chosen on test episodes"):
-        cli("tiny-twelve", "--split", "test", "--write")
-    assert not tuned.FILE.exists()
 
 
 @pytest.mark.parametrize(
@@ -218,14 +185,12 @@ def test_a_broken_file_is_named(text: bytes, message: str) -> None:
 def test_what_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tuned, "FILE", Path(tuned.__file__).with_name("tuned.json"))
     shipped = tuned.read()
-    assert shipped
+    assert shipped and set(shipped) <= set(suites.SUITES)
     for suite, entries in shipped.items():
-        assert suite in suites.SUITES
         specs = default_policies(suite)
         assert len(set(specs)) == len(specs)
         for policy, entry in entries.items():
-            assert entry["setting"] in tune.settings(policy)
-            assert entry["split"] == "validation"
+            assert entry["setting"] in tune.settings(policy) and entry["split"] == "validation"
             assert entry["command"].startswith(f"bufgym tune {suite}") and entry["command"].endswith("--write")
             assert (entry["setting"] == policy) == (entry["setting"] not in tuned.tuned(suite))
     assert json.dumps(shipped, indent=1, sort_keys=True) + "\n" == tuned.FILE.read_text(encoding="utf-8")

@@ -13,19 +13,21 @@ import naive
 
 
 class Robot(naive.Sender):
-    """A sender whose message in transmission has so many bytes left; when they cross is the cell's affair."""
+    """A sender whose message in transmission has so many bytes ``left``; when they cross is the cell's affair."""
 
-    left = 0
+    def __init__(self, cell, policy, *limits):
+        super().__init__(cell, policy, *limits)
+        self.cell, self.left = cell, 0
 
-    def first_time(self, position):
-        return None
+    def dequeue(self, message, position):
+        if position is None and not self.cell.busy():
+            self.cell.position = max(self.cell.position, self.cell.reached(self.now))
+        self.cell.starts += 1
+        self.left = Fraction(message["bytes"])
+        super().dequeue(message, 0)
 
-    def take_head(self, now, position=0):
-        super().take_head(now, position)
-        self.left = Fraction(self.sending["bytes"]) if self.sending is not None else 0
-
-    def left_bytes(self, now):
-        return self.left if self.sending is not None else 0
+    def left_bytes(self):
+        return self.left if self.socket else 0
 
 
 class Cell:
@@ -33,40 +35,32 @@ class Cell:
 
     def __init__(self, link, policies, capacity, max_bytes=None, decide_at="arrival", whole=True):
         self.link, self.whole = link, whole
-        self.robots = [Robot(None, policy, capacity, max_bytes, decide_at) for policy in policies]
-        for robot in self.robots:
-            robot.link = robot
+        self.robots = [Robot(self, policy, capacity, max_bytes, decide_at) for policy in policies]
         self.position = Fraction(0)  # bytes of the link given out
         self.starts = 0
 
+    def first_time(self, position):
+        """No robot knows when its message will have crossed."""
+        return None
+
     def busy(self):
-        return [robot for robot in self.robots if robot.sending is not None]
+        return [robot for robot in self.robots if robot.socket]
 
     def run(self, messages):
         """``messages``: a list for each robot."""
-        arrivals = sorted((m["us"], i, m["seq"], m) for i, mine in enumerate(messages) for m in mine)
         before = None
-        for now, i, _, message in arrivals:
+        for now, i, _, message in sorted((m["us"], i, m["seq"], m) for i, mine in enumerate(messages) for m in mine):
             if now != before:
                 self.advance(now)
                 self.give_until(now)
-            before = now
-            robot = self.robots[i]
-            robot.settle(message, robot.decide_at == "arrival" or not robot.fits(robot.queue, message))
-            if robot.sending is None and robot.queue:
-                if not self.busy():
-                    self.position = max(self.position, self.reached(now))
-                self.start(robot, now)
+            before = self.robots[i].now = now
+            self.robots[i].arrive(message, True)
         self.advance(math.inf)
         return self
 
     def reached(self, now):
         exact = self.link.bytes_by(now)
         return Fraction(math.floor(exact)) if self.whole else exact
-
-    def start(self, robot, now):
-        self.starts += 1
-        robot.take_head(now)
 
     def advance(self, until):
         """All that finishes up to and including ``until`` leaves; successors start at the byte where it ended."""
@@ -80,17 +74,12 @@ class Cell:
             for robot in busy:
                 robot.left -= least
             for robot in [robot for robot in busy if robot.left == 0]:
-                seq = robot.sending["seq"]
-                robot.transmitted[seq] = now
-                robot.order.append(seq)
-                robot.sending = None
-                if robot.queue:
-                    self.start(robot, now)
+                robot.now = now
+                robot.crossed()
 
     def give_until(self, now):
         """Each busy robot gets its share of what the link has carried by now."""
-        busy = self.busy()
-        if busy:
+        if busy := self.busy():
             each = (self.reached(now) - self.position) / len(busy)
             if self.whole:
                 each = Fraction(math.floor(each))

@@ -17,7 +17,7 @@ class Pipe:
         self.rate = None
 
     def look(self, queue, sender, now):
-        own, passed = sum(m["bytes"] for m in queue) + sender.left_bytes(now), now - self.since
+        own, passed = sum(m["bytes"] for m in queue) + sender.left_bytes(), now - self.since
         if self.own > 0 and passed > 0 and own <= self.own:
             rate = (self.own - own) / passed
             if own > 0:
@@ -57,7 +57,7 @@ class ZenohDrop(DropNewest):
     def decide(self, queue, newcomer, L, last_dequeued, previous):
         ahead = self.pipe.look(queue, self.sender, newcomer["us"])
         size, put = newcomer["bytes"], 0
-        if not self.sender.fits(queue, newcomer):
+        if not self.sender.fits(newcomer):
             self.pipe.note(ahead, 0)
             return REJECT
         for deadline in self.deadlines():
@@ -78,7 +78,7 @@ class BestEffort(DropNewest):
     def decide(self, queue, newcomer, L, last_dequeued, previous):
         ahead = self.pipe.look(queue, self.sender, newcomer["us"])
         at_once = ahead + newcomer["bytes"] <= self.room
-        kept = newcomer["bytes"] if at_once and self.sender.fits(queue, newcomer) else 0
+        kept = newcomer["bytes"] if at_once and self.sender.fits(newcomer) else 0
         self.pipe.note(max(ahead, min(self.room, ahead + newcomer["bytes"])), kept)
         return ACCEPT if kept else REJECT
 
@@ -114,7 +114,7 @@ class FrameDropper(DropNewest):
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
         ahead = self.pipe.look(queue, self.sender, newcomer["us"])
-        keep = self.sender.fits(queue, newcomer)
+        keep = self.sender.fits(newcomer)
         if self.pipe.rate is not None:
             self.set_rates(self.pipe.rate)
             self.leak()

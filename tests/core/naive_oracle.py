@@ -7,6 +7,7 @@ import functools
 import math
 
 import naive
+from naive_sender import ACCEPT, REJECT, Rules, Sender
 
 
 class Link(naive.Link):
@@ -18,37 +19,29 @@ class Link(naive.Link):
         self.first_time = functools.cache(super().first_time)
 
 
-class Chosen(naive.Policy):
-    """Does as it is told, one decision ahead."""
-
-    decision = None
-
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
-        return self.decision
-
-
 def fork(sender):
     """A copy whose future does not touch this one's."""
     twin = copy.copy(sender)
     for name, held in vars(sender).items():
-        if isinstance(held, list | dict):
+        if isinstance(held, dict):
             setattr(twin, name, held.copy())
+        elif isinstance(held, list):
+            setattr(twin, name, [each.copy() if isinstance(each, list) else each for each in held])
     return twin
 
 
 def best(link, messages, capacity, v, max_bytes=None, decide_at="arrival", first_decision=0, last_decision=math.inf):
     """The highest H that any sequence of decisions reaches, each slot to evict, REJECT and ACCEPT tried at each."""
     x, known = [m["x"] for m in messages], {}
-    policy = Chosen()
 
     def options(sender, message):
-        fits = sender.fits(sender.queue, message)
+        fits = sender.fits(message)
         if message["bytes"] > sender.max_bytes:
-            return [naive.REJECT]
+            return [REJECT]
         asked = first_decision <= message["seq"] <= last_decision
         if not asked or (fits and decide_at == "overflow"):
-            return [naive.ACCEPT]
-        return [naive.REJECT, *([naive.ACCEPT] if fits else []), *range(len(sender.queue))]
+            return [ACCEPT]
+        return [REJECT, *([ACCEPT] if fits else []), *range(len(sender.queues[0]))]
 
     def added(before, after):
         """What the messages received since then have added to H."""
@@ -56,8 +49,8 @@ def best(link, messages, capacity, v, max_bytes=None, decide_at="arrival", first
 
     def from_here(sender, n):
         """The most that H can still grow once ``n`` messages have been decided on."""
-        state = (n, *(m["seq"] for m in sender.queue), None, sender.sending and sender.sending["seq"], sender.position)
-        state = (*state, sender.order[-1] if sender.order else None)
+        sending = [sent.message["seq"] for sent in sender.socket]
+        state = (n, *(m["seq"] for m in sender.queues[0]), None, *sending, sender.position, *sender.order[-1:])
         if state not in known:
             known[state] = decided(sender, n)
         return known[state]
@@ -70,19 +63,16 @@ def best(link, messages, capacity, v, max_bytes=None, decide_at="arrival", first
             return added(before, sender.order)
         message = messages[n]
         sender.advance(message["us"])
-        most = -math.inf
+        sender.now, most = message["us"], -math.inf
         for decision in options(sender, message):
-            after, policy.decision = fork(sender), decision
-            if not after.carry_out(decision, message):
-                most = max(most, from_here(after, n))
-                continue
-            after.previous = message
-            if after.sending is None and after.queue:
-                after.take_head(message["us"], math.floor(link.bytes_by(message["us"])))
-            most = max(most, from_here(after, n + 1))
+            after = fork(sender)
+            settled = after.carry_out(decision, message)
+            if settled:
+                after.offer()
+            most = max(most, from_here(after, n + settled))
         return added(before, sender.order) + most
 
-    return from_here(naive.Sender(link, policy, capacity, max_bytes, decide_at), 0)
+    return from_here(Sender(link, Rules(None), capacity, max_bytes=max_bytes, decide_at=decide_at), 0)
 
 
 def best_by_bytes(c, size, limit, x, v, ends):

@@ -35,7 +35,7 @@ class Reservoir(Policy):
         again, s = self.sender.evictions > 0, len(queue)
         if not again:
             self.n = max(self.n, s) + 1  # what came unasked is all there
-        if self.sender.fits(queue, newcomer):
+        if self.sender.fits(newcomer):
             return ACCEPT
         return one_of([*range(s), *[REJECT] * (0 if again else self.n - s)], uniform_of(newcomer, self.sender))
 
@@ -53,7 +53,7 @@ class Decimate(Policy):
             self.n += 1
             if self.n not in range(1, self.n + 1, 3):
                 return REJECT
-        return ACCEPT if self.sender.fits(queue, newcomer) else 0
+        return ACCEPT if self.sender.fits(newcomer) else 0
 
 
 class Afr(Policy):
@@ -88,7 +88,7 @@ class Afr(Policy):
             if self.c < self.gap():
                 return REJECT
             self.c = math.fmod(self.c - self.gap(), 1)
-        if self.sender.fits(queue, newcomer):
+        if self.sender.fits(newcomer):
             return ACCEPT
         self.end_pass(queue)
         victim = self.p
@@ -146,7 +146,7 @@ class LinearAlpha(Afr):
         return float(self.r) ** a * float(L) ** (1 - a) * (float(L + self.p + 1) ** a - float(L + self.p) ** a)
 
     def count(self, queue, newcomer):
-        if self.r == 1 and self.sender.fits(queue, newcomer):
+        if self.r == 1 and self.sender.fits(newcomer):
             self.c = 0
             return ACCEPT
         return super().count(queue, newcomer)
@@ -205,7 +205,7 @@ class Steady(Policy):
             return REJECT
         if place in places:
             return places.index(place)
-        return ACCEPT if self.sender.fits(queue, newcomer) else 0
+        return ACCEPT if self.sender.fits(newcomer) else 0
 
 
 class GreedyQoi(Policy):
@@ -233,7 +233,7 @@ class OldestThatHelps(Policy):
         self.depth = depth
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        return ACCEPT if len(queue) < self.depth and self.sender.fits(queue, newcomer) else 0
+        return ACCEPT if len(queue) < self.depth and self.sender.fits(newcomer) else 0
 
 
 class Anything(Policy):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-ACCEPT, REJECT = "accept", "reject"
+from naive_sender import ACCEPT, REJECT
 
 
 class Policy:
@@ -13,7 +13,7 @@ class Policy:
     sender = None  # whose policy it is
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        if self.sender.fits(queue, newcomer):
+        if self.sender.fits(newcomer):
             return ACCEPT
         return self.full(queue, newcomer, len(queue), last_dequeued, previous)
 
@@ -67,7 +67,7 @@ class KeepLast(Policy):
         self.depth = depth
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        return 0 if len(queue) >= self.depth or not self.sender.fits(queue, newcomer) else ACCEPT
+        return 0 if len(queue) >= self.depth or not self.sender.fits(newcomer) else ACCEPT
 
 
 class Lifespan(KeepLast):
@@ -102,8 +102,8 @@ class FoxgloveBacklog(Policy):
         self.limit = limit_mb * 1e6
 
     def decide(self, queue, newcomer, L, last_dequeued, previous):
-        waiting = sum(m["bytes"] for m in queue) + self.sender.left_bytes(newcomer["us"])
-        if waiting + newcomer["bytes"] >= self.limit or not self.sender.fits(queue, newcomer):
+        waiting = sum(m["bytes"] for m in queue) + self.sender.left_bytes()
+        if waiting + newcomer["bytes"] >= self.limit or not self.sender.fits(newcomer):
             return REJECT
         return ACCEPT
 
@@ -187,4 +187,4 @@ class Red(Policy):
             return REJECT
         else:
             self.count = -1
-        return ACCEPT if self.sender.fits(queue, newcomer) else REJECT
+        return ACCEPT if self.sender.fits(newcomer) else REJECT

@@ -8,7 +8,7 @@ import naive_oracle
 import numpy as np
 import pytest
 from cases import VALUES, Case, cases, trace, traces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym import policies, scenario
@@ -22,13 +22,9 @@ from bufgym.scenario import Episode, Interruption, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 
+kernels = pytest.mark.kernels
 V = qoi.exponential(0.5)
 EXACT = 1e-9
-
-
-def tries(compiled: int, uncompiled: int) -> settings:
-    """So many examples: one of them costs from a millisecond to a second."""
-    return settings(max_examples=compiled if JIT else uncompiled)
 
 
 def line(times, *, sizes=10, x=None, knots=((0, 0), (1_000, 1_000)), after="loop", **decisions) -> Episode:
@@ -37,9 +33,7 @@ def line(times, *, sizes=10, x=None, knots=((0, 0), (1_000, 1_000)), after="loop
     return Episode(messages(np.array(times), np.asarray(sizes), x), Link(trace(list(knots), after)), **decisions)
 
 
-# --- by hand ---------------------------------------------------------------------------------------------------------
-
-
+@kernels
 def test_by_hand():
     # L = 1. Message 0 crosses until 10. Of 1, 2 and 3, which arrive meanwhile, one can wait; the others are lost.
     plan = clairvoyant(line([0, 1, 2, 3]), 1, V)
@@ -51,6 +45,7 @@ def test_by_hand():
     assert clairvoyant(line([0, 1, 2, 3]), 2, V).qoi == 2.25
 
 
+@kernels
 def test_it_gives_up_the_first_message_for_better_ones():
     # The link rests until 100. What it took at 0 cannot be dropped any more, unless it was never accepted: x = 0 and
     # x = 0 are the same picture, so the clairvoyant sends the second of them or neither is missed.
@@ -62,12 +57,10 @@ def test_it_gives_up_the_first_message_for_better_ones():
     assert clairvoyant(episode, 2, V).qoi == 1 + V(5)
 
 
-def test_one_message():
+@kernels
+def test_one_message_and_nothing_that_can_be_delivered():
     plan = clairvoyant(line([0]), 1, V)
     assert (plan.qoi, plan.kept.tolist(), plan.certified) == (1.0, [True], True)
-
-
-def test_nothing_can_be_delivered():
     stopped = clairvoyant(line([0, 5, 9], knots=((0, 0), (100, 9)), after="stop"), 3, V)
     assert (stopped.qoi, stopped.kept.any()) == (0.0, False)
     # Nor ever, where every message is larger than B.
@@ -76,6 +69,7 @@ def test_nothing_can_be_delivered():
     assert clairvoyant(line([0, 5, 9], sizes=[10, 20, 30]), 3, V, max_bytes=9).qoi == 0.0
 
 
+@kernels
 def test_a_message_larger_than_the_buffer_takes_nobodys_place():
     # B = 50 has no room for message 1. So nothing comes between 0 and 2: 1 + V(2).
     plan = clairvoyant(line([0, 20, 1_000], sizes=[10, 100, 10]), 2, V, max_bytes=50)
@@ -89,9 +83,6 @@ def test_a_message_larger_than_the_buffer_takes_nobodys_place():
 def test_errors(capacity, max_bytes, message):
     with pytest.raises(BufgymError, match=message):
         clairvoyant(line([0]), capacity, V, max_bytes=max_bytes)
-
-
-# --- against every sequence of decisions -----------------------------------------------------------------------------
 
 
 @st.composite
@@ -137,7 +128,7 @@ def played(case: Case, v: qoi.Value) -> float:
     return outcome(case.run(policies.get("clairvoyant"), v), 0).qoi
 
 
-@tries(500, 30)
+@kernels
 @given(small(equal=True), VALUES)
 def test_is_the_best_of_all_decisions(case, v):
     plan = plan_of(case, v)
@@ -146,7 +137,7 @@ def test_is_the_best_of_all_decisions(case, v):
     assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
 
 
-@tries(400, 20)
+@kernels
 @given(small(equal=False), VALUES)
 def test_is_an_upper_bound_where_sizes_differ(case, v):
     plan, best = plan_of(case, v), best_of_all(case, v)
@@ -156,6 +147,7 @@ def test_is_an_upper_bound_where_sizes_differ(case, v):
         assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
 
 
+@kernels
 def test_where_nothing_need_be_dropped_all_is_sent_at_once():
     """A few small messages on a link of gigabytes: no grid over its bytes is laid out."""
     fast = ((0, 0), (300_000_000, 3_000_000_000))
@@ -168,6 +160,7 @@ def test_where_nothing_need_be_dropped_all_is_sent_at_once():
     assert clairvoyant(stopped, 3, V).kept.sum() == 2
 
 
+@kernels
 def test_unequal_sizes_by_hand():
     """L = 1, messages of 10, 30 and 10 us at 0, 5 and 6: of the two that wait only one has room, and the small one
     lets the fourth, at 25, find an idle link."""
@@ -177,7 +170,7 @@ def test_unequal_sizes_by_hand():
     assert plan.qoi == pytest.approx(V.information(np.array([0.0, 2.0, 3.0])), abs=EXACT)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("L", "limits"), [(5, {}), (15, {}), (15, {"max_bytes": 3_000_000})])
 def test_with_unequal_sizes_the_plan_comes_close_to_the_bound(L, limits):
     """Log-normal sizes on fading links, over frame indices and over motion: the plan keeps to its room, and reaches the
@@ -195,7 +188,7 @@ def test_with_unequal_sizes_the_plan_comes_close_to_the_bound(L, limits):
             assert max(outcome(run(rival, [episode], L, lte.value, **limits), 0).qoi for rival in rivals) <= result.qoi
 
 
-@tries(300, 15)
+@kernels
 @given(st.booleans().flatmap(lambda equal: small(equal, windows=True)), VALUES)
 def test_is_an_upper_bound_where_not_every_arrival_asks(case, v):
     plan, best = plan_of(case, v), best_of_all(case, v)
@@ -205,99 +198,40 @@ def test_is_an_upper_bound_where_not_every_arrival_asks(case, v):
         assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
 
 
-# --- against the interruption's own truth ----------------------------------------------------------------------------
-
-LENGTHS = (1, 2, 3, 8, 9, 17, 18, 36, 71, 120) if JIT else (1, 2, 9, 17)
-INTERRUPTION = Interruption(t_max=max(LENGTHS))
-
-
-@tries(30, 2)
-@given(VALUES)
-def test_is_the_best_integer_solution_of_an_interruption(v):
-    for T in LENGTHS:
-        for L in (1, 2, 3, 5, 8, 13):
-            plan = clairvoyant(INTERRUPTION.episode(T), L, v)
-            assert plan.qoi - 1 == pytest.approx(integer(L, T, v), abs=EXACT), (L, T)
-            assert plan.certified
+@kernels
+@given(VALUES, st.integers(1, 60), st.integers(1, 13))
+def test_is_the_best_integer_solution_of_an_interruption(v, T, L):
+    plan = clairvoyant(Interruption(t_max=T).episode(T), L, v)
+    assert plan.qoi - 1 == pytest.approx(integer(L, T, v), abs=EXACT) and plan.certified
 
 
-# --- against the policies --------------------------------------------------------------------------------------------
-
-
-def no_policy_beats(episodes: list[Episode], L: int, v: qoi.Value, **limits) -> None:
-    byte_limit = {key: limits[key] for key in limits if key == "max_bytes"}
-    bounds: dict[int | None, list[float]] = {L: [clairvoyant(episode, L, v, **byte_limit).qoi for episode in episodes]}
-    for name in policies.names():
-        policy = policies.get(name)
+def no_policy_beats(names, episodes: list[Episode], L: int, v: qoi.Value, **limits) -> None:
+    for policy in map(policies.get, names):
         senders = run(policy, episodes, L, v, **limits)
-        if policy.unbounded and None not in bounds:
-            bounds[None] = [clairvoyant(e, senders.capacity, v).qoi for e in episodes]
-        for i, bound in enumerate(bounds[None if policy.unbounded else L]):
-            assert outcome(senders, i).qoi <= bound + EXACT, name
+        bytes_limit = None if policy.unbounded else limits.get("max_bytes")
+        for i, episode in enumerate(episodes):
+            bound = clairvoyant(episode, senders.capacity if policy.unbounded else L, v, max_bytes=bytes_limit).qoi
+            assert outcome(senders, i).qoi <= bound + EXACT, policy.name
 
 
-def drop_half(buffer, memory):
-    """Drops every second head before the socket takes it."""
-    memory[0] += 1
-    return memory[0] % 2 == 0
+@given(cases(max_messages=25), VALUES, st.lists(st.sampled_from(list(policies.names())), min_size=4, max_size=4))
+def test_no_policy_beats_it(case, v, names):
+    no_policy_beats(names, [case.episode], case.capacity, v, max_bytes=case.max_bytes, decide_at=case.decide_at)
 
 
-def drop_oldest(buffer, arrival, memory):
-    return -2 if len(buffer.slots) < buffer.capacity else 0
-
-
-@tries(80, 3)
-@given(cases(), VALUES)
-def test_no_policy_beats_it(case, v):
-    no_policy_beats([case.episode], case.capacity, v, max_bytes=case.max_bytes, decide_at=case.decide_at)
-    halving = policies.Policy("test-halving", drop_oldest, on_dequeue=drop_half, memory={"heads": 0.0}, compile=True)
-    assert outcome(case.run(halving, v), 0).qoi <= plan_of(case, v).qoi + EXACT
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("cv", [0.0, 0.4])
 def test_no_policy_beats_it_over_lte(cv):
     lte = scenario.get("lte", duration_s=8.0, size_bytes=500_000, size_cv=cv)
-    streams = scenario.Streams.seeded(7)
-    episodes = [lte.draw(streams).with_uniforms(streams.policy) for _ in range(4)]
+    episodes = [draw(lte, seed) for seed in range(4)]
     plans = [clairvoyant(episode, 8, lte.value) for episode in episodes]
     # The link is too slow for all, so that there is something to decide.
     assert any(not plan.kept.all() for plan in plans)
     assert all(plan.certified for plan in plans) or cv > 0
-    no_policy_beats(episodes, 8, lte.value)
+    no_policy_beats(policies.names(), episodes, 8, lte.value)
 
 
-# --- how it depends on the link and the buffer -----------------------------------------------------------------------
-
-
-def equal_sizes(case: Case) -> Case:
-    arrivals = case.episode.arrivals.copy()
-    arrivals["size_bytes"] = 1_500
-    return replace(case, episode=replace(case.episode, arrivals=arrivals))
-
-
-@given(cases(), VALUES)
-def test_more_room_is_never_worse(case, v):
-    case = equal_sizes(case)
-    by_capacity = [clairvoyant(case.episode, L, v, max_bytes=case.max_bytes).qoi for L in (1, 2, 3, 5, 8, 40)]
-    assert (np.diff(by_capacity) >= -EXACT).all()
-
-
-@given(cases(), VALUES, st.integers(2, 4))
-def test_a_faster_link_is_never_worse(case, v, scale):
-    # The bytes that wait before a message never grow when the link carries more between any two arrivals, so what
-    # found room finds it still. (floor(k C) grows by at least as much as floor(C), for whole k.)
-    case = equal_sizes(case)
-    link = case.episode.link
-    faster = trace([(us, scale * carried) for us, carried in case.knots], link.trace.after)
-    quick = replace(case.episode, link=replace(link, trace=faster))
-    assert clairvoyant(quick, case.capacity, v).qoi >= clairvoyant(case.episode, case.capacity, v).qoi - EXACT
-
-
-# --- the dynamic programme itself ------------------------------------------------------------------------------------
-
-
-@tries(1_000, 60)
+@kernels
 @given(st.integers(0, 2**32), st.booleans(), VALUES)
 def test_it_is_exact_to_the_byte(seed, equal, v):
     rng = np.random.default_rng(seed)
@@ -334,30 +268,28 @@ def without_bounds(c, size, limit, x, v, ends) -> float:
     return labels.plan_of(labels.fill(p, -np.inf, labels.no_labels(len(c))))[1]
 
 
-MIDDLING = range(24) if JIT else range(2)
-
-
+@kernels
 @pytest.mark.parametrize("grid", [1, 16, 400])
 def test_bounds_lose_nothing(grid, monkeypatch):
     monkeypatch.setattr(labels, "GRID", grid)
-    for seed in MIDDLING:
+    for seed in range(12 if JIT else 2):
         problem = middling(seed, 60 + 6 * seed if JIT else 25)
         assert labels.best(*problem)[1] == pytest.approx(without_bounds(*problem), abs=EXACT), seed
 
 
+@kernels
 def test_a_coarse_grid_loses_nothing(monkeypatch):
-    problems = [middling(seed, 60 if JIT else 20) for seed in MIDDLING]
+    problems = [middling(seed, 60 if JIT else 20) for seed in range(12 if JIT else 2)]
     fine = [labels.best(*problem)[1] for problem in problems]
     monkeypatch.setattr(programme, "MAX_CELLS", 64)
     assert [labels.best(*problem)[1] for problem in problems] == pytest.approx(fine, abs=EXACT)
 
 
+@kernels
 def test_labels_get_more_room_when_they_need_it(monkeypatch):
-    problem = middling(1, 100 if JIT else 25)
+    problem = middling(1, 25)
     plan, gain = labels.best(*problem)
     monkeypatch.setattr(labels, "LABELS", 4)
     again, same = labels.best(*problem)
-    assert same == gain
-    assert again.tolist() == plan.tolist()
-    # Four labels were too few indeed.
-    assert len(plan) > 4
+    assert same == gain and again.tolist() == plan.tolist()
+    assert len(plan) > 4  # four labels were too few indeed

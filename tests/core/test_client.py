@@ -27,9 +27,6 @@ def client(*streams: Stream, **parameters: Any) -> Client:
     return Client(streams or (Stream(Topic("a"), 2, 100),), **{"traces": (LINK,), "duration_s": 2.0, **parameters})
 
 
-# -------------------- what it draws
-
-
 def test_streams_are_merged_in_order_of_time() -> None:
     """Every 0.5 s an "a", every second a "b"; of one moment the first topic comes first."""
     two = client(
@@ -43,6 +40,8 @@ def test_streams_are_merged_in_order_of_time() -> None:
     assert got["x"].tolist() == [0, 0, 1, 2, 1, 3]  # in periods of the own rate
     assert got["seq"].tolist() == list(range(6))
     assert (episode.window, episode.ack_delay_us, episode.link.propagation_us) == (3, 40_000, 20_000)
+    assert client(propagation_us=7).ack_delay_us == 14
+    assert client(propagation_us=7, round_trip_us=0).draw(Streams.seeded(0)).ack_delay_us == 0
 
 
 def test_where_there_is_a_rate_limit_x_counts_its_periods() -> None:
@@ -87,14 +86,12 @@ def test_draws_are_well_formed(rates: list[float], jitter: float, cv: float, ran
         own = got[got["topic"] == k]
         assert len(own) == max(1, round(hz * 3))
         assert own["x"][0] == 0 and (np.diff(own["x"]) >= 0).all()
-    again = drawing.draw(Streams.seeded(seed)).arrivals
-    assert again.tobytes() == got.tobytes()
-
-
-def test_sizes_have_the_mean_and_the_spread_asked_for() -> None:
-    sizes = client(Stream(Topic("a"), 1000, 10_000, size_cv=0.5), duration_s=50.0).draw(Streams.seeded(1)).arrivals
-    assert sizes["size_bytes"].mean() == pytest.approx(10_000, rel=0.02)
-    assert sizes["size_bytes"].std() == pytest.approx(5_000, rel=0.05)
+    again, faster = (
+        drawing.draw(Streams.seeded(seed)),
+        client(scale=2.0, random_offset=random_offset).draw(Streams.seeded(seed)),
+    )
+    assert again.arrivals.tobytes() == got.tobytes()
+    assert again.link.offset_us == faster.link.offset_us  # links and arrivals have chances of their own
 
 
 def test_other_encodings_keep_each_messages_share() -> None:
@@ -110,27 +107,6 @@ def test_other_encodings_keep_each_messages_share() -> None:
     assert tiny.encodings["ros"].min() == 1
 
 
-def test_links_and_arrivals_have_chances_of_their_own() -> None:
-    one = client(scale=2.0).draw(Streams.seeded(3))
-    other = client(Stream(Topic("z"), 9, 9), scale=2.0).draw(Streams.seeded(3))
-    assert one.link.offset_us == other.link.offset_us > 0
-    assert one.link.trace.cumulative_bytes[-1] == 2 * LINK.cumulative_bytes[-1]
-
-
-def test_a_round_trip_of_its_own() -> None:
-    assert client(propagation_us=7).ack_delay_us == 14
-    assert client(propagation_us=7, round_trip_us=0).draw(Streams.seeded(0)).ack_delay_us == 0
-
-
-def test_the_scenario_topics_is_the_example() -> None:
-    named = scenario.get("topics")
-    assert isinstance(named, Client) and named.streams == robofleet_example() and named.scale == 0.25
-    assert [topic.name for topic in named.topics if topic.no_drop] == ["subscriptions"]
-
-
-# -------------------- its file
-
-
 def test_the_example_file_is_robofleets_example() -> None:
     read = read_client(EXAMPLE, **WORLD)
     assert read.streams == robofleet_example()
@@ -138,6 +114,8 @@ def test_the_example_file_is_robofleets_example() -> None:
         # Values compare by name; to the last bit they are the same too.
         assert ours.value is not None and theirs.topic.value is not None
         assert ours.value.array.tolist() == theirs.topic.value.array.tolist()
+    named = scenario.get("topics")
+    assert isinstance(named, Client) and named.streams == robofleet_example() and named.scale == 0.25
     default = Client(robofleet_example(), **WORLD)
     for name in ("window", "propagation_us", "ack_delay_us", "consumers", "duration_s", "value", "scale"):
         assert getattr(read, name) == getattr(default, name), name
@@ -147,14 +125,18 @@ A = '[[topic]]\nname = "a"\nrate_hz = 2\nsize_bytes = 100\n'
 """The least that a file can hold. (All rules for a topic: test_topics.py.)"""
 
 
-def read(tmp_path: Path, text: str, **parameters: Any) -> Client:
+def read(tmp_path: Path, text: str | bytes | None, **parameters: Any) -> Client:
     path = tmp_path / "client.toml"
-    path.write_text(text)
+    if text is not None:
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
     return read_client(path, **{"traces": (LINK,), **parameters})
 
 
 def test_the_least_file(tmp_path: Path) -> None:
     assert read(tmp_path, A) == Client((Stream(Topic("a"), 2, 100),), (LINK,))
+    without = read_client(EXAMPLE)  # it meets what is shipped
+    assert without.traces == tuple(traces.load(f"lte-synthetic-{k}") for k in range(8))
+    assert [motion.name for motion in without.motion] == ["drive-0", "drive-1"]
 
 
 def test_a_file_may_say_all_that_a_topic_takes(tmp_path: Path) -> None:
@@ -171,53 +153,35 @@ def test_a_file_may_say_all_that_a_topic_takes(tmp_path: Path) -> None:
     [
         (A + "priority = -1\n", "topic 'a': priority = -1: must be a number >= 0"),
         (A.replace("rate_hz = 2", "rate_hz = 0"), "topic 'a': rate_hz = 0: must be a number > 0"),
-        (A.replace("rate_hz = 2", "rate_hz = inf"), "topic 'a': rate_hz = inf: must be a number > 0"),
         (A.replace("rate_hz = 2", "rate_hz = 1e6"), "topic 'a': rate_hz = 1000000.0: must be at most 100000"),
         (A.replace("rate_hz = 2", ""), "topic 'a': rate_hz is missing"),
         (A.replace('name = "a"', ""), "name is missing"),
         (A.replace('"a"', "3"), "topic 3: a name must be a non-empty text"),
-        (A.replace("100", "0"), "topic 'a': size_bytes = 0: must be a number > 0"),
         (A.replace("100", "1.5"), "topic 'a': size_bytes = 1.5: must be a whole number"),
         (A + "jitter = 2\n", "topic 'a': jitter = 2: must lie between 0 and 1"),
-        (A + "size_cv = -1\n", "topic 'a': size_cv = -1: must lie between 0 and 10"),
         (A + 'value = "cubic:3"\n', "unknown kind 'cubic'"),
         (A + "encodings = { xml = 3 }\n", "topic 'a': unknown encoding 'xml'; known: ros, json"),
-        (A + "encodings = { json = 0 }\n", "topic 'a': bytes in json = 0: must be a number > 0"),
         (A + "encodings = 3\n", "topic 'a': encodings = 3: must be a table"),
         (A + "moves = true\n", "topic 'a': moves, but the client has no motion recording"),
         (A + "priorty = 2\n", "topic 'a': unknown key 'priorty'; known: .*priority"),
         (A + A, "topic 'a': two topics have this name"),
         (A.replace("[[topic]]", "[[topics]]"), "unknown key 'topics'; known: topic, consumers"),
         ("window = 0\n" + A, "window = 0: n_T must be a whole number from 1"),
-        ("window = 1.0\n" + A, r"window = 1\.0: n_T must be a whole number from 1"),
         ("consumers = 0\n" + A, "consumers = 0: must be a whole number >= 1"),
-        ("propagation_us = -1\n" + A, "propagation_us = -1: must be a whole number from 0 to"),
         ("round_trip_us = -1\n" + A, "round_trip_us = -1: must be a whole number from 0 to"),
         ('duration_s = "x"\n' + A, "duration_s = 'x': must be a number > 0"),
         ("duration_s = 1e7\n" + A, "20000000 messages in all: must lie between 1 and 10000000"),
         ("", r"needs at least one \[\[topic\]\]"),
-        ("topic = 3", r"needs at least one \[\[topic\]\]"),
         ("topic = [3]", r"topic = 3: must be a \[\[topic\]\] table"),
         ("window = \n", "line 1"),
+        (b"\xff\xfe", "must be UTF-8 text"),
+        (None, "no such file"),
     ],
 )
-def test_bad_files_are_one_line_that_names_the_file(tmp_path: Path, text: str, rule: str) -> None:
+def test_bad_files_are_one_line_that_names_the_file(tmp_path: Path, text: Any, rule: str) -> None:
     with pytest.raises(BufgymError, match=f"client.toml: .*{rule}") as caught:
         read(tmp_path, text)
     assert "\n" not in str(caught.value)
-
-
-def test_without_traces_it_meets_the_shipped_ones() -> None:
-    assert read_client(EXAMPLE).traces == tuple(traces.load(f"lte-synthetic-{k}") for k in range(8))
-    assert [motion.name for motion in read_client(EXAMPLE).motion] == ["drive-0", "drive-1"]
-
-
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(BufgymError, match=r"^[^:]*missing.toml: no such file$"):
-        read_client(tmp_path / "missing.toml")
-    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(BufgymError, match=r"binary.toml: must be UTF-8 text"):
-        read_client(tmp_path / "binary.toml")
 
 
 @pytest.mark.parametrize(
@@ -238,8 +202,5 @@ def test_bad_clients(parameters: dict[str, Any], rule: str) -> None:
     assert set(parameters) <= {f.name for f in fields(Client)}
     with pytest.raises(BufgymError, match=rule):
         replace(client(), **parameters)
-
-
-def test_a_stream_publishes_on_a_topic() -> None:
     with pytest.raises(BufgymError, match=r"stream: 'a' is not a bufgym\.model\.topics\.Topic"):
         Stream("a", 1, 1)

@@ -6,12 +6,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from bufgym.kernel import announce, cache, direct, kernel
+from bufgym.kernel import announce, bundle, cache, direct, kernel
 from tests.conftest import COMPILED
 
 TALE = """
@@ -45,6 +46,14 @@ def run(tmp_path: Path, before: str = "", source: str = TALE, **environment: str
     assert done.returncode == 0, done.stderr
     assert done.stdout == "42\n"
     return done
+
+
+@bundle
+class Numbers(NamedTuple):
+    """An array, which may be marked."""
+
+    of: NDArray[np.float64]
+    several: bool | None = None
 
 
 needs_compilation = pytest.mark.skipif(not COMPILED, reason="nothing is kept without compilation")
@@ -120,11 +129,16 @@ def test_a_direct_call_is_the_call() -> None:
     """Rows are stepped without a look at the types of their arrays: by the code that Numba would have found."""
 
     @kernel
-    def double(numbers: Any, factor: Any) -> None:
-        for k in range(len(numbers)):
-            numbers[k] *= 2 * factor
+    def double(numbers: Numbers, factor: Any) -> None:
+        for k in range(len(numbers.of)):
+            numbers.of[k] *= 2 * factor
+            if numbers.several is not None:
+                numbers.of[k] += 1
 
-    doubled, directly = np.arange(4.0), direct(double)
+    one, directly = np.arange(4.0), direct(double)
+    several = one.copy()
     for _ in range(3):
-        directly(doubled, 1.0)
-    assert doubled.tolist() == [0, 8, 16, 24] and len(double.overloads) == 1  # type: ignore[attr-defined]
+        directly(Numbers(one), 1.0)
+        directly(Numbers(several, True), 1.0)
+    assert one.tolist() == [0, 8, 16, 24] and several.tolist() == [7, 15, 23, 31]
+    assert len(double.overloads) == 2  # type: ignore[attr-defined]

@@ -48,6 +48,7 @@ def queue_of_two():
 
 
 def test_outcome():
+    assert METRICS[0] == "qoi" and len(set(METRICS)) == len(METRICS)
     result = outcome(queue_of_two(), 0)
     assert (result.arrived, result.delivered, result.dropped) == (4, 3, 1)
     assert (result.in_transmission, result.buffered, result.invalid) == (0, 0, 0)
@@ -73,8 +74,3 @@ def test_nothing_received():
     assert (result.qoi, result.delivered, result.in_transmission, result.buffered) == (0, 0, 1, 1)
     assert result.longest_gap == result.longest_gap_s == 0
     assert math.isnan(result.mean_sojourn_s) and math.isnan(result.mean_age_s)
-
-
-def test_names():
-    assert METRICS[0] == "qoi"
-    assert len(set(METRICS)) == len(METRICS)

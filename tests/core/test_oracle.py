@@ -1,28 +1,39 @@
-"""The oracle: best of all subsets, and never beaten."""
+"""Optima: the oracle of one interruption, that over a small link, and plans for small queues."""
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
-from cases import VALUES
-from hypothesis import given, settings
+from cases import VALUES, newcomer, queue_of
+from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym import policies
+from bufgym import files, policies
 from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
 from bufgym.model import qoi
-from bufgym.oracle import by_length, ideal, integer
+from bufgym.model.buffer import REJECT
+from bufgym.oracle import by_length, clairvoyant, ideal, integer, law, online_optimum
+from bufgym.oracle.lengths import EveryLength
+from bufgym.oracle.small_link import ASKED, QUARTERS, Chain, cut_off, small_link
+from bufgym.policies import small_queue
+from bufgym.policies.small_queue import BASES, CAPACITIES, LONGEST, NONE
+from bufgym.reproduce.small_link import episode
 from bufgym.scenario import Interruption, Streams, registry
 from bufgym.sim import run
 
 # The number of examples is set where one of them is hundreds of runs.
-FEW = settings(max_examples=12 if JIT else 3)
 
 
+kernels = pytest.mark.kernels
+
+
+@kernels
 def test_by_hand():
     v = qoi.exponential(0.5)
     # L = 1, T = 2: keep 1 or 2 of 0, 1, 2, 3: gaps 1 and 2, V = 1/2 + 3/4.
@@ -34,6 +45,7 @@ def test_by_hand():
     assert integer(1, 0, v) == 0.5
 
 
+@kernels
 def test_one_run_tells_of_every_shorter_interruption():
     """Messages 1, 2, 3 arrive, L = 1: the second evicts the first, the third is rejected; message 4 follows."""
     v = qoi.exponential(0.5)
@@ -42,6 +54,7 @@ def test_one_run_tells_of_every_shorter_interruption():
     assert h.tolist() == [1 + v(1), 1 + 2 * v(1), 1 + v(2) + v(1), 1 + 2 * v(2)]
 
 
+@kernels
 @given(VALUES, st.integers(1, 5), st.integers(0, 10))
 def test_is_the_best_of_all_subsets(v, L, T):
     best = max(
@@ -51,6 +64,7 @@ def test_is_the_best_of_all_subsets(v, L, T):
     assert ideal(L, T, v) >= best - 1e-12
 
 
+@kernels
 def test_they_meet_where_gaps_come_out_even():
     v = qoi.exponential()
     # L = 8: nine gaps. T + 1 = 18, 36, 72 are 9 times 2, 4, 8; 19 is not.
@@ -59,39 +73,20 @@ def test_they_meet_where_gaps_come_out_even():
     assert integer(8, 18, v) < ideal(8, 18, v) - 1e-4
 
 
-LENGTHS = range(1, 121) if JIT else (1, 2, 9, 17, 36)
-CAPACITIES = range(1, 13) if JIT else (1, 3, 8)
+LENGTHS = range(1, 81)
+EPISODES = [Interruption(t_max=80).episode(T).with_uniforms(np.random.default_rng(T)) for T in LENGTHS]
 
 
-LEAVES_ROOM = (
-    *("decimate", "keyframe", "time-filter", "latest-only", "ros-keep-last"),
-    *("steady", "lifespan", "codel", "red", "robofleet", "robofleet-literal", "robofleet-released"),
-    *("zenoh-drop", "ros2-best-effort", "ros2-reliable-udp", "webrtc-frame-dropper"),
-)
-"""These drop where others would not yet."""
-
-
-@FEW
-@given(VALUES)
-def test_no_policy_beats_it(v):
-    for L in CAPACITIES:
-        best = np.array([integer(L, T, v) for T in LENGTHS])
-        for name in policies.names():
-            if not policies.get(name).ranked:
-                continue
-            senders = run(policies.get(name), EPISODES, L, v)
-            gained = senders.batch.senders["delivered_gain"]
-            assert (gained <= best + 1e-9).all(), (name, L)
-            # With room for all, whoever keeps all that fits gains as much.
-            if name not in LEAVES_ROOM:
-                fits = np.array(LENGTHS) <= L
-                assert gained[fits] == pytest.approx(best[fits], abs=1e-9)
+@given(VALUES, st.integers(1, 12), st.sampled_from([name for name in policies.names() if policies.get(name).ranked]))
+def test_no_policy_beats_it(v, L, name):
+    gained = run(policies.get(name), EPISODES, L, v).batch.senders["delivered_gain"]
+    assert (gained <= np.array([integer(L, T, v) for T in LENGTHS]) + 1e-9).all()
 
 
 @pytest.mark.parametrize("limits", [{}, {"max_bytes": 3 * 230_000}])
 def test_as_a_policy_it_reaches_its_number(limits):
     v = qoi.exponential()
-    for L in CAPACITIES:
+    for L in (1, 3, 8):
         senders = run(policies.get("oracle"), EPISODES, L, v, **limits)
         best = [integer(min(L, 3) if limits else L, T, v) for T in LENGTHS]
         assert senders.batch.senders["delivered_gain"] == pytest.approx(best, abs=1e-9)
@@ -105,12 +100,167 @@ def test_as_a_policy_it_plays_one_interruption_only():
         run(policies.get("oracle"), [registry.get("lte").draw(Streams.seeded(0))], 4, qoi.exponential())
 
 
-SCENARIO = Interruption(t_max=max(LENGTHS))
-EPISODES = [SCENARIO.episode(T).with_uniforms(np.random.default_rng(T)) for T in LENGTHS]
-
-
-@pytest.mark.parametrize(("L", "T"), [(0, 5), (3, -1)])
-def test_errors(L, T):
+def test_l_and_t_are_checked():
     for truth in (ideal, integer):
-        with pytest.raises(BufgymError, match=f"oracle: L = {L}, T = {T}: need L >= 1 and T >= 0"):
-            truth(L, T, qoi.exponential())
+        for L, T in ((0, 5), (3, -1)):
+            with pytest.raises(BufgymError, match=f"oracle: L = {L}, T = {T}: need L >= 1 and T >= 0"):
+                truth(L, T, qoi.exponential())
+
+
+CUT = cut_off(qoi.exponential(0.5), 4)
+"""CUT(1..4) = 1/2, 3/4, 7/8, 15/16."""
+
+
+def searched(L, chain, arrivals, asked):
+    """E[H]: every decision tried at every arrival, over the messages themselves and the mean over all rates."""
+    matrix = chain.matrix
+
+    def gain(a, b):
+        return CUT(float(min(b - a, 4)))
+
+    def carried(last, queue, left, quarters):
+        """What one period makes of the message dequeued last, the queue, the socket, and what it gains."""
+        gained = 0.0
+        while left and quarters >= left:
+            quarters, left = quarters - left, 0
+            if queue:
+                gained, last, queue, left = gained + gain(last, queue[0]), queue[0], queue[1:], 4
+        return last, queue, left - quarters if left else 0, gained
+
+    @functools.cache
+    def behind(t, last, queue, left, state):
+        """Of the periods from arrival t on, once it has been decided on."""
+        if t == arrivals - 1:
+            whole = (last, *queue)
+            return sum(gain(a, b) for a, b in itertools.pairwise(whole))
+        mean = 0.0
+        for rate, probability in enumerate(matrix[state]):
+            *then, gained = carried(last, queue, left, int(QUARTERS[rate]))
+            mean += probability * (gained + ahead(t + 1, *then, rate))
+        return mean
+
+    def ahead(t, last, queue, left, state):
+        if left == 0:
+            taken = gain(last, t) + behind(t, t, (), 4, state)
+            return max(taken, behind(t, last, (), 0, state)) if asked == "always" else taken
+        full = len(queue) == L
+        choices = [] if full else [(*queue, t)]
+        if full or asked != "full":
+            choices += [queue, *((*queue[:k], *queue[k + 1 :], t) for k in range(len(queue)))]
+        return max(behind(t, last, choice, left, state) for choice in choices)
+
+    return 1 + np.mean([behind(0, 0, (), 4, state) for state in range(4)])
+
+
+@kernels
+def test_a_small_link_by_hand():
+    # Two arrivals: message 0 is in the socket, 1 waits and is sent at the end. H = 1 + V(1).
+    assert small_link(1, CUT, Chain(), arrivals=2).value == pytest.approx(1.5)
+    # Three, at rates that never change. At 1 and 1/2 the socket has taken 1 when 2 arrives: all get there, 1 + 2 V(1).
+    # At 0 and 1/4 message 0 is still in it: one of 1 and 2 must go, and 1 + V(2) is more than 1 + V(1).
+    assert small_link(1, CUT, Chain(1.0), arrivals=3).value == pytest.approx((2 + 2 + 1.75 + 1.75) / 4)
+
+
+@kernels
+@pytest.mark.parametrize("asked", ASKED)
+@pytest.mark.parametrize(("L", "arrivals"), [(1, 5), (2, 5), (3, 4)])
+def test_it_is_what_a_search_of_every_decision_finds(L, arrivals, asked):
+    solved = small_link(L, CUT, Chain(0.9), arrivals=arrivals, depth=4, asked=asked)
+    assert solved.value == pytest.approx(searched(L, Chain(0.9), arrivals, asked), abs=1e-12)
+
+
+@pytest.mark.parametrize("asked", ["full", "busy"])
+def test_its_policy_reaches_its_value_in_the_simulator(asked):
+    # Over every course of the rates, each with its probability: the mean is exact, not drawn.
+    chain, arrivals, L = Chain(0.7), 5, 2
+    courses = np.indices((4,) * (arrivals - 1)).reshape(arrivals - 1, -1).T
+    weights = chain.matrix.mean(axis=0)[courses[:, 0]]
+    for k in range(1, arrivals - 1):
+        weights = weights * chain.matrix[courses[:, k - 1], courses[:, k]]
+    episodes = [episode(np.append(course, 3)) for course in courses]
+    solved = small_link(L, CUT, chain, arrivals=arrivals, depth=4, asked=asked)
+    reached = 1 + weights @ run(solved.policy(), episodes, L, CUT).batch.senders["delivered_gain"]
+    assert reached == pytest.approx(solved.value, abs=1e-9)
+    best = weights @ [clairvoyant(each, L, CUT).qoi for each in episodes]
+    for name in ("min-gap", "drop-oldest"):
+        other = 1 + weights @ run(policies.get(name), episodes, L, CUT).batch.senders["delivered_gain"]
+        assert other <= reached + 1e-9 <= best + 2e-9
+
+
+def test_a_chain_draws_its_own_law():
+    states = Chain(0.8).draw(20_000, np.random.default_rng(1))
+    assert np.bincount(states) / len(states) == pytest.approx([0.25] * 4, abs=0.03)
+    assert np.mean(states[1:] == states[:-1]) == pytest.approx(0.8, abs=0.01)
+
+
+def test_what_it_can_not_solve_is_an_error():
+    with pytest.raises(BufgymError, match="asked = 'never'"):
+        small_link(1, CUT, Chain(), arrivals=2, asked="never")
+    with pytest.raises(BufgymError, match="too many states"):
+        small_link(9, CUT, Chain(), arrivals=2)
+    with pytest.raises(BufgymError, match=r"stays = 2"):
+        Chain(2)
+
+
+TEXT = Path(small_queue.__file__).with_suffix(".txt").read_text(encoding="utf-8")
+LINES = [line.split() for line in TEXT.splitlines()]
+AGENT = policies.load(files.shipped("agents", "agents/pretrained", "*.safetensors")["learned-motion"])
+
+
+def asked(kept, t, *, base=0.618, v=None, step=1.0, capacity=None, shift=0.0):
+    """The plan's answer to the ``t``-th arrival of an interruption, of messages a step apart; ``kept`` are queued."""
+    buffer = queue_of(len(kept), capacity or len(kept))._replace(v=(v or qoi.exponential(base)).array)
+    buffer.slots["x"] = np.array(kept) * step + shift
+    arrival = newcomer()
+    arrival["x"] = t * step
+    return small_queue.planned(buffer._replace(previous_x=(t - 1) * step), arrival, small_queue.packed())
+
+
+def test_the_file_has_a_plan_for_each_base_and_length():
+    assert [(float(b), int(L)) for b, L, _ in LINES] == [(round(b, 6), L) for b in BASES for L in CAPACITIES]
+    for _, L, digits in LINES:
+        assert len(digits) == LONGEST - int(L) and set(digits) <= set("01234"[: int(L) + 1])
+    assert any(math.isclose(b, 0.618) for b in BASES) and any(math.isclose(b, 0.9) for b in BASES)
+
+
+@kernels
+@pytest.mark.parametrize("number", range(0, len(LINES), 5))
+def test_each_digit_is_what_is_evicted(number):
+    base, L, digits = float(LINES[number][0]), int(LINES[number][1]), LINES[number][2]
+    kept = list(range(1, L + 1))
+    for t, digit in enumerate(digits, L + 1):
+        expected = int(digit) if int(digit) < L else REJECT
+        if t < 60 or t % 37 == 0:
+            assert asked(kept, t, base=base) == expected
+        kept.append(t)
+        del kept[int(digit)]
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(("L", "t_max"), [(1, 400), (2, 300), (3, 120), (4, 70)])
+@pytest.mark.parametrize("v", [qoi.exponential(0.618), qoi.exponential(0.9), qoi.saturating(8)], ids=str)
+def test_an_agent_with_shortcuts_loses_no_more_than_the_optimum(v, L, t_max):
+    lengths = EveryLength(Interruption(t_max=t_max, value=v), [L])
+    optimum = online_optimum(L, law(lengths.scenario), v, objective="qoi").policy()
+    assert lengths.regrets(AGENT)[0] == pytest.approx(lengths.regrets(optimum)[0], abs=1e-12)
+
+
+@kernels
+def test_a_plan_counts_steps_of_whatever_size():
+    # 0.9^4.567 = 0.618: a scene that moves 4.567 at each arrival is that of the other base.
+    step = math.log(0.618) / math.log(0.9)
+    for t in range(5, 12):
+        assert asked([1, 2, 3, 4], t, base=0.9, step=step) == asked([1, 2, 3, 4], t, base=0.618)
+    assert asked([1, 2, 3, 4], 5, base=0.9, step=step) != NONE
+
+
+@kernels
+def test_where_there_is_no_plan():
+    assert asked([1, 2, 3, 4], 5) != NONE
+    assert asked([1, 2, 3, 4, 5], 6) == NONE  # L = 5
+    assert asked([1, 2, 3], 4, capacity=4) == NONE  # there is room
+    assert asked([1, 2, 3, 4], 5, v=qoi.saturating(8)) == NONE
+    assert asked([1, 2, 3, 4], 5, base=0.999) == NONE and asked([1, 2, 3, 4], 5, base=0.1) == NONE
+    assert asked([1, 2, 3, 4], 5, shift=0.01) == NONE  # other messages than the plan has kept
+    assert asked([1], LONGEST + 1) == NONE
+    assert asked([1, 2, 3, 4], 5, step=0.0) == NONE

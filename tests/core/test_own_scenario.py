@@ -76,9 +76,6 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return "own_scenario_module"
 
 
-# --- scenarios --------------------------------------------------------------------------------------------------------
-
-
 class Steady:
     """Ten messages over a steady link."""
 
@@ -101,24 +98,6 @@ def test_a_registered_scenario_is_one_like_the_others() -> None:
     assert info["arrived"] == 10
     with pytest.raises(BufgymError, match=r"Steady: no parameter 'speed'; it has: none \(it is no dataclass\)"):
         scenario.get("steady-ten", speed=2)
-    with pytest.raises(BufgymError, match="scenario 'lte': a built-in scenario has this name"):
-        scenario.register("lte")(Steady)
-    with pytest.raises(BufgymError, match="without spaces"):
-        scenario.register("my scenario")
-
-
-@pytest.mark.parametrize(
-    ("broken", "message"),
-    [
-        ({"draw": None}, r"has no method `draw\(streams\)`"),
-        ({"value": 3}, "has no `value`"),
-        ({"max_messages": 0}, "has no `max_messages`, a whole number >= 1"),
-        ({"topics": None}, "has no `topics`"),
-    ],
-)
-def test_what_a_scenario_must_have(broken: dict[str, Any], message: str) -> None:
-    with pytest.raises(BufgymError, match=message):
-        scenario.get(type("Broken", (Steady,), broken)())
 
 
 def test_a_spec_as_text_brings_its_own(module: str) -> None:
@@ -127,13 +106,6 @@ def test_a_spec_as_text_brings_its_own(module: str) -> None:
     assert spec is not None
     rows = gym.make(gym.envs.registration.EnvSpec.from_json(spec.to_json())).unwrapped.rows  # type: ignore[attr-defined]
     assert rows.scenario.t_max == 9 and rows.scenario.value.name == f"{module}:doorways"
-    with pytest.raises(BufgymError, match=f"{module}:long: the module {module} has no long"):
-        scenario.get(f"{module}:long")
-    with pytest.raises(BufgymError, match="no module 'missing_module' in "):
-        scenario.get("missing_module:made")
-
-
-# --- links ------------------------------------------------------------------------------------------------------------
 
 
 def test_links_from_a_function_of_a_seed(module: str) -> None:
@@ -141,15 +113,6 @@ def test_links_from_a_function_of_a_seed(module: str) -> None:
     assert [trace.name for trace in uplink.traces] == ["corridor-3", "corridor-4", "corridor-5", "lte-synthetic-0"]
     assert uplink.traces[0].duration_us == 5_000_000
     assert len(Uplink(traces=f"{module}:corridor").traces) == 8  # type: ignore[arg-type]
-    for text, message in (
-        (f"{module}:no_link", "for seed 0 it is 0"),
-        (f"{module}:corridor:5-3", "needs 1 to 10000 seeds"),
-    ):
-        with pytest.raises(BufgymError, match=message):
-            Uplink(traces=text)  # type: ignore[arg-type]
-
-
-# --- V ----------------------------------------------------------------------------------------------------------------
 
 
 def test_a_function_as_v() -> None:
@@ -162,60 +125,62 @@ def test_a_function_as_v() -> None:
     assert Interruption(value=lambda d: min(1.0, d / 4)).value(4.0) == pytest.approx(1)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("v", "message"),
-    [
-        (lambda d: d * d, r"grows faster|exceed"),
-        (lambda d: 0.5 + 0 * d, "V\\(0\\) must be 0"),
-        (lambda d: d * math.exp(-d), "V falls"),
-        (lambda d: 3 * d / (d + 1), "must not exceed 1"),
-        (lambda d: "much", "must be a number"),
-        (3, "must be a bufgym.model.qoi Value, a function"),
-    ],
-)
-def test_a_v_that_breaks_a_rule(v: Any, message: str) -> None:
-    with pytest.raises(BufgymError, match=message):
-        Interruption(value=v)
-
-
 def test_v_as_text(module: str) -> None:
     assert qoi.parse("tabulated:0=0,1=0.5,4=0.8")(2.5) == pytest.approx(0.65)
     assert qoi.load(f"{module}:made")(4.0) == pytest.approx(0.8)
     assert qoi.load(f"{module}:doorways").name == f"{module}:doorways"
-    with pytest.raises(BufgymError, match="must be of the form tabulated:distance=V"):
-        qoi.parse("tabulated:0,1")
-    with pytest.raises(BufgymError, match=f"V = {module}:rising"):
-        qoi.load(f"{module}:rising")
 
 
-def test_a_configuration_of_a_stranger_imports_nothing(module: str, tmp_path: Path) -> None:
-    file = tmp_path / "client.toml"
-    topic = f'[[topic]]\nname = "a"\nrate_hz = 1\nsize_bytes = 1\nvalue = "{module}:made"\n'
-    file.write_text(topic)
-    with pytest.raises(BufgymError, match="unknown kind"):
-        read_client(file)
+def no_scenario(**broken: Any) -> Any:
+    return scenario.get(type("Broken", (Steady,), broken)())
 
 
-# --- bufgym bench -----------------------------------------------------------------------------------------------------
+def configuration(value: str) -> Any:
+    """A client's file, which names no module that would be imported."""
+    Path("client.toml").write_text(f'[[topic]]\nname = "a"\nrate_hz = 1\nsize_bytes = 1\nvalue = "{value}"\n')
+    return read_client(Path("client.toml"))
 
 
-def test_bench_with_a_scenario_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file, out = tmp_path / "mine.py", tmp_path / "out"
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda _: scenario.register("lte")(Steady), "scenario 'lte': a built-in scenario has this name"),
+        (lambda _: scenario.register("my scenario"), "without spaces"),
+        (lambda _: no_scenario(draw=None), r"has no method `draw\(streams\)`"),
+        (lambda _: no_scenario(value=3), "has no `value`"),
+        (lambda _: no_scenario(max_messages=0), "has no `max_messages`, a whole number >= 1"),
+        (lambda _: no_scenario(topics=None), "has no `topics`"),
+        (lambda m: scenario.get(f"{m}:long"), "own_scenario_module:long: the module own_scenario_module has no long"),
+        (lambda _: scenario.get("missing_module:made"), "no module 'missing_module' in "),
+        (lambda m: Uplink(traces=f"{m}:no_link"), "for seed 0 it is 0"),
+        (lambda m: Uplink(traces=f"{m}:corridor:5-3"), "needs 1 to 10000 seeds"),
+        (lambda _: Interruption(value=lambda d: d * d), r"grows faster|exceed"),
+        (lambda _: Interruption(value=lambda d: 0.5 + 0 * d), r"V\(0\) must be 0"),
+        (lambda _: Interruption(value=lambda d: d * math.exp(-d)), "V falls"),
+        (lambda _: Interruption(value=lambda d: 3 * d / (d + 1)), "must not exceed 1"),
+        (lambda _: Interruption(value=lambda d: "much"), "must be a number"),
+        (lambda _: Interruption(value=3), "must be a bufgym.model.qoi Value, a function"),
+        (lambda _: qoi.parse("tabulated:0,1"), "must be of the form tabulated:distance=V"),
+        (lambda m: qoi.load(f"{m}:rising"), "V = own_scenario_module:rising"),
+        (lambda m: configuration(f"{m}:made"), "unknown kind"),
+    ],
+)
+def test_what_is_refused(module: str, build: Any, message: str) -> None:
+    with pytest.raises(BufgymError, match=message):
+        build(module)
+
+
+def test_bench_with_a_file_and_with_modules(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+    file, quick = Path("mine.py"), ["--policies", "afr", "--capacity", "2", "--seeds", "2"]
     file.write_text(FILE)
-    command = [
-        "bench",
-        "--scenario-file",
-        str(file),
-        "--policies",
-        "afr,drop-oldest",
-        "--capacity",
-        "2",
-        "--seeds",
-        "2",
-    ]
-    assert main([*command, "--out", str(out), "--format", "csv"]) == 0
+    command = ["bench", "--scenario-file", str(file), *quick]
+    assert main([*command, "--out", "out", "--format", "csv"]) == 0
     assert "Scenario nine: Interruptions of nine messages." in capsys.readouterr().out
-    assert {row["arrived"] for row in read_rows(out / "rows.csv")} == {11}
+    assert {row["arrived"] for row in read_rows(Path("out/rows.csv"))} == {11}
+    links = ["--trace", f"{module}:corridor:1-2", "--value", f"{module}:doorways", "--seconds", "1"]
+    assert main(["bench", *links, *quick]) == 0
+    shown = capsys.readouterr().out
+    assert "over corridor-1, corridor-2" in shown and f"V = {module}:doorways" in shown
     for more, message in (
         (["--fps", "10"], "--fps cannot go with a scenario of your own"),
         (["--suite", "lte-v1"], "--scenario-file cannot go with --suite"),
@@ -223,18 +188,10 @@ def test_bench_with_a_scenario_file(tmp_path: Path, capsys: pytest.CaptureFixtur
     ):
         assert main([*command, *more]) == 2
         assert message in capsys.readouterr().err
-    file.write_text(FILE + "\nraise RuntimeError('no')\n")
-    assert main(command) == 2
-    assert capsys.readouterr().err == f"bufgym: error: {file}, line 10: RuntimeError: no\n"
-    file.write_text("")
-    assert main(command) == 2
-    assert "registers no scenario" in capsys.readouterr().err
-
-
-def test_bench_with_modules(module: str, capsys: pytest.CaptureFixture[str]) -> None:
-    quick = ["--policies", "afr", "--capacity", "2", "--seeds", "1"]
-    assert main(["bench", "--scenario", f"{module}:short", *quick]) == 0
-    links = ["--trace", f"{module}:corridor:1-2", "--value", f"{module}:doorways", "--seconds", "1"]
-    assert main(["bench", *links, *quick]) == 0
-    shown = capsys.readouterr().out
-    assert "over corridor-1, corridor-2" in shown and f"V = {module}:doorways" in shown
+    for text, message in (
+        (FILE + "\nraise RuntimeError('no')\n", f"error: {file}, line 10: RuntimeError: no\n"),
+        ("", "registers no scenario"),
+    ):
+        file.write_text(text)
+        assert main(command) == 2
+        assert message in capsys.readouterr().err

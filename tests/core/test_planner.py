@@ -20,6 +20,7 @@ from bufgym.sim import run
 from bufgym.traces import Trace
 
 divide = getattr(hindsight.divide, "py_func", hindsight.divide)
+kernels = pytest.mark.kernels
 V = qoi.exponential(0.618)
 
 
@@ -74,6 +75,7 @@ def best_without(j, x, s, L, points, us, v, takes):
     return best(0, 0)
 
 
+@kernels
 @pytest.mark.parametrize("takes", [False, True])
 @pytest.mark.parametrize("room", [0, 1, 3])
 @pytest.mark.parametrize("v", [qoi.exponential(0.5), qoi.saturating(1.3)])
@@ -84,6 +86,7 @@ def test_every_candidate_is_worth_what_a_search_of_all_plans_finds(v, room, take
             assert table.without[j] == pytest.approx(best_without(j, x, s, L, grid.points, us, v, takes)), (seed, j)
 
 
+@kernels
 def test_the_expected_future_by_hand():
     # 1 byte/us now and in the long run, 10 bytes left, then messages of 20 bytes: at 10, 30, 50, ... us.
     us = np.zeros(9)
@@ -94,6 +97,7 @@ def test_the_expected_future_by_hand():
     assert us[1:4].tolist() == [10, 40, 80]
 
 
+@kernels
 def test_futures_mirror_each_other():
     # A pair's rates have the same geometric mean as the expected ones: one is above where the other is below.
     link, grid, us = Link(1.0, 0.0, 0.0, 1e5, 1e5, 50, 1e5), Grid(50, 1e5), np.zeros((3, 101))
@@ -125,6 +129,7 @@ def test_the_budget_is_one_of_work():
     assert not same(runs[0], runs[2])
 
 
+@kernels
 def test_a_link_that_stands_still_is_left_to_min_motion_gap():
     # It never carries anything: there is no rate to plan with.
     still = Trace.steps([(1.0, 1.0)], name="still")

@@ -25,121 +25,78 @@ from bufgym.traces import Trace
 V = qoi.exponential()
 EPISODE = Episode(messages(np.arange(40) * 1_000, 4_000), Link(Trace.constant(1e6, 10)))
 
-
-def keep(buffer: Any) -> int:
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
-def renumbers(buffer: Any, arrival: Any, memory: Any) -> int:
-    if len(buffer.slots) > 0:
-        buffer.slots[0].seq = buffer.slots[len(buffer.slots) - 1].seq
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
-def numbers_queued_wildly(buffer: Any, arrival: Any, memory: Any) -> int:
-    if len(buffer.slots) > 0:
-        buffer.slots[0].seq = 10**9
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
-def numbers_arrivals_wildly(buffer: Any, arrival: Any, memory: Any) -> int:
-    arrival.seq = -(10**9)
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
-def moves_queued(buffer: Any, arrival: Any, memory: Any) -> int:
-    if len(buffer.slots) > 0:
-        buffer.slots[len(buffer.slots) - 1].x -= 0.5
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
-def praises_queued(buffer: Any, arrival: Any, memory: Any) -> int:
-    if len(buffer.slots) > 0:
-        buffer.slots[len(buffer.slots) - 1].gain = 1.0
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
-def moves(buffer: Any, arrival: Any, memory: Any) -> int:
-    arrival.x *= 1000
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
-def shrinks(buffer: Any, arrival: Any, memory: Any) -> int:
-    arrival.size_bytes = 1
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
-def shrinks_queued(buffer: Any, arrival: Any, memory: Any) -> int:
-    if len(buffer.slots) > 0:
-        buffer.slots[0].size_bytes = 1
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
-def lifts_limits(buffer: Any, arrival: Any, memory: Any) -> int:
-    buffer.topics[0].limit = 10**6
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
-WRITERS = {
-    renumbers: "not every message was sent, dropped or queued exactly once",
-    numbers_queued_wildly: "not every message was sent, dropped or queued exactly once",
-    numbers_arrivals_wildly: "a message that arrived is not as the episode has it",
-    moves_queued: "H is not that of the messages that were received",
-    praises_queued: "H is not that of the messages that were received",
-    moves: "a message that arrived is not as the episode has it",
-    shrinks: "a message that arrived is not as the episode has it",
-    shrinks_queued: "the queue's bytes are not those of its messages",
-    lifts_limits: "a topic's rules are not as they were",
+NOT_ONCE = "not every message was sent, dropped or queued exactly once"
+NOT_AS_DRAWN = "a message that arrived is not as the episode has it"
+NOT_H = "H is not that of the messages that were received"
+WRITES = {
+    "buffer.slots[0].seq = buffer.slots[len(buffer.slots) - 1].seq": NOT_ONCE,
+    "buffer.slots[0].seq = 10**9": NOT_ONCE,
+    "arrival.seq = -(10**9)": NOT_AS_DRAWN,
+    "buffer.slots[len(buffer.slots) - 1].x -= 0.5": NOT_H,
+    "buffer.slots[len(buffer.slots) - 1].gain = 1.0": NOT_H,
+    "arrival.x *= 1000": NOT_AS_DRAWN,
+    "arrival.size_bytes = 1": NOT_AS_DRAWN,
+    "buffer.slots[0].size_bytes = 1": "the queue's bytes are not those of its messages",
+    "buffer.topics[0].limit = 10**6": "a topic's rules are not as they were",
 }
+"""What a policy writes, and what is said of it."""
 
 
-@pytest.mark.parametrize("writer", WRITERS)
-def test_a_python_policy_cannot_write(writer: Any) -> None:
+def writer(write: str, **options: Any) -> Policy:
+    made: dict[str, Any] = {"__name__": __name__}
+    accept = "return -2 if len(buffer.slots) < buffer.capacity else 0"
+    queued = "True" if write.startswith("arrival") else "len(buffer.slots) > 0"
+    exec(f"def on_arrival(buffer, arrival, memory):\n if {queued}: {write}\n {accept}", made)
+    return Policy("test-writer", made["on_arrival"], **options)
+
+
+def honest(buffer: Any, arrival: Any, memory: Any) -> int:
+    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
+
+
+@pytest.mark.parametrize("write", WRITES)
+def test_a_python_policy_cannot_write(write: str) -> None:
     with pytest.raises(ValueError, match="read-only"):
-        run(Policy("test-writer", writer), [EPISODE], 3, V)
-
-
-@pytest.mark.parametrize("writer", WRITERS)
-def test_nor_can_a_player(writer: Any) -> None:
-    env, player = SenderEnv(Uplink(traces=(EPISODE.link.trace,), size_bytes=200_000), 3), Player(Policy("test", writer))
+        run(writer(write), [EPISODE], 3, V)
+    env, player = SenderEnv(Uplink(traces=(EPISODE.link.trace,), size_bytes=200_000), 3), Player(writer(write))
     env.reset(seed=0)
     with pytest.raises(ValueError, match="read-only"):
         for _ in range(9):
             env.step(player.action(env.rows.senders))
 
 
+@pytest.mark.parametrize("write", WRITES)
+def test_a_compiled_policy_that_writes_has_no_result(write: str) -> None:
+    policy = writer(write, compile=True)
+    told = f"policy test-writer: wrote to what it may only read: {WRITES[write]}|read-only"  # that without a compiler
+    with pytest.raises((BufgymError, ValueError), match=told):
+        run(policy, [EPISODE], 3, V)
+    with pytest.raises((BufgymError, ValueError), match=told):
+        run_fleet(policy, [FleetEpisode((EPISODE.arrivals,) * 2, EPISODE.link)], 3, V)
+
+
+def two_topics(period_us: int) -> Episode:
+    arrivals = messages(np.arange(40) * period_us, 4_000)
+    arrivals["topic"] = np.arange(40) % 2
+    return Episode(arrivals, EPISODE.link)
+
+
 def test_marks_on_topics_are_on_a_copy() -> None:
     """With several topics kernels leave marks in what they are shown: their rows are no one else's."""
-    arrivals = messages(np.arange(40) * 1_000, 4_000)
-    arrivals["topic"] = np.arange(40) % 2
-    episode = Episode(arrivals, EPISODE.link)
     rules = [Topic("a", limit=1), Topic("b", limit=1)]
-    honest = run(Policy("test-honest", lambda buffer, arrival, memory: keep(buffer)), [episode], 3, V, topics=rules)
-    lifted = run(Policy("test-writer", lifts_limits), [episode], 3, V, topics=rules)
-    assert lifted.batch.senders.tobytes() == honest.batch.senders.tobytes()
+    kept = run(Policy("test-honest", honest), [two_topics(1_000)], 3, V, topics=rules)
+    lifted = run(writer("buffer.topics[0].limit = 10**6"), [two_topics(1_000)], 3, V, topics=rules)
+    assert lifted.batch.senders.tobytes() == kept.batch.senders.tobytes()
 
 
 def test_h_of_several_topics_is_added_up_again() -> None:
     """As honest as it was run, the sum stands; with anything added it does not."""
-    arrivals = messages(np.arange(40) * 10_000, 4_000)
-    arrivals["topic"] = np.arange(40) % 2
-    rules = [Topic("a", weight=2.0), Topic("b", value=qoi.saturating(4))]
-    policy = Policy("test-honest", lambda buffer, arrival, memory: keep(buffer))
-    senders = run(policy, [Episode(arrivals, EPISODE.link)], 3, V, topics=rules)
+    rules, policy = [Topic("a", weight=2.0), Topic("b", value=qoi.saturating(4))], Policy("test-honest", honest)
+    senders = run(policy, [two_topics(10_000)], 3, V, topics=rules)
     senders.check_untouched(policy)
     senders.batch.senders["delivered_gain"] += 1e-3
-    with pytest.raises(BufgymError, match="H is not that of the messages that were received"):
+    with pytest.raises(BufgymError, match=NOT_H):
         senders.check_untouched(policy)
-
-
-@pytest.mark.parametrize("writer", WRITERS)
-def test_a_compiled_policy_that_writes_has_no_result(writer: Any) -> None:
-    told = f"policy test-writer: wrote to what it may only read: {WRITERS[writer]}"
-    with pytest.raises((BufgymError, ValueError), match=f"{told}|read-only"):  # the latter without a compiler
-        run(Policy("test-writer", writer, compile=True), [EPISODE], 3, V)
-    with pytest.raises((BufgymError, ValueError), match=f"{told}|read-only"):
-        cell = FleetEpisode((EPISODE.arrivals,) * 2, EPISODE.link)
-        run_fleet(Policy("test-writer", writer, compile=True), [cell], 3, V)
 
 
 def test_a_row_above_the_clairvoyant_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,154 +7,52 @@ from dataclasses import replace
 import naive_schedulers
 import numpy as np
 import pytest
-from cases import cases, same
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from naive_queues import ACCEPT as ACCEPTED
-from naive_queues import REJECT as REJECTED
-from test_schedulers import ALL, NAMES, V, count
+from cases import log, order, same, twin_log
+from hypothesis import given
+from test_topics_twin import hold
+from topic_cases import topic_cases
 
 from bufgym import policies
-from bufgym.kernel import JIT
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT
-from bufgym.model.topics import Topic
-from bufgym.sim import NEVER, Senders
+from bufgym.sim import NEVER
 
 
-@st.composite
-def topics_cases(draw, max_bytes=True):
-    """(case, topics): random episodes of three topics with all that a topic may have."""
-    case = draw(cases(max_bytes=max_bytes))
-    window, ack_delay_us = draw(st.integers(1, 4)), draw(st.sampled_from([0, 0, 2_000, 30_000]))
-    case = replace(case, episode=replace(case.episode, window=window, ack_delay_us=ack_delay_us))
-    made = []
-    for name in "ABC":
-        no_drop = draw(st.booleans())
-        rules = {
-            "priority": draw(st.sampled_from([0.0, 1.0, 1.0, 2.0, 3.5])),
-            "weight": draw(st.sampled_from([None, 0.0, 1.0, 4.0])),
-            "deadline_s": draw(st.sampled_from([None, 0.001, 0.02])),
-            "rate_limit_hz": draw(st.sampled_from([None, None, 150.0, 2_000.0])),
-        }
-        if not no_drop:
-            rules["limit"] = draw(st.sampled_from([None, None, 1, 2]))
-        made.append(Topic(name, no_drop=no_drop, **rules))
-    return case, made
-
-
-def run_topics(case, topics, policy):
-    capacity = len(case.twin_messages) if policy.unbounded else case.capacity
-    senders = Senders(
-        1,
-        capacity,
-        V,
-        max_messages=len(case.twin_messages),
-        max_bytes=case.max_bytes,
-        decide_at=case.decide_at,
-        topics=topics,
-    )
-    senders.load(0, case.episode)
+def played(case, policy):
+    senders = case.senders()
     senders.run(policy)
     return senders
 
 
-def listed(slots):
-    return [
-        {"seq": int(m.seq), "us": int(m.arrival_us), "bytes": int(m.size_bytes), "topic": int(m.topic)} for m in slots
-    ]
-
-
-def beside_its_twin(name, case, topics):
-    """The policy, each of whose answers is held against its twin's."""
+@pytest.mark.kernels
+@pytest.mark.parametrize("name", naive_schedulers.TWINS)
+@given(topic_cases(min_topics=2, max_messages=30))
+def test_agrees_with_its_twin(name, case):
     policy = policies.get(name)
-    twin = naive_schedulers.TWINS[name](topics, case.capacity, case.max_bytes)
-
-    def on_arrival(buffer, arrival, memory):
-        decision, queue = policy.on_arrival(buffer, arrival, memory), listed(buffer.slots)
-        expected, victim = twin.decide(queue, listed([arrival])[0]), queue[decision] if decision >= 0 else None
-        assert expected == {ACCEPT: ACCEPTED, REJECT: REJECTED}.get(decision, victim)
-        return decision
-
-    def on_send(buffer, memory):
-        k, queue = policy.on_send(buffer, memory), listed(buffer.slots)
-        expected = twin.choose(queue, int(buffer.now_us), int(buffer.in_flight), int(buffer.window))
-        assert expected == (None if k == HOLD else queue[k])
-        return k
-
-    return replace(policy, on_arrival=on_arrival, on_send=on_send, compile=False)
+    case = replace(case, client=policy.client, schedules=True, drops_heads=False)
+    twin, episode = case.twin(), case.case.episode
+    if not policy.client.awaits_acks:  # then the socket takes the next message when the last has crossed
+        twin.window, twin.ack_delay_us = 1, 0
+    naive_schedulers.TWINS[name](twin)
+    twin.run(case.case.twin_messages, episode.first_decision, episode.last_decision)
+    senders = played(case, policy)
+    assert log(senders) == twin_log(twin)
+    assert order(senders) == twin.order
+    assert senders.batch.senders["invalid"][0] == twin.invalid
+    assert twin.invalid == 0 or episode.first_decision > 0 or episode.last_decision < len(case.case.twin_messages)
+    assert same(senders, played(case, replace(policy, compile=False)))
 
 
-@pytest.mark.parametrize("name", NAMES)
-@given(topics_cases())
-@settings(max_examples=60 if JIT else 8)
-def test_agrees_with_its_twin(name, drawn):
-    case, topics = drawn
-    senders = run_topics(case, topics, beside_its_twin(name, case, topics))
-    # What came of it is what the policy itself does, compiled.
-    assert same(senders, run_topics(case, topics, policies.get(name)))
-
-
-@pytest.mark.parametrize("name", NAMES)
-@given(topics_cases())
-@settings(max_examples=60 if JIT else 8)
-def test_every_answer_is_possible(name, drawn):
-    case, topics = drawn
-    # Outside the arrivals that ask a full queue rejects unasked: those are not the policy's.
-    case = replace(case, episode=replace(case.episode, first_decision=0, last_decision=2**31))
-    assert count(run_topics(case, topics, policies.get(name)), "invalid") == 0
-
-
-@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("robofleet")])
-@given(cases(max_bytes=False))
-@settings(max_examples=20 if JIT else 4)
-def test_on_one_queue_they_drop_the_oldest(name, case):
-    assert same(case.run(policies.get(name), V), case.run(policies.get("drop-oldest"), V))
-
-
-@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("robofleet")])
-@given(cases(max_bytes=False))
-@settings(max_examples=20 if JIT else 4)
-def test_on_one_queue_robofleet_keeps_one_slot(name, case):
-    case = replace(case, decide_at="arrival", episode=replace(case.episode, first_decision=0, last_decision=2**31))
-    assert same(case.run(policies.get(name), V), case.run(policies.get("latest-only"), V))
-
-
-# --- the whole registry, with topics ---------------------------------------------------------------------------------
-
-
-def accounts(senders, topics):
-    """For each topic, how many messages were transmitted, are being sent, are queued and were dropped; each is one."""
-    sender, batch = np.asarray(senders.batch.senders)[0], senders.batch
-    n = int(sender["arrivals"])
-    rows, topic = np.asarray(batch.log[0])[:n], np.asarray(batch.arrivals[0])["topic"][:n]
-    queued = np.zeros(n, bool)
-    queued[np.asarray(batch.slots[0])["seq"][sender["first"] : sender["first"] + sender["occupancy"]]] = True
-    transmitted, lost = rows["transmitted_us"] != NEVER, rows["dropped_us"] != NEVER
-    sending = (rows["dequeued_us"] != NEVER) & ~transmitted
-    entry = np.stack([transmitted, sending, queued, lost])
-    assert (entry.sum(0) == 1).all()
-    return [entry[:, topic == k].sum(1).tolist() for k in range(len(topics))]
-
-
-@pytest.mark.parametrize("name", ALL)
-@given(topics_cases(max_bytes=False))
-@settings(max_examples=12 if JIT else 2)
-def test_every_policy_runs_on_topics_and_nothing_is_lost(name, drawn):
-    case, topics = drawn
-    senders = run_topics(case, topics, policies.get(name))
-    rows = np.asarray(senders.batch.topics)[0]
-    for k, (delivered, sending, queued, lost) in enumerate(accounts(senders, topics)):
-        assert rows["arrived"][k] == delivered + sending + queued + lost
-        assert rows["dequeued"][k] == delivered + sending
-        assert rows["queued"][k] == queued
-    assert count(senders, "next") == len(case.twin_messages)
-    no_drop_is_kept_while_others_could_go(senders, topics)
-
-
-def no_drop_is_kept_while_others_could_go(senders, topics):
-    n = int(senders.batch.senders[0]["arrivals"])
-    rows, arrivals = np.asarray(senders.batch.log[0])[:n], np.asarray(senders.batch.arrivals[0])[:n]
-    free = np.array([not topic.no_drop for topic in topics])[arrivals["topic"]]
+@pytest.mark.parametrize("name", [name for name in policies.names() if policies.get(name).privileged is None])
+@given(topic_cases(min_topics=2, max_messages=25))
+def test_every_policy_runs_on_topics_and_nothing_is_lost(name, case):
+    policy = policies.get(name)
+    capacity = len(case.case.twin_messages) if policy.unbounded else case.case.capacity
+    case = replace(case, client=policy.client, case=replace(case.case, capacity=capacity, max_bytes=None))
+    senders = played(case, policy)
+    hold(case, senders)
+    assert senders.batch.senders["next"][0] == len(case.case.twin_messages)
+    # No no_drop message goes while another that could go is queued.
+    rows, arrivals = np.asarray(senders.batch.log[0]), case.case.episode.arrivals
+    free = np.array([not topic.no_drop for topic in case.topics])[arrivals["topic"]]
     for lost in np.flatnonzero(~free & (rows["dropped_us"] != NEVER) & (rows["limited"] == 0)):
         at_us = arrivals["arrival_us"][lost]
         assert rows["dropped_us"][lost] == at_us  # rejected when it came: no_drop is never evicted

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -46,8 +47,9 @@ def used(scenario: Interruption | Uplink) -> set[tuple[str, object]]:
     return {("content", each) for each in contents} | {("name", name) for name in names}
 
 
-def check(name: str, data: Path | None = None) -> None:
-    """What holds for every suite."""
+@pytest.mark.parametrize("name", [*EMBEDDED, *(pytest.param(name, marks=pytest.mark.nightly) for name in RECORDED)])
+def test_a_suite_builds_every_split_and_splits_share_nothing(name: str, request: pytest.FixtureRequest) -> None:
+    data = request.getfixturevalue("shared_data") if name in RECORDED else None
     suite = suites.get(name)
     assert suite.name == name and suite.about and name[-1].isdigit()
     assert len(set(suite.capacities)) == len(suite.capacities) and min(suite.capacities) >= 1
@@ -70,39 +72,7 @@ def check(name: str, data: Path | None = None) -> None:
         assert known[one] and not known[one] & known[other], (one, other)
 
 
-@pytest.mark.parametrize("name", EMBEDDED)
-def test_a_suite_builds_every_split_and_splits_share_nothing(name: str) -> None:
-    check(name)
-
-
-@pytest.mark.parametrize("name", RECORDED)
-def test_so_does_a_suite_over_recordings(name: str, shared_data: Path) -> None:
-    check(name, shared_data)
-
-
-def test_paper_numbers_and_capacities() -> None:
-    for name in EMBEDDED + RECORDED:
-        capacities = suites.get(name).capacities
-        assert set(suites.CAPACITIES) <= set(capacities) or name == "stress-v1"  # AFR's, in all of them but that
-    assert suites.CAPACITIES == (5, 10, 15, 20, 25)
-    outages = scenarios("outage-v1", "test")
-    for label, setting in suites.get("outage-v1").settings("test").items():
-        # The blackout lies within the episode, wherever that begins on its trace.
-        (outage_s,) = {setting.outage_s}
-        scenario = outages[label]
-        assert isinstance(scenario, Uplink) and outage_s is not None and scenario.duration_s == 60 + outage_s
-        assert scenario.link_offset_s == (0.0, 10.0)
-        for trace in scenario.traces:
-            edges = (30_000_000, 30_000_000 + round(outage_s * 1e6))
-            first, last = np.interp(edges, trace.time_us, trace.cumulative_bytes)
-            assert first == last and trace.cumulative_bytes[-1] > last
-    steady = scenarios("sustained-v1", "test")["time-half"]
-    assert isinstance(steady, Uplink)
-    for trace in steady.traces:
-        share = trace.cumulative_bytes[-1] / (trace.duration_us / 1e6) / (30 * 230_000)
-        assert share == pytest.approx(0.5, rel=0.061)
-
-
+@pytest.mark.nightly
 def test_5g_uplinks_are_split_by_day_without_the_runs_that_failed(shared_data: Path) -> None:
     counts = {}
     for split, days in (("train", "123"), ("validation", "4"), ("test", "5")):
@@ -114,6 +84,7 @@ def test_5g_uplinks_are_split_by_day_without_the_runs_that_failed(shared_data: P
     assert counts == {"train": 24, "validation": 6, "test": 12}
 
 
+@pytest.mark.nightly
 def test_wifi_and_mmwave_uplinks_are_split_by_place(shared_data: Path) -> None:
     for split, place, spot in (("train", "loc2", "p1"), ("validation", "loc1", "p2"), ("test", "loc3", "p3")):
         wifi = scenarios("uplink-wifi-v1", split, shared_data)["motion-900kB"]
@@ -122,60 +93,6 @@ def test_wifi_and_mmwave_uplinks_are_split_by_place(shared_data: Path) -> None:
         assert isinstance(mmwave, Uplink)
         ways = {trace.name.rpartition("-")[0].split("_5g_")[1] for trace in mmwave.traces}
         assert ways > {f"away_{spot}", f"toward_{spot}"} and len(ways) == 3
-
-
-def test_generated_links_are_of_all_ways_of_moving() -> None:
-    for split, times in (("train", 4), ("validation", 1), ("test", 2)):
-        built = scenarios("generated-v1", split)
-        assert list(built) == ["time-230kB", "motion-230kB", "time-900kB", "motion-900kB"]
-        for scenario in built.values():
-            assert isinstance(scenario, Uplink) and all(trace.duration_us == 300_000_000 for trace in scenario.traces)
-            modes = [trace.name.rpartition("-")[0] for trace in scenario.traces]
-            assert modes == ["foot", "bicycle", "bus", "tram", "train", "car"] * times
-
-
-def test_stress_is_what_nobody_trained_on() -> None:
-    built = scenarios("stress-v1", "test")
-    assert suites.get("stress-v1").capacities == (1, 2, 3, 15, 64, 200)
-
-    def uplink(label: str) -> Uplink:
-        scenario = built[label]
-        assert isinstance(scenario, Uplink)
-        return scenario
-
-    for frames in (4, 8, 16, 32):
-        assert uplink(f"saturating-{frames}-time").value(frames / 2) == 0.5
-    assert uplink("tabulated-time").value(2) == 0.5 and uplink("tabulated-motion").value(0.5) == 0.7
-    for percent in (10, 30, 50, 70, 90):
-        for trace in uplink(f"steady-{percent}-time").traces:
-            assert trace.mean_bytes_per_s == pytest.approx(percent / 100 * 30 * 230_000, rel=0.061)
-    # Ten messages within 9 ms, three times a second; of the Poisson process gaps whose deviation is their mean.
-    bursts, poisson = (
-        np.diff(draw(uplink(f"{kind}-time"), 0).arrivals["arrival_us"]) for kind in ("bursts", "poisson")
-    )
-    assert set(bursts[:9]) == {1_000} and bursts[9] == pytest.approx(324_333, abs=1)
-    assert poisson.mean() == pytest.approx(33_333, rel=0.1) and poisson.std() == pytest.approx(poisson.mean(), rel=0.1)
-    assert {uplink(label).size_bytes for label in ("frames-5kB-time", "frames-20MB-motion")} == {5_000, 20_000_000}
-    assert {uplink(label).rate_hz for label in ("rate-5Hz-time", "rate-120Hz-motion")} == {5.0, 120.0}
-    still, teleporting = (np.diff(draw(uplink(f"{kind}-motion"), 1).arrivals["x"]) for kind in ("still", "teleporting"))
-    assert (still == 0).mean() > 0.8 and 0 < still.max() < 0.05
-    assert (teleporting == 0).mean() > 0.95 and teleporting.max() == pytest.approx(3.0)
-    limits = {label: setting.max_bytes for label, setting in suites.get("stress-v1").settings("test").items()}
-    assert {label for label, limit in limits.items() if limit is not None} == {
-        f"bytes-{n}-{v}" for n in (5, 20) for v in ("time", "motion")
-    }
-    assert limits["bytes-5-time"] == 5 * 230_000 + 115_000
-    for trace in uplink("blackouts-time").traces:  # four of a minute, in steps of 1 s
-        assert (trace.segments()[1] == 0).sum() == 4 * 60
-
-
-def test_interruption_lengths_are_dealt_out_by_their_remainder() -> None:
-    lengths = {split: scenarios("interruption-v1", split)["saturating-8"] for split in suites.SPLITS}
-    dealt = {split: scenario.lengths for split, scenario in lengths.items() if isinstance(scenario, Interruption)}
-    assert sorted(T for each in dealt.values() for T in each) == list(range(1, 401))
-    assert {T % 5 for T in dealt["test"]} == {4} and {T % 5 for T in dealt["validation"]} == {3}
-    drawn = {draw(lengths["test"], seed).last_decision for seed in range(50)}
-    assert drawn <= set(dealt["test"]) and len(drawn) > 10
 
 
 @pytest.mark.parametrize("name", EMBEDDED)
@@ -204,27 +121,17 @@ def fingerprint(name: str) -> str:
     return digest.hexdigest()[:16]
 
 
-def test_unknown_names_are_named() -> None:
+def test_what_is_unknown_or_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(BufgymError, match=r"unknown suite 'lte-v0'; known: interruption-v1, lte-v1"):
         suites.get("lte-v0")
     with pytest.raises(BufgymError, match=r"split = 'tests': must be one of train, validation, test"):
         suites.get("lte-v1").settings("tests")
-
-
-@pytest.mark.parametrize("name", RECORDED)
-def test_a_suite_without_its_recordings_says_what_it_needs(name: str, tmp_path: Path) -> None:
-    suite = suites.get(name)
-    with pytest.raises(
-        BufgymError, match=rf"suite {name} needs a folder of recordings \(--data DIR\) with \w+"
-    ) as told:
-        suite.settings("test")
-    assert suite.needs in str(told.value)
-    with pytest.raises(BufgymError) as told:
-        suite.settings("test", tmp_path / "nowhere")
-    assert str(tmp_path / "nowhere") in str(told.value)
-
-
-def test_a_missing_recording_is_named(tmp_path: Path) -> None:
+    for name in RECORDED:
+        told = rf"suite {name} needs a folder of recordings \(--data DIR\) with .*{re.escape(suites.get(name).needs)}"
+        with pytest.raises(BufgymError, match=told):
+            suites.get(name).settings("test")
+        with pytest.raises(BufgymError, match=str(tmp_path / "nowhere")):
+            suites.get(name).settings("test", tmp_path / "nowhere")
     (tmp_path / "mahimahi").mkdir()
     for k in range(5):
         with gzip.open(tmp_path / f"mahimahi/link-{k}.down.gz", "wt") as file:

@@ -13,8 +13,9 @@ from bufgym.model.link import FOREVER, Link
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
 from bufgym.scenario import Episode, messages
-from bufgym.sim import DECISION, Senders, age_until, can_evict, decide, has_room, next_event, run
+from bufgym.sim import age_until, run
 
+pytestmark = pytest.mark.kernels
 V = qoi.exponential(0.5)
 MS = 1_000
 
@@ -43,31 +44,26 @@ def after_run(played, topics=(), *, capacity=5, on_arrival=take_all, client=None
     return run(policy, [played], capacity, V, topics=topics)
 
 
-def test_two_in_flight_over_a_round_trip_of_100_ms():
-    # 0 and 1 go at once: 0 crosses at 1 ms, 1 behind it at 2. Their pongs come at 101 and 102 ms and let 2 and 3 go;
-    # 3 follows 2 on the link (102 to 103 ms). The pong of 2 comes at 202 ms and lets 4 go.
-    senders = after_run(episode([0] * 5, window=2, ack_delay_us=100 * MS))
-    assert log(senders) == {
-        "dequeued_us": {0: 0, 1: 0, 2: 101 * MS, 3: 102 * MS, 4: 202 * MS},
-        "transmitted_us": {0: 1 * MS, 1: 2 * MS, 2: 102 * MS, 3: 103 * MS, 4: 203 * MS},
-        "dropped_us": {},
-    }
-
-
-def test_one_in_flight_leaves_the_link_idle():
-    # Each message takes 1 ms and its pong another 50: one every 51 ms, on a link that could carry 51 meanwhile.
-    senders = after_run(episode([0, 0, 0], window=1, ack_delay_us=50 * MS))
-    assert log(senders)["dequeued_us"] == {0: 0, 1: 51 * MS, 2: 102 * MS}
-    assert log(senders)["transmitted_us"] == {0: 1 * MS, 1: 52 * MS, 2: 103 * MS}
-    # Without pongs to wait for, the window only counts what has not crossed yet.
-    senders = after_run(episode([0, 0, 0], window=3))
-    assert log(senders)["dequeued_us"] == {0: 0, 1: 0, 2: 0}
-    assert log(senders)["transmitted_us"] == {0: 1 * MS, 1: 2 * MS, 2: 3 * MS}
-
-
-def test_a_client_that_awaits_no_pongs():
-    senders = after_run(episode([0, 0, 0], window=2, ack_delay_us=50 * MS), client=ClientSettings(awaits_acks=False))
-    assert log(senders)["dequeued_us"] == {0: 0, 1: 1 * MS, 2: 2 * MS}
+@pytest.mark.parametrize(
+    ("messages_at_0", "settings", "client", "dequeued_ms", "transmitted_ms"),
+    [
+        # 0 and 1 go at once: 0 crosses at 1 ms, 1 behind it at 2. Their acks come at 101 and 102 ms and let 2 and 3 go;
+        # 3 follows 2 on the link (102 to 103 ms). The ack of 2 comes at 202 ms and lets 4 go.
+        (5, {"window": 2, "ack_delay_us": 100 * MS}, {}, [0, 0, 101, 102, 202], [1, 2, 102, 103, 203]),
+        # Each message takes 1 ms and its ack another 50: one every 51 ms, on a link that could carry 51 meanwhile.
+        (3, {"window": 1, "ack_delay_us": 50 * MS}, {}, [0, 51, 102], [1, 52, 103]),
+        # Without acks to wait for, the window only counts what has not crossed yet.
+        (3, {"window": 3}, {}, [0, 0, 0], [1, 2, 3]),
+        # A client that awaits no acks.
+        (3, {"window": 2, "ack_delay_us": 50 * MS}, {"awaits_acks": False}, [0, 1, 2], [1, 2, 3]),
+        # Flushing is for no_drop topics: a plain sender has none, and its window holds.
+        (3, {"window": 1, "ack_delay_us": 50 * MS}, {"flush_no_drop": True}, [0, 51, 102], [1, 52, 103]),
+    ],
+)
+def test_windows_of_messages_in_flight(messages_at_0, settings, client, dequeued_ms, transmitted_ms):
+    senders = after_run(episode([0] * messages_at_0, **settings), client=ClientSettings(**client))
+    assert log(senders)["dequeued_us"] == {k: ms * MS for k, ms in enumerate(dequeued_ms)}
+    assert log(senders)["transmitted_us"] == {k: ms * MS for k, ms in enumerate(transmitted_ms)}
 
 
 @pytest.mark.parametrize(("third_ms", "dropped"), [(51, {}), (50.999, {2: 50_999})])
@@ -138,17 +134,13 @@ def test_a_buffer_full_of_no_drop():
     assert log(senders)["dropped_us"] == {2: 0}
 
 
-@pytest.mark.parametrize("nonsense", [REJECT, -3, -4, 99])
-def test_no_answer_drops_a_no_drop_message_that_has_room(nonsense):
-    senders = after_run(episode([0]), (Topic("command", no_drop=True),), on_arrival=lambda b, a, m: nonsense)
-    assert log(senders)["dropped_us"] == {}
-    assert senders.batch.senders[0]["invalid"] == 1
-
-
-def test_minus_three_is_no_decision():
-    # Neither for a queue without topics: impossible, so what a queue does.
-    senders = after_run(episode([0]), on_arrival=lambda b, a, m: -3)
-    assert (order(senders), senders.batch.senders[0]["invalid"]) == ([0], 1)
+@pytest.mark.parametrize(
+    ("answer", "topics", "invalid"),
+    [(REJECT, (Topic("command", no_drop=True),), 1), (99, (Topic("command", no_drop=True),), 1), (-3, (), 1)],
+)
+def test_an_impossible_answer_keeps_what_has_room(answer, topics, invalid):
+    senders = after_run(episode([0]), topics, on_arrival=lambda b, a, m: answer)
+    assert (order(senders), senders.batch.senders[0]["invalid"]) == ([0], invalid)
 
 
 def test_a_limit_of_one_topic():
@@ -156,15 +148,6 @@ def test_a_limit_of_one_topic():
     topics = (Topic("camera", limit=1), Topic("status"))
     senders = after_run(episode([0, 0, 0, 0], [0, 0, 0, 1]), topics)
     assert log(senders)["dropped_us"] == {2: 0}
-    # Slot 0 (status) is no help for a camera message, slot 1 (camera) is.
-    topics = (Topic("camera", limit=1), Topic("status"))
-    senders = Senders(1, 5, V, max_messages=4, topics=topics)
-    senders.load(0, episode([0, 0, 0, 0], [1, 1, 0, 0]))
-    while next_event(senders.batch, None, 0) != DECISION or senders.batch.senders[0]["next"] < 3:
-        if senders.batch.senders[0]["waiting"]:
-            decide(senders.batch, 0, ACCEPT)
-    assert [can_evict(senders.batch, 0, k) for k in range(3)] == [False, True, False]
-    assert not has_room(senders.batch, 0)
 
 
 def test_a_topic_is_sent_in_order():
@@ -201,12 +184,6 @@ def test_flushing_no_drop():
         assert log(senders)["dequeued_us"] == {0: 0, 1: 0, 3: 0, 2: 53 * MS}
 
 
-def test_flushing_is_for_no_drop_alone():
-    # A plain sender has no no_drop messages: its window holds.
-    senders = after_run(episode([0] * 3, window=1, ack_delay_us=50 * MS), client=ClientSettings(flush_no_drop=True))
-    assert log(senders)["dequeued_us"] == {0: 0, 1: 51 * MS, 2: 102 * MS}
-
-
 def test_information_of_two_topics():
     # V = 1 - 0.5^d. Topic a (weight 2) has x = 0, 1, 3: 2 x (V(1) + V(2)) = 2 x 1.25. Topic b (weight its priority,
     # 0.5) has x = 2, 5: 0.5 x V(3) = 0.5 x 0.875. The first of each adds no V.
@@ -221,12 +198,6 @@ def test_information_of_two_topics():
     )
     assert order(senders) == [0, 2, 3, 4]
     assert senders.batch.senders[0]["delivered_gain"] == senders.batch.senders[0]["retained_gain"] == 2 * 0.875 + 0.4375
-
-
-def test_a_topic_with_a_value_of_its_own():
-    topics = (Topic("a", value=qoi.saturating(4)), Topic("b"))
-    senders = after_run(episode([0] * 4, [0, 0, 1, 1], x=[0, 1, 2, 4]), topics)
-    assert senders.batch.senders[0]["delivered_gain"] == 0.25 + 0.75
 
 
 def test_the_first_message_of_a_held_queue_is_evicted():
@@ -276,6 +247,21 @@ def test_gaps_of_a_topic_of_which_nothing_was_sent():
     # a: at the same time as 0 and 2 on in x; likewise.
     expected = [(0, 250, 0, 2), (0, 0, 2, 2), (250, 250, 2, 2), (0, 0, 0, 0)]
     assert gaps == [expected, expected]
+
+
+def test_the_step_expected_after_a_message_begins_at_the_arrival_that_was_rejected_behind_it():
+    # b: 1 is kept at 0, 2 at 250 us is rejected; the newcomer is a's. One more step of 250 us is expected after 2, so
+    # 500 us after 1. In x b goes from 1 to 4, so 7 is next.
+    seen = []
+
+    def note(buffer, arrival, memory):
+        seen.append(
+            [(*time_gaps(buffer, arrival, k), *motion_gaps(buffer, arrival, k)) for k in range(len(buffer.slots))]
+        )
+        return REJECT if arrival.seq == 2 else ACCEPT
+
+    after_run(episode([0, 0, 0.25, 0.5], [0, 1, 1, 0], x=[0, 1, 4, 5]), (Topic("a"), Topic("b")), on_arrival=note)
+    assert seen[3] == [(0, 500, 0, 6)]
 
 
 def test_gaps_behind_a_message_that_was_held_back():

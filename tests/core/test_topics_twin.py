@@ -10,64 +10,42 @@ import pytest
 from cases import ANYTHING, VALUES, cases, log, order, same, twin_log
 from hypothesis import given
 from hypothesis import strategies as st
-from topic_cases import choice, decision, topic_cases, unwanted
+from topic_cases import topic_cases
 
 from bufgym import policies, sim
-from bufgym.model.buffer import (
-    ACCEPT,
-    HOLD,
-    REJECT,
-    after,
-    arrival_gain,
-    before,
-    is_first,
-    loss,
-    motion_gaps,
-    time_gaps,
-)
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, arrival_gain, before, is_first, loss, motion_gaps, time_gaps
+from bufgym.model.buffer import after as slot_after
 from bufgym.model.link import FOREVER
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
 
-NAMES = {sim.DECISION: "decision", sim.DEPARTURE: "departure", sim.DEQUEUE: "dequeue", sim.SEND: "send", sim.END: "end"}
+pytestmark = pytest.mark.kernels
 
 
-# --- against the twin ------------------------------------------------------------------------------------------------
-
-
-@given(topic_cases())
+@given(topic_cases(max_messages=40))
 def test_agrees_with_twin_event_by_event(case):
-    senders, twin = case.senders(), case.twin()
-    batch, events, answer, expected = senders.batch, case.twin_events(twin), None, ""
-    while expected != "end":
-        expected, event = events.send(answer), sim.next_event(batch, None, 0)
-        assert NAMES[event] == expected
+    L = case.case.capacity
+
+    def check(event, senders, twin):
+        batch = senders.batch
         sim.credit(batch, 0, int(batch.senders[0]["now_us"]))
         agree(senders, twin)
         view = sim.python_view(sim.named(batch), 0)
         assert (view.window, view.in_flight) == (case.case.episode.window, len(twin.in_flight))
         assert (view.busy, view.left_bytes) == (int(bool(twin.socket)), twin.left_bytes())
-        answer = None
-        if expected == "decision":
+        if event == "decision":
             agree_on_gaps(senders, twin)
-            answer = decision(twin.newcomer["uniform"], case.case.capacity)
-            sim.decide(batch, 0, answer)
-        elif expected == "send":
-            masks = [sim.can_send(batch, 0, k) for k in range(-1, case.case.capacity + 1)]
-            assert masks == [False, *(twin.sendable(m) for m in twin.slots())] + [False] * (
-                len(masks) - 1 - view.slots.size
-            )
+        if event == "send":
+            can = [twin.sendable(m) for m in twin.slots()]
+            assert [sim.can_send(batch, 0, k) for k in range(-1, L + 1)] == [False, *can] + [False] * (L + 1 - len(can))
             assert sim.can_hold(batch, 0) == twin.may_hold()
-            answer = choice(twin.now, len(twin.slots()), len(twin.dequeued), case.case.capacity)
-            sim.answer_send(batch, 0, answer)
-        elif expected == "dequeue":
-            answer = unwanted(twin.now, len(twin.slots()))
-            sim.answer_dequeue(batch, 0, answer)
+
+    senders, twin = case.beside_its_twin(check)
     agree_on_log(senders, twin)
-    until = int(batch.senders[0]["now_us"]) + 5_000
-    sim.credit(batch, 0, until)
+    until = int(senders.batch.senders[0]["now_us"]) + 5_000
+    sim.credit(senders.batch, 0, until)
     for k in range(len(case.topics)):
-        sim.age_until(batch, 0, k, until)
+        sim.age_until(senders.batch, 0, k, until)
     agree(senders, twin, until, to_the_end=True)
 
 
@@ -82,11 +60,7 @@ def agree(senders, twin, until=None, to_the_end=False):
     assert sender["backlog_bytes"] == sum(m["bytes"] for m in twin.slots())
     assert sender["dequeued"] - sender["acked"] == len(twin.in_flight)
     assert sender["busy"] == len(twin.socket)
-    assert (sender["rejected"], sender["evicted"], sender["invalid"]) == (
-        twin.rejected,
-        twin.evicted,
-        twin.invalid,
-    )
+    assert (sender["rejected"], sender["evicted"], sender["invalid"]) == (twin.rejected, twin.evicted, twin.invalid)
     assert sender["retained_gain"] == pytest.approx(twin.retained_gain(), abs=1e-9)
     assert sender["delivered_gain"] == pytest.approx(twin.delivered_gain(until), abs=1e-9)
     for slot, message in zip(slots, twin.slots(), strict=True):
@@ -135,7 +109,7 @@ def agree_on_gaps(senders, twin):
         own = [j for j, m in enumerate(slots) if twin.lane(m) == lane]
         assert before(buffer, k, lane) == max([j for j in own if j < k], default=-1)
         if k < len(slots):
-            assert after(buffer, k, lane) == min([j for j in own if j > k], default=len(slots))
+            assert slot_after(buffer, k, lane) == min([j for j in own if j > k], default=len(slots))
             assert is_first(buffer, k) == (k == own[0])
             assert sim.can_evict(senders.batch, 0, k) == (message in evictable)
 
@@ -146,47 +120,28 @@ def agree_on_log(senders, twin):
     assert order(senders) == twin.order
 
 
-@given(topic_cases(max_messages=150), st.booleans())
-def test_rollouts_agree_with_twin(case, compiled):
-    answers = {
-        "decision": lambda: decision(twin.newcomer["uniform"], case.case.capacity),
-        "send": lambda: choice(twin.now, len(twin.slots()), len(twin.dequeued), case.case.capacity),
-        "dequeue": lambda: unwanted(twin.now, len(twin.slots())),
-    }
-    twin, answer, event = case.twin(), None, ""
-    events = case.twin_events(twin)
-    while event != "end":
-        event = events.send(answer)
-        answer = answers[event]() if event in answers else None
-    senders = case.senders()
-    senders.run(case.policy(compile=compiled))
+@given(topic_cases(max_messages=25))
+def test_rollouts_agree_with_twin_compiled_and_not(case):
+    twin, policy = case.run_twin(), case.policy(compile=True)
+    senders, again = case.senders(), case.senders()
+    senders.run(policy)
     agree_on_log(senders, twin)
     agree(senders, twin, FOREVER)
-
-
-@given(topic_cases())
-def test_the_same_inputs_make_the_same_run(case):
-    first, again = case.senders(), case.senders()
-    policy = case.policy(compile=True)
-    first.run(policy)
     again.run(replace(policy, compile=False))
-    assert same(first, again)
-    again.load(0, case.case.episode)  # which forgets the run before
-    again.run(policy)
-    assert same(first, again)
-    for name in ("aged", "late", "invalid"):
-        assert first.batch.senders[0][name] == again.batch.senders[0][name]
-    assert (np.asarray(first.batch.topics) == np.asarray(again.batch.topics)).all()
+    for _ in range(2):
+        assert same(senders, again)
+        for name in ("aged", "late", "invalid"):
+            assert senders.batch.senders[0][name] == again.batch.senders[0][name]
+        assert (np.asarray(senders.batch.topics) == np.asarray(again.batch.topics)).all()
+        again.load(0, case.case.episode)  # which forgets the run before
+        again.run(policy)
 
 
-# --- whatever is decided ---------------------------------------------------------------------------------------------
-
-
-@given(topic_cases(), st.randoms(use_true_random=False))
-def test_invariants_after_every_event(case, chance):
+@given(topic_cases(max_messages=30), st.randoms(use_true_random=False))
+def test_what_the_masks_allow_is_carried_out_and_invariants_hold(case, chance):
     senders = case.senders()
     batch, sender = senders.batch, senders.batch.senders[0]
-    capacity, event, now_us = case.case.capacity, None, 0
+    L, event, now_us = case.case.capacity, None, 0
     # Arrivals that ask nobody may find no room; where all ask, and are given what is possible, nothing is impossible.
     everyone = case.case.episode.first_decision == 0 and case.case.episode.last_decision > len(case.case.twin_messages)
     while event != sim.END:
@@ -195,54 +150,17 @@ def test_invariants_after_every_event(case, chance):
         now_us = int(sender["now_us"])
         hold(case, senders)
         if event == sim.DECISION:
-            possible = [k for k in range(capacity) if sim.can_evict(batch, 0, k)]
+            possible = [k for k in range(L) if sim.can_evict(batch, 0, k)]
             possible += [REJECT] * sim.can_reject(batch, 0) + [ACCEPT] * sim.has_room(batch, 0)
-            kept_if_possible(case, senders, chance.choice(possible), possible=True)
+            assert sim.decide(batch, 0, chance.choice(possible))
         elif event == sim.SEND:
-            possible = [k for k in range(capacity) if sim.can_send(batch, 0, k)] + [HOLD] * sim.can_hold(batch, 0)
+            possible = [k for k in range(L) if sim.can_send(batch, 0, k)] + [HOLD] * sim.can_hold(batch, 0)
             assert sim.answer_send(batch, 0, chance.choice(possible))
         elif event == sim.DEQUEUE:
             sim.answer_dequeue(batch, 0, chance.random() < 0.5)
-        hold(case, senders)
     assert sender["invalid"] == 0 or not everyone
     assert sender["next"] == len(case.case.twin_messages)
     assert sim.next_event(batch, None, 0) == sim.END  # and stays there
-
-
-@given(topic_cases())
-def test_invariants_under_impossible_decisions(case):
-    senders = case.senders()
-    batch, event = senders.batch, None
-    while event != sim.END:
-        event = sim.next_event(batch, None, 0)
-        if event == sim.DECISION:
-            uniform = float(batch.arrivals[0, batch.senders[0]["next"]]["uniform"])
-            kept_if_possible(case, senders, decision(uniform, case.case.capacity))
-        elif event == sim.SEND:
-            sender = batch.senders[0]
-            k = choice(int(sender["now_us"]), int(sender["occupancy"]), int(sender["dequeued"]), case.case.capacity)
-            sim.answer_send(batch, 0, k)
-        elif event == sim.DEQUEUE:
-            sim.answer_dequeue(batch, 0, True)
-        hold(case, senders)
-
-
-def kept_if_possible(case, senders, answer, possible=False):
-    """No decision drops a no_drop message but a newcomer that has no room even without all droppable ones."""
-    batch = senders.batch
-    sender = np.asarray(batch.senders)[0].copy()
-    slots = np.asarray(batch.slots[0])[sender["first"] : sender["first"] + sender["occupancy"]].copy()
-    seq = int(sender["next"])
-    newcomer = np.asarray(batch.arrivals[0])[seq].copy()
-    assert sim.decide(batch, 0, answer) or not possible
-    gone = np.asarray(batch.log[0])["dropped_us"] != sim.NEVER
-    no_drop = [rules.no_drop for rules in case.topics] or [False] * 3  # one queue ignores the messages' topics
-    assert not any(gone[m["seq"]] and no_drop[m["topic"]] for m in slots)
-    if not (gone[seq] and no_drop[newcomer["topic"]]):
-        return
-    spare = (case.case.max_bytes or 2**62) - sender["backlog_bytes"] - newcomer["size_bytes"]
-    droppable = [m["size_bytes"] for m in slots if not no_drop[m["topic"]]]
-    assert spare + sum(droppable) < 0 or (not droppable and len(slots) == case.case.capacity)
 
 
 def hold(case, senders):
@@ -287,9 +205,6 @@ def hold(case, senders):
     assert sender["retained_gain"] == pytest.approx(gain, abs=1e-9)
 
 
-# --- one topic without rules is a plain sender -----------------------------------------------------------------------
-
-
 def head(buffer, memory):
     """The scheduler of a first in, first out queue."""
     return 0
@@ -307,27 +222,21 @@ PLAIN = [
 """All policies of one queue that know nothing beforehand, and one that decides at random."""
 
 
-def one_topic(case):
+@given(
+    cases(max_messages=25),
+    VALUES,
+    st.sampled_from([None, head, holds_sometimes]),
+    st.sampled_from(PLAIN),
+    st.integers(1, 4),
+    st.sampled_from([0, 0, 1, 3_000]),
+)
+def test_one_topic_without_rules_is_a_plain_sender(case, v, on_send, policy, window, ack_delay_us):
+    episode = replace(case.episode, window=window, ack_delay_us=ack_delay_us)
     arrivals = case.episode.arrivals.copy()
     arrivals["topic"] = 0
-    return replace(case.episode, arrivals=arrivals)
-
-
-@given(cases(), VALUES, st.sampled_from([None, head, holds_sometimes]), st.data())
-def test_one_topic_without_rules_is_a_plain_sender(case, v, on_send, data):
     limits = {"max_bytes": case.max_bytes, "decide_at": case.decide_at}
-    for policy in data.draw(st.lists(st.sampled_from(PLAIN), min_size=4, max_size=4)):
-        scheduled = policy if on_send is None else replace(policy, on_send=on_send)
-        plain = sim.run(policy if on_send is head else scheduled, [case.episode], case.capacity, v, **limits)
-        topics = sim.run(scheduled, [one_topic(case)], case.capacity, v, topics=[Topic("only")], **limits)
-        assert same(plain, topics), policy.name
-
-
-@given(cases(), VALUES, st.integers(1, 4), st.sampled_from([0, 1, 3_000]))
-def test_one_topic_without_rules_has_the_same_window(case, v, window, ack_delay_us):
-    for on_send in (head, holds_sometimes):
-        policy = replace(PLAIN[-1], on_send=on_send)
-        windowed = {"window": window, "ack_delay_us": ack_delay_us}
-        plain = sim.run(policy, [replace(case.episode, **windowed)], case.capacity, v)
-        topics = sim.run(policy, [replace(one_topic(case), **windowed)], case.capacity, v, topics=[Topic("only")])
-        assert same(plain, topics)
+    scheduled = policy if on_send is None else replace(policy, on_send=on_send)
+    plain = sim.run(policy if on_send is head else scheduled, [episode], case.capacity, v, **limits)
+    only = [Topic("only")]
+    topics = sim.run(scheduled, [replace(episode, arrivals=arrivals)], case.capacity, v, topics=only, **limits)
+    assert same(plain, topics), policy.name

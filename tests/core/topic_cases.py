@@ -1,17 +1,19 @@
-"""Random episodes with topics, each for the package and for its twin in ``naive_topics``."""
+"""Random episodes with topics, each for the package and for its twin in ``naive_sender``."""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import naive
-import naive_topics
+import naive_sender
 import numpy as np
 from cases import Case, cases
 from hypothesis import strategies as st
 
-from bufgym import policies
+from bufgym import policies, sim
 from bufgym.model import qoi
 from bufgym.model.buffer import HOLD
 from bufgym.model.topics import Topic
@@ -24,6 +26,10 @@ TWIN_V = {
 }
 """V functions and their twins."""
 V = st.sampled_from(list(TWIN_V))
+
+EVENTS = dict(zip(range(5), ("end", "departure", "decision", "dequeue", "send"), strict=True))
+"""The twin's names of ``sim.END``, ``sim.DEPARTURE`` and so on."""
+assert (sim.END, sim.DEPARTURE, sim.DECISION, sim.DEQUEUE, sim.SEND) == tuple(range(5))
 
 CLIENT_RULES = ("limit_at_send", "limit_since_sent", "flush_no_drop")
 """Settings of the client that change what a sender does."""
@@ -93,12 +99,12 @@ class TopicCase:
             hooks["on_dequeue"] = drop_some
         return policies.Policy("test-anything", decide_anything, client=self.client, compile=compile, **hooks)
 
-    def twin(self) -> naive_topics.Sender:
+    def twin(self) -> naive_sender.Sender:
         case, episode = self.case, self.case.episode
-        rules: Any = naive_topics.Rules(TWIN_V[self.v])
+        rules: Any = naive_sender.Rules(TWIN_V[self.v])
         if self.topics:
             rules = [twin_rules(topic, self.v) for topic in self.topics]
-        return naive_topics.Sender(
+        return naive_sender.Sender(
             naive.Link(case.knots, episode.link.trace.after, episode.link.offset_us),
             rules,
             case.capacity,
@@ -112,13 +118,40 @@ class TopicCase:
             **{rule: getattr(self.client, rule) for rule in CLIENT_RULES},
         )
 
-    def twin_events(self, twin: naive_topics.Sender) -> Any:
-        episode = self.case.episode
-        return twin.events(self.case.twin_messages, episode.first_decision, episode.last_decision)
+    def beside_its_twin(self, check: Callable[[str, Senders, Any], None]) -> tuple[Senders, Any]:
+        """Product and twin after the same answers to the same events; ``check(event, senders, twin)`` sees each."""
+        senders = self.senders()
+        batch, to_kernel = (
+            senders.batch,
+            {"decision": sim.decide, "send": sim.answer_send, "dequeue": sim.answer_dequeue},
+        )
+
+        def ask(twin: Any, event: str) -> Any:
+            assert EVENTS[sim.next_event(batch, None, 0)] == event
+            check(event, senders, twin)
+            answer = self.answer(twin, event)
+            if event in to_kernel:
+                to_kernel[event](batch, 0, answer)
+            return answer
+
+        return senders, self.run_twin(ask)
+
+    def run_twin(self, ask: Callable[[Any, str], Any] | None = None) -> Any:
+        """The twin after the episode; ``ask(twin, event)`` answers, as the policy does if not given."""
+        twin, episode = self.twin(), self.case.episode
+        twin.ask = functools.partial(ask or self.answer, twin)
+        return twin.run(self.case.twin_messages, episode.first_decision, episode.last_decision)
+
+    def answer(self, twin: Any, event: str) -> Any:
+        if event == "decision":
+            return decision(twin.newcomer["uniform"], self.case.capacity)
+        if event == "send":
+            return choice(twin.now, len(twin.slots()), len(twin.dequeued), self.case.capacity)
+        return unwanted(twin.now, len(twin.slots())) if event == "dequeue" else None
 
 
-def twin_rules(topic: Topic, v: qoi.Value) -> naive_topics.Rules:
-    return naive_topics.Rules(
+def twin_rules(topic: Topic, v: qoi.Value) -> naive_sender.Rules:
+    return naive_sender.Rules(
         TWIN_V[topic.value or v],
         topic.priority,
         topic.priority if topic.weight is None else topic.weight,

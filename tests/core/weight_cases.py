@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 
 import numpy as np
 import pytest
@@ -25,6 +26,16 @@ def network(rng, inputs, *widths):
 
     layers = tuple((some(a, b), some(b)) for a, b in itertools.pairwise([inputs, *widths]))
     return Network(some(inputs), some(1), layers, some(widths[-1] if widths else 0))
+
+
+def score(net, f):
+    """The formula in the text of ``bufgym.policies.learned``, number by number."""
+    h = f
+    for weight, bias in net.layers:
+        sums = [math.fsum(each * float(w) for each, w in zip(h, weight[:, o], strict=True)) for o in range(len(bias))]
+        h = [max(0.0, total + float(b)) for total, b in zip(sums, bias, strict=True)]
+    out = math.fsum(float(w) * each for w, each in zip(net.out, h, strict=True)) if net.layers else 0.0
+    return out + math.fsum(float(s) * each for s, each in zip(net.skip, f, strict=True)) + float(net.bias[0])
 
 
 def random_weights(kind, fields, *widths, seed=0):

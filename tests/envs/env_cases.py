@@ -31,6 +31,10 @@ STREAMS = (
 LINKS = (Trace.steps([(0.4, 60_000), (0.5, 0), (0.6, 40_000)]), Trace.steps([(0.7, 90_000), (0.2, 0)], after="stop"))
 
 
+FADING = Trace.steps([(0.4, 9e6), (0.5, 0), (0.6, 2e6)])
+DYING = Trace.steps([(0.4, 9e6), (0.3, 1e6)], after="stop")
+
+
 def client(**parameters: Any) -> Client:
     """These streams over these links."""
     return Client(STREAMS, LINKS, **parameters)

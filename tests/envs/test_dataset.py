@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -85,30 +84,3 @@ def test_infos_have_the_same_entries_in_every_step() -> None:
         while not ended:
             _, _, ended, _, after = env.step(4)
             assert after.keys() == info.keys()
-
-
-@pytest.mark.filterwarnings("ignore:Implicitly cleaning up", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_minaris_own_collector_records_infos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    minari = pytest.importorskip("minari")
-    pytest.importorskip("jax", reason="Minari's DataCollector needs jax")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    env = minari.DataCollector(
-        gym.make("bufgym/Uplink-v0", capacity=4, info="steady", **SHORT), record_infos=True, data_format="arrow"
-    )
-    for seed in range(2):
-        env.reset(seed=seed)
-        ended = False
-        while not ended:
-            _, _, ended, _, _ = env.step(4)
-    made = env.create_dataset(
-        "bufgym/test-v0",
-        algorithm_name="reject",
-        author="a",
-        author_email="a@b.c",
-        code_permalink="c",
-        description="rejects everything",
-        eval_env=env.spec,
-    )
-    episode = next(iter(made))
-    assert episode.infos["arrived"][-1] == 60
-    assert episode.infos["action_mask"].shape == (61, 6)

@@ -9,13 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from env_cases import valid_action
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym import expert, oracle, policies
 from bufgym.envs import SenderEnv, SenderVectorEnv
 from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.oracle.online import law, online_optimum
@@ -71,9 +70,7 @@ def check_values(env: SenderEnv, values: np.ndarray) -> None:
     assert (np.isnan(values[0]) == ~env.action_masks()).all()
 
 
-# --- the clairvoyant -------------------------------------------------------------------------------------------------
-
-
+@pytest.mark.kernels
 def test_by_hand() -> None:
     # One byte a microsecond, 10 bytes a message, L = 1: while 0 crosses (until 10), 1, 2 and 3 arrive.
     episode = Episode(messages(np.array([0, 1, 2, 3]), 10), Link(trace([(0, 0), (1_000, 1_000)])))
@@ -94,6 +91,7 @@ def test_by_hand() -> None:
     assert know.actions().tolist() == [0]
 
 
+@pytest.mark.kernels
 def test_a_queue_that_cannot_be_emptied() -> None:
     # x: 1 and 2 show what 0 showed; 120 bytes are carried in all, so of what is queued behind 0 one more crosses.
     episode = Episode(
@@ -112,7 +110,7 @@ def test_a_queue_that_cannot_be_emptied() -> None:
 @st.composite
 def episodes(draw: Any) -> tuple[Episode, int]:
     """A few messages of 4 bytes over a link of fits and starts, and L."""
-    n = draw(st.integers(2, 7))
+    n = draw(st.integers(2, 6))
     gaps = st.lists(st.integers(0, 9), min_size=n, max_size=n)
     times, x = np.cumsum(draw(gaps)), np.cumsum(draw(gaps)) / draw(st.sampled_from([1, 4]))
     steps = draw(st.lists(st.tuples(st.integers(1, 12), st.integers(0, 14)), min_size=1, max_size=5))
@@ -124,8 +122,8 @@ def episodes(draw: Any) -> tuple[Episode, int]:
     return Episode(messages(times, 4, x), link), draw(st.integers(1, 3))
 
 
+@pytest.mark.kernels
 @given(episodes(), st.sampled_from([V, qoi.saturating(3.0)]), st.lists(st.integers(0, 2**32 - 1), max_size=4))
-@settings(max_examples=80 if JIT else 5, deadline=None)
 def test_values_are_those_of_all_action_sequences(case: tuple[Episode, int], v: Any, seeds: list[int]) -> None:
     """At the start, and after actions at random."""
     episode, capacity = case
@@ -141,7 +139,7 @@ def test_values_are_those_of_all_action_sequences(case: tuple[Episode, int], v: 
 
 def test_the_value_at_the_start_is_the_clairvoyants() -> None:
     """On real links, where the sweep leaves most successors out."""
-    n, duration_s = (48, 10.0) if JIT else (2, 1.0)
+    n, duration_s = 16, 10.0
     envs = SenderVectorEnv(n, "lte", 8, duration_s=duration_s, size_bytes=500_000, info="none")
     envs.reset(seed=0)
     values, senders = expert.clairvoyant(envs).values(), envs.rows.senders
@@ -154,11 +152,11 @@ FAMILIES = (SHORT, Interruption(t_max=90, law="fixed", value=V), replace(SHORT, 
 
 
 @pytest.mark.parametrize("capacity", [1, 4])
-@pytest.mark.parametrize("steps_at_random", [0, 15, 60] if JIT else [0, 5])
-@pytest.mark.parametrize("family", FAMILIES if JIT else [replace(SHORT, duration_s=0.5)])
+@pytest.mark.parametrize("steps_at_random", [0, 15])
+@pytest.mark.parametrize("family", FAMILIES)
 def test_who_follows_it_earns_what_it_says(family: Any, steps_at_random: int, capacity: int) -> None:
     """From the start and after actions at random, in a batch, whose rows are those of the single environment."""
-    n, rng = 6 if JIT else 2, np.random.default_rng(1)
+    n, rng = 4, np.random.default_rng(1)
     envs = SenderVectorEnv(n, family, capacity, autoreset_mode="Disabled")
     envs.reset(options={"episodes": [draw(family, seed) for seed in range(n)]})
     know = expert.clairvoyant(envs)
@@ -178,7 +176,7 @@ def test_who_follows_it_earns_what_it_says(family: Any, steps_at_random: int, ca
 
 def test_many_episodes_share_its_room() -> None:
     """Steps of past episodes make room for new ones, and those of the others stay what they were."""
-    n, steps, duration_s = (16, 150, 10.0) if JIT else (3, 8, 0.5)
+    n, steps, duration_s = (8, 100, 10.0)
     envs = SenderVectorEnv(n, replace(SHORT, duration_s=duration_s), 4, autoreset_mode="SameStep")
     envs.reset(seed=0)
     know = expert.clairvoyant(envs)
@@ -205,9 +203,6 @@ def test_where_it_is_not_known_it_says_so(options: dict[str, Any], why: str) -> 
     env.reset(seed=0)
     with pytest.raises(BufgymError, match=why):
         expert.clairvoyant(env).values()
-
-
-# --- policies --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["afr", "random", "clairvoyant", "python"])

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from env_cases import valid_action
+from env_cases import same, valid_action
 from gymnasium.vector import AutoresetMode
 
 from bufgym import policies
@@ -37,8 +37,7 @@ def oldest_goes(mask: np.ndarray) -> int:
     return L + 1 if mask[L + 1] else 0
 
 
-@pytest.mark.parametrize("robots", [1, 3])
-@pytest.mark.parametrize("mask_in_observation", [False, True])
+@pytest.mark.parametrize(("robots", "mask_in_observation"), [(1, False), (3, True)])
 def test_pettingzoo_has_nothing_to_say(robots, mask_in_observation, capsys):
     def make():
         return parallel_env(robots=robots, mask_in_observation=mask_in_observation, **SMALL)
@@ -50,27 +49,13 @@ def test_pettingzoo_has_nothing_to_say(robots, mask_in_observation, capsys):
 
 # Remarks that are no rules: on observations that are dicts, and on zeros, which a robot sees at the end.
 @pytest.mark.filterwarnings("ignore:Observation")
-@pytest.mark.parametrize("options", [{}, {"mask_in_observation": True}, {"observation": "flat"}, {"info": "none"}])
+@pytest.mark.parametrize("options", [{"mask_in_observation": True}, {"observation": "flat"}, {"info": "none"}])
 def test_pettingzoo_has_nothing_to_say_of_it_turn_by_turn(options):
     def make():
         return parallel_to_aec(parallel_env(robots=3, **SMALL, **options))
 
     api_test(make(), num_cycles=70)
     seed_test(make, num_cycles=20)
-
-
-@pytest.mark.parametrize("fields", [None, ["loss", "busy"]])
-@pytest.mark.parametrize("form", ["flat", "slots"])
-def test_every_form_is_that_of_the_rows(form, fields):
-    env = FleetEnv(3, "lte", observation=form, fields=fields, **SMALL)
-    envs = FleetVecEnv(1, 3, "lte", L, observation=form, fields=fields, parameters=PARAMETERS)
-    seen, rows = env.reset(seed=2)[0], envs.reset(seed=2)[0]
-    for _ in range(10):
-        for i, agent in enumerate(env.agents):
-            assert env.observation_space(agent).contains(seen[agent])
-            for own, row in [(seen[agent], rows)] if form == "flat" else [(seen[agent][k], rows[k]) for k in rows]:
-                assert np.array_equal(own, row[i])
-        seen, rows = env.step(dict.fromkeys(env.agents, L + 1))[0], envs.step(np.full(3, L + 1))[0]
 
 
 def test_one_robot_is_the_single_environment():
@@ -122,6 +107,7 @@ def test_an_episode_is_the_rollout_of_the_same_policy(reward):
         env.step({})
 
 
+@pytest.mark.kernels
 def test_left_is_what_is_left_of_the_share():
     # 1 byte/us. A alone from 0; at 500 it has 500 of its 1000 bytes left, and B joins. At 750 A has 375 left, B 875.
     link = Link(Trace("even", np.array([0, 1_000_000]), np.array([0, 1_000_000])))
@@ -142,28 +128,22 @@ def test_left_is_what_is_left_of_the_share():
 def test_what_a_step_hands_out_is_never_written_again():
     env = FleetEnv(robots=2, mask_in_observation=True, **SMALL)
     seen, infos = env.reset(seed=0)
-    held = [(seen["robot_1"], infos["robot_1"]["action_mask"])]
-    copies = [({k: a.copy() for k, a in seen["robot_1"].items()}, infos["robot_1"]["action_mask"].copy())]
+    held, copies = [], []
     while env.agents:
+        held.append({**seen["robot_1"], "mask": infos["robot_1"]["action_mask"]})
+        copies.append({name: array.copy() for name, array in held[-1].items()})
+        assert np.array_equal(held[-1]["action_mask"], held[-1]["mask"])
         seen, _, _, _, infos = env.step(dict.fromkeys(env.agents, L + 1))
-        held.append((seen["robot_1"], infos["robot_1"]["action_mask"]))
-        copies.append(({k: a.copy() for k, a in seen["robot_1"].items()}, infos["robot_1"]["action_mask"].copy()))
-    for (observation, mask), (copy, mask_copy) in zip(held, copies, strict=True):
-        assert all(np.array_equal(observation[key], copy[key]) for key in copy)
-        assert np.array_equal(mask, mask_copy)
-        assert np.array_equal(observation["action_mask"], mask)
+    assert all(same(now, then) for now, then in zip(held, copies, strict=True))
 
 
-def test_state_and_spaces():
+def test_fields_and_state():
     env = FleetEnv(robots=3, fields=["occupancy", "loss"], **SMALL)
     seen, _ = env.reset(seed=0)
-    assert env.state().shape == env.state_space.shape == (3 * (len(SLOT_FIELDS) * (L + 1) + len(CONTEXT_FIELDS)),)
+    assert env.state().shape == (3 * (len(SLOT_FIELDS) * (L + 1) + len(CONTEXT_FIELDS)),)
     assert env.state_space.contains(env.state())
     assert set(seen["robot_2"]) == {"occupancy", "loss"}
     assert env.observation_space("robot_2").contains(seen["robot_2"])
-    assert env.action_space("robot_0").n == L + 2
-    assert env.state().tobytes() != FleetEnv(robots=3, **SMALL).state().tobytes()
-    env.close()
 
 
 def test_seeds_make_the_same_episode_and_go_on_from_it():
@@ -180,68 +160,43 @@ def test_seeds_make_the_same_episode_and_go_on_from_it():
     assert crossings(other, 6) != first
 
 
-def test_as_text_every_robot_has_a_line():
-    env = FleetEnv(robots=3, render_mode="ansi", **SMALL)
+def test_pictures_have_a_line_and_a_bar_for_every_robot():
+    env, image = FleetEnv(robots=3, render_mode="ansi", **SMALL), FleetEnv(robots=60, render_mode="rgb_array", **SMALL)
     with pytest.raises(gym.error.ResetNeeded):
         env.render()
-    env.reset(seed=0)
+    env.reset(seed=0), image.reset(seed=0)
+    shown = [image.render()]
     for _ in range(8):
-        env.step(dict.fromkeys(env.agents, L + 1))
+        env.step(dict.fromkeys(env.agents, L + 1)), image.step(dict.fromkeys(image.agents, L + 1))
     head, *lines = env.render().splitlines()
     assert head.endswith("of 3 sending")
     assert [line.split()[0] for line in lines] == env.possible_agents
-    sender = env.rows.senders.batch.senders[1]
-    assert lines[1].count("■") == sender["occupancy"]
-    assert lines[1].count("·") == L - sender["occupancy"]
-    with pytest.warns(UserWarning, match="render_mode"):
-        assert FleetEnv(robots=3, **SMALL).render() is None
-    wide = FleetEnv(robots=2, capacity=100, render_mode="ansi", duration_s=1.0)
-    wide.reset(seed=0)
-    assert "0/100" in wide.render()
-
-
-@pytest.mark.parametrize("robots", [1, 3, 60])
-def test_as_an_image_every_robot_has_a_bar(robots):
-    env = FleetEnv(robots=robots, render_mode="rgb_array", **SMALL)
-    env.reset(seed=0)
-    shown = [env.render()]
-    for _ in range(12):
-        env.step(dict.fromkeys(env.agents, L + 1))
-    shown.append(env.render())
-    assert all(image.shape == (400, 800, 3) and image.dtype == np.uint8 for image in shown)
-    queued = [int((image == (0xE0, 0xA1, 0x00)).all(axis=-1).sum()) for image in shown]
-    assert queued[1] > queued[0] + 500  # the legend has the colour, too
-    assert (env.rows.senders.batch.senders["next"] == 12).all()  # drawing changes nothing
+    queued = env.rows.senders.batch.senders[1]["occupancy"]
+    assert (lines[1].count("■"), lines[1].count("·")) == (queued, L - queued)
+    shown.append(image.render())
+    assert all(frame.shape == (400, 800, 3) and frame.dtype == np.uint8 for frame in shown)
+    before, after = (int((frame == (0xE0, 0xA1, 0x00)).all(axis=-1).sum()) for frame in shown)
+    assert after > before + 500  # the legend has the colour, too
+    assert (image.rows.senders.batch.senders["next"] == 8).all()  # drawing changes nothing
     envs = FleetVecEnv(1, 2, "lte", L, parameters=PARAMETERS, render_mode="rgb_array")
     envs.reset(seed=0)
-    assert [image.shape for image in envs.render()] == [(400, 800, 3)] * 2
-
-
-@pytest.mark.slow
-def test_256_robots():
-    env = FleetEnv(robots=256, capacity=2, duration_s=0.5)
-    _, infos = env.reset(seed=0)
-    while env.agents:
-        _, rewards, _, _, infos = env.step(dict.fromkeys(env.agents, 3))
-    assert len(rewards) == 256
-    assert sum(infos[agent]["delivered"] for agent in env.possible_agents) > 256
+    assert [frame.shape for frame in envs.render()] == [(400, 800, 3)] * 2
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert FleetEnv(robots=3, **SMALL).render() is None
 
 
 @pytest.mark.parametrize(
     ("act", "complaint"),
     [
-        (lambda: FleetEnv(robots=0), "robots = 0"),
         (lambda: FleetEnv(reward="all"), "reward = 'all': must be 'team'"),
         (lambda: FleetEnv(term="speed"), "unknown term 'speed'"),
         (lambda: FleetEnv(fields=["colour"]), "unknown field 'colour'"),
         (lambda: FleetEnv(render_mode="human"), "render_mode = 'human'"),
         (lambda: FleetEnv(observation="flat", mask_in_observation=True), "'flat' has no place for it"),
         (lambda: begun().step({"robot_0": 0, "robot_1": 1.7}), "actions['robot_1'] = 1.7: must be a whole number"),
-        (lambda: FleetEnv(wheels=4), "no parameter 'wheels'"),
         (lambda: begun().step({"robot_0": 0}), "actions: none for 'robot_1'"),
         (lambda: begun().step({"robot_0": 0, "robot_1": L + 2}), "actions['robot_1'] = 6: must lie in 0..5"),
         (lambda: begun().reset(options={"episode": apart()}), "arrive at the same times"),
-        (lambda: begun().reset(options={"episode": apart(3)}), "the same times"),
         (lambda: FleetVecEnv(0), "cells = 0"),
         (lambda: FleetVecEnv(2, reward="mine"), "reward = 'mine'"),
         (lambda: FleetVecEnv(2, 2).reset(options={"episodes": [None]}), "1 given for 2 cells"),
@@ -285,9 +240,6 @@ def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
     with pytest.raises(AttributeError, match="no_such_thing"):
         bufgym.envs.__getattr__("no_such_thing")
     assert bufgym.envs.FleetVecEnv is FleetVecEnv
-
-
-# --- robots as the rows of a batch -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("reward", ["team", "own"])
@@ -337,7 +289,7 @@ def test_cells_can_be_given_and_begun_one_by_one():
     assert envs.rows.senders.batch.senders["next"].tolist() == [10, 10, 0, 0]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_weights_shared_by_all_robots_learn():
     pytest.importorskip("stable_baselines3", reason="the extra [train] is not installed")
     maskable = pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
@@ -355,6 +307,7 @@ def test_weights_shared_by_all_robots_learn():
     assert actions.shape == (8,)
 
 
+@pytest.mark.kernels
 def test_a_robot_that_is_asked_again_holds_the_others_up():
     # B = 2500. Robot 0: 1000, 1000 and 500 are queued behind its first message, then 2000 comes: both of the oldest go.
     # Robot 1's last message, 3000, is larger than B: it is dropped unasked.

@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
-import bufgym
 from bufgym import policies
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.envs import SenderEnv, SenderVectorEnv
 from bufgym.errors import BufgymError
 from bufgym.expert import Player
-from bufgym.kernel import JIT
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Uplink, suites
 from bufgym.scenario.numbered import draw
@@ -47,9 +45,6 @@ def score(rows: list[dict[str, Any]], row: dict[str, Any]) -> float:
     ]
     gap = row["clairvoyant"] - base
     return (row["qoi"] - base) / gap if gap > 1e-9 * row["clairvoyant"] else math.nan
-
-
-# --- suites ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -100,17 +95,6 @@ def test_the_numbers_of_a_row_lead_to_its_episode(mixed: str, tmp_path: Path) ->
         assert ours == pytest.approx({name: alone[name] for name in ours}, nan_ok=True)
 
 
-def test_every_scenario_of_a_suite_is_drawn(mixed: str) -> None:
-    env = SenderEnv("suite", L, suite=mixed, split="train")
-    env.reset(seed=1)
-    drawn = []
-    for _ in range(20):
-        env.reset()
-        drawn.append((env.rows.senders.value_of(0).name, env.rows.senders.episodes[0].link.trace.name))  # type: ignore[union-attr]
-    assert {value for value, _ in drawn} == {"saturating:3", "exponential:0.4"}
-    assert {trace for _, trace in drawn} == {"train-0", "train-1"}
-
-
 def test_the_rows_of_a_bench_without_a_suite_are_found_too() -> None:
     uplink = Uplink(traces=tuple(Trace.constant(2e6, 9, name="same") for _ in range(2)), duration_s=3)
     env = SenderEnv(uplink, L)
@@ -123,48 +107,36 @@ def test_the_rows_of_a_bench_without_a_suite_are_found_too() -> None:
     assert alone.rows.senders.episodes[0].last_decision == draw(Interruption(t_max=30), 5).last_decision  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"scenario": "time"}, "seed = None: must be a whole number"),
-        ({"scenario": "nowhere", "seed": 0}, "scenario = 'nowhere': must be one of time, motion"),
-        ({"seed": 0}, "scenario: missing; a suite's row has one besides its seed: one of time, motion"),
-        ({"scenario": "time", "seed": 2_000}, "trace = 2: must be 0..1 or one of test-0, test-1"),
-        ({"scenario": "time", "seed": 0, "trace": "b"}, "trace = 'b': must be 0..1"),
-        ({"episode": None, "seed": 0}, "options: an episode, or its scenario, trace, seed; not both"),
-        ({"number": 3}, "known: episode, scenario, trace, seed"),
-    ],
-)
-def test_no_such_episode(mixed: str, options: dict[str, Any], says: str) -> None:
-    with pytest.raises(BufgymError, match=says):
-        SenderEnv("suite", L, suite=mixed, split="test").reset(options=options)
-
-
-def test_what_has_no_such_numbers() -> None:
-    with pytest.raises(BufgymError, match="scenario = 'lte': only the episodes of a suite have one"):
-        SenderEnv("lte", L).reset(options={"scenario": "lte", "trace": 0, "seed": 0})
-    with pytest.raises(BufgymError, match=r"trace = None: must be 0..7 or one of lte-synthetic-0"):
-        SenderEnv("lte", L).reset(options={"seed": 0})
-    with pytest.raises(BufgymError, match="episode: 'label' is unknown; known: scenario, trace, seed"):
-        SenderVectorEnv(1, "interruption", L).reset(options={"episodes": [{"label": 1}]})
+def suite_env(**arguments: Any) -> Any:
+    return gym.make("bufgym/Suite-v0", **arguments)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("act", "says"),
     [
-        ({"suite": "topics-v1"}, "suite topics-v1 is one of topics: bufgym/Suite-v0 has those of one queue alone"),
-        ({"suite": "fleet-v1"}, "suite fleet-v1 is one of fleet"),
-        ({"suite": "lte-v9"}, "unknown suite 'lte-v9'"),
-        ({"split": "all"}, "split = 'all': must be one of train, validation, test"),
-        ({"suite": "lte-belgium-v1"}, "needs a folder of recordings"),
+        (lambda suite: suite.reset(options={"scenario": "time"}), "seed = None: must be a whole number"),
+        (lambda suite: suite.reset(options={"scenario": "no", "seed": 0}), "'no': must be one of time"),
+        (lambda suite: suite.reset(options={"seed": 0}), "scenario: missing; a suite's row has one"),
+        (lambda suite: suite.reset(options={"scenario": "time", "seed": 2_000}), "trace = 2: must be 0..1"),
+        (lambda suite: suite.reset(options={"scenario": "time", "seed": 0, "trace": "b"}), "trace = 'b': must be 0..1"),
+        (lambda suite: suite.reset(options={"episode": None, "seed": 0}), "options: an episode, or its scenario"),
+        (lambda suite: suite.reset(options={"number": 3}), "known: episode, scenario, trace, seed"),
+        (lambda _: SenderEnv("lte", L).reset(options={"scenario": "lte", "seed": 0}), "only the episodes of a suite"),
+        (lambda _: SenderEnv("lte", L).reset(options={"seed": 0}), r"trace = None: must be 0..7 or one of lte"),
+        (
+            lambda _: SenderVectorEnv(1, "lte").reset(options={"episodes": [{"label": 1}]}),
+            "episode: 'label' is unknown",
+        ),
+        (lambda _: suite_env(suite="topics-v1"), "suite topics-v1 is one of topics"),
+        (lambda _: suite_env(suite="lte-v9"), "unknown suite 'lte-v9'"),
+        (lambda _: suite_env(split="all"), "split = 'all': must be one of train, validation, test"),
+        (lambda _: suite_env(suite="lte-belgium-v1"), "needs a folder of recordings"),
+        (lambda _: gym.make("bufgym/Topics-v0", bound=True), "bound = True: the clairvoyant is known for one queue"),
     ],
 )
-def test_suites_that_make_no_environment(arguments: dict[str, Any], says: str) -> None:
+def test_no_such_episode_or_suite(mixed: str, act: Any, says: str) -> None:
     with pytest.raises(BufgymError, match=says):
-        gym.make("bufgym/Suite-v0", **arguments)
-
-
-# --- what an episode was worth ---------------------------------------------------------------------------------------
+        act(SenderEnv("suite", L, suite=mixed, split="test"))
 
 
 @pytest.mark.parametrize(
@@ -195,15 +167,6 @@ def test_the_bound_worked_by_hand(T: int, action: int, h: float, best: float, sc
     found = [info[name] for name in ("qoi", "clairvoyant", "regret", "score")]
     assert found == pytest.approx([h, best, 1 - h / best, score], nan_ok=True)
 
-
-def test_no_bound_unless_asked_for_nor_of_topics() -> None:
-    env = SenderEnv("interruption", 1, t_max=3)
-    assert "clairvoyant" not in played(env, "drop-oldest", seed=0)
-    with pytest.raises(BufgymError, match="bound = True: the clairvoyant is known for one queue"):
-        gym.make("bufgym/Topics-v0", bound=True)
-
-
-# --- arguments as text -----------------------------------------------------------------------------------------------
 
 TEXTS: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
     ("bufgym/Interruption-v0", {"value": "saturating:4"}, {"value": qoi.saturating(4)}),
@@ -261,19 +224,18 @@ def test_text_that_names_nothing(arguments: dict[str, Any], says: str) -> None:
         gym.make("bufgym/Uplink-v0", **arguments)
 
 
-# --- chance ----------------------------------------------------------------------------------------------------------
+SLOW: dict[str, dict[str, Any]] = {
+    "bufgym/Interruption-v0": {"t_max": 30},
+    "bufgym/Uplink-v0": {"duration_s": 4.0, "size_bytes": 1_000_000},
+    "bufgym/Suite-v0": {"suite": "interruption-v1"},
+}
 
 
-@pytest.mark.parametrize("env_id", [id for id in bufgym.ENVIRONMENTS if "Topics" not in id])
+@pytest.mark.parametrize("env_id", SLOW)
 def test_a_randomised_policy_is_random_in_an_environment(env_id: str) -> None:
     """Same seed same run, alone and as a row of a batch; other seeds and Drop Oldest differ; and the episode keeps
     its draws, so that a rollout does the same."""
-    smaller: dict[str, Any] = {} if JIT else {"t_max": 30} if "Interruption" in env_id else {}
-    if "Suite" in env_id:
-        smaller = {"suite": "interruption-v1"}
-    elif "Uplink" in env_id:
-        smaller = {"duration_s": 4.0, "size_bytes": 1_000_000}
-    env: Any = gym.make(env_id, capacity=3, **smaller)
+    env: Any = gym.make(env_id, capacity=3, **SLOW[env_id])
 
     def sent(policy: str, seed: int) -> list[int]:
         played(env, policy, seed=seed)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
+import inspect
 import io
 import os
 import random
@@ -13,77 +15,21 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 REPO = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(REPO))
 
-VALUES = [
-    *(
-        "",
-        "0",
-        "1",
-        "2",
-        "-1",
-        "1e9",
-        "1e-9",
-        "nan",
-        "inf",
-        "9" * 30,
-        "1" * 5000,
-        "1,2",
-        "1,1",
-        "none",
-        "x",
-        "\x1b[31m",
-    ),
-    *(
-        "\n",
-        "\u2013",
-        "afr",
-        "afr,drop-oldest",
-        "decimate:every=2",
-        "decimate:every=0",
-        "afr:x=1",
-        "lte-v1",
-        "topics-v1",
-    ),
-    *(
-        "fleet-v1",
-        "lte-synthetic-0",
-        "drive-0",
-        "exponential:0.5",
-        "exponential:2",
-        "saturating:3",
-        "nowhere",
-        "nowhere.csv",
-    ),
-    *("/dev/null", "/dev/zero", ".", "out.csv", "out.png", "out", "csv", "mahimahi", "validation", "test", "uniform"),
-    *("client.toml", "link.csv", "Uplink-v0", "--", "-o", "\udcff"),
-]
-WORK = (
-    ("bufgym.benchmark.run", "run"),
-    ("bufgym.benchmark.sweep", "run_sweep"),
-    ("bufgym.benchmark.tune", "tune"),
-    ("bufgym.benchmark.leaderboard", "make"),
-    ("bufgym.benchmark.leaderboard", "validate"),
-    ("bufgym.benchmark.perf", "measure"),
-    ("bufgym.benchmark.perf_queue", "measure"),
-    ("bufgym.traces.datasets.fetch", "fetch_dataset"),
-    ("bufgym.cli.figures", "_text"),
-    ("bufgym.gallery", "page"),
-    ("bufgym.gallery", "write_film"),
-    ("bufgym.cli.play", "_play"),
-    ("bufgym.cli.live", "run_async"),
-    ("bufgym.cli.ros2", "run_async"),
-    ("bufgym.cli.relay", "run_async"),
-    ("bufgym.cli.relay_robots", "run_async"),
-    ("bufgym.live.validate", "validate"),
-    ("bufgym.expert.dataset", "make"),
-)
+WORDS = """0 1 2 -1 1e9 1e-9 nan inf 1,2 1,1 none x afr afr,drop-oldest decimate:every=2 decimate:every=0 afr:x=1
+lte-v1 topics-v1 fleet-v1 lte-synthetic-0 drive-0 exponential:0.5 exponential:2 saturating:3 nowhere nowhere.csv
+/dev/null /dev/zero . out.csv out.png out csv mahimahi validation test uniform client.toml link.csv Uplink-v0 -- -o"""
+VALUES = [*WORDS.split(), "", "9" * 30, "1" * 5000, "\x1b[31m", "\n", "\u2013", "\udcff"]
+
+WORK = """benchmark.run.run benchmark.sweep.run_sweep benchmark.tune.tune benchmark.leaderboard.make
+benchmark.leaderboard.validate benchmark.perf.measure benchmark.perf_queue.measure traces.datasets.fetch.fetch_dataset
+cli.figures._text gallery.page gallery.write_film cli.play._play cli.live.run_async cli.ros2.run_async
+cli.relay.run_async cli.relay_robots.run_async live.validate.validate expert.dataset.make"""
 """What takes long, downloads, or needs a terminal."""
 
 
 def leave_out_work() -> None:
-    import importlib
-    import inspect
-
     from bufgym.errors import BufgymError
 
     def left_out(*given: object, **__: object) -> NoReturn:
@@ -92,9 +38,10 @@ def leave_out_work() -> None:
                 one.close()
         raise BufgymError("left out")
 
-    for module, name in WORK:
+    for path in WORK.split():
+        module, name = f"bufgym.{path}".rsplit(".", 1)
         room = importlib.import_module(module)
-        assert hasattr(room, name), f"{module}.{name}"
+        assert hasattr(room, name), path
         setattr(room, name, left_out)
 
 
@@ -118,42 +65,30 @@ def drawn(uniform: random.Random, parser: argparse.ArgumentParser) -> list[str]:
     return words
 
 
-def run_all(first: int, last: int) -> None:
-    import signal
-
-    from inputs import MOST_S, late
-    from mutations import SEED
+def run(k: int, seed: str) -> None:
+    from mutations import limited
 
     from bufgym import cli
 
-    signal.signal(signal.SIGALRM, late)
-    leave_out_work()
-    for k in range(first, last):
-        uniform = random.Random(f"{SEED}-command-{k}")
-        words = drawn(uniform, cli._parser())
-        out, err = io.StringIO(), io.StringIO()
-        signal.alarm(MOST_S)
-        try:
-            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-                code: Any = cli.main(words)
-        except SystemExit as end:
-            code = end.code
-        except BaseException as error:
-            raise AssertionError(f"command {k} of seed {SEED}: {words}: {error!r}") from error
-        finally:
-            signal.alarm(0)
-        said = err.getvalue()
-        assert code in (0, 1, 2), (words, code)
-        assert code != 2 or (said.count("\n") == 1 and said[:-1].isprintable()), (words, said)
+    words = drawn(random.Random(f"{seed}-command-{k}"), cli._parser())
+    out, err = io.StringIO(), io.StringIO()
+    try:
+        with limited(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code: Any = cli.main(words)
+    except SystemExit as end:
+        code = end.code
+    except BaseException as error:
+        raise AssertionError(f"command {k} of seed {seed}: {words}: {error!r}") from error
+    said = err.getvalue()
+    assert code in (0, 1, 2), (words, code)
+    assert code != 2 or (said.count("\n") == 1 and said[:-1].isprintable()), (words, said)
 
 
 if __name__ == "__main__":
-    sys.path[:0] = [str(REPO), str(REPO / "tests" / "fuzz")]
-    from inputs import bounded
-
     with tempfile.TemporaryDirectory() as scratch:
         os.chdir(scratch)
         Path("client.toml").write_bytes((REPO / "examples" / "client.toml").read_bytes())
         Path("link.csv").write_text("t_ms,bytes,interval_ms\n1000,500000,1000\n")
-        bounded()
-        run_all(int(sys.argv[1]), int(sys.argv[2]))
+        leave_out_work()
+        for number in range(int(sys.argv[1])):
+            run(number, sys.argv[2])

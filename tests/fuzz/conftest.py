@@ -5,5 +5,4 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-for name in ("traces", "core"):
-    sys.path.append(str(Path(__file__).resolve().parents[1] / name))
+sys.path += [str(Path(__file__).resolve().parents[1] / name) for name in ("traces", "core", "benchmark")]

@@ -1,95 +1,271 @@
 """Whatever comes in, it ends in a result or in one line: files of every kind, command lines, random episodes.
 
-Each batch of inputs has a process of its own, with 2 GB of memory and 10 s an input. `make fuzz` has 100,000 files of
-each kind, 10,000 command lines and 1,000,000 episodes; every day there are a few.
+A failure names the seed and the number of its input. Each night has 10,000 files of each kind and 1,000 command lines.
 """
 
 from __future__ import annotations
 
+import gzip
+import io
+import json
 import os
 import random
+import shutil
 import subprocess
 import sys
+import tarfile
+import tempfile
+import zipfile
+from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
 import pytest
-from inputs import KINDS
-from mutations import COUNT, SEED
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from link_files import HEADER, SAMPLES, written
+from mutations import COUNT, SEED, limited, mutated
 
 from bufgym import policies
+from bufgym.benchmark import leaderboard, report
+from bufgym.errors import BufgymError, TraceError
 from bufgym.model import qoi
-from bufgym.scenario import Streams, Uplink
+from bufgym.policies import weights as weight_files
+from bufgym.scenario import Streams, Uplink, read_client
 from bufgym.sim.metrics import outcome
 from bufgym.sim.senders import run
-from bufgym.traces import Trace
+from bufgym.traces import FORMATS, Trace, load_motion, read_motion, read_trace, read_workload
+from bufgym.traces.datasets.unpack import unpack
 
 HERE = Path(__file__).parent
-BATCHES = max(1, COUNT // 10_000)
-EPISODES = 16
-"""Of one scenario, which all policies meet."""
+pytestmark = pytest.mark.skipif(not hasattr(__import__("signal"), "SIGALRM"), reason="needs alarms")
+
+Kind = tuple[list[tuple[str, bytes]], Callable[[Path, random.Random], object]]
+"""Sound files, by their names, and what reads them."""
 
 
-def ended_well(program: str, *arguments: str) -> None:
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_DISABLE_JIT": "0", "PYTHONWARNINGS": "ignore"}
-    command = [sys.executable, str(HERE / program), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=environment)
-    assert done.returncode == 0, f"{' '.join(arguments)}: code {done.returncode}: {done.stderr[-3000:]}"
+def weights(folder: Path) -> Kind:
+    from weight_cases import ABOUT, KINDS, made
+
+    files = []
+    for kind in KINDS:
+        for layers in ((), (1,), (3,)):
+            weight_files.save(folder / "sound", made(*layers, kind=kind), ABOUT)
+            files.append(("w.safetensors", (folder / "sound").read_bytes()))
+    return files, lambda path, uniform: policies.load(path)
 
 
-def batch(k: int, count: int) -> tuple[str, str]:
-    return str(k * count // BATCHES), str((k + 1) * count // BATCHES)
+def poses(folder: Path) -> Kind:
+    tum = "".join(f"{k / 10} {k} 0 0 0 0 0 1\n" for k in range(30))
+    euroc = "#timestamp [ns],x\n" + "".join(f"{k * 10**8},{k},0,0,1,0,0,0\n" for k in range(30))
+    motion = "t_s,motion\n" + "".join(f"{k / 10},{k / 7}\n" for k in range(30))
+    kitti = "".join(f"1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in range(3))
+    (folder / "k_times.txt").write_text("0\n0.1\n0.2\n")
+    texts = {"p.txt": tum, "e.csv": euroc, "m.csv": motion, "k.txt": kitti}
+    return [(name, text.encode()) for name, text in texts.items()], lambda path, uniform: read_motion(path)
 
 
-@pytest.mark.parametrize("k", range(BATCHES))
-@pytest.mark.parametrize("kind", KINDS)
-def test_broken_files(kind: str, k: int) -> None:
-    pytest.importorskip("resource")
-    ended_well("inputs.py", kind, *batch(k, max(50, COUNT // (1 if BATCHES > 1 else 4))))
+def bags(folder: Path) -> Kind:
+    import bag_cases as cases
+    from mcap.writer import CompressionType
+    from rosbags.rosbag1 import Writer
+    from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-
-@pytest.mark.parametrize("k", range(BATCHES))
-def test_command_lines(k: int) -> None:
-    pytest.importorskip("resource")
-    ended_well("commands.py", *batch(k, max(50, COUNT // (10 if BATCHES > 1 else 4))))
-
-
-def scenario(uniform: random.Random) -> Uplink:
-    steps = [
-        (uniform.choice([0.01, 0.3, 2]), uniform.choice([0, 0, 1, 3e3, 1e5])) for _ in range(uniform.randint(1, 5))
+    drive, drive1 = cases.drive()[:6], cases.drive(cases.ROS1)[:6]
+    files = [
+        cases.write_mcap(folder / "a.mcap", drive),
+        cases.write_mcap(folder / "b.mcap", drive, CompressionType.NONE),
+        cases.write_ros1(folder / "c.bag", drive1),
+        cases.write_ros1(folder / "d.bag", drive1, Writer.CompressionFormat.BZ2),
+        cases.write_rosbag2(folder / "e", drive, StoragePlugin.SQLITE3) / "e.db3",
+        cases.write_rosbag2(folder / "f", drive, StoragePlugin.SQLITE3, CompressionMode.MESSAGE) / "metadata.yaml",
+        cases.write_rosbag2(folder / "g", drive, StoragePlugin.SQLITE3, CompressionMode.FILE) / "g.db3.zstd",
     ]
-    link = Trace.steps([*steps, (0.2, 5e3)], after=uniform.choice(["loop", "hold"]))
-    return Uplink(
-        traces=(link,),
-        rate_hz=uniform.choice([5, 30, 1000]),
-        duration_s=uniform.choice([0.2, 0.5, 1.0]),
-        jitter=uniform.choice([0, 0.1, 1]),
-        size_bytes=uniform.choice([1, 40, 1000, 10**6]),
-        size_cv=uniform.choice([0, 0.5, 3]),
-        value=uniform.choice([qoi.exponential(), qoi.exponential(0.01), qoi.saturating(7)]),
-    )
+
+    def read(path: Path, uniform: random.Random) -> object:
+        return read_workload(path.parent if path.parent.name in "fg" else path, odom="/odom", bridge_gaps=True)
+
+    return [(str(file.relative_to(folder)), file.read_bytes()) for file in files], read
 
 
-@pytest.mark.parametrize("k", range(BATCHES))
-def test_random_episodes_keep_the_invariants(k: int) -> None:
-    """Each message ends somewhere, once; no more than L wait; deliveries come in order; H is within its bounds."""
-    first, last = map(int, batch(k, max(160, COUNT * 10 if BATCHES > 1 else 0)))
-    for number in range(first // EPISODES, -(-last // EPISODES)):
-        uniform = random.Random(f"{SEED}-episode-{number}")
-        met = scenario(uniform)
-        capacity = uniform.choice([1, 2, 3, 8, 40])
-        policy = policies.get(
-            uniform.choice([name for name in policies.names(for_topics=False) if name != "clairvoyant"])
-        )
-        limit = uniform.choice([None, None, 2 * 10**6])
-        episodes = []
-        for i in range(EPISODES):
-            streams = Streams.seeded(number * EPISODES + i)
-            episodes.append(met.draw(streams).with_uniforms(streams.policy))
-        senders = run(policy, episodes, capacity, met.value, max_bytes=limit)
-        for i in range(EPISODES):
-            case = f"{policy.name}, L = {capacity}, seed {SEED}, scenario {number}, episode {i}"
-            end = outcome(senders, i)
-            assert end.arrived == end.delivered + end.dropped + end.in_transmission + end.buffered, case
-            assert end.buffered <= capacity or not policy.ranked, case
-            assert 0 <= end.qoi <= max(1, end.arrived) + 1e-9 and np.isfinite(end.qoi), case
+def toml(folder: Path) -> Kind:
+    links, motion = (Trace.constant(1e6, 1),), (load_motion("drive-0"),)
+    file = "client.toml", (HERE.parents[1] / "examples" / "client.toml").read_bytes()
+    return [file], lambda path, uniform: read_client(path, traces=links, motion=motion)
+
+
+def results(folder: Path) -> Kind:
+    from report_cases import make
+
+    make(folder / "run")
+    rows = "\nlte-v1,afr,1,3,score,0.5,0.4,0.6,0.1,x\nlte-v1,afr,1,3,regret,0,0,0,0.1,x\n"
+    names = ("manifest.json", "rows.csv", "timeline.json")
+    files = [(f"run/{name}", (folder / "run" / name).read_bytes()) for name in names]
+
+    def read(path: Path, uniform: random.Random) -> object:
+        return leaderboard.read(path) if path.name == "board.csv" else report.markdown(path.parent)
+
+    return [*files, ("board.csv", (",".join(leaderboard.COLUMNS) + rows).encode())], read
+
+
+def archives(folder: Path) -> Kind:
+    with zipfile.ZipFile(folder / "a.zip", "w", zipfile.ZIP_DEFLATED) as made:
+        made.writestr("two/three.txt", random.Random(1).randbytes(500))
+    with tarfile.open(folder / "a.tgz", "w:gz") as tar:
+        tar.add(folder / "a.zip", "one.zip")
+
+    def read(path: Path, uniform: random.Random) -> object:
+        try:
+            return unpack(path, folder / "out")
+        except BufgymError:
+            assert not (folder / "out").exists()  # all or nothing
+            raise
+        finally:
+            shutil.rmtree(folder / "out", ignore_errors=True)
+
+    return [(name, (folder / name).read_bytes()) for name in ("a.zip", "a.tgz")], read
+
+
+def links(folder: Path) -> Kind:
+    """A file of each format, and the beginnings of recorded ones; some packed, and some of these changed after that."""
+    files = [("lte.csv", text.encode()) for text in SAMPLES.values()]
+    named = os.environ.get("BUFGYM_SHARED_DATA")
+    data = Path(named) if named else HERE.parents[2] / "shared" / "data"
+    globs = "mahimahi/*.gz belgium_4g/csv/*foot*.csv belgium_4g/raw/*.log belgium_4g/sabre_json/*foot*.json"
+    globs += " norway_hsdpa/cooked/*bus* uplink_5g/*.gz uplink_wifi/*.gz uplink_mmwave/*.gz"
+    for pattern in globs.split():
+        for path in sorted(data.glob(pattern))[:3]:
+            raw = path.read_bytes()
+            files.append(("lte.csv", (gzip.decompress(raw) if path.suffix == ".gz" else raw)[:3000]))
+    others = [raw for _, raw in files]
+
+    def read(path: Path, uniform: random.Random) -> object:
+        if uniform.random() < 0.2:
+            raw = packed(uniform, path.read_bytes())
+            path.write_bytes(mutated(uniform, raw, others) if uniform.random() < 0.5 else raw)
+        column = uniform.choice([None, None, None, "UL_bitrate"])
+        return ended(path, uniform.choice([None, uniform.choice(list(FORMATS))]), column)
+
+    return files, read
+
+
+def packed(uniform: random.Random, data: bytes) -> bytes:
+    if uniform.random() < 0.5:
+        return gzip.compress(data, 1)
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w", uniform.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])) as archive:
+        for k in range(uniform.choice([1, 1, 1, 2])):
+            archive.writestr(f"{k}.csv", data)
+    return target.getvalue()
+
+
+def ended(path: Path, format: str | None, column: str | None = None) -> Trace:
+    """A sound trace; a TraceError names the file."""
+    try:
+        trace = read_trace(path, format, column=column)
+    except TraceError as error:
+        assert path.name in str(error) and len(str(error)) < 1500
+        raise
+    assert trace.total_bytes > 0 and 0 < trace.duration_us <= 10**13
+    return trace
+
+
+@pytest.mark.parametrize("kind", [weights, poses, bags, toml, results, archives, links])
+def test_broken_files(tmp_path: Path, kind: Callable[[Path], Kind]) -> None:
+    files, read = kind(tmp_path)
+    others, sound = [data for _, data in files], 0
+    for k in range(COUNT):
+        uniform = random.Random(f"{SEED}-{kind.__name__}-{k}")
+        name, data = uniform.choice(files)
+        path = tmp_path / name
+        path.write_bytes(mutated(uniform, data, others))
+        try:
+            with limited(), redirect_stdout(io.StringIO()):
+                read(path, uniform)
+            sound += 1
+        except BufgymError as error:
+            assert str(error).isprintable() and len(str(error)) < 3000, error
+        except BaseException as error:
+            kept = Path(tempfile.gettempdir()) / f"fuzz-{kind.__name__}-{SEED}-{k}"
+            kept.write_bytes(path.read_bytes())
+            raise AssertionError(f"{kind.__name__} {k} of seed {SEED} ({name}, kept as {kept}): {error!r}") from error
+        path.write_bytes(data)
+    assert sound > COUNT // 20, "mutations are meant to be mild"
+
+
+def test_command_lines() -> None:
+    """In a process of its own: commands change the folder, the terminal and what is imported. Nothing is compiled."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_DISABLE_JIT": "1", "PYTHONWARNINGS": "ignore"}
+    command = [sys.executable, str(HERE / "commands.py"), str(max(30, COUNT // 10)), SEED]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=environment)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+SCALARS = st.none() | st.booleans() | st.integers(-5, 10**20) | st.floats() | st.text(max_size=3)
+KEYS = st.sampled_from(["duration_ms", "bandwidth_kbps", "x"])
+JSON = st.recursive(SCALARS, lambda s: st.lists(s, max_size=3) | st.dictionaries(KEYS, s, max_size=3), max_leaves=12)
+CELLS = st.integers(-5, 10**14).map(str) | st.floats(allow_nan=True).map(str)
+CELLS |= st.sampled_from(["", "-0", "1e999", "٣", "+", "Mbits/sec", "2019.12.16_13.40.04", "{}", "["])
+LINES = st.sampled_from([" ", ",", "\t"]).flatmap(lambda c: st.lists(CELLS, min_size=1, max_size=7).map(c.join))
+HEADERS = ["", HEADER, "time_s,bytes_per_s\n", "Timestamp,DL_bitrate,UL_bitrate\n", "[", "\n\n"]
+TEXTS = st.builds(
+    lambda header, lines: header + "\n".join(lines), st.sampled_from(HEADERS), st.lists(LINES, max_size=6)
+)
+MAGIC = st.sampled_from([b"", b"\x1f\x8b", b"PK\x03\x04", b"PK\x05\x06", b"["])
+BYTES = st.builds(lambda magic, rest: magic + rest, MAGIC, st.binary(max_size=60))
+
+
+@pytest.mark.parametrize("content", [TEXTS, BYTES, st.lists(JSON, max_size=4).map(json.dumps)])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data(), format=st.sampled_from([None, *FORMATS]))
+def test_anything_ends_well(
+    tmp_path: Path, content: st.SearchStrategy[str | bytes], data: st.DataObject, format: str | None
+) -> None:
+    path = written(tmp_path, data.draw(content))
+    with limited():
+        try:
+            ended(path, format)
+        except BufgymError as error:
+            assert str(error).isprintable()
+
+
+STEPS = st.lists(
+    st.tuples(st.sampled_from([0.01, 0.3, 2]), st.sampled_from([0, 0, 1, 3e3, 1e5])), min_size=1, max_size=5
+)
+UPLINKS = st.builds(
+    Uplink,
+    traces=st.builds(
+        lambda steps, a: (Trace.steps([*steps, (0.2, 5e3)], after=a),), STEPS, st.sampled_from(["loop", "hold"])
+    ),
+    rate_hz=st.sampled_from([5, 30, 1000]),
+    duration_s=st.sampled_from([0.2, 0.5, 1.0]),
+    jitter=st.sampled_from([0, 0.1, 1]),
+    size_bytes=st.sampled_from([1, 40, 1000, 10**6]),
+    size_cv=st.sampled_from([0, 0.5, 3]),
+    value=st.sampled_from([qoi.exponential(), qoi.exponential(0.01), qoi.saturating(7)]),
+)
+POLICIES = [name for name in policies.names(for_topics=False) if name != "clairvoyant"]
+
+
+@given(
+    met=UPLINKS,
+    name=st.sampled_from(POLICIES),
+    capacity=st.sampled_from([1, 2, 3, 8, 40]),
+    limit=st.sampled_from([None, None, 2 * 10**6]),
+    first=st.integers(0, 2**31),
+)
+def test_random_episodes_keep_the_invariants(
+    met: Uplink, name: str, capacity: int, limit: int | None, first: int
+) -> None:
+    """Each message ends somewhere, once; no more than L wait; H is within its bounds."""
+    policy, episodes = policies.get(name), []
+    for i in range(8):
+        streams = Streams.seeded(first + i)
+        episodes.append(met.draw(streams).with_uniforms(streams.policy))
+    senders = run(policy, episodes, capacity, met.value, max_bytes=limit)
+    for i in range(8):
+        end = outcome(senders, i)
+        assert end.arrived == end.delivered + end.dropped + end.in_transmission + end.buffered
+        assert end.buffered <= capacity or not policy.ranked
+        assert 0 <= end.qoi <= max(1, end.arrived) + 1e-9 and np.isfinite(end.qoi)

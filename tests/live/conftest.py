@@ -1,7 +1,8 @@
-"""A broker of MQTT for the tests that want one."""
+"""A broker of MQTT for the tests that want one, and quick reconnects for all."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import socket
@@ -10,8 +11,15 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from loop_cases import pytest_pyfunc_call, runner  # noqa: F401
 
+from bufgym.live import sender
 from bufgym.live.sockets import free_port
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sender, "RETRY_S", 0.01)
 
 
 @pytest.fixture(scope="session")
@@ -20,15 +28,14 @@ def broker_port() -> Iterator[int]:
     if mosquitto is None:
         pytest.skip("no mosquitto here, a broker of MQTT")
     port = free_port("127.0.0.1")
-    broker = subprocess.Popen([mosquitto, "-p", str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        for _ in range(200):
-            try:
-                socket.create_connection(("127.0.0.1", port), 1).close()
-                break
-            except OSError:
-                time.sleep(0.05)
-        yield port
-    finally:
-        broker.terminate()
-        broker.wait(10)
+    with subprocess.Popen([mosquitto, "-p", str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as broker:
+        try:
+            while True:
+                with contextlib.suppress(OSError):
+                    socket.create_connection(("127.0.0.1", port), 1).close()
+                    break
+                assert broker.poll() is None, "mosquitto has ended"
+                time.sleep(0.01)
+            yield port
+        finally:
+            broker.kill()

@@ -2,14 +2,36 @@
 
 import json
 import os
+import socket
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rosmaster.master import Master
 
 from bufgym import ros1
+
+MESSAGES = 60
+"""Of each topic; not more than five of them are on their way at a time."""
+
+
+def wait(holds: Callable[[], bool]) -> None:
+    while not holds():
+        time.sleep(0.001)
+
+
+def raw_subscriber(topic: str, kind: type) -> Any:
+    """A second connection to a topic of this process, of which nothing is read."""
+    from rosgraph.network import write_ros_handshake_header
+    from rospy.impl.tcpros_base import get_tcpros_server_address, start_tcpros_server
+
+    start_tcpros_server()
+    connection = socket.create_connection(("127.0.0.1", get_tcpros_server_address()[1]))
+    fields = {"topic": topic, "callerid": "/raw", "md5sum": kind._md5sum, "type": kind._type, "tcp_nodelay": "0"}
+    write_ros_handshake_header(connection, fields)
+    return connection
 
 
 def main(folder: str) -> None:
@@ -24,56 +46,35 @@ def main(folder: str) -> None:
 
     ros1.install("afr", topics={"/named": "drop-oldest", "/plain": None}, odometry="/odom", log=folder)
     rospy.init_node("session", disable_signals=True, disable_rosout=True)
-    topics = ("chosen", "named", "plain", "endless", "at_once")
-    came: dict[str, list[str]] = {topic: [] for topic in topics}
-    sizes = {"endless": 0, "at_once": None}
-    publishers = {topic: rospy.Publisher(topic, String, queue_size=sizes.get(topic, 10)) for topic in topics}
+    sizes = {"chosen": 10, "named": 10, "plain": 10, "endless": 0, "at_once": None}
+    came: dict[str, list[str]] = {topic: [] for topic in sizes}
+    publishers = {topic: rospy.Publisher(topic, String, queue_size=size) for topic, size in sizes.items()}
     odometry = rospy.Publisher("odom", Odometry, queue_size=10)
-    for topic in topics:
+    for topic in sizes:
         rospy.Subscriber(topic, String, lambda text, topic=topic: came[topic].append(text.data))
+    wait(lambda: all(one.get_num_connections() for one in (*publishers.values(), odometry)))
     # Two subscribers of one process have one connection: a raw one is the second.
     second = raw_subscriber("/chosen", String)
-    deadline_s = time.monotonic() + 20
-    while any(one.get_num_connections() < 1 for one in (*publishers.values(), odometry)):
-        time.sleep(0.01)
-        if time.monotonic() > deadline_s:
-            raise SystemExit("no connections")
-    for k in range(200):
+    wait(lambda: publishers["chosen"].get_num_connections() == 2)
+    for k in range(MESSAGES):
+        wait(lambda k=k: all(len(texts) > k - 5 for texts in came.values()))  # type: ignore[misc]
         pose = Odometry()
-        pose.header.stamp = rospy.Time(100, k * 4_000_000)
-        pose.pose.pose.position.x = 0.01 * k
+        pose.header.stamp = rospy.Time(100, k * 16_000_000)
+        pose.pose.pose.position.x = 0.03 * k
         pose.pose.pose.orientation.w = 1.0
         odometry.publish(pose)
         for one in publishers.values():
             one.publish(str(k))
-        time.sleep(0.004)
-    time.sleep(0.5)
+    wait(lambda: all(len(texts) == MESSAGES for texts in came.values()))
     kinds = {
         topic: [type(one).__name__ for one in publisher.impl.connections] for topic, publisher in publishers.items()
     }
     statistics = publishers["named"].impl.get_stats()
     second.close()
-    rospy.signal_shutdown("done")
-    time.sleep(0.5)
+    rospy.signal_shutdown("done")  # ends the logs
     logs = sorted(path.name for path in Path(folder).glob("*.mcap"))
     print(json.dumps({"came": came, "kinds": kinds, "logs": logs, "named": statistics[2]}), flush=True)
     os._exit(0)
-
-
-def raw_subscriber(topic: str, kind: type) -> Any:
-    """A second connection to a topic of this process, of which nothing is read."""
-    import socket
-
-    import rospy
-    from rosgraph.network import write_ros_handshake_header
-    from rospy.impl.tcpros_base import get_tcpros_server_address, start_tcpros_server
-
-    start_tcpros_server()
-    connection = socket.create_connection(("127.0.0.1", get_tcpros_server_address()[1]))
-    fields = {"topic": topic, "callerid": "/raw", "md5sum": kind._md5sum, "type": kind._type, "tcp_nodelay": "0"}
-    write_ros_handshake_header(connection, fields)
-    rospy.sleep(0.2)
-    return connection
 
 
 if __name__ == "__main__":

@@ -2,62 +2,62 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from live_cases import Bench
 
 from bufgym.cli import main
+from bufgym.live import LogFile
+from bufgym.live.sockets import free_port
+from bufgym.live.view import View
+from bufgym.model import qoi
+from bufgym.traces.formats import bags
+
+FAST = ["--size", "1000", "--rate", "300", "--duration", "0.1", "--capacity", "64"]
+"""30 messages in 0.1 s, and room for all of them, however slow the machine is."""
 
 
-def free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+@contextmanager
+def receiver(capsys: pytest.CaptureFixture[str], *words: str) -> Iterator[str]:
+    """Where ``bufgym live receive`` listens, in a thread, for 30 messages."""
+    port = str(free_port("127.0.0.1"))
+    arguments = ["live", "receive", "--port", port, "--messages", "30", *words]
+    thread = threading.Thread(target=main, args=(arguments,), daemon=True)
+    thread.start()
+    while "listening" not in capsys.readouterr().out:
+        assert thread.is_alive()
+        time.sleep(0.005)
+    yield f"127.0.0.1:{port}"
+    thread.join()
 
 
 def test_send_receive_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    port = str(free_port())
     came, log = tmp_path / "came.mcap", tmp_path / "log.mcap"
-    receiving = threading.Thread(
-        target=main, args=(["live", "receive", "--port", port, "--messages", "30", "--out", str(came)],), daemon=True
-    )
-    receiving.start()
-    out, patience = "", time.monotonic() + 60
-    while "listening" not in out and time.monotonic() < patience:
-        time.sleep(0.05)
-        out += capsys.readouterr().out
-    room = ["--capacity", "64"]  # however slow the machine is: nothing is dropped
-    sent = main(["live", "send", f"127.0.0.1:{port}", "--size", "1000", "--duration", "1", *room, "--log", str(log)])
-    receiving.join(30)
-    assert sent == 0 and not receiving.is_alive()
+    with receiver(capsys, "--out", str(came)) as place:
+        assert main(["live", "send", place, *FAST, "--log", str(log)]) == 0
     assert main(["live", "replay", str(log)]) == 0
-    out += capsys.readouterr().out
+    out = capsys.readouterr().out
     assert "30 received; 0 broken connections" in out
     assert "30 put, 30 delivered, 0 dropped" in out and "makes the same decisions" in out
-    assert main(["bench", "--workload", str(came), "--topics", "/topic_0", "--trace", "lte-synthetic-0"]) == 0
+    bag = bags.read_bag(came)
+    assert bag.size_bytes[bag.topic == list(bag.topics).index("/topic_0")].tolist() == [1000] * 30
+
+
+def test_send_shows_what_the_queue_does(capsys: pytest.CaptureFixture[str]) -> None:
+    with receiver(capsys) as place:
+        assert main(["live", "send", place, *FAST, "--view"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("afr, L = 64") == 2 and "left         30" in out
 
 
 def test_validate_prints_both_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = [
-        "--trace",
-        "lte-synthetic-0",
-        "--policies",
-        "afr",
-        "--duration",
-        "2",
-        "--size",
-        "50000",
-        "--speed",
-        "2",
-        "--transport",
-        "tcp",
-        "websocket",
-        "--out",
-        str(tmp_path),
-    ]
+    arguments = ["--trace", "lte-synthetic-0", "--policies", "afr", "--duration", "0.5", "--size", "5000"]
+    arguments += ["--speed", "4", "--transport", "tcp", "websocket", "--out", str(tmp_path)]
     assert main(["live", "validate", *arguments]) == 0
     out = capsys.readouterr().out
     assert "| afr |" in out and "2 runs" in out
@@ -71,8 +71,53 @@ def test_validate_prints_both_side_by_side(tmp_path: Path, capsys: pytest.Captur
         (["send", "robot"], "robot: must be HOST:PORT"),
         (["link", "--trace", "lte-synthetic-0", "--to", "robot:99999"], "robot:99999: must be HOST:PORT"),
         (["replay", "none.mcap"], "none.mcap: No such file"),
+        (["view", "none.mcap"], "none.mcap: No such file"),
     ],
 )
 def test_mistakes_are_told(words: list[str], fault: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["live", *words]) == 2
     assert fault in capsys.readouterr().err
+
+
+# --- what ``view`` says of a log, by hand ----------------------------------------------------------------------------
+
+
+def story() -> Bench:
+    """Six puts, a tenth of a second apart, into a queue of two behind a socket that one message leaves at 0.65 s."""
+    bench = Bench("drop-oldest", 2, value=qoi.exponential(0.5))
+    for k in range(6):
+        bench.put(100_000 * (k + 1), 12_500)
+        if k == 0:
+            bench.take()
+    bench.gone(650_000)
+    return bench
+
+
+def test_a_log_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """0 is sent; 1, 2 and 3 are dropped as the oldest of three; 4 goes to the socket, 5 stays: for 50 ms so far."""
+    records = story().records
+    text = View(records).text()
+    lines = text.splitlines()
+    assert lines[0] == "drop-oldest, L = 2   0.7 s"  # 0.65 s
+    assert lines[2] == "queue         1   [#.]   the oldest 0.05 s"
+    assert lines[3] == "socket        1"
+    assert lines[4] == "put           6       6 /s     0.6 Mbit/s"
+    assert lines[5] == "left          1       1 /s     0.1 Mbit/s"
+    assert lines[6] == "dropped       3       3 /s     0.3 Mbit/s   3 evicted"
+    assert lines[7] == "QoI         1.0   of what has left   the longest gap 0"
+    assert lines[-1].endswith("█|") and len(lines[-1]) == 62
+    for cut in range(1, len(records)):  # wherever a log breaks off
+        View(records[:cut]).text()
+    with LogFile(tmp_path / "log.mcap") as file:
+        for record in records:
+            file(record)
+    assert main(["live", "view", str(tmp_path / "log.mcap")]) == 0
+    assert text in capsys.readouterr().out
+
+
+def test_rates_fall_as_time_goes_on_and_bars_stay() -> None:
+    view = View(story().records)
+    assert view.text(1_250_001).splitlines()[4] == "put           6       4 /s     0.4 Mbit/s"  # those after 0.25 s
+    last = view.text(3_000_000).splitlines()
+    assert last[4] == "put           6       0 /s     0.0 Mbit/s"
+    assert last[-1].endswith("█   |")  # 3 s later

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 from cli_cases import fails
+from loop_cases import compiled
 
 from bufgym.cli import main
-from bufgym.kernel import JIT
 from bufgym.reproduce import figure, run_live
 
 SMALL: dict[str, dict[str, Any]] = {
@@ -22,10 +22,10 @@ SMALL: dict[str, dict[str, Any]] = {
     "robofleet-fig7": {"bad_from": 5, "bad_s": 1.0, "after_s": 1.0},
 }
 """Options that keep each short; one that is played live must add its own."""
-compiled = pytest.mark.skipif(not JIT, reason="uncompiled, decisions take as long as messages do")
 
 
 @compiled
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", SMALL)
 def test_each_is_played_live(name: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
@@ -48,6 +48,7 @@ def test_each_is_played_live(name: str, tmp_path: Path) -> None:
 
 
 @compiled
+@pytest.mark.nightly
 def test_on_an_easy_link_nothing_is_dropped_live_either() -> None:
     """Five clouds of 160 kB (JSON: 562 kB), 250 ms apart, over 2.5 MB/s: each program sends each of them.
 
@@ -67,11 +68,11 @@ def test_the_command_says_how_far_it_is(
 ) -> None:
     from bufgym.reproduce.robofleet_fig5 import Reproduction
 
-    monkeypatch.setattr(Reproduction, "LIVE", {**Reproduction.LIVE, **SMALL["robofleet-fig5"], "live": 4.0})
+    monkeypatch.setattr(Reproduction, "LIVE", {**Reproduction.LIVE, **SMALL["robofleet-fig5"], "live": 8.0})
     assert main(["reproduce", "robofleet-fig5", "--live", "--out", str(tmp_path)]) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("robofleet-fig5: ")]
     assert told == [
-        "robofleet-fig5: 4 runs on real sockets take about 2 s",  # 2 s, four programs, four times as fast
+        "robofleet-fig5: 4 runs on real sockets take about 1 s",  # 2 s, four programs, eight times as fast
         *(f"robofleet-fig5: run {k} of 4" for k in (1, 2, 3, 4)),
     ]
 

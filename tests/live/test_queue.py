@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from live_cases import Bench
 
@@ -66,32 +66,26 @@ def test_the_policy_sees_how_much_of_the_message_in_transmission_is_left() -> No
 
 @pytest.mark.parametrize("name", PLAYABLE)
 @given(data=st.data())
-@settings(max_examples=12)
 def test_a_log_replayed_makes_the_same_decisions(name: str, data: st.DataObject) -> None:
     """Whatever the clock does (it may step back), the sizes, the progress and the order of calls; also where the
     row has to forget settled messages again and again (room 8)."""
     draw = data.draw
     many = name not in ONE_QUEUE
-    topics = (
-        (Topic("map", 2.0, rate_limit_hz=2.0), Topic("pose", 5.0, no_drop=True), Topic("image", 1.0, limit=2))
-        if many
-        else ()
-    )
+    topics = (Topic("map", 2.0, rate_limit_hz=2.0), Topic("pose", 5.0, no_drop=True), Topic("image", 1.0, limit=2))
     bench = Bench(
         name,
         draw(st.integers(1, 5)),
-        topics=topics,
+        topics=topics if many else (),
         window=draw(st.integers(1, 3)),
         room=draw(st.sampled_from([8, 1024])),
         decide_at=draw(st.sampled_from(["arrival", "overflow"])),
         max_bytes=draw(st.sampled_from([None, 4000])),
     )
     rng = np.random.default_rng(draw(st.integers(0, 10**6)))
-    calls, slow = draw(st.integers(1, 120)), draw(st.floats(0.0, 0.9))
+    calls, slow = draw(st.integers(1, 40)), draw(st.floats(0.0, 0.9))
     at_us, x, away = 2, 0.0, 0
     for _ in range(calls):
-        at_us += int(rng.choice([-30_000, 0, 1, 40_000, 300_000]))
-        at_us = max(0, at_us)
+        at_us = max(0, at_us + int(rng.choice([-30_000, 0, 1, 40_000, 300_000])))
         if rng.random() < slow or not away:
             x += float(rng.choice([0.0, 0.1, 1.0]))
             bench.left = int(rng.integers(-10, 6000))
@@ -104,21 +98,20 @@ def test_a_log_replayed_makes_the_same_decisions(name: str, data: st.DataObject)
             away += 1
     played = replay(bench.records)
     assert played.differences == ()
-    stats = played.outcome if not many else None
-    if stats is not None:
-        assert stats.dropped == bench.queue.dropped and stats.buffered == len(bench.queue)
+    if not many:
+        assert (played.outcome.dropped, played.outcome.buffered) == (bench.queue.dropped, len(bench.queue))
 
 
-@pytest.mark.parametrize("name", ["afr", "steady", "min-motion-gap"])
+@pytest.mark.parametrize("name", ["afr", "min-motion-gap"])
 def test_hours_leave_no_trace_in_memory(name: str) -> None:
-    """5,000 messages through a row of 64 columns: decisions as in one run, messages let go of, arrays as they were."""
+    """2,000 messages through a row of 64 columns: decisions as in one run, messages let go of, arrays as they were."""
 
     class Frame:
         """Something that can be watched."""
 
     bench = Bench(name, 4, room=64)
     alive = weakref.WeakSet[Frame]()
-    for k in range(5000):
+    for k in range(2000):
         bench.us = 1000 * (k + 1)
         frame = Frame()
         alive.add(frame)

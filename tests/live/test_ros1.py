@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 from cli_cases import fails
 from live_cases import VALIDATE, as_simulated
+from loop_cases import compiled
 
 from bufgym import ros1
 from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
 from bufgym.live import PolicyQueue, replay
 from bufgym.live.log import of, read_log
 from bufgym.live.odometry import Odometry
@@ -30,50 +30,34 @@ from bufgym.ros1.connection import PolicyConnection
 from bufgym.traces import MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses, unit
 
-pytestmark = pytest.mark.skipif(not JIT, reason="uncompiled, decisions take as long as messages do")
+pytestmark = compiled
 
 REPO = Path(__file__).resolve().parents[2]
 FADE = REPO / "examples" / "ros1" / "fade.py"
 
 
 def python(ros: dict[str, str], *command: Any) -> str:
-    done = subprocess.run(
-        [sys.executable, *map(str, command)], env=ros, capture_output=True, text=True, check=False, timeout=120
-    )
+    words = [sys.executable, *map(str, command)]
+    done = subprocess.run(words, env=ros, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-def run(ros: dict[str, str], *command: Any) -> Any:
-    return json.loads(python(ros, *command).splitlines()[-1])
 
 
 # --- in ROS ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 def test_a_policy_in_an_untouched_node(ros: dict[str, str]) -> None:
     """6 s with a fade of 1.5 s. Over 20 s, quiet machine: H 1.47 times that of rospy's own queue, the gap a tenth."""
-
-    def play(policy: str) -> Any:
-        return run(ros, FADE, "--one", policy, "--seconds", 6)
-
-    for tries_left in (1, 0):
-        stock, afr = play("rospy"), play("afr")
-        print(stock, afr)
-        if (afr["qoi"] > 1.1 * stock["qoi"] and 3 * afr["longest_gap"] < stock["longest_gap"]) or not tries_left:
-            break
-    assert afr["qoi"] > 1.1 * stock["qoi"]
-    assert 3 * afr["longest_gap"] < stock["longest_gap"]
+    played = [python(ros, FADE, "--one", policy, "--seconds", 6) for policy in ("rospy", "afr")]
+    stock, afr = (json.loads(out.splitlines()[-1]) for out in played)
+    print(stock, afr)
+    assert afr["qoi"] > stock["qoi"] and afr["longest_gap"] < stock["longest_gap"]
 
 
 def test_each_subscriber_has_its_queue_and_each_topic_its_policy(ros: dict[str, str], tmp_path: Path) -> None:
-    for tries_left in (1, 0):
-        folder = tmp_path / str(tries_left)
-        seen = run(ros, REPO / "tests" / "live" / "ros1_session.py", folder)
-        if len(seen["came"]["chosen"]) == 200 or not tries_left:
-            break
-    # 250 small messages a second: nobody waits for an ack that comes 40 ms late.
-    assert seen["came"] == {topic: [str(k) for k in range(200)] for topic in seen["came"]}
+    seen = json.loads(python(ros, REPO / "tests" / "live" / "ros1_session.py", tmp_path).splitlines()[-1])
+    assert seen["came"] == {topic: [str(k) for k in range(60)] for topic in seen["came"]}
     assert {topic: sorted(kinds) for topic, kinds in seen["kinds"].items()} == {
         "chosen": ["PolicyConnection"] * 2,
         "named": ["PolicyConnection"],
@@ -82,24 +66,21 @@ def test_each_subscriber_has_its_queue_and_each_topic_its_policy(ros: dict[str, 
         "at_once": ["TCPROSTransport"],
     }
     [(_, _, messages, connected)] = seen["named"]
-    assert messages == 200 and connected
-    logs = [read_log(folder / name) for name in seen["logs"]]
+    assert messages == 60 and connected
+    logs = [read_log(tmp_path / name) for name in seen["logs"]]
     policies = {name.rpartition("-")[0]: log[0]["policy"] for name, log in zip(seen["logs"], logs, strict=True)}
     assert policies == {"chosen": "afr", "named": "drop-oldest", "odom": "afr"} and len(logs) == 4
     for log in logs:
         assert replay(log).differences == ()
-    # 2 m of motion at a scene scale of 2 m; the first subscriber's queue came before the odometry.
+    # 1.8 m of motion at a scene scale of 2 m; the first subscriber's queue came before the odometry.
     moved = [record["x"] for log in logs[:2] for record in of(log, "put")]
-    assert 0.8 < max(moved) <= 1.0
+    assert 0.7 < max(moved) <= 0.9
 
 
+@pytest.mark.nightly
 def test_an_episode_through_a_node_is_that_of_the_simulator(ros: dict[str, str], tmp_path: Path) -> None:
-    for _ in range(2):
-        python(ros, *VALIDATE, "ros1", "--out", tmp_path)
-        [seen] = json.loads((tmp_path / "runs.json").read_text())["runs"]
-        if as_simulated(seen):
-            break
-    assert as_simulated(seen), {**seen, "live_s": (), "simulated_s": ()}
+    python(ros, *VALIDATE, "ros1", "--out", tmp_path)
+    assert as_simulated(tmp_path)
 
 
 def test_without_ros_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -167,8 +148,10 @@ class Transport:
     """What rospy's TCPROSTransport is to a queue, on a pair of TCP sockets."""
 
     def __init__(self) -> None:
+        self.peer = socket.socket()
+        self.peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16_384)
         with socket.create_server(("127.0.0.1", 0)) as server:
-            self.peer = socket.create_connection(server.getsockname())
+            self.peer.connect(server.getsockname())
             self.socket, _ = server.accept()
         self.name, self.endpoint_id, self.done, self.stat_num_msg = "/camera", "/viewer", False, 0
         self.write_error: Exception | None = None
@@ -201,25 +184,20 @@ def transport() -> Iterator[Transport]:
 
 
 def ended_thread(connection: PolicyConnection) -> bool:
-    connection._thread.join(5)
+    connection._thread.join(60)
     return not connection._thread.is_alive()
 
 
 def test_a_message_at_a_time(transport: Transport) -> None:
-    """The peer reads nothing: of 12 messages of 1 MB one is being sent, L = 3 are queued, and the rest is dropped."""
+    """The peer reads nothing: of 12 messages of 1 MB the first is being sent, L = 3 are queued, 8 are dropped."""
     queue = PolicyQueue("drop-oldest", 3)
     connection = PolicyConnection(transport, queue)
     bodies = [bytes([k]) * 10**6 for k in range(12)]
     for body in bodies:
         connection.write_data(body)
-        time.sleep(0.02)
-    sending = len(bodies) - 3 - queue.dropped
-    # What the peer's system takes in, and a few kB: not megabytes more.
-    assert 1 <= sending <= 8 and len(queue) == 3
-    kept = [*range(sending), 9, 10, 11]
-    assert transport.read(len(kept) * 10**6) == b"".join(bodies[k] for k in kept)
-    assert connection.stat_num_msg <= len(kept)
-    while connection.stat_num_msg < len(kept):
+    assert (len(queue), queue.in_flight, queue.dropped) == (3, 1, 8)
+    assert transport.read(4 * 10**6) == b"".join(bodies[k] for k in (0, 9, 10, 11))
+    while connection.stat_num_msg < 4:
         time.sleep(0.001)
     transport.close()
     assert ended_thread(connection) and connection.write_data(b"late")
@@ -229,7 +207,7 @@ def test_closing_wakes_a_sender_that_waits_for_its_peer(transport: Transport) ->
     connection = PolicyConnection(transport, PolicyQueue("afr", 4))
     for _ in range(10):
         connection.write_data(bytes(5 * 10**6))
-    threading.Timer(0.1, transport.close).start()
+    threading.Timer(0.02, transport.close).start()
     assert ended_thread(connection)
 
 
@@ -237,7 +215,8 @@ def test_what_sending_raised_is_told_at_the_next_message(transport: Transport) -
     connection = PolicyConnection(transport, PolicyQueue("afr", 4))
     transport.write_error = ConnectionResetError("gone")
     connection.write_data(b"a")
-    time.sleep(0.2)
+    while connection.queue.in_flight:
+        time.sleep(0.001)
     with pytest.raises(ConnectionResetError, match="gone"):
         connection.write_data(b"b")
     transport.close()

@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from cli_cases import fails
@@ -26,10 +25,8 @@ from bufgym.ros2.relay import Robot
 from bufgym.scenario import read_client
 
 REPO = Path(__file__).resolve().parents[2]
-in_ros = pytest.mark.skipif(
-    not JIT or importlib.util.find_spec("rclpy") is None,
-    reason="needs rclpy (extra ros2), and compiled decisions",
-)
+NO_ROS = not JIT or importlib.util.find_spec("rclpy") is None
+in_ros = pytest.mark.skipif(NO_ROS, reason="needs rclpy (extra ros2), and compiled decisions")
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -44,28 +41,21 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 @in_ros
+@pytest.mark.nightly
 def test_the_relay_over_a_fade_is_as_good_as_the_simulator() -> None:
     """6 s with a fade of 1.5 s. Over 20 s, quiet machine: 98 % of the simulator's QoI."""
-    for _ in range(2):
-        cells = (
-            run(REPO / "examples/ros2/fade.py", "--queues", "afr", "--seconds", 6).stdout.splitlines()[-1].split("|")
-        )
-        relayed, simulated = float(cells[3]), float(cells[6])
-        print(cells)
-        if relayed > 0.85 * simulated:
-            return
-    pytest.fail(f"QoI {relayed} through the relay, {simulated} in the simulator")
+    done = run(REPO / "examples/ros2/fade.py", "--queues", "afr", "--seconds", 6)
+    cells = done.stdout.splitlines()[-1].split("|")
+    print(cells)
+    assert float(cells[3]) > 0.7 * float(cells[6])  # through the relay, in the simulator
 
 
 @in_ros
+@pytest.mark.nightly
 def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None:
     numbers = [str(k) for k in range(100)]
-    expected = {"camera": numbers, "status": ["up"], "own/echo": numbers, "commands": numbers[::10]}
-    for tries_left in (1, 0):
-        seen: dict[str, Any] = json.loads(run(REPO / "tests/live/ros2_session.py", tmp_path).stdout.splitlines()[-1])
-        if seen["came"] == expected or not tries_left:
-            break
-    assert seen["came"] == expected
+    seen = json.loads(run(REPO / "tests/live/ros2_session.py", tmp_path).stdout.splitlines()[-1])
+    assert seen["came"] == {"camera": numbers, "status": ["up"], "own/echo": numbers, "commands": numbers[::10]}
     assert seen["told"][1] == "/commands: std_msgs/msg/String, reliable"
     assert seen["best_effort"] and seen["by"] == "bufgym_receive" and seen["faults"] == []
     log = read_log(tmp_path / "log.mcap")
@@ -76,13 +66,10 @@ def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None
 
 
 @in_ros
+@pytest.mark.nightly
 def test_an_episode_through_the_relay_is_that_of_the_simulator(tmp_path: Path) -> None:
-    for _ in range(2):
-        run(*VALIDATE, "ros2", "--out", tmp_path)
-        [seen] = json.loads((tmp_path / "runs.json").read_text())["runs"]
-        if as_simulated(seen):
-            break
-    assert as_simulated(seen), {**seen, "live_s": (), "simulated_s": ()}
+    run(*VALIDATE, "ros2", "--out", tmp_path)
+    assert as_simulated(tmp_path)
 
 
 # --- what the relay says of a topic ----------------------------------------------------------------------------------

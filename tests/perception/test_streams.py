@@ -1,26 +1,48 @@
-"""Frames sent over a link: sizes, the fade at another place, and what arrives."""
+"""Frames sent over a link, what arrives, how much of it is new, and which frames images call similar."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from view_cases import Wall
 
+from bufgym import scenario, sim
+from bufgym.errors import BufgymError
 from bufgym.perception import streams
+from bufgym.perception.frames import Camera, Depth, Image, Sequence
+from bufgym.perception.orb import OrbSimilarity, decision_ms, orbbuf_by
+from bufgym.perception.views import Coverage, overlap_information, seen_shares
+from bufgym.policies import get
+from bufgym.scenario.numbered import draw
 from bufgym.traces import Trace
 
 TRACE = Trace.steps([(1, 100.0), (1, 50.0), (2, 10.0)], name="falling")
 
 
-def test_sizes_lie_between_those_that_were_encoded() -> None:
-    """Frame k has 1000 (k + 1) bytes; every second one is encoded, and the last."""
+class Wall(Sequence):
+    """A wall 2 m ahead of a camera that looks along z and moves to the right; a pixel is 10 cm wide there."""
+
+    def __init__(self, right_m: list[float]) -> None:
+        self.name, self.camera = "wall", Camera(40, 30, 20.0, 20.0, 19.5, 14.5)
+        self.time_us = np.arange(len(right_m)) * 33_333
+        self.poses = np.tile(np.eye(4), (len(right_m), 1, 1))
+        self.poses[:, 0, 3] = right_m
+        self.depths = np.full((len(right_m), 30, 40), 2.0, np.float32)
+
+    def depth(self, k: int) -> Depth:
+        return self.depths[k]
+
+    def image(self, k: int) -> Image:
+        return np.zeros((30, 40), np.uint8)
+
+    def size_bytes(self, k: int) -> int:
+        return 1000 * (k + 1)
+
+
+def test_sizes_and_the_first_frames() -> None:
+    """Every second frame is encoded, and the last; sizes in between lie between these."""
     assert streams.sizes(Wall([0.0] * 4), every=2).tolist() == [1000, 2000, 3000, 4000]
-
-
-def test_the_first_frames_are_a_recording() -> None:
     part = streams.first(Wall([0, 1, 2]), 2)
-    assert len(part) == 2 and part.poses[1, 0, 3] == 1 and part.depth(1)[0, 0] == 2
-    assert part.size_bytes(1) == 2000
+    assert (len(part), part.poses[1, 0, 3], part.depth(1)[0, 0], part.size_bytes(1)) == (2, 1, 2, 2000)
     whole = Wall([0, 1])
     assert streams.first(whole, 5) is whole
 
@@ -31,27 +53,86 @@ def test_an_offset_moves_the_fade_and_changes_nothing_else(offset_us: int, first
     link = streams.fading(2_000_000, TRACE, offset_us)
     carried = np.diff([link.carried_at(t) for t in (0, 1_000_000, 2_000_000, 3_000_000)])
     assert carried[0] == first_second and carried[:2].sum() == 150 and carried[2] == carried[0]
-
-
-def test_a_stream_longer_than_the_trace_meets_it_again() -> None:
-    link = streams.fading(9_000_000, TRACE)
-    assert link.carried_at(4_000_000) == 170 and link.carried_at(8_000_000) == 340
+    longer = streams.fading(9_000_000, TRACE)  # than the trace, which it meets again
+    assert longer.carried_at(4_000_000) == 170 and longer.carried_at(8_000_000) == 340
 
 
 def test_what_arrives_over_a_slow_link() -> None:
     """Frames of 10 bytes each 1/30 s; the link carries one while three come, the queue holds one."""
-    wall = Wall([0.1 * k for k in range(9)])
-    fast, slow = (Trace.constant(rate, 10.0, name="link") for rate in (1e6, 100.0))
-    size = np.full(9, 10, np.int64)
-    everything = streams.received("drop-oldest", streams.episode(wall, size, streams.fading(300_000, fast)), 1)
-    assert everything == tuple(range(9))
-    # In transmission: 0 until 0.1 s, as 3 comes; 3 replaces 2 before the next is taken, and so on.
-    some = streams.received("drop-oldest", streams.episode(wall, size, streams.fading(10_000_000, slow)), 1)
-    assert some[0] == 0 and some[-1] == 8 and len(some) < 6
-
-
-def test_random_draws_by_the_seed() -> None:
     wall, size = Wall([0.1 * k for k in range(60)]), np.full(60, 10, np.int64)
-    link = streams.fading(10_000_000, Trace.constant(60.0, 10.0, name="link"))
-    kept = [streams.received("random", streams.episode(wall, size, link, seed), 5) for seed in (0, 0, 1)]
+
+    def received(policy: str, frames: int, bytes_per_s: float, L: int, seed: int = 0) -> tuple[int, ...]:
+        link = streams.fading(10_000_000, Trace.constant(bytes_per_s, 10.0, name="link"))
+        return streams.received(policy, streams.episode(streams.first(wall, frames), size[:frames], link, seed), L)
+
+    assert received("drop-oldest", 9, 1e6, 1) == tuple(range(9))
+    # In transmission: 0 until 0.1 s, as 3 comes; 3 replaces 2 before the next is taken, and so on.
+    some = received("drop-oldest", 9, 100.0, 1)
+    assert some[0] == 0 and some[-1] == 8 and len(some) < 6
+    kept = [received("random", 60, 60.0, 5, seed) for seed in (0, 0, 1)]
     assert kept[0] == kept[1] != kept[2]
+
+
+def test_shares_of_a_view_that_were_seen_before() -> None:
+    """1 m to the right is 10 of 40 pixels, a quarter of the view; 5 m leave nothing in common."""
+    seen = seen_shares(Wall([0, 1, 5]))
+    assert (seen[0, 1], seen[0, 2], seen[1, 0]) == (0.75, 0, 0)  # only what came after
+    assert seen.diagonal().tolist() == [1, 1, 1]
+    wall = Wall([0, 0])
+    wall.depths[0, :, :20] = 0  # frame 0 measured nothing on its left half: a hole tells nothing
+    assert seen_shares(wall)[0, 1] == 1
+    wall.depths[0, :, :20] = 1.5  # something stood before the wall there
+    assert seen_shares(wall)[0, 1] == 0.5
+    wall.depths[0] = 0
+    assert seen_shares(wall)[0, 1] == 0
+    turned = Wall([0, 0])
+    turned.poses[1, :3, :3] = np.diag([-1, 1, -1])
+    assert seen_shares(turned)[0, 1] == 0
+
+
+def test_information_and_coverage_count_what_is_new() -> None:
+    seen = seen_shares(Wall([0, 1, 0]))
+    # A quarter there, and another back.
+    assert [overlap_information(seen, kept) for kept in ([], [1], [0, 1, 2], [0, 2])] == [0, 1, 1.5, 1]
+    # Frame 0 and its return see 40 columns of the wall, frame 1 the 10 beyond them, and 30 of the 40.
+    coverage = Coverage(Wall([0, 1, 0]), least_views=1)
+    assert coverage.cells == 50 * 30
+    assert coverage.share([0]) == coverage.share([1]) == coverage.share([0, 2]) == 0.8
+    assert (coverage.share([0, 1]), coverage.share([2, 1, 0]), coverage.share([])) == (1, 1, 0)
+    assert Coverage(Wall([0, 1, 0]), least_views=2).cells == 40 * 30
+    with pytest.raises(BufgymError, match=r"wall: no cell of 0\.1 m was seen by 3 of its frames"):
+        Coverage(Wall([0, 0]))
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("L", [1, 3, 8])
+def test_with_motion_for_images_it_decides_as_orbbuf(L: int) -> None:
+    uplink = scenario.get("lte", duration_s=2.0)
+    episode = draw(uplink, 3)
+    x = episode.arrivals["x"]
+    similar = orbbuf_by(lambda i, j: 1 - uplink.value(float(x[j] - x[i])), episode)
+    kept = [
+        np.asarray(sim.run(policy, [episode], L, uplink.value).batch.log[0])["dropped_us"]
+        for policy in (similar, get("orbbuf"))
+    ]
+    assert kept[0].tolist() == kept[1].tolist() and (kept[0] >= 0).any()
+
+
+def texture(seed: int) -> np.ndarray:
+    """Squares of noise, which have corners."""
+    return np.random.default_rng(seed).integers(0, 255, (30, 40), np.uint8).repeat(8, 0).repeat(8, 1)
+
+
+def test_images_are_like_themselves_less_like_what_moved_and_hardly_like_others() -> None:
+    pytest.importorskip("cv2")
+    from bufgym.perception.room import room
+
+    first = texture(0)
+    images = [first, np.roll(first, 80, axis=1), texture(1), np.zeros_like(first), first]
+    similar = OrbSimilarity(images.__getitem__)
+    assert similar(0, 4) > 0.95
+    assert 0.3 < similar(0, 1) < similar(0, 4)
+    assert similar(0, 2) < 0.3
+    assert similar(0, 3) == similar(3, 0) == 0  # no features, no likeness
+    assert similar(1, 0) == similar(0, 1)
+    assert (decision_ms(room(0, frames=5).reduced(4), 2) > 0).all()

@@ -27,24 +27,21 @@ def plane(z: float) -> np.ndarray:
     return points
 
 
-def test_unprojected_points() -> None:
-    points = plane(2.0)
+@pytest.mark.kernels
+def test_unprojected_points_and_their_normals() -> None:
+    """Normals face the camera and stop at edges."""
+    points, normals = plane(2.0), np.zeros((6, 8, 3), np.float32)
     assert points[0, 0].tolist() == [-1.75, -1.25, 2.0]
+    icp.orient(points, np.zeros(3), 0.3, normals)
+    assert normals[1:5, 1:7].reshape(-1, 3) == pytest.approx(np.tile([0, 0, -1.0], (24, 1)))
+    points[:, 4:, 2] = 9.0  # another wall behind
+    icp.orient(points, np.zeros(3), 0.3, normals)
+    assert np.isnan(normals[0]).all() and np.isnan(normals[1:5, 3:5]).all() and not np.isnan(normals[1:5, 1:3]).any()
     icp.unproject(NOWHERE, 10.0, lens_of(CAMERA), points)
     assert np.isnan(points).all()
 
 
-def test_normals_face_the_camera_and_stop_at_edges() -> None:
-    points, normals = plane(2.0), np.zeros((6, 8, 3), np.float32)
-    icp.orient(points, np.zeros(3), 0.3, normals)
-    assert normals[1:5, 1:7].reshape(-1, 3) == pytest.approx(np.tile([0, 0, -1.0], (24, 1)))
-    assert np.isnan(normals[0]).all()
-    points[:, 4:, 2] = 9.0  # another wall behind
-    icp.orient(points, np.zeros(3), 0.3, normals)
-    assert np.isnan(normals[1:5, 3:5]).all()
-    assert not np.isnan(normals[1:5, 1:3]).any()
-
-
+@pytest.mark.kernels
 def test_smoothing_stays_on_one_surface() -> None:
     depth = np.array([[1.0, 1.02, 3.0], [1.0, 0.0, 3.0]], np.float32)
     result = np.zeros_like(depth)
@@ -52,6 +49,7 @@ def test_smoothing_stays_on_one_surface() -> None:
     assert result == pytest.approx(np.array([[3.02 / 3, 3.02 / 3, 3.0], [3.02 / 3, 0.0, 3.0]]), rel=1e-6)
 
 
+@pytest.mark.kernels
 def test_the_normal_equations_of_a_wall_that_is_five_centimetres_off() -> None:
     """All 24 points with a normal have a pair; moving back by 5 cm along z brings all into the plane."""
     model, points = plane(2.0), plane(2.05)
@@ -86,17 +84,11 @@ def test_the_model_is_seen_where_it_is() -> None:
         assert vertices[2, 3, 0] == pytest.approx(-0.5 / 4 * 1.2, abs=1e-3)
 
 
-def test_the_difference_of_two_poses() -> None:
-    assert difference(np.eye(4), frame_cases.TURNED) == pytest.approx((0.5, 90.0))
-    assert difference(frame_cases.TURNED, frame_cases.TURNED) == pytest.approx((0.0, 0.0))
-
-
 @functools.cache
 def walk() -> Sequence:
     return room(0, frames=80).reduced(4).loaded()
 
 
-@pytest.mark.slow
 def test_a_known_movement_is_found_again() -> None:
     """3 cm to the right, 2 cm down, 1 cm ahead, and a turn of 1.5 degrees: found within 6 mm and 0.3 degrees."""
     still = room(0, frames=2)
@@ -113,36 +105,29 @@ def test_a_known_movement_is_found_again() -> None:
     pose = tracker.follow(depths[1])
     assert pose is not None
     off_m, off_deg = difference(pose, poses[1])
-    assert off_m < 0.006
-    assert off_deg < 0.3
+    assert off_m < 0.006 and off_deg < 0.3
+    assert difference(np.eye(4), frame_cases.TURNED) == pytest.approx((0.5, 90.0))
 
 
-@pytest.mark.slow
 def test_it_follows_every_frame_and_fails_at_a_gap() -> None:
     """The same frames with 40 of them missing: lost at the first frame after the gap."""
     sequence = walk()
     whole = track(sequence, range(80))
-    assert not whole.failed
-    assert whole.where is None
-    assert whole.error_m.max() < 0.05
-    assert whole.error_m[0] == 0
+    assert not whole.failed and whole.where is None
+    assert whole.error_m.max() < 0.05 and whole.error_m[0] == 0
     torn = track(sequence, [*range(20), *range(60, 80)])
-    assert torn.failed
-    assert torn.where == 60
+    assert torn.failed and torn.where == 60
     assert torn.error_m[:20].tolist() == whole.error_m[:20].tolist()
-    assert np.isnan(torn.error_deg[20:]).all()
-    assert np.isnan(torn.poses[20:]).all()
+    assert np.isnan(torn.error_deg[20:]).all() and np.isnan(torn.poses[20:]).all()
+    # The recording claims a jump that its frames do not show.
+    told = frame_cases.Held(sequence.camera, [sequence.depth(k) for k in range(6)], list(sequence.poses[:6]))
+    told.poses[4:, 0, 3] += 0.2
+    assert track(told, range(6)).where == 4
+    assert track(told, range(6), settings=TrackingSettings(most_error_m=0.3)).where is None
 
 
-@pytest.mark.slow
-def test_same_frames_same_track_bit_for_bit() -> None:
-    first, again = (track(walk(), range(0, 20, 2)) for _ in range(2))
-    assert first.poses.tobytes() == again.poses.tobytes()
-
-
-@pytest.mark.slow
 def test_smoothed_depths_that_are_kept_change_nothing() -> None:
-    """One run asks for those of all its frames but the first, and finds the same poses."""
+    """One run asks for those of all its frames but the first, and finds the same poses, bit for bit."""
     asked: list[int] = []
 
     def smooth(k: int) -> np.ndarray:
@@ -156,16 +141,7 @@ def test_smoothed_depths_that_are_kept_change_nothing() -> None:
     assert again.poses.tobytes() != plain.poses.tobytes()  # what is given is what is used
 
 
-@pytest.mark.slow
-def test_a_step_that_is_off_is_a_failure() -> None:
-    """The recording claims a jump that its frames do not show."""
-    sequence = walk()
-    told = frame_cases.Held(sequence.camera, [sequence.depth(k) for k in range(6)], list(sequence.poses[:6]))
-    told.poses[4:, 0, 3] += 0.2
-    assert track(told, range(6)).where == 4
-    assert track(told, range(6), settings=TrackingSettings(most_error_m=0.3)).where is None
-
-
+@pytest.mark.kernels
 def test_a_single_wall_leaves_the_way_along_it_open() -> None:
     """Nothing says how far the camera moved along a wall: the tracker says that it is lost."""
     grid = Grid((-1.2, -0.9, 0.0), (49, 37, 28), 0.05)
@@ -175,13 +151,11 @@ def test_a_single_wall_leaves_the_way_along_it_open() -> None:
     assert (tracker.model.weight == Map.empty(grid).weight).all()
 
 
-@pytest.mark.parametrize("frames", [[], [3, 2], [2, 2], [-1, 1], [1, 80]])
-def test_frames_that_are_not_in_order(frames: list[int]) -> None:
-    with pytest.raises(BufgymError, match="at least one index below 80, increasing"):
-        track(room(0, frames=80).reduced(20), frames)
-
-
-@pytest.mark.parametrize("field", ["apart_m", "apart_deg", "most_error_m", "most_error_deg", "least_pairs"])
-def test_settings_that_mean_nothing(field: str) -> None:
-    with pytest.raises(BufgymError, match=f"{field} = -1"):
-        TrackingSettings(**{field: -1})
+def test_frames_and_settings_that_mean_nothing() -> None:
+    sequence = room(0, frames=80).reduced(20)
+    for frames in ([], [3, 2], [2, 2], [-1, 1], [1, 80]):
+        with pytest.raises(BufgymError, match="at least one index below 80, increasing"):
+            track(sequence, frames)
+    for field in ("apart_m", "apart_deg", "most_error_m", "most_error_deg", "least_pairs"):
+        with pytest.raises(BufgymError, match=f"{field} = -1"):
+            TrackingSettings(**{field: -1})

@@ -9,17 +9,23 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import bufgym  # noqa: F401  (registers the environment)
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
+
+pytest.importorskip("cv2", reason="the extra perception is not installed")
+pytest.importorskip("rvl", reason="the extra perception is not installed")
+from bufgym.perception import streams, views, worth
 
 pytestmark = pytest.mark.skipif(not JIT, reason="without compilation a room takes minutes to draw")
 
 
 def made(**settings: Any) -> Any:
-    for library in ("cv2", "rvl"):
-        pytest.importorskip(library)
     return gym.make("bufgym/Mapping-v0", **settings).unwrapped
+
+
+@pytest.mark.nightly
+def test_gymnasium_finds_nothing_to_complain_about() -> None:
+    check_env(made(observation="flat"))
 
 
 def played(env: Any, action: int) -> tuple[list[float], dict[str, Any]]:
@@ -32,15 +38,8 @@ def played(env: Any, action: int) -> tuple[list[float], dict[str, Any]]:
     return rewards, info
 
 
-def test_gymnasium_finds_nothing_to_complain_about() -> None:
-    check_env(made(observation="flat"))
-
-
 def test_frames_have_the_sizes_that_they_are_said_to_have() -> None:
     """Two of them encoded again; in between they follow the neighbours that were."""
-    from bufgym.perception import streams, worth
-
-    made()
     whole, sizes = worth.recording(), streams.between(worth.SIZES, worth.FRAMES)
     measured = {k: whole.size_bytes(k) for k in (120, 239)}
     assert measured == pytest.approx({k: int(sizes[k]) for k in measured}, rel=0.01)
@@ -49,8 +48,6 @@ def test_frames_have_the_sizes_that_they_are_said_to_have() -> None:
 
 def test_what_is_paid_comes_at_the_end() -> None:
     """Slot 0 goes where the queue is full: Drop Oldest. The terms are those of the frames which arrived."""
-    from bufgym.perception import views, worth
-
     env = made(reward={"covered": 1.0, "followed": 0.0, "tracked": 0.0})
     rewards, info = played(env, 0)
     terms = info["reward_terms"]

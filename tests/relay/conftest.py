@@ -1,20 +1,46 @@
-"""Mutations lie beside the fuzzing of files; what a relay compiles, it compiles before any test waits for it."""
+"""One relay for each module of tests, and for each test a corner of it that no other test uses."""
 
 from __future__ import annotations
 
+import asyncio
+import itertools
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from loop_cases import pytest_pyfunc_call, runner  # noqa: F401
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "fuzz"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "fuzz"))  # mutations lie beside the fuzzing of files
+_NUMBERS = itertools.count(1)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiled() -> None:
+    """Compile what a relay compiles before a test waits for it."""
     from relay_cases import settings
 
     from bufgym.relay import policies
 
     for name in settings().policies:
         policies.warm(name)
+
+
+@pytest.fixture(scope="module")
+def server(request: pytest.FixtureRequest, runner: asyncio.Runner) -> Iterator[Any]:  # noqa: F811
+    """The module's relay, with the settings in the module's ``CONFIG``."""
+    from relay_cases import Server, settings
+
+    one = Server(getattr(request.module, "CONFIG", None) or settings())
+    runner.run(one.start())
+    yield one
+    runner.run(one.close())
+
+
+@pytest.fixture
+def corner(server: Any) -> Any:
+    """This test's corner of the module's relay."""
+    from relay_cases import Corner
+
+    return Corner(server, next(_NUMBERS))

@@ -28,7 +28,6 @@ from bufgym.relay.server import serve_forever
 from bufgym.relay.wire import Message
 
 SIZE_BYTES, RATE_HZ, MEMORY_S = 50_000, 10, 30.0
-_LENGTH, _PART, _STAMP = struct.Struct("!H"), struct.Struct("!Q"), struct.Struct("!q")
 _BINARY, _PING, _PONG, _MASKED = 0x82, 0x89, 0x8A, 0x80
 _HEAD_BYTES = 10 + 32
 """Of a WebSocket's frame, at most, and of a message with its stamp."""
@@ -38,7 +37,7 @@ class Relay:
     """The process, and what it takes."""
 
     def __init__(self, process: Any, port: int) -> None:
-        self.process, self.port = process, port
+        self.process, self.port, self.proc = process, port, Path(f"/proc/{process.pid}")
 
     @classmethod
     @contextlib.asynccontextmanager
@@ -54,12 +53,12 @@ class Relay:
 
     @property
     def cpu_s(self) -> float:
-        times = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        times = (self.proc / "stat").read_text().rpartition(")")[2].split()
         return (int(times[11]) + int(times[12])) / os.sysconf("SC_CLK_TCK")
 
     @property
     def megabytes(self) -> float:
-        return int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]) * 4096 / 1e6
+        return int((self.proc / "statm").read_text().split()[1]) * 4096 / 1e6
 
 
 async def idle(count: int) -> None:
@@ -71,30 +70,15 @@ async def idle(count: int) -> None:
             await one.subscribe("^/robots/")
             times_s.append(time.perf_counter() - began_s)
         median, late = np.percentile(times_s, [50, 99]) * 1e3
-        print(
-            f"{count} connections: {before:.0f} -> {relay.megabytes:.0f} MB; {median:.1f} ms a new one, p99 {late:.1f}"
-        )
-
-
-class Camera:
-    """A message's frame, with 0 for a mask: only the stamp changes."""
-
-    def __init__(self, robot: int) -> None:
-        message = Message(f"/robots/{robot}/camera", os.urandom(SIZE_BYTES), "raw")
-        data = wire.encode(message)
-        self._frame = bytearray(bytes([_BINARY, _MASKED | 127]) + _PART.pack(len(data)) + bytes(4) + data)
-
-    def frame(self) -> bytes:
-        """As it goes out now."""
-        _STAMP.pack_into(self._frame, 14 + 24, time.time_ns() // 1000)
-        return bytes(self._frame)
+        memory = f"{before:.0f} -> {relay.megabytes:.0f} MB"
+        print(f"{count} connections: {memory}; {median:.1f} ms a new one, p99 {late:.1f}")
 
 
 class Viewer(asyncio.BufferedProtocol):
     """Takes frames off a connection that ``client`` has made; ``latency_us`` gets that of each message."""
 
-    def __init__(self, transport: Any) -> None:
-        self.latency_us: list[int] = []
+    def __init__(self, transport: Any, latency_us: list[int]) -> None:
+        self.latency_us = latency_us
         self._buffer, self._end, self._skip = bytearray(2**18), 0, 0
         self._transport = transport
         transport.set_protocol(self)
@@ -119,70 +103,72 @@ class Viewer(asyncio.BufferedProtocol):
 
     def _frame(self, head: bytearray) -> int:
         """Bytes of the frame that begins so; 0 if too little of it is here."""
-        if len(head) < 2:
-            return 0
-        kind, size, at = head[0], head[1], 2
+        kind, size, at = head[0] if head else 0, head[1] if len(head) > 1 else 0, 2
         if size >= 126:
-            form, at = (_LENGTH, 4) if size == 126 else (_PART, 10)
+            form, at = ("!H", 4) if size == 126 else ("!Q", 10)
             if len(head) < at:
                 return 0
-            (size,) = form.unpack_from(head, 2)
-        if len(head) < min(at + size, at + 32):
+            (size,) = struct.unpack_from(form, head, 2)
+        if len(head) < max(2, min(at + size, at + 32)):
             return 0
         if kind == _BINARY:
-            self.latency_us.append(time.time_ns() // 1000 - int(_STAMP.unpack_from(head, at + 24)[0]))
+            self.latency_us.append(time.time_ns() // 1000 - int(struct.unpack_from("!q", head, at + 24)[0]))
         elif kind == _PING:
             self._transport.write(bytes([_PONG, _MASKED | size]) + bytes(4) + head[at : at + size])
         return at + size
 
 
+async def view(port: int, slowly: bool, latency_us: list[int]) -> None:
+    async with client(port, receive_buffer_bytes=65_536 if slowly else None, name="viewer") as one:
+        await one.subscribe("^/robots/")
+        if not slowly:
+            Viewer(one.socket.transport, latency_us)
+            await asyncio.Event().wait()
+        while True:
+            message = await one.next()
+            if isinstance(message, Message):
+                latency_us.append(time.time_ns() // 1000 - message.stamp_us)
+                await asyncio.sleep(SIZE_BYTES / 1e5)
+
+
+async def publish(port: int, k: int, robots: int, seconds: float) -> None:
+    """Frames with 0 for a mask, of which only the stamp changes."""
+    data = wire.encode(Message(f"/robots/{k}/camera", os.urandom(SIZE_BYTES), "raw"))
+    frame = bytearray(bytes([_BINARY, _MASKED | 127]) + struct.pack("!Q", len(data)) + bytes(4) + data)
+    async with client(port, name=f"robot-{k}") as one:
+        await asyncio.sleep(k / robots / RATE_HZ)
+        began_s = time.monotonic()
+        for i in range(round(seconds * RATE_HZ)):
+            await asyncio.sleep(max(0.0, began_s + i / RATE_HZ - time.monotonic()))
+            struct.pack_into("!q", frame, 14 + 24, time.time_ns() // 1000)
+            one.socket.transport.write(bytes(frame))
+
+
+async def watch(relay: Relay, memory_mb: list[float]) -> None:
+    while True:
+        await asyncio.sleep(MEMORY_S)
+        memory_mb.append(relay.megabytes)
+
+
 async def busy(robots: int, viewers: int, seconds: float, slow: bool) -> None:
+    latency_us: list[list[int]] = [[] for _ in range(viewers)]
+    memory_mb: list[float] = []
     async with Relay.started() as relay:
-        latency_us: list[list[int]] = [[] for _ in range(viewers)]
-
-        async def view(k: int) -> None:
-            slowly = slow and k == 0
-            async with client(relay.port, receive_buffer_bytes=65_536 if slowly else None, name=f"viewer-{k}") as one:
-                await one.subscribe("^/robots/")
-                if not slowly:
-                    latency_us[k] = Viewer(one.socket.transport).latency_us
-                    await asyncio.Event().wait()
-                while True:
-                    message = await one.next(1e6)
-                    if isinstance(message, Message):
-                        latency_us[k].append(time.time_ns() // 1000 - message.stamp_us)
-                        await asyncio.sleep(SIZE_BYTES / 1e5)
-
-        async def publish(k: int) -> None:
-            async with client(relay.port, name=f"robot-{k}") as one:
-                await asyncio.sleep(k / robots / RATE_HZ)
-                began_s, camera = time.monotonic(), Camera(k)
-                for i in range(round(seconds * RATE_HZ)):
-                    await asyncio.sleep(max(0.0, began_s + i / RATE_HZ - time.monotonic()))
-                    one.socket.transport.write(camera.frame())
-
-        memory_mb: list[float] = []
-
-        async def watch_memory() -> None:
-            while True:
-                await asyncio.sleep(MEMORY_S)
-                memory_mb.append(relay.megabytes)
-
-        watching = [asyncio.create_task(view(k)) for k in range(viewers)]
-        watching.append(asyncio.create_task(watch_memory()))
+        views = [view(relay.port, slow and k == 0, latency_us[k]) for k in range(viewers)]
+        beside = [asyncio.create_task(work) for work in (*views, watch(relay, memory_mb))]
         await asyncio.sleep(5.0)  # until the policy is compiled
         began_s, cpu_s, before = time.monotonic(), relay.cpu_s, relay.megabytes
-        await asyncio.gather(*(publish(k) for k in range(robots)))
+        await asyncio.gather(*(publish(relay.port, k, robots, seconds) for k in range(robots)))
         cores = (relay.cpu_s - cpu_s) / (time.monotonic() - began_s)
         await asyncio.sleep(1.0)
-        for task in watching:
+        for task in beside:
             task.cancel()
         print(f"{robots} robots, {viewers} viewers: {cores:.2f} cores, {before:.0f} -> {relay.megabytes:.0f} MB")
-        print(f"every {MEMORY_S:g} s: {' '.join(f'{mb:.0f}' for mb in memory_mb)} MB")
-        for k, times_us in enumerate(latency_us):
-            median, late, longest = np.percentile(times_us, [50, 99, 100]) / 1e3
-            of = round(seconds * RATE_HZ) * robots
-            print(f"viewer {k}: {len(times_us)} of {of}, {median:.2f} ms, p99 {late:.2f}, longest {longest:.0f}")
+    print(f"every {MEMORY_S:g} s: {' '.join(f'{mb:.0f}' for mb in memory_mb)} MB")
+    for k, times_us in enumerate(latency_us):
+        median, late, longest = np.percentile(times_us, [50, 99, 100]) / 1e3
+        of = round(seconds * RATE_HZ) * robots
+        print(f"viewer {k}: {len(times_us)} of {of}, {median:.2f} ms, p99 {late:.2f}, longest {longest:.0f}")
 
 
 def main() -> None:

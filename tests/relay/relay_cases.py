@@ -6,7 +6,8 @@ import asyncio
 import contextlib
 import socket
 import ssl
-from collections.abc import AsyncIterator, Awaitable, Callable
+import sys
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,7 @@ from bufgym.relay.config import Config, Rule  # noqa: E402
 from bufgym.relay.server import Server  # noqa: E402
 from bufgym.relay.wire import Message  # noqa: E402
 
-ALL = Rule(address="127.0.0.1", send=True, receive=True)
-COMMAND = "/robots/a/command"
+ALL = Rule(address="127.0.0.0/8", send=True, receive=True)
 
 
 def settings(**changed: Any) -> Config:
@@ -45,25 +45,44 @@ class Client:
     async def put(self, topic: str, payload: bytes = b"1", **fields: Any) -> None:
         await self.socket.send(wire.encode(Message(topic, payload, **{"encoding": "raw", **fields})))
 
-    async def command(self, seq: int, topic: str = COMMAND) -> None:
-        await self.put(topic, str(seq).encode(), encoding="json", seq=seq, no_drop=True)
+    async def command(self, seq: int, topic: str, **fields: Any) -> None:
+        await self.put(topic, str(seq).encode(), **{"encoding": "json", "seq": seq, "no_drop": True, **fields})
 
-    async def next(self, timeout_s: float = 20.0) -> Any:
+    async def next(self) -> Any:
         """What comes next: a ``Message``, or the object of a text frame."""
-        async with asyncio.timeout(timeout_s):  # wait_for of Python 3.11 can lose a cancellation
-            data = await self.socket.recv()
+        data = await self.socket.recv()
         return wire.decode(data) if isinstance(data, bytes) else wire.heard(data)
 
-    async def nothing(self, for_s: float = 0.15) -> bool:
-        try:
-            return await self.next(for_s) is None
-        except TimeoutError:
-            return True
+    async def rest(self) -> list[Any]:
+        """All that still comes of what the relay has been told so far.
+
+        The relay answers a request before it sends messages that wait. So it is asked again until nothing lies between
+        two answers.
+        """
+        found: list[Any] = []
+        for asked in range(10**6):
+            before = len(found)
+            await self.say("recordings")
+            while not isinstance(said := await self.next(), dict) or said["op"] != "recordings":
+                found.append(said)
+            if asked and len(found) == before:
+                break
+        return found
 
     async def subscribe(self, topic: str, id: str = "a", **fields: Any) -> dict[str, Any]:
         await self.say("subscribe", id=id, topic=topic, **fields)
         said: dict[str, Any] = await self.next()
         return said
+
+    async def came(self, seq: int, payload: bytes) -> None:
+        """The next message is this one, no_drop."""
+        message = await self.next()
+        assert (message.seq, bytes(message.payload), message.no_drop) == (seq, payload, True)
+
+
+async def nothing(*clients: Client) -> bool:
+    """Whether nothing comes to any of these, once the relay has taken all that they have said."""
+    return not any([await one.rest() for one in clients] + [await one.rest() for one in clients])
 
 
 @contextlib.asynccontextmanager
@@ -76,6 +95,7 @@ async def client(
 ) -> AsyncIterator[Client]:
     """Connected and welcomed, or with the refusal in ``welcome``."""
     own = socket.socket()
+    own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     if receive_buffer_bytes is not None:
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
     own.bind((local, 0))
@@ -95,10 +115,8 @@ async def client(
 
 
 @contextlib.asynccontextmanager
-async def stranger(
-    port: int, local: str = "127.0.0.1"
-) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
-    """A bare TCP connection."""
+async def stranger(port: int, local: str = "127.0.0.1") -> AsyncIterator[tuple[Any, Any]]:
+    """A bare TCP connection: its reader and its writer."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(local, 0))
     try:
         yield reader, writer
@@ -110,6 +128,7 @@ async def stranger(
 
 @contextlib.asynccontextmanager
 async def relay(config: Config | None = None) -> AsyncIterator[Server]:
+    """A relay with settings that no other test of the module wants."""
     server = Server(config or settings())
     await server.start()
     try:
@@ -118,9 +137,35 @@ async def relay(config: Config | None = None) -> AsyncIterator[Server]:
         await server.close()
 
 
-def run(story: Callable[[], Awaitable[None]], most_s: float = 60.0) -> None:
-    asyncio.run(asyncio.wait_for(story(), most_s))  # type: ignore[arg-type]
+@contextlib.asynccontextmanager
+async def process(port: int, folder: Path, table: str = "") -> AsyncIterator[Any]:
+    """A relay in a process of its own; it is killed in the end, without warning."""
+    config = folder / "relay.toml"
+    rule = '[[rules]]\naddress = "127.0.0.1"\nsend = true\nreceive = true\n'
+    config.write_text(f'port = {port}\nfolder = "held"\npolicies = ["drop-oldest"]\n{rule}{table}')
+    words = ["-um", "bufgym", "relay", "serve", "--config", str(config)]
+    one = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=asyncio.subprocess.PIPE)
+    try:
+        assert one.stdout is not None and b"http" in await one.stdout.readline()
+        yield one
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            one.kill()
+        await one.wait()
 
 
-def in_folder(folder: Path, **changed: Any) -> Config:
-    return settings(folder=folder, **changed)
+class Corner:
+    """A test's corner of the module's relay: an address, and a robot with its topics, that no other test has."""
+
+    def __init__(self, server: Server, number: int) -> None:
+        self.server, self.hub, self.port = server, server.hub, server.port
+        self.url = f"ws://127.0.0.1:{server.port}"
+        self.robot = f"r{number}"
+        self.address = f"127.1.{number // 250}.{1 + number % 250}"
+        self.command = self.topic("command")
+
+    def topic(self, name: str) -> str:
+        return f"/robots/{self.robot}/{name}"
+
+    def client(self, **settings: Any) -> contextlib.AbstractAsyncContextManager[Client]:
+        return client(self.port, **{"local": self.address, **settings})

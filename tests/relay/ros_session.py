@@ -1,4 +1,4 @@
-"""A robot of ROS at a relay, for test_relay_ros.py: prints what came each way. Needs rospy and rosmaster, or rclpy.
+"""A robot of ROS at a relay, for test_robot.py: prints what came each way. Needs rospy and rosmaster, or rclpy.
 
 node --/chatter, /odom--> ``bufgym relay robot`` --> relay --> viewer; viewer --/robots/r/to/speech--> node
 """
@@ -10,10 +10,10 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from loop_cases import beside, until
 from relay_cases import relay, settings
 
 from bufgym.errors import BufgymError
@@ -30,82 +30,55 @@ def cdr(text: str) -> bytes:
     return b"\0\1\0\0" + (len(text) + 1).to_bytes(4, "little") + text.encode() + b"\0"
 
 
-class Node:
-    """What both versions have: it publishes texts and one pose, and hears."""
+def node_1(folder: str, hear: Any) -> list[Any]:
+    """A node of ROS 1 with its master: its publishers of texts and of poses."""
+    from rosmaster.master import Master
 
-    def __init__(self) -> None:
-        self.heard: list[str] = []
-        self.publish: Callable[[str], None]
+    master = Master(0)
+    master.start()
+    port = master.master_node.server.socket.getsockname()[1]
+    os.environ.update(ROS_MASTER_URI=f"http://127.0.0.1:{port}", ROS_IP="127.0.0.1", ROS_LOG_DIR=folder)
+    import rospy
+    from nav_msgs.msg import Odometry
+    from std_msgs.msg import String
 
-    def _take(self, text: Any) -> None:
-        self.heard.append(text.data)
-
-    @staticmethod
-    def _posed(odometry: Any) -> Any:
-        odometry.header.frame_id = "map"
-        odometry.pose.pose.position.x, odometry.pose.pose.orientation.w = 3.0, 1.0
-        return odometry
-
-
-class Node1(Node):
-    def __init__(self, folder: str) -> None:
-        super().__init__()
-        from rosmaster.master import Master
-
-        master = Master(0)
-        master.start()
-        port = master.master_node.server.socket.getsockname()[1]
-        os.environ.update(ROS_MASTER_URI=f"http://127.0.0.1:{port}", ROS_IP="127.0.0.1", ROS_LOG_DIR=folder)
-        import rospy
-        from nav_msgs.msg import Odometry
-        from std_msgs.msg import String
-
-        rospy.init_node("node", disable_signals=True, disable_rosout=True)
-        texts, poses = rospy.Publisher("chatter", String, queue_size=9), rospy.Publisher("odom", Odometry, queue_size=9)
-        rospy.Subscriber("speech", String, self._take)
-
-        def publish(text: str) -> None:
-            texts.publish(text)
-            poses.publish(self._posed(Odometry()))
-
-        self.publish = publish
+    rospy.init_node("node", disable_signals=True, disable_rosout=True)
+    rospy.Subscriber("speech", String, hear)
+    return [rospy.Publisher(topic, kind, queue_size=9) for topic, kind in (("chatter", String), ("odom", Odometry))]
 
 
-class Node2(Node):
-    def __init__(self, folder: str) -> None:
-        super().__init__()
-        os.environ["ROS_DOMAIN_ID"] = str(20 + os.getpid() % 80)  # another for each run: two may run at a time
-        import rclpy
-        from nav_msgs.msg import Odometry
-        from std_msgs.msg import String
+def node_2(folder: str, hear: Any) -> list[Any]:
+    """The same of ROS 2, in a domain of its own: two may run at a time."""
+    os.environ["ROS_DOMAIN_ID"] = str(20 + os.getpid() % 80)
+    import rclpy
+    from nav_msgs.msg import Odometry
+    from std_msgs.msg import String
 
-        rclpy.init(args=[])
-        node = rclpy.create_node("node")
-        texts, poses = node.create_publisher(String, "chatter", 9), node.create_publisher(Odometry, "odom", 9)
-        node.create_subscription(String, "speech", self._take, 9)
-        threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
-
-        def publish(text: str) -> None:
-            texts.publish(String(data=text))
-            poses.publish(self._posed(Odometry()))
-
-        self.publish = publish
+    rclpy.init(args=[])
+    node = rclpy.create_node("node")
+    node.create_subscription(String, "speech", hear, 9)
+    threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
+    return [node.create_publisher(kind, topic, 9) for topic, kind in (("chatter", String), ("odom", Odometry))]
 
 
-async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
+async def story(version: str, folder: Path) -> dict[str, Any]:
     config = folder / "client.toml"
     config.write_text(CONFIG)
-    came: list[Message] = []
-    location: list[Any] = []
-    sent: list[str] = []
-
-    def take_status(message: Message) -> None:
-        location.append(json.loads(bytes(message.payload))["location"])
+    came, location, sent, heard = list[Message](), list[Any](), list[str](), list[str]()
+    make = {"1": node_1, "2": node_2}[version]
+    texts, poses = make(str(folder), lambda text: heard.append(text.data))
 
     async def publish() -> None:
+        from nav_msgs.msg import Odometry
+        from std_msgs.msg import String
+
+        text, pose = String(), Odometry()
+        pose.header.frame_id, pose.pose.pose.position.x, pose.pose.pose.orientation.w = "map", 3.0, 1.0
         while True:
-            sent.append(f"text {len(sent):06}")  # 12 bytes with the 0: DDS fills up to a multiple of 4
-            node.publish(sent[-1])
+            text.data = f"text {len(sent):06}"  # 12 bytes with the 0: DDS fills up to a multiple of 4
+            sent.append(text.data)
+            texts.publish(text)
+            poses.publish(pose)
             await asyncio.sleep(0.05)
 
     async def command(*what: Any) -> None:
@@ -124,36 +97,29 @@ async def story(node: Node, version: str, folder: Path) -> dict[str, Any]:
         robot = await asyncio.create_subprocess_exec(sys.executable, "-m", "bufgym", *words, stdout=sys.stderr)
         viewer = Session(url, "viewer", say=lambda text: print(text, file=sys.stderr))
         viewer.subscribe("^/robots/r/chatter$", came.append)
-        viewer.subscribe("^/robots/r/status$", take_status)
-        tasks = [asyncio.create_task(work) for work in (viewer.run(), publish())]
+        viewer.subscribe("^/robots/r/status$", lambda one: location.append(json.loads(bytes(one.payload))["location"]))
         try:
-            while len(came) < 10 or not any(location):
-                await asyncio.sleep(0.01)
-            # What is no message, of no type that is here, or not for this robot's ROS, stops nothing.
-            await command("/robots/r/to/speech", b"\0\1\0\0\xff\xff\xff\xff", TEXT)
-            await command("/robots/r/to/speech", b"", "no_such_msgs/msg/B")
-            await command("/robots/r/to/private", cdr("secret"), TEXT)
-            for text in COMMANDS:
-                await command("/robots/r/to/speech", cdr(text), TEXT)
-            while len(node.heard) < len(COMMANDS):
-                await asyncio.sleep(0.01)
-            assert robot.returncode is None
+            async with beside(viewer.run(), publish()):
+                await until(lambda: len(came) >= 10 and any(location))
+                # What is no message, of no type that is here, or not for this robot's ROS, stops nothing.
+                await command("/robots/r/to/speech", b"\0\1\0\0\xff\xff\xff\xff", TEXT)
+                await command("/robots/r/to/speech", b"", "no_such_msgs/msg/B")
+                await command("/robots/r/to/private", cdr("secret"), TEXT)
+                for text in COMMANDS:
+                    await command("/robots/r/to/speech", cdr(text), TEXT)
+                await until(lambda: len(heard) >= len(COMMANDS))
+                assert robot.returncode is None
         finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
             robot.terminate()
             await robot.wait()
     return {
         "exact": all(bytes(message.payload) in {cdr(text) for text in sent} for message in came),
         "kinds": sorted({(message.encoding, message.type) for message in came}),
-        "heard": node.heard,
+        "heard": heard,
         "location": next(filter(None, location)),
     }
 
 
 if __name__ == "__main__":
-    version, folder = sys.argv[1:]
-    node = {"1": Node1, "2": Node2}[version](folder)
-    print(json.dumps(asyncio.run(asyncio.wait_for(story(node, version, Path(folder)), 100))), flush=True)
+    print(json.dumps(asyncio.run(story(sys.argv[1], Path(sys.argv[2])))), flush=True)
     os._exit(0)

@@ -9,73 +9,64 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 import urllib.request
 from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Any
 
 import pytest
-from relay_cases import client, run
+from cli_cases import fails
+from loop_cases import beside, until
+from relay_cases import client, nothing
 
 from bufgym.cli import main
 from bufgym.errors import BufgymError
+from bufgym.live.sockets import free_port
 from bufgym.policies import registry
 from bufgym.policies.registry import Policy
 from bufgym.relay import demo, policies
 from bufgym.relay.session import Session
 
 
-def test_the_page_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_page_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     compiler, compiled, said = threading.Event(), policies.compiled, list[str]()
 
     def slowly(chosen: Policy) -> Policy:
         if chosen.name == "drop-oldest":  # the robots'
-            compiler.wait(20)
+            compiler.wait()
         return compiled(chosen)
 
     monkeypatch.setattr(policies, "compiled", slowly)
-    monkeypatch.setattr(demo, "PATIENCE_S", 0.05)
-
-    async def story() -> None:
-        async with demo.running(1, policy="drop-oldest", fades=False, say=said.append) as port:
+    monkeypatch.setattr(demo, "PATIENCE_S", 0.01)
+    async with demo.running(1, policy="drop-oldest", fades=False, say=said.append) as port, client(port) as viewer:
+        try:
 
             def page() -> bytes:
-                with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10) as answer:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
                     return bytes(answer.read())
 
             assert b"<html" in (await asyncio.to_thread(page)).lower()
-            async with client(port) as viewer:
-                await viewer.subscribe("^/robots/")
-                assert await viewer.nothing(0.5)
-                assert said == ["the robots come when their queue is compiled: up to a minute, the first time"]
-                compiler.set()
-                assert (await viewer.next()).topic.startswith("/robots/robot-1/")
-
-    run(story)
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return int(free.getsockname()[1])
+            await viewer.subscribe("^/robots/")
+            await until(lambda: said)
+            assert said == ["the robots come when their queue is compiled: up to a minute, the first time"]
+            assert await nothing(viewer)
+        finally:
+            compiler.set()
+        assert (await viewer.next()).topic.startswith("/robots/robot-1/")
 
 
-def test_uncompiled_robots_are_seen_until_the_compiled_take_over() -> None:
-    port = free_port()
-
-    async def story() -> None:
-        topics: asyncio.Queue[str] = asyncio.Queue()
-        viewer = Session(f"ws://127.0.0.1:{port}", "viewer")
-        viewer.subscribe("^/robots/", lambda message: topics.put_nowait(message.topic))
-        async with (
-            demo.uncompiled(["--robots", "1", "--port", str(port), "--no-browser"]),
-            asyncio.TaskGroup() as tasks,
-        ):
-            running = tasks.create_task(viewer.run())
-            assert (await topics.get()).startswith("/robots/robot-1/")
-            running.cancel()
-        socket.create_server(("127.0.0.1", port)).close()  # the place is free
-
-    run(story)
+async def test_the_uncompiled_robots_are_a_process_as_long_as_the_block(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A shell script stands in for Python: it says what it was given and waits to be ended."""
+    python, told = tmp_path / "python", tmp_path / "told"
+    python.write_text(f'#!/bin/sh\ntrap "echo ended >> {told}; exit" TERM\necho $NUMBA_DISABLE_JIT $* > {told}.new\n')
+    python.write_text(f"{python.read_text()}mv {told}.new {told}\nwhile :; do sleep 0.01; done\n")
+    python.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(python))
+    async with demo.uncompiled(["--robots", "1"]):
+        await until(told.exists)
+    assert told.read_text() == "1 -m bufgym relay demo --robots 1\nended\n"
 
 
 UNTIL_KILLED = """
@@ -84,33 +75,31 @@ from bufgym.relay import demo
 
 async def show():
     async with demo.uncompiled(["--robots", "1", "--port", sys.argv[1], "--no-browser"]):
-        await asyncio.sleep(60)
+        await asyncio.Event().wait()
 
 asyncio.run(show())
 """
 
 
-def test_who_is_told_to_end_leaves_no_robots_behind() -> None:
-    port = free_port()
-
-    def there() -> bool:
-        try:
-            socket.create_connection(("127.0.0.1", port), timeout=5).close()
-        except OSError:
-            return False
-        return True
-
-    def wait_until(wanted: bool) -> None:
-        until_s = time.monotonic() + 30
-        while there() != wanted:
-            assert time.monotonic() < until_s
-            time.sleep(0.1)
-
-    with subprocess.Popen([sys.executable, "-c", UNTIL_KILLED, str(port)]) as process:
-        wait_until(True)
+@pytest.mark.nightly
+async def test_who_is_told_to_end_leaves_no_robots_behind() -> None:
+    """Robots are seen until the program that shows them is told to end; then their place is free."""
+    port, topics = free_port("127.0.0.1"), asyncio.Queue[str]()
+    process = await asyncio.create_subprocess_exec(sys.executable, "-c", UNTIL_KILLED, str(port))
+    viewer = Session(f"ws://127.0.0.1:{port}", "viewer")
+    viewer.subscribe("^/robots/", lambda message: topics.put_nowait(message.topic))
+    async with beside(viewer.run()):
+        assert (await topics.get()).startswith("/robots/robot-1/")
         process.terminate()
-        assert process.wait(30) == -signal.SIGTERM
-    wait_until(False)
+        assert await process.wait() == -signal.SIGTERM
+
+    def free() -> bool:
+        with contextlib.suppress(OSError):
+            socket.create_server(("127.0.0.1", port)).close()
+            return True
+        return False
+
+    await until(free)
 
 
 def test_the_command_shows_them_while_another_process_compiles(
@@ -154,7 +143,15 @@ def test_what_is_not_kept_another_process_compiles(monkeypatch: pytest.MonkeyPat
     assert asked == 2 * [[sys.executable, "-m", "bufgym.relay.policies", "afr"]]
 
 
-@pytest.mark.parametrize("name", ["drop-oldest", "my-own"])
-def test_that_process_knows_what_comes_with_bufgym(name: str) -> None:
-    done = subprocess.run([sys.executable, "-m", "bufgym.relay.policies", name], capture_output=True, check=False)
-    assert (done.returncode, done.stderr) == (0, b"")
+def test_the_commands_name_what_is_wrong(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    missing = str(tmp_path / "none")
+    for words, naming in (
+        (["robot", "--config", missing], missing),
+        (["robot", "--bag", missing], missing),
+        (["robot", "--ros", "2"], "--ros needs --config"),
+        (["robot", "--to", "there:1"], "there:1: must be ws://HOST:PORT"),
+        (["robot", "--token-file", missing], missing),
+        (["robot", "--policies", "oracle"], "oracle"),
+        (["demo", "--robots", "0"], "must be a whole number >= 1"),
+    ):
+        fails(["relay", *words], naming, capsys)

@@ -2,57 +2,101 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from pathlib import Path
 
 import pytest
-from relay_cases import ALL, client, in_folder, relay, run
+from relay_cases import ALL, client, relay, settings
 
-from bufgym import cli
+from bufgym.errors import BufgymError
 from bufgym.relay.audit import FILE, Audit
 from bufgym.relay.config import Rotation, Rule
-from bufgym.relay.recorder import FOLDER
+from bufgym.relay.recorder import FOLDER, Recorder
+from bufgym.relay.replay import piece, recordings
+from bufgym.relay.wire import Message
 from bufgym.traces.formats import bags
 
+pytest.importorskip("mcap", reason="no mcap here: the extra relay")
 RECORD = Rule(recorder=True, receive=True, topic="/robots/.*")
 
 
-def test_what_a_rule_allows_is_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("mcap")
-
-    async def story() -> None:
-        async with relay(in_folder(tmp_path, rules=(ALL, RECORD))) as server, client(server.port) as robot:
-            await robot.subscribe("nothing")
-            for k in range(40):
-                await robot.put("/robots/a/camera", bytes(1_000 + k), encoding="jpeg", seq=k)
-                await robot.put("/private/a", b"12")
-            await robot.put("/robots/a/odom", b"12", encoding="cdr", type="nav_msgs/msg/Odometry")
-            await robot.subscribe("that all has come")
-
-    run(story)
+async def test_what_a_rule_allows_is_recorded(tmp_path: Path) -> None:
+    async with relay(settings(folder=tmp_path, rules=(ALL, RECORD))) as server, client(server.port) as robot:
+        for k in range(40):
+            await robot.put("/robots/a/camera", bytes(1_000 + k), encoding="jpeg", seq=k)
+            await robot.put("/private/a", b"12")
+        await robot.put("/robots/a/odom", b"12", encoding="cdr", type="nav_msgs/msg/Odometry")
+        await robot.rest()
     (path,) = (tmp_path / FOLDER).glob("*.mcap")
     bag = bags.read_bag(path)
     assert bag.topics == {"/robots/a/camera": "", "/robots/a/odom": "nav_msgs/msg/Odometry"}
     assert bag.size_bytes.tolist() == [*range(1_000, 1_040), 2]
-    words = ["bench", "--workload", str(path), "--policies", "afr", "--capacity", "2", "--out", str(tmp_path / "out")]
-    assert cli.main(words) == 0 and "afr" in capsys.readouterr().out
+
+
+def recorder(folder: Path, payloads: list[bytes], file_bytes: int = 10**6) -> Recorder:
+    """One that has written these, of encoding json and jpeg in turn, and has not been closed."""
+    one = Recorder.of(settings(folder=folder, rules=(RECORD,), recording=Rotation(bytes=file_bytes, files=3)))
+    assert one is not None
+    for k, payload in enumerate(payloads):
+        one(Message(f"/robots/{'ab'[k % 2]}", payload, ("json", "jpeg")[k % 2], seq=k))
+    return one
 
 
 def test_recordings_take_turns(tmp_path: Path) -> None:
-    pytest.importorskip("mcap")
-    rotation = Rotation(bytes=10_000, files=3)
-
-    async def story() -> None:
-        config = in_folder(tmp_path, rules=(ALL, RECORD), recording=rotation)
-        async with relay(config) as server, client(server.port) as robot:
-            for _ in range(50):
-                await robot.put("/robots/a/camera", bytes(1_000))
-            await robot.subscribe("that all has come")
-
-    run(story)
+    recorder(tmp_path, [bytes(1_000)] * 50, 10_000).close()
     files = sorted((tmp_path / FOLDER).glob("*.mcap"))
     assert len(files) == 3 and all(file.stat().st_size < 13_000 for file in files)
     assert sum(len(bags.read_bag(file).size_bytes) for file in files) < 50
+
+
+# --- recordings piece by piece, for the page -------------------------------------------------------------------------
+
+
+def every(topic: str) -> bool:
+    return True
+
+
+def test_pieces_are_the_whole(tmp_path: Path) -> None:
+    """Six messages of 3 bytes, at most 3 in a piece (or more where they were recorded in the same microsecond)."""
+    recorder(tmp_path, [b"100", b"\xff\x01\x02", b"102", b"\xff\x03\x04", b"104", b"\xff\x05\x06"]).close()
+    folder = tmp_path / FOLDER
+    (file,) = recordings(folder)
+    came, next_us = [], 0
+    while next_us is not None:
+        part = piece(folder, file["name"], next_us, 7, every)
+        assert 0 < len(part["messages"]) < 6
+        came += part["messages"]
+        next_us = part["next_us"]
+    assert [(one["topic"], one["seq"]) for one in came] == [(f"/robots/{'ab'[k % 2]}", k) for k in range(6)]
+    assert came[2]["data"] == 102 and base64.b64decode(came[3]["data"]) == b"\xff\x03\x04"
+    assert (came[0]["stamp_us"], came[-1]["stamp_us"]) == (part["first_us"], part["last_us"])
+    later = piece(folder, file["name"], came[4]["stamp_us"], 100, lambda topic: topic.endswith("/b"))
+    assert later["messages"][-1]["seq"] == 5 and all(one["topic"] == "/robots/b" for one in later["messages"])
+
+
+def test_a_recording_that_is_being_written_goes_on(tmp_path: Path) -> None:
+    record, folder = recorder(tmp_path, [b"1", b"2"]), tmp_path / FOLDER
+    record._file.flush()  # type: ignore[union-attr]
+    name = recordings(folder)[0]["name"]
+    first = piece(folder, name, 0, 100, every)
+    record(Message("/robots/c", b"3"))
+    record.close()
+    second = piece(folder, name, first["last_us"] + 1, 100, every)
+    assert len(first["messages"]) == 2 and [one["topic"] for one in second["messages"]] == ["/robots/c"]
+
+
+def test_only_recordings_are_read(tmp_path: Path) -> None:
+    assert recordings(None) == [] and recordings(tmp_path / "none") == []
+    (tmp_path / "own.mcap").write_bytes(b"no recording at all")
+    for name in ("../own.mcap", "/etc/passwd", "", "none.mcap"):
+        with pytest.raises(BufgymError, match="there is none of this name"):
+            piece(tmp_path, name, 0, 1, every)
+    with pytest.raises(BufgymError, match=r"recording own\.mcap: must be an MCAP file"):
+        piece(tmp_path, "own.mcap", 0, 1, every)
+
+
+# --- the audit log ---------------------------------------------------------------------------------------------------
 
 
 def entries(folder: Path) -> list[dict[str, object]]:

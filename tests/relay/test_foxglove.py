@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import struct
-from pathlib import Path
 from typing import Any
 
 import pytest
-from relay_cases import ALL, client, relay, run, settings
-from test_relay_client import compiled, until
+from loop_cases import beside, compiled, until
+from relay_cases import ALL, Corner, client, relay, settings
 
 pytest.importorskip("foxglove", reason="no foxglove here: the extra foxglove")
 
@@ -19,7 +17,7 @@ from websockets.typing import Subprotocol
 
 from bufgym.errors import BufgymError
 from bufgym.relay import ros_messages
-from bufgym.relay.config import Foxglove, Rule, load
+from bufgym.relay.config import Foxglove, Rule
 from bufgym.relay.foxglove import Bridge, Screen
 from bufgym.relay.madeup import MadeUp
 from bufgym.relay.robot import Robot
@@ -27,7 +25,7 @@ from bufgym.relay.server import Server
 from bufgym.relay.session import Session
 from bufgym.relay.wire import MAX_STAMP_US, Message
 
-TOPICS = {"/robots/r/camera", "/robots/r/odom", "/robots/r/queue", "/robots/r/scan", "/robots/r/status", "/tf"}
+CONFIG = settings(policies=("drop-oldest",))
 
 
 class Viewer:
@@ -56,81 +54,64 @@ class Viewer:
 
 
 @compiled
-def test_a_client_of_foxglove_sees_the_fleet() -> None:
+async def test_a_client_of_foxglove_sees_the_fleet(corner: Corner, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bufgym.relay.robot.STATUS_S", 0.1)
     viewer = Viewer()
-    channels, came = viewer.channels, viewer.came
-
-    async def story() -> None:
-        async with relay(settings(policies=("drop-oldest",))) as server:
-            url = f"ws://127.0.0.1:{server.port}"
-            bridge = Bridge(Session(url, "foxglove"), port=0)
-            robot = Robot(url, "r", MadeUp(), policy="drop-oldest", capacity=16)
-            tasks = [asyncio.create_task(work) for work in (bridge.run(), robot.run(), viewer.listen(bridge.address))]
-            try:
-                await until(lambda: set(came) == TOPICS)
-            finally:
-                for task in tasks:
-                    task.cancel()
-                await asyncio.gather(*tasks, return_exceptions=True)
-
-    asyncio.run(story())
-    scan = channels["/robots/r/scan"]
+    channels, came, robot = viewer.channels, viewer.came, f"/robots/{corner.robot}"
+    bridge = Bridge(Session(corner.url, "foxglove"), port=0)
+    source = Robot(corner.url, corner.robot, MadeUp(), policy="drop-oldest", capacity=16)
+    topics = {f"{robot}/{name}" for name in ("camera", "odom", "queue", "scan", "status")}
+    async with beside(bridge.run(), source.run(), viewer.listen(bridge.address)):
+        await until(lambda: set(came) >= {*topics, "/tf"})  # and the relay's own
+    scan = channels[f"{robot}/scan"]
     assert (scan["encoding"], scan["schemaName"], scan["schemaEncoding"]) == ("cdr", ros_messages.SCAN, "ros2msg")
     assert "float32[] ranges" in scan["schema"]
-    assert ros_messages.read(came["/robots/r/scan"], ros_messages.SCAN).header.frame_id == "r/base"
-    assert channels["/robots/r/camera"]["schemaName"] == "foxglove.CompressedImage"
-    assert channels["/tf"]["schemaName"] == "foxglove.FrameTransform" and b"r/base" in came["/tf"]
-    assert 0 < json.loads(came["/robots/r/status"])["battery"] <= 1
+    base = f"{corner.robot}/base"
+    assert ros_messages.read(came[f"{robot}/scan"], ros_messages.SCAN).header.frame_id == base
+    assert channels[f"{robot}/camera"]["schemaName"] == "foxglove.CompressedImage"
+    assert channels["/tf"]["schemaName"] == "foxglove.FrameTransform" and base.encode() in came["/tf"]
+    assert 0 < json.loads(came[f"{robot}/status"])["battery"] <= 1
 
 
 # --- the relay's own ------------------------------------------------------------------------------------------------
 
 
-def test_a_relay_shows_what_its_rules_allow() -> None:
+async def test_a_relay_shows_what_its_rules_allow() -> None:
     """Of what a robot sends, who connects to the relay's own server sees what rules with ``foxglove`` let it see."""
     viewer = Viewer()
     rules = (ALL, Rule(foxglove=True, receive=True, topic="/robots/[^/]+/(scan|odom|text|camera|stop)"))
-
-    async def story() -> None:
-        config = settings(rules=rules, foxglove=Foxglove(port=0), no_drop=("/robots/[^/]+/stop",))
-        async with relay(config) as server, client(server.port) as robot, client(server.port) as other:
-            assert server.window is not None
-            listening = asyncio.create_task(viewer.listen(server.window.address))
-            await other.subscribe("stop$")
+    config = settings(rules=rules, foxglove=Foxglove(port=0), no_drop=("/robots/[^/]+/stop",))
+    async with relay(config) as server, client(server.port) as robot, client(server.port) as other:
+        assert server.window is not None
+        await other.subscribe("stop$")
+        async with beside(viewer.listen(server.window.address)):
             seq = 0
             while set(viewer.came) != {f"/robots/r/{name}" for name in ("odom", "camera", "text", "stop")}:
                 seq += 1
-                assert seq < 400, viewer.came
                 await robot.put("/robots/r/private", b"secret")
                 # What says that it is a pose and is none, and a time that no clock of Foxglove's has, stop nothing.
                 await robot.put("/robots/r/odom", b"12", encoding="cdr", type=ros_messages.ODOMETRY)
                 await robot.put("/robots/r/camera", b"jpeg", encoding="jpeg", stamp_us=MAX_STAMP_US)
                 await robot.put("/robots/r/text", b"hello")
-                await robot.put("/robots/r/stop", b"1", encoding="json", seq=seq, no_drop=True)
-                await asyncio.sleep(0.05)
-            listening.cancel()
-            await asyncio.gather(listening, return_exceptions=True)
-            assert server.hub.status()["refused"] == 0
-
-    run(story)
+                await robot.command(seq, "/robots/r/stop")
+                while not any(said.get("op") == "ack" for said in await robot.rest()):
+                    pass
+                await other.came(seq, b"%d" % seq)
+                await other.say("ack", seq=seq)
+        assert server.hub.status()["refused"] == 0
     assert viewer.came["/robots/r/text"] == b"hello" and viewer.channels["/robots/r/text"]["encoding"] == "raw"
 
 
-def test_without_a_rule_it_shows_nothing() -> None:
-    viewer = Viewer()
-
-    async def story() -> None:
-        async with relay(settings(foxglove=Foxglove(port=0))) as server, client(server.port) as robot:
-            assert server.window is not None
-            listening = asyncio.create_task(viewer.listen(server.window.address))
-            for _ in range(10):
-                await robot.put("/robots/r/text", b"hello")
-                await asyncio.sleep(0.02)
-            listening.cancel()
-            await asyncio.gather(listening, return_exceptions=True)
-
-    run(story)
-    assert viewer.channels == {}
+async def test_without_a_rule_it_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[Message] = []
+    monkeypatch.setattr(Screen, "show", lambda screen, message: shown.append(message))
+    for rules in ((ALL,), (ALL, Rule(foxglove=True, receive=True))):
+        assert not shown
+        config = settings(foxglove=Foxglove(port=0), rules=rules)
+        async with relay(config) as server, client(server.port) as robot:
+            await robot.put("/robots/r/text", b"hello")
+            await robot.rest()
+    assert [message.topic for message in shown] == ["/robots/r/text"]
 
 
 def test_strangers_cannot_fill_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,13 +123,9 @@ def test_strangers_cannot_fill_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(screen._channels) == 3
 
 
-def test_its_table_and_its_port(tmp_path: Path) -> None:
-    path = tmp_path / "relay.toml"
-    path.write_text("[foxglove]\nport = 9000\n[[rules]]\nfoxglove = true\nreceive = true\n")
-    config = load(path)
-    assert config.foxglove == Foxglove(port=9000) and config.rules == (Rule(foxglove=True, receive=True),)
+async def test_a_port_that_is_taken() -> None:
     screen = Screen("127.0.0.1", 0)
     taken = int(screen.address.rpartition(":")[2])
     with pytest.raises(BufgymError, match=rf"127\.0\.0\.1:{taken}: Foxglove's server: "):
-        asyncio.run(Server(settings(foxglove=Foxglove(port=taken))).start())
+        await Server(settings(foxglove=Foxglove(port=taken))).start()
     screen.close()

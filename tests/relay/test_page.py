@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import queue
 import shutil
 import threading
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_relay_client import compiled
+from loop_cases import compiled
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 for library in ("websockets", "re2", "rosbags", "PIL"):
@@ -34,26 +35,22 @@ SEES = """canvas => {
 @pytest.fixture(scope="module")
 def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """Of a relay with two made-up robots, in a thread; it records."""
-    found: list[int] = []
-    ready, over = threading.Event(), threading.Event()
+    found: queue.Queue[int] = queue.Queue()
+    over = threading.Event()
 
     async def show(folder: Path) -> None:
         async with demo.running(2, policy="drop-oldest", fades=False, folder=folder) as number:
-            found.append(number)
-            ready.set()
+            found.put(number)
             await asyncio.to_thread(over.wait)
 
     thread = threading.Thread(target=lambda: asyncio.run(show(tmp_path_factory.mktemp("relay"))))
     thread.start()
-    try:
-        assert ready.wait(120)
-        yield found[0]
-    finally:
-        over.set()
-        thread.join(30)
+    yield found.get()
+    over.set()
+    thread.join()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as play:
         one = play.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
@@ -79,18 +76,23 @@ class Page:
 
     def until(self, expression: str) -> None:
         """Wait until this holds on the page."""
-        for _ in range(600):  # the page's own rules forbid it to wait for text that is evaluated there
+        for _ in range(6_000):  # the page's own rules forbid it to wait for text that is evaluated there
+            assert not self.faults, expression
             if self.page.evaluate(expression):
                 return
-            self.page.wait_for_timeout(50)
-        pytest.fail(f"never {expression}; {self.faults}")
+            self.page.wait_for_timeout(20)
+        pytest.fail(f"never {expression}")
 
     def sees(self, canvas: str, colours: int) -> None:
         """Wait until the canvas has so many."""
         self.until(f"({SEES})(document.querySelector('{canvas}')) >= {colours}")
 
+    def close(self) -> None:
+        assert self.faults == []
+        self.page.close()
 
-@pytest.mark.parametrize(("scheme", "width"), [("light", 1360), ("dark", 390)])
+
+@pytest.mark.parametrize(("scheme", "width"), [("light", 1360), pytest.param("dark", 390, marks=pytest.mark.nightly)])
 def test_it_shows_the_robots(browser: Any, port: int, scheme: str, width: int) -> None:
     shown = Page(browser, port, color_scheme=scheme, viewport={"width": width, "height": 800})
     shown.until("document.querySelectorAll('.card').length === 2")
@@ -106,33 +108,25 @@ def test_it_shows_the_robots(browser: Any, port: int, scheme: str, width: int) -
         shown.sees(canvas, colours)
     assert shown.page.text_content("#state") == "live"
     assert shown.page.evaluate("document.documentElement.scrollWidth") <= width
-    assert shown.faults == []
     assert all(f"127.0.0.1:{port}/" in url or url.startswith(("data:", "blob:")) for url in shown.asked)
+    shown.close()
 
 
-def test_a_viewer_chooses_the_policy(browser: Any, port: int) -> None:
+@pytest.mark.nightly
+def test_a_viewer_chooses_the_policy_and_plays_a_recording(browser: Any, port: int) -> None:
     shown = Page(browser, port)
-    shown.until("document.querySelector('#policy').value === 'drop-oldest'")
+    cards = "document.querySelectorAll('.card').length === 2"
+    shown.until(f"{cards} && document.querySelector('#policy').value === 'drop-oldest'")
     shown.page.select_option("#policy", "drop-newest")
     shown.until("document.querySelector('#told').textContent === ''")
     assert shown.page.input_value("#policy") == "drop-newest"
-    assert shown.faults == []
-
-
-def test_a_recording_is_played(browser: Any, port: int) -> None:
-    shown = Page(browser, port)
-    shown.until("document.querySelectorAll('.card').length === 2")
     shown.page.click("#recordings")
     shown.page.click("#files li button")
-    shown.until(
-        "document.querySelectorAll('.card').length === 2 && document.querySelector('#clock').textContent !== ''"
-    )
+    shown.until(f"{cards} && document.querySelector('#clock').textContent !== ''")
     shown.until("document.querySelector('#camera-says').textContent.startsWith('camera')")
     assert shown.page.text_content("#state") == "replay" and shown.page.is_disabled("#policy")
     shown.page.click("#play")
     assert shown.page.text_content("#play") == "Play"
     shown.page.click("#live")
-    shown.until(
-        "document.querySelector('#state').textContent === 'live' && document.querySelectorAll('.card').length === 2"
-    )
-    assert shown.faults == []
+    shown.until(f"document.querySelector('#state').textContent === 'live' && {cards}")
+    shown.close()

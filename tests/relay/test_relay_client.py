@@ -2,210 +2,170 @@
 
 from __future__ import annotations
 
-import asyncio
+import contextlib
 import json
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from relay_cases import relay, settings
+from loop_cases import beside, compiled, until
+from relay_cases import Corner, relay, settings
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
 from bufgym.live.shaped import ShapedLink
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
+from bufgym.relay import session
 from bufgym.relay.client import Client
 from bufgym.relay.session import RefusedError, Session, security, token
 from bufgym.relay.unanswered import Unanswered
 from bufgym.relay.wire import Message
 from bufgym.traces import Trace
 
-compiled = pytest.mark.skipif(not JIT, reason="uncompiled, decisions take as long as messages do")
-COMMAND = "/robots/a/command"
 
-
-async def until(holds: Any, timeout_s: float = 30.0) -> None:
-    """Returns once ``holds()``."""
-    async with asyncio.timeout(timeout_s):
-        while not holds():
-            await asyncio.sleep(0.01)
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "RETRY_S", 0.01)
 
 
 # --- what is not answered --------------------------------------------------------------------------------------------
 
 
-def test_a_refused_number_is_used_again() -> None:
+async def test_a_refused_number_is_used_again() -> None:
     """Window 3: 1 is acked, 2 refused, 3 and 4 come back as out of order, and go again as 2 and 3."""
+    unanswered = Unanswered()
+    unanswered.window = 3
 
-    async def story() -> None:
-        unanswered = Unanswered()
-        unanswered.window = 3
-        futures = [unanswered.put(Message("/a", str(k).encode())) for k in range(5)]
-        sent = [unanswered.next() for _ in range(4)]
-        assert [message and (message.seq, message.payload) for message in sent] == [
-            (1, b"0"),
-            (2, b"1"),
-            (3, b"2"),
-            None,
-        ]
-        unanswered.ack(1)
-        assert unanswered.next() == Message("/a", b"3", seq=4)
-        assert unanswered.expects("/a", 2) and not unanswered.expects("/a", 3) and not unanswered.expects("/b", 2)
-        unanswered.refuse("store_full", "no room")
-        assert unanswered.next() is None and unanswered.expects("/a", 3)
-        unanswered.refuse("out_of_order", "2 first")
-        assert unanswered.next() is None  # 4 is still to come back
-        unanswered.refuse("out_of_order", "2 first")
-        sent = [unanswered.next() for _ in range(3)]
-        assert [message and (message.seq, message.payload) for message in sent] == [(2, b"2"), (3, b"3"), (4, b"4")]
-        unanswered.ack(4)
-        assert len(unanswered) == 0 and [future.done() for future in futures] == [True] * 5
-        with pytest.raises(BufgymError, match="topic /a: refused: store_full: no room"):
-            await futures[1]
+    def sent() -> tuple[int, bytes] | None:
+        message = unanswered.next()
+        return None if message is None else (message.seq, bytes(message.payload))
 
-    asyncio.run(story())
+    futures = [unanswered.put(Message("/a", str(k).encode())) for k in range(5)]
+    assert [sent() for _ in range(4)] == [(1, b"0"), (2, b"1"), (3, b"2"), None]
+    unanswered.ack(1)
+    assert sent() == (4, b"3")
+    assert unanswered.expects("/a", 2) and not unanswered.expects("/a", 3) and not unanswered.expects("/b", 2)
+    unanswered.refuse("store_full", "no room")
+    assert sent() is None and unanswered.expects("/a", 3)
+    unanswered.refuse("out_of_order", "2 first")
+    assert sent() is None  # 4 is still to come back
+    unanswered.refuse("out_of_order", "2 first")
+    assert [sent() for _ in range(3)] == [(2, b"2"), (3, b"3"), (4, b"4")]
+    unanswered.ack(4)
+    assert len(unanswered) == 0 and all(future.done() for future in futures)
+    with pytest.raises(BufgymError, match="topic /a: refused: store_full: no room"):
+        await futures[1]
 
 
-def test_after_a_reconnect_what_the_relay_lacks_goes_again() -> None:
-    async def story() -> None:
-        unanswered = Unanswered()
-        unanswered.window = 4
-        futures = [unanswered.put(Message("/a", str(k).encode())) for k in range(4)]
-        assert [unanswered.next() is not None for _ in range(4)] == [True] * 4
-        unanswered.resume(received=2, window=1)
-        assert [future.done() for future in futures] == [True, True, False, False]
-        assert unanswered.next() == Message("/a", b"2", seq=3) and unanswered.next() is None
-        unanswered.give_up("the client has ended")
-        with pytest.raises(BufgymError, match="has ended"):
-            await futures[3]
-
-    asyncio.run(story())
+async def test_after_a_reconnect_what_the_relay_lacks_goes_again() -> None:
+    unanswered = Unanswered()
+    unanswered.window = 4
+    futures = [unanswered.put(Message("/a", str(k).encode())) for k in range(4)]
+    assert all(unanswered.next() for _ in range(4))
+    unanswered.resume(received=2, window=1)
+    assert [future.done() for future in futures] == [True, True, False, False]
+    assert unanswered.next() == Message("/a", b"2", seq=3) and unanswered.next() is None
+    unanswered.give_up("the client has ended")
+    with pytest.raises(BufgymError, match="has ended"):
+        await futures[3]
 
 
 # --- over real connections -------------------------------------------------------------------------------------------
 
 
+@contextlib.asynccontextmanager
+async def links(corner: Corner, count: int) -> AsyncIterator[list[Any]]:
+    """Links of 10 MB/s to the relay, and the URLs where they begin."""
+    fast = Link(Trace.constant(1e7, duration_s=10))
+    made = [ShapedLink(fast, ("127.0.0.1", corner.port)) for _ in range(count)]
+    try:
+        yield [(link, f"ws://127.0.0.1:{await link.listen()}") for link in made]
+    finally:
+        for link in made:
+            await link.close()
+
+
+async def cut(link: ShapedLink, end: Session) -> None:
+    """Break its connection, and mend it when it has been noticed."""
+    faults = len(end.faults)
+    link.cut()
+    await until(lambda: len(end.faults) > faults)
+    link.mend()
+
+
 @compiled
-def test_commands_come_once_and_in_order_over_a_link_that_breaks() -> None:
-    """30 commands, one at a time, while the sender's and the receiver's link are cut in turn."""
+async def test_commands_come_once_and_in_order_over_a_link_that_breaks(corner: Corner) -> None:
+    """20 commands, one at a time, while the sender's and the receiver's link are cut in turn."""
     came: list[int] = []
-
-    async def story() -> None:
-        async with relay(settings()) as server:
-            fast = Link(Trace.constant(1e8, duration_s=10))
-            links = [ShapedLink(fast, ("127.0.0.1", server.port)) for _ in range(2)]
-            ends = [
-                Session(f"ws://127.0.0.1:{await link.listen()}", name) for link, name in zip(links, "ab", strict=True)
-            ]
-            sender, receiver = ends
-            receiver.subscribe(
-                f"^{COMMAND}$", lambda message: came.append(json.loads(bytes(message.payload))), durable=True
-            )
-            tasks = [asyncio.create_task(end.run()) for end in ends]
-            await asyncio.gather(*(end.ready.wait() for end in ends))
-
-            async def cuts() -> None:
-                for k in range(4):
-                    link, faults = links[k % 2], ends[k % 2].faults
-                    await asyncio.sleep(0.15)
-                    met = len(faults)
-                    link.cut()
-                    while len(faults) == met:  # noticed, however slow the machine is
-                        await asyncio.sleep(0.02)
-                    link.mend()
-
-            cutting = asyncio.create_task(cuts())
-            for k in range(30):
-                await sender.command(COMMAND, k)
-                await asyncio.sleep(0.02)
-            await cutting
-            await until(lambda: len(came) >= 30)
+    async with links(corner, 2) as ((near, sends), (far, receives)):
+        sender, receiver = Session(sends, "a"), Session(receives, "b")
+        async with beside(sender.run()):
+            with pytest.raises(BufgymError, match=f"topic {corner.command}: refused: no_receiver"):
+                await sender.command(corner.command, {"command": "stop"})
+        sender = Session(sends, "a")
+        receiver.subscribe(
+            f"^{corner.command}$", lambda message: came.append(json.loads(bytes(message.payload))), durable=True
+        )
+        async with beside(sender.run(), receiver.run()):
+            await receiver.ready.wait()
+            for k in range(20):
+                if k % 5 == 2:
+                    async with beside(cut(near, sender) if k % 2 else cut(far, receiver)) as (cutting,):
+                        await sender.command(corner.command, k)
+                        await cutting
+                else:
+                    await sender.command(corner.command, k)
+            await until(lambda: len(came) >= 20)
             assert sender.faults and receiver.faults
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-            for link in links:
-                await link.close()
-
-    asyncio.run(story())
-    assert came == list(range(30))
+    assert came == list(range(20))
 
 
 @compiled
-def test_a_queue_over_a_break_and_a_change_of_policy() -> None:
+async def test_a_queue_over_a_break_and_a_change_of_policy(corner: Corner) -> None:
     """What is queued when the policy changes goes all the same; the numbers of what comes rise."""
     came: list[Message] = []
     records: list[tuple[int, str]] = []
-
-    async def story() -> None:
-        async with relay(settings()) as server:
-            link = ShapedLink(Link(Trace.constant(40_000.0, duration_s=10)), ("127.0.0.1", server.port))
-            robot = Client(
-                f"ws://127.0.0.1:{await link.listen()}",
-                "a",
-                topics=(Topic("/robots/a/camera"),),
-                policy="drop-newest",
-                capacity=8,
-                log=lambda number, record: records.append((number, record["event"])),
-            )
-            viewer = Session(f"ws://127.0.0.1:{server.port}", "v")
-            viewer.subscribe("^/robots/a/camera$", came.append)
-            tasks = [asyncio.create_task(end.run()) for end in (viewer, robot)]
-            await asyncio.gather(viewer.ready.wait(), robot.ready.wait())
-            for _ in range(8):
-                robot.publish("/robots/a/camera", bytes(4_000), "jpeg")
-            robot.change("drop-oldest")
-            for _ in range(8):
-                robot.publish("/robots/a/camera", bytes(4_000), "jpeg")
+    topic = corner.topic("camera")
+    async with links(corner, 1) as ((link, url),):
+        robot = Client(
+            url,
+            "a",
+            topics=(Topic(topic),),
+            policy="drop-newest",
+            capacity=8,
+            log=lambda number, record: records.append((number, record["event"])),
+        )
+        viewer = Session(corner.url, "v")
+        viewer.subscribe(f"^{topic}$", came.append)
+        async with beside(viewer.run(), robot.run()):
+            await viewer.ready.wait()
+            await robot.ready.wait()
+            for policy in ("drop-oldest", None):
+                for _ in range(8):
+                    robot.publish(topic, bytes(4_000), "jpeg")
+                if policy is not None:
+                    robot.change(policy)
             await until(lambda: len(came) == 16)
             assert {number for number, _ in records} == {0, 1} and (1, "dropped") not in records
-            link.cut()
-            await until(lambda: robot.faults)
-            link.mend()
+            await cut(link, robot)
             while len(came) == 16:  # what the link itself held when it broke is lost
-                robot.publish("/robots/a/camera", bytes(4_000), "jpeg")
-                await asyncio.sleep(0.05)
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-            await link.close()
-
-    asyncio.run(story())
+                robot.publish(topic, bytes(4_000), "jpeg")
+                await robot.ready.wait()
+                await until(lambda: not robot.queue.in_flight)
     assert all(message.sender == "a" and message.encoding == "jpeg" for message in came)
     assert [message.seq for message in came[:16]] == list(range(1, 17)) and came[-1].seq > 16
 
 
-def test_who_is_not_let_in_is_told_why() -> None:
+async def test_who_is_not_let_in_is_told_why(corner: Corner) -> None:
     """An address without a rule is not talked to, and tries again; one whose token is no good gives up."""
-
-    async def story() -> None:
-        async with relay(settings(rules=())) as server:
-            stranger = Session(f"ws://127.0.0.1:{server.port}", "stranger")
-            running = asyncio.create_task(stranger.run())
-            await until(lambda: stranger.faults)
-            assert "HTTP 403" in stranger.faults[0] and "no rule" in stranger.faults[0]
-            running.cancel()
-        async with relay(settings()) as server:
-            await Session(f"ws://127.0.0.1:{server.port}", "stranger", token="x.y.z").run()
-
+    async with relay(settings(rules=())) as server:
+        stranger = Session(f"ws://127.0.0.1:{server.port}", "stranger")
+        async with beside(stranger.run()):
+            await until(lambda: len(stranger.faults) > 1)
+        assert "HTTP 403" in stranger.faults[0] and "no rule" in stranger.faults[0]
     with pytest.raises(RefusedError, match=r"ws://127.0.0.1:\d+: refused: unauthorized: token"):
-        asyncio.run(asyncio.wait_for(story(), 30))
-
-
-@compiled
-def test_what_nobody_subscribes_to_is_refused_to_its_sender() -> None:
-    async def story() -> None:
-        async with relay(settings()) as server:
-            sender = Session(f"ws://127.0.0.1:{server.port}", "a")
-            task = asyncio.create_task(sender.run())
-            try:
-                with pytest.raises(BufgymError, match="topic /robots/a/command: refused: no_receiver"):
-                    await asyncio.wait_for(sender.command(COMMAND, {"command": "stop"}), 30)
-            finally:
-                task.cancel()
-
-    asyncio.run(story())
+        await Session(corner.url, "stranger", token="x.y.z").run()
 
 
 def test_tokens_addresses_and_certificates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
+import os
+import subprocess
+import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from relay_cases import relay, settings
-from test_relay_client import compiled, until
+from loop_cases import beside, compiled, until
+from relay_cases import Corner, settings
 
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
-from bufgym.relay import ros_messages, wire
+from bufgym.relay import robot, ros_messages, wire
 from bufgym.relay.bag import Recorded
 from bufgym.relay.madeup import MadeUp
 from bufgym.relay.monitor import Monitor
@@ -27,6 +29,7 @@ from bufgym.relay.session import Session
 
 pytest.importorskip("rosbags", reason="no rosbags here: the extra relay")
 pytest.importorskip("PIL", reason="no Pillow here: the extra relay")
+CONFIG = settings(policies=("drop-oldest",))
 
 
 # --- the made-up room ------------------------------------------------------------------------------------------------
@@ -84,16 +87,10 @@ def test_a_queue_told_by_hand() -> None:
     h = 1 + 0.5 + 0.875
     assert state["topics"]["a"] == {"put": 5, "left": 3, "dropped": 2, "age_s": 0.25, "qoi": round(h / 3, 3)}
     assert state["topics"]["b"]["age_s"] is None and state["qoi"] == round(h / 3, 3)
-
-
-def test_a_new_queue_counts_on() -> None:
-    monitor = Monitor([Topic("a")], clock=lambda: 0.0)
-    for number, policy in enumerate(("afr", "drop-oldest")):
-        monitor(number, {"event": "settings", "policy": policy, "capacity": 2})
-        monitor(number, {"event": "put", "seq": 0, "x": 0.0, "topic": 0, "size_bytes": 1})
-        monitor(number, {"event": "dequeued", "seq": 0})
-        monitor(number, {"event": "gone", "seq": 0})
-    assert monitor.state()["policy"] == "drop-oldest" and monitor.state()["left"] == 2
+    monitor(1, {"event": "settings", "policy": "drop-oldest", "capacity": 2})  # another queue counts on
+    for event in ({"event": "put", "x": 0.0, "topic": 0, "size_bytes": 1}, {"event": "dequeued"}, {"event": "gone"}):
+        monitor(1, {"seq": 0, **event})
+    assert monitor.state()["policy"] == "drop-oldest" and monitor.state()["left"] == 4
 
 
 # --- messages of ROS -------------------------------------------------------------------------------------------------
@@ -117,53 +114,48 @@ def test_messages_read_as_they_were_made() -> None:
 
 # --- at a relay ------------------------------------------------------------------------------------------------------
 
+Came = dict[str, list[wire.Message]]
 
-async def watched(source: Any, story: Any, **robot: Any) -> dict[str, list[wire.Message]]:
-    """What a viewer receives of a robot while ``story(viewer, came)`` goes on."""
-    came: dict[str, list[wire.Message]] = defaultdict(list)
-    async with relay(settings(policies=("drop-oldest",))) as server:
-        url = f"ws://127.0.0.1:{server.port}"
-        viewer = Session(url, "viewer")
-        viewer.subscribe("^/robots/", lambda message: came[message.topic].append(message))
-        tasks = [asyncio.create_task(viewer.run())]
+
+async def watched(corner: Corner, source: Any, story: Any, **settings: Any) -> Came:
+    """What a viewer receives of a robot while ``story(viewer, came)`` goes on, by the last part of the topic."""
+    came: Came = defaultdict(list)
+    viewer = Session(corner.url, "viewer")
+    viewer.subscribe(f"^{corner.topic('')}", lambda message: came[message.topic.rpartition("/")[2]].append(message))
+    async with beside(viewer.run()):
         await viewer.ready.wait()
-        tasks.append(asyncio.create_task(Robot(url, "r", source, capacity=16, **robot).run()))
-        try:
-            await asyncio.wait_for(story(viewer, came), 60)
-        finally:
-            for task in tasks:
-                task.cancel()
-            ended = await asyncio.gather(*tasks, return_exceptions=True)
-    for error in ended:
-        if isinstance(error, Exception):
-            raise error
+        async with beside(Robot(corner.url, corner.robot, source, capacity=16, **settings).run()):
+            await story(viewer, came)
     return came
 
 
 @compiled
-def test_the_made_up_robot_and_a_command() -> None:
-    async def story(viewer: Session, came: dict[str, list[wire.Message]]) -> None:
-        topics = [f"/robots/r/{name}" for name in ("odom", "scan", "camera", "queue", "status")]
-        await until(lambda: all(len(came[topic]) >= 2 for topic in topics))
-        for wrong in ({"command": "policy", "policy": "oracle"}, "stop", 3):
-            await viewer.command("/robots/r/command", wrong)
-        await viewer.command("/robots/r/command", {"command": "policy", "policy": "drop-newest"})
-        await until(lambda: json.loads(bytes(came["/robots/r/queue"][-1].payload))["policy"] == "drop-newest")
+async def test_the_made_up_robot_and_a_command(corner: Corner, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robot, "STATUS_S", 0.1)
+    monkeypatch.setattr(robot, "QUEUE_S", 0.1)
 
-    came = asyncio.run(watched(MadeUp(), story, policy="drop-oldest", policies=("drop-newest",)))
-    status = json.loads(bytes(came["/robots/r/status"][-1].payload))
+    async def story(viewer: Session, came: Came) -> None:
+        await until(lambda: all(len(came[topic]) >= 2 for topic in ("odom", "scan", "camera", "queue", "status")))
+        for wrong in ({"command": "policy", "policy": "oracle"}, "stop", 3):
+            await viewer.command(corner.command, wrong)
+        await viewer.command(corner.command, {"command": "policy", "policy": "drop-newest"})
+        await until(lambda: json.loads(bytes(came["queue"][-1].payload))["policy"] == "drop-newest")
+
+    came = await watched(corner, MadeUp(), story, policy="drop-oldest", policies=("drop-newest",))
+    status = json.loads(bytes(came["status"][-1].payload))
     assert 0.9 < status["battery"] <= 1 and abs(status["location"]["x"]) < HALF_M[0]
     assert status["policies"] == ["drop-oldest", "drop-newest"]
     assert status["publishes"]["scan"] == {"type": ros_messages.SCAN, "encoding": "cdr"}
     assert set(status["queue"]["topics"]) == {"status", "queue", "odom", "scan", "camera"}
-    assert all(message.sender == "r" for messages in came.values() for message in messages if not message.no_drop)
-    pose = ros_messages.read(bytes(came["/robots/r/odom"][0].payload), ros_messages.ODOMETRY)
+    every = [message for messages in came.values() for message in messages if not message.no_drop]
+    assert all(message.sender == corner.robot for message in every)
+    pose = ros_messages.read(bytes(came["odom"][0].payload), ros_messages.ODOMETRY)
     assert abs(pose.pose.pose.position.y) < HALF_M[1]
-    assert bytes(came["/robots/r/camera"][0].payload[:2]) == b"\xff\xd8"
+    assert bytes(came["camera"][0].payload[:2]) == b"\xff\xd8"
 
 
 def recording(path: Path) -> Path:
-    """Two topics over a second: 10 scans, and 5 messages of a type of one's own."""
+    """Two topics over 0.1 s: 10 scans, and 5 messages of a type of one's own."""
     from mcap.writer import Writer
 
     with path.open("wb") as file:
@@ -173,26 +165,28 @@ def recording(path: Path) -> Path:
         notes = writer.register_channel("/notes", "json", writer.register_schema("own", "jsonschema", b"{}"))
         for k in range(10):
             payload = ros_messages.scan(k, "bag", np.radians([0.0, 1.0]), np.array([float(k), 1.0]))
-            writer.add_message(scans, log_time=k * 10**8, publish_time=k * 10**8, data=payload)
+            writer.add_message(scans, log_time=k * 10**7, publish_time=k * 10**7, data=payload)
             if k % 2 == 0:
-                writer.add_message(notes, log_time=k * 10**8 + 1, publish_time=0, data=b'{"k":%d}' % k)
+                writer.add_message(notes, log_time=k * 10**7 + 1, publish_time=0, data=b'{"k":%d}' % k)
         writer.finish()
     return path
 
 
 @compiled
-def test_a_recording_is_a_robot(tmp_path: Path) -> None:
-    async def story(viewer: Session, came: dict[str, list[wire.Message]]) -> None:
-        await until(lambda: len(came["/robots/r/scan"]) >= 12 and came["/robots/r/status"])
+async def test_a_recording_is_a_robot(corner: Corner, tmp_path: Path) -> None:
+    """It is played again and again. (A busy machine may drop a scan, but not change their order.)"""
+
+    async def story(viewer: Session, came: Came) -> None:
+        await until(lambda: len(came["scan"]) >= 12 and came["status"] and came["notes"])
 
     source = Recorded(recording(tmp_path / "drive.mcap"))
     assert [(stream.topic.name, stream.rate_hz) for stream in source.streams] == [("notes", 5.0), ("scan", 10.0)]
-    came = asyncio.run(watched(source, story, policy="drop-oldest"))
-    ranges = [ros_messages.read(bytes(one.payload), one.type).ranges[0] for one in came["/robots/r/scan"]]
-    start = ranges.index(0.0)
-    assert ranges[start : start + 3] == [0, 1, 2] and len(ranges) > 10  # it begins anew
-    assert came["/robots/r/notes"][0].encoding == "json"
-    assert json.loads(bytes(came["/robots/r/status"][0].payload))["recording"] == "drive.mcap"
+    came = await watched(corner, source, story, policy="drop-oldest")
+    ranges = [ros_messages.read(bytes(one.payload), one.type).ranges[0] for one in came["scan"]]
+    falls = [k for k in range(1, len(ranges)) if ranges[k] <= ranges[k - 1]]
+    assert set(ranges) <= set(range(10)) and 1 <= len(falls) < len(ranges) / 2
+    assert came["notes"][0].encoding == "json"
+    assert json.loads(bytes(came["status"][0].payload))["recording"] == "drive.mcap"
 
 
 def test_what_a_recording_lacks(tmp_path: Path) -> None:
@@ -204,3 +198,32 @@ def test_what_a_recording_lacks(tmp_path: Path) -> None:
         Recorded(tmp_path / "none.mcap")
     with pytest.raises(BufgymError, match="robot 'a/b': a name must be a text without '/'"):
         Robot("ws://a:1", "a/b", MadeUp())
+
+
+# --- robots of ROS: what a node publishes arrives byte by byte, and commands become messages of ROS ------------------
+
+HERE = Path(__file__).resolve().parent
+SEEN = {
+    "exact": True,
+    "kinds": [["cdr", "std_msgs/msg/String"]],
+    "heard": [str(k) for k in range(8)],
+    "location": {"x": 3.0, "y": 0.0, "yaw": 0.0},
+}
+"""Each command once and in order; nothing of what was broken, or meant for other topics."""
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("version", ["1", "2"])
+def test_a_robot_of_ros(version: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    if version == "1":
+        where = request.getfixturevalue("ros")
+    else:
+        pytest.importorskip("rclpy", reason="needs rclpy (extra ros2)")
+        where = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    places = [where.get("PYTHONPATH", ""), str(HERE), str(HERE.parent), str(HERE.parents[1])]
+    where = {**where, "PYTHONPATH": os.pathsep.join(filter(None, places))}
+    words = [sys.executable, str(HERE / "ros_session.py"), version, str(tmp_path)]
+    done = subprocess.run(words, env=where, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "not published" in done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == SEEN

@@ -5,15 +5,16 @@ Some hundred configurations every day; ``BUFGYM_FUZZ=100000`` is the full count.
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
+import itertools
 import random
 import re
 
 import pytest
 from mutations import COUNT, SEED
-from relay_cases import client, relay, run, settings
+from relay_cases import client, relay, settings
 
-from bufgym.errors import BufgymError
 from bufgym.relay import policies
 from bufgym.relay.config import Rule
 from bufgym.relay.hub import Frame, Hub
@@ -23,54 +24,34 @@ from bufgym.relay.store import Session
 from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import Message
 
-IDENTITIES = {
-    "address": (Rule(address="10.0.0.7", send=True), Identity("10.0.0.7"), Identity("10.0.0.8")),
-    "range": (Rule(address="10.0.0.0/24", send=True), Identity("10.0.0.7"), Identity("10.0.1.7")),
-    "address 6": (Rule(address="fd00::/8", send=True), Identity("fd00::7"), Identity("fe80::7")),
-    "email": (Rule(email="A@x.org", send=True), Identity("1.2.3.4", "a@X.org"), Identity("1.2.3.4", "b@x.org")),
-    "no email": (Rule(email="a@x.org", send=True), Identity("1.2.3.4", "a@x.org"), Identity("1.2.3.4")),
-    "recorder": (Rule(recorder=True, send=True), RECORDER, Identity("10.0.0.7")),
-    "foxglove": (Rule(foxglove=True, send=True), FOXGLOVE, RECORDER),
-    "all but it": (Rule(address="0.0.0.0/0", send=True), Identity("10.0.0.7"), RECORDER),
-}
+VERBS = ("send", "receive")
 
 
-@pytest.mark.parametrize("kind", IDENTITIES)
-@pytest.mark.parametrize("verb", ["send", "receive"])
-@pytest.mark.parametrize("topic", ["/a/b", "/a/bc", "/x/a/b", "/a/B"])
-def test_each_kind_of_rule(kind: str, verb: str, topic: str) -> None:
+@pytest.mark.parametrize(
+    ("known", "who", "other"),
+    [
+        ({"address": "10.0.0.7"}, Identity("10.0.0.7"), Identity("10.0.0.8")),
+        ({"address": "10.0.0.0/24"}, Identity("10.0.0.7"), Identity("10.0.1.7")),
+        ({"address": "fd00::/8"}, Identity("fd00::7"), Identity("fe80::7")),
+        ({"email": "A@x.org"}, Identity("1.2.3.4", "a@X.org"), Identity("1.2.3.4", "b@x.org")),
+        ({"email": "a@x.org"}, Identity("1.2.3.4", "a@x.org"), Identity("1.2.3.4")),
+        ({"recorder": True}, RECORDER, Identity("10.0.0.7")),
+        ({"foxglove": True}, FOXGLOVE, RECORDER),
+        ({"address": "0.0.0.0/0"}, Identity("10.0.0.7"), RECORDER),
+    ],
+)
+def test_each_kind_of_rule(known: dict[str, object], who: Identity, other: Identity) -> None:
     """Allowed is this identity, this verb, this whole topic; everything else is denied."""
-    rule, who, other = IDENTITIES[kind]
-    fields = {name: getattr(rule, name) for name in ("address", "email", "recorder", "foxglove")}
-    for allowed in ("send", "receive"):
-        rules = [Rule(**fields, **{allowed: True}, topic="/a/b")]  # type: ignore[arg-type]
+    for verb, allowed, topic in itertools.product(VERBS, VERBS, ("/a/b", "/a/bc", "/x/a/b", "/a/B")):
+        rules = [Rule(**known, **{allowed: True}, topic="/a/b")]  # type: ignore[arg-type]
         assert Permissions(rules, who).allow(verb, topic) == (verb == allowed and topic == "/a/b")  # type: ignore[arg-type]
         assert not Permissions(rules, other).allow(verb, topic)  # type: ignore[arg-type]
-    assert not Permissions([], who).allow(verb, topic)  # type: ignore[arg-type]
+        assert not Permissions([], who).allow(verb, topic)  # type: ignore[arg-type]
 
 
 def test_addresses_are_taken_as_they_are_meant() -> None:
     assert plain_address("::ffff:10.0.0.7") == "10.0.0.7"
     assert plain_address("fe80::1%eth0") == "fe80::1"
-
-
-@pytest.mark.parametrize(
-    ("fields", "error"),
-    [
-        ({"send": True}, "needs one identity"),
-        ({"address": "10.0.0.1", "email": "a@x.org", "send": True}, "needs one identity"),
-        ({"recorder": True, "foxglove": True, "send": True}, "needs one identity"),
-        ({"address": "10.0.0.1"}, "must allow send or receive"),
-        ({"address": "10.0.0.1/8", "send": True}, "has host bits set"),
-        ({"address": "robot", "send": True}, "does not appear to be"),
-        ({"email": "a@x.org", "send": 1}, "must be true or false"),
-        ({"email": "a@x.org", "send": True, "topic": "(a"}, "pattern '(a': missing )"),
-        ({"email": "a@x.org", "send": True, "topic": r"(a)\1"}, "invalid escape sequence"),
-    ],
-)
-def test_a_rule_that_says_nothing_clear(fields: dict[str, object], error: str) -> None:
-    with pytest.raises(BufgymError, match=re.escape(error)):
-        Rule(**fields)  # type: ignore[arg-type]
 
 
 # --- random configurations -------------------------------------------------------------------------------------------
@@ -126,74 +107,50 @@ def test_random_rules_as_the_reference() -> None:
     for k in range(COUNT):
         uniform = random.Random(f"{SEED}-rules-{k}")
         configuration = drawn(uniform)
-        ears = [
-            Ear(str(n), configuration, Identity(uniform.choice(ADDRESSES), uniform.choice(["", *EMAILS])))
-            for n in range(2)
-        ]
+        whos = [Identity(uniform.choice(ADDRESSES), uniform.choice(["", *EMAILS])) for _ in range(2)]
+        ears = [Ear(str(n), configuration, who) for n, who in enumerate(whos)]
         for ear in ears:
             hub.join(ear)  # type: ignore[arg-type]
         for topic in TOPICS:
             hub.publish(None, Message(topic, b""))
         for ear in ears:
             hub.leave(ear)  # type: ignore[arg-type]
-            who = ear.identity
-            expected = {
-                (verb, topic)
-                for verb in ("send", "receive")
-                for topic in TOPICS
-                if reference(configuration, who.address, who.email, verb, topic)
-            }
-            allowed = {
-                (verb, topic)
-                for verb in ("send", "receive")
-                for topic in TOPICS
-                if ear.permissions.allow(verb, topic)  # type: ignore[arg-type]
-            }
-            assert allowed == expected, k
+            who, every = ear.identity, list(itertools.product(VERBS, TOPICS))
+            expected = {one for one in every if reference(configuration, who.address, who.email, *one)}
+            assert {one for one in every if ear.permissions.allow(*one)} == expected, k  # type: ignore[arg-type]
             assert ear.came == {topic for verb, topic in expected if verb == "receive"}, k
     hub.close()
 
 
 @pytest.mark.parametrize("seed", range(max(2, COUNT // 1_000)))
-def test_nothing_is_delivered_that_no_rule_allows(seed: int) -> None:
+async def test_nothing_is_delivered_that_no_rule_allows(seed: int) -> None:
     """On sockets: of what each of three clients sends, each other gets exactly what the reference lets through."""
     uniform = random.Random(seed)
     addresses = ["127.0.0.1", "127.0.0.2", "127.0.0.3"]
     places = [*addresses, "127.0.0.0/30", "127.0.0.0/8"]
-    configuration = [Rule(address=each, send=True, topic="/open") for each in addresses]
+    rules = [Rule(address=each, send=True, topic="/open") for each in addresses]
     for _ in range(5):
         send = uniform.random() < 0.5
         place, topic = uniform.choice(places), uniform.choice(PATTERNS)
-        configuration.append(Rule(address=place, send=send, receive=not send, topic=topic))
-
-    async def story() -> None:
-        async with (
-            relay(settings(rules=tuple(configuration))) as server,
-            client(server.port, local=addresses[0]) as a,
-            client(server.port, local=addresses[1]) as b,
-            client(server.port, local=addresses[2]) as c,
-        ):
-            clients = dict(zip(addresses, (a, b, c), strict=True))
-            for one in clients.values():
-                assert (await one.subscribe(".*", capacity=100))["op"] == "subscribed"
-            for sender, topic in ((sender, topic) for sender in addresses for topic in TOPICS):
-                await clients[sender].put(topic, sender.encode())
-            for receiver in addresses:
-                came = set()
-                while True:
-                    try:
-                        said = await clients[receiver].next(0.1)
-                    except TimeoutError:
-                        break
-                    if isinstance(said, tuple):
-                        came.add((bytes(said.payload).decode(), said.topic))
-                assert came == {
-                    (sender, topic)
-                    for sender in addresses
-                    for topic in TOPICS
-                    if sender != receiver
-                    and reference(configuration, sender, "", "send", topic)
-                    and reference(configuration, receiver, "", "receive", topic)
-                }
-
-    run(story)
+        rules.append(Rule(address=place, send=send, receive=not send, topic=topic))
+    async with relay(settings(rules=tuple(rules))) as server, contextlib.AsyncExitStack() as stack:
+        clients = {one: await stack.enter_async_context(client(server.port, local=one)) for one in addresses}
+        for one in clients.values():
+            assert (await one.subscribe(".*", capacity=100))["op"] == "subscribed"
+        for sender, topic in itertools.product(addresses, TOPICS):
+            await clients[sender].put(topic, sender.encode())
+        came: dict[str, set[tuple[str, str]]] = {one: set() for one in addresses}
+        for receiver in addresses * 2:  # in the first round each sender's messages are taken
+            said = await clients[receiver].rest()
+            messages = [
+                one for one in said if isinstance(one, Message) and one.topic in TOPICS
+            ]  # the relay's own status comes once a second
+            came[receiver] |= {(bytes(one.payload).decode(), one.topic) for one in messages}
+        for receiver in addresses:
+            assert came[receiver] == {
+                (sender, topic)
+                for sender, topic in itertools.product(addresses, TOPICS)
+                if sender != receiver
+                and reference(rules, sender, "", "send", topic)
+                and reference(rules, receiver, "", "receive", topic)
+            }

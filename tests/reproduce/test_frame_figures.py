@@ -11,8 +11,7 @@ import pytest
 from bufgym.kernel import JIT
 from bufgym.reproduce import STORE, afr_fig7, afr_fig8, afr_overlap, afr_qoi_task, frame_tasks, run
 from bufgym.reproduce.correlation import spearman, spearman_over
-from bufgym.reproduce.figure import heat_table
-from bufgym.reproduce.frame_runs import POLICIES, FrameFigure, Setting
+from bufgym.reproduce.frame_runs import Setting
 from bufgym.reproduce.frame_tasks import Store, Task, carry_out
 from bufgym.reproduce.rows import Rows
 from bufgym.traces import Trace
@@ -22,9 +21,6 @@ LINK = Trace.constant(1e6, 10.0, name="link")
 
 def task(kept: tuple[int, ...], kind: Any = "map") -> Task:
     return Task(kind, "room", None, 40, kept, "afr", LINK)
-
-
-# -------------------- tasks
 
 
 def test_a_task_is_known_by_what_is_asked() -> None:
@@ -54,100 +50,62 @@ def test_what_is_finished_is_not_done_again(tmp_path: Path, monkeypatch: pytest.
     assert Store(path)[task((0, 5, 6))] == {"rmse_mm": 3.0}  # also behind the line that was cut short
 
 
-# -------------------- numbers
-
-
 def test_spearman() -> None:
     a = np.array([1.0, 2, 3, 4])
     assert spearman(a, np.exp(a)) == pytest.approx(1)
     assert spearman(a, np.array([4.0, 3, 1, 2])) == pytest.approx(-0.8)  # 1 - 6 (9 + 1 + 4 + 4) / (4 x 15)
     assert np.isnan(spearman(a, np.ones(4)))
-
-
-def test_spearman_over_groups_draws_whole_groups() -> None:
-    """Within each group b falls with a; whichever groups are drawn, it is -1."""
+    # Within each group b falls with a; whichever groups are drawn, it is -1.
     a, group = np.array([1.0, 2, 1, 2, 1, 2]), np.repeat([0, 1, 2], 2)
     assert spearman_over(a, -a, group, "falls") == pytest.approx((-1, -1, -1))
-
-
-def test_the_change_is_paired_over_offsets() -> None:
-    """AFR is 10 % below at every place of the fade, however much these differ: the interval has no width."""
+    # AFR is 10 % below at every place of the fade, however much these differ: the interval has no width.
     pairs = [("drop-oldest", 10.0), ("afr", 9.0)]
     rows = Rows({"k": k, "L": 5, "policy": p, "rmse_mm": mm * (1 + k)} for k in range(4) for p, mm in pairs)
-    assert afr_fig7.change(rows, "rmse_mm", "afr", "drop-oldest") == pytest.approx((-0.1, -0.1, -0.1))
     assert afr_fig7.spelled(afr_fig7.change(rows, "rmse_mm", "afr", "drop-oldest")) == "-10.0% [-10.0%, -10.0%]"
 
 
-def test_the_claims_of_fig8_count_failures() -> None:
-    """Of ten runs at each of two L Drop Oldest breaks 6, AFR 2 and the agent 1, at L = 5 alone."""
-    broken = {("drop-oldest", 5): 4, ("drop-oldest", 15): 2, ("afr", 5): 2, ("learned-motion", 5): 1}
+def fig8_claims(broken: dict[tuple[str, str, int], int], data: Path | None, *capacities: int) -> dict[str, Any]:
+    """Claims where of ten runs so many fail: by recording, policy and L; none where nothing is said."""
     policies = ("drop-oldest", "afr", "learned-motion")
     rows = Rows(
-        {"recording": "room", "k": k, "L": L, "policy": p, "failed": k < broken.get((p, L), 0), "failed_at": None}
+        {"recording": r, "k": k, "L": L, "policy": p, "failed": k < broken.get((r, p, L), 0), "failed_at": None}
+        for r in ("room", "7-scenes")[: 1 + (data is not None)]
         for p in policies
-        for L in (5, 15)
+        for L in capacities
         for k in range(10)
     )
-    fig8 = afr_fig8.Reproduction(policies=policies, capacities=(5, 15))
+    fig8 = afr_fig8.Reproduction(policies=policies, capacities=capacities, data=data)
     object.__setattr__(fig8, "about", lambda: "")
-    facts = fig8.claims(rows)
+    return fig8.claims(rows)
+
+
+def test_the_claims_of_fig8_count_failures(tmp_path: Path) -> None:
+    """Of ten runs at each of two L Drop Oldest breaks 6, AFR 2 and the agent 1, at L = 5 alone."""
+    broken = {("room", "drop-oldest", 5): 4, ("room", "drop-oldest", 15): 2, ("room", "afr", 5): 2}
+    broken["room", "learned-motion", 5] = 1
+    facts = fig8_claims(broken, None, 5, 15)
     assert facts["counts"] == "room: Drop Oldest 6, AFR 2, learned-motion 1"
     assert (facts["oldest_rate"], facts["afr_rate"]) == ("room 30%", "room 10%")
     assert (facts["third_count"], facts["learned_count"]) == ("room 2 against 6", "room 1 against 2")
     assert facts["third"] and facts["large"] and facts["learned"]
     assert not facts["oldest"] and not facts["afr"]  # 30 % of the runs, and 10 %
-    assert afr_fig8.failures(rows, policy="afr", L=15) == 0
-    rows[30]["failed"] = True  # AFR's first at L = 15
-    assert not fig8.claims(rows)["large"] and not fig8.claims(rows)["third"]
-
-
-def test_a_claim_of_fig8_holds_on_every_recording_or_not(tmp_path: Path) -> None:
-    """Of ten runs Drop Oldest breaks 5 on both; AFR 0 in the room and 1 on 7-Scenes, the agent none and 2."""
-    broken = {("room", "drop-oldest"): 5, ("7-scenes", "drop-oldest"): 5, ("7-scenes", "afr"): 1}
-    broken["7-scenes", "learned-motion"] = 2
-    policies = ("drop-oldest", "afr", "learned-motion")
-    rows = Rows(
-        {"recording": r, "k": k, "L": 5, "policy": p, "failed": k < broken.get((r, p), 0), "failed_at": None}
-        for r in ("room", "7-scenes")
-        for p in policies
-        for k in range(10)
-    )
+    facts = fig8_claims(broken | {("room", "afr", 15): 1}, None, 5, 15)  # AFR's first at L = 15
+    assert not facts["large"] and not facts["third"]
+    # A claim holds on every recording: on 7-Scenes AFR breaks one and the agent two.
     (tmp_path / "rgbd_7scenes").mkdir()
-    fig8 = afr_fig8.Reproduction(policies=policies, capacities=(5,), data=tmp_path)
-    object.__setattr__(fig8, "about", lambda: "")
-    facts = fig8.claims(rows)
-    assert facts["oldest"] and facts["third"]
+    broken = {("room", "drop-oldest", 5): 5, ("7-scenes", "drop-oldest", 5): 5, ("7-scenes", "afr", 5): 1}
+    facts = fig8_claims(broken | {("7-scenes", "learned-motion", 5): 2}, tmp_path, 5)
+    assert facts["oldest"] and facts["third"] and not facts["learned"] and facts["large"] is None  # no L above 10
     assert not facts["afr"] and facts["afr_rate"] == "room 0%; 7-scenes 10%"
-    assert not facts["learned"] and facts["learned_count"] == "room 0 against 0; 7-scenes 2 against 1"
-    assert facts["large"] is None  # no L above 10
 
 
-def test_a_heat_table_shows_every_number() -> None:
-    figure = pytest.importorskip("matplotlib.figure").Figure()
-    axes = figure.subplots()
-    heat_table(axes, np.array([[1.0, 2.5], [0.25, 4.0]]), ".1f", ["AFR", "Random"], ["5", "10"], vmin=0, vmax=4)
-    assert [text.get_text() for text in axes.texts] == ["1.0", "2.5", "0.2", "4.0"]
-    assert [text.get_position() for text in axes.texts] == [(0, 0), (1, 0), (0, 1), (1, 1)]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["AFR", "Random"]
-    assert axes.images[0].norm(4.0) == 1
-
-
-def test_maps_are_seen_along_the_direction_in_which_they_spread_least() -> None:
-    """A plate of 4 x 2 x 0.1 m: its plan has x and y."""
-    plate = np.random.default_rng(0).uniform(-1, 1, (5000, 3)) * [2, 1, 0.05]
-    assert np.abs(afr_fig7._plan(plate)) == pytest.approx(np.eye(3)[:, :2], abs=0.05)
-
-
-def test_the_best_frames_in_hindsight() -> None:
-    """Four frames: 0 to 1 and 1 to 3 are new by 0.5 each, all else by 0.1; one frame between may be kept."""
+def test_the_best_frames_in_hindsight_and_rules_at_a_distance() -> None:
+    # Four frames: 0 to 1 and 1 to 3 are new by 0.5 each, all else by 0.1; one frame between may be kept.
     v = np.full((4, 4), 0.1)
     v[0, 1] = v[1, 3] = 0.5
     assert afr_overlap.best_gain(v, 1) == 1.0
     assert afr_overlap.best_gain(v, 0) == pytest.approx(0.1)
-
-
-def test_rules_at_a_distance() -> None:
-    """V = 0, 0.1, 0.4, 0.3 at distance 0..3 from frame 0: from 1 to 2 it more than doubles."""
+    # V = 0, 0.1, 0.4, 0.3 at distance 0..3 from frame 0: from 1 to 2 it more than doubles.
     v = np.zeros((4, 4))
     v[0] = [0, 0.1, 0.4, 0.3]
     found = afr_overlap._rules(v, np.arange(4.0), 1)
@@ -156,44 +114,20 @@ def test_rules_at_a_distance() -> None:
     assert afr_overlap._rules(v, np.arange(4.0), 2) is None  # 4 frames on is beyond the end
 
 
-def test_within_compares_runs_of_one_cell_alone() -> None:
+def test_runs_of_one_cell_are_compared_and_policies_ranked_by_their_means() -> None:
     less = afr_qoi_task._less_mean(np.array([1.0, 3, 10, 30]), [(0, 5), (0, 5), (1, 5), (1, 5)])
     assert less.tolist() == [-1, 1, -10, 10]
-
-
-def test_policies_are_ranked_by_their_means() -> None:
-    """Two runs each: Random covers 0.6 on average, AFR 0.7; AFR's map is 8 mm off, Random's 7 mm."""
+    # Two runs each: Random covers 0.6 on average, AFR 0.7; AFR's map is 8 mm off, Random's 7 mm.
     runs = {"random": [(0.4, 5.0), (0.8, 9.0)], "afr": [(0.7, 8.0), (0.7, 8.0)]}
     rows = Rows({"policy": name, "coverage": c, "rmse_mm": mm} for name, some in runs.items() for c, mm in some)
     assert afr_qoi_task.ranked(rows, "coverage") == ["afr", "random"]
     assert afr_qoi_task.ranked(rows, "rmse_mm") == ["random", "afr"]
 
 
-def test_the_claims_of_qoi_and_task() -> None:
-    """Time tells failures a little better than motion, which is in motion's interval; overlap tells nothing."""
-    found = {"time": (-0.74, -0.8, -0.7), "motion": (-0.72, -0.76, -0.66), "overlap": (0.1, -0.1, 0.3)}
-    rows = Rows(
-        {"recording": "room", "scope": scope, "measure": measure, "task": task}
-        | dict(zip(("spearman", "low", "high"), numbers, strict=True))
-        for scope in (afr_qoi_task.ACROSS, afr_qoi_task.WITHIN)
-        for measure, numbers in found.items()
-        for task in ("map error", "tracking failure")
-    )
-    figure = afr_qoi_task.Reproduction()
-    object.__setattr__(figure, "about", lambda: "")
-    facts = figure.claims(rows)
-    assert facts["best"] and facts["ranking"].startswith("map error on room: time (-0.74 [-0.80, -0.70]); tracking")
-    assert not facts["stands"] and facts["wrong"] == "overlap on room" and (facts["right"], facts["asked"]) == (2, 3)
-    for row in rows.where(measure="time"):
-        row["spearman"] = -0.77  # beyond it
-    assert not figure.claims(rows)["best"]
-
-
-# -------------------- on the made-up room
-
 SMALL: dict[str, Any] = {"frames": 40, "capacities": (2,), "offsets": 2, "jobs": 1}
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(not JIT, reason="without compilation a room takes minutes to draw")
 def test_a_run_on_the_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for library in ("cv2", "rvl", "scipy"):
@@ -214,10 +148,3 @@ def test_a_run_on_the_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         assert row["received"] == len(fig8.kept(Setting("room", row["k"], 2, row["policy"])))
     # The images and the plan are kept; which frames Drop Oldest keeps is found out again, as it takes no time.
     assert fig8.recordings == ["room"] and fig8.link.name == "fade"
-
-
-def test_recordings_are_shown_where_they_are(tmp_path: Path) -> None:
-    assert FrameFigure.recordings.fget(afr_fig8.Reproduction(data=tmp_path)) == ["room"]  # type: ignore[attr-defined]
-    (tmp_path / "rgbd_7scenes").mkdir()
-    assert afr_fig8.Reproduction(data=tmp_path).recordings == ["room", "7-scenes"]
-    assert set(afr_fig7.SHOWN) <= set(POLICIES)

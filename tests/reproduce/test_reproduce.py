@@ -14,25 +14,17 @@ from cli_cases import fails
 from bufgym.cli import main
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
-from bufgym.reproduce import FIGURES, run
+from bufgym.reproduce import FIGURES, afr_fig5, page, run
 from bufgym.reproduce.figure import statements
 from bufgym.reproduce.page import claim_rows
 
-SHORT: dict[str, Any] = {
-    "trace": "lte-synthetic-0",
-    "frames": 40,
-    "capacities": (2, 4),
-    "runs": 2,
-    "sweep_kb": (500,),
-}
+LTE = {"trace": "lte-synthetic-0"}
+SHORT: dict[str, Any] = {**LTE, "frames": 40, "capacities": (2, 4), "runs": 2, "sweep_kb": (500,)}
 FRAMES: dict[str, Any] = {"frames": 40, "capacities": (2,), "policies": ("drop-oldest", "afr"), "offsets": 2, "jobs": 1}
 SMALL: dict[str, dict[str, Any]] = {
-    "afr-fig1": {},
-    "afr-fig2": {},
-    "afr-fig3": {},
-    "afr-fig4": {},
+    **{f"afr-fig{k}": {} for k in (1, 2, 3, 4)},
     "afr-fig5": {"runs": 50 if JIT else 3, "last_T": 40 if JIT else 18},
-    "afr-fig6": {"trace": "lte-synthetic-0"},
+    "afr-fig6": LTE,
     "afr-frame-size": SHORT,
     "afr-fig7-qoi": {**SHORT, "motion": ["drive-0"]},
     "afr-fig8-gap": {**SHORT, "motion": ["drive-0"], "more_runs": 3},
@@ -62,20 +54,16 @@ NEEDS_LIBRARIES = {
 }
 
 CLAIMS = Path(__file__).parent.parent.parent / "docs" / "claims.md"
+SLOW = {"afr-qoi-task", "afr-fig7", "afr-fig9", "robofleet-table2"}
 
-PNG = b"\x89PNG\r\n\x1a\n"
 
-
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in SLOW)) for n in FIGURES])
 def test_saves_its_numbers_and_its_figure(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for library in ("matplotlib", *NEEDS_LIBRARIES.get(name, ())):
         pytest.importorskip(library)
     if not JIT and name in OF_FRAMES:
         pytest.skip("without compilation a room takes minutes to draw")
-    if not JIT:
-        from bufgym.reproduce import afr_fig5
-
-        monkeypatch.setattr(afr_fig5, "MEAN_OVER", (9, 20))
+    monkeypatch.setattr(afr_fig5, "MEAN_OVER", (9, 40 if JIT else 20))
     text = run(name, tmp_path / "new", **SMALL[name])
     assert "paper" in text
     table = tmp_path / "new" / f"{name}.csv"
@@ -83,88 +71,63 @@ def test_saves_its_numbers_and_its_figure(name: str, tmp_path: Path, monkeypatch
     assert str(table) in text and str(figure) in text
     with table.open(newline="", encoding="utf-8") as file:
         header, *rows = csv.reader(file)
-    assert len(rows) >= 4
-    assert all(len(row) == len(header) for row in rows)
-    assert figure.read_bytes().startswith(PNG)
+    assert len(rows) >= 4 and all(len(row) == len(header) for row in rows)
+    assert figure.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
 
 
-def test_without_a_folder_it_saves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_folder_nothing_is_saved_and_without_matplotlib_numbers_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    assert "Fig. 4" in run("afr-fig4")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_without_matplotlib_the_numbers_still_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "Fig. 4" in run("afr-fig4") and list(tmp_path.iterdir()) == []
     for name in ("matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)  # None there makes the import fail
     text = run("afr-fig4", tmp_path)
-    assert "10 of 10 drops" in text
-    assert "pip install matplotlib" in text
+    assert "10 of 10 drops" in text and "pip install matplotlib" in text
     assert [path.name for path in tmp_path.iterdir()] == ["afr-fig4.csv"]
 
 
-def test_every_claim_has_its_place_or_is_ours() -> None:
-    for name, texts in statements().items():
-        assert {"title"} <= set(texts) or name.endswith("-other"), name
-        for claim, text in texts["claims"].items():
-            assert {"says", "ours"} <= set(text), (name, claim)
-            assert bool(text.get("own")) != ("place" in text), (name, claim)
-
-
-def test_the_page_has_a_row_for_every_claim() -> None:
-    page = CLAIMS.read_text(encoding="utf-8")
-    for name in FIGURES:
-        assert page.count(f"`{name}` |") + page.count(f"`{name}` † |") == len(statements()[name]["claims"]), name
-
-
-@pytest.mark.parametrize("name", [name for name, texts in statements().items() if texts.get("fast")])
-def test_fast_rows_of_the_page_are_what_comes_out(name: str) -> None:
-    for library in NEEDS_LIBRARIES.get(name, ()):
-        pytest.importorskip(library)
-    page = CLAIMS.read_text(encoding="utf-8").splitlines()
-    for row in claim_rows(name):
-        assert row in page
+@pytest.mark.parametrize("name", statements())
+def test_every_claim_has_its_place_or_is_ours_and_a_row_on_the_page(name: str) -> None:
+    texts, text_of_page = statements()[name], CLAIMS.read_text(encoding="utf-8")
+    assert "title" in texts or name.endswith("-other")
+    for claim, text in texts["claims"].items():
+        assert {"says", "ours"} <= set(text) and bool(text.get("own")) != ("place" in text), claim
+    if name in FIGURES:
+        assert len(re.findall(f"`{name}`( †)? \\|", text_of_page)) == len(texts["claims"])
+    if texts.get("fast"):
+        for library in NEEDS_LIBRARIES.get(name, ()):
+            pytest.importorskip(library)
+        assert set(claim_rows(name)) <= set(text_of_page.splitlines())  # what comes out now
 
 
 def test_the_command_writes_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from bufgym.reproduce import page
-
     # The two that need neither recordings nor time, and one that is left unchecked without recordings.
     names = ("afr-fig4", "afr-fig6", "robofleet-other")
     monkeypatch.setattr(page, "statements", lambda: {name: statements()[name] for name in names})
     assert main(["reproduce", "--claims", str(tmp_path / "claims.md")]) == 0
     text = (tmp_path / "claims.md").read_text(encoding="utf-8")
-    assert "| 10 of 10 drops as in the paper. | holds |" in text
-    assert "(--data DIR)" in text and "| not checked |" in text
+    for said in ("| 10 of 10 drops as in the paper. | holds |", "(--data DIR)", "| not checked |"):
+        assert said in text
 
 
 def test_the_rows_of_one_figure_are_renewed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Fig. 4's row is made again, and those of figures that are not named stay, however old."""
-    page, old = tmp_path / "claims.md", "| place | an old sentence | `{}` | ours | not checked | |"
-    page.write_text(
-        "\n".join(["# Head", "", old.format("afr-fig4").replace("fig4`", "fig4` †"), old.format("afr-fig5")])
-    )
-    command = ["reproduce", "afr-fig4", "--claims", str(page), "--out", str(tmp_path / "out")]
+    file, old = tmp_path / "claims.md", "| place | an old sentence | `{}` | ours | not checked | |"
+    file.write_text("\n".join(["# Head", "", old.format("afr-fig4").replace("4`", "4` †"), old.format("afr-fig5")]))
+    command = ["reproduce", "afr-fig4", "--claims", str(file), "--out", str(tmp_path / "out")]
     assert main(command) == 0
-    assert page.read_text().splitlines() == ["# Head", "", *claim_rows("afr-fig4"), old.format("afr-fig5")]
+    assert file.read_text().splitlines() == ["# Head", "", *claim_rows("afr-fig4"), old.format("afr-fig5")]
     assert main(["reproduce", "afr-fig6", *command[2:]]) == 2
     assert "figure afr-fig6: no row of it in the page of claims" in capsys.readouterr().err
-
-
-def test_a_page_that_cannot_be_written_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from bufgym.reproduce import page
-
-    file = tmp_path / "claims.md"
+    # What cannot be written stays as it was.
     file.write_text("what was known")
     monkeypatch.setattr(page, "claims_page", lambda data, out: "new, and no text \udc80")
     with pytest.raises(UnicodeEncodeError):
         main(["reproduce", "--claims", str(file)])
-    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("claims.md", "what was known")]
-
-
-def test_claims_are_not_made_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert file.read_text() == "what was known"
     command = ["reproduce", "robofleet-fig3", "--live", "--claims", str(tmp_path / "claims.md")]
     fails(command, "--live: not with --claims, whose numbers are simulated", capsys)
 
@@ -176,25 +139,16 @@ def test_what_is_cited_is_in_the_references() -> None:
     assert {"wang2022afr", "sikand2021robofleet", "vanderhooft2016http2"} <= cited <= keys
 
 
-def test_unknown_names_and_options_list_the_known() -> None:
-    with pytest.raises(BufgymError, match="unknown figure 'afr-fig99'; known: afr-fig1, afr-fig2"):
-        run("afr-fig99")
-    with pytest.raises(BufgymError, match="afr-fig5: no option 'rums'; it has: runs, last_T, seed"):
-        run("afr-fig5", rums=3)
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("afr-fig4", {"last_T": 7}),
-        ("afr-fig5", {"runs": 1}),
-        ("afr-fig5", {"last_T": 0}),
-        ("afr-theorems", {"max_capacity": 0}),
-        ("afr-fig2", {"turn_degrees": 0}),
-        ("afr-vs-random", {"last_T": 3}),
-        ("afr-fig9", {"calls": 0}),
-    ],
-)
-def test_unusable_options_are_refused(name: str, options: dict[str, int]) -> None:
-    with pytest.raises(BufgymError, match=r"must be|need"):
-        run(name, **options)
+def test_unknown_names_and_unusable_options_are_refused() -> None:
+    for name, options, says in (
+        ("afr-fig99", {}, "unknown figure 'afr-fig99'; known: afr-fig1, afr-fig2"),
+        ("afr-fig5", {"rums": 3}, "afr-fig5: no option 'rums'; it has: runs, last_T, seed"),
+        *(("afr-fig5", {name: 0}, "must be|need") for name in ("runs", "last_T")),
+        *(
+            (name, {option: 0}, "must be|need")
+            for name, option in (("afr-fig2", "turn_degrees"), ("afr-fig9", "calls"))
+        ),
+        *(("afr-theorems", {"max_capacity": 0}, "must be|need"), ("afr-vs-random", {"last_T": 3}, "must be|need")),
+    ):
+        with pytest.raises(BufgymError, match=says):
+            run(name, **options)

@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("rosbags", reason="extra ros")
 pytest.importorskip("flatbuffers", reason="extra robofleet")
 
-from flatbuffers import number_types as fbtypes
+from flatbuffers.number_types import Float32Flags
 from flatbuffers.table import Table
 
 from bufgym.errors import BufgymError, install
@@ -24,9 +24,6 @@ from bufgym.reproduce.encodings import ENCODINGS, KINDS, content, encode, sizes,
 from bufgym.reproduce.robofleet_table1 import PAPER, Reproduction, fitted, of_paper
 
 HEADER = 4 + 8 + 4  # seq, stamp, length of frame_id
-
-
-# --- counted by hand -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("frame_id", ["", "map", "a/longer/frame"])
@@ -53,14 +50,11 @@ def test_ros1_sizes_are_the_sums_of_their_fields(frame_id: str) -> None:
     assert sizes("RobofleetStatus", status="on", location="lab")["ros1"] == (4 + 2) + 1 + 4 + (4 + 3)
 
 
-def test_cdr_of_a_pose_by_hand() -> None:
+def test_cdr_and_flatbuffer_by_hand() -> None:
+    """CDR of a pose; a RobofleetStatus as flatbuffer, each text: length 4, letters, its 0, then a multiple of 4."""
     # Encapsulation 4; stamp 8; frame_id 4 + "map" + its 0; doubles begin at a multiple of 8: 16 already is one.
     assert sizes("PoseStamped", frame_id="map")["cdr"] == 4 + 8 + 4 + 4 + 7 * 8
     assert sizes("PoseStamped", frame_id="maps")["cdr"] == 4 + 8 + 4 + (5 + 7) + 7 * 8
-
-
-def test_flatbuffer_of_a_status_by_hand() -> None:
-    """RobofleetStatus without metadata; each text: length 4, letters, its 0, then up to a multiple of 4."""
     root = 4
     vtable = 2 + 2 + 5 * 2  # own size, table's size, a slot each for metadata and four fields
     table = 4 + (3 + 1) + 3 * 4  # where the vtable is, is_ok after 3 of padding, status, battery_level, location
@@ -74,34 +68,23 @@ def test_flatbuffer_of_a_status_by_hand() -> None:
     assert sizes("RobofleetStatus", topic="/s", status="on", location="lab")["robofleet"] == 120
 
 
-def test_a_table_has_its_larger_fields_last_as_flatc_has() -> None:
-    """Slots: metadata (absent), status, is_ok, battery_level, location; the single byte comes first, at 4 + 3."""
-    reader = Reader(encode("RobofleetStatus", content("RobofleetStatus"), "robofleet-bare"))
-    assert [reader.at(slot) and reader.at(slot) - reader.table.Pos for slot in range(5)] == [0, 8, 7, 12, 16]
-    # After where the vtable is: status, header and position_covariance, then the doubles.
-    reader = Reader(encode("NavSatFix", content("NavSatFix"), "robofleet-bare"))
-    assert [reader.at(slot) - reader.table.Pos for slot in range(1, 8)] == [8, 12, 20, 28, 36, 16, 7]
-
-
-def test_json_of_a_status_by_hand() -> None:
+def test_json_by_hand_and_read_back_with_infinity_as_null_and_bytes_two_ways() -> None:
     message = content("RobofleetStatus", status="on", location="lab") | {"battery_level": 1.0}
     spaced = '{"op": "publish", "topic": "/s", "msg": {"status": "on", "is_ok": true, "battery_level": 1.0, '
     assert encode("RobofleetStatus", message, "json", "/s").decode() == spaced + '"location": "lab"}}'
     compact = '{"op":"publish","topic":"/s","msg":{"status":"on","is_ok":true,"battery_level":1,"location":"lab"}}'
     assert encode("RobofleetStatus", message, "json-numbers", "/s").decode() == compact
-
-
-@pytest.mark.parametrize(
-    ("kind", "parameter", "each"),
-    [("LaserScan", "beams", 4), ("CompressedImage", "data_bytes", 1), ("PointCloud2", "points", 16)],
-)
-def test_binary_sizes_grow_with_the_payload_alone(kind: str, parameter: str, each: int) -> None:
-    small, large = sizes(kind, **{parameter: 100}), sizes(kind, **{parameter: 500})
-    for encoding in ("ros1", "cdr", "robofleet", "robofleet-bare"):
-        assert large[encoding] - small[encoding] == 400 * each
-
-
-# --- decoded again ---------------------------------------------------------------------------------------------------
+    scan = content("LaserScan", beams=40, no_return=0.25)
+    assert np.isinf(scan["ranges"]).sum() == 10
+    for encoding in ("json", "json-numbers"):
+        operation = json.loads(encode("LaserScan", scan, encoding, "/scan"))
+        assert (operation["op"], operation["topic"]) == ("publish", "/scan")
+        ranges = [math.inf if x is None else x for x in operation["msg"]["ranges"]]
+        np.testing.assert_array_equal(np.array(ranges, np.float32), scan["ranges"])
+        assert operation["msg"]["header"]["stamp"] == {"secs": 1_600_000_000, "nsecs": 123_456_789}
+    image = content("CompressedImage", data_bytes=1000)
+    data = [json.loads(encode("CompressedImage", image, e))["msg"]["data"] for e in ("json", "json-numbers")]
+    assert base64.b64decode(data[0]) == image["data"].tobytes() and data[1] == image["data"].tolist()
 
 
 def same(ours: Any, theirs: Any) -> None:
@@ -120,144 +103,40 @@ def same(ours: Any, theirs: Any) -> None:
         assert ours == theirs
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_ros_reads_what_was_written(kind: str) -> None:
-    message, type_name = content(kind, seed=3), KINDS[kind][0]
-    same(message, stores()["ros1"].deserialize_ros1(encode(kind, message, "ros1"), type_name))
-    same(message, stores()["cdr"].deserialize_cdr(encode(kind, message, "cdr"), type_name))
+def test_ros_reads_what_was_written() -> None:
+    for kind, (type_name, *_) in KINDS.items():
+        message = content(kind, seed=3)
+        same(message, stores()["ros1"].deserialize_ros1(encode(kind, message, "ros1"), type_name))
+        same(message, stores()["cdr"].deserialize_cdr(encode(kind, message, "cdr"), type_name))
 
 
-class Reader:
-    """A table by its slots, as the code generated from Robofleet's schema reads it."""
+def test_flatbuffers_read_by_the_released_slots() -> None:
+    """Of a scan, by the library's own table: metadata 0, header 1, numbers from 2 on, ranges 9."""
+    scan = content("LaserScan", beams=37, intensities=5, no_return=0.5, seed=1)
+    data = encode("LaserScan", scan, "robofleet", "/a/topic")
+    table = Table(bytearray(data), int(np.frombuffer(data, "<u4", 1)[0]))
 
-    def __init__(self, data: bytes, position: int | None = None) -> None:
-        if position is None:
-            position = int(np.frombuffer(data, "<u4", 1)[0])
-        self.data, self.table = data, Table(bytearray(data), position)
+    def text(outer: int, slot: int) -> str:
+        inner = Table(table.Bytes, table.Indirect(table.Pos + table.Offset(4 + 2 * outer)))
+        return inner.String(inner.Pos + inner.Offset(4 + 2 * slot)).decode()
 
-    def at(self, slot: int) -> int:
-        offset = self.table.Offset(4 + 2 * slot)
-        return self.table.Pos + offset if offset else 0
-
-    def number(self, slot: int, flags: Any) -> Any:
-        return self.table.Get(flags, self.at(slot)) if self.at(slot) else 0
-
-    def text(self, slot: int) -> str:
-        return self.table.String(self.at(slot)).decode()
-
-    def inside(self, slot: int) -> Reader:
-        return Reader(self.data, self.table.Indirect(self.at(slot)))
-
-    def numbers(self, slot: int, dtype: str) -> Any:
-        offset = self.at(slot) - self.table.Pos
-        return np.frombuffer(self.data, dtype, self.table.VectorLen(offset), self.table.Vector(offset))
-
-    def tables(self, slot: int) -> list[Reader]:
-        offset = self.at(slot) - self.table.Pos
-        first = self.table.Vector(offset)
-        return [Reader(self.data, self.table.Indirect(first + 4 * i)) for i in range(self.table.VectorLen(offset))]
-
-    def header_is(self, header: dict[str, Any]) -> None:
-        inner = self.inside(1)
-        assert inner.number(1, fbtypes.Uint32Flags) == header["seq"]
-        stamp = np.frombuffer(self.data, "<u4", 2, inner.at(2))
-        assert stamp.tolist() == [header["stamp"]["sec"], header["stamp"]["nanosec"]]
-        assert inner.text(3) == header["frame_id"]
-
-
-def read(kind: str, message: dict[str, Any]) -> Reader:
-    reader = Reader(encode(kind, message, "robofleet", "/a/topic"))
-    metadata = reader.inside(0)
-    assert (metadata.text(0), metadata.text(1)) == (KINDS[kind][0].replace("/msg/", "/"), "/a/topic")
-    return reader
-
-
-def test_the_flatbuffer_of_a_scan_reads_by_the_released_slots() -> None:
-    message = content("LaserScan", beams=37, intensities=5, no_return=0.5, seed=1)
-    reader = read("LaserScan", message)
-    reader.header_is(message["header"])
+    assert (text(0, 0), text(0, 1)) == ("sensor_msgs/LaserScan", "/a/topic")
+    assert text(1, 3) == scan["header"]["frame_id"]
     names = ("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min", "range_max")
     for slot, name in enumerate(names, start=2):
-        assert reader.number(slot, fbtypes.Float32Flags) == message[name]
-    np.testing.assert_array_equal(reader.numbers(9, "<f4"), message["ranges"])
-    np.testing.assert_array_equal(reader.numbers(10, "<f4"), message["intensities"])
+        assert table.Get(Float32Flags, table.Pos + table.Offset(4 + 2 * slot)) == scan[name]
+    for slot, name in ((9, "ranges"), (10, "intensities")):
+        offset = table.Offset(4 + 2 * slot)
+        numbers = np.frombuffer(data, "<f4", table.VectorLen(offset), table.Vector(offset))
+        np.testing.assert_array_equal(numbers, scan[name])
 
 
-def test_the_flatbuffer_of_a_fix_reads_by_the_released_slots() -> None:
-    message = content("NavSatFix") | {"status": {"status": -1, "service": 8}}
-    reader = read("NavSatFix", message)
-    reader.header_is(message["header"])
-    assert reader.inside(2).number(1, fbtypes.Int8Flags) == -1
-    assert reader.inside(2).number(2, fbtypes.Uint16Flags) == 8
-    for slot, name in enumerate(("latitude", "longitude", "altitude"), start=3):
-        assert reader.number(slot, fbtypes.Float64Flags) == message[name]
-    np.testing.assert_array_equal(reader.numbers(6, "<f8"), message["position_covariance"])
-    assert reader.number(7, fbtypes.Uint8Flags) == 2
-
-
-def test_the_flatbuffer_of_a_cloud_and_of_an_image_read_by_the_released_slots() -> None:
-    message = content("PointCloud2", points=7, point_step=18)
-    reader = read("PointCloud2", message)
-    reader.header_is(message["header"])
-    numbers = [reader.number(slot, fbtypes.Uint32Flags) for slot in (2, 3, 6, 7)]
-    assert numbers == [1, 7, 18, 7 * 18]
-    fields = [(f.text(1), f.number(2, fbtypes.Uint32Flags), f.number(3, fbtypes.Uint8Flags)) for f in reader.tables(4)]
-    assert fields == [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7)]
-    assert not reader.number(5, fbtypes.BoolFlags) and reader.number(9, fbtypes.BoolFlags)
-    np.testing.assert_array_equal(reader.numbers(8, "u1"), message["data"])
-
-    image = content("CompressedImage", data_bytes=99)
-    reader = read("CompressedImage", image)
-    reader.header_is(image["header"])
-    assert reader.text(2) == "jpeg"
-    np.testing.assert_array_equal(reader.numbers(3, "u1"), image["data"])
-
-
-def test_the_flatbuffer_of_odometry_and_of_a_pose_read_by_the_released_slots() -> None:
-    message = content("Odometry")
-    reader = read("Odometry", message)
-    assert reader.text(2) == "base_link"
-    for slot, name, inner, axes in ((3, "pose", ("position", "orientation"), "xyzw"), (4, "twist", ("linear",), "xyz")):
-        table = reader.inside(slot)
-        np.testing.assert_array_equal(table.numbers(2, "<f8"), message[name]["covariance"])
-        for part, field in enumerate(inner, start=1):
-            values = message[name][name][field]
-            for i, axis in enumerate(axes[: len(values)], start=1):
-                assert table.inside(1).inside(part).number(i, fbtypes.Float64Flags) == values[axis]
-    pose = content("PoseStamped")
-    reader = read("PoseStamped", pose)
-    reader.header_is(pose["header"])
-    assert reader.inside(2).inside(1).number(1, fbtypes.Float64Flags) == pose["pose"]["position"]["x"]
-
-
-def test_json_reads_back_with_infinity_as_null_and_bytes_two_ways() -> None:
-    scan = content("LaserScan", beams=40, no_return=0.25)
-    assert np.isinf(scan["ranges"]).sum() == 10
-    for encoding in ("json", "json-numbers"):
-        operation = json.loads(encode("LaserScan", scan, encoding, "/scan"))
-        assert (operation["op"], operation["topic"]) == ("publish", "/scan")
-        ranges = [math.inf if x is None else x for x in operation["msg"]["ranges"]]
-        np.testing.assert_array_equal(np.array(ranges, np.float32), scan["ranges"])
-        assert operation["msg"]["header"]["stamp"] == {"secs": 1_600_000_000, "nsecs": 123_456_789}
-    image = content("CompressedImage", data_bytes=1000)
-    data = [json.loads(encode("CompressedImage", image, e))["msg"]["data"] for e in ("json", "json-numbers")]
-    assert base64.b64decode(data[0]) == image["data"].tobytes()
-    assert data[1] == image["data"].tolist()
-
-
-def test_a_jpeg_has_its_markers_and_no_other() -> None:
-    data = content("CompressedImage", data_bytes=50_000)["data"].tolist()
-    assert (data[:2], data[-2:]) == ([0xFF, 0xD8], [0xFF, 0xD9])
-    followers = {data[i + 1] for i in range(2, len(data) - 3) if data[i] == 0xFF}
-    assert followers == {0}
-
-
-def test_the_seed_decides_the_content() -> None:
+def test_the_seed_decides_the_content_and_a_jpeg_has_its_markers_and_no_other() -> None:
     first, again, other = (content("LaserScan", beams=50, seed=seed)["ranges"].tolist() for seed in (1, 1, 2))
     assert first == again != other
-
-
-# --- beside the paper ------------------------------------------------------------------------------------------------
+    data = content("CompressedImage", data_bytes=50_000)["data"].tolist()
+    assert (data[:2], data[-2:]) == ([0xFF, 0xD8], [0xFF, 0xD9])
+    assert {data[i + 1] for i in range(2, len(data) - 3) if data[i] == 0xFF} == {0}
 
 
 @pytest.mark.parametrize("beams", [1786, 1800, 1802])
@@ -269,92 +148,46 @@ def test_the_fitted_messages_have_the_papers_bytes_as_ros_binary(beams: int) -> 
 
 
 def test_table1_stands_beside_the_papers() -> None:
+    """Its ratios are on the page of claims; here what the page does not say."""
     rows = Reproduction().simulate()
     ours = {(row["message"], row["encoding"]): row["bytes"] for row in rows}
     ratio = {(row["message"], row["encoding"]): row["ours_to_paper"] for row in rows}
     assert len(rows) == len(KINDS) * len(ENCODINGS)
-    assert ours["NavSatFix", "robofleet-bare"] == PAPER["NavSatFix"][1]
-    assert ours["LaserScan", "robofleet-bare"] == PAPER["LaserScan"][1] + 4
-    assert ours["CompressedImage", "robofleet-bare"] == PAPER["CompressedImage"][1] + 24
-    # The paper's picture: flatbuffers close to ROS binary for large messages, JSON several times as long.
-    for kind in ("LaserScan", "CompressedImage"):
-        assert float(ratio[kind, "robofleet"]) == pytest.approx(1, abs=0.011)
-        assert ours[kind, "json-numbers"] > 3.5 * ours[kind, "ros1"]
+    bare = [ours[kind, "robofleet-bare"] - PAPER[kind][1] for kind in ("NavSatFix", "LaserScan", "CompressedImage")]
+    assert bare == [0, 4, 24]
     # Bytes as a list of numbers is what the paper measured; base64 is not.
     assert float(ratio["CompressedImage", "json-numbers"]) == pytest.approx(1, abs=0.005)
     assert float(ratio["CompressedImage", "json"]) < 0.4
-    assert 1 < float(ratio["LaserScan", "json-numbers"]) < 1.25
-    assert 1 < float(ratio["NavSatFix", "json-numbers"]) < 1.35
-    assert ratio["PoseStamped", "json"] == ratio["LaserScan", "cdr"] is None
-    assert of_paper("PoseStamped", "ros1") is None
-    for said in (
-        "Not in the paper's table: PointCloud2, PoseStamped",
-        "with seq = 0 has 7,328 bytes, +0",
-        "cannot be of",
-    ):
-        assert said in " ".join(run("robofleet-table1").split())
-
-
-def test_the_share_of_beams_without_return_that_the_text_names_has_the_papers_json() -> None:
-    text = " ".join(run("robofleet-table1").split())
-    share = float(text.split("json-numbers with ")[1].split("%")[0]) / 100
+    assert ratio["PoseStamped", "json"] == ratio["LaserScan", "cdr"] is of_paper("PoseStamped", "ros1") is None
+    # The share of beams without return that the text names has the paper's JSON; it names whole per cent.
+    share = float(" ".join(run("robofleet-table1").split()).split("json-numbers with ")[1].split("%")[0]) / 100
     size = sizes("LaserScan", beams=1800, frame_id="l" * 8, no_return=share)["json-numbers"]
-    assert size == pytest.approx(PAPER["LaserScan"][2], rel=0.01)  # it names whole per cent
+    assert size == pytest.approx(PAPER["LaserScan"][2], rel=0.01)
 
 
-# --- bad input -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("kind", "parameters", "rule"),
-    [
+def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind, parameters, rule in (
         ("Laser", {}, "unknown kind of message 'Laser'; known: LaserScan, NavSatFix"),
         ("LaserScan", {"rays": 3}, "LaserScan: no parameter 'rays'; it has: beams, intensities"),
-        ("LaserScan", {"beams": -1}, "beams = -1: must be a whole number from 0"),
         ("LaserScan", {"beams": 2.5}, "beams = 2.5: must be a whole number"),
-        ("LaserScan", {"intensities": True}, "intensities = True: must be a whole number"),
-        ("LaserScan", {"no_return": 1.5}, "no_return = 1.5: must be from 0 to 1"),
         ("LaserScan", {"no_return": math.nan}, "no_return = nan: must be from 0 to 1"),
         ("CompressedImage", {"data_bytes": 3}, "data_bytes = 3: must be a whole number from 4"),
-        ("CompressedImage", {"data_bytes": 10**10}, "data_bytes = 10000000000: must be"),
         ("CompressedImage", {"format": 7}, "format = 7: must be a text"),
         ("PointCloud2", {"point_step": 12}, "point_step = 12: must be a whole number from 16"),
-        ("PointCloud2", {"points": 10**9}, "points = 1000000000: must be"),
         ("PoseStamped", {"frame_id": "grün"}, "frame_id = 'grün': must be a text of at most 255 ASCII letters"),
         ("Odometry", {"seed": -1}, "seed = -1: must be a whole number >= 0"),
-        ("NavSatFix", {"topic": None}, "topic = None: must be a text"),
-    ],
-)
-def test_unusable_parameters_are_refused(kind: str, parameters: dict[str, Any], rule: str) -> None:
-    with pytest.raises(BufgymError) as refused:
-        sizes(kind, **parameters)
-    assert rule in str(refused.value)
-
-
-def test_an_unknown_encoding_lists_the_known() -> None:
+    ):
+        with pytest.raises(BufgymError, match=re.escape(rule)):
+            sizes(kind, **parameters)
     with pytest.raises(BufgymError, match="unknown encoding 'xml'; known: ros1, cdr, robofleet"):
         encode("PoseStamped", content("PoseStamped"), "xml")
-
-
-def test_beams_that_cannot_make_the_papers_size_are_refused() -> None:
     for beams in (1785, 1803):
         with pytest.raises(BufgymError, match=f"beams = {beams}: 7260 bytes would need a frame_id of"):
             Reproduction(beams=beams).simulate()
-
-
-@pytest.mark.parametrize(
-    ("library", "encoding", "extra"),
-    [("rosbags.typesys", "cdr", "ros"), ("flatbuffers", "robofleet", "robofleet")],
-)
-def test_without_the_library_the_extra_is_named(
-    library: str, encoding: str, extra: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
     stores.cache_clear()
-    monkeypatch.setitem(sys.modules, library, None)  # None there makes the import fail
-    with pytest.raises(BufgymError, match=re.escape(f"needs {library}: {install(extra)}")):
-        encode("PoseStamped", content("PoseStamped"), encoding)
-    assert len(encode("PoseStamped", content("PoseStamped"), "json")) > 0  # which needs neither
-
-
-def test_messages_need_no_library() -> None:
+    for library, encoding, extra in (("rosbags.typesys", "cdr", "ros"), ("flatbuffers", "robofleet", "robofleet")):
+        monkeypatch.setitem(sys.modules, library, None)  # None there makes the import fail
+        with pytest.raises(BufgymError, match=re.escape(f"needs {library}: {install(extra)}")):
+            encode("PoseStamped", content("PoseStamped"), encoding)
+        assert len(encode("PoseStamped", content("PoseStamped"), "json")) > 0  # which needs neither
     assert "flatbuffers" not in vars(encodings) and "rosbags" not in vars(encodings)

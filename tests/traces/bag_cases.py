@@ -23,34 +23,31 @@ Entry = tuple[int, str, str, bytes]
 """Time in ms from START_NS, topic, type, serialised message."""
 
 
+def _bytes(message: Any, type: str, store: Any) -> bytes:
+    return bytes(store.serialize_ros1(message, type) if store is ROS1 else store.serialize_cdr(message, type))
+
+
 def odometry(x_m: float, yaw_deg: float, store: Any = ROS2, scale: float = 1.0) -> bytes:
     """nav_msgs/Odometry at (x, 0, 0), turned about z; ``scale``: length of the quaternion."""
-    t = store.types
-    half = math.radians(yaw_deg) / 2
-    stamp = t["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    seq = {"seq": 0} if store is ROS1 else {}
-    vector = t["geometry_msgs/msg/Vector3"]
+    t, half = store.types, math.radians(yaw_deg) / 2
+    vector, seq = t["geometry_msgs/msg/Vector3"], {"seq": 0} if store is ROS1 else {}
     pose = t["geometry_msgs/msg/Pose"](
         position=t["geometry_msgs/msg/Point"](x=x_m, y=0.0, z=0.0),
         orientation=t["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=scale * math.sin(half), w=scale * math.cos(half)),
     )
     twist = t["geometry_msgs/msg/Twist"](linear=vector(x=0.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
+    stamp = t["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
     message = t["nav_msgs/msg/Odometry"](
         header=t["std_msgs/msg/Header"](stamp=stamp, frame_id="odom", **seq),
         child_frame_id="base",
         pose=t["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
         twist=t["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
     )
-    if store is ROS1:
-        return bytes(store.serialize_ros1(message, "nav_msgs/msg/Odometry"))
-    return bytes(store.serialize_cdr(message, "nav_msgs/msg/Odometry"))
+    return _bytes(message, "nav_msgs/msg/Odometry", store)
 
 
 def text(content: str, store: Any = ROS2) -> bytes:
-    message = store.types["std_msgs/msg/String"](data=content)
-    if store is ROS1:
-        return bytes(store.serialize_ros1(message, "std_msgs/msg/String"))
-    return bytes(store.serialize_cdr(message, "std_msgs/msg/String"))
+    return _bytes(store.types["std_msgs/msg/String"](data=content), "std_msgs/msg/String", store)
 
 
 def drive(store: Any = ROS2) -> list[Entry]:
@@ -91,13 +88,7 @@ def write_rosbag2(
     writer = Writer2(path, version=8, storage_plugin=storage)
     if compression != CompressionMode.NONE:
         writer.set_compression(compression, CompressionFormat.ZSTD)
-    with writer:
-        connections = {
-            t: writer.add_connection(t, type, typestore=ROS2) for t, type in {e[1]: e[2] for e in entries}.items()
-        }
-        for ms, topic, _, data in sorted(entries):
-            writer.write(connections[topic], START_NS + ms * MS, data)
-    return path
+    return _written(writer, path, entries, ROS2)
 
 
 def write_ros1(path: Path, entries: list[Entry], compression: Any = None) -> Path:
@@ -105,10 +96,13 @@ def write_ros1(path: Path, entries: list[Entry], compression: Any = None) -> Pat
     writer = Writer1(path)
     if compression is not None:
         writer.set_compression(compression)
+    return _written(writer, path, entries, ROS1)
+
+
+def _written(writer: Any, path: Path, entries: list[Entry], store: Any) -> Path:
     with writer:
-        connections = {
-            t: writer.add_connection(t, type, typestore=ROS1) for t, type in {e[1]: e[2] for e in entries}.items()
-        }
+        types = {topic: type for _, topic, type, _ in entries}
+        connections = {t: writer.add_connection(t, type, typestore=store) for t, type in types.items()}
         for ms, topic, _, data in sorted(entries):
             writer.write(connections[topic], START_NS + ms * MS, data)
     return path

@@ -18,12 +18,13 @@ from bufgym.traces.datasets.table import Dataset, Remote
 
 DATA = random.Random(1).randbytes(300_000)
 SHA256 = hashlib.sha256(DATA).hexdigest()
-HASTY = Patience(attempts=3, first_wait_s=0.01, silence_s=0.3)
+HASTY = Patience(attempts=3, first_wait_s=0.01)
+ELSEWHERE = {"/moved": "/data.bin", "/file": "file:///etc/hostname", "/nowhere": "http://a..b/"}
 
 
 @dataclass
 class Site:
-    """What the server does with requests of `/data.bin`, and what it was asked."""
+    """How the server answers requests of `/data.bin`, and which it got."""
 
     data: bytes = DATA
     etag: str | None = '"v1"'
@@ -32,12 +33,10 @@ class Site:
     """Bytes after which each of the next connections is cut."""
     codes: list[int] = field(default_factory=list)
     """Answers to the next requests, instead of the file."""
-    stall: bool = False
-    """Silent after the first 1000 bytes."""
-    drip: tuple[int, float] | None = None
-    """Bytes at a time, and seconds between them."""
+    stall: int | None = None
+    """Silent after so many bytes."""
     length: int | None = None
-    """What Content-Length says instead of the truth; -1: nothing."""
+    """Content-Length instead of the true one; -1: none."""
     chunked: bool = False
     headers: dict[str, str] = field(default_factory=dict)
     asked: list[str | None] = field(default_factory=list)
@@ -55,61 +54,44 @@ class Handler(http.server.BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         site = self.site
         self.close_connection = True
-        if self.path == "/moved":
-            return self.answer(302, {"Location": "/data.bin"})
-        if self.path == "/file":
-            return self.answer(302, {"Location": "file:///etc/hostname"})
-        if self.path == "/nowhere":
-            return self.answer(302, {"Location": "http://a..b/"})
+        if self.path in ELSEWHERE:
+            return self.answer(302, {"Location": ELSEWHERE[self.path], "Content-Length": "0"})
         if self.path != "/data.bin":
-            return self.answer(404, {})
+            return self.answer(404, {"Content-Length": "0"})
         asked = self.headers["Range"]
         site.asked.append(asked)
         if site.codes:
-            return self.answer(site.codes.pop(0), {"Retry-After": "0"})
+            return self.answer(site.codes.pop(0), {"Retry-After": "0", "Content-Length": "0"})
         start = 0
         if asked and site.ranges and self.headers["If-Range"] in (site.etag, site.headers.get("Last-Modified")):
             start = int(asked.removeprefix("bytes=").removesuffix("-"))
             if start >= len(site.data):
                 return self.answer(416, {"Content-Range": f"bytes */{len(site.data)}"})
-        self.send_response(206 if start else 200)
         body = site.data[start:]
-        if start:
-            self.send_header("Content-Range", f"bytes {start}-{len(site.data) - 1}/{len(site.data)}")
+        headers = {"Content-Range": f"bytes {start}-{len(site.data) - 1}/{len(site.data)}"} if start else {}
         if site.chunked:
-            self.send_header("Transfer-Encoding", "chunked")
+            headers["Transfer-Encoding"] = "chunked"
         elif site.length != -1:
-            self.send_header("Content-Length", str(len(body) if site.length is None else site.length))
-        for name, value in {"ETag": site.etag, "Connection": "close", **site.headers}.items():
-            if value is not None:
-                self.send_header(name, value)
-        self.end_headers()
+            headers["Content-Length"] = str(len(body) if site.length is None else site.length)
+        if site.etag is not None:
+            headers["ETag"] = site.etag
+        self.answer(206 if start else 200, headers | site.headers)
         self.body(body[: site.cuts.pop(0)] if site.cuts else body)
 
     def body(self, body: bytes) -> None:
         site = self.site
         if site.chunked:
-            self.wfile.write(
-                b"%x\r\n%s\r\n" % (len(body), body) if len(body) == len(site.data) else b"fffff\r\n" + body
-            )
-            self.wfile.write(b"0\r\n\r\n" if len(body) == len(site.data) else b"")
-        elif site.stall:
-            self.wfile.write(body[:1000])
-            site.closing.wait(5)
-        elif site.drip is not None:
-            count, wait_s = site.drip
-            for at in range(0, len(body), count):
-                try:
-                    self.wfile.write(body[at : at + count])
-                except OSError:
-                    return  # the client was killed
-                site.closing.wait(wait_s)
+            whole = len(body) == len(site.data)
+            self.wfile.write(b"%x\r\n%s\r\n0\r\n\r\n" % (len(body), body) if whole else b"fffff\r\n" + body)
+        elif site.stall is not None:
+            self.wfile.write(body[: site.stall])
+            site.closing.wait(60)
         else:
             self.wfile.write(body)
 
     def answer(self, code: int, headers: dict[str, str]) -> None:
         self.send_response(code)
-        for name, value in {"Content-Length": "0", "Connection": "close", **headers}.items():
+        for name, value in {"Connection": "close", **headers}.items():
             self.send_header(name, value)
         self.end_headers()
 
@@ -136,7 +118,7 @@ def of(*remotes: Remote) -> Dataset:
 
 def get(site: Site, to: Path, sha256: str | None = SHA256, path: str = "data.bin", **options: Any) -> Fetched:
     remote = Remote(path, f"{site.address}/data.bin", sha256)
-    return fetch_dataset(of(remote), to, patience=HASTY, **options)[0]
+    return fetch_dataset(of(remote), to, patience=options.pop("patience", HASTY), **options)[0]
 
 
 def left(to: Path) -> list[str]:

@@ -1,22 +1,28 @@
-"""Files downloaded from a server that cuts connections, lies, stalls and changes its mind."""
+"""Files fetched over a network: resumed where they were cut, checked against their sum, never patched together."""
 
 from __future__ import annotations
 
 import errno
 import hashlib
 import io
+import os
 import random
 import shutil
 import socket
 import threading
-from contextlib import suppress
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
+from urllib.request import Request
 
 import pytest
 from http_server import DATA, HASTY, SHA256, Site, get, left
 
 from bufgym.errors import BufgymError
+from bufgym.traces.datasets import connection
 from bufgym.traces.datasets import download as downloading
 from bufgym.traces.datasets.download import Patience, download
 from bufgym.traces.datasets.fetch import Fetched
@@ -24,209 +30,128 @@ from bufgym.traces.datasets.fetch import Fetched
 
 def test_a_whole_file(site: Site, tmp_path: Path) -> None:
     heard: list[tuple[int, int | None]] = []
-    done = get(site, tmp_path, watch=lambda name: lambda count, total: heard.append((count, total)))
+    mask = os.umask(0o022)
+    try:
+        done = get(site, tmp_path, watch=lambda name: lambda count, total: heard.append((count, total)))
+    finally:
+        os.umask(mask)
     assert done == Fetched(tmp_path / "mine" / "data.bin", SHA256, True, "downloaded")
-    assert done.path.read_bytes() == DATA
+    assert done.path.read_bytes() == DATA and done.path.stat().st_mode & 0o777 == 0o644
     assert heard[-1] == (300_000, 300_000) and heard == sorted(heard)
     assert left(tmp_path) == ["data.bin"]
-    assert get(site, tmp_path).origin == "there already"
-    assert site.asked == [None]  # the second time, nobody asked
-
-
-def test_a_cut_connection_goes_on_where_it_was(site: Site, tmp_path: Path) -> None:
-    site.cuts = [100_000, 50_000]
-    assert get(site, tmp_path).path.read_bytes() == DATA
-    assert site.asked == [None, "bytes=100000-", "bytes=150000-"]
-
-
-def test_the_next_call_goes_on_too(site: Site, tmp_path: Path) -> None:
-    site.cuts = [1000, 1000, 1000]
-    with pytest.raises(BufgymError, match=r"cut after 3000 of 300000 bytes \(gave up after 3 attempts\); 3000 bytes"):
-        get(site, tmp_path)
-    assert left(tmp_path) == [".data.bin.part", ".data.bin.part.json"]
-    assert get(site, tmp_path).path.read_bytes() == DATA
-    assert site.asked[-1] == "bytes=3000-"
-    assert left(tmp_path) == ["data.bin"]
-
-
-def test_headway_is_no_failure(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten cuts, thirty thousand bytes each, with patience for three."""
-    monkeypatch.setattr(downloading, "HEADWAY_BYTES", 30_000)
-    site.cuts = [30_000] * 9
-    assert get(site, tmp_path).path.read_bytes() == DATA
-    assert len(site.asked) == 10
-
-
-def test_a_server_without_ranges_starts_anew(site: Site, tmp_path: Path) -> None:
-    site.ranges = False
-    site.cuts = [200_000]
-    assert get(site, tmp_path).path.read_bytes() == DATA
-    assert site.asked == [None, "bytes=200000-"]
-
-
-def test_a_server_that_names_no_version_starts_anew(site: Site, tmp_path: Path) -> None:
-    site.etag, site.cuts = None, [200_000]
-    assert get(site, tmp_path).path.read_bytes() == DATA
-    assert site.asked == [None, None]
-
-
-def test_a_date_is_a_version_too(site: Site, tmp_path: Path) -> None:
-    """A weak ETag vouches for the meaning and not for the bytes."""
-    site.etag, site.headers = 'W/"v1"', {"Last-Modified": "Sat, 29 Feb 2020 09:36:00 GMT"}
-    site.cuts = [1000]
-    assert get(site, tmp_path).path.read_bytes() == DATA
-    assert site.asked == [None, "bytes=1000-"]
-
-
-def test_a_file_in_chunks(site: Site, tmp_path: Path) -> None:
-    """Its length is not announced, yet that it was cut is noticed."""
-    site.chunked, site.ranges = True, False
-    site.cuts = [1000]
-    assert get(site, tmp_path, None).path.read_bytes() == DATA
-    assert site.asked == [None, "bytes=1000-"]
-
-
-@pytest.mark.parametrize("sha256", [None, "new"])
-def test_a_file_that_changed_meanwhile_is_not_patched_together(site: Site, tmp_path: Path, sha256: str | None) -> None:
-    site.cuts = [1000] * 3
-    with pytest.raises(BufgymError, match="run the same command again to resume"):
-        get(site, tmp_path, None)
-    site.data, site.etag = bytes(250_000), '"v2"'
-    done = get(site, tmp_path, sha256 and hashlib.sha256(site.data).hexdigest())
-    assert done.path.read_bytes() == site.data
-
-
-def test_parts_that_do_not_fit_are_found_by_the_sum(site: Site, tmp_path: Path) -> None:
-    """The server changes the file and keeps its ETag."""
-    site.cuts = [1000] * 3
-    with pytest.raises(BufgymError, match="run the same command again to resume"):
-        get(site, tmp_path)
-    site.data = DATA[::-1]
+    assert get(site, tmp_path).origin == "there already" and site.asked == [None]  # the second time, nobody asked
+    assert (get(site, tmp_path, None).sha256, get(site, tmp_path, None).known) == (SHA256, False)
+    done.path.write_bytes(b"scribble")
     said: list[str] = []
-    done = get(site, tmp_path, hashlib.sha256(site.data).hexdigest(), note=said.append)
-    assert done.path.read_bytes() == DATA[::-1]
-    assert said == ["data.bin: the parts do not fit together: fetching it again"]
-
-
-def test_a_wrong_sum_keeps_nothing(site: Site, tmp_path: Path) -> None:
+    assert get(site, tmp_path, note=said.append).path.read_bytes() == DATA
+    assert "changed since it was fetched" in said[0]
+    done.path.unlink()
     with pytest.raises(BufgymError, match=f"wrong checksum: sha256 is {SHA256}, must be {'0' * 64}; not kept"):
         get(site, tmp_path, "0" * 64)
     assert left(tmp_path) == []
 
 
-def test_an_unknown_sum_is_found(site: Site, tmp_path: Path) -> None:
-    done = get(site, tmp_path, None)
-    assert (done.sha256, done.known) == (SHA256, False)
-
-
-def test_a_damaged_cache_is_renewed(site: Site, tmp_path: Path) -> None:
-    get(site, tmp_path).path.write_bytes(b"scribble")
-    said: list[str] = []
-    assert get(site, tmp_path, note=said.append).path.read_bytes() == DATA
-    assert "changed since it was fetched" in said[0]
-
-
-def test_slow_bytes_are_waited_for(site: Site, tmp_path: Path) -> None:
-    """Half a second in all, more than the 0.3 s of silence that are allowed."""
-    site.data, site.drip = DATA[:1000], (20, 0.01)
-    assert get(site, tmp_path, None).path.read_bytes() == DATA[:1000]
-    assert len(site.asked) == 1
-
-
-def test_silence_is_not(site: Site, tmp_path: Path) -> None:
-    site.stall = True
-    with pytest.raises(BufgymError, match=r"the server fell silent \(gave up after 3 attempts\); 3000 bytes are kept"):
-        get(site, tmp_path)
-    assert site.asked == [None, "bytes=1000-", "bytes=2000-"]
-
-
-def test_errors_that_pass_and_errors_that_stay(site: Site, tmp_path: Path) -> None:
-    site.codes = [500, 429]
-    assert get(site, tmp_path).path.read_bytes() == DATA
-    site.codes = [503] * 3
-    with pytest.raises(BufgymError, match=r"the server says 503 Service Unavailable \(gave up after 3 attempts\)$"):
-        get(site, tmp_path, path="other.bin")
-    site.codes = [403, 200]
-    with pytest.raises(BufgymError, match=r"the server says 403 Forbidden$"):
-        get(site, tmp_path, path="other.bin")
-    assert site.codes == [200]  # no second attempt
+ATAD = DATA[::-1]
+DATED = {"Last-Modified": "Sat, 29 Feb 2020 09:36:00 GMT"}
 
 
 @pytest.mark.parametrize(
-    ("path", "says"),
+    ("settings", "asked"),
     [
-        ("/nothing", r"/nothing: no such file on the server \(404\)"),
-        ("/file", "302 .*'file:///etc/hostname' is not allowed"),
-        ("/nowhere", "redirects to an invalid address"),
+        ({"cuts": [100_000, 50_000]}, [None, "bytes=100000-", "bytes=150000-"]),
+        # Ten connections of 30,000 bytes each, with patience for three: headway is no failure.
+        ({"cuts": [30_000] * 9}, [None] + [f"bytes={30_000 * k}-" for k in range(1, 10)]),
+        # A server without ranges starts anew, and one that names no version is asked to.
+        ({"ranges": False, "cuts": [200_000]}, [None, "bytes=200000-"]),
+        ({"etag": None, "cuts": [200_000]}, [None, None]),
+        # A weak ETag vouches for the meaning and not for the bytes; a date is a version too.
+        ({"etag": 'W/"v1"', "headers": DATED, "cuts": [1000]}, [None, "bytes=1000-"]),
+        # The length of a file in chunks is not announced, yet that it was cut is noticed.
+        ({"chunked": True, "ranges": False, "cuts": [1000]}, [None, "bytes=1000-"]),
+        ({"codes": [500, 429]}, [None, None, None]),
+        ({"length": -1}, [None]),
     ],
 )
-def test_addresses_that_lead_nowhere(site: Site, tmp_path: Path, path: str, says: str) -> None:
+def test_what_goes_on(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], asked: list[str | None]
+) -> None:
+    monkeypatch.setattr(downloading, "HEADWAY_BYTES", 30_000)
+    vars(site).update(settings)
+    assert get(site, tmp_path).path.read_bytes() == DATA
+    assert site.asked == asked and left(tmp_path) == ["data.bin"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "says", "attempts"),
+    [
+        ({"codes": [503] * 3}, r"the server says 503 Service Unavailable \(gave up after 3 attempts\)$", 3),
+        ({"codes": [403, 200]}, r"the server says 403 Forbidden$", 1),
+        ({"length": 299_000}, "sends more bytes than the 299000 announced", 1),
+        ({"length": 301_000}, "cut after 300000 of 301000 bytes", 3),
+        ({"data": b"\n<!DOCTYPE html><title>Please log in</title>"}, "is an HTML page, not data", 1),
+        ({"headers": {"Content-Type": "text/html; charset=utf-8"}}, "is an HTML page", 1),
+        ({"headers": {"Content-Encoding": "gzip"}}, "comes with Content-Encoding gzip", 1),
+        ({"data": b""}, "the server sent nothing", 3),
+        ({"cuts": [1000] * 3}, r"cut after 3000 of 300000 bytes \(gave up after 3 attempts\); 3000 bytes are kept", 3),
+    ],
+)
+def test_what_does_not(site: Site, tmp_path: Path, settings: dict[str, Any], says: str, attempts: int) -> None:
+    vars(site).update(settings)
     with pytest.raises(BufgymError, match=says):
-        download(site.address + path, tmp_path / "part", None, HASTY)
-    with pytest.raises(BufgymError, match="must be an http or https address"):
-        download("file:///etc/hostname", tmp_path / "part")
+        get(site, tmp_path, None)
+    assert len(site.asked) == attempts and "data.bin" not in left(tmp_path)
 
 
-def test_a_redirection_is_followed(site: Site, tmp_path: Path) -> None:
-    download(f"{site.address}/moved", tmp_path / "part", None, HASTY)
-    assert (tmp_path / "part").read_bytes() == DATA
+def test_the_next_call_goes_on_unless_the_file_changed_meanwhile(site: Site, tmp_path: Path) -> None:
+    for k, (etag, data, known) in enumerate(
+        (('"v1"', DATA, True), ('"v2"', bytes(250_000), False), ('"v2"', bytes(250_000), True), ('"v1"', ATAD, True))
+    ):
+        site.cuts, site.data, site.etag, to = [1000] * 3, DATA, '"v1"', tmp_path / f"{k}"
+        with pytest.raises(BufgymError, match="run the same command again to resume"):
+            get(site, to, None)
+        assert left(to) == [".data.bin.part", ".data.bin.part.json"]
+        site.data, site.etag, site.asked, said = data, etag, [], []
+        done = get(site, to, hashlib.sha256(data).hexdigest() if known else None, note=said.append)
+        assert done.path.read_bytes() == data and left(to) == ["data.bin"] and "bytes=3000-" in site.asked
+        # The server changed the file and kept its ETag: the sum tells.
+        assert said == (["data.bin: the parts do not fit together: fetching it again"] if data is ATAD else [])
 
 
-def test_no_way_back_from_https_to_http() -> None:
-    from urllib.error import HTTPError
-    from urllib.request import Request
+def test_silence_ends_an_attempt(site: Site, tmp_path: Path) -> None:
+    site.stall = 1000
+    with pytest.raises(BufgymError, match=r"the server (fell silent|does not respond) \(gave up after 2 attempts\)"):
+        get(site, tmp_path, patience=Patience(attempts=2, first_wait_s=0, silence_s=0.3))
 
-    from bufgym.traces.datasets.connection import SafeRedirects
 
+def test_addresses(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    part = tmp_path / "part"
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        port = closed.getsockname()[1]
+    for address, says in {
+        f"{site.address}/nothing": r"/nothing: no such file on the server \(404\)",
+        f"{site.address}/file": "302 .*'file:///etc/hostname' is not allowed",
+        f"{site.address}/nowhere": "redirects to an invalid address",
+        "file:///etc/hostname": "must be an http or https address",
+        f"http://127.0.0.1:{port}/": r"no connection \(Connection refused\) \(gave up after 3 attempts\)$",
+    }.items():
+        with pytest.raises(BufgymError, match=says):
+            download(address, part, None, HASTY)
     nothing: Any = None
     with pytest.raises(HTTPError, match="redirects to http://b/, which is not allowed") as caught:
-        SafeRedirects().redirect_request(Request("https://a/"), io.BytesIO(), 302, "Found", nothing, "http://b/")
+        connection.SafeRedirects().redirect_request(
+            Request("https://a/"), io.BytesIO(), 302, "Found", nothing, "http://b/"
+        )
     caught.value.close()
-
-
-def test_more_or_less_than_announced(site: Site, tmp_path: Path) -> None:
-    site.length = 299_000
-    with pytest.raises(BufgymError, match="sends more bytes than the 299000 announced"):
-        get(site, tmp_path, None)
-    site.length = 301_000
-    with pytest.raises(BufgymError, match="cut after 300000 of 301000 bytes"):
-        get(site, tmp_path, None)
-    site.length = -1
-    assert get(site, tmp_path).path.read_bytes() == DATA
-
-
-def test_a_page_is_no_data(site: Site, tmp_path: Path) -> None:
-    site.data = b"\n<!DOCTYPE html><title>Please log in</title>"
-    with pytest.raises(BufgymError, match="is an HTML page, not data"):
-        get(site, tmp_path, None)
-    site.data, site.headers = DATA, {"Content-Type": "text/html; charset=utf-8"}
-    with pytest.raises(BufgymError, match="is an HTML page, not data"):
-        get(site, tmp_path)
-    site.headers = {"Content-Encoding": "gzip"}
-    with pytest.raises(BufgymError, match="comes with Content-Encoding gzip"):
-        get(site, tmp_path)
-    assert left(tmp_path) == []
-
-
-def test_an_empty_answer_is_no_file(site: Site, tmp_path: Path) -> None:
-    site.data = b""
-    with pytest.raises(BufgymError, match="the server sent nothing"):
-        get(site, tmp_path, None)
-
-
-def test_nobody_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("no_proxy", "*")
-    with socket.create_server(("127.0.0.1", 0)) as dequeued:
-        port = dequeued.getsockname()[1]
-    with pytest.raises(BufgymError, match=r"no connection \(Connection refused\) \(gave up after 3 attempts\)$"):
-        download(f"http://127.0.0.1:{port}/", tmp_path / "part", None, HASTY)
+    download(f"{site.address}/moved", part, None, HASTY)
+    assert part.read_bytes() == DATA
 
     def unresolved(*arguments: object, **options: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
     monkeypatch.setattr(socket, "getaddrinfo", unresolved)
+    monkeypatch.setenv("no_proxy", "*")
     with pytest.raises(BufgymError, match=r"no network, or no such host as data\.example"):
-        download("http://data.example/x", tmp_path / "part", None, HASTY)
+        download("http://data.example/x", part, None, HASTY)
 
 
 def test_a_full_disk(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,6 +168,28 @@ def test_a_full_disk(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         get(site, tmp_path)
 
 
+@contextmanager
+def speaking(talk: Callable[[socket.socket], None]) -> Iterator[str]:
+    """The address of a server that says this to each client in turn, whatever it asks."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            with suppress(OSError):  # the server was shut down
+                while True:
+                    client, _ = server.accept()
+                    with client, suppress(OSError):  # the client may have gone
+                        client.recv(4096)
+                        talk(client)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.getsockname()[1]}/"
+        finally:
+            server.shutdown(socket.SHUT_RDWR)
+            thread.join()
+
+
 def test_garbled_answers_end_in_a_file_or_our_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     whole = (
@@ -250,33 +197,21 @@ def test_garbled_answers_end_in_a_file_or_our_error(tmp_path: Path, monkeypatch:
         b"Content-Type: text/plain\r\nConnection: close\r\n\r\n" + DATA[:50]
     )
     dice, refused = random.Random(3), 0
-    with socket.create_server(("127.0.0.1", 0)) as server:
 
-        def serve() -> None:
-            while True:
-                try:
-                    connection, _ = server.accept()
-                except OSError:
-                    return
-                with connection, suppress(OSError):  # the client may have gone
-                    connection.recv(4096)
-                    raw = bytearray(whole)
-                    for _ in range(dice.randint(1, 5)):
-                        raw[dice.randrange(len(whole) - 45)] = dice.randrange(256)
-                    connection.sendall(raw)
+    def talk(client: socket.socket) -> None:
+        raw = bytearray(whole)
+        for _ in range(dice.randint(1, 5)):
+            raw[dice.randrange(len(whole) - 45)] = dice.randrange(256)
+        client.sendall(raw)
 
-        thread = threading.Thread(target=serve)
-        thread.start()
+    with speaking(talk) as address:
         for _ in range(300):
             downloading.discard(tmp_path / "part")
             try:
-                address = f"http://127.0.0.1:{server.getsockname()[1]}/"
-                download(address, tmp_path / "part", None, Patience(attempts=2, first_wait_s=0, silence_s=0.5))
+                download(address, tmp_path / "part", None, Patience(attempts=2, first_wait_s=0))
             except BufgymError as error:
                 refused += 1
                 assert str(error).isprintable()
-        server.shutdown(socket.SHUT_RDWR)
-        thread.join()
     assert 30 < refused < 300
 
 
@@ -286,33 +221,20 @@ ENDLESS = {
 }
 
 
-@pytest.mark.parametrize("wait_s", [0.0, 0.05])
+@pytest.mark.parametrize("wait_s", [0.0, 0.02])
 @pytest.mark.parametrize("kind", ENDLESS)
 def test_headers_and_trailers_without_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, wait_s: float
 ) -> None:
     """As fast as they can, or never silent for long: the attempt ends by bytes, or by time."""
-    from bufgym.traces.datasets import connection
-
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     monkeypatch.setattr(connection, "MAX_HEAD_BYTES", 10**5)
-    first, again = ENDLESS[kind]
-    stop = threading.Event()
-    with socket.create_server(("127.0.0.1", 0)) as server:
 
-        def serve() -> None:
-            with suppress(OSError):
-                while True:
-                    client, _ = server.accept()
-                    with client, suppress(OSError):
-                        client.recv(4096)
-                        client.sendall(first)
-                        while not stop.wait(wait_s):
-                            client.sendall(again)
+    def talk(client: socket.socket) -> None:
+        client.sendall(ENDLESS[kind][0])
+        while True:  # until the client has gone
+            client.sendall(ENDLESS[kind][1])
+            time.sleep(wait_s)
 
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        address = f"http://127.0.0.1:{server.getsockname()[1]}/"
-        with pytest.raises(BufgymError, match="gave up after 1 attempts"):
-            download(address, tmp_path / "part", None, Patience(attempts=1, silence_s=0.5))
-        stop.set()
+    with speaking(talk) as address, pytest.raises(BufgymError, match="gave up after 1 attempts"):
+        download(address, tmp_path / "part", None, Patience(attempts=1, silence_s=0.2))

@@ -13,7 +13,7 @@ from bufgym.cli.options import Parser
 from bufgym.errors import BufgymError
 from bufgym.scenario import suites
 from bufgym.scenario.suites.synthetic import both_values
-from bufgym.traces import Trace, write_csv
+from bufgym.traces import write_csv
 from bufgym.traces.fit.compare import compare, held_out, ks_distance
 from bufgym.traces.fit.fit import fit_links, mode_of, rates_of
 from bufgym.traces.fit.statistics import autocorrelation, spells
@@ -38,16 +38,18 @@ def recordings(link: LinkParameters = KNOWN, first_seed: int = 0) -> list[Float6
     return [link_rates(link, first_seed + seed, link.seconds // link.recordings) for seed in range(link.recordings)]
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fits that try each memory on some thousand seconds only."""
-    monkeypatch.setattr("bufgym.traces.fit.fit._TRIAL_S", 2_000)
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Fits try each memory on some hundred seconds only, but in the night."""
+    if request.node.get_closest_marker("nightly") is None:
+        monkeypatch.setattr("bufgym.traces.fit.fit._TRIAL_S", 500)
 
 
 def rows_of(values: list[float]) -> list[Float64Array]:
     return [np.array(values)]
 
 
+@pytest.mark.nightly
 def test_the_fit_recovers_the_parameters_of_the_generator() -> None:
     fitted = fit_links({"known": recordings()})["known"]
     assert (fitted.recordings, fitted.seconds) == (20, 12_000)
@@ -60,94 +62,63 @@ def test_the_fit_recovers_the_parameters_of_the_generator() -> None:
     assert 14 <= fitted.level_stay_s <= 56
     assert fitted.fast_memory <= 0.6
     outages = fitted.outages
-    assert outages is not None
-    assert outages.spells > 100
-    assert 0.3 <= outages.short_gap_share <= 0.7
-    assert 3 <= outages.short_gap_s <= 9
-    assert 0.4 <= outages.shoulder <= 0.6
-    assert 80 <= outages.long_gap_s <= 180
+    assert outages is not None and outages.spells > 100
+    assert 0.3 <= outages.short_gap_share <= 0.7 and 3 <= outages.short_gap_s <= 9
+    assert 0.4 <= outages.shoulder <= 0.6 and 80 <= outages.long_gap_s <= 180
     # P(over 3 s) = (1 + 3 / 4)**-3 = 0.19
     assert abs((1 + 3 / outages.length_scale_s) ** -outages.length_tail - 0.19) < 0.06
 
 
-@pytest.mark.usefixtures("quick")
-def test_the_same_recordings_give_the_same_parameters() -> None:
-    rows = recordings(replace(KNOWN, recordings=4, seconds=1200))
-    assert fit_links({"a": rows}) == fit_links({"a": rows})
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_mode_with_few_outages_borrows_from_the_others() -> None:
+def test_fits_of_few_seconds() -> None:
+    """A mode with few outages borrows from the others; without any it has none; recordings that differ have a place."""
     calm = [np.full(300, 2e6) for _ in range(3)]
     calm[0][100:102] = 1e5
-    links = fit_links({"calm": calm, "known": recordings()})
+    known = recordings(replace(KNOWN, recordings=4, seconds=2400))
+    links = fit_links({"calm": calm, "known": known, "still": [np.full(300, 2e6)]})
+    assert links == fit_links({"calm": calm, "known": known, "still": [np.full(300, 2e6)]})
     lent, own = links["known"].outages, links["calm"].outages
     assert lent is not None and own is not None
-    assert (own.spells, own.borrowed, lent.borrowed) == (1, True, False)
-    assert own.short_gap_share == 0
-    # One outage in 898 s outside of it.
-    assert own.long_gap_s == 898
-
-
-@pytest.mark.usefixtures("quick")
-def test_no_outages() -> None:
+    assert (own.spells, own.borrowed, lent.borrowed, own.short_gap_share) == (1, True, False, 0)
+    assert own.long_gap_s == 898  # one outage in 898 s outside of it
     assert fit_links({"calm": [np.full(300, 2e6)]})["calm"].outages is None
-
-
-@pytest.mark.usefixtures("quick")
-def test_recordings_that_differ_have_a_place() -> None:
     rows = [row / 2 + 4e6 * (k % 2) for k, row in enumerate(recordings(replace(KNOWN, outages=None)))]
     assert fit_links({"two": rows})["two"].place_share >= 0.3
 
 
-def test_runs() -> None:
+def test_statistics_by_hand() -> None:
     starts, ends = spells(np.array([True, False, True, True, False]))
     assert (starts.tolist(), ends.tolist()) == ([0, 2], [1, 4])
-
-
-def test_autocorrelation_by_hand() -> None:
-    """1, -1, 1, -1 about 0: products at lag 1 are all -1, at lag 2 all 1, the variance is 1; no pair at lag 9."""
+    # 1, -1, 1, -1 about 0: products at lag 1 are all -1, at lag 2 all 1, the variance is 1; no pair at lag 9.
     correlations, pairs = autocorrelation(rows_of([1.0, -1.0, 1.0, -1.0]), (1, 2, 9))
-    assert correlations.tolist() == [-1.0, 1.0, 0.0]
-    assert pairs.tolist() == [3, 2, 0]
-
-
-def test_ks_distance_by_hand() -> None:
-    """Of 1, 2 none is above 2; of 2, 3, 4, 5 three are: distance 3/4."""
+    assert (correlations.tolist(), pairs.tolist()) == ([-1.0, 1.0, 0.0], [3, 2, 0])
+    # Of 1, 2 none is above 2; of 2, 3, 4, 5 three are: distance 3/4.
     assert ks_distance(np.array([1.0, 2.0]), np.array([2.0, 3.0, 4.0, 5.0])) == 0.75
     assert ks_distance(np.array([1.0, 2.0]), np.array([1.0, 2.0])) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("name", "mode"),
-    [
-        ("report_car_0002.csv", "car"),
-        ("logs/wifi_office_231114-151821.txt", "wifi-office"),
-        ("Tram.csv", "tram"),
-        ("report_bus_0001.csv.gz", "bus"),
-    ],
-)
-def test_modes_in_names(name: str, mode: str) -> None:
-    assert mode_of(name) == mode
+def test_modes_in_names() -> None:
+    names = ("report_car_0002.csv", "logs/wifi_office_231114-151821.txt", "Tram.csv", "report_bus_0001.csv.gz")
+    assert [mode_of(name) for name in names] == ["car", "wifi-office", "tram", "bus"]
+    with pytest.raises(BufgymError, match=r"0001.csv: its name does not say the mode: give --mode"):
+        mode_of("0001.csv")
 
 
 def test_what_the_fit_refuses() -> None:
     for wrong, says in (
         ({}, "no recordings"),
         ({"slow": rows_of([1e5] * 100)}, "mode slow: 0 of 100 s have 500000 bytes/s or more: must be at least 60"),
-        ({"short": rows_of([1e6] * 59)}, "mode short: 59 of 59"),
         ({"nan": rows_of([float("nan")] * 100)}, "mode nan: rates must be finite"),
         ({"negative": rows_of([-1.0] * 100)}, "mode negative: rates must be finite and >= 0"),
     ):
         with pytest.raises(BufgymError, match=says):
             fit_links(wrong)
-    with pytest.raises(BufgymError, match=r"0001.csv: its name does not say the mode: give --mode"):
-        mode_of("0001.csv")
     with pytest.raises(BufgymError, match="low_bytes_per_s = 0"):
         fit_links({"a": rows_of([1e6] * 100)}, 0)
 
 
 def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory() -> None:
+    halves = held_out("one", [link_rates(KNOWN, 1, 600)], sets=9)
+    assert halves.parts == 2 and 0 < halves.distance < 1
     small = replace(KNOWN, recordings=5, seconds=1500)
     rows = recordings(small, first_seed=77)
     own = {row.name: row.p for row in compare(small, rows, sets=59)}
@@ -160,16 +131,6 @@ def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory()
     assert {row.name: row.p for row in twice}["KS distance"] < 0.05
 
 
-@pytest.mark.usefixtures("quick")
-def test_halves_of_a_single_recording_are_held_out() -> None:
-    halves = held_out("one", [link_rates(KNOWN, 1, 600)], sets=19)
-    assert halves.parts == 2
-    assert 0 < halves.distance < 1
-
-
-# -------------------- the command
-
-
 def fit(*arguments: str) -> None:
     parser = Parser(prog="bufgym trace")
     trace_fit.add(parser.add_subparsers(required=True))
@@ -177,36 +138,21 @@ def fit(*arguments: str) -> None:
     options.command(options)
 
 
-def write_recordings(folder: Path) -> list[str]:
-    files = []
-    for seed in range(3):
-        trace = markov_link("known", seed, 200, links={"known": KNOWN})
-        files.append(str(folder / f"report_known_{seed}.csv"))
-        write_csv(trace, files[-1])
-    return files
-
-
-@pytest.mark.usefixtures("quick")
 def test_the_command_writes_parameters_and_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib")
-    files = write_recordings(tmp_path)
-    out, page = tmp_path / "links.json", tmp_path / "page.md"
-    fit(*files, "-o", str(out), "--page", str(page), "--sets", "9")
-    first = (out.read_bytes(), page.read_bytes(), (tmp_path / "figures" / "link-known.svg").read_bytes())
-    fit(*reversed(files), "-o", str(out), "--page", str(page), "--sets", "9")
-    assert first == (out.read_bytes(), page.read_bytes(), (tmp_path / "figures" / "link-known.svg").read_bytes())
-    assert read_links(out)["known"].seconds == 600
-    text = page.read_text()
-    assert "| autocorrelation at 30 s |" in text
+    files = [str(tmp_path / f"report_known_{seed}.csv") for seed in range(3)]
+    for seed, file in enumerate(files):
+        write_csv(markov_link("known", seed, 200, links={"known": KNOWN}), file)
+    out, page, figure = tmp_path / "links.json", tmp_path / "page.md", tmp_path / "figures" / "link-known.svg"
+    fit(*files[::-1], "-o", str(out), "--page", str(page), "--sets", "9")
+    assert "3 recordings" in capsys.readouterr().out and figure.exists()
+    text, fitted = page.read_text(), read_links(out)
+    assert "| autocorrelation at 30 s |" in text and str(tmp_path) not in text + out.read_text()
     assert "![known: recordings and generated links](figures/link-known.svg)" in text
-    assert str(tmp_path) not in text + out.read_text()
-    assert "3 recordings" in capsys.readouterr().out
-
-
-@pytest.mark.usefixtures("quick")
-def test_one_mode_for_all(tmp_path: Path) -> None:
-    fit(*write_recordings(tmp_path), "--mode", "walk", "-o", str(tmp_path / "links.json"))
-    assert list(read_links(tmp_path / "links.json")) == ["walk"]
+    fit(*files, "-o", str(out))  # in any order
+    assert read_links(out) == fitted and fitted["known"].seconds == 600
+    fit(*files, "--mode", "walk", "-o", str(out))
+    assert list(read_links(out)) == ["walk"]
 
 
 def test_the_command_fits_what_a_suite_trains_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -224,21 +170,18 @@ def test_the_command_fits_what_a_suite_trains_on(monkeypatch: pytest.MonkeyPatch
 
 
 def test_what_the_command_refuses(tmp_path: Path) -> None:
-    with pytest.raises(BufgymError, match=r"needs recordings, FILE ... or --suite NAME"):
-        fit("-o", "b.json")
-    with pytest.raises(BufgymError, match=r"--suite: cannot go with FILE or --mode"):
-        fit("a.csv", "--suite", "lte-v1", "-o", "b.json")
-    with pytest.raises(BufgymError, match=r"--data: needs --suite"):
-        fit("a.csv", "--data", ".", "-o", "b.json")
-    with pytest.raises(BufgymError, match=r"--page x.html: must end in .md"):
-        fit("a.csv", "-o", "b.json", "--page", "x.html")
-    write_csv(Trace.constant(1e6, 10), tmp_path / "short_1.csv")
-    with pytest.raises(BufgymError, match="mode short: 10 of 10 s"):
-        fit(str(tmp_path / "short_1.csv"), "-o", str(tmp_path / "b.json"))
+    for words, says in (
+        ("", r"needs recordings, FILE ... or --suite NAME"),
+        ("a.csv --suite lte-v1", r"--suite: cannot go with FILE or --mode"),
+        ("a.csv --data .", r"--data: needs --suite"),
+        ("a.csv --page x.html", r"--page x.html: must end in .md"),
+    ):
+        with pytest.raises(BufgymError, match=says):
+            fit(*words.split(), "-o", str(tmp_path / "b.json"))
     assert not (tmp_path / "b.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_committed_parameters_are_the_fit_of_the_recordings(shared_data: Path) -> None:
     files = sorted((shared_data / "belgium_4g" / "csv").glob("*.csv"))
     files += sorted((shared_data / "solis_wifi").glob("wifi_*.txt"))
@@ -248,7 +191,7 @@ def test_the_committed_parameters_are_the_fit_of_the_recordings(shared_data: Pat
     assert fit_links(rows) == read_links(LINKS)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_committed_uplinks_are_the_fit_of_what_their_suites_train_on(shared_data: Path, tmp_path: Path) -> None:
     names = "uplink-5g-v1,uplink-wifi-v1,uplink-mmwave-v1"
     fit("--suite", names, "--data", str(shared_data), "-o", str(tmp_path / "uplinks.json"))

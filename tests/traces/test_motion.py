@@ -1,173 +1,230 @@
-"""Camera trajectories to motion, with numbers worked by hand."""
+"""Camera trajectories of every format to motion, with numbers worked by hand; and real ones."""
 
 from __future__ import annotations
 
 import gzip
 import math
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from link_files import written
 
 from bufgym.errors import BufgymError, TraceError
 from bufgym.traces import Motion, MotionSettings, Poses, motion_from_poses, read_motion, write_motion_csv
+from bufgym.traces.formats.trajectories import detect_pose_format, read_poses
+from bufgym.traces.poses import angles, quaternions, rotations, slerp
 
-DATA = Path(os.environ.get("BUFGYM_SHARED_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
-
-# 1 m forward in the first second, then a turn of 90 degrees about z in the next.
-HALF = math.sqrt(0.5)
-WALK_AND_TURN = f"""# t tx ty tz qx qy qz qw
-100 0 0 0 0 0 0 1
-101 1 0 0 0 0 0 1
-102 1 0 0 0 0 {HALF} {HALF}
+# 1 m forward in the first second, then a turn of 90 degrees about z in the next: 1 / 2 m = 0.5; 90 / 60 degrees = 1.5.
+H = math.sqrt(0.5)
+TUM = f"# t tx ty tz qx qy qz qw\n100 0 0 0 0 0 0 1\n101 1 0 0 0 0 0 1\n102 1 0 0 0 0 {H} {H}\n"
+# EuRoC's times are ns, and its quaternions begin with w.
+EUROC = f"""#timestamp [ns] p_RS_R_x [m] p_RS_R_y [m] p_RS_R_z [m] q_RS_w [] q_RS_x [] q_RS_y [] q_RS_z []
+1403636580863555584.0000000000 0 0 0 1 0 0 0
+1403636581863555584.0000000000 1 0 0 1 0 0 0
+1403636582863555584.0000000000 1 0 0 {H} 0 0 {H}
 """
+EUROC_CSV = "#timestamp, p_RS_R_x [m], ..., b_a_RS_S_z [m s^-2]\n" + "".join(
+    line.replace(".0000000000", "").replace(" ", ",") + ",1,2,3,4,5,6,7,8,9\n" for line in EUROC.split("\n")[1:4]
+)
+KITTI = "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n0 -1 0 1 1 0 0 0 0 0 1 0\n"
+KITTI_TIMES = "0.000000e+00\n1.000000e+00\n2.000000e+00\n"
+REPEATED = TUM.replace("101 1", "101 9 9 9 0 0 0 1\n101 1")
+"""Of two poses with one time the last counts."""
+UPRIGHT = [0.0, 0, 0, 1]
+PATHS = [("tum", TUM), ("tum", REPEATED), ("euroc", EUROC), ("euroc", EUROC_CSV), ("kitti", KITTI)]
 
 
-def written(folder: Path, text: str, name: str = "path.txt") -> Path:
-    path = folder / name
-    path.write_text(text)
-    return path
-
-
-def test_translation_over_scale_and_rotation_over_field_of_view(tmp_path: Path) -> None:
-    motion = read_motion(written(tmp_path, WALK_AND_TURN))
+@pytest.mark.parametrize(("format", "text"), PATHS)
+def test_one_path_in_each_format(tmp_path: Path, format: str, text: str) -> None:
+    path = written(tmp_path, text, "path.txt")
+    written(tmp_path, KITTI_TIMES, "path_times.txt")
+    assert detect_pose_format(path) == format
+    motion = read_motion(path)
     assert motion.time_us.tolist() == [0, 1_000_000, 2_000_000]
-    # 1 m / 2 m = 0.5; 90 degrees / 60 degrees = 1.5.
     assert motion.coordinate == pytest.approx([0.0, 0.5, 2.0])
-    assert (motion.name, motion.gaps) == ("path", ())
-    other = read_motion(tmp_path / "path.txt", MotionSettings(fov_deg=90, scene_scale_m=4))
-    assert other.coordinate == pytest.approx([0.0, 0.25, 1.25])
+    assert (motion.name, motion.gaps) == ("path", ()) and f"format {format}" in motion.source
+    assert read_motion(path, MotionSettings(fov_deg=90, scene_scale_m=4)).coordinate == pytest.approx([0, 0.25, 1.25])
+    gappy = read_motion(path, MotionSettings(max_gap_s=0.5))
+    assert gappy.gaps == ((0, 1_000_000), (1_000_000, 2_000_000)) and gappy.longest_gap_s == 1.0
+    zipped = written(tmp_path, gzip.compress(text.encode()), "path.txt.gz")
+    assert read_motion(zipped).coordinate.tolist() == motion.coordinate.tolist()
 
 
-def test_a_quaternion_and_its_negative_are_one_orientation(tmp_path: Path) -> None:
-    text = "0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 -1\n"
-    assert read_motion(written(tmp_path, text)).total == pytest.approx(0.0, abs=1e-12)
+def test_times_in_ns_are_exact(tmp_path: Path) -> None:
+    lines = [f"14036365808635{k:05d} 0 0 0 1 0 0 0" for k in (0, 1000, 2999, 55584)]
+    poses = read_poses(written(tmp_path, "# timestamp[ns] px py pz qw qx qy qz\n" + "\n".join(lines), "path.txt"))
+    assert poses.time_us.tolist() == [0, 1, 2, 55]
 
 
-def test_small_angles_are_not_lost() -> None:
-    angle = 1e-7
-    quaternions = np.array([[0, 0, 0, 1], [0, 0, math.sin(angle / 2), math.cos(angle / 2)]])
-    motion = motion_from_poses(
-        Poses(np.array([0, 1_000_000]), np.zeros((2, 3)), quaternions), MotionSettings(fov_deg=math.degrees(1.0))
-    )
-    assert motion.total == pytest.approx(angle, rel=1e-6)
+def test_kitti_times_from_elsewhere(tmp_path: Path) -> None:
+    path = written(tmp_path, KITTI, "00.txt")
+    with pytest.raises(TraceError, match=r"holds KITTI matrices, which carry no time: .*no 00_times.txt beside"):
+        read_motion(path)
+    times = written(tmp_path, KITTI_TIMES, "times.txt")
+    assert read_motion(path, times=times).total == pytest.approx(2.0)
+    for text, says in (
+        ("0\n1\n", r"00.txt, line 3: must have a time, but .*times.txt has no more"),
+        (KITTI_TIMES + "3\n", "holds more times than .*00.txt has poses"),
+        ("0\n2\n1\n", r"00.txt, line 3: time in s = 1: must not be before the line above"),
+    ):
+        times.write_text(text)
+        with pytest.raises(TraceError, match=says):
+            read_motion(path, times=times)
 
 
-def test_fast_poses_are_resampled_so_that_jitter_is_not_motion() -> None:
-    """A mocap at 300 Hz that stands still and jitters by 0.2 mm: the camera at 30 Hz sees a tenth of it."""
-    count = 3001
-    time_us = np.rint(np.arange(count) * (1e6 / 300)).astype(np.int64)
-    position = np.zeros((count, 3))
-    position[:, 0] = 2e-4 * (np.arange(count) % 3 == 1)
-    upright = np.tile([0.0, 0, 0, 1], (count, 1))
-    poses = Poses(time_us, position, upright)
-    every = motion_from_poses(poses, MotionSettings(rate_hz=1000))
-    camera = motion_from_poses(poses)
-    assert every.time_us.size == count and camera.time_us.size == 301
-    assert every.total == pytest.approx(2000 * 2e-4 / 2)
-    assert camera.total < every.total / 5
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("0 0 0 0 0 0 0 1\n", "holds 1 samples: must hold at least 2"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 0\n", "line 2: norm of the quaternion = 0: must be 1 within 1 %"),
+        ("0 0 0 1e8 0 0 0 1\n", "line 1: tz = 1e8: must be from -1e\\+07 to 1e\\+07"),
+        ("0 0 0 0 0 0 0 1\n2e7 0 0 0 0 0 0 1\n", "line 2: time in s = 2e7: must be at most 10000000 s after"),
+        ("t_s,motion\n0,0\n1,2\n2,1.5\n", "line 4: motion = 1.5: must not be below the line above"),
+        ("#timestamp [ns] ...\n1 0 0 0 1 0 0\n", r"line 2: '1 0 0 0 1 0 0': must have 8 columns \(or the 17 of"),
+        ("1 0 0 0 0 1 0 0 0 0 2 0\n", "must be a rotation within 1 %"),
+        # A reflection: orthogonal, but no rotation.
+        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "must be a rotation within 1 %"),
+        # Nanoseconds without EuRoC's header could be anybody's: not guessed.
+        ("1403636579763555584 0 0 0 0 0 0 1\n", "line 1: time in s = 1403636579763555584: must be from 0 to"),
+    ],
+)
+def test_broken_files(tmp_path: Path, text: str, says: str) -> None:
+    written(tmp_path, KITTI_TIMES, "path_times.txt")
+    with pytest.raises(TraceError, match=says):
+        read_motion(written(tmp_path, text, "path.txt"))
 
 
-def test_resampling_keeps_a_steady_turn_steady() -> None:
-    """One turn a second about z, given at 100 Hz: at 30 Hz each step is 12 degrees."""
-    time_us = np.arange(101, dtype=np.int64) * 10_000
-    angle = 2 * np.pi * time_us / 1e6
-    quaternion = np.stack([0 * angle, 0 * angle, np.sin(angle / 2), np.cos(angle / 2)], axis=1)
-    motion = motion_from_poses(Poses(time_us, np.zeros((101, 3)), quaternion), MotionSettings(rate_hz=30))
-    assert np.diff(motion.coordinate) == pytest.approx(np.full(30, 12 / 60), rel=1e-3)
-    assert motion.total == pytest.approx(6.0)
-
-
-def test_gaps_are_reported() -> None:
-    time_us = np.array([0, 500_000, 3_000_000, 3_500_000])
-    position = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0]])
-    motion = motion_from_poses(Poses(time_us, position, np.tile([0.0, 0, 0, 1], (4, 1))))
-    assert motion.gaps == ((500_000, 3_000_000),)
-    assert motion.at(1_750_000) == pytest.approx(0.25)
-
-
-def test_past_the_end_the_total_is_carried_on() -> None:
-    motion = Motion("m", np.array([0, 10, 20]), np.array([0.0, 1.0, 1.5]))
-    assert motion.at([0, 5, 10, 20, 25, 45]).tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 3.5]
-    steps = np.diff(motion.at(np.arange(100)))
-    assert (steps >= 0).all()
-    with pytest.raises(BufgymError, match="time_us = -1: must be >= 0"):
-        motion.at(-1)
+def test_formats_that_do_not_exist_or_do_not_fit(tmp_path: Path) -> None:
+    path, times = written(tmp_path, TUM, "path.txt"), written(tmp_path, KITTI_TIMES, "times.txt")
+    with pytest.raises(BufgymError, match="format = 'bvh': must be one of tum, euroc, kitti"):
+        read_motion(path, format="bvh")
+    with pytest.raises(BufgymError, match=r"times = 't\.txt': goes with KITTI matrices only"):
+        read_motion(path, times="t.txt")
+    with pytest.raises(TraceError, match=r"line 2: .*must have 12 columns, has 8"):
+        read_motion(path, format="kitti", times=times)
 
 
 def test_round_trip_is_exact(tmp_path: Path) -> None:
     motion = Motion("m", np.array([0, 1, 1_500_000]), np.array([0.0, 1 / 3, 2e5 / 7]))
     write_motion_csv(motion, tmp_path / "m.csv")
     again = read_motion(tmp_path / "m.csv")
-    assert again.name == "m"
-    assert again.time_us.tolist() == motion.time_us.tolist()
+    assert again.name == "m" and again.time_us.tolist() == motion.time_us.tolist()
     assert again.coordinate.tolist() == motion.coordinate.tolist()
     with pytest.raises(TraceError, match="cannot be written"):
         write_motion_csv(motion, tmp_path)
 
 
-def test_gzip_and_repeated_times(tmp_path: Path) -> None:
-    path = tmp_path / "path.txt.gz"
-    path.write_bytes(gzip.compress(WALK_AND_TURN.replace("101 1", "101 9 9 9 0 0 0 1\n101 1").encode()))
-    assert read_motion(path).coordinate == pytest.approx([0.0, 0.5, 2.0])
+def about(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
+    half = math.radians(degrees) / 2
+    return np.array([*(math.sin(half) * np.array(axis) / np.linalg.norm(axis)), math.cos(half)])
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("", "path.txt: is empty"),
-        ("# only this\n", "path.txt: is empty"),
-        ("0 0 0 0 0 0 0 1\n", "holds 1 samples: must hold at least 2"),
-        ("0 0 0 0 0 0 0\n", "path.txt, line 1: '0 0 0 0 0 0 0': must have 8 columns, has 7"),
-        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 0\n", "line 2: norm of the quaternion = 0: must be 1 within 1 %"),
-        ("0 0 0 0 0 0 0 1.02\n", "line 1: norm of the quaternion = 1.02"),
-        ("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n", "line 2: tx = nan: must be a finite number"),
-        ("0 0 0 1e8 0 0 0 1\n", "line 1: tz = 1e8: must be from -1e\\+07 to 1e\\+07"),
-        ("5 0 0 0 0 0 0 1\n4 0 0 0 0 0 0 1\n", "line 2: time in s = 4: must not be before the line above"),
-        ("0 0 0 0 0 0 0 1\n2e7 0 0 0 0 0 0 1\n", "line 2: time in s = 2e7: must be at most 10000000 s after"),
-        ("1403636579763555584 0 0 0 0 0 0 1\n", "line 1: time in s = 1403636579763555584: must be from 0 to"),
-        ("-1 0 0 0 0 0 0 1\n", "line 1: time in s = -1"),
-        ("t_s,motion\n0,0\n1,2\n2,1.5\n", "line 4: motion = 1.5: must not be below the line above"),
-        ("t_s,motion\n0,0\n1,-2\n", "line 3: motion = -2: must be from 0"),
-        ("t_s,motion\n0,0\n1\n", "line 3: 1: must have 2 columns, has 1"),
-        ("t_s,motion\n0,0\n", "holds 1 samples"),
-    ],
-)
-def test_broken_files(tmp_path: Path, text: str, says: str) -> None:
-    with pytest.raises(TraceError, match=says):
-        read_motion(written(tmp_path, text))
+def test_small_angles_are_not_lost_and_a_negative_quaternion_is_no_turn() -> None:
+    end = about((0, 0, 1), math.degrees(1e-7))
+    for quaternion in (end, -end):
+        poses = Poses(np.array([0, 1_000_000]), np.zeros((2, 3)), np.array([UPRIGHT, quaternion]))
+        assert motion_from_poses(poses, MotionSettings(fov_deg=math.degrees(1))).total == pytest.approx(1e-7, rel=1e-6)
+
+
+def test_fast_poses_are_resampled_so_that_jitter_is_not_motion() -> None:
+    """A mocap at 300 Hz that stands still and jitters by 0.2 mm: the camera at 30 Hz sees a tenth of it."""
+    time_us = np.rint(np.arange(3001) * (1e6 / 300)).astype(np.int64)
+    position = np.zeros((3001, 3))
+    position[:, 0] = 2e-4 * (np.arange(3001) % 3 == 1)
+    poses = Poses(time_us, position, np.tile(UPRIGHT, (3001, 1)))
+    every, camera = motion_from_poses(poses, MotionSettings(rate_hz=1000)), motion_from_poses(poses)
+    assert every.time_us.size == 3001 and camera.time_us.size == 301
+    assert every.total == pytest.approx(2000 * 2e-4 / 2) and camera.total < every.total / 5
+
+
+def test_resampling_keeps_a_steady_turn_steady() -> None:
+    """One turn a second about z, given at 100 Hz: at 30 Hz each step is 12 degrees."""
+    time_us = np.arange(101, dtype=np.int64) * 10_000
+    turn = np.stack([about((0, 0, 1), 360 * t / 1e6) for t in time_us.tolist()])
+    motion = motion_from_poses(Poses(time_us, np.zeros((101, 3)), turn), MotionSettings(rate_hz=30))
+    assert np.diff(motion.coordinate) == pytest.approx(np.full(30, 12 / 60), rel=1e-3)
+    assert motion.total == pytest.approx(6.0)
+
+
+def test_gaps_are_reported_and_past_the_end_the_total_is_carried_on() -> None:
+    time_us = np.array([0, 500_000, 3_000_000, 3_500_000])
+    position = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0]])
+    gappy = motion_from_poses(Poses(time_us, position, np.tile(UPRIGHT, (4, 1))))
+    assert gappy.gaps == ((500_000, 3_000_000),) and gappy.at(1_750_000) == pytest.approx(0.25)
+    motion = Motion("m", np.array([0, 10, 20]), np.array([0.0, 1.0, 1.5]))
+    assert motion.at([0, 5, 10, 20, 25, 45]).tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 3.5]
 
 
 def test_broken_arguments() -> None:
-    for name in ("fov_deg", "scene_scale_m", "rate_hz", "max_gap_s"):
-        for value in (0.0, float("nan"), -1.0):
-            with pytest.raises(BufgymError, match=f"{name} = {value}: must be a finite number above 0"):
-                MotionSettings(**{name: value})
+    time_us = np.array([0, 1, 2])
+    for x, says in (([0.0, 1.0, 0.5], "must not decrease at index 2"), ([0.0, math.nan, 1], "finite")):
+        with pytest.raises(BufgymError, match=says):
+            Motion("m", time_us, np.array(x))
     with pytest.raises(BufgymError, match="must increase at index 1"):
         Motion("m", np.array([0, 0]), np.array([0.0, 1.0]))
-    with pytest.raises(BufgymError, match="must not decrease at index 2"):
-        Motion("m", np.array([0, 1, 2]), np.array([0.0, 1.0, 0.5]))
-    with pytest.raises(BufgymError, match="finite"):
-        Motion("m", np.array([0, 1]), np.array([0.0, float("nan")]))
+    with pytest.raises(BufgymError, match="time_us = -1: must be >= 0"):
+        Motion("m", time_us, np.array([0.0, 1.0, 1.0])).at(-1)
+    for name in ("fov_deg", "scene_scale_m", "rate_hz", "max_gap_s"):
+        with pytest.raises(BufgymError, match=f"{name} = 0.0: must be a finite"):
+            MotionSettings(**{name: 0.0})
 
 
-# Coordinate gained a second: the desks are hand-held sweeps, xyz is mostly translation, 360 a turning robot.
-TUM = {
-    "freiburg1_desk": 0.81,
-    "freiburg1_desk2": 1.00,
-    "freiburg1_rpy": 1.15,
-    "freiburg1_xyz": 0.44,
-    "freiburg2_desk": 0.27,
-    "freiburg2_pioneer_360": 0.42,
-}
+def test_slerp_turns_evenly_and_the_short_way() -> None:
+    """From 10 to 130 degrees about (1, 1, 0): a quarter of the way is 40 degrees; a chord would give 36.1."""
+    start, end = about((1, 1, 0), 10), about((1, 1, 0), 130)
+    for sign in (1, -1):
+        quarter = slerp(start[None], sign * end[None], np.array([[0.25]]))
+        assert np.degrees(angles(quarter, about((1, 1, 0), 40)[None])) == pytest.approx([0], abs=1e-6)
+        assert np.degrees(angles(start[None], sign * end[None])) == pytest.approx([120])
+    # From 350 to 10 degrees the short way is through 0.
+    middle = slerp(about((0, 0, 1), 350)[None], about((0, 0, 1), 10)[None], np.array([[0.5]]))
+    assert np.degrees(angles(middle, about((0, 0, 1), 0)[None])) == pytest.approx([0], abs=1e-6)
 
 
-@pytest.mark.skipif(not (DATA / "tum_rgbd").is_dir(), reason=f"no TUM trajectories under {DATA}")
-@pytest.mark.parametrize("name", TUM)
-def test_real_trajectories(name: str) -> None:
-    motion = read_motion(DATA / "tum_rgbd" / f"{name}.groundtruth.txt.gz")
-    assert motion.total / motion.duration_us * 1e6 == pytest.approx(TUM[name], abs=0.006)
-    # The README of the data tells of a gap of 12 s in freiburg2_desk.
-    longest_s = max((end - start for start, end in motion.gaps), default=0) / 1e6
-    assert longest_s == pytest.approx(12.0 if name == "freiburg2_desk" else 0.0, abs=0.1)
+def test_poses_between_poses() -> None:
+    quaternion = np.stack([about((0, 0, 1), degrees) for degrees in (0, 100, 100)])
+    position = np.array([[0.0, 0, 0], [4, 0, 0], [4, 2, 0]])
+    poses = Poses(np.array([0, 2_000_000, 3_000_000]), position, quaternion)
+    between = poses.at(np.array([0, 500_000, 2_500_000, 3_000_000]))
+    assert between.position_m.tolist() == [[0, 0, 0], [1, 0, 0], [4, 1, 0], [4, 2, 0]]
+    turned = np.degrees(angles(between.quaternion, quaternion[[0]].repeat(4, axis=0)))
+    assert turned == pytest.approx([0, 25, 100, 100], abs=1e-6)
+    assert poses.resampled(2).time_us.tolist() == list(range(0, 3_000_001, 500_000))
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1))
+def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, float]) -> None:
+    """Whichever component is the largest; q and -q are one rotation."""
+    x, y, z, w = expected = np.array(numbers) / math.hypot(*numbers)
+    matrix = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    computed = quaternions(np.array([matrix]))[0]
+    assert rotations(expected[None])[0] == pytest.approx(np.array(matrix))
+    assert min(np.abs(computed - expected).max(), np.abs(computed + expected).max()) < 1e-12
+
+
+@pytest.mark.nightly
+def test_real_tum(shared_data: Path) -> None:
+    """Coordinate gained a second: a hand-held sweep, one with a gap of 12 s by its README, and a turning robot."""
+    for name, per_s in (("freiburg1_desk", 0.81), ("freiburg2_desk", 0.27), ("freiburg2_pioneer_360", 0.42)):
+        motion = read_motion(shared_data / "tum_rgbd" / f"{name}.groundtruth.txt.gz")
+        assert motion.total / motion.duration_us * 1e6 == pytest.approx(per_s, abs=0.006)
+        assert motion.longest_gap_s == pytest.approx(12.0 if name == "freiburg2_desk" else 0.0, abs=0.1)
+
+
+def test_real_kitti(shared_data: Path) -> None:
+    path = shared_data / "kitti" / "KITTI_00_gt.txt.gz"
+    motion = read_motion(path, MotionSettings(fov_deg=1e9, scene_scale_m=1))
+    # Sequence 00 is 3.7 km long, 4541 poses in 470.6 s; its times come from KITTI_00_gt_times.txt.gz.
+    rows = np.array([line.split() for line in gzip.decompress(path.read_bytes()).decode().splitlines()], np.float64)
+    metres = np.linalg.norm(np.diff(rows[:, 3::4], axis=0), axis=1).sum()
+    assert motion.total == pytest.approx(metres) == pytest.approx(3724, abs=1)
+    assert (motion.time_us.size, motion.gaps) == (4541, ())
+    assert motion.duration_us / 1e6 == pytest.approx(470.6, abs=0.1)
+    assert "times from KITTI_00_gt_times.txt.gz" in motion.source

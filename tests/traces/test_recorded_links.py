@@ -22,147 +22,83 @@ SETS = {
     "belgium_4g": ("belgium_4g/csv/*.csv", "csv", 30),
     "belgium_4g raw": ("belgium_4g/raw/*.log", "belgium", 5),
     "belgium_4g sabre": ("belgium_4g/sabre_json/*.json", "sabre", 30),
-    "mahimahi": ("mahimahi/*.gz", "mahimahi", 13),
     "norway_hsdpa": ("norway_hsdpa/cooked/*", "mbit", 80),
     "lumos5g_4G": ("lumos5g/4G/*", "mbit", 175),
     "solis_wifi": ("solis_wifi/*.txt", "mbit", 80),
 }
-# The table gives one decimal, so half a tenth and a little for its rounding of exact ties.
 ROUNDING = 0.051
+"""The table gives one decimal, so half a tenth and a little for its rounding of exact ties."""
 # How far a data set's rule may put them apart: rates in KB/s, min and max and mean relative to theirs, and s.
-#   mahimahi: the table's seconds run from ms 0 to 999, ours end with the packets of ms 1000.
 #   solis_wifi: the table takes each line as 1 s, we go by the times in the file, which jitter.
 #   sabre: whole kbit/s, cut off, so up to 0.125 KB/s less.
-LOOSER = {
-    "mahimahi": (0.0, 0.01, 1e-3, 1.0),
-    "solis_wifi": (0.0, 0.01, 4e-3, 0.6),
-    "belgium_4g sabre": (0.125, 0.0, 0.0, 0.0),
-}
+LOOSER = {"solis_wifi": (0.0, 0.01, 4e-3, 0.6), "belgium_4g sabre": (0.125, 0.0, 0.0, 0.0)}
 # Two Solis files whose only zeros are lines with the same time as the next one.
 LEAST_WITHOUT_LINES_OF_NO_LENGTH = {"wifi_cafe_231115-154511": 45.0, "wifi_restr_231115-134450": 42.5}
 
-Table = dict[tuple[str, str], dict[str, float]]
 
-
-@pytest.fixture(scope="module")
-def table(shared_data: Path) -> Table:
+def compare(shared_data: Path, data_set: str, traces: dict[str, Trace], looser: tuple[float, ...] = (0,) * 4) -> None:
+    rates, extremes, mean, s = looser
     with open(shared_data / "STATS.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    return {
-        (row["set"], row["trace"]): {k: float(v) for k, v in row.items() if k not in ("set", "trace")} for row in rows
-    }
+        rows = {row.pop("trace"): row for row in csv.DictReader(file) if row.pop("set") == data_set}
+    for name, trace in traces.items():
+        summary, expected = describe(trace), {key: float(value) for key, value in rows[name].items()}
+        expected["min_KBps"] = LEAST_WITHOUT_LINES_OF_NO_LENGTH.get(name, expected["min_KBps"])
+        assert set(summary) == set(expected)
+        for key, value in expected.items():
+            relative = {"mean_KBps": mean, "min_KBps": extremes, "max_KBps": extremes}.get(key, 0.0)
+            absolute = ROUNDING + (rates if key.endswith("KBps") and key[0] == "m" else s)
+            assert summary[key] == pytest.approx(value, rel=relative, abs=absolute), (trace.source, key)
 
 
-def compare(trace: Trace, expected: dict[str, float], rates: float, extremes: float, mean: float, s: float) -> None:
-    summary = describe(trace)
-    assert set(summary) == set(expected)
-    for key, value in expected.items():
-        if key == "min_KBps":
-            value = LEAST_WITHOUT_LINES_OF_NO_LENGTH.get(trace.name, value)
-        relative = {"mean_KBps": mean, "min_KBps": extremes, "max_KBps": extremes}.get(key, 0.0)
-        absolute = ROUNDING + (rates if key.endswith("KBps") and key[0] == "m" else s)
-        assert summary[key] == pytest.approx(value, rel=relative, abs=absolute), (trace.source, key)
+NIGHTLY = [pytest.param(name, marks=pytest.mark.nightly) for name in SETS if "raw" not in name]
 
 
-@pytest.mark.parametrize("name", SETS)
-def test_recorded_links_agree_with_the_table(shared_data: Path, table: Table, name: str) -> None:
+@pytest.mark.parametrize("name", ["belgium_4g raw", *NIGHTLY])
+def test_recorded_links_agree_with_the_table(shared_data: Path, name: str) -> None:
     pattern, format, count = SETS[name]
     paths = sorted(shared_data.glob(pattern))
-    assert len(paths) == count
-    for path in paths:
-        trace = read_trace(path)
-        assert f"format {format}, detected" in trace.source
-        compare(trace, table[name.split()[0], trace.name], *LOOSER.get(name, (0.0, 0.0, 0.0, 0.0)))
+    traces = {trace.name: trace for trace in map(read_trace, paths)}
+    assert len(traces) == count and all(f"format {format}, detected" in trace.source for trace in traces.values())
+    compare(shared_data, name.split()[0], traces, LOOSER.get(name, (0,) * 4))
+    if format == "belgium":  # a raw log and its CSV are one trace
+        for path in paths:
+            assert read_trace(path) == read_trace(shared_data / "belgium_4g" / "csv" / f"{path.stem}.csv")
 
 
-def test_ucc_downloads_agree_with_the_table(shared_data: Path, table: Table) -> None:
-    """The table counts each line as 1 s, and so does the reader: nothing is left but rounding."""
+@pytest.mark.nightly
+def test_every_member_of_the_ucc_archive(shared_data: Path) -> None:
+    """The table counts each line of a download as 1 s, and so does the reader: nothing is left but rounding."""
     archive = shared_data / "ucc_5g" / "5G-production-dataset.zip"
-    expected = {name: row for (data_set, name), row in table.items() if data_set == "ucc_5g_download"}
-    downloads = [name for name in members(archive) if "/Download/" in name]
-    assert len(downloads) == len(expected) == 21
-    for member in downloads:
-        trace = read_trace(f"{archive}:{member}")
-        assert "format ucc, detected, column DL_bitrate" in trace.source
-        compare(trace, expected["/".join(member.split("/")[-2:])], 0.0, 0.0, 0.0, 0.0)
-
-
-def test_every_member_of_the_ucc_archive_reads_by_either_column(shared_data: Path) -> None:
-    archive = shared_data / "ucc_5g" / "5G-production-dataset.zip"
-    assert len(members(archive)) == 83
-    for k, member in enumerate(members(archive)):
-        column = ("DL_bitrate", "UL_bitrate")[k % 2]
-        trace = read_trace(f"{archive}:{member}", column=column)
-        assert f"column {column}, 1 s a line" in trace.source
-        assert trace.duration_us == (trace.time_us.size - 1) * 1_000_000 and trace.total_bytes > 0
-
-
-def test_mahimahi_by_the_tables_own_seconds(shared_data: Path, table: Table) -> None:
-    """In windows that end before the packets of ms 1000, 2000, .. the table's numbers come out exactly."""
-    for path in sorted((shared_data / "mahimahi").glob("*.gz")):
-        trace = read_trace(path)
-        assert trace.total_bytes == 1500 * len(gzip.decompress(path.read_bytes()).split())
-        edges_us = np.arange(0, trace.duration_us + 1, 1_000_000) - 1000
-        edges_us[0] = 0
-        rates = np.diff(np.interp(edges_us, trace.time_us, trace.cumulative_bytes)) / 1e3
-        row = table["mahimahi", trace.name]
-        assert rates.min() == pytest.approx(row["min_KBps"], abs=ROUNDING)
-        assert rates.max() == pytest.approx(row["max_KBps"], abs=ROUNDING)
-        assert (rates < 500).sum() == row["seconds_below_500KBps"]
-
-
-def test_belgium_csv_and_raw_log_are_one_trace(shared_data: Path) -> None:
-    for raw in sorted((shared_data / "belgium_4g" / "raw").glob("*.log")):
-        assert read_trace(raw) == read_trace(shared_data / "belgium_4g" / "csv" / f"{raw.stem}.csv")
+    traces = {member: read_trace(f"{archive}:{member}") for member in members(archive)}
+    downloads = {"/".join(m.split("/")[-2:]): trace for m, trace in traces.items() if "/Download/" in m}
+    assert len(traces) == 83 and len(downloads) == 21
+    compare(shared_data, "ucc_5g_download", downloads)
 
 
 def test_car_0002_fades_in_its_seconds_21_and_23(shared_data: Path) -> None:
     """The trace of the AFR paper's evaluation (490.2 and 222.3 KB/s, by the README of the data)."""
     _, rates = read_trace(shared_data / "belgium_4g" / "csv" / "report_car_0002.csv").segments()
-    low = np.flatnonzero(rates < 500_000)
-    assert low.tolist() == [21, 23, 73, 82, 128, 157, 294, 296, 395]
+    assert np.flatnonzero(rates < 500_000).tolist() == [21, 23, 73, 82, 128, 157, 294, 296, 395]
     assert (rates[[21, 23]] / 1e3).round(1).tolist() == [490.2, 222.3]
 
 
-def test_5g_uplinks_but_the_runs_that_failed(shared_data: Path) -> None:
-    """263 runs are sound; the other 4 are refused with what their server said. All together as the README says."""
-    paths, traces, failed = sorted((shared_data / "uplink_5g").glob("*.gz")), [], []
-    for path in paths:
+@pytest.mark.nightly
+def test_uplinks_carry_what_their_own_totals_say(shared_data: Path) -> None:
+    """Of 267 runs on 5G 4 failed, and are refused with what their server said; iperf3 adds up its own bytes."""
+    traces, failed = [], []
+    for path in sorted((shared_data / "uplink_5g").glob("*.gz")):
         try:
             traces.append(read_trace(path))
         except TraceError as error:
             failed.append(str(error))
-    assert len(traces) == 263 and len(failed) == 4
-    assert all(
-        "error from server" not in trace.source and "format nuttcp, detected" in trace.source for trace in traces
-    )
-    assert all("must be a run that succeeded" in error for error in failed)
+    assert len(traces) == 263 and len(failed) == 4 and all("must be a run that succeeded" in error for error in failed)
     seconds = sum(trace.duration_us for trace in traces) / 1e6
     assert sum(trace.total_bytes for trace in traces) / seconds == pytest.approx(5.27e6, abs=0.01e6)
-
-
-def test_a_5g_run_has_the_bytes_that_nuttcp_adds_up(shared_data: Path) -> None:
-    """Its last line says 1047.5190 MB in 120.63 s; the last tenth of a second has no interval of its own."""
-    trace = read_trace(shared_data / "uplink_5g" / "20241101_145941847.out.gz")
-    assert trace.duration_us == 120_500_000
-    assert trace.total_bytes / 2**20 == pytest.approx(1047.519, rel=1e-3)
-
-
-def test_wifi_uplinks_have_the_bytes_that_iperf3_adds_up(shared_data: Path) -> None:
-    paths = sorted((shared_data / "uplink_wifi").glob("*.json.gz"))
-    assert len(paths) == 38
-    for path in paths:
+    for path in sorted((shared_data / "uplink_wifi").glob("*.json.gz")):
         trace, received = read_trace(path), json.loads(gzip.decompress(path.read_bytes()))["end"]["sum_received"]
-        assert trace.total_bytes == received["bytes"], path.name
+        assert trace.total_bytes == received["bytes"] and trace.source.endswith("measured by the receiver)"), path.name
         assert trace.duration_us / 1e6 == pytest.approx(received["end"], abs=1e-3)
-        assert trace.source.endswith("measured by the receiver)")
-
-
-def test_mmwave_uplinks_read_run_by_run(shared_data: Path) -> None:
     paths = sorted((shared_data / "uplink_mmwave").glob("*.list.gz"))
-    traces = [read_trace(path, column=run) for path in paths for run in runs_of(path)]
-    assert len(paths) == 18 and len(traces) == 122
-    for trace in traces:
-        # Of a static run 11 to 18 s, of a walking one 43 to 63 s.
-        least, most = (11, 18) if trace.name.startswith("static") else (43, 63)
-        assert least < trace.duration_us / 1e6 < most, trace.source
+    assert sum(read_trace(path, column=run).total_bytes > 0 for path in paths for run in runs_of(path)) == 122
+    for path in sorted((shared_data / "mahimahi").glob("*.gz")):
+        assert read_trace(path).total_bytes == 1500 * len(gzip.decompress(path.read_bytes()).split())

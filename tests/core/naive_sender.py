@@ -1,7 +1,7 @@
-"""Slow, obvious twin of a sender with topics: a list per topic, messages in flight in a list, everything from scratch.
+"""Slow, obvious twin of a sender, of one queue or of several topics: lists, and everything from scratch.
 
-Written from the model's description, as ``naive`` is; it shares the exact ``naive.Link`` and calls no kernel. Messages
-are dictionaries: seq, us, bytes, x, luck, topic.
+Written from the model's description; it calls no kernel. A list holds each topic's queue, another the messages in
+flight. Messages are dictionaries: seq, us, bytes, x, uniform, topic.
 """
 
 from __future__ import annotations
@@ -36,33 +36,20 @@ class Sent(NamedTuple):
     due: int | None
 
 
+SETTINGS = {"max_bytes": None, "decide_at": "arrival", "window": 1, "ack_delay_us": 0, "propagation_us": 0}
+SETTINGS |= dict.fromkeys(("schedules", "drops_heads", "limit_at_send", "limit_since_sent", "flush_no_drop"), False)
+
+
 class Sender:
     """One sender, event by event; ``rules`` is a list, one each topic, or a single one for one queue."""
 
-    def __init__(
-        self,
-        link,
-        rules,
-        capacity,
-        *,
-        max_bytes=None,
-        decide_at="arrival",
-        window=1,
-        ack_delay_us=0,
-        propagation_us=0,
-        schedules=False,
-        drops_heads=False,
-        limit_at_send=False,
-        limit_since_sent=False,
-        flush_no_drop=False,
-    ):
-        self.link, self.capacity, self.decide_at = link, capacity, decide_at
+    def __init__(self, link, rules, capacity, **settings):
+        """``settings``: any of ``SETTINGS``."""
+        vars(self).update({**SETTINGS, **settings}, link=link, capacity=capacity)
+        self.ask = lambda event: None  # who answers, to be set
         self.one_queue = isinstance(rules, Rules)
         self.rules = [rules] if self.one_queue else rules
-        self.max_bytes = math.inf if max_bytes is None else max_bytes
-        self.window, self.ack_delay_us, self.propagation_us = window, ack_delay_us, propagation_us
-        self.schedules, self.drops_heads = schedules, drops_heads
-        self.limit_at_send, self.limit_since_sent, self.flush_no_drop = limit_at_send, limit_since_sent, flush_no_drop
+        self.max_bytes = self.max_bytes or math.inf
         self.queues = [[] for _ in self.rules]
         self.arrived = [[] for _ in self.rules]  # all that came, kept or not
         self.kept = [[] for _ in self.rules]  # all that was ever enqueued
@@ -76,11 +63,10 @@ class Sender:
         self.to_come = self.last_us = 0
         self.now = 0
         self.dequeued, self.transmitted, self.dropped, self.order = {}, {}, {}, []
+        self.origin = {}  # by topic, before any of it was sent: the message that entered its empty queue last
         self.limited = set()  # dropped by a rate limit
         self.rejected = self.evicted = self.invalid = 0
         self.evictions = 0  # of those, for the newcomer
-
-    # --- what there is ---------------------------------------------------------------------------------------------
 
     def lane(self, message):
         """Which of the queues the message belongs to."""
@@ -96,38 +82,38 @@ class Sender:
         earlier = [m for m in self.sent[lane] + self.queues[lane] if m["seq"] < message["seq"]]
         return earlier[-1] if earlier else None
 
-    # --- events ----------------------------------------------------------------------------------------------------
-
-    def events(self, messages, first_decision=0, last_decision=math.inf):
-        """Yields "decision", "send", "dequeue" (each wants an answer sent back), "departure" and at last "end"."""
+    def run(self, messages, first_decision=0, last_decision=math.inf):
+        """Meets all messages. ``ask(event)`` answers "decision", "send" and "dequeue", and hears "departure", "end"."""
         self.to_come, self.last_us = len(messages), messages[-1]["us"]
         for message in messages:
-            yield from self.advance(message["us"])
+            self.advance(message["us"])
             self.now, self.held = message["us"], False
-            if self.too_soon(message):
-                self.drop(message)
-                self.limited.add(message["seq"])
-                self.rejected += 1
-            elif message["bytes"] > self.max_bytes:
-                self.drop(message)
-                self.rejected += 1
-            else:
-                asked = first_decision <= message["seq"] <= last_decision
-                asked = asked and not (self.decide_at == "overflow" and self.fits(message))
-                self.newcomer = message if asked else None
-                self.evictions, settled = 0, False
-                while not settled:
-                    decision = (yield "decision") if asked else ACCEPT
-                    settled = self.carry_out(decision, message)
-                self.newcomer = None
-            self.arrived[self.lane(message)].append(message)
-            self.to_come -= 1
-            yield from self.offer()
-        yield from self.advance(math.inf)
-        yield "end"
+            self.arrive(message, first_decision <= message["seq"] <= last_decision)
+        self.advance(math.inf)
+        self.ask("end")
+        return self
+
+    def arrive(self, message, asked):
+        if self.too_soon(message):
+            self.drop(message)
+            self.limited.add(message["seq"])
+            self.rejected += 1
+        elif message["bytes"] > self.max_bytes:
+            self.drop(message)
+            self.rejected += 1
+        else:
+            asked = asked and not (self.decide_at == "overflow" and self.fits(message))
+            self.newcomer = message if asked else None
+            self.evictions, settled = 0, False
+            while not settled:
+                settled = self.carry_out(self.ask("decision") if asked else ACCEPT, message)
+            self.newcomer = None
+        self.arrived[self.lane(message)].append(message)
+        self.to_come -= 1
+        self.offer()
 
     def advance(self, until):
-        """All pongs and crossings up to and including ``until``; of those at the same time, pongs first."""
+        """All acks and crossings up to and including ``until``; of those at the same time, acks first."""
         while True:
             ack = self.acks[0][0] if self.acks else math.inf
             done = self.socket[0].due if self.socket and self.socket[0].due is not None else math.inf
@@ -136,17 +122,20 @@ class Sender:
             self.now = min(ack, done)
             if ack <= done:
                 self.answered(self.acks.pop(0)[1])
-                yield from self.offer()
-                continue
-            message = self.socket.pop(0).message
-            self.transmitted[message["seq"]] = self.now
-            self.order.append(message["seq"])
-            if self.ack_delay_us > 0:
-                self.acks.append((self.now + self.ack_delay_us, message))
+                self.offer()
             else:
-                self.answered(message)
-            # What is taken at this very moment follows byte by byte, without a pause.
-            yield from self.offer(self.position)
+                self.crossed()
+
+    def crossed(self):
+        """The message in transmission has left; what is taken at this moment follows byte by byte, without a pause."""
+        message = self.socket.pop(0).message
+        self.transmitted[message["seq"]] = self.now
+        self.order.append(message["seq"])
+        if self.ack_delay_us > 0:
+            self.acks.append((self.now + self.ack_delay_us, message))
+        else:
+            self.answered(message)
+        self.offer(self.position)
 
     def answered(self, message):
         self.in_flight.remove(message)
@@ -156,17 +145,17 @@ class Sender:
         """The socket takes what it may; into an empty one the first byte goes at ``position``, or at the link's now."""
         while not self.held and any(self.window_open(m) for m in self.slots()):
             head = self.slots()[0]
-            if self.drops_heads and (yield "dequeue") and not self.rules[self.lane(head)].no_drop:
+            if self.drops_heads and self.ask("dequeue") and not self.rules[self.lane(head)].no_drop:
                 self.remove(head)
                 continue
             message = self.oldest_sendable()
             if self.schedules:
-                message = self.choice((yield "send"))
+                message = self.choice(self.ask("send"))
             if message is None:
                 self.held = True
                 return
             self.dequeue(message, position)
-            yield "departure"
+            self.ask("departure")
 
     def dequeue(self, message, position):
         if not self.socket:
@@ -177,8 +166,6 @@ class Sender:
         self.queues[self.lane(message)].remove(message)
         self.sent[self.lane(message)].append(message)
         self.dequeued[message["seq"]] = self.now
-
-    # --- what may be sent ------------------------------------------------------------------------------------------
 
     def window_open(self, message):
         flushed = self.flush_no_drop and self.rules[self.lane(message)].no_drop
@@ -209,8 +196,6 @@ class Sender:
             return slots[k]
         self.invalid += 1
         return self.oldest_sendable()
-
-    # --- what may be kept ------------------------------------------------------------------------------------------
 
     def too_soon(self, message):
         lane = self.lane(message)
@@ -272,6 +257,8 @@ class Sender:
         return True
 
     def enqueue(self, message):
+        if not self.sent[self.lane(message)] and not self.queues[self.lane(message)]:
+            self.origin[self.lane(message)] = message
         self.queues[self.lane(message)].append(message)
         self.kept[self.lane(message)].append(message)
 
@@ -282,8 +269,6 @@ class Sender:
 
     def drop(self, message):
         self.dropped[message["seq"]] = self.now
-
-    # --- information, each time from scratch -----------------------------------------------------------------------
 
     def gain(self, lane, messages):
         """Weight x sum of V over these messages of one topic."""
@@ -331,8 +316,6 @@ class Sender:
             for us, m in self.received(lane, until)
             if us - m["us"] > rules.deadline_us
         )
-
-    # --- what the policy sees --------------------------------------------------------------------------------------
 
     def left_bytes(self):
         """Bytes that the socket took and that have not crossed yet."""

@@ -1,14 +1,14 @@
-"""What is observed of several topics: event by event against its twin, written from the table of fields."""
+"""What is observed of one queue and of several topics: event by event against a twin, written from their tables."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from topic_cases import TWIN_V, TopicCase, choice, decision, topic_cases, unwanted
+from hypothesis import given
+from topic_cases import TWIN_V, TopicCase, topic_cases
 
-from bufgym.kernel import JIT
 from bufgym.model.buffer import UNLIMITED_BYTES
+from bufgym.model.topics import Topic
 from bufgym.observe import (
     CONTEXT_FIELDS,
     FIELDS,
@@ -16,26 +16,15 @@ from bufgym.observe import (
     TOPIC_CONTEXT_FIELDS,
     TOPIC_FIELDS,
     TOPIC_SLOT_FIELDS,
+    observe_context,
+    observe_slots,
     observe_topic_context,
     observe_topic_slots,
 )
-from bufgym.sim import (
-    DECISION,
-    DEPARTURE,
-    DEQUEUE,
-    END,
-    SEND,
-    answer_dequeue,
-    answer_send,
-    decide,
-    named,
-    next_event,
-    python_view,
-)
+from bufgym.sim import named, python_view
 
 SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
 CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
-NAMES = {DECISION: "decision", DEPARTURE: "departure", DEQUEUE: "dequeue", SEND: "send", END: "end"}
 
 
 def per(g, r):
@@ -44,11 +33,11 @@ def per(g, r):
 
 
 class Twin:
-    """The fields of one moment, from what the slow sender of ``naive_topics`` knows."""
+    """The fields of one moment, from what the slow sender of ``naive_sender`` knows."""
 
-    def __init__(self, case: TopicCase, sender, buffer, origin) -> None:
-        self.case, self.sender, self.buffer, self.origin = case, sender, buffer, origin
-        self.topics = case.topics
+    def __init__(self, case: TopicCase, sender, buffer) -> None:
+        self.case, self.sender, self.buffer = case, sender, buffer
+        self.topics = case.topics or (Topic("only"),)
         self.top = max(topic.share for topic in self.topics) or 1.0
         self.newcomer = sender.newcomer
         self.L = case.case.capacity
@@ -57,23 +46,30 @@ class Twin:
         return TWIN_V[self.topics[lane].value or self.case.v]
 
     def even(self, lane, field, last):
-        """The even spacing of a topic: from what was sent last (until then: kept first) to its arrival ``last``."""
+        """The even spacing of a topic: from what was sent last (until then: kept first) to its arrival ``last``.
+
+        One queue: that of L messages.
+        """
+        if self.sender.one_queue:
+            return (last - self.sender.reference()[field]) / (self.L + 1)
         sent, queued = self.sender.sent[lane], self.sender.queues[lane]
         if not sent and not queued:
             return 0.0
-        begin = sent[-1] if sent else self.origin[lane]
+        begin = sent[-1] if sent else self.sender.origin[lane]
         return max(last - begin[field], 0) / (len(queued) + 1)
 
     def last(self, lane, field):
         """Of a topic's last arrival, the newcomer included."""
-        if self.newcomer is not None and self.newcomer["topic"] == lane:
+        if self.newcomer is not None and self.sender.lane(self.newcomer) == lane:
             return self.newcomer[field]
         arrived = self.sender.arrived[lane]
         return arrived[-1][field] if arrived else 0
 
     def gaps(self, m, field):
         """To what is kept before it on its topic, and to what follows; one more step where nothing does."""
-        lane, s = m["topic"], self.sender
+        lane, s = self.sender.lane(m), self.sender
+        if s.one_queue:
+            return s.gaps(m, field)
         before = s.kept_before(m) or m
         arrived, later = s.arrived[lane], [q for q in s.queues[lane] if q["seq"] > m["seq"]]
         step = arrived[-1][field] - arrived[-2][field] if len(arrived) > 1 else 0
@@ -90,19 +86,22 @@ class Twin:
     def gain(self, m):
         """V of what its delivery adds, weighted; the first of a topic is the 1 in its H."""
         before = self.sender.kept_before(m)
-        return 0.0 if before is None else self.topics[m["topic"]].share * self.v(m["topic"])(m["x"] - before["x"])
+        lane = self.sender.lane(m)
+        return 0.0 if before is None else self.topics[lane].share * self.v(lane)(m["x"] - before["x"])
 
     def candidate(self, m, k):
         """All slot fields of message ``m`` at place ``k``; the newcomer comes after all that are queued."""
-        s, lane, messages = self.sender, m["topic"], self.candidates()
+        s, lane, messages = self.sender, self.sender.lane(m), self.candidates()
         topic, v, queue = self.topics[lane], self.v(lane), s.queues[lane]
         (a_us, b_us), (a, b) = self.gaps(m, "us"), self.gaps(m, "x")
         even_us = self.even(lane, "us", self.last(lane, "us"))
         even_x = self.even(lane, "x", self.last(lane, "x"))
         lost = max(v(a) + v(b) - v(a + b), 0.0)
+        if s.one_queue and k == 0 and not s.sent[0]:
+            lost = 0.0  # the first message of all has no gap before it yet
         age = s.now - m["us"]
         gains = [self.gain(each) / self.top / each["bytes"] for each in messages]
-        of_newcomer = self.newcomer is not None and lane == self.newcomer["topic"]
+        of_newcomer = self.newcomer is not None and lane == s.lane(self.newcomer)
         return {
             "occupied": 1.0,
             "rank": 1.0 if m is self.newcomer else (k + 1) / (len(s.slots()) + 1),
@@ -154,7 +153,7 @@ class Twin:
             "in_flight": per(len(s.in_flight), self.case.case.episode.window),
         }
         if m is not None:
-            lane = m["topic"]
+            lane = s.lane(m)
             before, v = s.arrived[lane][-1:] or [m], self.v(lane)
             even_us, even_x = self.even(lane, "us", m["us"]), self.even(lane, "x", m["x"])
             made["arrival_time_gap"] = per(m["us"] - before[0]["us"], even_us)
@@ -164,72 +163,39 @@ class Twin:
         return made
 
 
-def with_origins(sender):
-    """{topic: the message that entered its empty queue last, before any was sent}, kept up to date by ``sender``."""
-    origin, enqueue = {}, sender.enqueue
-
-    def noting(message):
-        lane = message["topic"]
-        if not sender.sent[lane] and not sender.queues[lane]:
-            origin[lane] = message
-        enqueue(message)
-
-    sender.enqueue = noting
-    return origin
-
-
 def observed(batch, buffer, arriving):
     """Both observations, by the kernels; the places are full of rubbish before."""
     rows = np.full((len(SLOT_NAMES), buffer.capacity + 1), np.nan)
     context = np.full(len(CONTEXT_NAMES), np.nan)
     sender = batch.senders[0]
     arrival = batch.arrivals[0, min(sender.next, sender.arrivals - 1)]
-    observe_topic_slots(buffer, arrival, arriving, rows)
-    observe_topic_context(buffer, arrival, arriving, context)
-    return dict(zip(SLOT_NAMES, rows, strict=True)), dict(zip(CONTEXT_NAMES, context, strict=True))
+    if sender.topics == 1:
+        rows, context = rows[: len(SLOT_FIELDS)], context[: len(CONTEXT_FIELDS)]
+        observe_slots(buffer, arrival, rows)
+        observe_context(buffer, arrival, context)
+    else:
+        observe_topic_slots(buffer, arrival, arriving, rows)
+        observe_topic_context(buffer, arrival, arriving, context)
+    return dict(zip(SLOT_NAMES, rows, strict=False)) | dict(zip(CONTEXT_NAMES, context, strict=False))
 
 
-@pytest.mark.slow
-@given(topic_cases(min_topics=2))
-@settings(max_examples=50 if JIT else 10)
+@pytest.mark.kernels
+@given(topic_cases(max_messages=25).filter(lambda case: len(case.topics) != 1))
 def test_every_field_is_its_twins(case):
-    senders, twin = case.senders(), case.twin()
-    batch, L = senders.batch, case.case.capacity
-    seen = named(batch)
-    origin, events = with_origins(twin), case.twin_events(twin)
-    event_name = next(events)
-    while True:
-        event = next_event(batch, None, 0)
-        assert NAMES[event] == event_name
-        if event == END:
-            break
-        sender = seen.senders[0]
-        if event in (DECISION, SEND):
+    def check(event, senders, twin):
+        if event == "decision" or (event == "send" and case.topics):
+            seen = named(senders.batch)
             buffer = python_view(seen, 0)
-            by_definition = Twin(case, twin, buffer, origin)
-            slots, context = observed(seen, buffer, event == DECISION)
-            for name, numbers in (by_definition.slots() | by_definition.context()).items():
-                kernels = (slots | context)[name]
-                np.testing.assert_allclose(kernels, numbers, rtol=1e-6, atol=1e-6, err_msg=f"{name} at a {event_name}")
-                assert ((kernels >= 0) & (kernels <= 1)).all(), name
-        answer = None
-        if event == DECISION:
-            answer = decision(seen.arrivals[0, sender.next].uniform, L)
-            decide(batch, 0, answer)
-        elif event == SEND:
-            answer = choice(twin.now, len(twin.slots()), len(twin.dequeued), L)
-            answer_send(batch, 0, answer)
-        elif event == DEQUEUE:
-            answer = unwanted(twin.now, len(twin.slots()))
-            answer_dequeue(batch, 0, answer)
-        event_name = events.send(answer)
+            by_definition = Twin(case, twin, buffer)
+            by_definition = by_definition.slots() | by_definition.context()
+            for name, numbers in observed(seen, buffer, event == "decision").items():
+                what = f"{name} at a {event}"
+                np.testing.assert_allclose(numbers, by_definition[name], rtol=1e-6, atol=1e-6, err_msg=what)
+                assert ((numbers >= 0) & (numbers <= 1)).all(), name
+
+    case.beside_its_twin(check)
 
 
 def test_the_twin_knows_every_field():
     assert len({*SLOT_NAMES, *CONTEXT_NAMES}) == len(FIELDS + TOPIC_FIELDS)
-
-
-@pytest.mark.parametrize("field", TOPIC_FIELDS, ids=lambda field: field.name)
-def test_fields_say_what_they_are(field):
-    assert field.meaning and field.unit and field.group == "topic"
-    assert (field in TOPIC_SLOT_FIELDS) == (field.per == "slot")
+    assert all(field.meaning and field.unit and field.group == "topic" for field in TOPIC_FIELDS)

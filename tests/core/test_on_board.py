@@ -1,4 +1,4 @@
-"""The link's rate as a robot's own socket shows it: by hand, then against the twin; and the fields made of it."""
+"""Fields of what a robot has on board: the link's rate by hand and against the twin, and gaps counted in messages."""
 
 from __future__ import annotations
 
@@ -7,14 +7,23 @@ from dataclasses import replace
 import naive
 import numpy as np
 import pytest
-from cases import cases, newcomer, queue_of
+from cases import ANYTHING, cases, newcomer, queue_of
 from hypothesis import given
 from test_sender import MS, V, line
 
 from bufgym import policies
 from bufgym.model import qoi
-from bufgym.model.buffer import ACCEPT
-from bufgym.observe import ON_BOARD_FIELDS, observe_on_board
+from bufgym.model.buffer import ACCEPT, REJECT
+from bufgym.observe import (
+    ON_BOARD_FIELDS,
+    ON_BOARD_SLOT_FIELDS,
+    SLOT_FIELDS,
+    observe_on_board,
+    observe_on_board_slots,
+    observe_slots,
+)
+
+pytestmark = pytest.mark.kernels
 
 
 def recorder(seen):
@@ -61,9 +70,6 @@ def test_the_links_rate_as_the_twin_measures_it(case):
     assert seen == twin
 
 
-# --- fields ----------------------------------------------------------------------------------------------------------
-
-
 def seen(**known):
     """The fields of an empty queue of L = 3 that a newcomer of 1000 bytes, 4 gaps on, meets each 10 ms."""
     arrival = newcomer()
@@ -100,3 +106,59 @@ def test_fields_by_hand():
 def test_only_those_who_read_the_rate_have_it_measured():
     assert not policies.get("afr").measures
     assert policies.Policy("own", lambda buffer, arrival, memory: ACCEPT).measures
+
+
+NUMBERS = [field.name for field in ON_BOARD_SLOT_FIELDS]
+OTHERS = [field.name for field in SLOT_FIELDS]
+
+
+def rows_of(buffer, arrival):
+    rows = np.zeros((len(NUMBERS), buffer.capacity + 1))
+    observe_on_board_slots(buffer, arrival, rows)
+    return rows
+
+
+def slots_recorder(seen, decide):
+    def on_arrival(buffer, arrival, memory):
+        seen.append((buffer.dequeued_seq, rows_of(buffer, arrival)))
+        one_by_one = [
+            [f.function(buffer, arrival, k) for k in range(len(buffer.slots) + 1)] for f in ON_BOARD_SLOT_FIELDS
+        ]
+        where = [*range(len(buffer.slots)), buffer.capacity]
+        np.testing.assert_array_equal(seen[-1][1][:, where], one_by_one)
+        return decide(buffer, arrival, memory)
+
+    return policies.Policy("recorder", on_arrival)
+
+
+def test_gaps_in_messages_by_hand():
+    # The socket takes message 0 at once and holds it; 1 is kept, 2 and 3 are rejected, 4 is kept, 5 asks. L = 2: the
+    # even spacing is 5 / 3 messages, and a third of 1, 2.5 and so on comes of gap / (gap + spacing).
+    seen = []
+    keep = {0, 1, 4}
+    line([0, 1, 1, 1, 1, 9], sizes=100_000).run(
+        slots_recorder(seen, lambda buffer, arrival, memory: ACCEPT if arrival.seq in keep else REJECT)
+    )
+    assert [seq for seq, _ in seen] == [0, 0, 0, 0, 0, 0]
+    even = 5 / 3
+    before, merged = np.array([1, 3, 1]), np.array([4, 4, 2])
+    np.testing.assert_allclose(seen[5][1], [before / (before + even), merged / (merged + 2 * even)])
+    # Message 1 was asked for before anything but 0: one message since, and the next is one more.
+    np.testing.assert_allclose(seen[1][1][:, [0, 2]], [[0, 1 / (1 + 1 / 3)], [0, 2 / (2 + 2 / 3)]])
+
+
+@given(cases())
+def test_a_coordinate_that_counts_messages_has_the_same_gaps(case):
+    arrivals = case.episode.arrivals.copy()
+    arrivals["x"] = np.arange(len(arrivals))
+    case = replace(case, episode=replace(case.episode, arrivals=arrivals))
+
+    def on_arrival(buffer, arrival, memory):
+        if arrival.seq > 0:  # the first of all has no step behind it
+            slots = np.zeros((len(OTHERS), buffer.capacity + 1))
+            observe_slots(buffer, arrival, slots)
+            of_x = [slots[OTHERS.index(name)] for name in ("motion_before", "motion_merged")]
+            np.testing.assert_allclose(rows_of(buffer, arrival), of_x, rtol=1e-6)
+        return ANYTHING.on_arrival(buffer, arrival, memory)
+
+    case.run(policies.Policy("compared", on_arrival), V)

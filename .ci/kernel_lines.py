@@ -1,0 +1,99 @@
+"""Which lines of kernels ran as plain Python? ``kernel_lines.py DATA`` reads what coverage.py measured in a test run.
+
+A kernel's line counts where the function is compiled: decorated with ``@kernel``, ``@direct`` or ``@register(...,
+compile=True)``, or handed to one of these. Fails where under 95 % ran, where a line that did not run has no reason in
+``kernel_lines.toml``, or where a reason there is out of date.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import coverage
+
+REPO = Path(__file__).resolve().parent.parent
+ROOMS = ("model", "sim", "policies", "oracle", "observe", "envs")
+"""Rooms of the core. All kernels that decide what a sender does are in these."""
+LEAST = 0.95
+"""Share of lines that must run."""
+DECORATORS = {"kernel", "direct", "_field"}
+CALLS = {"kernel", "direct", "compile_for"}
+HOOKS = {"on_arrival", "on_departure", "on_dequeue", "on_send", "function"}
+
+
+def _called(node: ast.expr) -> str:
+    """Name of a decorator or of a function that is called."""
+    node = node.func if isinstance(node, ast.Call) else node
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def _compiles(call: ast.Call) -> bool:
+    """Whether a call says ``compile=True``."""
+    return any(
+        word.arg == "compile" and isinstance(word.value, ast.Constant) and word.value.value is True
+        for word in call.keywords
+    )
+
+
+def kernels(source: str) -> Iterator[ast.FunctionDef]:
+    """All functions of a module that Numba compiles."""
+    nodes = list(ast.walk(ast.parse(source)))
+    handed: set[str] = set()
+    for node in nodes:
+        if isinstance(node, ast.Call) and (_called(node) in CALLS or _compiles(node)):
+            values = [*node.args, *(word.value for word in node.keywords if word.arg in HOOKS)]
+            handed |= {value.id for value in values if isinstance(value, ast.Name)}
+    for node in nodes:
+        if isinstance(node, ast.FunctionDef):
+            marks = node.decorator_list
+            decorated = any(
+                _called(mark) in DECORATORS or (isinstance(mark, ast.Call) and _compiles(mark)) for mark in marks
+            )
+            if decorated or node.name in handed:
+                yield node
+
+
+def lines(function: ast.FunctionDef) -> range:
+    """Line numbers of a function's body."""
+    return range(function.body[0].lineno, (function.end_lineno or 0) + 1)
+
+
+def main(data: str) -> int:
+    """Print the share and the lines that did not run; 1 for a failure."""
+    measured = coverage.Coverage(data_file=data)
+    measured.load()
+    with open(REPO / ".ci" / "kernel_lines.toml", "rb") as file:
+        reasons: dict[str, dict[str, str]] = tomllib.load(file)
+    total, ran, faults = 0, 0, []
+    for path in sorted(path for room in ROOMS for path in (REPO / "bufgym" / room).rglob("*.py")):
+        name = path.relative_to(REPO / "bufgym").as_posix()
+        text = path.read_text(encoding="utf-8")
+        found = {line for function in kernels(text) for line in lines(function)}
+        if not found:
+            continue
+        _, statements, _, missing, _ = measured.analysis2(str(path))
+        total += len(found & set(statements))
+        ran += len(found & set(statements) - set(missing))
+        given = dict(reasons.pop(name, {}))
+        left = set()
+        for number in sorted(found & set(missing)):
+            line = text.splitlines()[number - 1].strip()
+            if line in given:
+                left.add(line)
+            else:
+                faults.append(f"bufgym/{name}:{number}: did not run: {line}")
+        faults += [f"kernel_lines.toml: {name}: it does run, or is gone: {line}" for line in given if line not in left]
+    faults += [f"kernel_lines.toml: {name}: has no kernels" for name in reasons]
+    share = ran / max(total, 1)
+    print("\n".join([*faults, f"{ran} of {total} lines of kernels ran as plain Python: {share:.1%}"]))
+    if share < LEAST:
+        print(f"at least {LEAST:.0%} must")
+    return 1 if faults or share < LEAST else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

@@ -1,0 +1,30 @@
+"""Does the sdist in ``dist`` stand alone? Its own tests, a quick part, run on its own sources in an empty folder."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
+from pathlib import Path
+
+REPO = Path(__file__).resolve().parent.parent
+TESTS = ("tests/core/test_sender.py", "tests/core/test_policies.py", "tests/envs/test_single.py", "tests/test_cli.py")
+
+
+def main() -> int:
+    """The exit code of pytest there."""
+    (archive,) = (REPO / "dist").glob("bufgym-*.tar.gz")
+    with tempfile.TemporaryDirectory() as name:
+        with tarfile.open(archive) as file:
+            file.extractall(name, filter="data")
+        (folder,) = Path(name).iterdir()
+        data = os.environ.get("BUFGYM_SHARED_DATA", str(REPO.parent / "shared" / "data"))
+        given = {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1", "BUFGYM_SHARED_DATA": data}
+        command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "-m", "not nightly", *TESTS]
+        return subprocess.run(command, cwd=folder, env={**os.environ, **given}, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())

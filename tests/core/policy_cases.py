@@ -1,0 +1,45 @@
+"""Short runs of policies that their tests follow step by step."""
+
+from __future__ import annotations
+
+import numpy as np
+from cases import log, order
+
+from bufgym import policies
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.scenario import Episode, Interruption, messages
+from bufgym.sim import run
+from bufgym.sim.metrics import outcome
+from bufgym.traces import Trace
+
+V = qoi.exponential(0.618)
+
+
+def interruption(spec, L, T, uniform=0):
+    """One run through an interruption of T messages."""
+    episode = Interruption(t_max=T).episode(T).with_uniforms(np.random.default_rng(uniform))
+    return run(policies.get(spec), [episode], L, V)
+
+
+def kept(spec, L, T):
+    """What is delivered between message 0 and message T + 1."""
+    return order(interruption(spec, L, T))[1:-1]
+
+
+def drops(senders, period_us=33_333):
+    """[(arrival at which it happened, message dropped)], in that order."""
+    return sorted((us // period_us, seq) for seq, us in log(senders)["dropped_us"].items())
+
+
+def worst_ratio(spec, L, lengths):
+    """Largest gap over the even gap (T + 1) / (L + 1), the worst of all T."""
+    scenario = Interruption(t_max=max(lengths))
+    senders = run(policies.get(spec), [scenario.episode(T) for T in lengths], L, V)
+    return max(outcome(senders, i).longest_gap / ((T + 1) / (L + 1)) for i, T in enumerate(lengths))
+
+
+def stream(spec, n, period_us, capacity, *, size_bytes=1_000, bytes_per_s=1e6, x=None):
+    """n arrivals, one a period, at a steady link: 1000 bytes cross in 1 ms."""
+    arrivals = messages(np.arange(n, dtype=np.int64) * period_us, size_bytes, x)
+    return run(policies.get(spec), [Episode(arrivals, Link(Trace.constant(bytes_per_s, 60)))], capacity, V)

@@ -1,0 +1,209 @@
+"""Machine code rests on what a kernel calls and reads, and on nothing else."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from bufgym import kernel
+from bufgym.kernel.closure import closure, told_types
+from tests.conftest import COMPILED, REPO
+
+TALE = """
+from typing import NamedTuple
+import math
+import numpy as np
+from bufgym.kernel import kernel
+
+READ, UNREAD, TABLE = 2, 3, np.array([1.0, 2.0])
+
+class Pair(NamedTuple):
+    a: int
+    b: int = 1
+
+def shifted_by(step):
+    @kernel
+    def shifted(k):
+        return k + step
+    return shifted
+
+shift = shifted_by(5)
+
+@kernel
+def innermost(k):
+    return k * READ + math.floor(0.5)
+
+@kernel
+def inner(k, factor=7):
+    "Says what it does."
+    return innermost(k) + shift(k) + int(TABLE[1]) * factor
+
+@kernel
+def outer(k):
+    pair = Pair(inner(k), k)
+    return pair.a + pair.b
+
+@kernel
+def bystander(k):
+    return k
+"""
+
+
+def hash_of(source: str) -> str:
+    """The closure of ``outer`` in a module with this source."""
+    module = ModuleType("tale")
+    exec(compile(source, "tale.py", "exec"), module.__dict__)
+    return closure(getattr(module.outer, "py_func", module.outer))
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("import math", "# a comment\n\nimport math"),
+        ("Says what it does.", "Says it otherwise."),
+        ("UNREAD, TABLE = 2, 3,", "UNREAD, TABLE = 2, 4,"),
+        ("    return k\n", "    return k + 1\n"),
+    ],
+    ids=["comment and lines", "docstring", "constant that nobody reads", "kernel that nobody calls"],
+)
+def test_what_code_does_not_rest_on(before: str, after: str) -> None:
+    assert TALE.count(before) == 1
+    assert hash_of(TALE.replace(before, after)) == hash_of(TALE)
+
+
+needs_compilation = pytest.mark.skipif(not COMPILED, reason="nothing is kept without compilation")
+
+
+@needs_compilation
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("return pair.a + pair.b", "return pair.a - pair.b"),
+        ("return innermost(k) + shift(k)", "return innermost(k) - shift(k)"),
+        ("return k * READ", "return k + READ"),
+        ("READ, UNREAD, TABLE = 2,", "READ, UNREAD, TABLE = 4,"),
+        ("np.array([1.0, 2.0])", "np.array([1.0, 3.0])"),
+        ("factor=7", "factor=8"),
+        ("shifted_by(5)", "shifted_by(6)"),
+        ("math.floor", "math.ceil"),
+        ("    a: int\n    b: int = 1", "    b: int\n    a: int = 1"),
+        ("    b: int = 1", "    b: int = 2"),
+    ],
+    ids=lambda text: text.strip().partition("\n")[0][:30],
+)
+def test_what_code_rests_on(before: str, after: str) -> None:
+    assert TALE.count(before) == 1
+    assert hash_of(TALE.replace(before, after)) != hash_of(TALE)
+
+
+@needs_compilation
+def test_types_are_told_by_the_names_of_their_fields() -> None:
+    """Code finds a field by its place: two tuples that differ in their names alone are different types."""
+    import numba
+
+    whole = numba.types.int64
+    tuples = [ModuleType(str(k)) for k in range(2)]
+    for module, source in zip(
+        tuples, (TALE, TALE.replace("a: int\n    b: int = 1", "b: int\n    a: int = 1")), strict=True
+    ):
+        exec(source, module.__dict__)
+    one, other = ((numba.types.NamedTuple((whole, whole), module.Pair),) for module in tuples)
+    assert repr(one) == repr(other) and told_types(one) != told_types(other)
+
+
+def compiled(folder: Path, script: str) -> list[str]:
+    """Names of the kernels that a process compiles which runs ``script`` with the packages in ``folder``."""
+    listen = """
+from numba.core import event
+class Listener(event.Listener):
+    def on_start(self, started): print("compiles", started.data["dispatcher"].py_func.__name__)
+    def on_end(self, ended): pass
+event.register("numba:compile", Listener())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", listen + script],
+        env={**os.environ, "PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(folder / "code")},
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return [line.split()[1] for line in done.stdout.splitlines() if line.startswith("compiles ")]
+
+
+@needs_compilation
+def test_a_change_recompiles_what_calls_it_and_nothing_else(tmp_path: Path) -> None:
+    """The relay's server has no kernels. AFR's text does not matter to Drop Oldest, and both are asked for here."""
+    shutil.copytree(REPO / "bufgym", tmp_path / "bufgym", ignore=shutil.ignore_patterns("__pycache__"))
+    script = "from bufgym import policies\nfor name in ('afr', 'drop-oldest'): policies.get(name).compiled"
+    cold = compiled(tmp_path, script)
+    assert {"afr", "drop_oldest"} <= set(cold)
+    assert compiled(tmp_path, script) == []
+
+    server = tmp_path / "bufgym" / "relay" / "server.py"
+    server.write_text(server.read_text() + "\nADDED = 1\n")
+    assert compiled(tmp_path, script) == []
+
+    afr = tmp_path / "bufgym" / "policies" / "afr.py"
+    text = afr.read_text()
+    assert "return REJECT" in text
+    afr.write_text(text.replace("return REJECT", "return REJECT - 0 * len(buffer.slots)"))
+    again = compiled(tmp_path, script)
+    assert "afr" in again and "drop_oldest" not in again
+
+
+@needs_compilation
+def test_a_stale_callee_is_never_used(tmp_path: Path) -> None:
+    """The caller's own file does not change; what it calls does, and a constant of that."""
+    (tmp_path / "bufgym").symlink_to(REPO / "bufgym")
+    (tmp_path / "number.py").write_text("STEP = 1\n")
+    callee = "from bufgym.kernel import kernel\nfrom number import STEP\n@kernel\ndef callee(k):\n    return k + STEP\n"
+    (tmp_path / "callee.py").write_text(callee)
+    caller = (
+        "from bufgym.kernel import kernel\nfrom callee import callee\n@kernel\ndef caller(k):\n    return callee(k)\n"
+    )
+    (tmp_path / "caller.py").write_text(caller)
+
+    def run(answer: int) -> list[str]:
+        return compiled(tmp_path, f"from caller import caller\nassert caller(40) == {answer}, caller(40)")
+
+    assert set(run(41)) == {"caller", "callee"}
+    assert run(41) == []
+    (tmp_path / "number.py").write_text("STEP = 2\n")
+    assert set(run(42)) == {"caller", "callee"}
+    (tmp_path / "callee.py").write_text(callee.replace("k + STEP", "k - STEP"))
+    assert set(run(38)) == {"caller", "callee"}
+    (tmp_path / "number.py").write_text("STEP = 1\n")
+    (tmp_path / "callee.py").write_text(callee)
+    assert run(41) == []  # code of the earlier source is still there
+
+
+def test_every_kernel_has_a_closure_that_any_process_finds_again() -> None:
+    """No constant that a kernel reads is told by its address."""
+    from bufgym.kernel import closure as module
+
+    seen: list[str] = []
+
+    def told(value: Any, waiting: list[Any]) -> str:
+        seen.append(answer := original(value, waiting))
+        return answer
+
+    original, module._told = module._told, told
+    try:
+        from bufgym.envs import step
+        from bufgym.sim import rollout
+
+        for one in (step.step_rows, step.step_cells, rollout.rollout):
+            closure(getattr(one, "py_func", one))
+    finally:
+        module._told = original
+    assert kernel.FOLDER or not COMPILED
+    assert [text for text in seen if " at 0x" in text] == []
