@@ -169,15 +169,6 @@ def test_gilbert_elliotts_share_of_bad_time() -> None:
     assert abs(np.count_nonzero(np.diff(rates)) / 2 - 20_000 / 22) < 150
 
 
-def test_no_shadows_one_access_point() -> None:
-    """4 m away in the beginning: -30 - 30 log10(4) = -48 dBm, the best rate. At 50 m -81 dBm, the worst one."""
-    corridor = Corridor(access_points=1, shadow_db=0.0, useful_share=0.5)
-    rates = roaming(0, 100, corridor).segments()[1]
-    assert rates[0] == 65e6 / 8 / 2
-    assert rates[500] == pytest.approx(6.5e6 / 8 / 2, abs=10)
-    assert (np.diff(rates[:501]) <= 0).all() and (np.diff(rates[501:]) >= 0).all()
-
-
 def test_each_hand_over_costs_its_gap() -> None:
     """Without shadows, from the first of two access points to the second: one gap of 2 s a crossing."""
     corridor = Corridor(access_points=2, spacing_m=80.0, shadow_db=0.0, gap_s=2.0)
@@ -187,9 +178,8 @@ def test_each_hand_over_costs_its_gap() -> None:
     assert (roaming(0, 80, replace(corridor, gap_s=0.0)).segments()[1] > 0).all()
 
 
-def still_then_turning() -> Motion:
-    """10 s at rest, 10 s at 0.75 views a second (45 degrees/s)."""
-    return Motion("m", np.array([0, 10_000_000, 20_000_000]), np.array([0.0, 0.0, 7.5]))
+TURNING = Motion("m", np.array([0, 10_000_000, 20_000_000]), np.array([0.0, 0.0, 7.5]))
+"""10 s at rest, 10 s at 0.75 views a second (45 degrees/s)."""
 
 
 def test_driving_as_told_and_by_default() -> None:
@@ -208,24 +198,19 @@ def test_driving_as_told_and_by_default() -> None:
 
 def test_frames_without_chance_follow_motion_alone() -> None:
     model = FrameModel(base_bytes=100_000, motion_share=0.5, detail_share=0.0, noise_share=0.0)
-    sizes = frame_sizes(np.arange(20) * 1_000_000, still_then_turning(), 0, model)
+    sizes = frame_sizes(np.arange(20) * 1_000_000, TURNING, 0, model)
     assert sizes.tolist() == [100_000] * 11 + [150_000] * 9
-    assert frame_sizes(np.zeros(0, np.int64), still_then_turning(), 0).tolist() == []
-
-
-def test_detail_stays_while_the_camera_stands_still() -> None:
+    assert frame_sizes(np.zeros(0, np.int64), TURNING, 0).tolist() == []
+    # Detail stays while the camera stands still.
     model = FrameModel(motion_share=0.0, noise_share=0.0)
-    sizes = frame_sizes(np.arange(600) * 33_333, still_then_turning(), 1, model)
-    assert len(set(sizes[:300].tolist())) == 1
-    assert len(set(sizes[301:].tolist())) > 250
-    assert sizes.tolist() != frame_sizes(np.arange(600) * 33_333, still_then_turning(), 2, model).tolist()
-    spread = [frame_sizes(np.array([0, 10_000_000, 20_000_000]), still_then_turning(), s, model)[2] for s in range(400)]
+    sizes = frame_sizes(np.arange(600) * 33_333, TURNING, 1, model)
+    assert len(set(sizes[:300].tolist())) == 1 and len(set(sizes[301:].tolist())) > 250
+    spread = [frame_sizes(np.array([0, 10_000_000, 20_000_000]), TURNING, s, model)[2] for s in range(400)]
     assert abs(np.std(spread) / 230_000 - 0.12) < 0.015
 
 
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
+def test_broken_arguments() -> None:
+    for make, says in (
         (lambda: markov_link("boat", 0), "mode = 'boat': must be one of bicycle, bus"),
         (lambda: synthetic_lte(-1), "seed = -1: must be >= 0"),
         (lambda: outage(1, 1, 5), "length_s = 1: must be above 0 and below period_s = 1"),
@@ -237,14 +222,12 @@ def test_detail_stays_while_the_camera_stands_still() -> None:
         (lambda: Driving(cruise_m_per_s=(2, 1)), r"cruise_m_per_s = \(2, 1\): must be in order"),
         (lambda: Driving(turn_chance=0.8), "at most 1 together"),
         (lambda: FrameModel(base_bytes=0), "base_bytes = 0: must be a number from 1"),
-        (lambda: frame_sizes(np.array([1, 1]), still_then_turning(), 0), "arrival_us must be a row of whole"),
+        (lambda: frame_sizes(np.array([1, 1]), TURNING, 0), "arrival_us must be a row of whole"),
         (lambda: replace(FLAT, place_share=0.7, level_share=0.7), "level_share = 0.7: must be a number from 0 to 0.3"),
         (lambda: replace(FLAT, quantiles_bytes_per_s=(1.0,)), "quantiles_bytes_per_s: must be 11 rates"),
-    ],
-)
-def test_broken_arguments(make: Callable[[], object], says: str) -> None:
-    with pytest.raises(BufgymError, match=says):
-        make()
+    ):
+        with pytest.raises(BufgymError, match=says):
+            make()
 
 
 def with_stay(value: str) -> str:
