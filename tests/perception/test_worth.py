@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
@@ -21,11 +20,6 @@ pytestmark = pytest.mark.skipif(not JIT, reason="without compilation a room take
 
 def made(**settings: Any) -> Any:
     return gym.make("bufgym/Mapping-v0", **settings).unwrapped
-
-
-@pytest.mark.nightly
-def test_gymnasium_finds_nothing_to_complain_about() -> None:
-    check_env(made(observation="flat"))
 
 
 def played(env: Any, action: int) -> tuple[list[float], dict[str, Any]]:
@@ -58,13 +52,8 @@ def test_what_is_paid_comes_at_the_end() -> None:
     assert terms["covered"] == worth.scene().coverage.share(kept)
     assert terms["followed"] == views.least_overlap(worth.scene().seen, np.union1d(kept, [0, worth.FRAMES - 1]))
     assert 0 <= terms["tracked"] <= 1
-
-
-def test_who_sends_nothing_earns_nothing() -> None:
-    env = made(reward={"covered": 1.0, "followed": 1.0, "tracked": 1.0})
-    rewards, info = played(env, env.action_space.n - 2)  # rejects all
-    assert info["delivered"] == 0 and rewards[-1] < 0.5
-    assert info["reward_terms"]["covered"] == info["reward_terms"]["tracked"] == 0
+    rewards, info = played(env, env.action_space.n - 2)  # rejects all: earns nothing
+    assert info["delivered"] == 0 == info["reward_terms"]["covered"] == info["reward_terms"]["tracked"] == rewards[-1]
 
 
 def test_its_terms_are_for_its_recording_alone() -> None:

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bufgym.kernel import JIT
-from bufgym.reproduce import STORE, afr_fig7, afr_fig8, afr_overlap, afr_qoi_task, frame_tasks, run
+from bufgym.reproduce import afr_fig7, afr_fig8, afr_overlap, afr_qoi_task, frame_tasks
 from bufgym.reproduce.correlation import spearman, spearman_over
-from bufgym.reproduce.frame_runs import Setting
 from bufgym.reproduce.frame_tasks import Store, Task, carry_out
 from bufgym.reproduce.rows import Rows
 from bufgym.traces import Trace
@@ -122,29 +120,3 @@ def test_runs_of_one_cell_are_compared_and_policies_ranked_by_their_means() -> N
     rows = Rows({"policy": name, "coverage": c, "rmse_mm": mm} for name, some in runs.items() for c, mm in some)
     assert afr_qoi_task.ranked(rows, "coverage") == ["afr", "random"]
     assert afr_qoi_task.ranked(rows, "rmse_mm") == ["random", "afr"]
-
-
-SMALL: dict[str, Any] = {"frames": 40, "capacities": (2,), "offsets": 2, "jobs": 1}
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(not JIT, reason="without compilation a room takes minutes to draw")
-def test_a_run_on_the_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for library in ("cv2", "rvl", "scipy"):
-        pytest.importorskip(library)
-    policies = ("drop-oldest", "orbbuf-images", "clairvoyant")
-    text = run("afr-fig8", tmp_path, **SMALL, policies=policies)
-    assert "room, runs of 2 in which tracking breaks" in text and (tmp_path / STORE).is_file()
-
-    def carried_out(one: Task) -> Any:
-        raise AssertionError(f"done again: {one}")
-
-    fig8 = afr_fig8.Reproduction(**SMALL, policies=policies, store=tmp_path / STORE)
-    monkeypatch.setattr(frame_tasks, "carried_out", carried_out)
-    rows = fig8.simulate()
-    assert len(rows) == 2 * len(policies)
-    for row in rows:
-        assert 2 < row["received"] < 40 and 0 < row["coverage"] <= 1 and 0 <= row["least_overlap"] <= 1
-        assert row["received"] == len(fig8.kept(Setting("room", row["k"], 2, row["policy"])))
-    # The images and the plan are kept; which frames Drop Oldest keeps is found out again, as it takes no time.
-    assert fig8.recordings == ["room"] and fig8.link.name == "fade"

@@ -6,7 +6,6 @@ import errno
 import hashlib
 import io
 import os
-import random
 import shutil
 import socket
 import threading
@@ -183,31 +182,6 @@ def speaking(talk: Callable[[socket.socket], None]) -> Iterator[str]:
         finally:
             server.shutdown(socket.SHUT_RDWR)
             thread.join()
-
-
-def test_garbled_answers_end_in_a_file_or_our_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
-    whole = (
-        b'HTTP/1.1 206 Partial Content\r\nContent-Length: 50\r\nETag: "v1"\r\nContent-Range: bytes 0-49/50\r\n'
-        b"Content-Type: text/plain\r\nConnection: close\r\n\r\n" + DATA[:50]
-    )
-    dice, refused = random.Random(3), 0
-
-    def talk(client: socket.socket) -> None:
-        raw = bytearray(whole)
-        for _ in range(dice.randint(1, 5)):
-            raw[dice.randrange(len(whole) - 45)] = dice.randrange(256)
-        client.sendall(raw)
-
-    with speaking(talk) as address:
-        for _ in range(300):
-            downloading.discard(tmp_path / "part")
-            try:
-                download(address, tmp_path / "part", None, Patience(attempts=2, first_wait_s=0))
-            except BufgymError as error:
-                refused += 1
-                assert str(error).isprintable()
-    assert 30 < refused < 300
 
 
 ENDLESS = (

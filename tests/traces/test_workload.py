@@ -127,19 +127,6 @@ def uplink(workload: Workload, **other: object) -> scenario.Uplink:
     return scenario.Uplink(workload=workload, **fixed, **other)  # type: ignore[arg-type]
 
 
-def test_an_episode_is_the_recording_as_it_is() -> None:
-    stream = uplink(recorded((1, 2, 3, 4)))
-    episode = stream.draw(scenario.Streams.seeded(3))
-    assert (stream.max_messages, episode.link.offset_us) == (4, 0)
-    columns = (episode.arrivals[name].tolist() for name in ("arrival_us", "size_bytes", "topic", "x"))
-    assert list(zip(*columns, strict=True)) == [
-        (0, 1, 0, 0),
-        (1_000_000, 2, 1, 0),
-        (2_000_000, 3, 0, 1),
-        (3_000_000, 4, 1, 2),
-    ]
-
-
 @pytest.mark.kernels
 def test_the_drops_of_a_recording() -> None:
     """L = 1 and nothing crosses for 4 s: message 0 is in transmission, 1 waits, 2 and 3 find the buffer full."""
@@ -157,13 +144,16 @@ def test_the_drops_of_a_recording() -> None:
         list(drops.drops(chosen, scenario.Uplink(traces=(NOTHING,)), [1], 1))
 
 
-def test_x_from_elsewhere_or_from_the_number() -> None:
+def test_an_episode_is_the_recording_with_x_of_its_own_or_from_elsewhere_or_from_the_number() -> None:
+    stream, streams = uplink(recorded((1, 2, 3, 4))), scenario.Streams.seeded(3)
+    episode = stream.draw(streams)
+    assert (stream.max_messages, episode.link.offset_us) == (4, 0)
+    columns = (episode.arrivals[name].tolist() for name in ("arrival_us", "size_bytes", "topic", "x"))
+    rows = [(0, 1, 0, 0), (1_000_000, 2, 1, 0), (2_000_000, 3, 0, 1), (3_000_000, 4, 1, 2)]
+    assert list(zip(*columns, strict=True)) == rows
     silent = Workload("w", np.array([0, 500_000, 1_000_000]), np.array([1, 1, 1]))
     motion = Motion("m", np.array([0, 1_000_000]), np.array([0.0, 3.0]))
-    streams = scenario.Streams.seeded(0)
     assert uplink(silent).draw(streams).arrivals["x"].tolist() == [0, 1, 2]
     assert uplink(silent, motion=(motion,)).draw(streams).arrivals["x"].tolist() == [0, 1.5, 3]
     with pytest.raises(BufgymError, match="workload 'drive' has an x of its own"):
         uplink(recorded(), motion=(motion,))
-    with pytest.raises(BufgymError, match=r"w\.csv: no such file"):
-        scenario.Uplink(traces=(NOTHING,), workload="w.csv")
