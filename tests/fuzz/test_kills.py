@@ -1,7 +1,7 @@
 """Killed at any moment, the run of a suite goes on, and ends as if nothing had been.
 
-In a commit's tests, without processes: `test_a_run_that_was_killed_goes_on_where_it_was` in benchmark/test_sweep.py and,
-for a training, `test_a_killed_run_goes_on_from_its_checkpoint` in test_train.py.
+In a commit's tests, without processes: `test_a_run_that_was_killed_goes_on_where_it_was` in benchmark/test_sweep.py
+and, for a training, `test_a_killed_run_goes_on_from_its_checkpoint` in test_train.py.
 """
 
 from __future__ import annotations

@@ -56,8 +56,7 @@ def test_what_the_projector_does_not_reach_is_missing() -> None:
     row = scene(thing, stride=1).depth(0)[240]
     missing = np.flatnonzero(row == 0)
     # The box's left edge is at 320 - 585 * 0.3 / 1.5 = 203.
-    assert missing.min() == pytest.approx(203 - 14.6, abs=1.1)
-    assert missing.max() == pytest.approx(202, abs=1.1)
+    assert [missing.min(), missing.max()] == pytest.approx([203 - 14.6, 202], abs=1.1)
     assert len(missing) == missing.max() - missing.min() + 1
 
 
@@ -71,20 +70,18 @@ def test_a_seed_gives_the_same_frames_and_another_seed_others() -> None:
     assert (half.depth(1) == whole.depth(1)[::2, ::2]).all() and (half.grey(1) == whole.grey(1)[::2, ::2]).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_what_is_seen_is_the_same_without_bounds(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_seen_is_the_same_without_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Things are looked for within their bounds alone: every thing for every pixel finds nothing else."""
-    made = room(seed).reduced(40)
-    frames = range(0, 794, 120)
-    bounded = [made.rendered(k) for k in frames]
+    views = [(room(seed).reduced(40), k) for seed in range(2) for k in range(0, 794, 120)]
+    bounded = [made.rendered(k) for made, k in views]
 
     def nowhere(*arguments: Any) -> None:
         arguments[-1][:] = [-np.inf, np.inf, -np.inf, np.inf, -np.inf]
 
     monkeypatch.setattr(rays, "bound", nowhere)
-    for k, (depth, grey) in zip(frames, bounded, strict=True):
+    for (made, k), (depth, grey) in zip(views, bounded, strict=True):
         everything = made.rendered(k)
-        assert depth.tobytes() == everything[0].tobytes() and grey.tobytes() == everything[1].tobytes()
+        assert (depth == everything[0]).all() and (grey == everything[1]).all()
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bufgym.reproduce import afr_fig7, afr_fig8, afr_overlap, afr_qoi_task, frame_tasks
+from bufgym.reproduce import afr_fig7, afr_fig8, afr_overlap, frame_tasks
 from bufgym.reproduce.correlation import spearman, spearman_over
 from bufgym.reproduce.frame_tasks import Store, Task, carry_out
 from bufgym.reproduce.rows import Rows
@@ -110,13 +110,3 @@ def test_the_best_frames_in_hindsight_and_rules_at_a_distance() -> None:
     assert found is not None and found["broken_6"] == 0.5  # at frame 0; frame 1 sees nothing new
     assert found["excess_6"] == pytest.approx(0.2) and found["broken_5"] == 0
     assert afr_overlap._rules(v, np.arange(4.0), 2) is None  # 4 frames on is beyond the end
-
-
-def test_runs_of_one_cell_are_compared_and_policies_ranked_by_their_means() -> None:
-    less = afr_qoi_task._less_mean(np.array([1.0, 3, 10, 30]), [(0, 5), (0, 5), (1, 5), (1, 5)])
-    assert less.tolist() == [-1, 1, -10, 10]
-    # Two runs each: Random covers 0.6 on average, AFR 0.7; AFR's map is 8 mm off, Random's 7 mm.
-    runs = {"random": [(0.4, 5.0), (0.8, 9.0)], "afr": [(0.7, 8.0), (0.7, 8.0)]}
-    rows = Rows({"policy": name, "coverage": c, "rmse_mm": mm} for name, some in runs.items() for c, mm in some)
-    assert afr_qoi_task.ranked(rows, "coverage") == ["afr", "random"]
-    assert afr_qoi_task.ranked(rows, "rmse_mm") == ["random", "afr"]

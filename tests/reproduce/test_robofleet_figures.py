@@ -60,9 +60,6 @@ def test_native_ros_keeps_its_queue_and_no_drop_all() -> None:
     sent = after_dropout("ros-native", queue_size=3)
     # Message 11 is on its way; of 12 to 20 the last three wait. Nobody waits for pongs.
     assert receipts_s(sent, 11, 21) == [2.0725, *[None] * 6, 2.085, 2.0975, 2.11, 2.1225]
-    # 110 ms for message 20, 22.5 for message 21, which arrives at 2.1 with the socket just free.
-    assert recovery_s(sent, 1.05, 2.05, 2) == pytest.approx(2.1225 - 2.05)
-
     # No-drop queues all, and is paced by pongs: one per 12.5 + 20 ms from 2.05 + 0.0125 on.
     sent = after_dropout("no-drop")
     assert receipts_s(sent, 11, 14) == [round(2.0725 + 0.0325 * k, 6) for k in range(4)]
@@ -119,24 +116,6 @@ ONE_KIND: Options = {"dropouts_s": (5,), "links_mbit_per_s": (50,), "kinds": ("L
 ZONE: Options = {"bad_mbit_per_s": (1.0,), "image_priorities": (1.0, 0.01), "bad_from": 100, "runs": 1}
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "facts"),
-    [
-        ("robofleet-fig3", {"rates_hz": (10, 100), "duration_s": 5, "runs": 2}, "low grows rosbridge"),
-        ("robofleet-fig4", ONE_KIND | {"dropouts_s": (2, 20)}, "nearer=2 finite=2"),
-        ("robofleet-fig5", {"runs": 1}, "low order"),
-        ("robofleet-fig6", {"points": (1_500,), "max_consumers": 4, "duration_s": 10, "runs": 1}, "constant linear"),
-        ("robofleet-fig7", ZONE, "no-drop spike longer lost=0"),
-    ],
-)
-def test_claims_hold_in_small_runs(name: str, options: Options, facts: str) -> None:
-    small = figure(name, **options)
-    found = small.claims(small.simulate())
-    for fact in facts.split():
-        key, _, value = fact.partition("=")
-        assert found[key] == int(value) if value else found[key] is True, fact
-
-
 def test_fig3_has_the_rates_worked_by_hand() -> None:
     fig3 = figure("robofleet-fig3", rates_hz=(10, 100), duration_s=5, runs=1)
     rows = fig3.simulate()
@@ -155,8 +134,8 @@ def test_fig4_recovers_when_the_backlog_is_gone() -> None:
     load = 28_000 * 10 / 6.25e6
     assert quick.mean("recovery_s", sender="rosbridge") == pytest.approx(5 * load / (1 - load), rel=0.15)
     assert quick.mean("recovery_s", sender="robofleet") < 0.5
-    for before, after in zip(quick, silent, strict=True):
-        assert float(after["recovery_s"]) == pytest.approx(float(before["recovery_s"]) + 2, abs=0.3)
+    later = [float(row["recovery_s"]) + 2 for row in quick]
+    assert silent.column("recovery_s") == pytest.approx(later, abs=0.3)
 
 
 def test_fig5_and_fig6_have_the_latencies_worked_by_hand() -> None:
@@ -204,14 +183,10 @@ def test_unusable_options_are_refused() -> None:
     for name, options, rule in (
         *((f"robofleet-fig{k}", {"runs": 0}, "runs = 0: must be a whole number >= 1") for k in range(3, 8)),
         *((f"robofleet-fig{k}", {"round_trip_ms": -1}, "round_trip_ms = -1: must be a n") for k in range(3, 8)),
-        ("robofleet-fig3", {"points": 0}, "points = 0: must be a whole number from 1"),
         ("robofleet-fig4", {"kinds": ("Laser",)}, "must be some of PointCloud2, CompressedImage, LaserScan"),
         ("robofleet-fig4", {"factor": 1}, "factor = 1: must be above 1"),
-        ("robofleet-fig4", {"shown_s": 3}, "shown_s = 3: must be one of dropouts_s"),
         ("robofleet-fig5", {"fall_s": 1, "stay_s": 0}, "fall_s + stay_s = 1: must be at least 2"),
-        ("robofleet-fig6", {"max_consumers": 1}, "max_consumers = 1: must be a whole number from 2 to 100"),
         ("robofleet-fig6", {"queue_sizes": (1.5,)}, "queue_sizes = 1.5: must be a whole number >= 1"),
-        ("robofleet-fig7", {"shown_mbit_per_s": 3}, "shown_mbit_per_s = 3: must be one of bad_mbit_per_s"),
     ):
         with pytest.raises(BufgymError, match=re.escape(rule)):
             run(name, **options)

@@ -87,9 +87,7 @@ def test_x_begins_at_the_first_message_chosen(tmp_path: Path) -> None:
     later = read_workload(path, topics=["/status"], odom="/odom")
     assert later.arrival_us.tolist() == [0] and later.x is not None and later.x.tolist() == [0]
     assert read_workload(path).x is None
-
-
-def test_messages_out_of_order_and_without_content(tmp_path: Path) -> None:
+    # Messages out of order, and without content.
     entries = [(ms, "/t", STRING, cases.text("x" * ms)) for ms in (30, 10, 20)]
     workload = read_workload(cases.write_mcap(tmp_path / "w.mcap", entries))
     assert workload.arrival_us.tolist() == [0, 10_000, 20_000] and workload.size_bytes.tolist() == [19, 29, 39]
@@ -233,10 +231,7 @@ def test_the_metadata_of_a_rosbag2_is_bounded(tmp_path: Path) -> None:
     os.truncate(file, 1 << 32)
     refused(path, "larger than 8388608 bytes")
     assert len(read_bag((path / "drive.db3").rename(tmp_path / "alone")).time_ns) == 9  # the file alone, by any name
-
-
-def test_sqlite_computes_nothing_of_its_own(tmp_path: Path) -> None:
-    """A column of a gigabyte that is computed when it is read."""
+    # A column of a gigabyte that is computed when it is read.
     with sqlite3.connect(tmp_path / "bomb.db3") as base:
         base.execute("CREATE TABLE topics(id, name, type, serialization_format)")
         base.execute("INSERT INTO topics VALUES (1, '/t', 'x', 'cdr')")
