@@ -30,6 +30,11 @@ def test_a_flat_wall_as_worked_by_hand() -> None:
     assert found.tsdf[0, 0] == pytest.approx([1, 1, 1, 1, 2 / 3, 1 / 3, 0, -1 / 3, -2 / 3, -1, 0, 0], abs=1e-6)
     assert found.weight[0, 0].tolist() == [1] * 10 + [0] * 2
     assert found.points()[:, 2] == pytest.approx(np.ones(4), abs=1e-6)
+    # The grid of its own holds all that was seen.
+    grid = grid_of(wall(1.0), voxel_m=0.1)
+    high = np.array(grid.origin_m) + grid.voxel_m * (np.array(grid.shape) - 1)
+    assert grid.origin_m == pytest.approx([-3.5 / 4 - 0.3, -2.5 / 4 - 0.3, 0.7])
+    assert (high >= [3.5 / 4 + 0.3, 2.5 / 4 + 0.3, 1.3 - 1e-9]).all()
 
 
 def test_frames_are_weighed() -> None:
@@ -80,15 +85,6 @@ def test_the_error_of_a_shifted_plane() -> None:
     # Pixels 0 to 3 see x < 0; of the points at 0 to 0.5 m each is as far away as it lies from that at -0.1 m.
     assert (found.to_reference_m, found.uncovered) == (0, pytest.approx(6 / 11))
     assert found.from_reference_m == pytest.approx(np.sqrt((0.01 + 0.04 + 0.09 + 0.16 + 0.25 + 0.36) / 11), abs=1e-6)
-
-
-def test_the_grid_holds_all_that_was_seen() -> None:
-    grid = grid_of(wall(1.0), voxel_m=0.1)
-    assert grid.truncation_m == pytest.approx(0.3)
-    low = np.array(grid.origin_m)
-    high = low + grid.voxel_m * (np.array(grid.shape) - 1)
-    assert low == pytest.approx([-3.5 / 4 - 0.3, -2.5 / 4 - 0.3, 0.7])
-    assert (high >= [3.5 / 4 + 0.3, 2.5 / 4 + 0.3, 1.3 - 1e-9]).all()
 
 
 def test_errors() -> None:

@@ -87,9 +87,7 @@ def walk() -> Sequence:
 
 def test_a_known_movement_is_found_again() -> None:
     """3 cm to the right, 2 cm down, 1 cm ahead, and a turn of 1.5 degrees: found within 6 mm and 0.3 degrees."""
-    still = room(0, frames=2)
-    angle = np.radians(1.5)
-    moved = np.eye(4)
+    still, angle, moved = room(0, frames=2), np.radians(1.5), np.eye(4)
     moved[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     moved[:3, 3] = 0.03, 0.02, 0.01
     poses = np.stack([still.poses[0], still.poses[0] @ moved])

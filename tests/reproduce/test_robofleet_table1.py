@@ -26,7 +26,8 @@ from bufgym.reproduce.robofleet_table1 import PAPER, Reproduction, fitted, of_pa
 HEADER = 4 + 8 + 4  # seq, stamp, length of frame_id
 
 
-def test_ros1_sizes_are_the_sums_of_their_fields(frame_id: str = "a/longer/frame") -> None:
+def test_ros1_sizes_are_the_sums_of_their_fields() -> None:
+    frame_id = "a/longer/frame"
     header = HEADER + len(frame_id)
     pose, twist, covariance = 7 * 8, 6 * 8, 36 * 8
     expected = {

@@ -87,10 +87,7 @@ def test_a_link_without_outages_keeps_its_quantiles() -> None:
     rates = link_rates(link, 1, 40_000)
     for bound, share in ((4e6, 0.1), (6e6, 0.5), (8e6, 0.9)):
         assert abs((rates < bound).mean() - share) < 0.02
-
-
-def test_memory_is_the_stated_one() -> None:
-    """Level 0.6 that stays 20 s, fast 0.4 with memory 0.5: after 5 s 0.6 x 0.95**5 + 0.4 x 0.5**5 = 0.477."""
+    # Memory: level 0.6 that stays 20 s, fast 0.4 with 0.5: after 5 s 0.6 x 0.95**5 + 0.4 x 0.5**5 = 0.477.
     linear = tuple(5e6 + 1e6 * z for z in (-3, -2.326348, -1.644854, -1.281552, -0.67449, 0))
     linear += tuple(1e7 - rate for rate in linear[-2::-1])
     link = replace(FLAT, quantiles_bytes_per_s=linear, level_share=0.6, level_stay_s=20.0, fast_memory=0.5)
@@ -106,10 +103,7 @@ def test_outages_are_as_long_and_as_far_apart_as_stated() -> None:
     lengths, gaps = edges[1::2] - edges[::2], edges[2::2] - edges[1:-1:2]
     assert [(lengths > 1).mean(), (lengths > 2).mean()] == pytest.approx([4 / 9, 1 / 4], abs=0.03)
     assert abs(gaps.mean() - 32) < 2 and lengths.max() <= MAX_OUTAGE_S
-
-
-def test_rates_beside_outages_are_lowered() -> None:
-    """1 MB/s, and half of it within 5 s of an outage; never less than the least rate outside of one."""
+    # Rates beside outages are lowered by half within 5 s; never below the least rate outside of one.
     quantiles = (0.3e6, *(1e6,) * 10)
     lowered = replace(FLAT, quantiles_bytes_per_s=quantiles, outages=replace(OUTAGES, shoulder=0.5))
     rates = link_rates(lowered, 1, 2000)
@@ -227,22 +221,19 @@ def test_broken_arguments() -> None:
             make()
 
 
-def with_stay(value: str) -> str:
-    """The shipped parameters, whose mode bus has this for level_stay_s."""
-    text = LINKS.read_text(encoding="ascii")
-    share = json.loads(text)["modes"]["bus"]["level_stay_s"]
-    return text.replace(f'"level_stay_s": {share}', f'"level_stay_s": {value}')
-
-
 def test_broken_parameter_files(tmp_path: Path) -> None:
-    file = tmp_path / "links.json"
+    file, shipped = tmp_path / "links.json", LINKS.read_text(encoding="ascii")
+    stay = f'"level_stay_s": {json.loads(shipped)["modes"]["bus"]["level_stay_s"]}'
+    stays = [
+        shipped.replace(stay, f'"level_stay_s": {value}') for value in ("null", "true", '"5"', "NaN", "-1", "1e400")
+    ]
     for text, says in (
         ("{", "must be JSON"),
         ("[]", 'must be an object with "modes"'),
         ('{"modes": {"bus": {"seconds": 5}}}', "mode 'bus': must be an object with fast_memory"),
         ("[" * 100_000, "must be JSON"),
         (" " * (2**20 + 1), "must be at most 1048576 bytes"),
-        *((with_stay(value), "mode '.*': level_stay_s = ") for value in ("null", "true", '"5"', "NaN", "-1", "1e400")),
+        *((text, "mode '.*': level_stay_s = ") for text in stays),
     ):
         file.write_text(text, encoding="utf-8")
         with pytest.raises(TraceError, match=f"links.json.*{says}"):

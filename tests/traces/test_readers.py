@@ -146,6 +146,22 @@ def archive(tmp_path: Path) -> str:
     return str(tmp_path / "two.zip")
 
 
+def test_what_convert_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = str(written(tmp_path, "1\n", "a.up")), str(written(tmp_path, "2\n", "b.up"))
+    out = tmp_path / "out"
+    both = ["trace", "convert", first, second, "--to", "csv", "--out", str(out)]
+    assert "must be an existing folder" in failed(both, capsys)
+    out.mkdir()
+    assert main(both) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["a.up.csv", "b.up.csv"]
+    for words, says in (
+        ([str(out), "--to", "csv"], "a.up.csv is taken"),
+        ([str(tmp_path / "x.up")], "must be one of csv, mahimahi"),
+        ([first, "--to", "csv"], "must not be the file that is read"),
+    ):
+        assert says in failed(["trace", "convert", first, "--out", *words], capsys)
+
+
 def test_info_of_every_format(tmp_path: Path, archive: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["trace", "info", *(str(written(tmp_path, text, format)) for format, text in SAMPLES.items())]) == 0
     for format, block in zip(SAMPLES, capsys.readouterr().out.split("\n\n"), strict=True):
@@ -181,21 +197,3 @@ def test_convert_states_what_was_lost(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["trace", "convert", str(up), "--out", str(back)]) == 0  # .csv says the format
     assert capsys.readouterr().out.endswith(": nothing lost\n")
     assert read_trace(back).time_us.tolist() == read_trace(up).time_us.tolist()
-
-
-def test_convert_many_into_a_folder_and_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    first, second = str(written(tmp_path, "1\n", "a.up")), str(written(tmp_path, "2\n", "b.up"))
-    convert, out = ["trace", "convert", first, "--out"], str(tmp_path / "out")
-    both = ["trace", "convert", first, second, "--to", "csv", "--out", out]
-    assert "must be an existing folder" in failed(both, capsys)
-    (tmp_path / "out").mkdir()
-    assert main(both) == 0
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.up.csv", "b.up.csv"]
-    for words, says in (
-        ([out, "--to", "csv"], "a.up.csv is taken"),
-        ([str(tmp_path / "x.up")], "must be one of csv, mahimahi"),
-        (["x", "--to", "json"], "--to json: must be one of csv, mahimahi"),
-        ([first, "--to", "csv"], "must not be the file that is read"),
-    ):
-        assert says in failed([*convert, *words], capsys)
-    assert Path(first).read_text() == "1\n"
