@@ -44,14 +44,6 @@ def test_every_layout_is_recognised(layout: str, time_us: Any, metres: Any, x_m:
         assert sequence.motion().total == pytest.approx(90 / camera.fov_deg + 0.25)
 
 
-def test_65535_is_no_measurement_and_a_pose_that_drifted_a_rotation_again(tmp_path: Path) -> None:
-    folder = frame_cases.seven_scenes(tmp_path / "desk")
-    (folder / "frame-000000.depth.png").write_bytes(frame_cases.png(65535))
-    (folder / "frame-000000.pose.txt").write_text("1.001 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
-    sequence = open_sequence(folder)
-    assert not sequence.depth(0).any() and sequence.poses[0, :3, :3] == pytest.approx(np.eye(3), abs=1e-12)
-
-
 CHANGES: dict[str, Callable[[bytes], bytes | None]] = {
     "gone": lambda data: None,
     "cut": lambda data: data[:-20],
@@ -91,6 +83,21 @@ def test_what_is_broken_is_one_error(layout: str, file: str, change: str, rule: 
     assert Path(file).name in message and rule in message and "\n" not in message
 
 
+def test_missing_measurements_poses_that_drifted_and_reduced_frames(tmp_path: Path) -> None:
+    """65535 is no measurement; what drifted is a rotation again; reduced is every second pixel."""
+    folder = frame_cases.seven_scenes(tmp_path / "desk")
+    (folder / "frame-000000.depth.png").write_bytes(frame_cases.png(65535))
+    (folder / "frame-000000.pose.txt").write_text("1.001 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
+    sequence = open_sequence(folder)
+    assert not sequence.depth(0).any() and sequence.poses[0, :3, :3] == pytest.approx(np.eye(3), abs=1e-12)
+    depth = np.arange(8, dtype=np.float32).reshape(2, 4)
+    whole = frame_cases.Held(Camera(4, 2, 8.0, 8.0, 2.0, 1.0), [depth], [np.eye(4)])
+    half = whole.reduced(2).loaded()
+    assert half.depth(0).tolist() == [[0.0, 2.0]] and half.camera == Camera(2, 1, 4.0, 4.0, 1.0, 0.5)
+    with pytest.raises(BufgymError, match="stride = 3: must divide 4 x 2"):
+        whole.reduced(3)
+
+
 def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(BufgymError, match=r"depth\.txt \(TUM\)"):
         open_sequence(tmp_path)
@@ -99,16 +106,6 @@ def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "rvl", None)
     with pytest.raises(BufgymError, match=r"bufgym\.perception needs rvl: pip install .*(rvl|perception)"):
         library("rvl")
-
-
-def test_reduced_frames_are_every_second_pixel() -> None:
-    camera = Camera(4, 2, 8.0, 8.0, 2.0, 1.0)
-    whole = frame_cases.Held(camera, [np.arange(8, dtype=np.float32).reshape(2, 4)], [np.eye(4)])
-    half = whole.reduced(2).loaded()
-    assert half.depth(0).tolist() == [[0.0, 2.0]]
-    assert half.camera == Camera(2, 1, 4.0, 4.0, 1.0, 0.5)
-    with pytest.raises(BufgymError, match="stride = 3: must divide 4 x 2"):
-        whole.reduced(3)
 
 
 def test_rvl_as_worked_by_hand_and_back() -> None:

@@ -189,15 +189,6 @@ def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, fl
     assert min(np.abs(computed - expected).max(), np.abs(computed + expected).max()) < 1e-12
 
 
-@pytest.mark.nightly
-def test_real_tum(shared_data: Path) -> None:
-    """Coordinate gained a second: a hand-held sweep, one with a gap of 12 s by its README, and a turning robot."""
-    for name, per_s in (("freiburg1_desk", 0.81), ("freiburg2_desk", 0.27), ("freiburg2_pioneer_360", 0.42)):
-        motion = read_motion(shared_data / "tum_rgbd" / f"{name}.groundtruth.txt.gz")
-        assert motion.total / motion.duration_us * 1e6 == pytest.approx(per_s, abs=0.006)
-        assert motion.longest_gap_s == pytest.approx(12.0 if name == "freiburg2_desk" else 0.0, abs=0.1)
-
-
 def test_real_kitti(shared_data: Path) -> None:
     """Sequence 00 is 3.7 km long, 4541 poses in 470.6 s; its times come from the file beside."""
     motion = read_motion(shared_data / "kitti" / "KITTI_00_gt.txt.gz", MotionSettings(fov_deg=1e9, scene_scale_m=1))
