@@ -47,7 +47,6 @@ def test_every_layout_is_recognised(layout: str, time_us: Any, metres: Any, x_m:
 CHANGES: dict[str, Callable[[bytes], bytes | None]] = {
     "gone": lambda data: None,
     "cut": lambda data: data[:-20],
-    "small": lambda data: frame_cases.png(1000, shape=(240, 320)),
     "text": lambda data: b"1 2 3",
     "outside": lambda data: data.replace(b"depth/0", b"../0"),
 }
@@ -58,13 +57,10 @@ CHANGES: dict[str, Callable[[bytes], bytes | None]] = {
     [
         ("tum", "depth/1.png", "gone", "no such file"),
         ("tum", "depth/1.png", "cut", "truncated or damaged"),
-        ("tum", "depth/1.png", "small", "size = '320 x 240': must be 640 x 480"),
         ("tum", "groundtruth.txt", "text", "must have 8 columns, has 3"),
-        ("7-scenes", "frame-000001.depth.png", "text", "must be a PNG or JPEG image"),
         ("7-scenes", "frame-000001.pose.txt", "text", "must be a 4x4 matrix"),
         ("packed", "poses_camera_to_world.txt", "text", "line 1: '1 2 3': must be a 4x4 matrix"),
         ("packed", "depth_320x240_mm.zip", "cut", "truncated, or no zip archive"),
-        ("packed", "gray_320x240.zip", "gone", "no such file"),
         ("tum", "depth.txt", "outside", "line 2: file = ../0.png: must be a path inside the folder"),
     ],
 )
@@ -84,7 +80,6 @@ def test_what_is_broken_is_one_error(layout: str, file: str, change: str, rule: 
 
 
 def test_missing_measurements_poses_that_drifted_and_reduced_frames(tmp_path: Path) -> None:
-    """65535 is no measurement; what drifted is a rotation again; reduced is every second pixel."""
     folder = frame_cases.seven_scenes(tmp_path / "desk")
     (folder / "frame-000000.depth.png").write_bytes(frame_cases.png(65535))
     (folder / "frame-000000.pose.txt").write_text("1.001 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
@@ -108,7 +103,7 @@ def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyP
         library("rvl")
 
 
-def test_rvl_as_worked_by_hand_and_back() -> None:
+def test_rvl_as_worked_by_hand_and_the_size_of_a_frame() -> None:
     """Two empty pixels, then 5, 6, 4 mm: runs 2 and 3, differences +5, +1, -2 as 10, 2, 3, a nibble each (a bit says
     that more follows): 2, 3, 10 as 010 with that bit and then 1, 2, 3; after a word with the number of pixels."""
     rvl = library("rvl")
@@ -116,10 +111,7 @@ def test_rvl_as_worked_by_hand_and_back() -> None:
     packed = rvl.compress(depth_mm)
     assert packed == (5).to_bytes(4, "little") + 0x23A12300.to_bytes(4, "little")
     assert rvl.decompress(packed)[: depth_mm.nbytes] == depth_mm.tobytes()
-
-
-def test_a_frames_size_is_its_depth_and_its_picture() -> None:
-    """An even wall costs a nibble for each of 307 200 pixels, 150 kB; where nothing was measured, nearly none."""
+    # An even wall costs a nibble for each of 307 200 pixels, 150 kB; where nothing was measured, nearly none.
     grey = np.full((480, 640), 90, np.uint8)
     picture = len(library("cv2").imencode(".jpg", grey, [1, 50])[1])
     wall = encoded_bytes(np.full((480, 640), 1.5, np.float32), grey)

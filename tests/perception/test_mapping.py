@@ -24,7 +24,7 @@ def wall(*depths_m: float, camera: Camera = CAMERA) -> frame_cases.Held:
     return frame_cases.Held(camera, depths, [np.eye(4)] * len(depths))
 
 
-def test_a_flat_wall_as_worked_by_hand() -> None:
+def test_flat_walls_as_worked_by_hand() -> None:
     """At 1 m: free up to 0.7 m, then (1 - z) / 0.3, nothing known behind 1.3 m."""
     found = fuse(wall(1.0), [0], AHEAD)
     assert found.tsdf[0, 0] == pytest.approx([1, 1, 1, 1, 2 / 3, 1 / 3, 0, -1 / 3, -2 / 3, -1, 0, 0], abs=1e-6)
@@ -35,10 +35,7 @@ def test_a_flat_wall_as_worked_by_hand() -> None:
     high = np.array(grid.origin_m) + grid.voxel_m * (np.array(grid.shape) - 1)
     assert grid.origin_m == pytest.approx([-3.5 / 4 - 0.3, -2.5 / 4 - 0.3, 0.7])
     assert (high >= [3.5 / 4 + 0.3, 2.5 / 4 + 0.3, 1.3 - 1e-9]).all()
-
-
-def test_frames_are_weighed() -> None:
-    """Two frames meet in the middle; with a memory of one frame the third counts half; one without depth nothing."""
+    # Two frames meet in the middle; with a memory of one frame the third counts half; one without depth nothing.
     found = fuse(wall(1.0, 1.1), [0, 1], AHEAD)
     assert found.points()[:, 2] == pytest.approx(np.full(4, 1.05), abs=1e-6) and found.weight.max() == 2
     assert fuse(wall(1.0, 1.1), [1], AHEAD).points()[:, 2] == pytest.approx(np.full(4, 1.1), abs=1e-6)
@@ -51,7 +48,6 @@ def test_frames_are_weighed() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_the_kernels_do_what_their_twins_do(seed: int) -> None:
-    """From any pose, in front of voxels and behind them."""
     rng = np.random.default_rng(seed)
     pose = np.eye(4)
     pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]

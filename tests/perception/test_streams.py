@@ -38,17 +38,13 @@ class Wall(Sequence):
         return 1000 * (k + 1)
 
 
-def test_sizes_and_the_first_frames() -> None:
-    """Every second frame is encoded, and the last; sizes in between lie between these."""
+def test_sizes_first_frames_and_fades() -> None:
     assert streams.sizes(Wall([0.0] * 4), every=2).tolist() == [1000, 2000, 3000, 4000]
     part = streams.first(Wall([0, 1, 2]), 2)
     assert (len(part), part.poses[1, 0, 3], part.depth(1)[0, 0], part.size_bytes(1)) == (2, 1, 2, 2000)
     whole = Wall([0, 1])
     assert streams.first(whole, 5) is whole
-
-
-def test_an_offset_moves_the_fade_and_changes_nothing_else() -> None:
-    """Two seconds carry 150 bytes wherever they begin; what comes after them is the two seconds again."""
+    # Two seconds carry 150 bytes wherever they begin; what comes after them is the two seconds again.
     for offset_us, first in ((0, 100), (1_000_000, 50), (2_000_000, 100)):
         link = streams.fading(2_000_000, TRACE, offset_us)
         assert np.diff([link.carried_at(1_000_000 * t) for t in range(4)]).tolist() == [first, 150 - first, first]

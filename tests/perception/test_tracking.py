@@ -29,7 +29,6 @@ def plane(z: float) -> np.ndarray:
 
 @pytest.mark.kernels
 def test_unprojected_points_and_their_normals() -> None:
-    """Normals face the camera and stop at edges."""
     points, normals = plane(2.0), np.zeros((6, 8, 3), np.float32)
     assert points[0, 0].tolist() == [-1.75, -1.25, 2.0]
     icp.orient(points, np.zeros(3), 0.3, normals)
@@ -104,7 +103,6 @@ def test_a_known_movement_is_found_again() -> None:
 
 
 def test_it_follows_every_frame_and_fails_at_a_gap() -> None:
-    """The same frames with 40 of them missing: lost at the first frame after the gap."""
     sequence = walk()
     whole = track(sequence, range(80))
     assert not whole.failed and whole.where is None
@@ -121,7 +119,6 @@ def test_it_follows_every_frame_and_fails_at_a_gap() -> None:
 
 
 def test_smoothed_depths_that_are_kept_change_nothing() -> None:
-    """One run asks for those of all its frames but the first, and finds the same poses, bit for bit."""
     asked: list[int] = []
 
     def smooth(k: int) -> np.ndarray:
@@ -137,7 +134,6 @@ def test_smoothed_depths_that_are_kept_change_nothing() -> None:
 
 @pytest.mark.kernels
 def test_a_single_wall_leaves_the_way_along_it_open() -> None:
-    """Nothing says how far the camera moved along a wall: the tracker says that it is lost."""
     grid = Grid((-1.2, -0.9, 0.0), (49, 37, 28), 0.05)
     tracker = Tracker(CAMERA, grid, TrackingSettings(apart_m=10.0, least_pairs=0.0))
     tracker.begin(NOWHERE, np.eye(4))

@@ -33,7 +33,6 @@ def played(env: Any, action: int) -> tuple[list[float], dict[str, Any]]:
 
 
 def test_frames_have_the_sizes_that_they_are_said_to_have() -> None:
-    """Two of them encoded again; in between they follow the neighbours that were."""
     whole, sizes = worth.recording(), streams.between(worth.SIZES, worth.FRAMES)
     measured = {k: whole.size_bytes(k) for k in (120, 239)}
     assert measured == pytest.approx({k: int(sizes[k]) for k in measured}, rel=0.01)

@@ -82,15 +82,7 @@ def test_fig8_counts_runs_whose_longest_gap_exceeds_the_threshold() -> None:
     assert afr_fig8_gap.failures(rows, gaps[0] - 1e-9, policy="drop-oldest", L=3) == 100
 
 
-def test_without_the_folder_the_message_says_what_it_needs(tmp_path: Path) -> None:
-    for name in NEEDS_DATA:
-        with pytest.raises(BufgymError, match=r"\(--data DIR\) with belgium_4g/csv/report_car_0002.csv"):
-            run(name)
-        with pytest.raises(BufgymError, match=r"report_car_0002.csv: no such file"):
-            run(name, data=tmp_path)
-
-
-def test_mistakes_are_named() -> None:
+def test_mistakes_are_named(tmp_path: Path) -> None:
     for name, options, match in (
         ("afr-fig6", LTE | {"size_bytes": 0}, "size_bytes = 0"),
         ("afr-fig7-qoi", SHIPPED | {"runs": 0}, "runs = 0"),
@@ -100,6 +92,11 @@ def test_mistakes_are_named() -> None:
     ):
         with pytest.raises(BufgymError, match=match):
             run(name, **options)
+    for name in NEEDS_DATA:
+        with pytest.raises(BufgymError, match=r"\(--data DIR\) with belgium_4g/csv/report_car_0002.csv"):
+            run(name)
+        with pytest.raises(BufgymError, match=r"report_car_0002.csv: no such file"):
+            run(name, data=tmp_path)
 
 
 def test_all_leaves_them_out_without_data_which_is_passed_on(

@@ -59,15 +59,6 @@ def test_fig5_afr_equals_the_ideal_where_its_gaps_are_equal_and_is_below_it_one_
     assert afr_fig5.mean_score("drop-oldest", 8, 9, 399) == pytest.approx(0.47050, abs=5e-6)
 
 
-def test_fig5_random_is_repeatable_and_batched_in_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    interruption = Interruption(law="fixed", t_max=20)
-    whole = afr_fig5.gained_at_random(interruption, 20, 8, 7, np.random.default_rng(1))
-    monkeypatch.setattr(afr_fig5, "BATCH", 3)
-    parts = afr_fig5.gained_at_random(interruption, 20, 8, 7, np.random.default_rng(1))
-    assert len(whole) == 7 and len(set(whole)) > 1
-    assert whole.tolist() == parts.tolist()
-
-
 @pytest.mark.parametrize(("L", "T"), [(1, 4), (3, 9), (8, 20)])
 def test_random_keeps_each_message_as_eq_9_says(L: int, T: int) -> None:
     """P{i kept at T} = (L / (L + 1))^min(T - i + 1, T - L): it survives each of the full arrivals that it meets."""

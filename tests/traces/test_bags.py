@@ -238,7 +238,6 @@ def test_the_metadata_of_a_rosbag2_is_bounded(tmp_path: Path) -> None:
 
 
 def test_cut_off_recordings_are_refused(tmp_path: Path) -> None:
-    """A robot that lost power: the recording lacks its end."""
     for kind in ("mcap, zstd", "mcap, plain", "ros1"):
         path = WRITERS[kind][2](tmp_path / f"{kind} cut")
         whole = path.read_bytes()
@@ -248,7 +247,6 @@ def test_cut_off_recordings_are_refused(tmp_path: Path) -> None:
 
 
 def test_real_recordings(shared_data: Path) -> None:
-    """Messages by topic as the libraries' own tools count them."""
     nav2, tree = {"/odom": 2639, "/tf": 5422, "/tf_static": 1, "/amcl_pose": 135}, {"/tf": 517, "/tf_static": 1}
     for name, counts, odom, seconds in (
         ("nav2_turtlebot.mcap", nav2, "/odom", 97.36),

@@ -23,7 +23,6 @@ from bufgym.traces.datasets.table import Remote, datasets
 
 
 def test_two_at_once_fetch_once(site: Site, tmp_path: Path) -> None:
-    """The first one's download lasts until the second says that it waits."""
     begun, waiting, origins = threading.Event(), threading.Event(), []
 
     def progress(count: int, total: int | None) -> None:
@@ -57,9 +56,6 @@ def test_from_a_file(tmp_path: Path) -> None:
         with pytest.raises(BufgymError, match=says):
             fetch_dataset(dataset, tmp_path / "other", [tmp_path / name])
         assert left(tmp_path / "other") == []
-
-
-def test_without_an_address_only_by_hand(tmp_path: Path) -> None:
     with pytest.raises(BufgymError, match=r"ucc-4g: the address .* not known: fetch them by hand from https://www.ucc"):
         fetch_dataset("ucc-4g", tmp_path)
     with zipfile.ZipFile(tmp_path / "4G.zip", "w") as archive:

@@ -177,7 +177,6 @@ def test_slerp_turns_evenly_and_the_short_way() -> None:
 
 @given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1))
 def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, float]) -> None:
-    """Whichever component is the largest; q and -q are one rotation."""
     x, y, z, w = expected = np.array(numbers) / math.hypot(*numbers)
     matrix = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

@@ -15,10 +15,12 @@ from bufgym.errors import BufgymError
 from bufgym.traces import detect_format, read_trace
 from bufgym.traces.formats import mahimahi
 
-NUTTCP = """[2024-11-01T14:59:42.722595-0700] nuttcp-t: v8.1.4: socket
+NUTTCP = """Start time: 1730498381814
+[2024-11-01T14:59:42.722595-0700] nuttcp-t: v8.1.4: socket
 [2024-11-01T14:59:42.724539-0700]     3.1250 MB /   0.50 sec =   52.4220 Mbps     0 retrans   2599 KB-cwnd
 [2024-11-01T14:59:42.724540-0700]     0.0000 MB /   0.49 sec =    0.0000 Mbps     2 retrans      1 KB-cwnd
 [2024-11-01T14:59:43.702696-0700]     0.0625 MB /   0.50 sec =    1.0486 Mbps     0 retrans      1 KB-cwnd
+[2024-11-01T15:01:42.809697-0700]
 [2024-11-01T15:01:42.809794-0700] nuttcp-r: 3.1875 MB in 1.50 real seconds = 2176.00 KB/sec = 17.8258 Mbps
 End time: 1730498502868
 """

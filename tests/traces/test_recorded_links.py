@@ -65,7 +65,6 @@ def test_recorded_links_agree_with_the_table(shared_data: Path, name: str) -> No
 
 @pytest.mark.nightly
 def test_every_member_of_the_ucc_archive(shared_data: Path) -> None:
-    """The table counts each line of a download as 1 s, and so does the reader: nothing is left but rounding."""
     archive = shared_data / "ucc_5g" / "5G-production-dataset.zip"
     traces = {member: read_trace(f"{archive}:{member}") for member in members(archive)}
     downloads = {"/".join(m.split("/")[-2:]): trace for m, trace in traces.items() if "/Download/" in m}

@@ -59,7 +59,7 @@ def generate(*arguments: str) -> None:
     options.command(options)
 
 
-def test_the_command_writes_traces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_traces_motion_and_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (
         "link --mode train --seed 4 --duration 50 --mean 8e6",
         "gilbert-elliott --seed 4 --duration 50 --mean-bad 1",
@@ -71,9 +71,6 @@ def test_the_command_writes_traces(tmp_path: Path, capsys: pytest.CaptureFixture
         generate(*arguments.split(), "-o", str(tmp_path / "a.csv"))
         assert read_trace(tmp_path / "a.csv").duration_us == 50_000_000
         assert "mean" in capsys.readouterr().out
-
-
-def test_the_command_writes_motion_and_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     generate("drive", "--seed", "1", "--duration", "20", "--cruise", "1,1", "-o", str(tmp_path / "m.csv"))
     assert read_motion(tmp_path / "m.csv").duration_us == 20_000_000
     generate("frames", "--motion", str(tmp_path / "m.csv"), "--duration", "2", "-o", str(tmp_path / "f.csv"))

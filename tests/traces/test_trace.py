@@ -46,7 +46,7 @@ def test_describe(trace: Trace, expected: tuple[float, ...]) -> None:
     assert STORY.seconds_below(700_000, window_us=4_000_000) == 4.0
 
 
-def test_scaled_rounds_each_count_and_equality_is_by_value() -> None:
+def test_scaling_equality_steps_and_copies() -> None:
     same = Trace("story", STORY.time_us.copy(), STORY.cumulative_bytes.copy(), source="elsewhere")
     assert same == STORY and hash(same) == hash(STORY)
     assert STORY.scaled(2) != STORY and STORY != "story"
@@ -57,9 +57,6 @@ def test_scaled_rounds_each_count_and_equality_is_by_value() -> None:
     assert trace.time_us.tolist() == [0, 1_000_000, 2_000_000, 2_500_000, 3_000_000]
     assert trace.cumulative_bytes.tolist() == [0, 1_000_000, 2_000_000, 2_500_000, 2_500_000]
     assert Trace.constant(0.5, 4).cumulative_bytes.tolist() == [0, 0, 1, 2, 2]
-
-
-def test_arrays_are_read_only_copies() -> None:
     given_us, given_bytes = np.array([0, 10]), np.array([0, 10])
     trace = Trace("link", given_us, given_bytes)
     given_us[1] = given_bytes[1] = 99
@@ -84,8 +81,6 @@ def test_broken_traces_and_arguments() -> None:
         (bad([0, 1, 2], [0, 5, 4]), r"cumulative_bytes\[2\] = 4 after 5: must not decrease"),
         (bad([0.0, float("nan")], [0, 1]), r"time_us\[1\] = nan: must be a whole number"),
         (bad([0, 1], [0, 2**63]), "below 2"),
-        (bad([False, True], [0, 1]), "holds bool values"),
-        (bad([[0, 1]], [0, 1]), "has 2 dimensions"),
         (bad([0, 2**62], [0, 1]), "both must be below"),
         (bad([0, 2**31], [0, 2**31]), "bytes x microseconds must be below 2"),
         (bad([0, 1], [0, 0]), "no capacity at all"),
@@ -94,12 +89,9 @@ def test_broken_traces_and_arguments() -> None:
         (lambda: STORY.scaled(1e13), "would pass 2"),
         (lambda: STORY.scaled(0), "no capacity"),
         (lambda: STORY.rate_bytes_per_s(-1), "time_us = -1: must be >= 0"),
-        (lambda: STORY.samples(0), "window_us = 0: must be >= 1"),
-        (lambda: Trace.constant(-1, 5), "step 0 has -1 bytes/s"),
         (lambda: Trace.steps([(1, 1), (float("inf"), 1)]), "step 1 lasts inf s"),
         (lambda: Trace.constant(1, 1.1e7), "beyond 10000000 s"),
         (lambda: Trace.from_intervals([1, 0], [1, 1]), r"interval_us\[1\] = 0: must be >= 1"),
-        (lambda: Trace.from_intervals([1, 1], [1, -4]), r"bytes_in_interval\[1\] = -4: must be >= 0"),
     ):
         with pytest.raises(BufgymError, match=says):
             make()
