@@ -44,18 +44,9 @@ def test_every_layout_is_recognised(layout: str, time_us: Any, metres: Any, x_m:
         assert sequence.motion().total == pytest.approx(90 / camera.fov_deg + 0.25)
 
 
-def test_65535_is_no_measurement_and_a_pose_that_drifted_a_rotation_again(tmp_path: Path) -> None:
-    folder = frame_cases.seven_scenes(tmp_path / "desk")
-    (folder / "frame-000000.depth.png").write_bytes(frame_cases.png(65535))
-    (folder / "frame-000000.pose.txt").write_text("1.001 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
-    sequence = open_sequence(folder)
-    assert not sequence.depth(0).any() and sequence.poses[0, :3, :3] == pytest.approx(np.eye(3), abs=1e-12)
-
-
 CHANGES: dict[str, Callable[[bytes], bytes | None]] = {
     "gone": lambda data: None,
     "cut": lambda data: data[:-20],
-    "small": lambda data: frame_cases.png(1000, shape=(240, 320)),
     "text": lambda data: b"1 2 3",
     "outside": lambda data: data.replace(b"depth/0", b"../0"),
 }
@@ -66,13 +57,10 @@ CHANGES: dict[str, Callable[[bytes], bytes | None]] = {
     [
         ("tum", "depth/1.png", "gone", "no such file"),
         ("tum", "depth/1.png", "cut", "truncated or damaged"),
-        ("tum", "depth/1.png", "small", "size = '320 x 240': must be 640 x 480"),
         ("tum", "groundtruth.txt", "text", "must have 8 columns, has 3"),
-        ("7-scenes", "frame-000001.depth.png", "text", "must be a PNG or JPEG image"),
         ("7-scenes", "frame-000001.pose.txt", "text", "must be a 4x4 matrix"),
         ("packed", "poses_camera_to_world.txt", "text", "line 1: '1 2 3': must be a 4x4 matrix"),
         ("packed", "depth_320x240_mm.zip", "cut", "truncated, or no zip archive"),
-        ("packed", "gray_320x240.zip", "gone", "no such file"),
         ("tum", "depth.txt", "outside", "line 2: file = ../0.png: must be a path inside the folder"),
     ],
 )
@@ -91,6 +79,20 @@ def test_what_is_broken_is_one_error(layout: str, file: str, change: str, rule: 
     assert Path(file).name in message and rule in message and "\n" not in message
 
 
+def test_missing_measurements_poses_that_drifted_and_reduced_frames(tmp_path: Path) -> None:
+    folder = frame_cases.seven_scenes(tmp_path / "desk")
+    (folder / "frame-000000.depth.png").write_bytes(frame_cases.png(65535))
+    (folder / "frame-000000.pose.txt").write_text("1.001 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
+    sequence = open_sequence(folder)
+    assert not sequence.depth(0).any() and sequence.poses[0, :3, :3] == pytest.approx(np.eye(3), abs=1e-12)
+    depth = np.arange(8, dtype=np.float32).reshape(2, 4)
+    whole = frame_cases.Held(Camera(4, 2, 8.0, 8.0, 2.0, 1.0), [depth], [np.eye(4)])
+    half = whole.reduced(2).loaded()
+    assert half.depth(0).tolist() == [[0.0, 2.0]] and half.camera == Camera(2, 1, 4.0, 4.0, 1.0, 0.5)
+    with pytest.raises(BufgymError, match="stride = 3: must divide 4 x 2"):
+        whole.reduced(3)
+
+
 def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(BufgymError, match=r"depth\.txt \(TUM\)"):
         open_sequence(tmp_path)
@@ -101,17 +103,7 @@ def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyP
         library("rvl")
 
 
-def test_reduced_frames_are_every_second_pixel() -> None:
-    camera = Camera(4, 2, 8.0, 8.0, 2.0, 1.0)
-    whole = frame_cases.Held(camera, [np.arange(8, dtype=np.float32).reshape(2, 4)], [np.eye(4)])
-    half = whole.reduced(2).loaded()
-    assert half.depth(0).tolist() == [[0.0, 2.0]]
-    assert half.camera == Camera(2, 1, 4.0, 4.0, 1.0, 0.5)
-    with pytest.raises(BufgymError, match="stride = 3: must divide 4 x 2"):
-        whole.reduced(3)
-
-
-def test_rvl_as_worked_by_hand_and_back() -> None:
+def test_rvl_as_worked_by_hand_and_the_size_of_a_frame() -> None:
     """Two empty pixels, then 5, 6, 4 mm: runs 2 and 3, differences +5, +1, -2 as 10, 2, 3, a nibble each (a bit says
     that more follows): 2, 3, 10 as 010 with that bit and then 1, 2, 3; after a word with the number of pixels."""
     rvl = library("rvl")
@@ -119,10 +111,7 @@ def test_rvl_as_worked_by_hand_and_back() -> None:
     packed = rvl.compress(depth_mm)
     assert packed == (5).to_bytes(4, "little") + 0x23A12300.to_bytes(4, "little")
     assert rvl.decompress(packed)[: depth_mm.nbytes] == depth_mm.tobytes()
-
-
-def test_a_frames_size_is_its_depth_and_its_picture() -> None:
-    """An even wall costs a nibble for each of 307 200 pixels, 150 kB; where nothing was measured, nearly none."""
+    # An even wall costs a nibble for each of 307 200 pixels, 150 kB; where nothing was measured, nearly none.
     grey = np.full((480, 640), 90, np.uint8)
     picture = len(library("cv2").imencode(".jpg", grey, [1, 50])[1])
     wall = encoded_bytes(np.full((480, 640), 1.5, np.float32), grey)

@@ -24,16 +24,18 @@ def wall(*depths_m: float, camera: Camera = CAMERA) -> frame_cases.Held:
     return frame_cases.Held(camera, depths, [np.eye(4)] * len(depths))
 
 
-def test_a_flat_wall_as_worked_by_hand() -> None:
+def test_flat_walls_as_worked_by_hand() -> None:
     """At 1 m: free up to 0.7 m, then (1 - z) / 0.3, nothing known behind 1.3 m."""
     found = fuse(wall(1.0), [0], AHEAD)
     assert found.tsdf[0, 0] == pytest.approx([1, 1, 1, 1, 2 / 3, 1 / 3, 0, -1 / 3, -2 / 3, -1, 0, 0], abs=1e-6)
     assert found.weight[0, 0].tolist() == [1] * 10 + [0] * 2
     assert found.points()[:, 2] == pytest.approx(np.ones(4), abs=1e-6)
-
-
-def test_frames_are_weighed() -> None:
-    """Two frames meet in the middle; with a memory of one frame the third counts half; one without depth nothing."""
+    # The grid of its own holds all that was seen.
+    grid = grid_of(wall(1.0), voxel_m=0.1)
+    high = np.array(grid.origin_m) + grid.voxel_m * (np.array(grid.shape) - 1)
+    assert grid.origin_m == pytest.approx([-3.5 / 4 - 0.3, -2.5 / 4 - 0.3, 0.7])
+    assert (high >= [3.5 / 4 + 0.3, 2.5 / 4 + 0.3, 1.3 - 1e-9]).all()
+    # Two frames meet in the middle; with a memory of one frame the third counts half; one without depth nothing.
     found = fuse(wall(1.0, 1.1), [0, 1], AHEAD)
     assert found.points()[:, 2] == pytest.approx(np.full(4, 1.05), abs=1e-6) and found.weight.max() == 2
     assert fuse(wall(1.0, 1.1), [1], AHEAD).points()[:, 2] == pytest.approx(np.full(4, 1.1), abs=1e-6)
@@ -46,7 +48,6 @@ def test_frames_are_weighed() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_the_kernels_do_what_their_twins_do(seed: int) -> None:
-    """From any pose, in front of voxels and behind them."""
     rng = np.random.default_rng(seed)
     pose = np.eye(4)
     pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -80,15 +81,6 @@ def test_the_error_of_a_shifted_plane() -> None:
     # Pixels 0 to 3 see x < 0; of the points at 0 to 0.5 m each is as far away as it lies from that at -0.1 m.
     assert (found.to_reference_m, found.uncovered) == (0, pytest.approx(6 / 11))
     assert found.from_reference_m == pytest.approx(np.sqrt((0.01 + 0.04 + 0.09 + 0.16 + 0.25 + 0.36) / 11), abs=1e-6)
-
-
-def test_the_grid_holds_all_that_was_seen() -> None:
-    grid = grid_of(wall(1.0), voxel_m=0.1)
-    assert grid.truncation_m == pytest.approx(0.3)
-    low = np.array(grid.origin_m)
-    high = low + grid.voxel_m * (np.array(grid.shape) - 1)
-    assert low == pytest.approx([-3.5 / 4 - 0.3, -2.5 / 4 - 0.3, 0.7])
-    assert (high >= [3.5 / 4 + 0.3, 2.5 / 4 + 0.3, 1.3 - 1e-9]).all()
 
 
 def test_errors() -> None:

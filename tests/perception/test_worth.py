@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
@@ -23,11 +22,6 @@ def made(**settings: Any) -> Any:
     return gym.make("bufgym/Mapping-v0", **settings).unwrapped
 
 
-@pytest.mark.nightly
-def test_gymnasium_finds_nothing_to_complain_about() -> None:
-    check_env(made(observation="flat"))
-
-
 def played(env: Any, action: int) -> tuple[list[float], dict[str, Any]]:
     """Rewards of an episode and its last info."""
     env.reset(seed=1)
@@ -39,7 +33,6 @@ def played(env: Any, action: int) -> tuple[list[float], dict[str, Any]]:
 
 
 def test_frames_have_the_sizes_that_they_are_said_to_have() -> None:
-    """Two of them encoded again; in between they follow the neighbours that were."""
     whole, sizes = worth.recording(), streams.between(worth.SIZES, worth.FRAMES)
     measured = {k: whole.size_bytes(k) for k in (120, 239)}
     assert measured == pytest.approx({k: int(sizes[k]) for k in measured}, rel=0.01)
@@ -58,13 +51,8 @@ def test_what_is_paid_comes_at_the_end() -> None:
     assert terms["covered"] == worth.scene().coverage.share(kept)
     assert terms["followed"] == views.least_overlap(worth.scene().seen, np.union1d(kept, [0, worth.FRAMES - 1]))
     assert 0 <= terms["tracked"] <= 1
-
-
-def test_who_sends_nothing_earns_nothing() -> None:
-    env = made(reward={"covered": 1.0, "followed": 1.0, "tracked": 1.0})
-    rewards, info = played(env, env.action_space.n - 2)  # rejects all
-    assert info["delivered"] == 0 and rewards[-1] < 0.5
-    assert info["reward_terms"]["covered"] == info["reward_terms"]["tracked"] == 0
+    rewards, info = played(env, env.action_space.n - 2)  # rejects all: earns nothing
+    assert info["delivered"] == 0 == info["reward_terms"]["covered"] == info["reward_terms"]["tracked"] == rewards[-1]
 
 
 def test_its_terms_are_for_its_recording_alone() -> None:

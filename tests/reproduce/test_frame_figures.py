@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bufgym.kernel import JIT
-from bufgym.reproduce import STORE, afr_fig7, afr_fig8, afr_overlap, afr_qoi_task, frame_tasks, run
+from bufgym.reproduce import afr_fig7, afr_fig8, afr_overlap, frame_tasks
 from bufgym.reproduce.correlation import spearman, spearman_over
-from bufgym.reproduce.frame_runs import Setting
 from bufgym.reproduce.frame_tasks import Store, Task, carry_out
 from bufgym.reproduce.rows import Rows
 from bufgym.traces import Trace
@@ -89,8 +87,6 @@ def test_the_claims_of_fig8_count_failures(tmp_path: Path) -> None:
     assert (facts["third_count"], facts["learned_count"]) == ("room 2 against 6", "room 1 against 2")
     assert facts["third"] and facts["large"] and facts["learned"]
     assert not facts["oldest"] and not facts["afr"]  # 30 % of the runs, and 10 %
-    facts = fig8_claims(broken | {("room", "afr", 15): 1}, None, 5, 15)  # AFR's first at L = 15
-    assert not facts["large"] and not facts["third"]
     # A claim holds on every recording: on 7-Scenes AFR breaks one and the agent two.
     (tmp_path / "rgbd_7scenes").mkdir()
     broken = {("room", "drop-oldest", 5): 5, ("7-scenes", "drop-oldest", 5): 5, ("7-scenes", "afr", 5): 1}
@@ -112,39 +108,3 @@ def test_the_best_frames_in_hindsight_and_rules_at_a_distance() -> None:
     assert found is not None and found["broken_6"] == 0.5  # at frame 0; frame 1 sees nothing new
     assert found["excess_6"] == pytest.approx(0.2) and found["broken_5"] == 0
     assert afr_overlap._rules(v, np.arange(4.0), 2) is None  # 4 frames on is beyond the end
-
-
-def test_runs_of_one_cell_are_compared_and_policies_ranked_by_their_means() -> None:
-    less = afr_qoi_task._less_mean(np.array([1.0, 3, 10, 30]), [(0, 5), (0, 5), (1, 5), (1, 5)])
-    assert less.tolist() == [-1, 1, -10, 10]
-    # Two runs each: Random covers 0.6 on average, AFR 0.7; AFR's map is 8 mm off, Random's 7 mm.
-    runs = {"random": [(0.4, 5.0), (0.8, 9.0)], "afr": [(0.7, 8.0), (0.7, 8.0)]}
-    rows = Rows({"policy": name, "coverage": c, "rmse_mm": mm} for name, some in runs.items() for c, mm in some)
-    assert afr_qoi_task.ranked(rows, "coverage") == ["afr", "random"]
-    assert afr_qoi_task.ranked(rows, "rmse_mm") == ["random", "afr"]
-
-
-SMALL: dict[str, Any] = {"frames": 40, "capacities": (2,), "offsets": 2, "jobs": 1}
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(not JIT, reason="without compilation a room takes minutes to draw")
-def test_a_run_on_the_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for library in ("cv2", "rvl", "scipy"):
-        pytest.importorskip(library)
-    policies = ("drop-oldest", "orbbuf-images", "clairvoyant")
-    text = run("afr-fig8", tmp_path, **SMALL, policies=policies)
-    assert "room, runs of 2 in which tracking breaks" in text and (tmp_path / STORE).is_file()
-
-    def carried_out(one: Task) -> Any:
-        raise AssertionError(f"done again: {one}")
-
-    fig8 = afr_fig8.Reproduction(**SMALL, policies=policies, store=tmp_path / STORE)
-    monkeypatch.setattr(frame_tasks, "carried_out", carried_out)
-    rows = fig8.simulate()
-    assert len(rows) == 2 * len(policies)
-    for row in rows:
-        assert 2 < row["received"] < 40 and 0 < row["coverage"] <= 1 and 0 <= row["least_overlap"] <= 1
-        assert row["received"] == len(fig8.kept(Setting("room", row["k"], 2, row["policy"])))
-    # The images and the plan are kept; which frames Drop Oldest keeps is found out again, as it takes no time.
-    assert fig8.recordings == ["room"] and fig8.link.name == "fade"

@@ -33,7 +33,7 @@ def receipts_s(sent: Sent, first: int, last: int) -> list[float | None]:
     return [None if math.isnan(at_s) else round(at_s, 6) for at_s in sent.received_s[first : last + 1].tolist()]
 
 
-def test_robofleet_over_a_dropout_of_a_second() -> None:
+def test_each_sender_over_a_dropout_of_a_second() -> None:
     sent = after_dropout("robofleet")
     # 12.5 ms of link and 10 ms to the server.
     assert receipts_s(sent, 0, 10) == [round(0.1 * k + 0.0225, 6) for k in range(11)]
@@ -44,9 +44,6 @@ def test_robofleet_over_a_dropout_of_a_second() -> None:
     assert recovery_s(sent, 1.05, 2.05, 2) == pytest.approx(2.1375 - 2.05)
     # Within 1.5 times, 33.75 ms, only from message 22 on.
     assert recovery_s(sent, 1.05, 2.05, 1.5) == pytest.approx(2.2225 - 2.05)
-
-
-def test_rosbridge_over_the_same_dropout() -> None:
     sent = after_dropout("rosbridge")
     # Nothing is dropped: message 11 + j leaves 37.5 ms x (j + 1) after the link's return, until they come slower.
     backlog = [round(2.05 + 0.0375 * (j + 1) + 0.01, 6) for j in range(16)]
@@ -54,15 +51,9 @@ def test_rosbridge_over_the_same_dropout() -> None:
     # Nominal 47.5 ms. Latency 0.9975 - 0.0625 j falls to 95 ms at j = 14.44: message 26 is the first within.
     assert recovery_s(sent, 1.05, 2.05, 2) == pytest.approx(backlog[15] - 2.05)
     assert backlog[15] - 2.05 == pytest.approx(0.61)
-
-
-def test_native_ros_keeps_its_queue_and_no_drop_all() -> None:
     sent = after_dropout("ros-native", queue_size=3)
     # Message 11 is on its way; of 12 to 20 the last three wait. Nobody waits for pongs.
     assert receipts_s(sent, 11, 21) == [2.0725, *[None] * 6, 2.085, 2.0975, 2.11, 2.1225]
-    # 110 ms for message 20, 22.5 for message 21, which arrives at 2.1 with the socket just free.
-    assert recovery_s(sent, 1.05, 2.05, 2) == pytest.approx(2.1225 - 2.05)
-
     # No-drop queues all, and is paced by pongs: one per 12.5 + 20 ms from 2.05 + 0.0125 on.
     sent = after_dropout("no-drop")
     assert receipts_s(sent, 11, 14) == [round(2.0725 + 0.0325 * k, 6) for k in range(4)]
@@ -119,25 +110,7 @@ ONE_KIND: Options = {"dropouts_s": (5,), "links_mbit_per_s": (50,), "kinds": ("L
 ZONE: Options = {"bad_mbit_per_s": (1.0,), "image_priorities": (1.0, 0.01), "bad_from": 100, "runs": 1}
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "facts"),
-    [
-        ("robofleet-fig3", {"rates_hz": (10, 100), "duration_s": 5, "runs": 2}, "low grows rosbridge"),
-        ("robofleet-fig4", ONE_KIND | {"dropouts_s": (2, 20)}, "nearer=2 finite=2"),
-        ("robofleet-fig5", {"runs": 1}, "low order"),
-        ("robofleet-fig6", {"points": (1_500,), "max_consumers": 4, "duration_s": 10, "runs": 1}, "constant linear"),
-        ("robofleet-fig7", ZONE, "no-drop spike longer lost=0"),
-    ],
-)
-def test_claims_hold_in_small_runs(name: str, options: Options, facts: str) -> None:
-    small = figure(name, **options)
-    found = small.claims(small.simulate())
-    for fact in facts.split():
-        key, _, value = fact.partition("=")
-        assert found[key] == int(value) if value else found[key] is True, fact
-
-
-def test_fig3_has_the_rates_worked_by_hand() -> None:
+def test_fig3_and_fig4_have_the_numbers_worked_by_hand() -> None:
     fig3 = figure("robofleet-fig3", rates_hz=(10, 100), duration_s=5, runs=1)
     rows = fig3.simulate()
     # Fewer messages: 100 Mbit/s take 12.83 ms for 160,344 bytes; with a round trip of 10 ms 43.8 a second.
@@ -147,16 +120,13 @@ def test_fig3_has_the_rates_worked_by_hand() -> None:
     slow = figure("robofleet-fig3", rates_hz=(5, 10), duration_s=1, runs=1)
     assert slow.claims(slow.simulate())["grows"] is None  # no rate exceeds the link
     assert rows == fig3.simulate()
-
-
-def test_fig4_recovers_when_the_backlog_is_gone() -> None:
-    """Rosbridge's backlog: dropout x load / (1 - load), to within a few messages; a silence delays both senders."""
+    # Rosbridge's backlog: dropout x load / (1 - load), to within a few messages; a silence delays both senders.
     quick, silent = (figure("robofleet-fig4", **ONE_KIND, silence_s=s).simulate() for s in (0.0, 2.0))
     load = 28_000 * 10 / 6.25e6
     assert quick.mean("recovery_s", sender="rosbridge") == pytest.approx(5 * load / (1 - load), rel=0.15)
     assert quick.mean("recovery_s", sender="robofleet") < 0.5
-    for before, after in zip(quick, silent, strict=True):
-        assert float(after["recovery_s"]) == pytest.approx(float(before["recovery_s"]) + 2, abs=0.3)
+    later = [float(row["recovery_s"]) + 2 for row in quick]
+    assert silent.column("recovery_s") == pytest.approx(later, abs=0.3)
 
 
 def test_fig5_and_fig6_have_the_latencies_worked_by_hand() -> None:
@@ -204,14 +174,9 @@ def test_unusable_options_are_refused() -> None:
     for name, options, rule in (
         *((f"robofleet-fig{k}", {"runs": 0}, "runs = 0: must be a whole number >= 1") for k in range(3, 8)),
         *((f"robofleet-fig{k}", {"round_trip_ms": -1}, "round_trip_ms = -1: must be a n") for k in range(3, 8)),
-        ("robofleet-fig3", {"points": 0}, "points = 0: must be a whole number from 1"),
         ("robofleet-fig4", {"kinds": ("Laser",)}, "must be some of PointCloud2, CompressedImage, LaserScan"),
-        ("robofleet-fig4", {"factor": 1}, "factor = 1: must be above 1"),
-        ("robofleet-fig4", {"shown_s": 3}, "shown_s = 3: must be one of dropouts_s"),
         ("robofleet-fig5", {"fall_s": 1, "stay_s": 0}, "fall_s + stay_s = 1: must be at least 2"),
-        ("robofleet-fig6", {"max_consumers": 1}, "max_consumers = 1: must be a whole number from 2 to 100"),
         ("robofleet-fig6", {"queue_sizes": (1.5,)}, "queue_sizes = 1.5: must be a whole number >= 1"),
-        ("robofleet-fig7", {"shown_mbit_per_s": 3}, "shown_mbit_per_s = 3: must be one of bad_mbit_per_s"),
     ):
         with pytest.raises(BufgymError, match=re.escape(rule)):
             run(name, **options)

@@ -29,18 +29,13 @@ class Site:
     data: bytes = DATA
     etag: str | None = '"v1"'
     ranges: bool = True
-    cuts: list[int] = field(default_factory=list)
-    """Bytes after which each of the next connections is cut."""
-    codes: list[int] = field(default_factory=list)
-    """Answers to the next requests, instead of the file."""
-    stall: int | None = None
-    """Silent after so many bytes."""
-    length: int | None = None
-    """Content-Length instead of the true one; -1: none."""
+    cuts: list[int] = field(default_factory=list)  # bytes after which each of the next connections is cut
+    codes: list[int] = field(default_factory=list)  # answers to the next requests, instead of the file
+    stall: int | None = None  # silent after so many bytes
+    length: int | None = None  # Content-Length instead of the true one; -1: none
     chunked: bool = False
     headers: dict[str, str] = field(default_factory=dict)
-    asked: list[str | None] = field(default_factory=list)
-    """The Range of each request."""
+    asked: list[str | None] = field(default_factory=list)  # the Range of each request
     address: str = ""
     closing: threading.Event = field(default_factory=threading.Event)
 

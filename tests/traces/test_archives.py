@@ -76,32 +76,22 @@ def test_one_of_several_members(tmp_path: Path) -> None:
             load(name)
 
 
-def test_archives_without_a_file(tmp_path: Path) -> None:
+def test_archives_without_a_file_or_damaged(tmp_path: Path) -> None:
     plain = written(tmp_path, "1\n", "plain.zip")
-    assert read_trace(plain).total_bytes == 1500  # told by its content, whatever its name
-    assert members(plain) == []
+    assert read_trace(plain).total_bytes == 1500 and members(plain) == []  # told by its content, whatever its name
     assert read_trace(written(tmp_path, "1\n", "a.zip:b.csv")).total_bytes == 1500
-    for path, says in (
-        (zipped(tmp_path / "data.zip", {"folder/": ""}), r"holds 0 members \(none\)"),
-        (tmp_path / "nothing.zip:a.csv", "no such file"),
-        (f"{plain}:a.csv", r"plain\.zip is no zip archive: cannot have members"),
-    ):
-        with pytest.raises(TraceError, match=says):
-            read_trace(path)
+    with pytest.raises(TraceError, match=r"holds 0 members \(none\)"):
+        read_trace(zipped(tmp_path / "data.zip", {"folder/": ""}))
+    with pytest.raises(TraceError, match=r"plain\.zip is no zip archive: cannot have members"):
+        read_trace(f"{plain}:a.csv")
     with pytest.raises(TraceError, match="cannot be read"):
         members(tmp_path / "nothing.zip")
-
-
-def test_damaged_archives(tmp_path: Path) -> None:
     whole = zipped(tmp_path / "data.zip", {"lte.csv": "\n".join(map(str, range(3000)))}).read_bytes()
-    broken = written(tmp_path, whole[:-30], "cut.zip")
-    for read in (read_trace, members):
-        with pytest.raises(TraceError, match=r"cut\.zip: zip data damaged or cut off"):
-            read(broken)
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 0xFF
-    with pytest.raises(TraceError, match=r"flipped.zip, line \d+: zip data damaged or cut off"):
-        read_trace(written(tmp_path, bytes(flipped), "flipped.zip"))
+    for name, raw in (("cut.zip", whole[:-30]), ("flipped.zip, line .*", bytes(flipped))):
+        with pytest.raises(TraceError, match=rf"{name}: zip data damaged or cut off"):
+            read_trace(written(tmp_path, raw, name.split(",")[0]))
 
 
 def test_limits_encryption_and_foreign_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -87,9 +87,7 @@ def test_x_begins_at_the_first_message_chosen(tmp_path: Path) -> None:
     later = read_workload(path, topics=["/status"], odom="/odom")
     assert later.arrival_us.tolist() == [0] and later.x is not None and later.x.tolist() == [0]
     assert read_workload(path).x is None
-
-
-def test_messages_out_of_order_and_without_content(tmp_path: Path) -> None:
+    # Messages out of order, and without content.
     entries = [(ms, "/t", STRING, cases.text("x" * ms)) for ms in (30, 10, 20)]
     workload = read_workload(cases.write_mcap(tmp_path / "w.mcap", entries))
     assert workload.arrival_us.tolist() == [0, 10_000, 20_000] and workload.size_bytes.tolist() == [19, 29, 39]
@@ -97,30 +95,27 @@ def test_messages_out_of_order_and_without_content(tmp_path: Path) -> None:
     assert empty.size_bytes.tolist() == [1] and empty.topics == {"/e": "std_msgs/msg/Empty"}
 
 
-@pytest.mark.parametrize(
-    ("times_s", "says", "gaps", "tens"),
-    [
-        # Turning by 10 degrees a second, odometry at these times; after the last pose nothing is known to move.
-        ([0, 1, 2, 6, 7, 8], "a gap of more than 1 s .*, the longest 4.0 s, at 2.0", [(2, 6)], [*range(9), 8]),
-        ([3, 4, 5], "2 gaps .*, the longest 4[.]0 s, at 5[.]0 s", [(0, 3), (5, 9)], [0, 0, 0, 0, 1, 2, 2, 2, 2, 2]),
-        # Gaps before the first message or after the last are no concern of it.
-        ([-5, *range(10), 20], None, [], range(10)),
-    ],
-)
-def test_gaps_are_refused_unless_told_to_bridge_them(
-    tmp_path: Path, times_s: list[int], says: str | None, gaps: list[tuple[int, int]], tens: list[int]
-) -> None:
-    turning = [(1000 * t, "/odom", ODOMETRY, cases.odometry(0, 10 * t)) for t in times_s]
-    messages = [(1000 * k, "/cam", STRING, cases.text("x")) for k in range(10)]
-    path = cases.write_mcap(tmp_path / "gap.mcap", turning + messages)
-    if says:
-        with pytest.raises(BufgymError, match=f"/odom has {says}"):
-            read_workload(path, topics=["/cam"], odom="/odom")
-    bridged = read_workload(path, topics=["/cam"], odom="/odom", bridge_gaps=says is not None)
-    assert bridged.gaps == tuple((a * 1_000_000, b * 1_000_000) for a, b in gaps)
-    assert bridged.longest_gap_s == (4.0 if gaps else 0.0)
-    assert bridged.x == pytest.approx([k / 6 for k in tens])
-    assert read_workload(path, topics=["/cam"], odom="/odom", settings=MotionSettings(max_gap_s=4)).gaps == ()
+def test_gaps_are_refused_unless_told_to_bridge_them(tmp_path: Path) -> None:
+    """Turning by 10 degrees a second, odometry at these times; after the last pose nothing is known to move."""
+    for k, (times_s, says, gaps, tens) in enumerate(
+        (
+            ([0, 1, 2, 6, 7, 8], "a gap of more than 1 s .*, the longest 4.0 s, at 2.0", [(2, 6)], [*range(9), 8]),
+            ([3, 4, 5], "2 gaps .*, the longest 4[.]0 s, at 5[.]0 s", [(0, 3), (5, 9)], [0, 0, 0, 0, 1, 2, 2, 2, 2, 2]),
+            # Gaps before the first message or after the last are no concern of it.
+            ([-5, *range(10), 20], None, [], range(10)),
+        )
+    ):
+        turning = [(1000 * t, "/odom", ODOMETRY, cases.odometry(0, 10 * t)) for t in times_s]
+        messages = [(1000 * t, "/cam", STRING, cases.text("x")) for t in range(10)]
+        path = cases.write_mcap(tmp_path / f"{k}.mcap", turning + messages)
+        if says:
+            with pytest.raises(BufgymError, match=f"/odom has {says}"):
+                read_workload(path, topics=["/cam"], odom="/odom")
+        bridged = read_workload(path, topics=["/cam"], odom="/odom", bridge_gaps=says is not None)
+        assert bridged.gaps == tuple((a * 1_000_000, b * 1_000_000) for a, b in gaps)
+        assert bridged.longest_gap_s == (4.0 if gaps else 0.0)
+        assert bridged.x == pytest.approx([ten / 6 for ten in tens])
+        assert read_workload(path, topics=["/cam"], odom="/odom", settings=MotionSettings(max_gap_s=4)).gaps == ()
 
 
 def test_odometry_that_is_none(tmp_path: Path) -> None:
@@ -233,10 +228,7 @@ def test_the_metadata_of_a_rosbag2_is_bounded(tmp_path: Path) -> None:
     os.truncate(file, 1 << 32)
     refused(path, "larger than 8388608 bytes")
     assert len(read_bag((path / "drive.db3").rename(tmp_path / "alone")).time_ns) == 9  # the file alone, by any name
-
-
-def test_sqlite_computes_nothing_of_its_own(tmp_path: Path) -> None:
-    """A column of a gigabyte that is computed when it is read."""
+    # A column of a gigabyte that is computed when it is read.
     with sqlite3.connect(tmp_path / "bomb.db3") as base:
         base.execute("CREATE TABLE topics(id, name, type, serialization_format)")
         base.execute("INSERT INTO topics VALUES (1, '/t', 'x', 'cdr')")
@@ -246,7 +238,6 @@ def test_sqlite_computes_nothing_of_its_own(tmp_path: Path) -> None:
 
 
 def test_cut_off_recordings_are_refused(tmp_path: Path) -> None:
-    """A robot that lost power: the recording lacks its end."""
     for kind in ("mcap, zstd", "mcap, plain", "ros1"):
         path = WRITERS[kind][2](tmp_path / f"{kind} cut")
         whole = path.read_bytes()
@@ -256,7 +247,6 @@ def test_cut_off_recordings_are_refused(tmp_path: Path) -> None:
 
 
 def test_real_recordings(shared_data: Path) -> None:
-    """Messages by topic as the libraries' own tools count them."""
     nav2, tree = {"/odom": 2639, "/tf": 5422, "/tf_static": 1, "/amcl_pose": 135}, {"/tf": 517, "/tf_static": 1}
     for name, counts, odom, seconds in (
         ("nav2_turtlebot.mcap", nav2, "/odom", 97.36),

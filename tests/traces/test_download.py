@@ -6,7 +6,6 @@ import errno
 import hashlib
 import io
 import os
-import random
 import shutil
 import socket
 import threading
@@ -84,14 +83,11 @@ def test_what_goes_on(
 @pytest.mark.parametrize(
     ("settings", "says", "attempts"),
     [
-        ({"codes": [503] * 3}, r"the server says 503 Service Unavailable \(gave up after 3 attempts\)$", 3),
         ({"codes": [403, 200]}, r"the server says 403 Forbidden$", 1),
         ({"length": 299_000}, "sends more bytes than the 299000 announced", 1),
         ({"length": 301_000}, "cut after 300000 of 301000 bytes", 3),
         ({"data": b"\n<!DOCTYPE html><title>Please log in</title>"}, "is an HTML page, not data", 1),
-        ({"headers": {"Content-Type": "text/html; charset=utf-8"}}, "is an HTML page", 1),
         ({"headers": {"Content-Encoding": "gzip"}}, "comes with Content-Encoding gzip", 1),
-        ({"data": b""}, "the server sent nothing", 3),
         ({"cuts": [1000] * 3}, r"cut after 3000 of 300000 bytes \(gave up after 3 attempts\); 3000 bytes are kept", 3),
     ],
 )
@@ -117,12 +113,6 @@ def test_the_next_call_goes_on_unless_the_file_changed_meanwhile(site: Site, tmp
         assert said == (["data.bin: the parts do not fit together: fetching it again"] if data is ATAD else [])
 
 
-def test_silence_ends_an_attempt(site: Site, tmp_path: Path) -> None:
-    site.stall = 1000
-    with pytest.raises(BufgymError, match=r"the server (fell silent|does not respond) \(gave up after 2 attempts\)"):
-        get(site, tmp_path, patience=Patience(attempts=2, first_wait_s=0, silence_s=0.3))
-
-
 def test_addresses(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     part = tmp_path / "part"
     with socket.create_server(("127.0.0.1", 0)) as closed:
@@ -136,11 +126,9 @@ def test_addresses(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     }.items():
         with pytest.raises(BufgymError, match=says):
             download(address, part, None, HASTY)
-    nothing: Any = None
+    redirected: Any = (Request("https://a/"), io.BytesIO(), 302, "Found", None, "http://b/")
     with pytest.raises(HTTPError, match="redirects to http://b/, which is not allowed") as caught:
-        connection.SafeRedirects().redirect_request(
-            Request("https://a/"), io.BytesIO(), 302, "Found", nothing, "http://b/"
-        )
+        connection.SafeRedirects().redirect_request(*redirected)
     caught.value.close()
     download(f"{site.address}/moved", part, None, HASTY)
     assert part.read_bytes() == DATA
@@ -154,7 +142,7 @@ def test_addresses(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         download("http://data.example/x", part, None, HASTY)
 
 
-def test_a_full_disk(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silence_and_a_full_disk(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(out: object, block: bytes) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -163,9 +151,13 @@ def test_a_full_disk(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         with pytest.raises(BufgymError, match="mine: the disk is full: make room and run the same command again"):
             get(site, tmp_path)
     usage = shutil.disk_usage(tmp_path)._replace(free=299_999)
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
-    with pytest.raises(BufgymError, match="the disk is full: 300000 bytes are needed, 299999 are free"):
-        get(site, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda path: usage)
+        with pytest.raises(BufgymError, match="the disk is full: 300000 bytes are needed, 299999 are free"):
+            get(site, tmp_path)
+    site.stall = 1000
+    with pytest.raises(BufgymError, match=r"the server (fell silent|does not respond) \(gave up after 2 attempts\)"):
+        get(site, tmp_path, patience=Patience(attempts=2, first_wait_s=0, silence_s=0.3))
 
 
 @contextmanager
@@ -190,51 +182,24 @@ def speaking(talk: Callable[[socket.socket], None]) -> Iterator[str]:
             thread.join()
 
 
-def test_garbled_answers_end_in_a_file_or_our_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
-    whole = (
-        b'HTTP/1.1 206 Partial Content\r\nContent-Length: 50\r\nETag: "v1"\r\nContent-Range: bytes 0-49/50\r\n'
-        b"Content-Type: text/plain\r\nConnection: close\r\n\r\n" + DATA[:50]
-    )
-    dice, refused = random.Random(3), 0
-
-    def talk(client: socket.socket) -> None:
-        raw = bytearray(whole)
-        for _ in range(dice.randint(1, 5)):
-            raw[dice.randrange(len(whole) - 45)] = dice.randrange(256)
-        client.sendall(raw)
-
-    with speaking(talk) as address:
-        for _ in range(300):
-            downloading.discard(tmp_path / "part")
-            try:
-                download(address, tmp_path / "part", None, Patience(attempts=2, first_wait_s=0))
-            except BufgymError as error:
-                refused += 1
-                assert str(error).isprintable()
-    assert 30 < refused < 300
-
-
-ENDLESS = {
-    "100 Continue": (b"", b"HTTP/1.1 100 Continue\r\n\r\n" * 40),
-    "trailers": (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n", b"More: and more\r\n" * 60),
-}
+ENDLESS = (
+    (b"", b"HTTP/1.1 100 Continue\r\n\r\n" * 40),
+    (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n", b"More: and more\r\n" * 60),
+)
 
 
 @pytest.mark.parametrize("wait_s", [0.0, 0.02])
-@pytest.mark.parametrize("kind", ENDLESS)
-def test_headers_and_trailers_without_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, wait_s: float
-) -> None:
+def test_headers_and_trailers_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wait_s: float) -> None:
     """As fast as they can, or never silent for long: the attempt ends by bytes, or by time."""
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     monkeypatch.setattr(connection, "MAX_HEAD_BYTES", 10**5)
+    for begin, more in ENDLESS:
 
-    def talk(client: socket.socket) -> None:
-        client.sendall(ENDLESS[kind][0])
-        while True:  # until the client has gone
-            client.sendall(ENDLESS[kind][1])
-            time.sleep(wait_s)
+        def talk(client: socket.socket, begin: bytes = begin, more: bytes = more) -> None:
+            client.sendall(begin)
+            while True:  # until the client has gone
+                client.sendall(more)
+                time.sleep(wait_s)
 
-    with speaking(talk) as address, pytest.raises(BufgymError, match="gave up after 1 attempts"):
-        download(address, tmp_path / "part", None, Patience(attempts=1, silence_s=0.2))
+        with speaking(talk) as address, pytest.raises(BufgymError, match="gave up after 1 attempts"):
+            download(address, tmp_path / "part", None, Patience(attempts=1, silence_s=0.2))

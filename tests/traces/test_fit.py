@@ -53,8 +53,7 @@ def rows_of(values: list[float]) -> list[Float64Array]:
 def test_the_fit_recovers_the_parameters_of_the_generator() -> None:
     fitted = fit_links({"known": recordings()})["known"]
     assert (fitted.recordings, fitted.seconds) == (20, 12_000)
-    # Quantiles within a tenth; those of 5 and 95 % and beyond within a fifth, but for that of 1 %, which few of some
-    # 400 levels reach.
+    # Quantiles within a tenth; the outer ones within a fifth, but for that of 1 %, which few of some 400 levels reach.
     wrong = np.abs(np.array(fitted.quantiles_bytes_per_s) / np.array(KNOWN.quantiles_bytes_per_s) - 1)
     assert wrong[3:-3].max() < 0.1
     assert np.delete(wrong, 1).max() < 0.2
@@ -96,13 +95,6 @@ def test_statistics_by_hand() -> None:
     assert ks_distance(np.array([1.0, 2.0]), np.array([1.0, 2.0])) == 0.0
 
 
-def test_modes_in_names() -> None:
-    names = ("report_car_0002.csv", "logs/wifi_office_231114-151821.txt", "Tram.csv", "report_bus_0001.csv.gz")
-    assert [mode_of(name) for name in names] == ["car", "wifi-office", "tram", "bus"]
-    with pytest.raises(BufgymError, match=r"0001.csv: its name does not say the mode: give --mode"):
-        mode_of("0001.csv")
-
-
 def test_what_the_fit_refuses() -> None:
     for wrong, says in (
         ({}, "no recordings"),
@@ -112,13 +104,16 @@ def test_what_the_fit_refuses() -> None:
     ):
         with pytest.raises(BufgymError, match=says):
             fit_links(wrong)
+    names = ("report_car_0002.csv", "logs/wifi_office_231114-151821.txt", "Tram.csv", "report_bus_0001.csv.gz")
+    assert [mode_of(name) for name in names] == ["car", "wifi-office", "tram", "bus"]
+    with pytest.raises(BufgymError, match=r"0001.csv: its name does not say the mode: give --mode"):
+        mode_of("0001.csv")
     with pytest.raises(BufgymError, match="low_bytes_per_s = 0"):
         fit_links({"a": rows_of([1e6] * 100)}, 0)
 
 
 def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory() -> None:
-    halves = held_out("one", [link_rates(KNOWN, 1, 600)], sets=9)
-    assert halves.parts == 2 and 0 < halves.distance < 1
+    assert 0 < held_out("one", [link_rates(KNOWN, 1, 600)], sets=9).distance < 1
     small = replace(KNOWN, recordings=5, seconds=1500)
     rows = recordings(small, first_seed=77)
     own = {row.name: row.p for row in compare(small, rows, sets=59)}
@@ -127,8 +122,6 @@ def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory()
     other = {row.name: row.p for row in compare(no_memory, rows, sets=59)}
     for name in ("autocorrelation at 1 s", "autocorrelation at 5 s", "seconds under 500 KB/s, %", "outages an hour"):
         assert other[name] < 0.05
-    twice = compare(small, [2 * row for row in rows], sets=59)
-    assert {row.name: row.p for row in twice}["KS distance"] < 0.05
 
 
 def fit(*arguments: str) -> None:
@@ -182,17 +175,11 @@ def test_what_the_command_refuses(tmp_path: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_the_committed_parameters_are_the_fit_of_the_recordings(shared_data: Path) -> None:
-    files = sorted((shared_data / "belgium_4g" / "csv").glob("*.csv"))
-    files += sorted((shared_data / "solis_wifi").glob("wifi_*.txt"))
+def test_the_committed_parameters_are_the_fit_of_the_recordings(shared_data: Path, tmp_path: Path) -> None:
     rows: dict[str, list[Float64Array]] = {}
-    for file in files:
+    for file in sorted([*shared_data.glob("belgium_4g/csv/*.csv"), *shared_data.glob("solis_wifi/wifi_*.txt")]):
         rows.setdefault(mode_of(file), []).append(rates_of(file))
     assert fit_links(rows) == read_links(LINKS)
-
-
-@pytest.mark.nightly
-def test_the_committed_uplinks_are_the_fit_of_what_their_suites_train_on(shared_data: Path, tmp_path: Path) -> None:
     names = "uplink-5g-v1,uplink-wifi-v1,uplink-mmwave-v1"
     fit("--suite", names, "--data", str(shared_data), "-o", str(tmp_path / "uplinks.json"))
     assert (tmp_path / "uplinks.json").read_bytes() == UPLINKS.read_bytes()

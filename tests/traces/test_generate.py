@@ -14,25 +14,13 @@ from hypothesis import strategies as st
 
 from bufgym.errors import BufgymError, TraceError
 from bufgym.traces import outage, synthetic_lte
-from bufgym.traces.generate import (
-    Corridor,
-    Driving,
-    FrameModel,
-    LinkParameters,
-    OutageParameters,
-    drive_motion,
-    fitted_links,
-    frame_sizes,
-    gilbert_elliott,
-    markov_link,
-    ramp,
-    read_links,
-    roaming,
-    steady,
-    tunnel,
-)
-from bufgym.traces.generate.markov import MAX_OUTAGE_S, link_rates
-from bufgym.traces.generate.parameters import LINKS, PROBABILITIES
+from bufgym.traces.generate.driving import Driving, drive_motion
+from bufgym.traces.generate.frames import FrameModel, frame_sizes
+from bufgym.traces.generate.gilbert_elliott import gilbert_elliott
+from bufgym.traces.generate.markov import MAX_OUTAGE_S, link_rates, markov_link
+from bufgym.traces.generate.parameters import LINKS, LinkParameters, OutageParameters, fitted_links, read_links
+from bufgym.traces.generate.roaming import Corridor, roaming
+from bufgym.traces.generate.rules import ramp, steady, tunnel
 from bufgym.traces.motion import Motion
 from bufgym.traces.trace import Trace
 
@@ -45,20 +33,17 @@ SEEDED: tuple[Callable[[int], Trace], ...] = (
 )
 
 # 8 Mbit/s = 1 MB/s everywhere outside outages, nothing inside.
-FLAT = LinkParameters(1, 1000, (1e6,) * len(PROBABILITIES), 0.0, 0.0, 10.0, 0.0, None)
+FLAT = LinkParameters(1, 1000, (1e6,) * 11, 0.0, 0.0, 10.0, 0.0, None)
 OUTAGES = OutageParameters(20, 0.5, 4.0, 60.0, 1.0, 2.0, 2.0, (0.0,) * 5)
 RATES = tuple(1e6 * k for k in range(1, 12))
 KNOWN = LinkParameters(1, 1000, RATES, 0.2, 0.4, 50.0, 0.3, replace(OUTAGES, long_gap_s=4.0, shoulder=0.5))
 
 
-def test_a_seed_is_a_trace() -> None:
+def test_a_seed_is_a_trace_whose_bytes_never_change() -> None:
     for make in SEEDED:
         assert make(5) == make(5)
         assert make(5).cumulative_bytes.tolist() != make(6).cumulative_bytes.tolist()
-
-
-def test_bytes_that_must_never_change() -> None:
-    """Results are quoted on seeds: a generator that changes is a new generator, under a new name."""
+    # Results are quoted on seeds: a generator that changes is a new generator, under a new name.
     link = markov_link("known", 2, 12, links={"known": KNOWN})
     # Lowered from the seventh on, for then an outage begins.
     lowered = [6621400, 6654152, 3027288, 2683391, 1422412, 1261835, 1853449, 0]
@@ -77,11 +62,8 @@ def test_links_never_run_backwards_and_a_longer_one_begins_as_the_shorter(seed: 
     assert (bytes_per_s >= 0).all() and bytes_per_s.max() <= fitted_links()[mode].quantiles_bytes_per_s[-1]
     longer = markov_link(mode, seed, seconds + 50).cumulative_bytes[: seconds + 1]
     assert longer.tolist() == trace.cumulative_bytes.tolist()
-
-
-def test_the_mean_is_the_one_asked_for() -> None:
-    for trace in (markov_link("bus", 1, 300, mean_bytes_per_s=7.5e6), synthetic_lte(0, 300, 7.5e6, "train")):
-        assert abs(trace.total_bytes - 300 * 7.5e6) <= 150  # half a byte for each second
+    asked = markov_link(mode, seed, seconds, mean_bytes_per_s=7.5e6)
+    assert abs(asked.total_bytes - seconds * 7.5e6) <= seconds / 2
 
 
 def test_a_link_without_outages_keeps_its_quantiles() -> None:
@@ -90,10 +72,7 @@ def test_a_link_without_outages_keeps_its_quantiles() -> None:
     rates = link_rates(link, 1, 40_000)
     for bound, share in ((4e6, 0.1), (6e6, 0.5), (8e6, 0.9)):
         assert abs((rates < bound).mean() - share) < 0.02
-
-
-def test_memory_is_the_stated_one() -> None:
-    """Level 0.6 that stays 20 s, fast 0.4 with memory 0.5: after 5 s 0.6 x 0.95**5 + 0.4 x 0.5**5 = 0.477."""
+    # Memory: level 0.6 that stays 20 s, fast 0.4 with 0.5: after 5 s 0.6 x 0.95**5 + 0.4 x 0.5**5 = 0.477.
     linear = tuple(5e6 + 1e6 * z for z in (-3, -2.326348, -1.644854, -1.281552, -0.67449, 0))
     linear += tuple(1e7 - rate for rate in linear[-2::-1])
     link = replace(FLAT, quantiles_bytes_per_s=linear, level_share=0.6, level_stay_s=20.0, fast_memory=0.5)
@@ -109,10 +88,7 @@ def test_outages_are_as_long_and_as_far_apart_as_stated() -> None:
     lengths, gaps = edges[1::2] - edges[::2], edges[2::2] - edges[1:-1:2]
     assert [(lengths > 1).mean(), (lengths > 2).mean()] == pytest.approx([4 / 9, 1 / 4], abs=0.03)
     assert abs(gaps.mean() - 32) < 2 and lengths.max() <= MAX_OUTAGE_S
-
-
-def test_rates_beside_outages_are_lowered() -> None:
-    """1 MB/s, and half of it within 5 s of an outage; never less than the least rate outside of one."""
+    # Rates beside outages are lowered by half within 5 s; never below the least rate outside of one.
     quantiles = (0.3e6, *(1e6,) * 10)
     lowered = replace(FLAT, quantiles_bytes_per_s=quantiles, outages=replace(OUTAGES, shoulder=0.5))
     rates = link_rates(lowered, 1, 2000)
@@ -124,7 +100,7 @@ def test_rates_beside_outages_are_lowered() -> None:
     assert all(markov_link("worst", seed, 1, links={"worst": worst}).total_bytes > 0 for seed in range(20))
 
 
-def test_robofleets_ramp() -> None:
+def test_links_by_rule() -> None:
     """12.5 to 0.5 MB/s in 15 s: 6.5 MB/s in the mean; half-way, after 7.5 s, (12.5 + 6.5) / 2 x 7.5 = 71.25 MB."""
     trace = ramp(100e6 / 8, 4e6 / 8)
     assert trace.total_bytes == 97_500_000
@@ -133,16 +109,6 @@ def test_robofleets_ramp() -> None:
     assert trace.rate_bytes_per_s([14_950_000, 16_000_000]).tolist() == [540_000.0, 540_000.0]
     up, down = ramp(0, 3e6, 3.3), ramp(3e6, 0, 3.3)
     assert np.diff(up.cumulative_bytes).tolist() == np.diff(down.cumulative_bytes).tolist()[::-1]
-
-
-@given(st.floats(0, 1e9), st.floats(1, 1e9), st.floats(0.001, 50), st.sampled_from(["hold", "stop"]))
-def test_a_ramp_carries_its_area(start: float, end: float, seconds: float, after: str) -> None:
-    trace = ramp(start, end, seconds, after)  # type: ignore[arg-type]
-    area = (start + end) / 2 * trace.duration_us / 1e6
-    assert abs(trace.total_bytes - area) <= 0.5 + 1e-9 * area
-
-
-def test_steady_link_outages_and_a_tunnel_with_sharp_ends() -> None:
     trace = steady(7e6, 2.5)
     assert (trace.duration_us, trace.total_bytes) == (2_500_000, 17_500_000)
     assert set(trace.segments()[1].tolist()) == {7e6}
@@ -160,26 +126,21 @@ def test_steady_link_outages_and_a_tunnel_with_sharp_ends() -> None:
     assert rates == pytest.approx([10e6 / 60, 0.0, 0.0, 10e6 / 40], abs=5)
 
 
-def test_gilbert_elliotts_share_of_bad_time() -> None:
+@given(st.floats(0, 1e9), st.floats(1, 1e9), st.floats(0.001, 50), st.sampled_from(["hold", "stop"]))
+def test_a_ramp_carries_its_area(start: float, end: float, seconds: float, after: str) -> None:
+    trace = ramp(start, end, seconds, after)  # type: ignore[arg-type]
+    area = (start + end) / 2 * trace.duration_us / 1e6
+    assert abs(trace.total_bytes - area) <= 0.5 + 1e-9 * area
+
+
+def test_two_states_and_hand_overs() -> None:
     """2 s bad in 22 s is 1/11. In 20,000 s there are some 900 cycles: a standard deviation of about 0.004."""
     trace = gilbert_elliott(7, 20_000, good_bytes_per_s=1e7, bad_bytes_per_s=1e6)
     rates = trace.segments()[1]
     assert set(rates.tolist()) == {1e7, 1e6}
     assert abs((rates == 1e6).mean() - 1 / 11) < 0.016
     assert abs(np.count_nonzero(np.diff(rates)) / 2 - 20_000 / 22) < 150
-
-
-def test_no_shadows_one_access_point() -> None:
-    """4 m away in the beginning: -30 - 30 log10(4) = -48 dBm, the best rate. At 50 m -81 dBm, the worst one."""
-    corridor = Corridor(access_points=1, shadow_db=0.0, useful_share=0.5)
-    rates = roaming(0, 100, corridor).segments()[1]
-    assert rates[0] == 65e6 / 8 / 2
-    assert rates[500] == pytest.approx(6.5e6 / 8 / 2, abs=10)
-    assert (np.diff(rates[:501]) <= 0).all() and (np.diff(rates[501:]) >= 0).all()
-
-
-def test_each_hand_over_costs_its_gap() -> None:
-    """Without shadows, from the first of two access points to the second: one gap of 2 s a crossing."""
+    # Without shadows, from the first of two access points to the second: one gap of 2 s a crossing.
     corridor = Corridor(access_points=2, spacing_m=80.0, shadow_db=0.0, gap_s=2.0)
     rates = roaming(0, 80, corridor).segments()[1]
     assert (rates == 0).sum() == 20
@@ -187,9 +148,8 @@ def test_each_hand_over_costs_its_gap() -> None:
     assert (roaming(0, 80, replace(corridor, gap_s=0.0)).segments()[1] > 0).all()
 
 
-def still_then_turning() -> Motion:
-    """10 s at rest, 10 s at 0.75 views a second (45 degrees/s)."""
-    return Motion("m", np.array([0, 10_000_000, 20_000_000]), np.array([0.0, 0.0, 7.5]))
+TURNING = Motion("m", np.array([0, 10_000_000, 20_000_000]), np.array([0.0, 0.0, 7.5]))
+"""10 s at rest, 10 s at 0.75 views a second (45 degrees/s)."""
 
 
 def test_driving_as_told_and_by_default() -> None:
@@ -208,24 +168,19 @@ def test_driving_as_told_and_by_default() -> None:
 
 def test_frames_without_chance_follow_motion_alone() -> None:
     model = FrameModel(base_bytes=100_000, motion_share=0.5, detail_share=0.0, noise_share=0.0)
-    sizes = frame_sizes(np.arange(20) * 1_000_000, still_then_turning(), 0, model)
+    sizes = frame_sizes(np.arange(20) * 1_000_000, TURNING, 0, model)
     assert sizes.tolist() == [100_000] * 11 + [150_000] * 9
-    assert frame_sizes(np.zeros(0, np.int64), still_then_turning(), 0).tolist() == []
-
-
-def test_detail_stays_while_the_camera_stands_still() -> None:
+    assert frame_sizes(np.zeros(0, np.int64), TURNING, 0).tolist() == []
+    # Detail stays while the camera stands still.
     model = FrameModel(motion_share=0.0, noise_share=0.0)
-    sizes = frame_sizes(np.arange(600) * 33_333, still_then_turning(), 1, model)
-    assert len(set(sizes[:300].tolist())) == 1
-    assert len(set(sizes[301:].tolist())) > 250
-    assert sizes.tolist() != frame_sizes(np.arange(600) * 33_333, still_then_turning(), 2, model).tolist()
-    spread = [frame_sizes(np.array([0, 10_000_000, 20_000_000]), still_then_turning(), s, model)[2] for s in range(400)]
+    sizes = frame_sizes(np.arange(600) * 33_333, TURNING, 1, model)
+    assert len(set(sizes[:300].tolist())) == 1 and len(set(sizes[301:].tolist())) > 250
+    spread = [frame_sizes(np.array([0, 10_000_000, 20_000_000]), TURNING, s, model)[2] for s in range(400)]
     assert abs(np.std(spread) / 230_000 - 0.12) < 0.015
 
 
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
+def test_broken_arguments() -> None:
+    for make, says in (
         (lambda: markov_link("boat", 0), "mode = 'boat': must be one of bicycle, bus"),
         (lambda: synthetic_lte(-1), "seed = -1: must be >= 0"),
         (lambda: outage(1, 1, 5), "length_s = 1: must be above 0 and below period_s = 1"),
@@ -233,36 +188,27 @@ def test_detail_stays_while_the_camera_stands_still() -> None:
         (lambda: markov_link("bus", 0, mean_bytes_per_s=float("nan")), "mean_bytes_per_s = nan"),
         (lambda: gilbert_elliott(0, bad_bytes_per_s=2e7), "bad_bytes_per_s = 20000000.0: must be at most good"),
         (lambda: steady(0), "bytes_per_s = 0: must be a number from 1"),
-        (lambda: tunnel(1e6, before_s=0, fade_s=0, recover_s=0, after_s=0), "no capacity at all"),
         (lambda: Driving(cruise_m_per_s=(2, 1)), r"cruise_m_per_s = \(2, 1\): must be in order"),
-        (lambda: Driving(turn_chance=0.8), "at most 1 together"),
-        (lambda: FrameModel(base_bytes=0), "base_bytes = 0: must be a number from 1"),
-        (lambda: frame_sizes(np.array([1, 1]), still_then_turning(), 0), "arrival_us must be a row of whole"),
+        (lambda: frame_sizes(np.array([1, 1]), TURNING, 0), "arrival_us must be a row of whole"),
         (lambda: replace(FLAT, place_share=0.7, level_share=0.7), "level_share = 0.7: must be a number from 0 to 0.3"),
-        (lambda: replace(FLAT, quantiles_bytes_per_s=(1.0,)), "quantiles_bytes_per_s: must be 11 rates"),
-    ],
-)
-def test_broken_arguments(make: Callable[[], object], says: str) -> None:
-    with pytest.raises(BufgymError, match=says):
-        make()
-
-
-def with_stay(value: str) -> str:
-    """The shipped parameters, whose mode bus has this for level_stay_s."""
-    text = LINKS.read_text(encoding="ascii")
-    share = json.loads(text)["modes"]["bus"]["level_stay_s"]
-    return text.replace(f'"level_stay_s": {share}', f'"level_stay_s": {value}')
+    ):
+        with pytest.raises(BufgymError, match=says):
+            make()
 
 
 def test_broken_parameter_files(tmp_path: Path) -> None:
-    file = tmp_path / "links.json"
+    file, shipped = tmp_path / "links.json", LINKS.read_text(encoding="ascii")
+    stay = f'"level_stay_s": {json.loads(shipped)["modes"]["bus"]["level_stay_s"]}'
+    stays = [
+        shipped.replace(stay, f'"level_stay_s": {value}') for value in ("null", "true", '"5"', "NaN", "-1", "1e400")
+    ]
     for text, says in (
         ("{", "must be JSON"),
         ("[]", 'must be an object with "modes"'),
         ('{"modes": {"bus": {"seconds": 5}}}', "mode 'bus': must be an object with fast_memory"),
         ("[" * 100_000, "must be JSON"),
         (" " * (2**20 + 1), "must be at most 1048576 bytes"),
-        *((with_stay(value), "mode '.*': level_stay_s = ") for value in ("null", "true", '"5"', "NaN", "-1", "1e400")),
+        *((text, "mode '.*': level_stay_s = ") for text in stays),
     ):
         file.write_text(text, encoding="utf-8")
         with pytest.raises(TraceError, match=f"links.json.*{says}"):

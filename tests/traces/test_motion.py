@@ -53,10 +53,17 @@ def test_one_path_in_each_format(tmp_path: Path, format: str, text: str) -> None
     assert read_motion(zipped).coordinate.tolist() == motion.coordinate.tolist()
 
 
-def test_times_in_ns_are_exact(tmp_path: Path) -> None:
-    lines = [f"14036365808635{k:05d} 0 0 0 1 0 0 0" for k in (0, 1000, 2999, 55584)]
+def test_times_in_ns_are_exact_and_a_file_written_is_read_back(tmp_path: Path) -> None:
+    lines = [f"14036365808635{k:05d} 0 0 0 1 0 0 0" for k in (0, 1000, 2999, 55584)]  # as floats known to 256 ns only
     poses = read_poses(written(tmp_path, "# timestamp[ns] px py pz qw qx qy qz\n" + "\n".join(lines), "path.txt"))
     assert poses.time_us.tolist() == [0, 1, 2, 55]
+    motion = Motion("m", np.array([0, 1, 1_500_000]), np.array([0.0, 1 / 3, 2e5 / 7]))
+    write_motion_csv(motion, tmp_path / "m.csv")
+    again = read_motion(tmp_path / "m.csv")
+    assert again.name == "m" and again.time_us.tolist() == motion.time_us.tolist()
+    assert again.coordinate.tolist() == motion.coordinate.tolist()
+    with pytest.raises(TraceError, match="cannot be written"):
+        write_motion_csv(motion, tmp_path)
 
 
 def test_kitti_times_from_elsewhere(tmp_path: Path) -> None:
@@ -73,11 +80,15 @@ def test_kitti_times_from_elsewhere(tmp_path: Path) -> None:
         times.write_text(text)
         with pytest.raises(TraceError, match=says):
             read_motion(path, times=times)
+    with pytest.raises(BufgymError, match="format = 'bvh': must be one of tum, euroc, kitti"):
+        read_motion(path, format="bvh")
+    with pytest.raises(BufgymError, match=r"times = .*: goes with KITTI matrices only"):
+        read_motion(written(tmp_path, TUM, "path.txt"), times=times)
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
+def test_broken_files(tmp_path: Path) -> None:
+    written(tmp_path, KITTI_TIMES, "path_times.txt")
+    for text, says in (
         ("0 0 0 0 0 0 0 1\n", "holds 1 samples: must hold at least 2"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 0\n", "line 2: norm of the quaternion = 0: must be 1 within 1 %"),
         ("0 0 0 1e8 0 0 0 1\n", "line 1: tz = 1e8: must be from -1e\\+07 to 1e\\+07"),
@@ -89,32 +100,9 @@ def test_kitti_times_from_elsewhere(tmp_path: Path) -> None:
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "must be a rotation within 1 %"),
         # Nanoseconds without EuRoC's header could be anybody's: not guessed.
         ("1403636579763555584 0 0 0 0 0 0 1\n", "line 1: time in s = 1403636579763555584: must be from 0 to"),
-    ],
-)
-def test_broken_files(tmp_path: Path, text: str, says: str) -> None:
-    written(tmp_path, KITTI_TIMES, "path_times.txt")
-    with pytest.raises(TraceError, match=says):
-        read_motion(written(tmp_path, text, "path.txt"))
-
-
-def test_formats_that_do_not_exist_or_do_not_fit(tmp_path: Path) -> None:
-    path, times = written(tmp_path, TUM, "path.txt"), written(tmp_path, KITTI_TIMES, "times.txt")
-    with pytest.raises(BufgymError, match="format = 'bvh': must be one of tum, euroc, kitti"):
-        read_motion(path, format="bvh")
-    with pytest.raises(BufgymError, match=r"times = 't\.txt': goes with KITTI matrices only"):
-        read_motion(path, times="t.txt")
-    with pytest.raises(TraceError, match=r"line 2: .*must have 12 columns, has 8"):
-        read_motion(path, format="kitti", times=times)
-
-
-def test_round_trip_is_exact(tmp_path: Path) -> None:
-    motion = Motion("m", np.array([0, 1, 1_500_000]), np.array([0.0, 1 / 3, 2e5 / 7]))
-    write_motion_csv(motion, tmp_path / "m.csv")
-    again = read_motion(tmp_path / "m.csv")
-    assert again.name == "m" and again.time_us.tolist() == motion.time_us.tolist()
-    assert again.coordinate.tolist() == motion.coordinate.tolist()
-    with pytest.raises(TraceError, match="cannot be written"):
-        write_motion_csv(motion, tmp_path)
+    ):
+        with pytest.raises(TraceError, match=says):
+            read_motion(written(tmp_path, text, "path.txt"))
 
 
 def about(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
@@ -138,15 +126,11 @@ def test_fast_poses_are_resampled_so_that_jitter_is_not_motion() -> None:
     every, camera = motion_from_poses(poses, MotionSettings(rate_hz=1000)), motion_from_poses(poses)
     assert every.time_us.size == 3001 and camera.time_us.size == 301
     assert every.total == pytest.approx(2000 * 2e-4 / 2) and camera.total < every.total / 5
-
-
-def test_resampling_keeps_a_steady_turn_steady() -> None:
-    """One turn a second about z, given at 100 Hz: at 30 Hz each step is 12 degrees."""
+    # A steady turn stays steady: once a second about z, given at 100 Hz; at 30 Hz each step is 12 degrees.
     time_us = np.arange(101, dtype=np.int64) * 10_000
     turn = np.stack([about((0, 0, 1), 360 * t / 1e6) for t in time_us.tolist()])
     motion = motion_from_poses(Poses(time_us, np.zeros((101, 3)), turn), MotionSettings(rate_hz=30))
     assert np.diff(motion.coordinate) == pytest.approx(np.full(30, 12 / 60), rel=1e-3)
-    assert motion.total == pytest.approx(6.0)
 
 
 def test_gaps_are_reported_and_past_the_end_the_total_is_carried_on() -> None:
@@ -182,22 +166,17 @@ def test_slerp_turns_evenly_and_the_short_way() -> None:
     # From 350 to 10 degrees the short way is through 0.
     middle = slerp(about((0, 0, 1), 350)[None], about((0, 0, 1), 10)[None], np.array([[0.5]]))
     assert np.degrees(angles(middle, about((0, 0, 1), 0)[None])) == pytest.approx([0], abs=1e-6)
-
-
-def test_poses_between_poses() -> None:
+    # Poses between poses.
     quaternion = np.stack([about((0, 0, 1), degrees) for degrees in (0, 100, 100)])
-    position = np.array([[0.0, 0, 0], [4, 0, 0], [4, 2, 0]])
-    poses = Poses(np.array([0, 2_000_000, 3_000_000]), position, quaternion)
+    poses = Poses(np.array([0, 2_000_000, 3_000_000]), np.array([[0.0, 0, 0], [4, 0, 0], [4, 2, 0]]), quaternion)
     between = poses.at(np.array([0, 500_000, 2_500_000, 3_000_000]))
     assert between.position_m.tolist() == [[0, 0, 0], [1, 0, 0], [4, 1, 0], [4, 2, 0]]
     turned = np.degrees(angles(between.quaternion, quaternion[[0]].repeat(4, axis=0)))
     assert turned == pytest.approx([0, 25, 100, 100], abs=1e-6)
-    assert poses.resampled(2).time_us.tolist() == list(range(0, 3_000_001, 500_000))
 
 
 @given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1))
 def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, float]) -> None:
-    """Whichever component is the largest; q and -q are one rotation."""
     x, y, z, w = expected = np.array(numbers) / math.hypot(*numbers)
     matrix = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -209,22 +188,9 @@ def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, fl
     assert min(np.abs(computed - expected).max(), np.abs(computed + expected).max()) < 1e-12
 
 
-@pytest.mark.nightly
-def test_real_tum(shared_data: Path) -> None:
-    """Coordinate gained a second: a hand-held sweep, one with a gap of 12 s by its README, and a turning robot."""
-    for name, per_s in (("freiburg1_desk", 0.81), ("freiburg2_desk", 0.27), ("freiburg2_pioneer_360", 0.42)):
-        motion = read_motion(shared_data / "tum_rgbd" / f"{name}.groundtruth.txt.gz")
-        assert motion.total / motion.duration_us * 1e6 == pytest.approx(per_s, abs=0.006)
-        assert motion.longest_gap_s == pytest.approx(12.0 if name == "freiburg2_desk" else 0.0, abs=0.1)
-
-
 def test_real_kitti(shared_data: Path) -> None:
-    path = shared_data / "kitti" / "KITTI_00_gt.txt.gz"
-    motion = read_motion(path, MotionSettings(fov_deg=1e9, scene_scale_m=1))
-    # Sequence 00 is 3.7 km long, 4541 poses in 470.6 s; its times come from KITTI_00_gt_times.txt.gz.
-    rows = np.array([line.split() for line in gzip.decompress(path.read_bytes()).decode().splitlines()], np.float64)
-    metres = np.linalg.norm(np.diff(rows[:, 3::4], axis=0), axis=1).sum()
-    assert motion.total == pytest.approx(metres) == pytest.approx(3724, abs=1)
-    assert (motion.time_us.size, motion.gaps) == (4541, ())
+    """Sequence 00 is 3.7 km long, 4541 poses in 470.6 s; its times come from the file beside."""
+    motion = read_motion(shared_data / "kitti" / "KITTI_00_gt.txt.gz", MotionSettings(fov_deg=1e9, scene_scale_m=1))
+    assert motion.total == pytest.approx(3724, abs=1) and (motion.time_us.size, motion.gaps) == (4541, ())
     assert motion.duration_us / 1e6 == pytest.approx(470.6, abs=0.1)
     assert "times from KITTI_00_gt_times.txt.gz" in motion.source
