@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 REPO = Path(__file__).resolve().parent.parent
-TESTS = ("tests/core/test_link.py", "tests/core/test_policies.py", "tests/envs/test_single.py", "tests/test_cli.py")
+TESTS = ("tests/core/test_sender.py", "tests/core/test_policies.py", "tests/envs/test_single.py", "tests/test_cli.py")
 
 
 def main() -> int:

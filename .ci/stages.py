@@ -134,15 +134,15 @@ def nightly(arguments: list[str]) -> list[Stage]:
     # Of the tests for the night, those of kernels alone run uncompiled: clusters, trainings and kills gain nothing.
     plain = ["-m", "kernels or not nightly", *others, *arguments]
     report = [PYTHON, "-m", "coverage", "report", "--skip-covered", "--include=bufgym/*"]
-    sample = [".ci/mutants", "--sample=150", "--minutes=15", f"--seed={time.strftime('%Y%m%d')}"]
+    sample = [".ci/mutants", "--sample=150", "--minutes=12", f"--seed={time.strftime('%Y%m%d')}"]
     make = ["make", "--no-print-directory"]
     return [
         *check(),
         *uncompiled(folder, arguments),
-        pytest("compiled", folder, *others, *add, environment=cov, limit_s=40 * MINUTE),
-        pytest("servers", folder, *servers, *add, environment=cov, limit_s=15 * MINUTE),
+        pytest("compiled", folder, *others, *add, environment=cov, limit_s=30 * MINUTE),
+        pytest("servers", folder, *servers, *add, environment=cov, limit_s=10 * MINUTE),
         Stage("coverage", report, environment=measured(folder)),
-        pytest("all uncompiled", folder, *plain, compiled=False, environment=many, limit_s=40 * MINUTE),
+        pytest("all uncompiled", folder, *plain, compiled=False, environment=many, limit_s=20 * MINUTE),
         pytest("fuzz", folder, "tests/fuzz", *arguments, environment=many, limit_s=15 * MINUTE),
         Stage("claims", [*make, "claims"], limit_s=15 * MINUTE),
         Stage("mutants", [PYTHON, *sample], limit_s=25 * MINUTE),

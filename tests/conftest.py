@@ -37,7 +37,7 @@ settings.register_profile(
 )
 settings.register_profile(
     "nightly",
-    max_examples=1000 if COMPILED else 100,
+    max_examples=200 if COMPILED else 30,
     deadline=None,
     print_blob=True,
     suppress_health_check=[HealthCheck.too_slow],

@@ -172,8 +172,9 @@ def test_the_scorer_of_a_still_link_is_stateed_alone_with_its_own_hidden_layer()
     assert again.still is agent.still and again.drop.skip[2] == 2
 
 
+@pytest.mark.nightly
 def test_a_run_leaves_an_agent_goes_on_after_a_kill_and_repeats(capsys: pytest.CaptureFixture[str]) -> None:
-    few = replace(TINY, steps=6_000, validate_every=2_000, validation_episodes=6, test_seeds=2)
+    few = replace(TINY, steps=38_000, validate_every=19_000, validation_episodes=6, test_seeds=2)
     train.main(few)
     home = Path("runs/tiny/seed-0")
     whole, notes = weights.read(home / MODEL)

@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-pytest.importorskip("stable_baselines3", reason="the extra [train] is not installed")
 pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
 
 import torch
@@ -76,8 +75,7 @@ def test_rows_are_those_of_the_native_batch_and_their_ends_are_told(id: str) -> 
             assert all(np.array_equal(told["terminal_observation"][key], final[key]) for key in last)
             assert told["TimeLimit.truncated"] is False
             assert (told["episode"]["r"], told["episode"]["l"]) == (pytest.approx(sums[i]), lengths[i])
-            names = ("qoi", "arrived", "delivered", "dropped", "invalid")
-            assert all(told[name] == info["final_info"][name][i] for name in names)
+            assert all(told[name] == info["final_info"][name][i] for name in ("qoi", "arrived", "delivered", "invalid"))
             if id != "bufgym/Topics-v0":  # each topic received adds its weight there
                 assert told["qoi"] == pytest.approx(1 + sums[i])
             sums[i], lengths[i], ends = 0.0, 0, ends + 1
@@ -91,21 +89,18 @@ def test_a_time_limit_truncates() -> None:
         _, _, dones, infos = envs.step(np.full(2, L))  # reject everything
         assert dones.tolist() == [step % 5 == 0] * 2
         if dones[0]:
-            assert infos[0]["TimeLimit.truncated"] is True
-            assert infos[0]["episode"]["l"] == 5
+            assert infos[0]["TimeLimit.truncated"] is True and infos[0]["episode"]["l"] == 5
             assert infos[0]["terminal_observation"]["rank"].shape == (L + 1,)
 
 
 def test_masks_and_attributes() -> None:
     envs = make_vec_env("bufgym/Interruption-v0", 5, **SMALL["bufgym/Interruption-v0"])
     envs.reset()
-    assert is_masking_supported(envs)
     masks = get_action_masks(envs)
-    assert masks.dtype == np.bool_
+    assert is_masking_supported(envs) and masks.dtype == np.bool_
     # An empty buffer: nothing to evict, the newcomer may be rejected or accepted.
     assert masks.tolist() == [[False] * L + [True, True]] * 5
-    assert len(envs.env_method("action_masks", indices=[1, 3])) == 2
-    assert len(envs.get_attr("action_masks")) == 5
+    assert (len(envs.env_method("action_masks", indices=[1, 3])), len(envs.get_attr("action_masks"))) == (2, 5)
     assert envs.get_attr("action_space", 0) == [gym.spaces.Discrete(L + 2)]
     assert envs.get_attr("render_mode") == [None] * 5 and not envs.has_attr("no_such_thing")
     envs.set_attr("note", "kept")
@@ -133,8 +128,7 @@ def test_seeds_and_options_hold_for_one_reset() -> None:
 
     first, second = lengths(), lengths()
     envs.seed(3)
-    assert lengths() == first
-    assert lengths() == second
+    assert (lengths(), lengths()) == (first, second)
     scenario = envs.get_attr("rows")[0].scenario
     envs.set_options({"episodes": [scenario.episode(4), scenario.episode(9)]})
     assert lengths() == [6, 11]  # T and the two messages around the interruption
@@ -142,14 +136,13 @@ def test_seeds_and_options_hold_for_one_reset() -> None:
         envs.set_options([{}, {}])
 
 
-@pytest.mark.parametrize("monitored", [False, True])
-def test_the_arguments_of_stable_baselines3s_own(monitored: bool, tmp_path: Path) -> None:
+def test_the_arguments_of_stable_baselines3s_own(tmp_path: Path) -> None:
     """T = 20 always: each episode has 20 decisions, and what it delivers is written to the folder as Monitor does."""
     twice = gym.wrappers.vector.TransformReward
     given: dict[str, Any] = {"env_kwargs": {"t_max": 20, "law": "fixed"}, "capacity": L, "seed": 5, "start_index": 2}
     given |= {"wrapper_class": twice, "wrapper_kwargs": {"func": lambda reward: 2 * reward}}
-    given |= {"monitor_kwargs": {"info_keywords": ("qoi", "dropped")}}
-    envs = make_vec_env("bufgym/Interruption-v0", n_envs=3, monitor_dir=str(tmp_path) if monitored else None, **given)
+    given |= {"monitor_kwargs": {"info_keywords": ("qoi", "dropped")}, "monitor_dir": str(tmp_path)}
+    envs = make_vec_env("bufgym/Interruption-v0", n_envs=3, **given)
     assert envs.num_envs == 3 and envs.env_is_wrapped(twice) == [True] * 3
     envs.reset()
     for _ in range(40):
@@ -157,15 +150,14 @@ def test_the_arguments_of_stable_baselines3s_own(monitored: bool, tmp_path: Path
     assert infos[0]["episode"]["r"] == pytest.approx(2 * (infos[0]["qoi"] - 1))
     assert infos[0]["episode"]["dropped"] == infos[0]["dropped"] == 20 - L
     envs.close()
-    assert [path.name for path in tmp_path.iterdir()] == (["2.monitor.csv"] if monitored else [])
-    if monitored:
-        (file,) = get_monitor_files(str(tmp_path))  # which ``load_results`` reads with pandas
-        header, *lines = Path(file).read_text().splitlines()
-        assert json.loads(header[1:])["env_id"] == "bufgym/Interruption-v0"
-        results = list(csv.DictReader(lines))
-        assert [row["l"] for row in results] == ["20"] * 6
-        assert [float(row["qoi"]) for row in results] == pytest.approx([infos[0]["qoi"]] * 6)
-        assert [float(row["r"]) for row in results] == pytest.approx([infos[0]["episode"]["r"]] * 6, abs=1e-6)
+    (file,) = get_monitor_files(str(tmp_path))  # which ``load_results`` reads with pandas
+    assert Path(file).name == "2.monitor.csv" and len([*tmp_path.iterdir()]) == 1
+    header, *lines = Path(file).read_text().splitlines()
+    assert json.loads(header[1:])["env_id"] == "bufgym/Interruption-v0"
+    results = list(csv.DictReader(lines))
+    assert [row["l"] for row in results] == ["20"] * 6
+    assert [float(row["qoi"]) for row in results] == pytest.approx([infos[0]["qoi"]] * 6)
+    assert [float(row["r"]) for row in results] == pytest.approx([infos[0]["episode"]["r"]] * 6, abs=1e-6)
 
 
 FLATTEN = gym.wrappers.FlattenObservation
@@ -218,8 +210,8 @@ def test_any_vector_environment_that_resets_in_the_same_step_will_do() -> None:
 
 
 def test_infos_of_every_step_on_request() -> None:
-    native = gym.make_vec("bufgym/Uplink-v0", 2, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
-    envs = GymVecEnv(native, step_infos=True)
+    same_step = gym.vector.AutoresetMode.SAME_STEP
+    envs = GymVecEnv(gym.make_vec("bufgym/Uplink-v0", 2, autoreset_mode=same_step), step_infos=True)
     envs.reset()
     _, rewards, _, infos = envs.step(np.full(2, 9))
     assert infos[1]["reward_terms"]["retained"] == pytest.approx(rewards[1])
@@ -349,13 +341,10 @@ def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
             as_policy(model, fields=fields)
 
 
-def test_a_slot_network_needs_named_fields() -> None:
+def test_a_slot_network_needs_named_fields_and_its_extractor_serves_other_policies() -> None:
     for form in ("flat", "slots"):
         with pytest.raises(BufgymError, match='observation="dict"'):
             untrained(MaskablePPO, SlotPolicy, make_vec_env("bufgym/Uplink-v0", 2, observation=form, **WORLD))
-
-
-def test_the_slot_extractor_serves_other_policies() -> None:
     model = untrained(PPO, "MultiInputPolicy", policy_kwargs={"features_extractor_class": SlotExtractor})
     assert isinstance(model.policy.features_extractor, SlotExtractor)
     assert model.policy.features_extractor.features_dim == (L + 1) * 20

@@ -22,8 +22,8 @@ from bufgym.errors import BufgymError  # noqa: E402
 
 REPO = Path(__file__).resolve().parent.parent
 LIBRARY = {"dask": "distributed", "ray": "ray"}
-FEW = {"suite": "interruption-v1", "capacities": "4", "algo": "evolution", "validate_every": 20_000}
-FEW |= {"validation_episodes": 30, "test_seeds": 25, "seeds": 2}
+FEW = {"suite": "interruption-v1", "capacities": "4", "algo": "evolution", "validate_every": 19_000}
+FEW |= {"validation_episodes": 6, "test_seeds": 2, "seeds": 2}
 
 
 @pytest.fixture(autouse=True)
@@ -51,7 +51,7 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run's folder without a cluster."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.chdir(tmp_path_factory.mktemp("local"))
-        trained("local", 60_000)
+        trained("local", 38_000)
         return Path("runs/local").resolve()
 
 
@@ -62,12 +62,12 @@ def test_a_cluster_gives_the_same_agents_bit_for_bit(backend: str, request: pyte
     if importlib.util.find_spec(LIBRARY[backend]) is None:
         pytest.skip(f"{LIBRARY[backend]} is not installed")
     local: Path = request.getfixturevalue("local")  # only where there is something to compare
-    trained("cluster", 30_000, "--backend", backend)
-    trained("cluster", 60_000, "--backend", backend, "--resume")
+    trained("cluster", 19_000, "--backend", backend)
+    trained("cluster", 38_000, "--backend", backend, "--resume")
     assert fitness(local, 0) != fitness(local, 1)
     cluster = Path("runs/cluster")
     for seed in (0, 1):
-        assert fitness(cluster, seed) == fitness(local, seed) != []
+        assert fitness(cluster, seed) == fitness(local, seed) and len(fitness(local, seed)) > 1
         one, other = (load_file(folder / f"seed-{seed}" / MODEL) for folder in (local, cluster))
         assert one.keys() == other.keys()
         assert all(one[key].tobytes() == other[key].tobytes() for key in one)

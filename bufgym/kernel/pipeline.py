@@ -8,6 +8,7 @@ is kept as it comes out of the translation. The kernel that Python calls links i
 
 from __future__ import annotations
 
+import gc
 from typing import Any, cast
 
 from llvmlite import binding
@@ -181,6 +182,16 @@ class WholeCompiler(_Compiler):  # type: ignore[misc]
         self.state.typingctx = Typing(typing)
         self.state.library = self.library(target.codegen(), type(self).__name__)
         self.state.library.enable_object_caching()
+
+    def compile_extra(self, function: Any) -> Any:
+        """Compile ``function``. Garbage is collected afterwards: a search among all these objects takes long."""
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return super().compile_extra(function)
+        finally:
+            if collects:
+                gc.enable()
 
     def define_pipelines(self) -> list[Any]:
         """Numba's own passes, with ``_NoneFields`` before all that look at types."""

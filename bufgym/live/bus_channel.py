@@ -114,10 +114,15 @@ class BusServer:
         self._channels: dict[str, BusChannel] = {}
         self._loop = asyncio.get_running_loop()
         self._bus: Bus | None = None
+        self._early: list[tuple[str, bytes]] | None = []
+        """What came before ``listen`` had the bus in its hands."""
 
     async def listen(self, opening: Open, host: str, port: int) -> None:
         """Be there."""
         self._bus = await asyncio.to_thread(opening, host, port, "", self._hear, lambda there: None)
+        early, self._early = self._early or [], None
+        for name, data in early:
+            self._take(name, data)
 
     async def close(self) -> None:
         """Be there no more."""
@@ -130,6 +135,9 @@ class BusServer:
             self._loop.call_soon_threadsafe(self._take, name, data)
 
     def _take(self, name: str, data: bytes) -> None:
+        if self._early is not None:
+            self._early.append((name, data))
+            return
         channel = self._channels.get(name)
         if channel is None:
             if len(data) < HEADER_BYTES or self._bus is None:

@@ -165,7 +165,7 @@ class DdsBus:
 
     def __init__(self, host: str, port: int, name: str, hear: Hear, peer: Peer) -> None:
         with needs("cyclonedds", "dds"):
-            from cyclonedds.core import DDSException, Listener
+            from cyclonedds.core import DDSException
             from cyclonedds.domain import Domain, DomainParticipant
             from cyclonedds.pub import DataWriter
             from cyclonedds.sub import DataReader
@@ -174,41 +174,47 @@ class DdsBus:
         from bufgym.live.dds_message import QUALITY, Message
 
         number, ways = port % 230, ("up", "down") if name else ("down", "up")
-        met = [0, 0]
-
-        def matched(end: int, count: int) -> None:
-            met[end] = count
-            peer(all(met))
-
-        class Meeting(Listener):  # type: ignore[misc]
-            def on_subscription_matched(self, _: Any, status: Any) -> None:
-                matched(0, status.current_count)
-
-            def on_publication_matched(self, _: Any, status: Any) -> None:
-                matched(1, status.current_count)
-
         try:
             if number not in _domains:
                 settings = _DDS.format(host=host, base=port - _FIRST_PORT, lease_s=DEAD_AFTER_S)
                 _domains[number] = Domain(number, settings)
-            participant, self._listener = DomainParticipant(number), Meeting()
+            participant = DomainParticipant(number)
             out, back = (Topic(participant, f"{ROOT}_{way}", Message) for way in ways)
-            self._reader = DataReader(participant, back, qos=QUALITY[ways[1]], listener=self._listener)
-            self._writer = DataWriter(participant, out, qos=QUALITY[ways[0]], listener=self._listener)
+            self._reader = DataReader(participant, back, qos=QUALITY[ways[1]])
+            self._writer = DataWriter(participant, out, qos=QUALITY[ways[0]])
         except DDSException as error:
             raise ConnectionError(f"dds, {host}:{port}: {error}") from None
         self._message, self._error, self._participant = Message, DDSException, participant
         self._closed = threading.Event()
-        threading.Thread(target=self._listen, args=(name, hear), daemon=True).start()
+        threading.Thread(target=self._listen, args=(name, hear, peer), daemon=True).start()
 
-    def _listen(self, name: str, hear: Hear) -> None:
-        """Hand on what comes. (A listener of the library's is called before the reader it is told of exists.)"""
+    def _listen(self, name: str, hear: Hear, peer: Peer) -> None:
+        """Hand on what comes, and whether the other end is there.
+
+        A listener of the library's would do so in a thread of the library's. But there Python's garbage collector may
+        delete an end that was closed before, which waits for that very thread.
+        """
+        from cyclonedds.core import DDSStatus, ReadCondition, SampleState, WaitSet
         from cyclonedds.util import duration
 
+        reader, writer, there = self._reader, self._writer, False
+        arrived = ReadCondition(reader, SampleState.NotRead)
+        waitset = WaitSet(self._participant)
+        reader.set_status_mask(DDSStatus.SubscriptionMatched)
+        writer.set_status_mask(DDSStatus.PublicationMatched)
+        for one in (arrived, reader, writer):
+            waitset.attach(one)
         while not self._closed.is_set():
-            for sample in self._reader.take_iter(timeout=duration(milliseconds=200)):
+            reader.take_status(DDSStatus.SubscriptionMatched)
+            writer.take_status(DDSStatus.PublicationMatched)
+            matched = bool(reader.get_matched_publications() and writer.get_matched_subscriptions())
+            if matched != there:
+                there = matched
+                peer(there)
+            for sample in reader.take(64, condition=arrived):
                 if isinstance(sample, self._message) and sample.name == (name or sample.name):
                     hear(sample.name, bytes(sample.data))
+            waitset.wait(duration(milliseconds=50))
         self._participant = self._reader = self._writer = None
 
     def publish(self, name: str, data: bytes) -> None:

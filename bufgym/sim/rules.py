@@ -123,8 +123,6 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
 def too_soon(batch: Batch, i: int, topic: int) -> bool:
     """Whether the arrival at hand comes sooner after the last one kept (or sent) than its topic's rate limit allows."""
     sender = batch.senders[i]
-    if batch.several is None:
-        return False
     rules = at(batch.topics, i, topic)
     if sender.limit_since_sent == 1:
         return bool(rules.dequeued > 0 and sender.now_us - rules.last_dequeue_us < rules.period_us)

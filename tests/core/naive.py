@@ -81,11 +81,18 @@ class Sender(naive_sender.Sender):
     def queue(self):
         return self.queues[0]
 
+    @property
+    def previous(self):
+        """The arrival before the newcomer, kept or not; the newcomer itself where it is the first."""
+        return self.arrived[0][-1] if self.arrived[0] else self.newcomer
+
+    @property
+    def last_dequeued(self):
+        return self.sent[0][-1] if self.sent[0] else self.previous
+
     def answer(self, event):
         if event == "decision":
-            previous = self.arrived[0][-1] if self.arrived[0] else self.newcomer
-            last_dequeued = self.sent[0][-1] if self.sent[0] else previous
-            return self.policy.decide(list(self.queue), self.newcomer, self.capacity, last_dequeued, previous)
+            return self.policy.decide(list(self.queue), self.newcomer)
         if event == "dequeue":
             if self.unwanted is None:
                 self.unwanted = self.policy.unwanted(list(self.queue), self.now)

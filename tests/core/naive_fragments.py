@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 
-from naive_queues import ACCEPT, REJECT, DropNewest, KeepLast
+from naive_queues import ACCEPT, REJECT, KeepLast, Policy
 
 
 class Pipe:
@@ -36,7 +36,7 @@ class Pipe:
         self.ahead, self.own, self.since = ahead, self.unsent + kept, self.now
 
 
-class ZenohDrop(DropNewest):
+class ZenohDrop(Policy):
     def __init__(
         self,
         batch_size=65_535,
@@ -54,7 +54,7 @@ class ZenohDrop(DropNewest):
         for k in itertools.count():
             yield self.wait + min(self.more, self.wait * (2 ** (k + 1) - 2))
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         ahead = self.pipe.look(queue, self.sender, newcomer["us"])
         size, put = newcomer["bytes"], 0
         if not self.sender.fits(newcomer):
@@ -71,11 +71,11 @@ class ZenohDrop(DropNewest):
             put = more
 
 
-class BestEffort(DropNewest):
+class BestEffort(Policy):
     def __init__(self, queue_kb=200, rate_memory_s=1):
         self.room, self.pipe = queue_kb * 1e3, Pipe(rate_memory_s)
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         ahead = self.pipe.look(queue, self.sender, newcomer["us"])
         at_once = ahead + newcomer["bytes"] <= self.room
         kept = newcomer["bytes"] if at_once and self.sender.fits(newcomer) else 0
@@ -88,13 +88,13 @@ class Reliable(KeepLast):
         super().__init__(depth)
         self.room, self.pipe = queue_kb * 1e3, Pipe(rate_memory_s)
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
-        decision = super().decide(queue, newcomer, L, last_dequeued, previous)
+    def decide(self, queue, newcomer):
+        decision = super().decide(queue, newcomer)
         if self.sender.evictions > 0:
             self.pipe.own -= queue[0]["bytes"] if decision == 0 else 0
             return decision
         ahead, rate = self.pipe.look(queue, self.sender, newcomer["us"]), self.pipe.rate
-        depth, size = min(self.depth, L), newcomer["bytes"]
+        depth, size = min(self.depth, self.sender.capacity), newcomer["bytes"]
         in_time = rate is None or ahead + depth * size <= rate * depth * self.sender.periods[-1]
         kept = size - queue[0]["bytes"] if decision == 0 else size
         if ahead + size > self.room and not in_time:
@@ -103,7 +103,7 @@ class Reliable(KeepLast):
         return decision
 
 
-class FrameDropper(DropNewest):
+class FrameDropper(Policy):
     """frame_dropper.cc, method by method, its bits as bytes/us and bytes; ``rate`` is the target."""
 
     def __init__(self):
@@ -112,7 +112,7 @@ class FrameDropper(DropNewest):
         self.average, self.large_count, self.large_chunk = None, 0, 0
         self.drop_next, self.was_below_max = False, True
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         ahead = self.pipe.look(queue, self.sender, newcomer["us"])
         keep = self.sender.fits(newcomer)
         if self.pipe.rate is not None:

@@ -10,17 +10,15 @@ from naive_queues import (
     ACCEPT,
     REJECT,
     Codel,
-    DropNewest,
-    DropOldest,
     FoxgloveBacklog,
     KeepLast,
     Lifespan,
     Policy,
-    Random,
     Red,
-    ReplaceNewest,
     Rosbridge,
     Spaced,
+    drop_newest,
+    drop_random,
     one_of,
     uniform_of,
 )
@@ -31,7 +29,7 @@ class Reservoir(Policy):
 
     n = 0
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         again, s = self.sender.evictions > 0, len(queue)
         if not again:
             self.n = max(self.n, s) + 1  # what came unasked is all there
@@ -48,7 +46,7 @@ class Decimate(Policy):
 
     n = 0
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         if self.sender.evictions == 0:
             self.n += 1
             if self.n not in range(1, self.n + 1, 3):
@@ -66,7 +64,8 @@ class Afr(Policy):
         if self.as_released and self.p > 0:
             self.p -= 1
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
+    def decide(self, queue, newcomer):
+        L = self.sender.capacity
         filled, backlog = Fraction(len(queue), L), sum(m["bytes"] for m in queue)
         if self.sender.max_bytes < math.inf:
             filled = max(filled, Fraction(backlog, self.sender.max_bytes))
@@ -102,36 +101,67 @@ class Afr(Policy):
             self.p = 0
 
 
-class MinGap(Policy):
-    """Drop what leaves the smallest gap between its neighbours, ties to the oldest; the next step is like the last."""
+def gaps_left(sender, queue, newcomer, key):
+    """The merged gap that each queued message, and last the newcomer, would leave; the next step is like the last."""
+    at = [m[key] for m in [sender.last_dequeued, *queue, newcomer]]
+    at.append(at[-1] + at[-1] - sender.previous[key])
+    return [after - before for before, after in zip(at, at[2:], strict=False)]
 
-    def __init__(self, key):
-        self.key = key
 
-    def gaps(self, queue, newcomer, last_dequeued, previous):
-        """The merged gap that each queued message, and last the newcomer, would leave."""
-        at = [m[self.key] for m in [last_dequeued, *queue, newcomer]]
-        at.append(at[-1] + at[-1] - previous[self.key])
-        return [after - before for before, after in zip(at, at[2:], strict=False)]
+def min_gap(key):
+    """Drop what leaves the smallest gap between its neighbours, ties to the oldest."""
 
-    def full(self, queue, newcomer, L, last_dequeued, previous):
-        gaps = self.gaps(queue, newcomer, last_dequeued, previous)
+    def full(sender, queue, newcomer):
+        gaps = gaps_left(sender, queue, newcomer, key)
         victim = gaps.index(min(gaps))
-        return victim if victim < L else REJECT
+        return victim if victim < len(queue) else REJECT
+
+    return Policy(full)
 
 
-class OrbBuf(Policy):
+def orbbuf(v):
     """Drop the message with the most similar neighbours, the first of equals; the head's is the one that left last."""
 
-    def __init__(self, v):
-        self.v = v
+    def full(sender, queue, newcomer):
+        if len(queue) < 3:
+            return len(queue) - 1
+        older = [sender.last_dequeued, *queue]
+        similar = [1 - v(c["x"] - a["x"]) for a, c in zip(older, older[2:], strict=False)]
+        return similar.index(max(similar))
 
-    def full(self, queue, newcomer, L, last_dequeued, previous):
-        if L < 3:
-            return L - 1
-        older = ([last_dequeued] if last_dequeued else []) + queue
-        similar = [1 - self.v(c["x"] - a["x"]) for a, c in zip(older, older[2:], strict=False)]
-        return (0 if last_dequeued else 1) + similar.index(max(similar))
+    return Policy(full)
+
+
+def spread(key, share, discount):
+    """A newcomer within ``share`` even gaps of the tail goes, else the smallest gap, the older the smaller."""
+
+    def full(sender, queue, newcomer):
+        L = len(queue)
+        even = share * (newcomer[key] - sender.last_dequeued[key]) / (L + 1)
+        if newcomer[key] - queue[-1][key] < even and sender.evictions == 0:
+            return REJECT
+        gaps = gaps_left(sender, queue, newcomer, key)[:L]
+        counted = [gap * (1 - discount * (1 - k / L)) for k, gap in enumerate(gaps)]
+        return counted.index(min(counted))
+
+    return Policy(full)
+
+
+def greedy_qoi(v):
+    """The first of the slots whose eviction for the newcomer adds most; reject if none adds anything."""
+
+    def loss(a, b):
+        if "exponential" in v.name:
+            return v(a) * v(b)  # equal, and rounded as in the kernel
+        return v(a) + v(b) - v(a + b)
+
+    def full(sender, queue, newcomer):
+        x = [m["x"] for m in [sender.last_dequeued, *queue, newcomer]]
+        gain = v(x[-1] - x[-2])
+        added = [gain - loss(b - a, c - b) for a, b, c in zip(x, x[1:], x[2:], strict=False)]
+        return added.index(max(added)) if max(added) > 0 else REJECT
+
+    return Policy(full)
 
 
 class LinearAlpha(Afr):
@@ -152,37 +182,6 @@ class LinearAlpha(Afr):
         return super().count(queue, newcomer)
 
 
-class EvenReject(MinGap):
-    """A newcomer within beta even gaps of the tail goes, else the smallest gap between two neighbours closes."""
-
-    def __init__(self, beta=1.3):
-        super().__init__("us")
-        self.beta = beta
-
-    def full(self, queue, newcomer, L, last_dequeued, previous):
-        even = self.beta * (newcomer["us"] - last_dequeued["us"]) / (L + 1)
-        if newcomer["us"] - queue[-1]["us"] < even and self.sender.evictions == 0:
-            return REJECT
-        gaps = self.gaps(queue, newcomer, last_dequeued, previous)[:L]
-        return gaps.index(min(gaps))
-
-
-class PacedMotionGap(MinGap):
-    """A newcomer within ``pace`` even gaps of the tail goes, else the smallest gap, the older the smaller."""
-
-    def __init__(self, pace=0.7, discount=0.35):
-        super().__init__("x")
-        self.pace, self.discount = pace, discount
-
-    def full(self, queue, newcomer, L, last_dequeued, previous):
-        even = (newcomer["x"] - last_dequeued["x"]) / (L + 1)
-        if newcomer["x"] - queue[-1]["x"] < self.pace * even and self.sender.evictions == 0:
-            return REJECT
-        gaps = self.gaps(queue, newcomer, last_dequeued, previous)[:L]
-        counted = [gap * (1 - self.discount * (1 - k / L)) for k, gap in enumerate(gaps)]
-        return counted.index(min(counted))
-
-
 class Steady(Policy):
     """Of the numbers m, 2m, 4m, ... (m odd) the last few are kept: s + 1 if m = 1, else s - floor(log2 m)."""
 
@@ -196,10 +195,10 @@ class Steady(Policy):
         width = s + 1 if m == 1 else s - math.floor(math.log2(m))
         return (m, h % width) if width > 0 else None
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         if not queue:
             self.first = newcomer["seq"]
-        places = [self.place(m["seq"] - self.first + 1, L) for m in [*queue, newcomer]]
+        places = [self.place(m["seq"] - self.first + 1, self.sender.capacity) for m in [*queue, newcomer]]
         place = places.pop()
         if place is None:
             return REJECT
@@ -208,49 +207,21 @@ class Steady(Policy):
         return ACCEPT if self.sender.fits(newcomer) else 0
 
 
-class GreedyQoi(Policy):
-    """The first of the slots whose eviction for the newcomer adds most; reject if none adds anything."""
-
-    def __init__(self, v):
-        self.v = v
-
-    def loss(self, a, b):
-        if "exponential" in self.v.name:
-            return self.v(a) * self.v(b)  # equal, and rounded as in the kernel
-        return self.v(a) + self.v(b) - self.v(a + b)
-
-    def full(self, queue, newcomer, L, last_dequeued, previous):
-        x = [m["x"] for m in [last_dequeued, *queue, newcomer]]
-        gain = self.v(x[-1] - x[-2])
-        added = [gain - self.loss(b - a, c - b) for a, b, c in zip(x, x[1:], x[2:], strict=False)]
-        return added.index(max(added)) if max(added) > 0 else REJECT
-
-
-class OldestThatHelps(Policy):
-    """On one queue, what is made for topics: the oldest goes until the newcomer fits; ``depth`` are kept."""
-
-    def __init__(self, depth=math.inf):
-        self.depth = depth
-
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
-        return ACCEPT if len(queue) < self.depth and self.sender.fits(newcomer) else 0
-
-
 class Anything(Policy):
     """A policy that decides at random, invalid decisions included: -2 accept, -1 reject, 0 .. L + 1 a slot."""
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
-        return one_of([ACCEPT, REJECT, *range(L + 2)], newcomer["uniform"])
+    def decide(self, queue, newcomer):
+        return one_of([ACCEPT, REJECT, *range(self.sender.capacity + 2)], newcomer["uniform"])
 
 
 def twins(v):
     """What makes the twin of each built-in policy, by name."""
     return {
-        "drop-oldest": DropOldest,
-        "drop-newest": DropNewest,
-        "replace-newest": ReplaceNewest,
+        "drop-oldest": lambda: Policy(lambda sender, queue, newcomer: 0),
+        "drop-newest": lambda: Policy(drop_newest),
+        "replace-newest": lambda: Policy(lambda sender, queue, newcomer: len(queue) - 1),
         "latest-only": lambda: KeepLast(1),
-        "random": Random,
+        "random": lambda: Policy(drop_random),
         "reservoir": Reservoir,
         "decimate": Decimate,
         "keyframe": lambda step=0.05: Spaced("x", step),
@@ -258,14 +229,14 @@ def twins(v):
         "afr-paper": lambda: Afr(as_released=False),
         "linear-alpha": LinearAlpha,
         "steady": Steady,
-        "min-gap": lambda: MinGap("us"),
-        "min-motion-gap": lambda: MinGap("x"),
-        "even-reject": EvenReject,
-        "paced-motion-gap": PacedMotionGap,
-        "orbbuf": lambda: OrbBuf(v),
-        "greedy-qoi": lambda: GreedyQoi(v),
+        "min-gap": lambda: min_gap("us"),
+        "min-motion-gap": lambda: min_gap("x"),
+        "even-reject": lambda beta=1.3: spread("us", beta, 0),
+        "paced-motion-gap": lambda pace=0.7, discount=0.35: spread("x", pace, discount),
+        "orbbuf": lambda: orbbuf(v),
+        "greedy-qoi": lambda: greedy_qoi(v),
         "ros-keep-last": lambda depth=10: KeepLast(depth),
-        "dds-keep-all": DropNewest,
+        "dds-keep-all": lambda: Policy(drop_newest),
         "lifespan": Lifespan,
         "time-filter": lambda separation_s=0.1: Spaced("us", separation_s * 1e6),
         "zenoh-drop": ZenohDrop,
@@ -278,8 +249,8 @@ def twins(v):
         "rosbridge": Rosbridge,
         "codel": Codel,
         "red": Red,
-        **dict.fromkeys(["fifo", "strict-priority", "age-greedy", "edf", "ros-native"], OldestThatHelps),
-        **dict.fromkeys(["robofleet", "robofleet-literal", "robofleet-released"], lambda: OldestThatHelps(1)),
+        **dict.fromkeys(["fifo", "strict-priority", "age-greedy", "edf", "ros-native"], KeepLast),
+        **dict.fromkeys(["robofleet", "robofleet-literal", "robofleet-released"], lambda: KeepLast(1)),
         "test-anything": Anything,
     }
 

@@ -8,14 +8,15 @@ from naive_sender import ACCEPT, REJECT
 
 
 class Policy:
-    """``decide`` says what to do with a newcomer; ``departed`` hears what is left after the head went."""
+    """``decide`` says what to do with a newcomer, ``full`` where there is no room; ``departed`` hears what is left."""
 
     sender = None  # whose policy it is
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
-        if self.sender.fits(newcomer):
-            return ACCEPT
-        return self.full(queue, newcomer, len(queue), last_dequeued, previous)
+    def __init__(self, full=None):
+        self.full = full  # (sender, queue, newcomer) -> the slot to evict, or REJECT
+
+    def decide(self, queue, newcomer):
+        return ACCEPT if self.sender.fits(newcomer) else self.full(self.sender, queue, newcomer)
 
     def departed(self, queue):
         pass
@@ -25,19 +26,8 @@ class Policy:
         return 0
 
 
-class DropOldest(Policy):
-    def full(self, queue, newcomer, L, last_dequeued, previous):
-        return 0
-
-
-class DropNewest(Policy):
-    def full(self, queue, newcomer, L, last_dequeued, previous):
-        return REJECT
-
-
-class ReplaceNewest(Policy):
-    def full(self, queue, newcomer, L, last_dequeued, previous):
-        return L - 1
+def drop_newest(sender, queue, newcomer):
+    return REJECT
 
 
 def one_of(candidates, uniform):
@@ -53,11 +43,9 @@ def uniform_of(newcomer, sender):
     return uniform
 
 
-class Random(Policy):
+def drop_random(sender, queue, newcomer):
     """The victim is uniform over the queue and the newcomer."""
-
-    def full(self, queue, newcomer, L, last_dequeued, previous):
-        return one_of([*range(L), REJECT], uniform_of(newcomer, self.sender))
+    return one_of([*range(len(queue)), REJECT], uniform_of(newcomer, sender))
 
 
 class KeepLast(Policy):
@@ -66,7 +54,7 @@ class KeepLast(Policy):
     def __init__(self, depth=math.inf):
         self.depth = depth
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         return 0 if len(queue) >= self.depth or not self.sender.fits(newcomer) else ACCEPT
 
 
@@ -88,11 +76,11 @@ class Spaced(KeepLast):
         super().__init__()
         self.key, self.distance = key, distance
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
-        accepted = [*([last_dequeued] if self.sender.dequeued else []), *queue]
+    def decide(self, queue, newcomer):
+        accepted = [*self.sender.sent[0], *queue]
         if accepted and newcomer[self.key] - accepted[-1][self.key] < self.distance:
             return REJECT
-        return super().decide(queue, newcomer, L, last_dequeued, previous)
+        return super().decide(queue, newcomer)
 
 
 class FoxgloveBacklog(Policy):
@@ -101,7 +89,7 @@ class FoxgloveBacklog(Policy):
     def __init__(self, limit_mb=10):
         self.limit = limit_mb * 1e6
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         waiting = sum(m["bytes"] for m in queue) + self.sender.left_bytes()
         if waiting + newcomer["bytes"] >= self.limit or not self.sender.fits(newcomer):
             return REJECT
@@ -109,14 +97,15 @@ class FoxgloveBacklog(Policy):
 
 
 class Rosbridge(Policy):
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         return ACCEPT
 
 
-class Codel(DropNewest):
+class Codel(Policy):
     """RFC 8289, 5.5 and 5.6, with its loop as it stands there; times in us, 0 for none."""
 
     def __init__(self, target_ms=5, interval_ms=100):
+        super().__init__(drop_newest)
         self.target, self.interval = target_ms * 1e3, interval_ms * 1e3
         self.first_above = self.drop_next = self.count = self.lastcount = self.maxpacket = 0
         self.dropping = False
@@ -171,8 +160,8 @@ class Red(Policy):
         self.min_th, self.max_th, self.max_p, self.weight = min_th, max_th, max_p, weight
         self.average, self.count = 0, -1
 
-    def decide(self, queue, newcomer, L, last_dequeued, previous):
-        in_bytes = sum(m["bytes"] for m in queue) / self.sender.max_bytes
+    def decide(self, queue, newcomer):
+        L, in_bytes = self.sender.capacity, sum(m["bytes"] for m in queue) / self.sender.max_bytes
         self.average += self.weight * (max(len(queue), L * in_bytes) - self.average)
         filled = self.average / L
         if self.min_th <= filled < self.max_th:

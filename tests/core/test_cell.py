@@ -180,7 +180,7 @@ def twin(episode, knots, policy, capacity, max_bytes=None, decide_at="arrival", 
 
 
 class TwinAccept(naive.Policy):
-    def decide(self, queue, message, capacity, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         return naive.ACCEPT
 
 
@@ -190,9 +190,9 @@ class TwinLook(naive_policies.Anything):
     def __init__(self):
         self.noted = []
 
-    def decide(self, queue, message, capacity, last_dequeued, previous):
+    def decide(self, queue, newcomer):
         self.noted.append(self.sender.left_bytes())
-        return super().decide(queue, message, capacity, last_dequeued, previous)
+        return super().decide(queue, newcomer)
 
 
 @kernels

@@ -14,16 +14,7 @@ from hypothesis import strategies as st
 from bufgym.errors import BufgymError
 from bufgym.kernel import records
 from bufgym.model import link, qoi
-from bufgym.model.buffer import (
-    MESSAGE,
-    arrival_gain,
-    evict,
-    loss,
-    motion_gaps,
-    push,
-    row_width,
-    time_gaps,
-)
+from bufgym.model.buffer import MESSAGE, arrival_gain, evict, loss, motion_gaps, push, row_width, time_gaps
 from bufgym.model.link import FOREVER, Knots, Link, position_at, segment, time_of
 
 pytestmark = pytest.mark.kernels

@@ -122,7 +122,7 @@ def test_what_the_policy_sees():
 
 
 def test_running_means_by_hand():
-    # Arrivals at 0, 8, 10 and 10 ms. The first gap, 8 ms, is the period; then 8 + (2 - 8) / 8 and 7.25 + (0 - 7.25) / 8.
+    # Arrivals at 0, 8, 10 and 10 ms. The first gap, 8 ms, is the period; then 8 + (2 - 8) / 8, 7.25 + (0 - 7.25) / 8.
     # Message 0 is dequeued before 1, then 1 before 2, and none before 3; each weighs a sixteenth in the service ratio.
     views = []
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import frame_cases
+import fragment_cases
 import numpy as np
 import pytest
 from cases import VALUES, cases, queue_of, same
@@ -33,7 +33,7 @@ kernels = pytest.mark.kernels
 def fast(*frames, **known):
     """x is twice the number of the frame, and the stream has run for 10 s. The rate over 0.5 s is not to be used."""
     rates = {f"{span}_rate_bytes_per_s": rate for span, rate in (("short", 7500.0), ("medium", 77.0), ("long", 7500.0))}
-    return frame_cases.waiting(*frames, per_frame=2.0, **rates | known)
+    return fragment_cases.waiting(*frames, per_frame=2.0, **rates | known)
 
 
 def remembered(rate=7500e-6, pace=2 / 33_333, seen_us=10e6, square=33_333.0**2):
@@ -178,7 +178,7 @@ V = qoi.exponential(0.618)
 
 def waiting(*frames, rate_bytes_per_s=7500.0, **known):
     rates = {"medium_rate_bytes_per_s": rate_bytes_per_s, "long_rate_bytes_per_s": rate_bytes_per_s / 2}
-    return frame_cases.waiting(*frames, **rates | known)
+    return fragment_cases.waiting(*frames, **rates | known)
 
 
 @kernels

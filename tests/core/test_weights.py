@@ -132,10 +132,7 @@ def test_metadata_that_could_not_be_read_are_not_written(path, about, rule):
 def test_weights_that_could_not_be_read_are_not_written(path):
     good, send = made(3), made(4, kind=TOPICS)
     for bad, rule in (
-        (
-            replace(good, drop=replace(good.drop, bias=np.float32([np.nan]))),
-            r"tensor drop\.bias must hold finite numbers",
-        ),
+        (replace(good, drop=replace(good.drop, bias=np.float32([np.nan]))), r"tensor drop\.bias must hold"),
         (replace(good, accept=made(4).accept), r"accept\.0\.weight = .*must be \[2, 3\]"),
         (made(3, 3, 3), "2 at most"),
         (made(257), "1 to 256 hidden units"),

@@ -146,20 +146,6 @@ def test_fields_and_state():
     assert env.observation_space("robot_2").contains(seen["robot_2"])
 
 
-def test_seeds_make_the_same_episode_and_go_on_from_it():
-    def crossings(env, seed):
-        env.reset(seed=seed)
-        while env.agents:
-            env.step(dict.fromkeys(env.agents, L + 1))
-        return np.asarray(env.rows.senders.batch.log)["transmitted_us"].tolist()
-
-    one, other = FleetEnv(robots=2, **SMALL), FleetEnv(robots=2, **SMALL)
-    first, second = crossings(one, 5), crossings(one, None)
-    assert crossings(other, 5) == first
-    assert crossings(other, None) == second != first
-    assert crossings(other, 6) != first
-
-
 def test_pictures_have_a_line_and_a_bar_for_every_robot():
     env, image = FleetEnv(robots=3, render_mode="ansi", **SMALL), FleetEnv(robots=60, render_mode="rgb_array", **SMALL)
     with pytest.raises(gym.error.ResetNeeded):
@@ -191,14 +177,12 @@ def test_pictures_have_a_line_and_a_bar_for_every_robot():
         (lambda: FleetEnv(reward="all"), "reward = 'all': must be 'team'"),
         (lambda: FleetEnv(term="speed"), "unknown term 'speed'"),
         (lambda: FleetEnv(fields=["colour"]), "unknown field 'colour'"),
-        (lambda: FleetEnv(render_mode="human"), "render_mode = 'human'"),
         (lambda: FleetEnv(observation="flat", mask_in_observation=True), "'flat' has no place for it"),
         (lambda: begun().step({"robot_0": 0, "robot_1": 1.7}), "actions['robot_1'] = 1.7: must be a whole number"),
         (lambda: begun().step({"robot_0": 0}), "actions: none for 'robot_1'"),
         (lambda: begun().step({"robot_0": 0, "robot_1": L + 2}), "actions['robot_1'] = 6: must lie in 0..5"),
         (lambda: begun().reset(options={"episode": apart()}), "arrive at the same times"),
         (lambda: FleetVecEnv(0), "cells = 0"),
-        (lambda: FleetVecEnv(2, reward="mine"), "reward = 'mine'"),
         (lambda: FleetVecEnv(2, 2).reset(options={"episodes": [None]}), "1 given for 2 cells"),
         (lambda: half_reset(), "begin together"),
     ],

@@ -8,6 +8,7 @@ import os
 import socket
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,13 +19,14 @@ from bufgym.cli import live as command
 from bufgym.errors import BufgymError
 from bufgym.live import LogFile, PolicyQueue, read_log, replay
 from bufgym.live import buses as libraries
-from bufgym.live.bus_channel import BusChannel
+from bufgym.live.bus_channel import BusChannel, BusServer
 from bufgym.live.buses import BUSES
 from bufgym.live.channels import TRANSPORTS, TcpChannel
 from bufgym.live.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, Frame, FrameError, header, parse
 from bufgym.live.receiver import Received, Recording, listener
 from bufgym.live.sender import Sender
 from bufgym.live.shaped import ShapedLink
+from bufgym.live.tasks import Tasks
 from bufgym.model.link import Link
 from bufgym.traces import Trace
 
@@ -164,6 +166,23 @@ async def test_who_does_not_greet_is_hung_up_on(transport: str, request: pytest.
         channel.close()
         await until(lambda: receiver.faults)
         assert "must be a greeting first" in receiver.faults[0]
+
+
+async def test_who_greets_before_the_receiver_has_its_bus_is_served() -> None:
+    """A library's thread hears it while the receiver is still being told that it listens."""
+    loop, came, tasks = asyncio.get_running_loop(), asyncio.Queue[Frame](), Tasks()
+
+    def opening(host: str, port: int, name: str, hear: Any, peer: Any) -> Any:
+        hear("sender", header(Frame(GREETING, 0, body=bytes(16))) + bytes(16))
+        asyncio.run_coroutine_threadsafe(asyncio.sleep(0), loop).result()
+        return SimpleNamespace(publish=None, close=None)
+
+    async def serve(channel: BusChannel) -> None:
+        came.put_nowait(await channel.receive())
+
+    await BusServer(serve, tasks.begin, 1000).listen(opening, "", 0)
+    assert (await came.get()).kind == GREETING
+    await tasks.end()
 
 
 async def test_a_receiver_that_sends_garbage_is_left() -> None:
