@@ -15,6 +15,7 @@ import contextlib
 import json
 import socket
 import threading
+import time
 from typing import Any, Final
 
 from bufgym.live.bus_channel import Hear, Open, Peer
@@ -91,7 +92,7 @@ class MqttBus:
         with needs("paho"):
             from paho.mqtt.client import Client
             from paho.mqtt.enums import CallbackAPIVersion
-        self._name, presence = name, f"{ROOT}/receiver"
+        self._name, presence, self._closed = name, f"{ROOT}/receiver", False
         self._client = Client(CallbackAPIVersion.VERSION2, reconnect_on_failure=not name)
         joined, refused = threading.Event(), list[bool]()
 
@@ -128,12 +129,16 @@ class MqttBus:
 
     def publish(self, name: str, data: bytes) -> None:
         way = "up" if self._name else "down"
+        until_s = time.monotonic() + DEAD_AFTER_S
         try:
-            self._client.publish(f"{ROOT}/{way}/{name}", data).wait_for_publish(DEAD_AFTER_S)
+            message = self._client.publish(f"{ROOT}/{way}/{name}", data)
+            while not (message.is_published() or self._closed or time.monotonic() > until_s):
+                message.wait_for_publish(0.05)
         except (RuntimeError, ValueError) as error:  # no connection
             raise ConnectionError(f"mqtt: {error}") from None
 
     def close(self) -> None:
+        self._closed = True
         if not self._name:
             with contextlib.suppress(RuntimeError):
                 self._client.publish(self._presence, b"", qos=1, retain=True).wait_for_publish(1)
