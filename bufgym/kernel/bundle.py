@@ -43,7 +43,7 @@ class BundleType(_Type):  # type: ignore[misc]  # Numba has no types
     @property
     def whole(self) -> Any:
         """Type of the same tuple by value."""
-        return cast(Any, types).NamedTuple(self.types, self.instance_class)
+        return cast(Any, types).BaseTuple.from_types(self.types, self.instance_class)
 
     def kind_of(self, field: str) -> Any:
         """Type of ``field``, or None where there is no such field."""
@@ -119,6 +119,6 @@ def _stored(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 _extending.type_callable(local)(_local_type)
 _extending.lower_builtin(local, BundleType)(_copied)
-_extending.lower_builtin(local, cast(Any, types).NamedTuple)(_stored)
+_extending.lower_builtin(local, cast(Any, types).BaseNamedTuple)(_stored)
 _extending.lower_getattr_generic(BundleType)(_field)
 _extending.unbox(BundleType)(_from_python)

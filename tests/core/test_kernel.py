@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bufgym.kernel import announce, bundle, cache, direct, kernel
+from bufgym.kernel import announce, bundle, cache, direct, kernel, local
 from tests.conftest import COMPILED
 
 TALE = """
@@ -142,3 +144,53 @@ def test_a_direct_call_is_the_call() -> None:
         directly(Numbers(several, True), 1.0)
     assert one.tolist() == [0, 8, 16, 24] and several.tolist() == [7, 15, 23, 31]
     assert len(double.overloads) == 2  # type: ignore[attr-defined]
+
+
+def _no_kernel(numbers: Any) -> int:
+    return len({str(number) for number in numbers})
+
+
+@needs_compilation
+def test_a_branch_that_needs_a_missing_field_is_not_compiled() -> None:
+    @kernel
+    def inner(numbers: Numbers) -> int:
+        if numbers.several is not None:
+            return _no_kernel(numbers.of)
+        return len(numbers.of)
+
+    @kernel
+    def outer(numbers: Numbers) -> int:
+        return inner(numbers)
+
+    assert outer(Numbers(np.zeros(3))) == 3
+    with pytest.raises(numba.core.errors.TypingError):
+        outer(Numbers(np.zeros(3), True))
+
+
+@needs_compilation
+def test_a_bundle_made_in_a_kernel_is_handed_on_by_address() -> None:
+    """Its fields stay as they were when it was made, the arrays that they name do not."""
+
+    @kernel
+    def doubled(numbers: Numbers) -> float:
+        numbers.of[0] *= 2
+        return float(numbers.of[0])
+
+    @kernel
+    def twice(numbers: NDArray[np.float64]) -> float:
+        made = local(Numbers(numbers[1:], None))
+        numbers = numbers[:1]
+        return doubled(made) + doubled(made) + numbers[0]
+
+    assert twice(np.array([100.0, 3.0])) == 6 + 12 + 100
+
+
+@needs_compilation
+def test_garbage_is_collected_again_after_compiling() -> None:
+    @kernel
+    def fails(k: int) -> int:
+        return _no_kernel(k)
+
+    with pytest.raises(numba.core.errors.TypingError):
+        fails(1)
+    assert gc.isenabled()
