@@ -120,6 +120,13 @@ def test_it_keeps_more_than_afr_where_a_link_changes():
     assert regret["planner"] < regret["afr"] < regret["drop-oldest"]
 
 
+@kernels
+def test_a_few_futures_are_better_than_none():
+    episodes = [episode([1e6], seconds=1)]
+    planned, min_gap = (run(policies.get(name), episodes, 3, V) for name in ("planner:budget_us=1", "min-motion-gap"))
+    assert planned.batch.senders["delivered_gain"][0] > min_gap.batch.senders["delivered_gain"][0]
+
+
 @pytest.mark.skipif(not JIT, reason="its futures take compiled code")
 def test_the_budget_is_one_of_work():
     # The same decisions again; with less work fewer futures, and other decisions.
