@@ -20,13 +20,11 @@ compiled = pytest.mark.skipif(not JIT, reason="uncompiled, decisions take as lon
 
 @pytest.fixture(scope="module", autouse=True)
 def runner() -> Iterator[asyncio.Runner]:
-    """The module's event loop."""
     with asyncio.Runner() as one:
         yield one
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run a test that is a coroutine in its module's loop."""
     if not inspect.iscoroutinefunction(pyfuncitem.obj):
         return None
     given = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}

@@ -1,8 +1,9 @@
-"""The parts of training on a suite: rows of different L side by side, the slot network, double DQN, evaluation sets."""
+"""The parts of training on a suite: padded rows, the slot network, double DQN, evaluation sets, ablation."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,18 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import train_cases  # noqa: F401  (it skips without the extra)
+from cli_cases import Patch
 from stable_baselines3.common.logger import Logger
+from train_cases import DropOldest
 
-from agents import mixed_env, runs, training
+from agents import ablation, mixed_env, runs, training
 from agents.dqn import INVALID, valid_actions
-from agents.evaluation import EvaluationSet, seeds_for, sweep_for
-from agents.settings import Settings
+from agents.evaluation import EvaluationSet, sweep_for
+from agents.settings import MOTION, Settings
 from bufgym import policies
 from bufgym.benchmark.run import draw
-from bufgym.benchmark.sweep import Sweep
-from bufgym.errors import BufgymError
 from bufgym.model.qoi import exponential
+from bufgym.policies import learned
 from bufgym.sb3 import GymVecEnv
 from bufgym.sb3.networks import SlotExtractor, SlotScorer
 from bufgym.scenario import Interruption
@@ -32,14 +33,6 @@ SHORT = Interruption(law="uniform", t_min=6, t_max=30)
 STEEP = dataclasses.replace(SHORT, value=exponential(0.2))
 MIXED = [mixed_env.Cell("short", SHORT, 3), mixed_env.Cell("steep", STEEP, 5)]
 SUITE = Settings(suite="interruption-v1", capacities="4,8", validation_episodes=60)
-
-
-class DropOldest:
-    """Accepts where that is possible, else evicts slot 0; remembers nothing."""
-
-    def predict(self, observation: Any, *, deterministic: bool = False, action_masks: Any = None) -> Any:
-        last = action_masks.shape[1] - 1
-        return np.where(action_masks[:, last], last, np.where(action_masks[:, 0], 0, last - 1)), None
 
 
 def mixed_rows(rows: int = 4, slots: int = 7) -> mixed_env.MixedEnv:
@@ -103,23 +96,6 @@ def test_rewards_add_up_to_the_information_and_rows_begin_anew() -> None:
             ends += 1
         assert np.stack(env.env_method("action_masks"))[done].any(axis=1).all()
     assert ends > 12
-
-
-def test_rows_begin_at_different_points_of_their_episodes() -> None:
-    def arrived() -> np.ndarray:
-        env = mixed_env.MixedEnv([mixed_env.Cell("long", Interruption(law="fixed", t_max=60), 4)], [16])
-        env.reset(seed=1)
-        return env.groups[0].senders.batch.senders["next"]
-
-    assert len(np.unique(arrived())) > 8 and arrived().max() > 30
-    assert (arrived() == arrived()).all()
-
-
-def test_a_cell_larger_than_its_padding_is_named() -> None:
-    assert Settings().capacities_of("lte-v1") == (5, 10, 15, 20, 25)
-    assert Settings(capacities="25,5").capacities_of("lte-v1") == (25, 5)
-    with pytest.raises(BufgymError, match="2 padded slots: a cell has L = 5"):
-        mixed_env.MixedEnv(MIXED, [1, 1], padded_slots=2)
 
 
 def scorer_of(env: mixed_env.MixedEnv, masked: bool = True) -> tuple[SlotExtractor, SlotScorer]:
@@ -235,18 +211,6 @@ def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: P
     assert file.stat().st_mtime_ns == written
 
 
-def test_as_many_episodes_as_asked_for_or_at_least_one_a_trace() -> None:
-    """interruption-v1 has 3 scenarios without traces: at two capacities one seed is 6 episodes."""
-    asked = [seeds_for("interruption-v1", "validation", (4, 8), episodes, None) for episodes in (60, 1)]
-    assert asked == [10, 1]
-
-
-def test_nothing_to_be_gained_is_an_error(tmp_path: Path) -> None:
-    evaluation = EvaluationSet(Sweep("interruption-v1", ("afr",), "validation", (500,), 1), tmp_path / "set")
-    with pytest.raises(BufgymError, match="cannot be bettered"):
-        evaluation.verdict(evaluation.run(policies.get("drop-oldest")))
-
-
 def test_a_record_goes_on_where_the_checkpoint_was(tmp_path: Path) -> None:
     columns = ("steps", "seconds", "qoi")
     record = runs.Record(tmp_path / "curve.csv", columns, 0)
@@ -262,3 +226,39 @@ def test_the_best_validation_is_the_earliest_of_equals(tmp_path: Path) -> None:
     best = [validations.add(steps, 0.0, (regret,)) for steps, regret in ((0, 0.5), (20, 0.4), (30, 0.4))]
     assert best == [True, True, False] and validations.best[0] == 20
     assert [validations.due(steps) for steps in (30, 40, 49, 50)] == [False, True, True, True]
+
+
+GIVEN = Settings(suite=ablation.SUITES, algo="evolution", name="parts", hidden=4, warm_up=10)
+HEAD = "steps,seconds,score,regret,over_afr,over_rivals\n"
+
+
+def test_each_variant_lacks_what_its_name_says() -> None:
+    made = ablation.variants(GIVEN)
+    assert len({variant.name for variant in made.values()}) == len(made)
+    assert made["everything"].observed == MOTION and made["one scorer for all links"].warm_up == 0
+    for name, left_out in ablation.WITHOUT.items():
+        assert {*MOTION} - {*made[name].observed} == {*left_out} <= {*learned.NAMES}
+    for hidden, still in ablation.HIDDEN:
+        variant = made[f"{hidden} hidden units where the link moves, {still} where it stands still"]
+        assert (variant.hidden, variant.still_hidden, variant.warm_up) == (hidden, still, 10)
+
+
+def run_of(folder: Path, name: str, algo: str, validations: dict[int, str]) -> Path:
+    """A run's folder, as train.py leaves it, but for the agents."""
+    run = folder / name
+    settings = dataclasses.replace(Settings(suite="interruption-v1", name=name), algo=algo, seeds=3)
+    for seed, rows in validations.items():
+        (run / f"seed-{seed}").mkdir(parents=True)
+        (run / f"seed-{seed}" / "validation.csv").write_text(HEAD + rows, encoding="utf-8")
+    (run / "settings.json").write_text(json.dumps({"command": settings.command, **dataclasses.asdict(settings)}))
+    return run
+
+
+def test_the_best_of_n_seeds_is_chosen_by_validation_and_shown_on_the_test(tmp_path: Path, monkeypatch: Patch) -> None:
+    """Validation says 0.5, 0.6, 0.7, the test 0.58, 0.55, 0.9: of two, seed 0 is chosen twice and seed 1 once."""
+    validations = {s: f"0,0,0,0,0,1.5\n1,1,0,0,0,{over}\n" for s, over in enumerate((0.5, 0.6, 0.7))}
+    run = run_of(tmp_path, "mine", "evolution", validations)
+    tested = {"seed-0": 0.58, "seed-1": 0.55, "seed-2": 0.9}
+    monkeypatch.setattr(ablation, "tested", lambda settings, model: [tested[model.parent.name]])
+    rows = ["| best of 1 | 0.600 | 0.677 |", "| best of 2 | 0.533 | 0.570 |", "| best of 3 | 0.500 | 0.580 |"]
+    assert ablation.more_seeds(run)[2:] == rows

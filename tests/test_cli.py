@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 from cli_cases import Capsys, Patch, fails, shown
 
-from bufgym import __version__, cli, policies, reproduce, scenario, traces
-from bufgym.benchmark import perf
+from bufgym import __version__, cli, policies, scenario, traces
+from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run
 from bufgym.cli import main
+from bufgym.kernel import JIT
+from bufgym.policies import registry
 from bufgym.traces.generate.shipped import shipped_calls
 
 
@@ -34,13 +37,6 @@ def test_list_names_everything_there_is(capsys: Capsys) -> None:
         assert head == kind and lines and all(line.startswith("  ") for line in lines)
 
 
-def test_list_has_a_group_of_policies_made_for_topics(capsys: Capsys) -> None:
-    one_queue, topics = shown(["list", "policies"], capsys).split("  -- made for several topics side by side --\n")
-    for name in policies.names():
-        part, other = (topics, one_queue) if policies.get(name).for_topics else (one_queue, topics)
-        assert f"\n  {name} " in f"\n{part}" and f"\n  {name} " not in f"\n{other}"
-
-
 def test_the_module_runs_as_a_command_and_opens_no_heavy_module() -> None:
     heavy = ("bufgym.sim", "bufgym.envs", "matplotlib", "pyarrow", "tqdm", "mcap", "rosbags")
     held = f"[m for m in {heavy!r} if m in sys.modules]"
@@ -55,15 +51,10 @@ def test_the_module_runs_as_a_command_and_opens_no_heavy_module() -> None:
     ("command", "naming"),
     [
         ("", "COMMAND"),
-        ("fly", "'fly'"),
-        ("list planets", "'planets'"),
         ("trace", "VERB"),
         ("trace info missing.csv", "missing.csv"),
         ("trace plot lte-synthetic-0 --out x.doc", "x.doc"),
         ("play --env Moon-v0", "'Moon-v0'"),
-        ("play --policies guess", "'guess'"),
-        ("play --seed -1", "-1"),
-        ("perf --repeats 0", "0: must be"),
         ("reproduce fig99", "'fig99'"),
     ],
 )
@@ -89,39 +80,6 @@ def test_ctrl_c_and_a_reader_that_left(monkeypatch: Patch, capsys: Capsys, tmp_p
     assert process.returncode == 141
 
 
-def test_trace_info(trace: str, capsys: Capsys) -> None:
-    first, second = shown(["trace", "info", trace, "lte-synthetic-0"], capsys).split("\n\n")
-    assert first.startswith("link\n") and "format csv, detected" in first and second.startswith("lte-synthetic-0\n")
-    lines = [line.split() for line in first.splitlines()]
-    assert ["duration_s", "3"] in lines and ["seconds_below_500KBps", "1"] in lines
-
-
-def test_trace_plot(trace: str, tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
-    pytest.importorskip("matplotlib")
-    out = tmp_path / "picture.png"
-    shown(["trace", "plot", trace, "lte-synthetic-1", "--out", out], capsys)
-    assert out.read_bytes().startswith(b"\x89PNG")
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    fails(["trace", "plot", trace, "--out", "x.png"], "pip install matplotlib", capsys)
-
-
-def test_reproduce_lists_and_dispatches(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
-    monkeypatch.setattr(reproduce, "FIGURES", {"one": "the first", "two": "the second"})
-    monkeypatch.setattr(reproduce, "run", lambda name, out: f"{name} in {out.name}")
-    assert "the second" in shown(["reproduce"], capsys)
-    assert shown(["reproduce", "two", "two", "--out", tmp_path / "o"], capsys) == "two in o\n"
-    assert shown(["reproduce", "all", "--out", tmp_path / "o"], capsys) == "one in o\n\ntwo in o\n"
-
-
-def test_perf(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
-    # tests/benchmark measures; here it is the command alone.
-    monkeypatch.setattr(perf, "measure", lambda sizes: [perf.Figure("rollout, afr", 2.5e7, "arrivals/s", 2e7, "what")])
-    target = tmp_path / "perf.json"
-    text = shown(["perf", "--quick", "--repeats", 1, "--json", target], capsys)
-    assert "rollout, afr  25 M arrivals/s  (target 20 M arrivals/s)" in text
-    assert json.loads(target.read_text())["sizes"]["repeats"] == 1
-
-
 def test_play_ends_where_bench_does(capsys: Capsys) -> None:
     words = "play --env Interruption-v0 --policies afr --speed 0 --seed 3 --capacity 4 --steps 400"
     over = shown(words.split(), capsys).splitlines()[-1]
@@ -131,12 +89,115 @@ def test_play_ends_where_bench_does(capsys: Capsys) -> None:
     )
 
 
-def test_play_stops_after_so_many_decisions_and_colours_a_terminal_alone(monkeypatch: Patch, capsys: Capsys) -> None:
-    words = ["play", "--speed", "0", "--steps", "2"]
-    text = shown(words, capsys)
-    assert "decision 2" in text and "decision 3" not in text and "stopped after 2 decisions" in text
-    assert "\x1b" not in text
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    for wish in ("", "1"):
-        monkeypatch.setenv("NO_COLOR", wish)
-        assert ("\x1b" in shown(words, capsys)) == (not wish)
+QUICK = ["--seconds", "1", "--fps", "10", "--seeds", "2", "--capacity", "2"]
+"""A benchmark of a few messages."""
+
+
+@pytest.fixture(autouse=True)
+def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
+
+
+def test_bench_writes_rows_and_a_table(trace: str, tmp_path: Path, capsys: Capsys) -> None:
+    out = tmp_path / "new" / "results"
+    chosen = ["--policies", "afr,decimate:every=2,random", "--format", "csv", "--out", out]
+    text = shown(["bench", "--trace", trace, "--motion", "none", *QUICK, *chosen], capsys)
+    assert "over link" in text and "decimate:every=2" in text and "V = exponential:0.618" in text
+    rows = read_rows(out / "rows.csv")
+    assert [row["policy"] for row in rows] == ["afr"] * 2 + ["decimate:every=2"] * 2 + ["random"] * 2
+    assert {row["trace"] for row in rows} == {"link"} and {row["arrived"] for row in rows} == {10}
+    assert "| decimate:every=2 | 2 |" in (out / "table.md").read_text()
+    assert sorted(path.name for path in out.iterdir()) == ["rows.csv", "table.md"]
+
+
+def test_bench_writes_parquet_where_it_can(trace: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pyarrow")
+    command = ["bench", "--trace", trace, *QUICK, "--policies", "afr", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert len(read_rows(tmp_path / "rows.parquet")) == 2
+    monkeypatch.setitem(sys.modules, "pyarrow", None)  # importing it now fails
+    assert main(command) == 0
+    assert (tmp_path / "rows.csv").exists()
+    assert main([*command, "--format", "parquet"]) == 2
+
+
+def test_bench_takes_shipped_traces_and_all_policies_by_default(capsys: Capsys) -> None:
+    text = shown(["bench", *QUICK, "--seeds", "1"], capsys)
+    assert "8 traces x 1 seed" in text
+    for name in policies.names():
+        told = f"\n{name} " in text or re.search(rf"^note: .*\b{name}\b.*the same rows here", text, re.M)
+        assert bool(told) != policies.get(name).for_topics
+
+
+@pytest.mark.skipif(not JIT, reason="it plays whole benchmarks, which takes compiled code")
+def test_bench_meets_the_episodes_of_the_environment_by_default(tmp_path: Path) -> None:
+    """Row (trace, seed) is what ``reset`` of bufgym/Uplink-v0 plays by these numbers; neither side has an argument."""
+    assert main(["bench", "--seeds", "1", "--policies", "drop-oldest", "--format", "csv", "--out", str(tmp_path)]) == 0
+    (row,) = (row for row in read_rows(tmp_path / "rows.csv") if row["trace"] == "lte-synthetic-3")
+    env = gym.make("bufgym/Uplink-v0", bound=True).unwrapped
+    _, info = env.reset(options={"trace": "lte-synthetic-3", "seed": 0})
+    ended = False
+    while not ended:
+        action = 9 if info["action_mask"][9] else 0  # accept, else evict the oldest
+        _, _, ended, _, info = env.step(action)
+    assert info["qoi"] == row["qoi"] and info["regret"] == pytest.approx(row["regret"]) and info["score"] == 0
+
+
+BOOM = """
+from bufgym.policies import register
+@register('boom'{})
+def boom(buffer, arrival, memory):
+    return {}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("def broken(:\n", "line 1"),
+        ("import a_module_that_is_not_there\n", "line 1: ModuleNotFoundError"),
+        (BOOM.format("", "1 // 0"), "line 5: ZeroDivisionError"),
+        (BOOM.format(", compile=True", "buffer.nothing"), "compile" if JIT else "line 5: AttributeError"),
+    ],
+)
+def test_a_users_mistake_is_shown_where_it_is(trace: str, tmp_path: Path, text: str, line: str, capsys: Capsys) -> None:
+    mine = tmp_path / "mine.py"
+    mine.write_text(text)
+    only = ["--policies", "boom"] if "boom" in text else []
+    fails(["bench", "--trace", trace, *QUICK, "--policy-file", mine, *only], line, capsys)
+
+
+@pytest.mark.parametrize(
+    ("options", "naming"),
+    [
+        ("--policies decimate:every=0", "every = 0"),
+        ("--policies mine.py", "--policy-file mine.py registers its policies"),
+        ("--capacity 0", "0: must be"),
+        ("--fps nan", "nan: must be"),
+        ("--bytes 1.5", "1.5"),
+        ("--seconds 1e9", "duration_s = 1000000000.0: must be at most"),
+        ("--jitter 2", "jitter = 2"),
+        ("--trace no-such.csv", "no-such.csv"),
+        ("--t-max 5", "--t-max needs --interruption"),
+        ("--interruption --trace x.csv", "--trace cannot go with --interruption"),
+        ("--out rows.csv", "rows.csv: without --suite it must be"),
+        ("--nonsense", "--nonsense"),
+    ],
+)
+def test_bad_options_of_bench(options: str, naming: str, capsys: Capsys) -> None:
+    fails(["bench", *options.split()], naming, capsys)
+
+
+def test_an_output_folder_that_cannot_be_written(trace: str, tmp_path: Path, capsys: Capsys) -> None:
+    (tmp_path / "taken").touch()
+    fails(["bench", "--trace", trace, *QUICK, "--out", tmp_path / "taken"], "taken: File exists", capsys)
+    (tmp_path / "manifest.json").write_text("{}", encoding="utf-8")
+    fails(["bench", "--policies", "afr", *QUICK, "--out", tmp_path], "holds the run of a suite", capsys)
+    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "taken", "link.csv"}
+
+
+def test_the_clairvoyant_plans_for_a_sender_that_is_always_asked(trace: str, capsys: Capsys) -> None:
+    overflow = ["bench", "--trace", trace, *QUICK, "--decide-at", "overflow"]
+    told = "policy clairvoyant: it plans for a sender that asks at every arrival"
+    fails([*overflow, "--policies", "clairvoyant,afr"], told, capsys)
+    assert "\nclairvoyant " not in shown(overflow, capsys)

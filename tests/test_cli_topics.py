@@ -1,4 +1,4 @@
-"""``bufgym topics`` as a user types it, and each mistake that ends in one line and exit code 2."""
+"""``bufgym topics``, ``bench --workload`` and ``trace from-bag`` as a user types them; every number worked by hand."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from cli_cases import FAR_OFF, Capsys, Patch, fails, shown
 
-from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.tasks.topics import ROWS
+from bufgym.cli import main
 from bufgym.policies import registry
 
 CONFIG = """
@@ -38,9 +38,7 @@ def config(tmp_path: Path) -> str:
 
 def test_a_client_of_ones_own(config: str, tmp_path: Path, capsys: Capsys) -> None:
     out = tmp_path / "rows.csv"
-    words = (
-        "--scale 0.01 --trace lte-synthetic-0 --seeds 2 --policies fifo,edf --capacity 2,4 --window 3 --by-topic edf"
-    )
+    words = "--scale .01 --trace lte-synthetic-0 --seeds 2 --policies fifo,edf --capacity 2,4 --window 3 --by-topic edf"
     text = shown(["topics", "--config", config, *words.split(), "--out", out], capsys)
     assert f"The client of {config}." in text
     assert "2 episodes of 2 s; n_T = 3, acks 40 ms after a message is transmitted, 1 consumer." in text
@@ -66,16 +64,7 @@ def test_the_suite_runs_by_default(capsys: Capsys) -> None:
     assert len(lines) == 7 and all(line[2:5] == ["1.000", "[1.000,", "1.000]"] and line[5] == "0" for line in lines)
 
 
-def test_all_policies_by_default_with_a_word_on_the_unbounded(config: str, capsys: Capsys) -> None:
-    words = ["topics", "--config", config, "--trace", "lte-synthetic-0", "--seeds", "1", "--motion", "none"]
-    text = shown(words, capsys)
-    assert all(f"\n{name} " in text for name in [*policies.names(for_topics=True), "drop-oldest", "rosbridge"])
-    assert "rosbridge has no rank: its queue is unbounded." in text
-
-
-def test_decisions_that_cannot_be_carried_out_are_told(
-    config: str, tmp_path: Path, capsys: Capsys, monkeypatch: Patch
-) -> None:
+def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Capsys, monkeypatch: Patch) -> None:
     """Each of the 2 s x (10 + 2) messages/s is sent by such a decision, whatever its topic."""
     monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     mine = tmp_path / "mine.py"
@@ -90,22 +79,16 @@ def test_decisions_that_cannot_be_carried_out_are_told(
 @pytest.mark.parametrize(
     ("options", "naming"),
     [
-        ("topics --window x", "'x'"),
         ("topics --consumers 0", "consumers = 0"),
         ("topics --suite fleet-v1", "suite fleet-v1 is not one of topics: bufgym bench --suite fleet-v1"),
         ("topics --policies clairvoyant", "policy clairvoyant: it plans with a queue of its own"),
         *((f"topics --{name} 2", f"--{name} needs --config") for name in ("trace", "motion", "scale")),
         ("topics --by-topic afr", "--by-topic afr: not among the policies that run"),
         ("topics --out rows.txt", "rows.txt: rows are written to .csv or .parquet files"),
-        ("topics --out no-such-folder/rows.csv", "no-such-folder/rows.csv: no folder"),
         ("topics --config no-such.toml", "error: no-such.toml: no such file\n"),
         ("topics --config x.toml --suite topics-v1", "--suite cannot go with --config"),
-        ("topics --config x.toml --split test", "--split cannot go with --config"),
-        ("topics --config x.toml --jobs 2", "--jobs cannot go with --config"),
         ("topics --config x.toml --out folder", "folder: with --config rows are written to .csv or .parquet files"),
         ("fleet --policies clairvoyant", "it plans with a link of its own, which no robot in a cell has"),
-        ("fleet --suite lte-v1", "suite lte-v1 is not one of fleet: bufgym bench --suite lte-v1"),
-        ("fleet --robots 0", "must be a whole number >= 1"),
         ("fleet --robots 257", "robots = 257: must be a whole number from 1 to 256"),
     ],
 )
@@ -113,12 +96,122 @@ def test_bad_options(options: str, naming: str, capsys: Capsys) -> None:
     fails(options.split(), naming, capsys)
 
 
-def test_what_is_wrong_on_the_command_line_is_not_the_files_fault(
-    config: str, capsys: Capsys, monkeypatch: Patch
-) -> None:
+def test_a_mistake_typed_is_not_the_files_fault(config: str, capsys: Capsys, monkeypatch: Patch) -> None:
     fails(["topics", "--config", config, "--trace", "lte-synthetic-0", "--window", 0], "error: window = 0", capsys)
     fails(["topics", "--config", config, "--trace", "none.csv"], "none.csv", capsys)
     Path(config).write_text(f"window = 0\n{CONFIG}")
     fails(["topics", "--config", config], "mine.toml: window = 0: n_T must be a whole number", capsys)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     fails(["topics", "--out", "rows.parquet"], "Parquet files need pyarrow", capsys)
+
+
+# A message a second; nothing crosses for 4 s, then 10 kB/s.
+WORKLOAD = """time_s,bytes,topic,x
+0,1000,/camera,0
+1,1000,/odom,0
+2,1000,/camera,1
+3,1000,/odom,2
+"""
+TRACE = "t_ms,bytes,interval_ms\n4000,0,4000\n5000,10000,1000\n"
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("w.csv").write_text(WORKLOAD)
+    Path("outage.csv").write_text(TRACE)
+    return tmp_path
+
+
+W = "--workload w.csv --trace outage.csv"
+BENCH = ["bench", *W.split(), "--capacity", "1"]
+
+
+def test_bench_of_a_recording(here: Path, capsys: Capsys) -> None:
+    text = shown([*BENCH, "--policies", "drop-oldest,drop-newest,clairvoyant", "--drops", "drops.csv"], capsys)
+    lines = text.splitlines()
+    # By topic: two messages each, 1 s between the two, 2 s apart.
+    assert lines[0] == "w.csv (time_s,bytes,topic,x)"
+    assert ["/camera", "2", "0.500", "2,000", "1,000", "50.0%"] in [line.split() for line in lines]
+    assert "4 messages, 4,000 bytes in 3.000 s, 1,333 bytes/s" in lines
+    assert "Played over outage, from the trace's start; all topics share one queue." in lines
+    # H: messages 0 and 3 give 1 + V(2) = 1.865; 0 and 1 give 1 + V(0) = 1.
+    first, _, second = text.partition("dropped of")
+    table = {line.split()[0]: line.split() for line in first.splitlines() if line}
+    assert table["drop-oldest"][1:6] == ["1", "1.865", "0.00%", "2.0", "2.0"]
+    assert table["drop-newest"][1:6] == ["1", "1.000", "46.37%", "2.0", "2.0"]
+    assert "note: L = 1: the clairvoyant's QoI is 1.865; regret is measured against it" in lines
+    # Best QoI first, as above; Drop Oldest drops one of each topic, Drop Newest as well.
+    shares = {line.split()[0]: line.split()[1:] for line in second.splitlines()[1:4]}
+    assert list(shares) == ["drop-oldest", "drop-newest", "clairvoyant"]
+    assert shares["drop-oldest"] == ["1", "50.0%", "50.0%"]
+    assert Path("drops.csv").read_text().splitlines()[:3] == [
+        "policy,capacity,trace,seed,message,time_s,topic,bytes,x,dropped_s",
+        "drop-oldest,1,outage,0,1,1.0,/odom,1000,0.0,2.0",
+        "drop-oldest,1,outage,0,2,2.0,/camera,1000,1.0,3.0",
+    ]
+    assert "6 dropped messages in drops.csv" in lines
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (f"{W} --fps 30", "--fps cannot go with --workload: a recording has its own"),
+        (f"{W} --topics /lidar", "no topic '/lidar'; it has: /camera, /odom"),
+        (f"{W} --odom /odom", "odom = '/odom': needs a recording, which this is not"),
+        (f"{W} --bridge-gaps", "--bridge-gaps needs --odom"),
+        (f"{W} --interruption", "cannot go with --interruption"),
+        (f"{W} --motion drive-0", "workload 'w' has an x of its own"),
+        ("--drops d.csv", "--drops needs --workload"),
+        ("--fov-deg 70", "--fov-deg needs --motion, or --workload with --odom"),
+        ("--motion drive-0 --fov-deg 70", "--fov-deg cannot go with drive-0, which holds finished coordinates"),
+    ],
+)
+def test_what_does_not_go_together(here: Path, capsys: Capsys, words: str, says: str) -> None:
+    fails(["bench", "--policies", "drop-oldest", *words.split()], says, capsys)
+
+
+@pytest.fixture
+def drive(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """1 m forward in a second, a turn of 90 degrees in the next; a picture every 500 ms (see bag_cases)."""
+    pytest.importorskip("mcap", reason="recordings need the extra 'ros'")
+    pytest.importorskip("rosbags", reason="recordings need the extra 'ros'")
+    monkeypatch.syspath_prepend(str(Path(__file__).parent / "traces"))
+    import bag_cases
+
+    monkeypatch.setitem(sys.modules, "bag_cases", bag_cases)
+    return bag_cases.write_mcap(Path("drive.mcap"), bag_cases.drive())
+
+
+def test_a_bag_becomes_a_csv_that_plays_the_same(drive: Path, capsys: Capsys) -> None:
+    chosen = ["--odom", "/odom", "--topics", "/camera/*"]
+    words = "--odom /odom --topics /camera/*,/status -o drive.csv"
+    text = shown(["trace", "from-bag", drive, *words.split()], capsys)
+    assert "drive.mcap (mcap, motion from /odom: 60 degrees, 2 m)" in text
+    assert "x: camera motion of 2.000 fields of view" in text
+    assert Path("drive.csv").read_text().splitlines()[:4] == [
+        "time_s,bytes,topic,x",
+        "0.000000,109,/camera/left,0.0",
+        "0.500000,209,/camera/left,0.25",
+        "0.700000,11,/status,0.35",
+    ]
+    bench = ["bench", "--trace", "outage.csv", "--capacity", "2", "--policies", "afr", "--workload"]
+    one, other = (shown([*bench, *words], capsys) for words in ([drive, *chosen, "/status"], ["drive.csv"]))
+    assert one.partition("\n\n")[2] == other.partition("\n\n")[2]
+
+
+# 1 m, then 90 degrees, then nothing for 5 s.
+TUM = "0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 1 0 0 0 0 0.70710678 0.70710678\n7 1 0 0 0 0 0.70710678 0.70710678\n"
+
+
+def test_a_trajectory_becomes_motion(here: Path, capsys: Capsys) -> None:
+    """1 m / 4 m + 90 / 45."""
+    Path("path.txt").write_text(TUM)
+    words = ["trace", "from-poses", "path.txt", "--fov-deg", "45", "--scene-scale-m", "4"]
+    text = shown(words, capsys)
+    assert "motion  2.250 fields of view in 7.000 s" in text and "gaps    1, the longest 5.0 s" in text
+    assert main([*words, "-o", "motion.csv"]) == 2
+    assert "path.txt: has gaps: say --bridge-gaps" in capsys.readouterr().err
+    assert not Path("motion.csv").exists()
+    shown([*words, "-o", "motion.csv", "--bridge-gaps"], capsys)
+    assert Path("motion.csv").read_text().splitlines()[:3] == ["t_s,motion", "0,0.0", "1,0.25"]

@@ -1,14 +1,18 @@
-"""Evolved agents: where they begin, what they leave behind, that a killed run goes on and a seed repeats itself."""
+"""Evolved agents: where they begin, what they leave, that a killed run goes on and repeats, also on a cluster."""
 
 from __future__ import annotations
 
-import pickle
+import csv
+import importlib.util
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from train_cases import columns
+from safetensors.numpy import load_file
+from train_cases import columns, in_a_folder_of_its_own  # noqa: F401
 
 import train
 from agents import training
@@ -17,8 +21,9 @@ from agents.mixed_env import Cell, cells
 from agents.objectives import queue
 from agents.objectives.objective import to_vector, with_vector
 from agents.runs import MODEL, prepare
-from agents.settings import LINK, MOTION, SEES, TIME, Settings
+from agents.settings import LINK, MOTION, SEES, Settings
 from bufgym import policies
+from bufgym.benchmark import cluster
 from bufgym.errors import BufgymError
 from bufgym.model.qoi import exponential
 from bufgym.oracle import integer, law
@@ -35,11 +40,6 @@ TINY = Settings(
 )
 
 
-@pytest.fixture(autouse=True)
-def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 @pytest.mark.parametrize(("sees", "like"), [("motion", "min-motion-gap"), ("time", "min-gap")])
 def test_it_begins_with_the_smallest_merged_gap(sees: str, like: str) -> None:
     """Without its leaning towards the new, the regret of the first weights is that of the policy they stand for."""
@@ -50,7 +50,6 @@ def test_it_begins_with_the_smallest_merged_gap(sees: str, like: str) -> None:
 
 
 def agent(seed: int = 1) -> weights.Weights:
-    """An agent with a scorer of still links."""
     rng = np.random.default_rng(seed)
     return replace(queue.start(MOTION, 3, rng), still=queue.start(MOTION, 2, rng))
 
@@ -136,7 +135,6 @@ def test_a_suite_is_measured_by_the_better_of_afr_and_drop_oldest() -> None:
 
 
 def test_interruptions_side_by_side_are_what_each_is_alone() -> None:
-    """Cells with V and L of their own, again and again."""
     given = cells("interruption-v1", "train", (1, 4, 9))[:6]
     together = queue.ExactRegrets(given)
     for name in ("min-gap", "afr", "min-gap"):
@@ -193,24 +191,71 @@ def test_a_run_leaves_an_agent_goes_on_after_a_kill_and_repeats(capsys: pytest.C
     assert (again.parameters() == whole.parameters()).all()
 
 
-@pytest.mark.nightly
-def test_a_warm_up_learns_a_second_scorer_first() -> None:
-    few = {"capacities": "25", "validation_episodes": 200, "steps": 100_000, "warm_up": 20_000, "still_hidden": 2}
-    both = replace(TINY, suite="interruption-v1,sustained-v1", name="warm", **few)
-    (run,) = training.train_all(both, prepare(both))
-    state = pickle.loads((run.folder / "evolution.pkl").read_bytes())
-    agent, first = state.agent, queue.start(MOTION, 2, np.random.default_rng(0))
-    assert not state.still and agent.still.widths == (2, 0) and agent.widths == (0, 0)
-    for mean, begin in ((agent.still, first), (agent, state.like)):
-        assert (to_vector(mean) != to_vector(begin)).any()
+REPO = Path(__file__).resolve().parent.parent
+LIBRARY = {"dask": "distributed", "ray": "ray"}
+FEW = {"suite": "interruption-v1", "capacities": "4", "algo": "evolution", "validate_every": 19_000}
+FEW |= {"validation_episodes": 6, "test_seeds": 2, "seeds": 2}
+
+
+def trained(name: str, steps: int, *more: str) -> None:
+    """A command of its own, as cluster libraries begin processes and threads that outlive a test."""
+    options = [(f"--{key.replace('_', '-')}", str(value)) for key, value in FEW.items()]
+    words = [word for pair in options for word in pair]
+    command = [sys.executable, str(REPO / "train.py"), *words, "--name", name, "--steps", str(steps), *more]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def fitness(folder: Path, seed: int) -> list[tuple[str, str]]:
+    with (folder / f"seed-{seed}" / "curve.csv").open(newline="", encoding="utf-8") as file:
+        return [(row["steps"], row["fitness"]) for row in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(tmp_path_factory.mktemp("local"))
+        trained("local", 38_000)
+        return Path("runs/local").resolve()
 
 
 @pytest.mark.nightly
-def test_several_suites_at_once_have_a_table_each(capsys: pytest.CaptureFixture[str]) -> None:
-    few = {"capacities": "25", "test_seeds": 1, "validation_episodes": 200, "steps": 200_000}
-    both = replace(TINY, suite="interruption-v1,sustained-v1", name="both", sees="time", hidden=0, **few)
-    train.main(both)
-    printed = capsys.readouterr().out
-    assert all(f"\n{suite}\n" in printed and Path(f"runs/both/{suite}/rows.csv").exists() for suite in both.suites)
-    agent, notes = weights.read("runs/both/model.safetensors")
-    assert agent.fields == TIME and agent.mix is not None and notes["suite"] == both.suite
+@pytest.mark.parametrize("backend", ["dask", "ray"])
+def test_a_cluster_gives_the_same_agents_bit_for_bit(backend: str, request: pytest.FixtureRequest) -> None:
+    """Two seeds; on the cluster half of the steps, and then the rest."""
+    if importlib.util.find_spec(LIBRARY[backend]) is None:
+        pytest.skip(f"{LIBRARY[backend]} is not installed")
+    local: Path = request.getfixturevalue("local")  # only where there is something to compare
+    trained("cluster", 19_000, "--backend", backend)
+    trained("cluster", 38_000, "--backend", backend, "--resume")
+    assert fitness(local, 0) != fitness(local, 1)
+    cluster = Path("runs/cluster")
+    for seed in (0, 1):
+        assert fitness(cluster, seed) == fitness(local, seed) and len(fitness(local, seed)) > 1
+        one, other = (load_file(folder / f"seed-{seed}" / MODEL) for folder in (local, cluster))
+        assert one.keys() == other.keys()
+        assert all(one[key].tobytes() == other[key].tobytes() for key in one)
+
+
+@pytest.mark.parametrize("backend", ["dask", "ray"])
+def test_a_missing_library_is_one_clear_error(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, LIBRARY[backend], None)
+    with pytest.raises(BufgymError, match=f"{LIBRARY[backend]} is missing: "), cluster.begun(backend, None):
+        pass
+
+
+def test_resuming_may_change_the_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The settings of a run leave out where it was computed, as the result is the same."""
+    local = Settings(name="run", **{**FEW, "seeds": 1})  # type: ignore[arg-type]
+    prepare(local)
+    dask = Settings(name="run", backend="dask", address="tcp://host:1", resume=True, **FEW)  # type: ignore[arg-type]
+    folder = prepare(dask)
+    assert dask.command == Settings(**FEW).command  # type: ignore[arg-type]
+
+    def refuse(backend: str, address: str | None) -> None:
+        raise BufgymError(f"{backend} at {address}")
+
+    monkeypatch.setattr(cluster, "_client", refuse)
+    monkeypatch.setattr(training, "ValidationSets", lambda *args, **options: None)
+    with pytest.raises(BufgymError, match="dask at tcp://host:1"):
+        training.train_all(dask, folder)

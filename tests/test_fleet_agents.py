@@ -26,7 +26,6 @@ FLEET_V1 = suites.get("fleet-v1")
 
 
 def two_robots(split: str, data: Path | None) -> dict[str, Setting]:
-    """fleet-v1's scenario with two robots."""
     ((label, setting),) = FLEET_V1.build(split, data).items()
     return {label: dataclasses.replace(setting, scenario=dataclasses.replace(setting.scenario, robots=2))}
 
@@ -43,7 +42,6 @@ PPO = dataclasses.replace(TINY, algo="maskable-ppo", **SMALL)  # type: ignore[ar
 
 @pytest.fixture(autouse=True)
 def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder of its own; a small suite, and only what takes no time of the rest."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(suites.SUITES, "fleet-v1", SUITE)
     monkeypatch.setattr(fleet, "EPISODE_S", 1.0)
@@ -65,21 +63,7 @@ def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
     assert cell.decisions == 2 * 2 * 60
 
 
-@pytest.mark.nightly
-def test_samples_go_once_round_the_training_links() -> None:
-    """The same episodes at each L; every seed has episodes of its own."""
-    made, again, other = (fleet.training_parts("fleet-v1", SUITE.capacities, seed) for seed in (3, 3, 4))
-    assert [[cell.fleet.senders.capacity for cell in part] for part in made] == [[3, 4]] * fleet.PARTS
-    assert all(part[0].episodes is part[1].episodes for part in made)
-    links = [episode.link.trace.name for part in made for episode in part[0].episodes]
-    assert len(links) == len(set(links)) == 24 and all("validation" not in name for name in links)
-    first, same, another = (parts[0][0].episodes[0] for parts in (made, again, other))
-    assert first.link.offset_us == same.link.offset_us != another.link.offset_us
-    assert first.robots == 2 and len(first.arrivals[0]) == 30
-
-
 def start_of(**changes: str) -> weights.Weights:
-    """Where evolution begins with these settings."""
     return fleet.FleetObjective(dataclasses.replace(TINY, **changes), Path(), 0).start()  # type: ignore[arg-type]
 
 
@@ -100,12 +84,6 @@ def test_the_shipped_agents_scorers_read_more_and_decide_the_same(sees: str) -> 
     assert first.accept.bias[0] == made.accept.bias[0] - fleet.THRIFT
     first.accept.bias[:] = made.accept.bias
     assert (first.parameters() == made.parameters()).all()
-
-
-def test_fields_of_ones_own_begin_with_greed() -> None:
-    made = start_of(fields="rank,motion_merged,left")
-    assert made.fields == ("rank", "motion_merged", "left") and made.still is None
-    assert made.drop.skip.tolist() == pytest.approx([-0.4, -10, 0])
 
 
 @pytest.mark.nightly

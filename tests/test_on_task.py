@@ -36,17 +36,3 @@ def test_a_task_is_the_mean_of_its_reward() -> None:
     assert task.fitness(policies.get("drop-oldest"), 0, False) == -task.measure(policies.get("drop-oldest"), episodes)
     trained_on = {each.link.trace.name for part in task.training for each in part[0].episodes}
     assert trained_on.isdisjoint({trace.name for trace in worth.mapping().traces[-on_task.TEST_LINKS :]})
-
-
-@pytest.mark.nightly
-def test_the_page_has_every_agent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(on_task, "PART_EPISODES", 2)
-    monkeypatch.setitem(on_task.TESTED, "tracked", worth.coverage_of)  # seconds an episode less
-    on_task.main(generations=2, seeds=1, capacity=2, episodes=2)
-    lines = [line.removesuffix(" |").split(" | ") for line in capsys.readouterr().out.splitlines()]
-    agents = [f"agent by {one}" for one in on_task.REWARDS]
-    assert [line[0] for line in lines[2:]] == [f"| {name}" for name in (*on_task.RIVALS, *agents)]
-    cells = {line[0].removeprefix("| "): line[-2:] for line in lines[2:]}
-    # Against itself nothing is said; against each other the two say the same, with the other sign.
-    assert cells["afr"][0].strip() == cells["agent by information"][1].strip() == ""
-    assert float(cells["afr"][1].split(" ")[0]) == -float(cells["agent by information"][0].split(" ")[0])

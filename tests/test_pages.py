@@ -1,4 +1,4 @@
-"""What README and site tell users to type is there: commands, programs, imports, links and pictures."""
+"""What README and site tell users to type is there, links lead somewhere, and the site builds from the registries."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from typing import Any, NamedTuple
 
 import pytest
 
+import bufgym
 from agents.settings import Settings
-from bufgym import cli
+from bufgym import cli, policies
 from bufgym.cli import main
+from bufgym.observe import FIELDS, TOPIC_FIELDS
 from bufgym.policies import registry
-from website import pages
+from bufgym.scenario.suites import SUITES
+from website import cards, commands, environments, markdown, pages, papers, suites
 from website import policies as policy_page
 
 REPO = Path(__file__).resolve().parent.parent
@@ -36,8 +39,6 @@ TUTORIALS = sorted((REPO / "docs" / "tutorials").glob("*.py"))
 
 
 class Block(NamedTuple):
-    """A fenced block."""
-
     page: str
     language: str
     text: str
@@ -58,13 +59,12 @@ def texts() -> dict[str, str]:
 
 @cache
 def blocks() -> tuple[Block, ...]:
-    """Every fenced block of every page."""
     fence = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
     return tuple(Block(page, *found) for page, whole in texts().items() for found in fence.findall(whole))
 
 
 @cache
-def commands() -> list[str]:
+def typed() -> list[str]:
     """Every command of a block or between backticks, without its comment and its program's folder."""
     found = [
         line.partition("  #")[0].strip()
@@ -89,7 +89,7 @@ def command_names(parser: argparse.ArgumentParser, before: str = "") -> set[str]
 def test_the_parser_takes_each_command() -> None:
     parser = cli._parser()
     names = command_names(parser)
-    told = [shlex.split(line)[1:] for line in commands() if line.startswith("bufgym")]
+    told = [shlex.split(line)[1:] for line in typed() if line.startswith("bufgym")]
     assert len(told) > 350
     for command in told:
         if " ".join(command) not in names and command != ["--help"]:
@@ -99,7 +99,7 @@ def test_the_parser_takes_each_command() -> None:
 def test_python_and_make_are_given_what_they_take() -> None:
     tyro = pytest.importorskip("tyro", reason="the extra train is not installed")
     rules = re.findall(r"^([\w-]+):", (REPO / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
-    for line in [line for line in commands() if not line.startswith("bufgym")]:
+    for line in [line for line in typed() if not line.startswith("bufgym")]:
         tool, program, *settings = shlex.split(line)
         if tool == "make":
             assert program in rules, line
@@ -171,7 +171,7 @@ def settings_of(line: str) -> str | None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("line", [line for line in commands() if settings_of(line) is not None])
+@pytest.mark.parametrize("line", [line for line in typed() if settings_of(line) is not None])
 def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     """In a folder with the guide's programs and the repository's examples and traces."""
     for block in blocks():
@@ -272,18 +272,50 @@ EXAMPLES = [
 @pytest.mark.nightly
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_the_example_runs(path: Path) -> None:
-    """A process of its own: examples register fields, rewards and scenarios."""
-    command, where = (
-        [sys.executable, str(path), "--steps", "40", "--seeds", "1"],
-        os.environ | {"PYTHONPATH": str(REPO)},
-    )
+    command = [sys.executable, str(path), "--steps", "40", "--seeds", "1"]
+    where = os.environ | {"PYTHONPATH": str(REPO)}
     done = subprocess.run(command, cwd=path.parent, env=where, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip()
 
 
-def test_the_guide_shows_what_the_examples_do() -> None:
-    section = (REPO / "docs" / "guide" / "yours-to-change.md").read_text(encoding="utf-8")
-    text = "\n".join(path.read_text(encoding="utf-8") for path in EXAMPLES)
-    blocks = [block.split("```")[0] for block in section.split("```python\n")[1:]]
-    assert len(blocks) == 5 and all(block in text for block in blocks)
+def test_every_environment_has_a_page_that_names_all_that_it_observes() -> None:
+    assert set(environments.HISTORY) == {*bufgym.ENVIRONMENTS, *bufgym.ON_TASKS, environments.FLEET}
+    assert all(id.endswith(history[0].name) for id, history in environments.HISTORY.items())
+    for id in bufgym.ENVIRONMENTS:
+        page, fields = environments.page(id), FIELDS + (TOPIC_FIELDS if "Topics" in id else ())
+        assert all(f"| `{field.name}` | {field.per} " in page for field in fields)
+        assert f"gallery/{environments.slug(id)}.webp" in page
+    assert "| `t_max` | `400` | " in environments.page("bufgym/Interruption-v0")
+
+
+def test_pages_have_all_of_their_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert all(f"| `{name}` |" in suites.page() for name in SUITES)
+    assert commands.page().count("```text\nusage: bufgym") == len(re.findall(r"^###? ", commands.page(), re.MULTILINE))
+    assert {name for name in policies.names() if name.startswith("learned-")} == set(cards.CARDS)
+    shipped = {suite: numbers for suite, *numbers in cards.board("learned-motion")}
+    assert shipped and all(f"| {suite} | {' | '.join(numbers)} |" in cards.page() for suite, numbers in shipped.items())
+    monkeypatch.setattr(policy_page, "picture", lambda policy: "")
+    names = [*policies.names(), *policies.names(named_only=True)]
+    assert sorted(re.findall(r"^### (.*)$", policy_page.page(), re.MULTILINE)) == sorted(names)
+    listed = set(re.findall(r'<a id="([^"]+)">', papers.page()))
+    for name in policies.names():
+        assert set(re.findall(r"papers\.md#(\w+)", markdown.cited(policies.get(name).source))) <= listed, name
+
+
+@pytest.mark.nightly
+def test_the_site_builds_without_a_broken_link(tmp_path: Path) -> None:
+    for package in ("mkdocs", "material", "mkdocstrings", "jupytext"):
+        pytest.importorskip(package, reason="the extra docs is not installed")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]
+    surroundings = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=REPO, env=surroundings, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    pages = {path.relative_to(tmp_path / "site").as_posix() for path in (tmp_path / "site").rglob("*.html")}
+    assert {"index.html", "interactive.html", "environments/uplink.html", "tutorials/fleet.html"} <= pages
+    # Nothing is fetched from elsewhere: every script, style and picture lies on the site.
+    for name in sorted(pages):
+        text = (tmp_path / "site" / name).read_text(encoding="utf-8")
+        fetched = re.findall(r"""<(?:script|img|iframe)[^>]+src=["']?(https?:[^"' >]+)""", text)
+        fetched += re.findall(r"""<link[^>]+rel=["']?stylesheet["']?[^>]+href=["']?(https?:[^"' >]+)""", text)
+        assert not fetched, name

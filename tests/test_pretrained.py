@@ -9,7 +9,6 @@ import pytest
 from bufgym import files, policies
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.run import run as rows_of
-from bufgym.benchmark.tasks.bound import best
 from bufgym.model import qoi
 from bufgym.oracle import integer, law
 from bufgym.policies import learned, weights
@@ -58,20 +57,6 @@ def test_its_regret_in_interruptions_is_what_its_file_says(name: str) -> None:
         share = law(scenario)[lengths]
         most = share @ [1 + integer(L, T, scenario.value) for T in lengths]
         assert 1 - share @ reached / most == pytest.approx(told[f"exponential-0.618, L = {L}"], abs=1e-8)
-
-
-@pytest.mark.nightly
-def test_motion_is_worth_something_on_fading_links() -> None:
-    """Four test links of lte-v1 with camera motion, L = 15: with odometry < on time alone < AFR's regret."""
-    scenario = suites.get("lte-v1").settings("test")["motion"].scenario
-    episodes = [draw(link, seed=1) for _, link in by_trace(scenario)[:4]]
-    most = sum(best(episode, 15, scenario).qoi for episode in episodes)
-
-    def regret(name: str) -> float:
-        senders = run(policies.get(name), episodes, 15, scenario.value)
-        return float(1 - (senders.batch.senders["delivered_gain"] + 1).sum() / most)
-
-    assert regret("learned-motion") < min(regret("afr"), regret("learned-time"))
 
 
 @pytest.mark.parametrize("name", SHIPPED)

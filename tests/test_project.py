@@ -136,7 +136,6 @@ HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "matplotlib", "scipy", "pa
 
 
 def output_of(program: str) -> str:
-    """What a fresh interpreter prints."""
     done = subprocess.run([sys.executable, "-c", program], cwd=REPO, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -169,11 +168,6 @@ def test_a_hint_names_the_packages_of_an_extra(monkeypatch: pytest.MonkeyPatch) 
     assert errors.install("plot") == "pip install matplotlib"
     # What a shell would take for a redirection is quoted, and an extra of bufgym's own is written out.
     assert errors.install("robofleet") == 'pip install flatbuffers "mcap<2,>=1.2"'
-
-
-def test_a_source_tree_that_was_never_installed_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.metadata, "requires", lambda name: importlib.metadata.distribution("no-such-name"))
-    assert errors.install("plot") == 'pip install -e ".[plot]"'
 
 
 def test_every_hint_names_an_extra_that_there_is() -> None:

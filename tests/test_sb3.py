@@ -20,7 +20,6 @@ from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_suppo
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common import env_util
 from stable_baselines3.common.env_checker import check_env
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor, get_monitor_files
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -28,7 +27,7 @@ import bufgym
 from bufgym.benchmark.run import draw
 from bufgym.envs import SenderVectorEnv
 from bufgym.errors import BufgymError
-from bufgym.sb3 import GymVecEnv, SlotExtractor, SlotPolicy, as_policy, make_vec_env
+from bufgym.sb3 import GymVecEnv, SlotPolicy, as_policy, make_vec_env
 from bufgym.scenario import Interruption
 from bufgym.scenario import get as scenario_of
 from bufgym.sim import run
@@ -117,7 +116,6 @@ def test_seeds_and_options_hold_for_one_reset() -> None:
     assert envs.seed(3) == [3, 4]
 
     def lengths() -> list[int]:
-        """Arrivals of the next episode of each row."""
         found = [0, 0]
         envs.reset()
         while not all(found):
@@ -209,15 +207,6 @@ def test_any_vector_environment_that_resets_in_the_same_step_will_do() -> None:
         GymVecEnv(gym.make_vec("bufgym/Uplink-v0", 2))
 
 
-def test_infos_of_every_step_on_request() -> None:
-    same_step = gym.vector.AutoresetMode.SAME_STEP
-    envs = GymVecEnv(gym.make_vec("bufgym/Uplink-v0", 2, autoreset_mode=same_step), step_infos=True)
-    envs.reset()
-    _, rewards, _, infos = envs.step(np.full(2, 9))
-    assert infos[1]["reward_terms"]["retained"] == pytest.approx(rewards[1])
-    assert infos[0]["action_mask"].shape == (10,)
-
-
 WORLD: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 1_000_000}
 FIELDS = ("rank", "motion_merged", "occupied", "occupancy")
 
@@ -236,7 +225,6 @@ def untrained(algorithm: Any, policy: Any, env: Any = None, seed: int = 4, **opt
 
 
 def flat_env() -> Any:
-    """Observations as one vector, for an MlpPolicy."""
     return env_util.make_vec_env(lambda: gym.wrappers.FlattenObservation(gym.make("bufgym/Uplink-v0", **WORLD)), 2)
 
 
@@ -253,7 +241,6 @@ def reached(policy: Any) -> list[Any]:
 
 
 def reached_in_env(model: Any, form: str, fields: Any = None) -> list[Any]:
-    """What the model reaches in the environment, decision by decision."""
     envs = SenderVectorEnv(4, SCENARIO, L, decide_at="arrival", fields=fields, observation=form)
     envs.reset(options={"episodes": EPISODES})
     rows = envs.rows
@@ -264,23 +251,9 @@ def reached_in_env(model: Any, form: str, fields: Any = None) -> list[Any]:
     return [outcome(rows.senders, i) for i in range(4)]
 
 
-@pytest.mark.parametrize(("form", "network"), [("flat", "MlpPolicy"), ("slots", "MultiInputPolicy")])
-@pytest.mark.parametrize("fields", [None, FIELDS])
-def test_networks_learn_from_other_forms(form: str, network: str, fields: Any) -> None:
-    """And as a policy they decide as they do in the environment: the order of the numbers is the same."""
-    envs = make_vec_env("bufgym/Uplink-v0", 2, seed=0, observation=form, info="mask", fields=fields, **WORLD)
-    model = MaskablePPO(network, envs, n_steps=16, batch_size=32, n_epochs=1, seed=0, device="cpu").learn(32)
-    assert model.num_timesteps == 32
-    assert isinstance(evaluate_policy(model, envs, n_eval_episodes=2)[0], float)
-    model = untrained(MaskablePPO, network, envs, 6)
-    assert repr(reached(as_policy(model, fields=fields))) == repr(reached_in_env(model, form, fields))
-
-
 @pytest.mark.parametrize("network", ["MultiInputPolicy", "MlpPolicy"])
 @pytest.mark.parametrize(("algorithm", "saved"), [(PPO, False), (MaskablePPO, True), (DQN, True), (A2C, False)])
-def test_any_model_decides_as_a_policy_what_it_does_in_the_environment(
-    algorithm: Any, saved: bool, network: str, tmp_path: Path
-) -> None:
+def test_any_model_decides_as_in_the_environment(algorithm: Any, saved: bool, network: str, tmp_path: Path) -> None:
     flat = network == "MlpPolicy"
     model = untrained(algorithm, network, flat_env() if flat else None)
     if saved:
@@ -339,12 +312,3 @@ def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(BufgymError, match=says):
             as_policy(model, fields=fields)
-
-
-def test_a_slot_network_needs_named_fields_and_its_extractor_serves_other_policies() -> None:
-    for form in ("flat", "slots"):
-        with pytest.raises(BufgymError, match='observation="dict"'):
-            untrained(MaskablePPO, SlotPolicy, make_vec_env("bufgym/Uplink-v0", 2, observation=form, **WORLD))
-    model = untrained(PPO, "MultiInputPolicy", policy_kwargs={"features_extractor_class": SlotExtractor})
-    assert isinstance(model.policy.features_extractor, SlotExtractor)
-    assert model.policy.features_extractor.features_dim == (L + 1) * 20

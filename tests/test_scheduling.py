@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_cases import Capsys, Patch
-from train_cases import KilledError, columns
+from train_cases import KilledError, columns, in_a_folder_of_its_own  # noqa: F401
 
 import train
 from agents import cma_es
@@ -21,7 +21,6 @@ from agents.objectives.objective import policy_of, to_vector, with_vector
 from agents.runs import MODEL, prepare
 from agents.settings import Settings
 from bufgym import policies
-from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.policies import learned_topics, weights
@@ -32,11 +31,6 @@ from bufgym.sim.metrics import topic_outcomes
 from bufgym.traces import Trace
 
 TINY = Settings(suite="topics-v1", algo="evolution", name="tiny", steps=4_000, validate_every=1_500, test_seeds=1)
-
-
-@pytest.fixture(autouse=True)
-def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: Patch) -> None:
-    monkeypatch.chdir(tmp_path)
 
 
 def client(**more: Any) -> Client:
@@ -68,18 +62,6 @@ def test_weights_are_a_vector_and_back() -> None:
     assert made.drop.skip.tolist() == [0] * c + list(range(n - c))
     assert made.send.skip.tolist() == [0] * c + list(range(len(vector) - n + c, len(vector)))
     assert made.accept.bias.tolist() == [2 * n - c]
-
-
-def test_it_begins_greedy() -> None:
-    """It reads fields that there are, sends what is no_drop first, and accepts with room."""
-    assert set(topics.FIELDS) <= set(learned_topics.NAMES)
-    (episode, *_) = episodes_of().episodes
-    given = client()
-    senders = run(policy_of("greedy", topics.start()), [episode], 6, given.value, topics=given.topics)
-    batch = senders.batch
-    assert batch.senders["invalid"][0] == 0
-    assert topic_outcomes(senders, 0)[2].lost == 0
-    assert batch.senders["rejected"][0] + batch.senders["evicted"][0] > 5
 
 
 def by_metrics(policy: policies.Policy, of: topics.ClientEpisodes) -> tuple[float, float, float, int]:
@@ -127,22 +109,8 @@ def test_fitness_by_hand(reached: tuple[float, float, float, int], expected: flo
     assert topics.mean_fitness(policy, [of, free]) == pytest.approx((expected - 2) / 2)
 
 
-@pytest.mark.nightly
-def test_a_suite_has_episodes_of_each_setting() -> None:
-    made, again, other = (
-        topics.client_episodes("topics-v1", "train", seed=seed, episodes=1, episode_s=2.0) for seed in (3, 3, 4)
-    )
-    suite = suites.get("topics-v1")
-    assert len(made) == len(suite.settings("train")) * len(suite.capacities)
-    assert all(each.episodes[0].arrivals["arrival_us"][-1] <= 2_000_000 for each in made)
-    rivals = [[each.rival for each in one] for one in (made, again, other)]
-    assert rivals[0] == rivals[1] != rivals[2]
-
-
 @pytest.fixture
 def short_episodes(monkeypatch: Patch) -> None:
-    """Episodes of seconds instead of minutes."""
-
     def client_episodes(
         suite: str, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
     ) -> Any:
@@ -204,19 +172,3 @@ def test_a_run_leaves_an_agent_and_a_table(short_episodes: None, monkeypatch: Pa
     assert {row["policy"] for row in rows} >= {"agent (seed 0)", "robofleet", "fifo"}
     assert (home / "results.txt").read_text(encoding="utf-8").strip() in printed
     assert prepare(dataclasses.replace(TINY, resume=True)).name == "tiny"
-
-
-def test_a_varied_client_keeps_three_topics_at_least() -> None:
-    """Some of its own, in their order, on links of another speed."""
-    whole, rng = client(), np.random.default_rng(1)
-    whole = dataclasses.replace(whole, streams=(*whole.streams, Stream(Topic("fourth"), 5, 100)))
-    varied = [topics.varied(whole, rng) for _ in range(30)]
-    assert {len(made.streams) for made in varied} == {3, 4}
-    for made in varied:
-        assert [stream for stream in whole.streams if stream in made.streams] == list(made.streams)
-        assert topics.SCALES[0] <= made.scale <= topics.SCALES[1]
-
-
-def test_a_suite_of_one_queue_has_no_clients() -> None:
-    with pytest.raises(BufgymError, match="suite interruption-v1: has no topics"):
-        topics.client_episodes("interruption-v1", "train", 0, 1)

@@ -57,11 +57,9 @@ def test_ppos_advantages_by_hand() -> None:
 @pytest.mark.nightly
 def test_a_model_of_stable_baselines3_gets_a_row(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
-    small = (
-        "--suite interruption-v1 --capacity 4 --steps 512 --num-envs 4 --out mine -- --seeds 3 --capacity 4 --jobs 1"
-    )
+    args = "--suite interruption-v1 --capacity 4 --steps 512 --num-envs 4 --out mine -- --seeds 3 --capacity 4 --jobs 1"
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["x", *small.split()])
+    monkeypatch.setattr(sys, "argv", ["x", *args.split()])
     example("sb3_to_leaderboard.py")["main"]()
     board = leaderboard.read(Path("mine/leaderboard.csv"))
     assert {entry.policy for entry in board.values()} == {"mine/model.zip", "afr", "drop-oldest"}
@@ -77,15 +75,6 @@ def test_a_moment_is_missed_more_than_half_a_view_from_what_arrived() -> None:
     x, arrived = np.array([0.0, 0.5, 1.0, 1.6, 2.0, 2.6]), np.array([1, 0, 0, 0, 1, 0], bool)
     assert view["missed"](x, arrived, 0.5) == 2 / 6
     assert view["missed"](x, np.zeros(6, bool), 0.5) == 1
-
-
-@pytest.mark.nightly
-def test_views_missed_are_told_by_policy(monkeypatch: Patch, capsys: Capsys) -> None:
-    monkeypatch.setattr(sys, "argv", ["x", "--policies", "clairvoyant,afr", "--seeds", "1", "--seconds", "3"])
-    example("view_missed.py")["main"]()
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert lines[0][:2] == ["policy", "score"] and lines[1][:2] == ["clairvoyant", "1.000"]
-    assert {line[0] for line in lines[1:4]} == {"clairvoyant", "afr", "drop-oldest"}
 
 
 @pytest.mark.nightly

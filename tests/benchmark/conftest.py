@@ -15,8 +15,6 @@ from bufgym.traces import Trace
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> Sweep:
-    """A suite of two traces, two labels and messages that one can count."""
-
     def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
         traces = tuple(
             Trace.steps([(1.0, 500_000), (2.0, 0), (1.0, 300_000)], name=f"{split}-{k}").scaled(1 + k / 2)

@@ -17,7 +17,6 @@ TINY = Sweep("interruption-v1", THREE, capacities=(2, 4), seeds=3)
 
 
 def bufgym(*words: object, **environment: str) -> subprocess.Popen[str]:
-    """The command in a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-m", "bufgym", *map(str, words)],
         env=os.environ | environment,
@@ -29,7 +28,6 @@ def bufgym(*words: object, **environment: str) -> subprocess.Popen[str]:
 
 
 def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
-    """Every file's content and time."""
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
 

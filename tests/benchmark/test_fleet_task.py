@@ -18,7 +18,7 @@ from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.fleet import ROWS
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.scenario import FleetScenario, Uplink, suites
+from bufgym.scenario import FleetScenario, Uplink
 from bufgym.traces import Trace
 
 TASK = TASKS["fleet"]
@@ -63,22 +63,7 @@ def test_a_fleet_of_one_has_the_rows_of_the_benchmark_for_one() -> None:
     assert [[row[name] for name in names] for row in mine] == [[row[name] for name in names] for row in alone]
 
 
-def test_every_policy_and_capacity_meets_the_same_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    uplink = suites.get("fleet-v1").settings("validation")["motion"].scenario.uplink
-    fleet = FleetScenario(3, replace(uplink, traces=uplink.traces[:2], duration_s=1.0))
-    chosen = [policies.get(name) for name in ("afr", "random")]
-    rows = run(chosen, fleet, [2, 4], 2)
-    assert len(rows) == 2 * 2 * 2 * 2 * 3  # traces, seeds, capacities, policies, robots
-    trace = uplink.traces[1].name
-    alone = run(chosen[1:], replace(fleet, uplink=replace(fleet.uplink, traces=uplink.traces[1:2])), [4], 2)
-    assert repr([r for r in rows if (r["trace"], r["policy"], r["capacity"]) == (trace, "random", 4)]) == repr(alone)
-    # One episode at a time: the same rows, each once.
-    monkeypatch.setattr("bufgym.benchmark.run._BATCH_MESSAGES", 1)
-    assert sorted(map(repr, run(chosen, fleet, [2, 4], 2))) == sorted(map(repr, rows))
-
-
 def made(policy: str, *teams: tuple[float, ...], capacity: int = 4, scenario: str = "s") -> list[Row]:
-    """Rows of one policy: H of each robot, episode by episode."""
     return [
         {"scenario": scenario, "trace": "t", "seed": seed, "policy": policy, "capacity": capacity, "robot": r, "qoi": h}
         for seed, team in enumerate(teams)
@@ -139,19 +124,8 @@ def test_rows_that_cannot_be_summed_up(rows: list[Row], message: str) -> None:
         summary(rows)
 
 
-def test_the_table_as_text() -> None:
-    more = [*made("afr", (1.0,), (1.0,), capacity=9), *made("mine", (4.0,), (4.0,), capacity=9)]
-    lines = plain(summary([*HAND, *[{**row, "scenario": "z"} for row in more]]), {"s": "a story"}).splitlines()
-    assert lines[0].split("  ")[0] == "policy" and "gain over afr" in lines[0]
-    assert lines[2] == "s: a story, L = 4" and lines[6] == "z, L = 9" and lines[10] == "mean of these 2"
-    assert lines[3].split()[:4] == ["mine", "6.000", "+1.000", "[+1.000,"]
-    assert lines[3].split()[5:] == ["50.0", "%", "[50.0,", "50.0]", "25.0", "%", "4.500", "0.8200"]
-    assert lines[4].split() == ["afr", "5.000", "–", "–", "–", "4.000", "0.9400"]
-
-
 @pytest.mark.nightly
 def test_the_command_prints_a_table_and_writes_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """AFR runs, named or not."""
     out = tmp_path / "rows.csv"
     options = "--robots 2 --seeds 1 --capacity 3 --split validation --policies drop-oldest,min-gap --jobs 1"
     text = shown(["fleet", *options.split(), "--out", out], capsys)

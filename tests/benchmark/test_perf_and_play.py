@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import pytest
 
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark import perf, perf_peers, perf_profile, perf_queue
+from bufgym.benchmark import perf
 from bufgym.benchmark.run import draw, run
 from bufgym.benchmark.warmup import PARTS
 from bufgym.cli import main
@@ -44,67 +41,16 @@ def test_every_figure_is_a_number_with_its_definition(tmp_path: Path) -> None:
     (topics,) = [figure for figure in figures if figure.name == "native batch of 8 topics, bufgym/Topics-v0"]
     assert (topics.target, topics.unit) == (5e6, "steps/s") and "n = 2, L = 32" in topics.definition
     text = perf.report(figures, TINY.repeats)
-    for figure in figures:
-        assert figure.name in text and figure.definition in text
+    assert all(figure.name in text and figure.definition in text for figure in figures)
     perf.write_json(figures, TINY, tmp_path / "perf.json")
     read = json.loads((tmp_path / "perf.json").read_text())
     assert [figure["name"] for figure in read["figures"]] == [figure.name for figure in figures]
-
-
-def test_the_parts_of_a_step_add_up_to_it() -> None:
-    parts = perf_profile.profile(TINY)
-    by_environment: dict[str, float] = {}
-    for part in parts:
-        by_environment[part.of] = by_environment.get(part.of, 0.0) + part.share
-    assert len(by_environment) == 4 and list(by_environment.values()) == pytest.approx([1.0] * 4, abs=1e-6)
-    text = perf_profile.report(parts)
-    assert all(part.of in text and part.name in text for part in parts)
-
-
-def test_what_a_live_queue_costs() -> None:
-    cost = perf_queue.measure("drop-oldest", 1)
-    assert 0 < cost.median_us <= cost.p99_us and cost.warm_us > 0 and cost.core_percent > 0
-    assert 1 < cost.held <= perf_queue.CAPACITY + 1  # 30 put, 12 sent, and memory is bounded by L and the socket's one
-    text = perf_queue.report([perf_queue.Cost("afr", 41.4, 99.5, 30.0, 0.456, 17)])
-    assert "| afr | 41 us | 100 us | 30 us | 0.46 % | 17 |" in text
-
-
-def test_a_peer_stands_beside_the_native_batch_of_the_same_run() -> None:
-    ours = [perf.Figure(f"native batch, {id}", 1e6, "steps/s", None, "as measured") for id in perf.ENVIRONMENTS]
-    nobody = perf_peers.Peer("no_such_package", "nobody's", lambda n: None)
-    broken = perf_peers.Peer("numpy", "half of it", lambda n: importlib.import_module("no_such_part"))
-    found, absent = perf_peers.measure(TINY, ours, (perf_peers.PEERS[0], nobody, broken))
-    speed, *ratios = found
-    assert speed.name == "CartPole, gymnasium" and f"gymnasium {version('gymnasium')}, n = 2" in speed.definition
-    assert [figure.value for figure in ratios] == [1e6 / speed.value] * len(ours)
-    assert absent == ["no_such_package", "numpy (No module named 'no_such_part')"]
-
-
-def test_recorded_actions_are_possible_when_played_again() -> None:
-    given: dict[str, Any] = {"capacity": 2, "law": "fixed", "t_max": 6, "vectorization_mode": "vector_entry_point"}
-    envs: Any = gym.make_vec("bufgym/Interruption-v0", 4, **given)
-    actions, decisions = perf.record(envs, 14)
-    assert decisions == 4 * 12  # 6 decisions and a reset, twice
-    envs.reset(seed=perf.SEED)
-    assert not any(envs.step(row)[4]["invalid"].any() for row in actions)
-
-
-def test_random_actions_are_those_of_the_mask() -> None:
-    mask = np.array([[False, True, False], [True, True, True]])
-    drawn = np.array([perf.random_actions(mask, np.random.default_rng(seed)) for seed in range(40)])
-    assert [set(column) for column in drawn.T] == [{1}, {0, 1, 2}]
-
-
-@pytest.mark.parametrize(("number", "text"), [(3.14159e6, "3.14 M"), (120_000, "120 k"), (57.31, "57.3"), (2e9, "2 G")])
-def test_human(number: float, text: str) -> None:
-    assert perf.human(number) == text
 
 
 GAPPY = Uplink(traces=(Trace.steps([(1.0, 900_000), (0.7, 0)], name="t"),), rate_hz=20, duration_s=5)
 
 
 def played(env: Any, player: Player, episode: Any) -> dict[str, Any]:
-    """The last info of an episode in the environment."""
     env.reset(options={"episode": episode})
     ended, info = False, {}
     while not ended:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +12,6 @@ import pytest
 from cli_cases import fails, shown
 from sweep_cases import THREE, bufgym
 
-from bufgym.benchmark import cluster
 from bufgym.files import locked
 from bufgym.kernel import announce
 
@@ -35,14 +31,12 @@ def {name}(buffer, arrival, memory):
 
 
 def words(policy: Path, out: Path) -> list[object]:
-    """A sweep over two processes with the policy in this file."""
     name = policy.stem
     sweep = ["bench", "--suite", "interruption-v1", "--policies", name, "--capacity", 2, "--seeds", 1]
     return [*sweep, "--policy-file", policy, "--format", "csv", "--jobs", 2, "--out", out]
 
 
 def policy_file(folder: Path, name: str, body: str) -> Path:
-    """A policy that does this before each decision."""
     file = folder / f"{name}.py"
     file.write_text(POLICY.format(name=name, body=body), encoding="utf-8")
     return file
@@ -82,37 +76,6 @@ def test_workers_end_with_their_parent(how: signal.Signals, tmp_path: Path) -> N
     assert "Traceback" not in process.communicate()[1]
 
 
-def runs(number: int) -> bool:
-    """Whether there is a process of this number that has not ended."""
-    try:
-        return Path(f"/proc/{number}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(not Path("/proc/self").exists(), reason="it looks for processes in /proc")
-def test_workers_without_work_end_with_their_parent_too() -> None:
-    """Whatever they were given last: here nothing of a sweep's."""
-    parent = """
-import os, time
-from bufgym.benchmark import cluster
-if __name__ == "__main__":
-    print(*set(cluster.spread([(os.getpid, ())] * 8, 8, 2, "loky", None)), flush=True)
-    time.sleep(1000)
-"""
-    with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        workers = [int(number) for number in process.stdout.readline().split()]
-        assert workers and process.pid not in workers
-        process.kill()
-    wait_for(lambda: not any(map(runs, workers)))
-    alive = [number for number in workers if runs(number)]
-    for number in alive:
-        os.kill(number, signal.SIGKILL)
-    assert not alive
-
-
 @pytest.mark.nightly
 def test_a_worker_that_dies_is_one_line_and_a_retry(tmp_path: Path) -> None:
     dead = tmp_path / "dead"
@@ -142,9 +105,3 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFi
     assert not list(tmp_path.iterdir())
     shown(command, capsys)
     assert ".lock" not in {path.name for path in tmp_path.iterdir()}
-
-
-def test_a_process_of_its_own_does_not_end_with_a_stranger() -> None:
-    before = threading.active_count()
-    cluster.end_with(1 if os.getppid() != 1 else 2)
-    assert threading.active_count() == before

@@ -1,21 +1,25 @@
-"""The report: what stands on the page and in the tables."""
+"""The report: what stands on the page and in the tables, folders that are refused, and the page in a real browser."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
+import os
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from browser_cases import opened
 from report_cases import MANIFEST, QOI, TIMELINE, make
 
 from bufgym.benchmark import folder as inputs
-from bufgym.benchmark import report, table
-from bufgym.benchmark.report import style, tables, timeline
+from bufgym.benchmark import report
+from bufgym.benchmark.report import timeline
 from bufgym.benchmark.sweep import Sweep, run_sweep
+from bufgym.errors import BufgymError
 from bufgym.scenario import FleetScenario, suites
 
 pytest.importorskip("jinja2", reason="the report needs Jinja")
@@ -28,7 +32,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 def figures(page: str) -> dict[str, Any]:
-    """The charts' numbers in a page."""
     found = re.search(r'<script type="application/json" id="figures">(.*?)</script>', page)
     assert found is not None
     made: dict[str, Any] = json.loads(found[1])
@@ -61,28 +64,6 @@ def test_cells_are_marked_where_they_are_not_discriminative_or_the_bound_is_not_
     assert "†" not in text and "\\*" not in text and "good" not in text
 
 
-@pytest.mark.parametrize("certified", [False, True])
-def test_regret_that_rests_on_an_upper_bound_says_so(folder: Path, certified: bool) -> None:
-    rows = [dict(row, certified=row["certified"] or certified) for row in inputs.read(folder).rows]
-    run = inputs.read(make(folder, rows=rows))
-    plain = tables.plain(run, run.task.summary(run.rows, run.manifest["unranked"]))
-    page = report.write(folder).read_text(encoding="utf-8")
-    assert ("regret at most" in page) is not certified
-    for text in (report.markdown(folder), plain, page):
-        assert ("regret, at most" in text) is not certified
-
-
-@pytest.mark.parametrize(
-    ("share", "written"),
-    [
-        *((0.1234, "12.3 %"), (0.01234, "1.23 %"), (0.001234, "0.123 %"), (0.09999, "10.0 %"), (-0.05, "−5.00 %")),
-        *((-1e-9, "0.000 %"), (math.nan, "–")),
-    ],
-)
-def test_per_cent_has_three_digits(share: float, written: str) -> None:
-    assert table.percent(share) == written
-
-
 def test_the_page_says_what_was_run_and_how_to_run_it_again(folder: Path) -> None:
     path = report.write(folder)
     assert path == folder / "report.html"
@@ -106,24 +87,6 @@ def test_names_are_shown_as_they_are_written(folder: Path) -> None:
     assert lane["y"] == ["&lt;b&gt;", "afr"]
 
 
-def test_what_a_run_does_not_have_has_no_chart(tmp_path: Path) -> None:
-    """One capacity, no outage of known length, no record of memory, no timeline."""
-    kept = [row for row in inputs.read(make(tmp_path / "a")).rows if row["capacity"] == 2 and row["scenario"] == "good"]
-    rows = [{name: cell for name, cell in row.items() if name != "peak_backlog_bytes"} for row in kept]
-    folder = make(tmp_path / "b", rows=rows)
-    (folder / "timeline.json").unlink()
-    page = report.write(folder).read_text(encoding="utf-8")
-    assert set(figures(page)) == {"delays"}  # and as the good link is not discriminative, no ranking
-    assert "there is no score" in page
-
-
-def test_without_a_clairvoyant_there_are_dashes(tmp_path: Path) -> None:
-    rows = [dict(row, clairvoyant=None, regret=None) for row in inputs.read(make(tmp_path / "a")).rows]
-    folder = make(tmp_path / "b", rows=rows)
-    assert "| – | afr | – | – | – | – |" in report.markdown(folder)
-    assert set(figures(report.write(folder).read_text(encoding="utf-8"))) == {"timeline", "memory"}
-
-
 @pytest.mark.parametrize(
     ("suite", "changes", "heading"),
     [
@@ -134,7 +97,6 @@ def test_without_a_clairvoyant_there_are_dashes(tmp_path: Path) -> None:
 def test_topics_and_fleets_have_a_page_too(
     suite: str, changes: dict[str, int], heading: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of the quantities that their task shows, over all cells and in each."""
     short = {
         label: dataclasses.replace(setting, scenario=shortened(setting.scenario))
         for label, setting in suites.get(suite).settings("validation").items()
@@ -151,7 +113,6 @@ def test_topics_and_fleets_have_a_page_too(
 
 
 def shortened(scenario: Any) -> Any:
-    """Two seconds on two of its traces."""
     if isinstance(scenario, FleetScenario):
         return dataclasses.replace(scenario, uplink=shortened(scenario.uplink))
     return dataclasses.replace(scenario, traces=scenario.traces[:2], duration_s=2.0)
@@ -168,8 +129,99 @@ def test_outcomes_and_the_longest_gap_by_hand() -> None:
     assert timeline.longest_gap([0, 1, 2], [0, 1, 2]) == (0, 1)  # the first of equals
 
 
-def test_labels_are_moved_apart_no_further_than_needed() -> None:
-    assert style.apart({"a": 0.0, "b": 100.0}, 10) == {"a": 0.0, "b": 100.0}
-    assert style.apart({"a": 50.0, "b": 50.0}, 10) == {"a": 45.0, "b": 55.0}
-    # b and c touch; moved apart they touch a: all three settle around their mean, 54.
-    assert style.apart({"a": 50.0, "c": 56.0, "b": 56.0}, 10) == {"a": 44.0, "c": 54.0, "b": 64.0}
+def refusal(folder: Path) -> str:
+    with pytest.raises(BufgymError) as caught:
+        report.write(folder)
+    assert not (folder / "report.html").exists()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_the_page_needs_an_extra_and_the_tables_do_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    assert "pip install jinja2 plotly" in refusal(folder)
+    assert "afr" in report.markdown(folder)
+
+
+def test_a_folder_must_hold_a_run(tmp_path: Path) -> None:
+    assert "must be a folder" in refusal(tmp_path / "absent")
+    assert "no manifest.json" in refusal(tmp_path)
+    folder = make(tmp_path / "run")
+    (folder / "rows.csv").unlink()
+    assert "no rows.parquet and no rows.csv" in refusal(folder)
+    (folder / "parts").mkdir()
+    assert f"not finished; the command that began it resumes it: {MANIFEST['command']}" in refusal(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ('{"format": 2,\n', ", line 2: must be JSON"),
+        ("[]", ": must be a JSON object"),
+        ('{"format": 1}', ": format = 1: must be 2"),
+        ({"scenarios": {"a": 1}}, ": scenarios.a must be an object"),
+        ({"task": "chess"}, ": task = chess: must be one of queue, stress, topics, fleet"),
+        (json.dumps({k: v for k, v in MANIFEST.items() if k != "command"}), ": no command"),
+    ],
+)
+def test_a_broken_manifest_is_refused(folder: Path, text: str | dict[str, Any], complaint: str) -> None:
+    text = text if isinstance(text, str) else json.dumps({**MANIFEST, **text})
+    (folder / "manifest.json").write_text(text, encoding="utf-8")
+    assert f"manifest.json{complaint}" in refusal(folder)
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"x": [0.0]}, "arrival_s and x must have one entry a message"),
+        ({"x": [0.0, 1.0, 2.0, 3.0, 4.0, math.nan]}, "NaN: numbers must be finite"),
+        ({"rate": {"t_s": [0.0], "bytes_per_s": []}}, "must be of one length"),
+        ({"policies": {"afr": {"qoi": 1.0, "received": [[6, 0.0, 0.0]], "dropped": []}}}, "a message 0..5"),
+        ({"policies": {"afr": {"received": [], "dropped": []}}}, "timeline.json: no policies.afr.qoi"),
+    ],
+)
+def test_a_broken_timeline_is_refused(folder: Path, changes: dict[str, Any], complaint: str) -> None:
+    (folder / "timeline.json").write_text(json.dumps({**TIMELINE, **changes}), encoding="utf-8")
+    found = refusal(folder)
+    assert complaint in found and "timeline.json" in found
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "rows.csv", "timeline.json"])
+@pytest.mark.parametrize("data", ["fifo", b"\xff", b"[" * 100_000, b"{}", b'{"format": 2}', b"1e999", b"9" * 5000])
+def test_files_that_are_none_are_refused(folder: Path, name: str, data: str | bytes) -> None:
+    (folder / name).unlink()
+    os.mkfifo(folder / name) if isinstance(data, str) else (folder / name).write_bytes(data)
+    assert (f"{name}: must be a regular file" if data == "fifo" else str(folder)) in refusal(folder)
+
+
+def test_broken_rows_are_refused(tmp_path: Path) -> None:
+    rows = inputs.read(make(tmp_path / "a")).rows
+    without = [{name: cell for name, cell in row.items() if name != "qoi"} for row in rows]
+    assert "rows.csv: no column 'qoi'" in refusal(make(tmp_path / "b", rows=without))
+    unmet = [row for row in rows if (row["policy"], row["seed"]) != ("afr", 1)]
+    assert "rows.csv: afr at " in refusal(make(tmp_path / "c", rows=unmet))
+    no_baseline = [row for row in rows if row["policy"] != "drop-oldest"]
+    assert "rows.csv: " in (found := refusal(make(tmp_path / "d", rows=no_baseline))) and "baseline" in found
+
+
+SIZES = """() => [...document.querySelectorAll("[data-panel]:not([hidden])")].map((place) => {
+    const box = place.querySelector("svg.main-svg").getBoundingClientRect();
+    return [place.closest("figure").dataset.chart, box.width, box.height, place.querySelectorAll("path, image").length];
+})"""
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_browser_draws_every_chart_without_network_or_complaint(folder: Path, scheme: str) -> None:
+    """Another scheme while the page is open: the charts follow. A name is shown as it is written, not as bold type."""
+    colour = "getComputedStyle(document.querySelector('#ranking .xtick text')).fill"
+    with opened(report.write(folder), scheme, 1000) as page:
+        page.wait_for_function("document.querySelectorAll('svg.main-svg').length >= 7")
+        sizes, ink = page.evaluate(SIZES), page.evaluate(colour)
+        page.emulate_media(color_scheme="light" if scheme == "dark" else "dark")
+        page.wait_for_function(f"(was) => {colour} !== was", arg=ink)
+        page.select_option("#capacities select", "long")
+        assert "<b>" in page.locator("#delays .ytick text").all_text_contents()
+    assert {chart for chart, *_ in sizes} == {"ranking", "capacities", "outages", "delays", "timeline", "memory"}
+    assert all(wide > 200 and high > 100 and shapes > 0 for _, wide, high, shapes in sizes), sizes
+    assert ink == ("rgb(27, 31, 36)" if scheme == "light" else "rgb(230, 233, 237)")

@@ -1,16 +1,23 @@
-"""The experiment: common random numbers, the oracle's column, rows in and out of files."""
+"""The experiment: common random numbers, the oracle's column, one episode in full; rows in files, to the last bit."""
 
 from __future__ import annotations
 
+import itertools
+import json
+import math
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from bufgym import oracle, policies
 from bufgym.benchmark import run
-from bufgym.benchmark.rows import RUNS
+from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
+from bufgym.benchmark.tasks.timeline import choose, timeline
 from bufgym.errors import BufgymError
+from bufgym.files import replaced
 from bufgym.model import qoi
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
@@ -22,8 +29,6 @@ UPLINK = Uplink(traces=(SLOW, FAST), rate_hz=10, duration_s=2, size_bytes=100_00
 
 
 def spy(name: str, log: list[Any]) -> Policy:
-    """A policy that writes down what it meets and rejects all."""
-
     def on_arrival(buffer: Any, arrival: Any, memory: Any) -> int:
         log.append((int(arrival.seq), int(arrival.arrival_us), int(arrival.size_bytes), float(arrival.uniform)))
         return policies.REJECT
@@ -101,11 +106,8 @@ def test_where_only_a_full_buffer_asks_the_bound_is_an_upper_one() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"policies": []}, "policies"),
-        ({"capacities": []}, "capacities"),
         ({"capacities": [0]}, "capacity = 0"),
         ({"seeds": 0}, "seeds = 0"),
-        ({"seeds": [-1]}, "seed = -1"),
         ({"policies": ["afr", "afr"]}, "'afr' is given more than once"),
         ({"decide_at": "never"}, "'never'"),
     ],
@@ -128,3 +130,163 @@ def test_functions_and_names_are_policies_too() -> None:
         run.run([3], UPLINK, [2], 1)  # type: ignore[list-item]
     with pytest.raises(BufgymError, match="'afr' is given more than once; 'afr' is a built-in policy's name"):
         run.run([Policy("afr", newest), "afr"], UPLINK, [2], 1)
+
+
+CHOSEN = [policies.get(spec) for spec in ("drop-oldest", "afr", "random", "codel", "clairvoyant", "rosbridge")]
+GAPPY = Uplink(
+    traces=(Trace.steps([(1.0, 600_000), (2.0, 0), (1.0, 250_000)], name="gappy"),),
+    rate_hz=10,
+    duration_s=6,
+    size_bytes=50_000,
+)
+STOPS = replace(GAPPY, traces=(Trace.steps([(2.0, 300_000), (2.0, 20_000)], name="stops", after="stop"),))
+"""Here the link ends for good: a message hangs in transmission and others stay queued."""
+
+
+@pytest.mark.parametrize("scenario", [GAPPY, STOPS, Interruption(t_max=30, value=qoi.saturating(4))])
+def test_every_message_is_accounted_for_as_in_the_rows(scenario: Any) -> None:
+    rows = run.run(CHOSEN, scenario, [3], [1003], label="here")
+    made = timeline(CHOSEN, scenario, rows[0])
+    assert json.loads(json.dumps(made, allow_nan=False)) == made
+    assert (made["scenario"], made["capacity"], made["seed"]) == ("here", 3, 1003)
+    assert list(made["policies"]) == [policy.name for policy in CHOSEN]
+    messages = len(made["arrival_s"])
+    for row in rows:
+        lane = made["policies"][row["policy"]]
+        received, dropped = [k for k, _, _ in lane["received"]], [k for k, _ in lane["dropped"]]
+        assert not set(received) & set(dropped)
+        assert len(set(received)) == len(received) == row["delivered"] and len(dropped) == row["dropped"]
+        left = messages - len(received) - len(dropped)
+        assert row["arrived"] == messages and left == row["in_transmission"] + row["buffered"]
+        assert lane["qoi"] == pytest.approx(row["qoi"], rel=1e-12)
+        assert lane["regret"] == (None if row["regret"] is None else pytest.approx(row["regret"], abs=1e-12))
+        # H once more, from the picture alone.
+        x = [made["x"][k] for k in sorted(received)]
+        gains = sum(scenario.value(b - a) for a, b in itertools.pairwise(x))
+        assert lane["qoi"] == pytest.approx(1 + gains if x else 0.0)
+        assert all(made["arrival_s"][k] <= dequeued <= transmitted for k, dequeued, transmitted in lane["received"])
+        assert all(made["arrival_s"][k] <= when for k, when in lane["dropped"])
+    assert scenario is not STOPS or any(row["in_transmission"] and row["buffered"] for row in rows)
+
+
+def test_the_episode_shown_is_the_one_that_costs_drop_oldest_most_at_the_middle_capacity() -> None:
+    given = [("drop-oldest", 2, 0, 0.9), ("drop-oldest", 4, 0, 0.2), ("drop-oldest", 4, 1, 0.3)]
+    given += [("drop-oldest", 4, 2, None), ("afr", 4, 3, 0.8), ("drop-oldest", 8, 0, 0.7)]
+    names = ("policy", "capacity", "seed", "regret")
+    rows = [dict(zip(names, cells, strict=True), scenario="s", trace="t") for cells in given]
+    assert choose(rows) == choose(rows[::-1]) == rows[2]
+    assert choose(rows[3:4]) is None
+
+
+ENDINGS = ["csv", "parquet"]
+
+
+def row(**changed: Any) -> Row:
+    cells = {str: "{0} text".format, bool: lambda _, __: True, int: lambda _, k: k, float: lambda _, k: k / 7}
+    return {name: cells[kind](name, k) for k, (name, kind) in enumerate(RUNS.items())} | changed
+
+
+HARD = [
+    row(),
+    row(qoi=0.1 + 0.2, regret=5e-324, mean_age_s=1.7976931348623157e308, peak_backlog_bytes=2**62 + 1),
+    row(mean_sojourn_s=math.nan, clairvoyant=None, certified=None, regret=None),
+    row(certified=False, regret=-0.0, longest_gap=math.inf, seed=2**53 + 1),
+    row(scenario='a, "quoted"\nlabel', trace="Übertragung;\t'x'", policy="decimate:every=2,phase=1"),
+    row(scenario="", qoi=3.0),
+]
+"""Numbers that need all their bits, nothing in all its forms, text that a CSV must quote."""
+
+
+def needs(ending: str) -> str:
+    if ending == "parquet":
+        pytest.importorskip("pyarrow")
+    return ending
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_rows_come_back_to_the_last_bit(tmp_path: Path, ending: str) -> None:
+    path = write_rows(HARD, tmp_path / f"rows.{needs(ending)}")
+    # repr tells None from NaN, 3 from 3.0, 0.0 from -0.0, and shows every bit of a float.
+    assert [repr(same) for same in read_rows(path)] == [repr(given) for given in HARD]
+    assert list(tmp_path.iterdir()) == [path]  # nothing temporary stays
+    again = write_rows(read_rows(path), tmp_path / f"again.{ending}")
+    assert again.read_bytes() == path.read_bytes()
+    assert read_rows(write_rows([], path)) == []
+    with pytest.raises(FileNotFoundError):
+        read_rows(tmp_path / f"none.{ending}")
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
+    target = write_rows(HARD, tmp_path / "rows.csv")
+    before = target.read_bytes()
+    with pytest.raises(ValueError, match="not in fieldnames"):
+        write_rows([row(), row(surprise=1)], target)
+    with pytest.raises(KeyboardInterrupt), replaced(target) as temporary:
+        temporary.write_text("half a")
+        raise KeyboardInterrupt
+    assert target.read_bytes() == before and list(tmp_path.iterdir()) == [target]
+
+
+def test_other_endings_and_parquet_without_pyarrow_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(BufgymError, match=r"rows\.txt: rows are written to \.csv or \.parquet"):
+        write_rows([], tmp_path / "rows.txt")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)  # importing it now fails
+    with pytest.raises(BufgymError, match=r"pip install .*pyarrow.* \(or write \.csv\)"):
+        write_rows(HARD, tmp_path / "rows.parquet")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "told"),
+    [
+        ("qoi", "many", "qoi = 'many': must be a number"),
+        ("seed", "1.5", "seed = '1.5': must be a number"),
+        ("certified", "yes", "certified = 'yes': must be True or False"),
+    ],
+)
+def test_a_bad_cell_is_named_with_its_line(tmp_path: Path, column: str, cell: str, told: str) -> None:
+    """In the third row of a file whose first row's label spans two lines: line 1 + 2 + 1 + 1 = 5."""
+    path = write_rows([row(scenario="two\nlines"), row(), row(**{column: cell})], tmp_path / "rows.csv")
+    with pytest.raises(BufgymError) as caught:
+        read_rows(path)
+    assert str(caught.value) == f"{path}, line 5: {told}"
+
+
+@pytest.mark.parametrize("change", [lambda line: line.rsplit(",", 1)[0], lambda line: f"{line},7"])
+def test_a_line_of_another_length_is_named(tmp_path: Path, change: Any) -> None:
+    path = write_rows([row(), row()], tmp_path / "rows.csv")
+    *rest, last = path.read_text().splitlines()
+    path.write_text("\n".join([*rest, change(last)]) + "\n")
+    with pytest.raises(BufgymError, match=rf"rows\.csv, line 3: must have {len(RUNS)} cells, as line 1 has"):
+        read_rows(path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"policy,qoi\nafr,\xff\xfe\n", b'policy,qoi\n"afr"x,1\n', b'policy,qoi\n"afr,1\n', 0, 0.3, 0.9]
+)
+def test_a_file_that_is_none_or_cut_short_is_named(tmp_path: Path, content: bytes | float) -> None:
+    """As CSV, or so much of a Parquet file."""
+    path = tmp_path / "rows.csv"
+    if not isinstance(content, bytes):
+        pytest.importorskip("pyarrow")
+        path = write_rows(HARD, tmp_path / "rows.parquet")
+        content = path.read_bytes()[: round(content * path.stat().st_size)]
+    path.write_bytes(content)
+    with pytest.raises(BufgymError, match=rf"{path.name}: no rows that can be read"):
+        read_rows(path)
+
+
+def test_one_wrong_bit_in_a_parquet_page_is_noticed(tmp_path: Path) -> None:
+    """Or else a number would be another and nobody the wiser. (Some bits say nothing that is needed.)"""
+    pytest.importorskip("pyarrow")
+    rows = [row(qoi=1234.5678 + k, mean_age_s=1 / (k + 1)) for k in range(50)]
+    path = write_rows(rows, tmp_path / "rows.parquet")
+    right, content = repr(rows), path.read_bytes()
+    noticed = 0
+    for place in range(4, len(content) // 3, 101):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+        try:
+            assert repr(read_rows(path)) == right, place
+        except BufgymError:
+            noticed += 1
+    assert noticed > 10

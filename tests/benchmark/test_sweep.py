@@ -1,23 +1,26 @@
-"""A suite's benchmark: the same rows wherever it runs, and nothing lost by a kill."""
+"""A suite's benchmark: the same rows wherever it runs, nothing lost by a kill, nothing mixed in a folder."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import subprocess
 import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_cases import Patch
+from cli_cases import Capsys, Patch, shown
 from sweep_cases import THREE, TINY, bufgym, contents, interrupt
 
 from bufgym import policies
 from bufgym.benchmark import run, sweep
-from bufgym.benchmark.rows import read_rows
+from bufgym.benchmark.rows import read_rows, write_rows
 from bufgym.benchmark.sweep import Sweep
 from bufgym.cli.options import load_policies
-from bufgym.scenario import suites
+from bufgym.errors import BufgymError
+from bufgym.scenario import Uplink, suites
+from bufgym.traces import Trace
 
 pytest.importorskip("joblib", reason="a sweep needs joblib")
 
@@ -25,7 +28,7 @@ WORDS = ["bench", "--suite", "interruption-v1", "--policies", ",".join(THREE), "
 """The same as ``TINY``, typed."""
 
 
-def finished(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
+def ended(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
     process = bufgym(*words, **environment)
     out, err = process.communicate()
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
@@ -38,7 +41,6 @@ def rows_in(out: Path, form: str = "csv") -> str:
 
 @pytest.fixture(scope="module")
 def expected() -> str:
-    """The rows of ``TINY``, straight from the experiment."""
     chosen = [policies.get(name) for name in THREE]
     rows = []
     for label, setting in suites.get("interruption-v1").settings("test").items():
@@ -55,9 +57,7 @@ def test_the_rows_are_those_of_the_experiment(tmp_path: Path, backend: str, expe
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("backend", ["loky", "dask", "ray"])
-def test_so_are_they_from_other_processes_which_know_a_users_policy(
-    tmp_path: Path, backend: str, mine: Path, expected: str
-) -> None:
+def test_other_processes_know_a_users_policy(tmp_path: Path, backend: str, mine: Path, expected: str) -> None:
     """Dask and Ray: a cluster of this machine's own."""
     needed = {"loky": "joblib", "dask": "distributed", "ray": "ray"}[backend]
     if importlib.util.find_spec(needed) is None:
@@ -65,7 +65,7 @@ def test_so_are_they_from_other_processes_which_know_a_users_policy(
     words = [word if word != ",".join(THREE) else ",".join(["mine", *THREE]) for word in WORDS]
     words += ["--policy-file", str(mine), "--backend", backend, "--jobs", "2", "--format", "csv"]
     out = tmp_path / "out"
-    done = finished(*words, "--out", out)
+    done = ended(*words, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "mine" in done.stdout and f"72 rows in {out}" in done.stdout
     rows = read_rows(out / "rows.csv")
@@ -133,9 +133,7 @@ def test_what_is_missing_of_a_finished_folder_is_made_anew(tmp_path: Path, small
 
 
 @pytest.mark.parametrize("backend", ["sequential", "threading"])
-def test_an_error_in_one_shard_loses_no_finished_rows(
-    tmp_path: Path, small: Sweep, backend: str, monkeypatch: Patch
-) -> None:
+def test_an_error_loses_no_finished_rows(tmp_path: Path, small: Sweep, backend: str, monkeypatch: Patch) -> None:
     """The second shard fails while the first one runs, which is finished and kept; no shard is begun afterwards."""
     right, begun, failed = sweep.run_shard, [], threading.Event()
 
@@ -165,6 +163,130 @@ def test_an_error_in_one_shard_loses_no_finished_rows(
 @pytest.mark.nightly
 def test_a_mistake_in_a_users_policy_is_shown_where_it_is_even_from_other_processes(tmp_path: Path, mine: Path) -> None:
     words = ["--policies", "mine", "--policy-file", mine, "--capacity", "2,5", "--seeds", "1", "--jobs", "2"]
-    failed = finished("bench", "--suite", "interruption-v1", *words, "--out", tmp_path, TEST_FAIL="1")
+    failed = ended("bench", "--suite", "interruption-v1", *words, "--out", tmp_path, TEST_FAIL="1")
     assert failed.returncode == 2 and failed.stderr.count("\n") == 1
     assert f"{mine}, line 8: ArithmeticError: on purpose" in failed.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"specs": ("afr", "red")}, "policies"),
+        ({"specs": ("random", "afr", "drop-oldest")}, "policies"),
+        ({"capacities": (2, 5)}, "capacities"),
+        ({"seeds": 4}, "seeds"),
+        ({"suite": "lte-v1"}, "suite"),
+    ],
+)
+def test_another_sweep_needs_another_folder(finished: Path, change: dict[str, Any], key: str) -> None:
+    before = contents(finished)
+    with pytest.raises(BufgymError, match=rf"manifest\.json: {key} is .*, but this run has .*choose another --out"):
+        sweep.run_sweep(Sweep(**{**vars(TINY), **change}), finished, backend="sequential")
+    assert contents(finished) == before
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished")
+    sweep.run_sweep(TINY, folder, backend="sequential")
+    return folder
+
+
+def test_so_does_another_version_or_policy_file(tmp_path: Path, small: Sweep, mine: Path, monkeypatch: Patch) -> None:
+    load_policies(str(mine))
+    plan = Sweep("small-v1", ("mine",), policy_file=str(mine))
+    sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
+    before = contents(tmp_path / "out")
+    text = mine.read_text()
+    mine.write_text(text.replace("% 2", "% 3"))
+    with pytest.raises(BufgymError, match="policy_file is"):
+        sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
+    mine.write_text(text)
+    monkeypatch.setattr(sweep, "__version__", "0.0.0")
+    with pytest.raises(BufgymError, match=r'bufgym is ".*", but this run has "0\.0\.0"'):
+        sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
+    assert contents(tmp_path / "out") == before
+
+
+def test_so_do_other_recordings_of_the_same_names(tmp_path: Path, monkeypatch: Patch) -> None:
+    def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
+        assert data is not None
+        trace = Trace.steps([(1.0, float((data / "rate").read_text()))], name="link")
+        return {"link": suites.Setting(Uplink(traces=(trace,), rate_hz=5, duration_s=2), "a link")}
+
+    found = suites.Suite("found-v1", "found", build, (2,), 1, needs="rate")
+    monkeypatch.setitem(suites.SUITES, "found-v1", found)
+    for name, rate in (("a", "500000"), ("b", "600000"), ("c", "500000")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "rate").write_text(rate)
+    first, other, same = (Sweep("found-v1", ("afr",), data=str(tmp_path / name)) for name in "abc")
+    rows = sweep.run_sweep(first, tmp_path / "out", backend="sequential")
+    with pytest.raises(BufgymError, match="scenarios is"):
+        sweep.run_sweep(other, tmp_path / "out", backend="sequential")
+    assert repr(sweep.run_sweep(same, tmp_path / "out", backend="sequential")) == repr(rows)
+
+
+@pytest.mark.parametrize("name", ["rows.csv", "rows.parquet", "parts/one-0-0.csv"])
+def test_rows_without_a_manifest_are_left_alone(tmp_path: Path, small: Sweep, name: str) -> None:
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("someone else's")
+    with pytest.raises(BufgymError, match=r"holds rows without a manifest\.json; choose another --out"):
+        sweep.run_sweep(small, tmp_path, backend="sequential")
+    assert list(contents(tmp_path)) == [name]
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_a_broken_part_is_named_and_made_anew(tmp_path: Path, small: Sweep, form: str, monkeypatch: Patch) -> None:
+    if form == "parquet":
+        pytest.importorskip("pyarrow")
+    out = tmp_path / "out"
+    whole = sweep.run_sweep(small, tmp_path / "whole", backend="sequential", form=form)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(sweep, "_read", interrupt)  # all parts are there, but not yet their sum
+        sweep.run_sweep(small, out, backend="sequential", form=form)
+    part = out / "parts" / f"one-1-1000.{form}"
+    rows, content = read_rows(part), part.read_bytes()
+    without = [{name: row[name] for name in row if name != "qoi"} for row in rows]
+    for harm in (content[: len(content) // 2], b"", b"\xff\x00" * 99, rows[:-1], without):
+        part.write_bytes(harm) if isinstance(harm, bytes) else write_rows(harm, part)
+        before = contents(out)
+        with pytest.raises(BufgymError, match=rf"one-1-1000\.{form}.*; delete this file and run the command again"):
+            sweep.run_sweep(small, out, backend="sequential", form=form)
+        assert contents(out) == before
+    part.unlink()
+    assert repr(sweep.run_sweep(small, out, backend="sequential", form=form)) == repr(whole)
+    assert (out / f"rows.{form}").read_bytes() == (tmp_path / "whole" / f"rows.{form}").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"split": "exam"}, "split = 'exam'"),
+        ({"specs": ("decimate:every=2", "decimate:every=2.0")}, "'decimate:every=2' is given more than once"),
+        ({"seeds": 0}, "seeds = 0: must lie between 1 and 1000"),
+        ({"capacities": (2, 2)}, r"capacities = \[2, 2\]: .* no two alike"),
+        ({"suite": "mahimahi-v1"}, r"needs a folder of recordings \(--data DIR\)"),
+        ({"jobs": 0}, "jobs = 0:"),
+        ({"backend": "sloky"}, "backend = 'sloky': must be one of loky"),
+    ],
+)
+def test_a_bad_sweep_writes_nothing(tmp_path: Path, small: Sweep, change: dict[str, Any], told: str) -> None:
+    where = {name: change.pop(name) for name in ("jobs", "backend") if name in change}
+    with pytest.raises(BufgymError, match=told):
+        sweep.run_sweep(Sweep(**{**vars(small), **change}), tmp_path / "out", **where)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_line_prints_scores_and_the_report_reads_them(tmp_path: Path, small: Sweep, capsys: Capsys) -> None:
+    pytest.importorskip("jinja2")
+    pytest.importorskip("plotly")
+    out = tmp_path / "a folder"
+    words = ["bench", "--suite", "small-v1", "--policies", "afr,random", "--backend", "sequential", "--out", out]
+    said = shown(words, capsys)
+    assert "afr" in said and "drop-oldest" in said and f"48 rows in {out}; bufgym report" in said
+    command = json.loads((out / "manifest.json").read_text())["command"]
+    assert command == f"bufgym bench --suite small-v1 --policies afr,random --out '{out}'"
+    tables = shown(["report", out, "--markdown"], capsys)
+    assert command in tables and "| drop-oldest |" in tables
+    page = Path(shown(["report", out], capsys).strip().removeprefix("wrote ")).read_text()
+    assert page.startswith("<!") and "drop-oldest" in page and "small-v1" in page

@@ -13,10 +13,8 @@ from bufgym import policies
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
 from bufgym.benchmark.summary import Summary, plain
-from bufgym.benchmark.sweep import Sweep
 from bufgym.benchmark.tasks import TASKS, topics
-from bufgym.benchmark.tasks.topics import ROWS, by_topic
-from bufgym.errors import BufgymError
+from bufgym.benchmark.tasks.topics import ROWS
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.scenario import Client, Stream
@@ -39,7 +37,6 @@ CLIENT = Client(
 
 
 def met(policy: str, client: Client = CLIENT, capacity: int = 16) -> dict[str, Row]:
-    """The rows of one run by topic."""
     return {row["topic"]: row for row in run([policies.get(policy)], client, [capacity], 1, label="hand")}
 
 
@@ -100,30 +97,6 @@ def test_a_full_buffer_and_a_rate_limit_show() -> None:
     assert (rows["pose"]["limited"], rows["pose"]["lost"], rows["pose"]["delivered"]) == (2, 0, 2)
 
 
-def test_every_policy_and_capacity_meets_the_same_episodes() -> None:
-    traces = tuple(Trace.constant(rate, 60.0, name="steady") for rate in (800.0, 1600.0))
-    client = replace(CLIENT, traces=traces, streams=(replace(POSE, jitter=0.5), MAP), random_offset=True)
-    chosen = [policies.get(name) for name in ("fifo", "robofleet")]
-    rows = run(chosen, client, [2, 4], [7, 3])
-    assert len(rows) == 2 * 2 * 2 * 2 * 2  # traces, seeds, capacities, policies, topics
-    assert {row["trace"] for row in rows} == {"steady", "steady#2"} and {row["seed"] for row in rows} == {3, 7}
-    assert [repr(row) for row in run(chosen, client, [2, 4], [7, 3])] == [repr(row) for row in rows]
-    alone = run(chosen[1:], client, [4], [3])
-    assert [repr(row) for row in rows if (row["policy"], row["capacity"], row["seed"]) == ("robofleet", 4, 3)] == [
-        repr(row) for row in alone
-    ]
-
-
-def test_a_suites_episodes_are_its_own() -> None:
-    sweep = Sweep("topics-v1", (), "validation", seeds=2, changes={"window": 5}).checked()
-    labels = ("scarce", "scarce-window-5", "half", "half-window-5", "ample", "ample-window-5")
-    assert tuple(dict.fromkeys(shard.label for shard in sweep.shards())) == labels
-    clients = [sweep.setting(shard.label, shard.trace).scenario for shard in sweep.shards()]
-    assert {(client.window, len(client.traces)) for client in clients} == {(5, 1)}
-    # No two traces of a scenario share a draw.
-    assert [shard.seeds for shard in sweep.shards() if shard.label == "half"][:2] == [(0, 1), (1000, 1001)]
-
-
 def made(policy: str, seed: int, weighted_qoi: float, scenario: str = "s", **first: Any) -> list[Row]:
     """The rows of one run of 10 s with a topic of priority 5 (changed by ``first``), one of 1, and one no_drop."""
     key = {"scenario": scenario, "trace": "t", "seed": seed, "policy": policy, "capacity": 4}
@@ -166,20 +139,6 @@ def test_a_summary_worked_by_hand() -> None:
     assert mine["late"] == exactly(1 / 8) and base["late"] == exactly(0.0) and mine["rate_hz"] == exactly(1.2)
 
 
-def test_over_all_cells_shares_are_means_and_losses_add_up() -> None:
-    more = [
-        row
-        for seed in (0, 1)
-        for row in [*made("robofleet", seed, 100.0, "other"), *made("mine", seed, 150.0, "other")]
-    ]
-    found = summary([*HALF, *more])
-    assert list(found.cells) == [("s", 4), ("other", 4)]  # as in the rows
-    assert [standing.policy for standing in found.cells["other", 4]] == ["mine", "robofleet"]
-    mine = found.standings["mine"]
-    assert mine["relative"] == exactly((0.5 + 1.5) / 2) and mine["lost"].value == 10
-    assert mine["age_first_s"] == exactly(1.5)
-
-
 def test_unknown_ages_are_left_out() -> None:
     rows = [*made("robofleet", 0, 1.0, mean_age_s=math.nan), *made("robofleet", 1, 1.0, mean_age_s=3.0)]
     assert summary(rows).overall[0]["age_first_s"] == exactly(3.0)
@@ -188,29 +147,3 @@ def test_unknown_ages_are_left_out() -> None:
     assert math.isnan(standing["age_others_s"].value) and math.isnan(standing["late"].value)
     assert math.isnan(standing["relative"].value)  # of nothing
     assert "  –  " in plain(summary(same))
-
-
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        ([], "no rows to score"),
-        ([HALF[0], HALF[0]], r"rows\[1\]: topic 'first' of one run has more than one row"),
-        ([{**HALF[0], "weighted_qoi": None}], r"rows\[0\]: no weighted_qoi"),
-    ],
-)
-def test_rows_that_cannot_be_summed_up(rows: list[Row], message: str) -> None:
-    with pytest.raises(BufgymError, match=message):
-        summary(rows)
-
-
-def test_the_tables_as_text() -> None:
-    lines = plain(summary(HALF), {"s": "a story"}).splitlines()
-    assert lines[0].split("  ")[0] == "policy" and "age, priority 5 (s)" in lines[0] and "QoI / robofleet" in lines[0]
-    assert lines[2] == "s: a story, L = 4"
-    assert lines[3].split()[:5] == ["robofleet", "53.3", "1.000", "[1.000,", "1.000]"]
-    assert lines[4].split()[-2:] == ["%", "1.2"] and len(lines) == 5
-    lines = by_topic(HALF, "mine").splitlines()
-    assert lines[2] == "s, L = 4"
-    assert lines[3].split() == ["first", "5", "1.00", "9.0", "0.0", "0.0", "4.0", "1.0", "1.000", "3.000", "0.500", "-"]
-    with pytest.raises(BufgymError, match="no row of the policy 'nobody'"):
-        by_topic(HALF, "nobody")
