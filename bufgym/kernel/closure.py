@@ -6,6 +6,7 @@ Comments, docstrings and line numbers are not part of it, nor is anything that n
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import sys
 from collections.abc import Iterator
@@ -32,18 +33,26 @@ TOOLS = (
 
 def closure(function: Any) -> str:
     """Hash of ``function``'s closure: equal where its machine code is, for equal types of its arguments."""
-    told: dict[int, str] = {}
+    told: dict[FunctionType, str] = {}
     waiting = [function]
     while waiting:
         one = waiting.pop()
-        if id(one) not in told:
-            parts = [one.__module__, one.__qualname__, *_code(one.__code__)]
-            for name, value in _read(one):
-                parts.append(f"{name} = {_told(value, waiting)}")
-            told[id(one)] = "\n".join(parts)
-    return hashlib.sha256("\n\n".join(sorted(told.values())).encode()).hexdigest()
+        if one not in told:
+            told[one], calls = _of_one(one)
+            waiting += calls
+    return hashlib.sha256("".join(sorted(told.values())).encode()).hexdigest()
 
 
+@functools.cache
+def _of_one(function: FunctionType) -> tuple[str, list[FunctionType]]:
+    """(Hash of the function alone, the functions that it names)."""
+    calls: list[FunctionType] = []
+    parts = [function.__module__, function.__qualname__, *_code(function.__code__)]
+    parts += [f"{name} = {_told(value, calls)}" for name, value in _read(function)]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest(), calls
+
+
+@functools.cache
 def told_types(types: Any) -> str:
     """``types``, a signature or several types, in words that name the fields of every tuple too."""
     found = [repr(types)]
