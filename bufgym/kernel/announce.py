@@ -11,7 +11,7 @@ from numba.core import event
 
 PATIENCE_S = 1.0
 """Compiling that takes longer is announced."""
-NOTICE = "bufgym: compiling, once (about 30 s; bufgym warmup does it beforehand)"
+NOTICE = "bufgym: compiling, once (about 10 s; bufgym warmup does it beforehand)"
 
 
 class _Announcer(event.Listener):
