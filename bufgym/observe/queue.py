@@ -89,8 +89,9 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
         rows[fields.TIME_MERGED, k] = after_us - before_us
         rows[fields.MOTION_BEFORE, k] = slot_x - before_x
         rows[fields.MOTION_MERGED, k] = after_x - before_x
-        rows[fields.LOSS, k] = merging_loss(buffer.v, slot_x - before_x, gain, after_x - slot_x, after_gain)
-        rows[fields.RELATIVE_LOSS, k] = max(rows[fields.LOSS, k], 0.0)
+        lost = merging_loss(buffer.v, slot_x - before_x, gain, after_x - slot_x, after_gain)
+        rows[fields.LOSS, k] = max(lost, 0.0)  # it may be rounded to less
+        rows[fields.RELATIVE_LOSS, k] = rows[fields.LOSS, k]
         rows[fields.SIZE, k] = slot.size_bytes
         before_us, before_x = slot_us, slot_x
     for k in range(s, last):

@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given
 from topic_cases import TWIN_V, TopicCase, topic_cases
 
-from bufgym.model.buffer import UNLIMITED_BYTES
+from bufgym.model.buffer import ACCEPT, UNLIMITED_BYTES
+from bufgym.model.link import Link
+from bufgym.model.qoi import saturating
 from bufgym.model.topics import Topic
 from bufgym.observe import (
     CONTEXT_FIELDS,
@@ -21,7 +23,9 @@ from bufgym.observe import (
     observe_topic_context,
     observe_topic_slots,
 )
-from bufgym.sim import named, python_view
+from bufgym.scenario import Episode, messages
+from bufgym.sim import DECISION, END, Senders, decide, named, next_event, python_view
+from bufgym.traces import Trace
 
 SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
 CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
@@ -199,3 +203,20 @@ def test_every_field_is_its_twins(case):
 def test_the_twin_knows_every_field():
     assert len({*SLOT_NAMES, *CONTEXT_NAMES}) == len(FIELDS + TOPIC_FIELDS)
     assert all(field.meaning and field.unit and field.group == "topic" for field in TOPIC_FIELDS)
+
+
+@pytest.mark.kernels
+def test_no_loss_is_rounded_below_nothing():
+    """V = min(1, d / 2.2), x = 1.3, 2.0, 2.3: V(0.7) + V(0.3) - V(1) comes out as -5.6e-17, which no space holds."""
+    link = Link(Trace("dead", np.array([0, 10**6]), np.array([0, 0]), "hold"))
+    senders = Senders(1, 3, saturating(2.2), max_messages=3)
+    senders.load(0, Episode(messages(np.arange(3), 1, np.array([1.3, 2.0, 2.3])), link))
+    while (event := next_event(senders.batch, None, 0)) != END:
+        batch = named(senders.batch)
+        if event == DECISION and batch.senders[0].next == 2:
+            loss = observed(batch, python_view(batch, 0), True)["loss"]
+            assert (loss >= 0).all() and loss[0] == 0
+            break
+        if event == DECISION:
+            decide(senders.batch, 0, ACCEPT)
+    assert event == DECISION

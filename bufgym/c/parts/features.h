@@ -108,8 +108,8 @@ static inline void bufgym_observe_slots(struct bufgym_queue *q, const struct buf
         rows[BUFGYM_TIME_MERGED][k] = (double)(after->arrival_us - before_us);
         rows[BUFGYM_MOTION_BEFORE][k] = slot->x - before_x;
         rows[BUFGYM_MOTION_MERGED][k] = after->x - before_x;
-        rows[BUFGYM_LOSS][k] = loss;
-        rows[BUFGYM_RELATIVE_LOSS][k] = loss > 0.0 ? loss : 0.0;
+        rows[BUFGYM_LOSS][k] = loss > 0.0 ? loss : 0.0;
+        rows[BUFGYM_RELATIVE_LOSS][k] = rows[BUFGYM_LOSS][k];
         rows[BUFGYM_SIZE][k] = (double)slot->size_bytes;
         rows[BUFGYM_INDEX_BEFORE][k] = bufgym_squash((double)(slot->seq - before_seq), even_seq);
         rows[BUFGYM_INDEX_MERGED][k] = bufgym_squash((double)(after->seq - before_seq), 2 * even_seq);
