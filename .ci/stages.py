@@ -139,10 +139,10 @@ def nightly(arguments: list[str]) -> list[Stage]:
     return [
         *check(),
         *uncompiled(folder, arguments),
-        pytest("compiled", folder, *others, *add, environment=cov, limit_s=30 * MINUTE),
-        pytest("servers", folder, *servers, *add, environment=cov, limit_s=10 * MINUTE),
+        pytest("compiled", folder, *others, *add, environment=cov, limit_s=40 * MINUTE),
+        pytest("servers", folder, *servers, *add, environment=cov, limit_s=20 * MINUTE),
         Stage("coverage", report, environment=measured(folder)),
-        pytest("all uncompiled", folder, *plain, compiled=False, environment=many, limit_s=20 * MINUTE),
+        pytest("all uncompiled", folder, *plain, compiled=False, environment=many, limit_s=25 * MINUTE),
         pytest("fuzz", folder, "tests/fuzz", *arguments, environment=many, limit_s=15 * MINUTE),
         Stage("claims", [*make, "claims"], limit_s=15 * MINUTE),
         Stage("mutants", [PYTHON, *sample], limit_s=25 * MINUTE),
