@@ -9,8 +9,6 @@ A profile has fewer examples where compilation is off, because kernels are some 
 has a deadline: the first call of a kernel compiles it.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Tests that are coroutines: a module has one event loop, and what a test begins in it ends with the test."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import inspect

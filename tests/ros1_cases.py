@@ -1,7 +1,5 @@
 """Where ROS 1 is, for the tests that run nodes of it."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

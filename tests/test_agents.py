@@ -1,7 +1,5 @@
 """The parts of training on a suite: padded rows, the slot network, double DQN, evaluation sets, ablation."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Iterator

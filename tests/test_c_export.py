@@ -1,7 +1,5 @@
 """The header in C: compiled with gcc, it decides as Python does, on a million decisions; a robot in C++ uses it."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Each command as a user types it, and each mistake that ends in one line and exit code 2."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """``bufgym topics``, ``bench --workload`` and ``trace from-bag`` as a user types them; every number worked by hand."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Evolved agents: where they begin, what they leave, that a killed run goes on and repeats, also on a cluster."""
 
-from __future__ import annotations
-
 import csv
 import importlib.util
 import subprocess

@@ -1,7 +1,5 @@
 """Agents that a whole fleet shares: where they are tried, where they begin, that a killed run goes on."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The gallery: films show what the simulator says, and the interactive page holds bufgym's own numbers."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

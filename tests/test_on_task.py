@@ -1,7 +1,5 @@
 """Agents that are evolved by the robot's own task: episodes, rewards, and the table."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

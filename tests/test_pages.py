@@ -1,7 +1,5 @@
 """What README and site tell users to type is there, links lead somewhere, and the site builds from the registries."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import functools

@@ -1,7 +1,5 @@
 """The agents that come with bufgym: small, named, with their command, and as good as their file says."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The house rules: rooms import only from rooms above, paths are relative, importing stays cheap, hints name extras."""
 
-from __future__ import annotations
-
 import ast
 import importlib.metadata
 import re

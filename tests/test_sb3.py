@@ -1,7 +1,5 @@
 """What stable-baselines3 may rely on: its own check of the single environment, and the contract of its VecEnv."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

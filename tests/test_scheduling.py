@@ -1,7 +1,5 @@
 """Learned schedulers: a vector and back, fitness by hand, a killed run goes on where it was, a run from end to end."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import pickle

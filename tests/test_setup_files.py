@@ -1,7 +1,5 @@
 """Container, hooks, workflows and stages name what is there: rules of the Makefile, supported Pythons, programs."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

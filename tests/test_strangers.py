@@ -1,7 +1,5 @@
 """Files of strangers: what is too large, endless, forged or no regular file ends in one line, and soon."""
 
-from __future__ import annotations
-
 import csv
 import os
 import subprocess

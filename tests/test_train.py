@@ -1,7 +1,5 @@
 """Training end to end with tiny settings: what it leaves behind, and that a killed run goes on."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

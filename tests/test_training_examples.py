@@ -1,7 +1,5 @@
 """The examples that train or measure run, with tiny settings, and do what they say."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import runpy

@@ -1,7 +1,5 @@
 """What the tests of training share; importing it skips them where the extra [train] is not installed."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from typing import Any

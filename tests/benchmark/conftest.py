@@ -1,7 +1,5 @@
 """A small suite and a policy file, for the tests of sweeps and their folders."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

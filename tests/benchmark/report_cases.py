@@ -1,7 +1,5 @@
 """A run made by hand, for the tests of its report."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

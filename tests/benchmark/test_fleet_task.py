@@ -1,7 +1,5 @@
 """The task of a fleet: rows of a cell worked by hand, statistics of rows made by hand, the command."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

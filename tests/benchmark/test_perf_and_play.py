@@ -1,7 +1,5 @@
 """The speed report at tiny sizes, a policy as the player of an environment, and what is compiled beforehand."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

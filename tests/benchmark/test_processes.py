@@ -1,7 +1,5 @@
 """A sweep's processes: a folder is one run's, workers end with their parent, and one that dies costs one line."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """The report: what stands on the page and in the tables, folders that are refused, and the page in a real browser."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

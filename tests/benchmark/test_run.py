@@ -1,7 +1,5 @@
 """The experiment: common random numbers, the oracle's column, one episode in full; rows in files, to the last bit."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

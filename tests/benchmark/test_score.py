@@ -1,7 +1,5 @@
 """The scores of one queue and the table, by hand: interquartile mean, improvement, paired bootstrap intervals."""
 
-from __future__ import annotations
-
 import math
 import random
 import re

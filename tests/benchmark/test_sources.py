@@ -1,7 +1,5 @@
 """Policies from files and modules in ``bufgym bench``: by what names, in which processes, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The summary that topics and fleets share, the task of stress, live margins, by hand; the leaderboard and its rows."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A suite's benchmark: the same rows wherever it runs, nothing lost by a kill, nothing mixed in a folder."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """The task of several topics: rows of an episode worked by hand, statistics of rows made by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

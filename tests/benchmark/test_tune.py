@@ -1,7 +1,5 @@
 """Tuning on validation episodes: the best setting of a suite that is worked out by hand, chance, ties, bad input."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Random episodes for the tests, each in two forms: for the package and for its slow twins in ``naive``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

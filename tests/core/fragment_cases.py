@@ -1,7 +1,5 @@
 """A queue of frames at 30 Hz, for the tests of the rules that look at gaps."""
 
-from __future__ import annotations
-
 import numpy as np
 from cases import newcomer, queue_of
 

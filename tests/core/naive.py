@@ -3,8 +3,6 @@
 Nothing here calls a kernel, and nothing here is clever. A twin and its kernel must agree exactly.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from fractions import Fraction

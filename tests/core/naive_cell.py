@@ -4,8 +4,6 @@
 sharing itself: every byte is divided, however small the shares.
 """
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 

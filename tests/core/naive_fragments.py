@@ -1,7 +1,5 @@
 """Slow, obvious twins of middleware that sends in fragments, and of WebRTC's frame dropper."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """The best H of all decision sequences, by trying every one on the plain-Python sender of ``naive``."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import math

@@ -1,7 +1,5 @@
 """Slow, obvious twins of the policies, written from their papers' descriptions: lists and dictionaries, no kernels."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 

@@ -1,7 +1,5 @@
 """Slow, obvious twins of what middleware and networks do; ``naive_policies`` has the others."""
 
-from __future__ import annotations
-
 import math
 
 from naive_sender import ACCEPT, REJECT

@@ -1,7 +1,5 @@
 """Slow, obvious twins of the schedulers: each answers for a ``naive_sender.Sender``, from what that sender knows."""
 
-from __future__ import annotations
-
 import math
 
 from naive_sender import ACCEPT, HOLD, REJECT

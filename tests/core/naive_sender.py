@@ -4,8 +4,6 @@ Written from the model's description; it calls no kernel. A list holds each topi
 flight. Messages are dictionaries: seq, us, bytes, x, uniform, topic.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from fractions import Fraction

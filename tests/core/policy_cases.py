@@ -1,7 +1,5 @@
 """Short runs of policies that their tests follow step by step."""
 
-from __future__ import annotations
-
 import numpy as np
 from cases import log, order
 

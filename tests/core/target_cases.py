@@ -3,8 +3,6 @@
 Gaps in ``x`` (motion) or ``seq`` (messages).
 """
 
-from __future__ import annotations
-
 from thinning_cases import fits, gaps_left, least_gap, places
 
 from bufgym.policies import ACCEPT, REJECT

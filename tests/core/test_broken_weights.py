@@ -1,7 +1,5 @@
 """Broken files of weights: whatever is wrong with one is said in one line, and nothing of it is used."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A byte limit B: an eviction that does not make room enough is carried out, and the policy is asked again."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

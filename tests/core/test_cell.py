@@ -1,7 +1,5 @@
 """The cell: sharing worked by hand, against the twins, and the one robot that must not notice that it is a cell."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The clairvoyant: as good as the best of all decision sequences, and never beaten."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import naive_oracle

@@ -1,7 +1,5 @@
 """A client of many topics: what it draws, its file, and every mistake in one line."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Machine code rests on what a kernel calls and reads, and on nothing else."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

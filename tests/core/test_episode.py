@@ -1,7 +1,5 @@
 """Episodes, of one robot and of a cell: checked when they are made, as kernels index by them and count in 64 bits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

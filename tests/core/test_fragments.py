@@ -1,7 +1,5 @@
 """Middleware that sends in fragments, and WebRTC's frame dropper: worked by hand, and beside what a real one did."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from cases import log, order

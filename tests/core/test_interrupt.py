@@ -1,7 +1,5 @@
 """Ctrl-C is answered within a second while a kernel works, and what a kernel's thread raises arrives."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Where compiled code is kept: it rests on the sources as they are, and neither damage nor a lack of room is fatal."""
 
-from __future__ import annotations
-
 import gc
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Learned policies decide as their weights say: against a slow twin, a fixed policy, and the network they came from."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """Learned schedulers decide as their weights say; ``test_weights`` has their files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a run was worth, worked by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

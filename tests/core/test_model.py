@@ -1,7 +1,5 @@
 """The model: the bounded buffer against a list, the link against exact fractions, and V's rules (Eq. 3-6)."""
 
-from __future__ import annotations
-
 import math
 
 import naive

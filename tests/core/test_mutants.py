@@ -1,7 +1,5 @@
 """Behaviour that small bugs, planted at random (``.ci/mutants``), were free to change. Numbers worked by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from cases import newcomer, queue_of, trace

@@ -1,7 +1,5 @@
 """What is observed of one queue and of several topics: event by event against a twin, written from their tables."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

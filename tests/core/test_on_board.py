@@ -1,7 +1,5 @@
 """Fields of what a robot has on board: the link's rate by hand and against the twin, and gaps counted in messages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import naive

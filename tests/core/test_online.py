@@ -1,7 +1,5 @@
 """The online optimum: against brute force, against every policy, and played."""
 
-from __future__ import annotations
-
 import math
 from itertools import combinations
 from typing import Any

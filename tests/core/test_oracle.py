@@ -1,7 +1,5 @@
 """Optima: the oracle of one interruption, that over a small link, and plans for small queues."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -1,7 +1,5 @@
 """A scenario, a link and a V of one's own: by name, as text, checked; and ``bufgym bench`` with them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The planner: its programme against a search of every plan, its futures by hand, and where it leaves to a rule."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Drop policies by hand: AFR's figures step by step, what chance may do, and what each keeps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The registry: what holds for every policy, beside its slow twin too, policies of one's own, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import naive

@@ -1,7 +1,5 @@
 """Each policy's own figures: what its paper, specification or program says it does, worked by hand."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A policy only reads what it sees: in Python a write is refused, compiled ones are found out after the run."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scenarios: every draw keeps to its parameters, and two policies meet the same episode."""
 
-from __future__ import annotations
-
 from dataclasses import FrozenInstanceError, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Schedulers against their slow twins, and every policy on several topics: nothing is lost on any of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import naive_schedulers

@@ -1,7 +1,5 @@
 """Schedulers and Robofleet's rivals: each rule worked by hand."""
 
-from __future__ import annotations
-
 import naive_schedulers
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The sender: every event worked by hand. ``test_topics_twin`` and ``test_policy_twins`` hold it beside its twin."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from cases import log, order, trace

@@ -1,7 +1,5 @@
 """The suites: every split builds, splits share nothing, and no embedded suite changes unnoticed."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import re

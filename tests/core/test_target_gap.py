@@ -1,7 +1,5 @@
 """Rules that look at gaps: towards the gap that link and room can carry, and thinned on a steady link."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import fragment_cases

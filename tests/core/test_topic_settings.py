@@ -1,7 +1,5 @@
 """Settings of topics and of the in-flight window that are refused."""
 
-from __future__ import annotations
-
 import pytest
 from cases import order
 from test_topics import V, after_run, episode

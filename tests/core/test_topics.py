@@ -1,7 +1,5 @@
 """The sender with topics, worked by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from cases import log, order, trace

@@ -1,7 +1,5 @@
 """The sender with topics: event by event against its twin, and what must hold whatever is decided."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Files of weights: what is written comes back bit for bit, and whatever cannot be read again is not written."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The slow twin of ``bufgym.policies.thinning``; gaps in ``x`` (motion) or ``seq`` (messages)."""
 
-from __future__ import annotations
-
 import itertools
 
 from bufgym.policies import REJECT

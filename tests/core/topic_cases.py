@@ -1,7 +1,5 @@
 """Random episodes with topics, each for the package and for its twin in ``naive_sender``."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Random weights of learned policies and their files, for the tests of both kinds."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

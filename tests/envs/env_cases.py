@@ -1,7 +1,5 @@
 """What the tests of environments share: comparing, choosing valid actions, reading pictures."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

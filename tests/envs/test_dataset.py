@@ -1,7 +1,5 @@
 """Data sets: what is recorded, written by Minari, and read again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

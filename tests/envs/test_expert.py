@@ -1,7 +1,5 @@
 """Experts: values that hold for every sequence of actions, and policies that say what they would do."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

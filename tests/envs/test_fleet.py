@@ -1,7 +1,5 @@
 """Fleet environments: PettingZoo's own checks, and that they are the rows and rollouts that are tested elsewhere."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Observations that are handed out again once nobody holds them, and never before."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Episodes by their numbers in a benchmark, suites as environments, what an episode was worth, arguments as text."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

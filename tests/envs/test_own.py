@@ -1,7 +1,5 @@
 """Observation fields and reward terms of one's own: worked by hand, compiled as uncompiled, a batch as its rows."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

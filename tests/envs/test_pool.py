@@ -1,7 +1,5 @@
 """A pool: episodes that are drawn once and come again, the same in every environment that has one."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any
 

@@ -1,7 +1,5 @@
 """PufferLib's native environment: the rows of the batch, written into the caller's own arrays."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pictures of an episode: what they say, that they change nothing, and that no odd case breaks them."""
 
-from __future__ import annotations
-
 import re
 import sys
 from typing import Any

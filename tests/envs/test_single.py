@@ -1,7 +1,5 @@
 """The single environment: Gymnasium's own checks, rewards worked by hand, masks, observations, wrong use."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``bufgym/Topics-v0``: two kinds of event, worked by hand, on copies of the sender, and in Gymnasium's forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

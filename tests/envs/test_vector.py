@@ -1,7 +1,5 @@
 """The batched environment: row i is the single environment with row i's seed, bit for bit, in Gymnasium's own forms."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

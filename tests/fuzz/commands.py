@@ -1,7 +1,5 @@
 """Command lines drawn from the parser itself: each ends in 0, or in 2 with one line; the work itself is left out."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib

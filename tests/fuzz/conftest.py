@@ -1,7 +1,5 @@
 """What fuzzing reads lies beside the other tests' helpers."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 The Hypothesis profile decides: more each night, and others.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import signal

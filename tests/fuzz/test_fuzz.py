@@ -3,8 +3,6 @@
 A failure names the seed and the number of its input. Each night has 10,000 files of each kind and 1,000 command lines.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import os

@@ -4,8 +4,6 @@ In a commit's tests, without processes: `test_a_run_that_was_killed_goes_on_wher
 and, for a training, `test_a_killed_run_goes_on_from_its_checkpoint` in test_train.py.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import signal

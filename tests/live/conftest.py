@@ -1,7 +1,5 @@
 """A broker of MQTT for the tests that want one, and quick reconnects for all."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A queue on a link of a test's own, where every time is an argument; and which transports there are here."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable

@@ -1,7 +1,5 @@
 """``bufgym live``, as a user types it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

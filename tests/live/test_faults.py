@@ -1,7 +1,5 @@
 """What goes wrong on a robot: no deadlock, no duplicate, order kept, memory bounded; it connects again by itself."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

@@ -1,7 +1,5 @@
 """Robofleet's figures on real sockets: the same messages, and what became of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

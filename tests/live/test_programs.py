@@ -1,7 +1,5 @@
 """The programs of an episode on ROS, without ROS."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import subprocess

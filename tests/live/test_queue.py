@@ -1,7 +1,5 @@
 """The live queue, by hand and against the simulator: its log, replayed, makes the same decisions bit for bit."""
 
-from __future__ import annotations
-
 import gc
 import math
 import weakref

@@ -1,7 +1,5 @@
 """ROS 1: a policy's queue inside rospy. Nodes run where rospy and rosmaster are; the connection alone everywhere."""
 
-from __future__ import annotations
-
 import json
 import socket
 import subprocess

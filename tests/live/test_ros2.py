@@ -1,7 +1,5 @@
 """ROS 2: the relay and the publisher. Nodes run where rclpy is; what the relay says of a topic everywhere."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

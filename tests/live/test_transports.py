@@ -1,7 +1,5 @@
 """Queues on real sockets, over shaped links: as in the simulator, and worse where the system's buffers hide a queue."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import json

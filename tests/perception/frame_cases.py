@@ -1,7 +1,5 @@
 """Small recordings of a depth camera, written to folders, and sequences held in memory."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Slow and obvious twins of the kernels in bufgym/perception/tsdf.py and icp.py."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bufgym.perception.frames import Camera, Depth

@@ -1,7 +1,5 @@
 """Recordings of depth cameras: read as they were written, and one clear error for each way in which they are broken."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Maps: a flat wall worked by hand, a slow twin, the error of a shifted plane, and the same bits every time."""
 
-from __future__ import annotations
-
 import frame_cases
 import naive_tsdf
 import numpy as np

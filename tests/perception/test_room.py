@@ -1,7 +1,5 @@
 """The made-up room: depths worked by hand, a Kinect's steps and shadows, and the same frames for the same seed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import frame_cases  # noqa: F401  skips where the extra is absent

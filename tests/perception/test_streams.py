@@ -1,7 +1,5 @@
 """Frames sent over a link, what arrives, how much of it is new, and which frames images call similar."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

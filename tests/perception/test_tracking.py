@@ -1,7 +1,5 @@
 """Tracking: a known movement is found again, a gap that is too long is a failure, and its kernels as worked by hand."""
 
-from __future__ import annotations
-
 import functools
 
 import frame_cases

@@ -1,7 +1,5 @@
 """`bufgym/Mapping-v0`: its rewards are what the frames that arrived are worth."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """One relay for each module of tests, and for each test a corner of it that no other test uses."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import sys

@@ -6,8 +6,6 @@ Three nodes know the second. A program at the first publishes 50 kB at 100 Hz, a
 the second is killed (-9), and with NATS in another run the third's server, which starts again after a second.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -6,8 +6,6 @@ Needs Playwright and a Chromium. The relay has a process of its own, with robots
 pose, a scan and a picture ten times a second each. ``--robots 0``: what the machine drops of an empty page.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import json

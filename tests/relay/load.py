@@ -7,8 +7,6 @@ The relay has a process of its own; robots and viewers share another. So that th
 robots send frames that are made beforehand, and viewers read no more of a frame than its header.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib

@@ -1,7 +1,5 @@
 """A relay in the test's own loop, and clients that say exactly what they are told to."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import socket

@@ -3,8 +3,6 @@
 node --/chatter, /odom--> ``bufgym relay robot`` --> relay --> viewer; viewer --/robots/r/to/speech--> node
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os

@@ -1,7 +1,5 @@
 """Configurations: the example is read, each fault is named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

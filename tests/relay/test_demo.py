@@ -1,7 +1,5 @@
 """The demonstration does not wait for the compiler: its page is there at once, and its robots uncompiled."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import signal

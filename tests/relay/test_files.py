@@ -1,7 +1,5 @@
 """What the relay writes: recordings that other commands read, an audit log that does not grow for ever."""
 
-from __future__ import annotations
-
 import base64
 import json
 from pathlib import Path

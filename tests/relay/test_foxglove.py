@@ -1,7 +1,5 @@
 """Foxglove's protocol, as Foxglove speaks it: channels are advertised, and their messages come."""
 
-from __future__ import annotations
-
 import json
 import struct
 from typing import Any

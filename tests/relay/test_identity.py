@@ -1,7 +1,5 @@
 """Who is at the other end: tokens of a local issuer whose keys change, certificates, TLS."""
 
-from __future__ import annotations
-
 import datetime
 import ipaddress
 import json

@@ -1,7 +1,5 @@
 """Three relays that share topics: robots at one, viewers at another; one is killed; commands arrive once."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import ipaddress

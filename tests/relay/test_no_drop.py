@@ -1,7 +1,5 @@
 """Messages of which nothing may be lost: exactly once, over reconnects of either side and kills of the relay."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools

@@ -1,7 +1,5 @@
 """The page in a browser: robots, map, senses, queue, a command, a recording; on a desk and on a phone."""
 
-from __future__ import annotations
-
 import asyncio
 import queue
 import shutil

@@ -1,7 +1,5 @@
 """What waits for a subscriber, and that a slow one slows nobody."""
 
-from __future__ import annotations
-
 import pytest
 from relay_cases import Corner, Server, relay, settings
 

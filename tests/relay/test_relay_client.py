@@ -1,7 +1,5 @@
 """The client: what the relay has not answered, by hand; a queue over a link that breaks; tokens and addresses."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import AsyncIterator

@@ -3,8 +3,6 @@
 A hundred of each in a commit; ten thousand in the night.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import random

@@ -1,7 +1,5 @@
 """Robofleet's released clients, played from its published schema."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import random

@@ -1,7 +1,5 @@
 """Robots: what a made-up one sees, how a queue is told, recordings, commands."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

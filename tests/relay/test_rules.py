@@ -3,8 +3,6 @@
 A hundred configurations in a commit; ten thousand in the night.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ipaddress
 import itertools

@@ -1,7 +1,5 @@
 """Robots and viewers at one relay: who gets what, and what is refused."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

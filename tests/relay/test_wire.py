@@ -1,7 +1,5 @@
 """Frames byte by byte, and what is none."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

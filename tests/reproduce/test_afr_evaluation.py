@@ -1,7 +1,5 @@
 """Fig. 6 to 8 of the AFR paper: facts of the recorded link, the policies' order, and small runs without recordings."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What the AFR paper states, against the simulator: Fig. 4 step by step, Fig. 5, Theorems 1-3, Eq. 9."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figures on frames that are mapped and tracked: tasks that are kept, the sweep, what the texts say of the numbers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

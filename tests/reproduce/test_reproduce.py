@@ -1,7 +1,5 @@
 """The door to the figures: names, options, files."""
 
-from __future__ import annotations
-
 import csv
 import re
 import sys

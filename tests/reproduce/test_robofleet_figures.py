@@ -1,7 +1,5 @@
 """Robofleet's Fig. 3 to 7: cases worked by hand, the paper's claims where they hold here, and options."""
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Any

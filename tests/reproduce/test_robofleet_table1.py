@@ -1,7 +1,5 @@
 """Sizes of ROS messages, encoded: counted by hand, decoded again, and beside the Robofleet paper's Table I."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math

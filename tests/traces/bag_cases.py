@@ -1,7 +1,5 @@
 """Small recordings written with the libraries that robots' recorders use."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """An HTTP server for tests that cuts connections, lies, stalls and changes its mind; and a data set that it serves."""
 
-from __future__ import annotations
-
 import hashlib
 import http.server
 import random

@@ -1,7 +1,5 @@
 """What the tests of link files share: a file of each format, and small helpers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bufgym.traces import Trace

@@ -1,7 +1,5 @@
 """Archives from strangers: zips read as traces, and archives unpacked inside their folder or refused."""
 
-from __future__ import annotations
-
 import io
 import random
 import re

@@ -1,7 +1,5 @@
 """Recordings of robots, in every container: the same drive reads the same, and what is broken or too much says so."""
 
-from __future__ import annotations
-
 import lzma
 import math
 import os

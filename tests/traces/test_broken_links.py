@@ -1,7 +1,5 @@
 """Broken bandwidth traces: each error names the file, the line, the value and the rule; limits hold."""
 
-from __future__ import annotations
-
 import gzip
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files fetched over a network: resumed where they were cut, checked against their sum, never patched together."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import io

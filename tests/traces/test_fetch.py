@@ -1,7 +1,5 @@
 """Public data sets in the cache folder, fetched by several at once or by hand; their table, and the command."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import re

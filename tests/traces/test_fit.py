@@ -1,7 +1,5 @@
 """The fit recovers the generator's parameters, and the comparison distinguishes a link from other ones."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Links, motions and frame sizes from a seed: rules worked by hand, chance by its laws."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Camera trajectories of every format to motion, with numbers worked by hand; and real ones."""
 
-from __future__ import annotations
-
 import gzip
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Bandwidth traces from files: numbers worked by hand in every format; and `trace info|plot|validate|convert`."""
 
-from __future__ import annotations
-
 import gzip
 import zipfile
 from pathlib import Path

@@ -5,8 +5,6 @@ as `describe` does. Where it goes by another rule than the reader, the differenc
 are read by the test of the committed fits.
 """
 
-from __future__ import annotations
-
 import csv
 import gzip
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What comes with bufgym: made by the calls that are stated, by the same generators as the command `generate` has."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A trace's rules and numbers, worked by hand; and written to files: exactly, or with a loss that is stated."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

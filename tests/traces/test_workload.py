@@ -1,7 +1,5 @@
 """Workloads: in and out of CSV files, summed up by topic, and played over a link."""
 
-from __future__ import annotations
-
 import gzip
 import math
 from pathlib import Path
