@@ -22,6 +22,7 @@ from bufgym.cli.options import Parser
 from bufgym.envs import SenderVectorEnv
 from bufgym.envs.step import decision_of
 from bufgym.errors import BufgymError
+from bufgym.kernel import named
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.observe import (
@@ -41,7 +42,7 @@ from bufgym.policies import weights as weights_file
 from bufgym.policies.learned import NAMES, Network, Weights
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Interruption
-from bufgym.sim import named, python_view, run
+from bufgym.sim import python_view, run
 from bufgym.sim.metrics import outcome
 
 kernels = pytest.mark.kernels

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from topic_cases import TWIN_V, TopicCase, topic_cases
 
+from bufgym.kernel import named
 from bufgym.model.buffer import ACCEPT, UNLIMITED_BYTES
 from bufgym.model.link import Link
 from bufgym.model.qoi import saturating
@@ -22,7 +23,7 @@ from bufgym.observe import (
     observe_topic_slots,
 )
 from bufgym.scenario import Episode, messages
-from bufgym.sim import DECISION, END, Senders, decide, named, next_event, python_view
+from bufgym.sim import DECISION, END, Senders, decide, next_event, python_view
 from bufgym.traces import Trace
 
 SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
