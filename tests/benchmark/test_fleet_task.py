@@ -49,18 +49,6 @@ def test_rows_of_a_cell_worked_by_hand() -> None:
         assert (row["delivered"], row["dropped"], row["qoi"]) == (2, 1, pytest.approx(1.5))
 
 
-def test_a_fleet_of_one_has_the_rows_of_the_benchmark_for_one() -> None:
-    uplink = replace(ONE, scale=0.3, duration_s=40.0, random_offset=True, jitter=0.5)
-    chosen = [policies.get(name) for name in ("afr", "random")]
-    mine = run(chosen, FleetScenario(1, uplink), [2, 4], [3, 8], label="s")
-    alone = run(chosen, uplink, [2, 4], [3, 8], label="s", bound=False)
-    names = [name for name in ROWS if name not in ("robots", "robot")]
-    place = ("capacity", "policy", "seed")
-    for rows in (mine, alone):
-        rows.sort(key=lambda row: [row[name] for name in place])
-    assert [[row[name] for name in names] for row in mine] == [[row[name] for name in names] for row in alone]
-
-
 def made(policy: str, *teams: tuple[float, ...], capacity: int = 4, scenario: str = "s") -> list[Row]:
     return [
         {"scenario": scenario, "trace": "t", "seed": seed, "policy": policy, "capacity": capacity, "robot": r, "qoi": h}

@@ -204,7 +204,7 @@ async def traced(port: int, robots: int, seconds: float) -> Any:
 
 
 async def page(robots: int, seconds: float) -> None:
-    async with relay() as (pid, port), beside(*(robot(port, number) for number in range(robots))):
+    async with relay() as (_, port), beside(*(robot(port, number) for number in range(robots))):
         await asyncio.sleep(5.0)  # until the policy is compiled
         events = await traced(port, robots, seconds)
     begun, dropped = (sum(event["name"] == name for event in events) for name in ("BeginFrame", "DroppedFrame"))

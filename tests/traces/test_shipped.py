@@ -4,11 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli_cases import Capsys, fails, shown
 
 from bufgym import traces
-from bufgym.cli import trace_generate
-from bufgym.cli.options import Parser
-from bufgym.errors import BufgymError, TraceError
+from bufgym.errors import TraceError
 from bufgym.traces import describe, drive_motion, load, load_motion, outage, read_motion, read_trace, synthetic_lte
 from bufgym.traces.generate.shipped import SHIPPED_LTE, shipped_calls, write_shipped
 
@@ -50,14 +49,10 @@ def test_shipped_names_and_loading(tmp_path: Path) -> None:
         read_motion(names["lte-synthetic-0"])
 
 
-def generate(*arguments: str) -> None:
-    parser = Parser(prog="bufgym trace")
-    trace_generate.add(parser.add_subparsers(required=True))
-    options = parser.parse_args(["generate", *arguments])
-    options.command(options)
+GENERATE = ["trace", "generate"]
 
 
-def test_the_command_writes_traces_motion_and_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_traces_motion_and_frames(tmp_path: Path, capsys: Capsys) -> None:
     for arguments in (
         "link --mode train --seed 4 --duration 50 --mean 8e6",
         "gilbert-elliott --seed 4 --duration 50 --mean-bad 1",
@@ -66,20 +61,19 @@ def test_the_command_writes_traces_motion_and_frames(tmp_path: Path, capsys: pyt
         "ramp --duration 50",
         "tunnel --before 15 --after 20",
     ):
-        generate(*arguments.split(), "-o", str(tmp_path / "a.csv"))
+        assert "mean" in shown([*GENERATE, *arguments.split(), "-o", tmp_path / "a.csv"], capsys)
         assert read_trace(tmp_path / "a.csv").duration_us == 50_000_000
-        assert "mean" in capsys.readouterr().out
-    generate("drive", "--seed", "1", "--duration", "20", "--cruise", "1,1", "-o", str(tmp_path / "m.csv"))
+    drive = ["drive", "--seed", "1", "--duration", "20", "--cruise", "1,1", "-o", tmp_path / "m.csv"]
+    shown([*GENERATE, *drive], capsys)
     assert read_motion(tmp_path / "m.csv").duration_us == 20_000_000
-    generate("frames", "--motion", str(tmp_path / "m.csv"), "--duration", "2", "-o", str(tmp_path / "f.csv"))
+    frames = ["frames", "--motion", tmp_path / "m.csv", "--duration", "2", "-o", tmp_path / "f.csv"]
+    assert "60 frames" in shown([*GENERATE, *frames], capsys)
     header, *lines = (tmp_path / "f.csv").read_text().splitlines()
     assert header == "time_s,bytes,x" and len(lines) == 60
     assert float(lines[-1].split(",")[2]) == pytest.approx(load_motion(tmp_path / "m.csv").at(1_966_667))
-    assert "60 frames" in capsys.readouterr().out
     for arguments, says in (
         ("drive --cruise 2,1 -o x.csv", "must not be above the second"),
         ("drive --cruise 2 -o x.csv", "must be two numbers"),
         ("link --mode bus --links no.json -o x.csv", "no.json: cannot be read"),
     ):
-        with pytest.raises(BufgymError, match=says):
-            generate(*arguments.split())
+        fails([*GENERATE, *arguments.split()], says, capsys)
