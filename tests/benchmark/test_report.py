@@ -142,36 +142,27 @@ def test_a_folder_must_hold_a_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("name", "text", "complaint"),
     [
-        ('{"format": 2,\n', ", line 2: must be JSON"),
-        ("[]", ": must be a JSON object"),
-        ('{"format": 1}', ": format = 1: must be 2"),
-        ({"scenarios": {"a": 1}}, ": scenarios.a must be an object"),
-        ({"task": "chess"}, ": task = chess: must be one of queue, stress, topics, fleet"),
-        (json.dumps({k: v for k, v in MANIFEST.items() if k != "command"}), ": no command"),
+        ("manifest", '{"format": 2,\n', "manifest.json, line 2: must be JSON"),
+        ("manifest", "[]", "manifest.json: must be a JSON object"),
+        ("manifest", '{"format": 1}', "manifest.json: format = 1: must be 2"),
+        ("manifest", {"scenarios": {"a": 1}}, "manifest.json: scenarios.a must be an object"),
+        ("manifest", {"task": "chess"}, "manifest.json: task = chess: must be one of queue, stress, topics, fleet"),
+        ("manifest", json.dumps(MANIFEST).replace('"command"', '"commands"'), "manifest.json: no command"),
+        ("timeline", {"x": [0.0]}, "arrival_s and x must have one entry a message"),
+        ("timeline", {"x": [0.0, 1.0, 2.0, 3.0, 4.0, math.nan]}, "NaN: numbers must be finite"),
+        ("timeline", {"rate": {"t_s": [0.0], "bytes_per_s": []}}, "must be of one length"),
+        ("timeline", {"policies": {"afr": {"qoi": 1.0, "received": [[6, 0, 0]], "dropped": []}}}, "a message 0..5"),
+        ("timeline", {"policies": {"afr": {"received": [], "dropped": []}}}, "timeline.json: no policies.afr.qoi"),
     ],
 )
-def test_a_broken_manifest_is_refused(folder: Path, text: str | dict[str, Any], complaint: str) -> None:
-    text = text if isinstance(text, str) else json.dumps({**MANIFEST, **text})
-    (folder / "manifest.json").write_text(text, encoding="utf-8")
-    assert f"manifest.json{complaint}" in refusal(folder)
-
-
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        ({"x": [0.0]}, "arrival_s and x must have one entry a message"),
-        ({"x": [0.0, 1.0, 2.0, 3.0, 4.0, math.nan]}, "NaN: numbers must be finite"),
-        ({"rate": {"t_s": [0.0], "bytes_per_s": []}}, "must be of one length"),
-        ({"policies": {"afr": {"qoi": 1.0, "received": [[6, 0.0, 0.0]], "dropped": []}}}, "a message 0..5"),
-        ({"policies": {"afr": {"received": [], "dropped": []}}}, "timeline.json: no policies.afr.qoi"),
-    ],
-)
-def test_a_broken_timeline_is_refused(folder: Path, changes: dict[str, Any], complaint: str) -> None:
-    (folder / "timeline.json").write_text(json.dumps({**TIMELINE, **changes}), encoding="utf-8")
+def test_broken_json_is_refused(folder: Path, name: str, text: str | dict[str, Any], complaint: str) -> None:
+    whole = {"manifest": MANIFEST, "timeline": TIMELINE}[name]
+    text = text if isinstance(text, str) else json.dumps(whole | text)
+    (folder / f"{name}.json").write_text(text, encoding="utf-8")
     found = refusal(folder)
-    assert complaint in found and "timeline.json" in found
+    assert complaint in found and f"{name}.json" in found
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "rows.csv", "timeline.json"])
