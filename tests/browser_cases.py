@@ -1,5 +1,7 @@
-"""A page in a real browser, and all that it says and asks for."""
+"""Pages: their data, and in a real browser all that they say and ask for."""
 
+import json
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,23 +14,43 @@ QUIET = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "-
 QUIET += ["--disable-component-update", "--disable-sync"]
 
 
+def embedded(page: str, pattern: str = r'<script type="application/json" id="figures">(.*?)</script>') -> Any:
+    """The data in a page's text, of which nothing ends its script."""
+    (found,) = re.findall(pattern, page, re.MULTILINE)
+    assert "<" not in found
+    return json.loads(found)
+
+
 @contextmanager
-def opened(file: Path, scheme: str, width: int) -> Iterator[Any]:
-    """The page of a file; it must complain of nothing, load nothing else, and fit the window's width."""
+def browsing() -> Iterator[Any]:
+    """A browser; skips where there is none."""
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("no chromium on this machine")
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with playwright.sync_playwright() as play, play.chromium.launch(executable_path=chromium, args=QUIET) as browser:
+        yield browser
+
+
+@contextmanager
+def shows(browser: Any, address: str, scheme: str = "light", width: int = 1360) -> Iterator[Any]:
+    """The page at an address; it must complain of nothing, load nothing from elsewhere, and fit the window's width."""
+    page = browser.new_page(color_scheme=scheme, viewport={"width": width, "height": 800})
     said: list[str] = []
     asked: list[str] = []
-    with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=QUIET)
-        page = browser.new_page(color_scheme=scheme, viewport={"width": width, "height": 800})
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
-        page.goto(file.as_uri())
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(address)
+    yield page
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    page.close()
+    assert [text for text in said if "willReadFrequently" not in text] == []  # said of what reads a canvas here
+    assert all(url.startswith((address, "data:", "blob:")) for url in asked)
+
+
+@contextmanager
+def opened(file: Path, scheme: str, width: int) -> Iterator[Any]:
+    """The page of a file."""
+    with browsing() as browser, shows(browser, file.as_uri(), scheme, width) as page:
         yield page
-        assert page.evaluate("document.documentElement.scrollWidth") == width
-        browser.close()
-    assert said == [] and [url for url in asked if not url.startswith("data:")] == [file.as_uri()]

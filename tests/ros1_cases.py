@@ -1,8 +1,10 @@
-"""Where ROS 1 is, for the tests that run nodes of it."""
+"""Where ROS 1 is, and how nodes of either ROS are run as programs."""
 
 import os
+import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 REPO = Path(__file__).resolve().parents[1]
 SYSTEM = Path("/usr/lib/python3/dist-packages")
@@ -19,3 +21,11 @@ def environment(folder: Path) -> dict[str, str]:
                 (own / package.name).symlink_to(package)
     places = [REPO, own, *(place for place in sys.path if place.endswith("site-packages")), SYSTEM]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, places)), "ROS_LOG_DIR": str(folder)}
+
+
+def played(where: dict[str, str], *words: Any) -> str:
+    """What a program of this Python prints, which ends well."""
+    command = [sys.executable, *map(str, words)]
+    done = subprocess.run(command, env=where, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout

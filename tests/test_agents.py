@@ -17,11 +17,10 @@ from train_cases import DropOldest
 from agents import ablation, mixed_env, runs, training
 from agents.dqn import INVALID, valid_actions
 from agents.evaluation import EvaluationSet, sweep_for
-from agents.settings import MOTION, Settings
+from agents.settings import Settings
 from bufgym import policies
 from bufgym.benchmark.run import draw
 from bufgym.model.qoi import exponential
-from bufgym.policies import learned
 from bufgym.sb3 import GymVecEnv
 from bufgym.sb3.networks import SlotExtractor, SlotScorer
 from bufgym.scenario import Interruption
@@ -226,19 +225,7 @@ def test_the_best_validation_is_the_earliest_of_equals(tmp_path: Path) -> None:
     assert [validations.due(steps) for steps in (30, 40, 49, 50)] == [False, True, True, True]
 
 
-GIVEN = Settings(suite=ablation.SUITES, algo="evolution", name="parts", hidden=4, warm_up=10)
 HEAD = "steps,seconds,score,regret,over_afr,over_rivals\n"
-
-
-def test_each_variant_lacks_what_its_name_says() -> None:
-    made = ablation.variants(GIVEN)
-    assert len({variant.name for variant in made.values()}) == len(made)
-    assert made["everything"].observed == MOTION and made["one scorer for all links"].warm_up == 0
-    for name, left_out in ablation.WITHOUT.items():
-        assert {*MOTION} - {*made[name].observed} == {*left_out} <= {*learned.NAMES}
-    for hidden, still in ablation.HIDDEN:
-        variant = made[f"{hidden} hidden units where the link moves, {still} where it stands still"]
-        assert (variant.hidden, variant.still_hidden, variant.warm_up) == (hidden, still, 10)
 
 
 def run_of(folder: Path, name: str, algo: str, validations: dict[int, str]) -> Path:

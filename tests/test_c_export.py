@@ -116,7 +116,7 @@ def play_in_c(folder, policy, L, episodes, value=EXPONENTIAL, B=None, text=None,
     return tuple(map(int, output(program, folder / "calls").split()))
 
 
-def check(folder, policy, decisions, settings=SETTINGS, flags=()):
+def check(folder, policy, decisions, settings, flags):
     for k, (L, value, B) in enumerate(settings):
         rng = np.random.default_rng(k)
         n = 1_000 if JIT else 40
@@ -126,15 +126,12 @@ def check(folder, policy, decisions, settings=SETTINGS, flags=()):
         assert made >= n * len(episodes)
 
 
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", [*SUPPORTED, *AGENTS])
-def test_it_decides_in_c_as_in_python(name, tmp_path):
-    check(tmp_path, AGENTS.get(name) or policies.get(name), 2_000, SETTINGS[3:], ["-O0"])
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", [*SUPPORTED, *AGENTS])
-def test_it_decides_in_c_as_in_python_a_million_times(name, tmp_path):
-    check(tmp_path, AGENTS.get(name) or policies.get(name), 250_000 if name in AGENTS else 20_000)
+def test_it_decides_in_c_as_in_python(name, whole, tmp_path):
+    """A million decisions in the night."""
+    most = (250_000 if name in AGENTS else 20_000, SETTINGS, []) if whole else (2_000, SETTINGS[3:], ["-O0"])
+    check(tmp_path, AGENTS.get(name) or policies.get(name), *most)
 
 
 @pytest.mark.parametrize("L", [1, 2, 3, 4])

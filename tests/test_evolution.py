@@ -12,7 +12,6 @@ import pytest
 from safetensors.numpy import load_file
 from train_cases import columns, in_a_folder_of_its_own  # noqa: F401
 
-import train
 from agents import training
 from agents.cma_es import Evolution
 from agents.mixed_env import Cell, cells
@@ -169,15 +168,14 @@ def test_the_scorer_of_a_still_link_is_stateed_alone_with_its_own_hidden_layer()
 
 
 @pytest.mark.nightly
-def test_a_run_leaves_an_agent_goes_on_after_a_kill_and_repeats(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_goes_on_after_a_kill_and_repeats() -> None:
+    """What it leaves behind, test_train.py shows for every algorithm."""
     few = replace(TINY, steps=38_000, validate_every=19_000, validation_episodes=6, test_seeds=2)
-    train.main(few)
-    home = Path("runs/tiny/seed-0")
-    whole, notes = weights.read(home / MODEL)
+    folder = prepare(few)
+    training.train_all(few, folder)
+    whole, notes = weights.read(folder / "seed-0" / MODEL)
     assert (notes["algo"], notes["suite"]) == ("evolution", "interruption-v1")
-    assert "agent (evolution)" in capsys.readouterr().out
-    assert Path("runs/tiny/model.safetensors").read_bytes() == (home / MODEL).read_bytes()
-    rows = columns(home / "validation.csv", "steps", "regret")
+    rows = columns(folder / "seed-0" / "validation.csv", "steps", "regret")
     assert rows[0][0] == 0 and rows[-1][0] >= few.steps and all(0 <= regret < 1 for _, regret in rows)
     # Half of the steps, then the rest: the same agent to the last bit.
     half = replace(few, name="half", steps=few.steps // 2)

@@ -1,12 +1,9 @@
 """The gallery: films show what the simulator says, and the interactive page holds bufgym's own numbers."""
 
-import json
-import re
 from pathlib import Path
-from typing import Any
 
 import pytest
-from browser_cases import opened
+from browser_cases import embedded, opened
 
 from bufgym import gallery
 from bufgym.cli import main
@@ -18,14 +15,6 @@ from bufgym.scenario.numbered import draw
 REPO = Path(__file__).resolve().parent.parent
 FILMS = REPO / "docs" / "gallery"
 MAX_ALL_BYTES = 2_000_000
-
-
-def shipped_data() -> dict[str, Any]:
-    text = (REPO / "docs" / "interactive.html").read_text(encoding="utf-8")
-    found = re.search(r"^const data = (\{.*\});$", text, re.MULTILINE)
-    assert found is not None
-    data: dict[str, Any] = json.loads(found[1])
-    return data
 
 
 def test_an_interruption_second_by_second() -> None:
@@ -58,8 +47,9 @@ def test_the_page_is_what_the_command_writes(tmp_path: Path) -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_browser_shows_them(scheme: str) -> None:
-    data = shipped_data()
-    with opened(REPO / "docs" / "interactive.html", scheme, 390) as page:
+    interactive = REPO / "docs" / "interactive.html"
+    data = embedded(interactive.read_text(encoding="utf-8"), r"^const data = (\{.*\});$")
+    with opened(interactive, scheme, 390) as page:
         page.check("input[name=L][value='4']")
         page.fill("#length", "37")
         shown = page.eval_on_selector_all(".run[data-policy]", ROWS)

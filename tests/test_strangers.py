@@ -11,8 +11,6 @@ from typing import Any
 import pytest
 from cli_cases import Capsys, fails, shown
 
-sys.path.insert(0, str(Path(__file__).parent / "traces"))
-
 from bufgym.benchmark import leaderboard, tuned
 from bufgym.cli import main
 from bufgym.errors import BufgymError, printable

@@ -25,6 +25,13 @@ def bufgym(*words: object, **environment: str) -> subprocess.Popen[str]:
     )
 
 
+def ended(*words: object, **environment: str) -> tuple[int, str, str]:
+    """Its exit code, and what it said on stdout and stderr."""
+    process = bufgym(*words, **environment)
+    out, err = process.communicate()
+    return process.returncode, out, err
+
+
 def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mtime_ns) for path in files}

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from cli_cases import shown
@@ -11,7 +10,7 @@ from sweep_cases import exactly
 from bufgym import policies
 from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.run import run
-from bufgym.benchmark.summary import Summary, plain
+from bufgym.benchmark.summary import plain
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.fleet import ROWS
 from bufgym.errors import BufgymError
@@ -49,18 +48,6 @@ def test_rows_of_a_cell_worked_by_hand() -> None:
         assert (row["delivered"], row["dropped"], row["qoi"]) == (2, 1, pytest.approx(1.5))
 
 
-def test_a_fleet_of_one_has_the_rows_of_the_benchmark_for_one() -> None:
-    uplink = replace(ONE, scale=0.3, duration_s=40.0, random_offset=True, jitter=0.5)
-    chosen = [policies.get(name) for name in ("afr", "random")]
-    mine = run(chosen, FleetScenario(1, uplink), [2, 4], [3, 8], label="s")
-    alone = run(chosen, uplink, [2, 4], [3, 8], label="s", bound=False)
-    names = [name for name in ROWS if name not in ("robots", "robot")]
-    place = ("capacity", "policy", "seed")
-    for rows in (mine, alone):
-        rows.sort(key=lambda row: [row[name] for name in place])
-    assert [[row[name] for name in names] for row in mine] == [[row[name] for name in names] for row in alone]
-
-
 def made(policy: str, *teams: tuple[float, ...], capacity: int = 4, scenario: str = "s") -> list[Row]:
     return [
         {"scenario": scenario, "trace": "t", "seed": seed, "policy": policy, "capacity": capacity, "robot": r, "qoi": h}
@@ -69,16 +56,12 @@ def made(policy: str, *teams: tuple[float, ...], capacity: int = 4, scenario: st
     ]
 
 
-def summary(rows: list[Row], **options: Any) -> Summary:
-    return TASK.summary(rows, **options)
-
-
 HAND = [*made("afr", (4.0, 2.0), (8.0, 6.0)), *made("mine", (7.0, 1.0), (8.0, 8.0))]
 
 
 def test_a_summary_worked_by_hand() -> None:
     """Teams of 3 and 7 under AFR become 4 and 8: one robot of each episode is above its own H, one of four below."""
-    found = summary(HAND)
+    found = TASK.summary(HAND)
     assert [standing.policy for standing in found.overall] == ["mine", "afr"]
     mine, base = found.overall
     assert found.cells == {("s", 4): [mine, base]}
@@ -96,14 +79,14 @@ def test_intervals_are_over_episodes_not_robots() -> None:
     """A hundred robots that all gain alike are one observation: two episodes cannot make the interval narrow."""
     many = 100
     rows = [*made("afr", (1.0,) * many, (1.0,) * many), *made("mine", (1.0,) * many, (3.0,) * many)]
-    mine = summary(rows).standings["mine"]
+    mine = TASK.summary(rows).standings["mine"]
     assert mine["gain"] == (1.0, 0.0, 2.0) and mine["above"] == (0.5, 0.0, 1.0)
 
 
 def test_rounding_is_no_gain_and_nothing_is_fair() -> None:
     nothing = (0.0, 0.0)
     teams = {"afr": (0.1 + 0.2, 0.0), "mine": (0.3, 0.0), "none": nothing}
-    found = summary([row for policy, team in teams.items() for row in made(policy, team, team)]).standings
+    found = TASK.summary([row for policy, team in teams.items() for row in made(policy, team, team)]).standings
     assert found["mine"]["above"] == found["mine"]["below"] == exactly(0.0)
     assert found["none"]["fairness"] == exactly(1.0) and found["none"]["below"] == exactly(0.5)
 
@@ -119,7 +102,7 @@ def test_rounding_is_no_gain_and_nothing_is_fair() -> None:
 )
 def test_rows_that_cannot_be_summed_up(rows: list[Row], message: str) -> None:
     with pytest.raises(BufgymError, match=message):
-        summary(rows)
+        TASK.summary(rows)
 
 
 @pytest.mark.nightly
@@ -132,4 +115,4 @@ def test_the_command_prints_a_table_and_writes_rows(tmp_path: Path, capsys: pyte
     assert ", L = 3\n" in text and "mean of these" not in text and f"36 rows in {out}" in text
     rows = read_rows(out, ROWS)
     assert len(rows) == 6 * 2 * 3 and {row["policy"] for row in rows} == {"drop-oldest", "min-gap", "afr"}
-    assert plain(summary(rows)).splitlines()[3:] == text.splitlines()[7:10]
+    assert plain(TASK.summary(rows)).splitlines()[3:] == text.splitlines()[7:10]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from cli_cases import fails, shown
-from sweep_cases import THREE, bufgym
+from sweep_cases import THREE, bufgym, ended
 
 from bufgym.files import locked
 from bufgym.kernel import announce
@@ -78,9 +78,8 @@ def test_workers_end_with_their_parent(how: signal.Signals, tmp_path: Path) -> N
 def test_a_worker_that_dies_is_one_line_and_a_retry(tmp_path: Path) -> None:
     dead = tmp_path / "dead"
     body = f"Path({str(dead)!r}).exists() or (Path({str(dead)!r}).touch(), os.kill(os.getpid(), signal.SIGKILL))"
-    process = bufgym(*words(policy_file(tmp_path, "frail", body), tmp_path / "out"))
-    out, err = process.communicate()
-    assert process.returncode == 0, err
+    code, out, err = ended(*words(policy_file(tmp_path, "frail", body), tmp_path / "out"))
+    assert code == 0, err
     usual = ("shard/s", announce.NOTICE)  # its progress, and where nothing was compiled yet
     lines = [line for line in err.splitlines() if line.strip() and not any(words in line for words in usual)]
     assert len(lines) == 1 and lines[0].startswith("bufgym: a worker process ended before its work did"), err
@@ -89,10 +88,10 @@ def test_a_worker_that_dies_is_one_line_and_a_retry(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_one_that_always_dies_is_an_error(tmp_path: Path) -> None:
-    process = bufgym(*words(policy_file(tmp_path, "doomed", "os.kill(os.getpid(), 9)"), tmp_path / "out"))
-    _, err = process.communicate()
-    assert process.returncode == 2
-    assert any(line.startswith("bufgym: error: a worker process ended before") for line in err.splitlines()), err
+    code, _, err = ended(*words(policy_file(tmp_path, "doomed", "os.kill(os.getpid(), 9)"), tmp_path / "out"))
+    assert code == 2 and any(
+        line.startswith("bufgym: error: a worker process ended before") for line in err.splitlines()
+    ), err
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,13 +4,12 @@ import dataclasses
 import json
 import math
 import os
-import re
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from browser_cases import opened
+from browser_cases import embedded, opened
 from report_cases import MANIFEST, QOI, TIMELINE, make
 
 from bufgym.benchmark import folder as inputs
@@ -27,13 +26,6 @@ pytest.importorskip("plotly", reason="the report needs plotly")
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     return make(tmp_path / "run")
-
-
-def figures(page: str) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="figures">(.*?)</script>', page)
-    assert found is not None
-    made: dict[str, Any] = json.loads(found[1])
-    return made
 
 
 def test_the_ranking_in_markdown(folder: Path) -> None:
@@ -70,7 +62,7 @@ def test_the_page_says_what_was_run_and_how_to_run_it_again(folder: Path) -> Non
     told += ['<html lang="en">', "<title>bufgym: tiny-v1, test</title>", "not ranked: it knows the future"]
     assert all(words in page for words in [*told, "Drop Oldest loses under 1 % there"])
     assert page.count(' flat"') == 2 * len(QOI)  # both capacities of the good link
-    assert set(figures(page)) == {"ranking", "capacities", "outages", "delays", "timeline", "memory"}
+    assert set(embedded(page)) == {"ranking", "capacities", "outages", "delays", "timeline", "memory"}
     assert report.write(folder).read_text(encoding="utf-8") == page and len(page) < 8e6
 
 
@@ -79,9 +71,7 @@ def test_names_are_shown_as_they_are_written(folder: Path) -> None:
     page = report.write(folder).read_text(encoding="utf-8")
     body = page[page.index("<body>") : page.index('<script type="application/json"')]
     assert "<b></b>" not in body and "</span><b>" not in body and "&lt;b&gt;" in body
-    data = re.search(r'id="figures">(.*?)</script>', page)
-    assert data is not None and "<" not in data[1]
-    (lane,) = (trace for trace in figures(page)["timeline"][""][0]["data"] if trace["type"] == "heatmap")
+    (lane,) = (trace for trace in embedded(page)["timeline"][""][0]["data"] if trace["type"] == "heatmap")
     assert lane["y"] == ["&lt;b&gt;", "afr"]
 
 
@@ -105,7 +95,7 @@ def test_topics_and_fleets_have_a_page_too(
     page = report.write(tmp_path).read_text(encoding="utf-8")
     assert page.count(heading) == 1 + 2 * len(short)
     assert f"{next(iter(changes))} = 2" in page and "not ranked: its queue is unbounded" in page
-    assert "ranking" in figures(page) and "discriminative" not in page
+    assert "ranking" in embedded(page) and "discriminative" not in page
     assert report.markdown(tmp_path).count("\n| # | policy |") == 1 + 2 * len(short)
     assert f"Suite {suite}, validation: " in report.plain(tmp_path)
 
@@ -152,36 +142,27 @@ def test_a_folder_must_hold_a_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("name", "text", "complaint"),
     [
-        ('{"format": 2,\n', ", line 2: must be JSON"),
-        ("[]", ": must be a JSON object"),
-        ('{"format": 1}', ": format = 1: must be 2"),
-        ({"scenarios": {"a": 1}}, ": scenarios.a must be an object"),
-        ({"task": "chess"}, ": task = chess: must be one of queue, stress, topics, fleet"),
-        (json.dumps({k: v for k, v in MANIFEST.items() if k != "command"}), ": no command"),
+        ("manifest", '{"format": 2,\n', "manifest.json, line 2: must be JSON"),
+        ("manifest", "[]", "manifest.json: must be a JSON object"),
+        ("manifest", '{"format": 1}', "manifest.json: format = 1: must be 2"),
+        ("manifest", {"scenarios": {"a": 1}}, "manifest.json: scenarios.a must be an object"),
+        ("manifest", {"task": "chess"}, "manifest.json: task = chess: must be one of queue, stress, topics, fleet"),
+        ("manifest", json.dumps(MANIFEST).replace('"command"', '"commands"'), "manifest.json: no command"),
+        ("timeline", {"x": [0.0]}, "arrival_s and x must have one entry a message"),
+        ("timeline", {"x": [0.0, 1.0, 2.0, 3.0, 4.0, math.nan]}, "NaN: numbers must be finite"),
+        ("timeline", {"rate": {"t_s": [0.0], "bytes_per_s": []}}, "must be of one length"),
+        ("timeline", {"policies": {"afr": {"qoi": 1.0, "received": [[6, 0, 0]], "dropped": []}}}, "a message 0..5"),
+        ("timeline", {"policies": {"afr": {"received": [], "dropped": []}}}, "timeline.json: no policies.afr.qoi"),
     ],
 )
-def test_a_broken_manifest_is_refused(folder: Path, text: str | dict[str, Any], complaint: str) -> None:
-    text = text if isinstance(text, str) else json.dumps({**MANIFEST, **text})
-    (folder / "manifest.json").write_text(text, encoding="utf-8")
-    assert f"manifest.json{complaint}" in refusal(folder)
-
-
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        ({"x": [0.0]}, "arrival_s and x must have one entry a message"),
-        ({"x": [0.0, 1.0, 2.0, 3.0, 4.0, math.nan]}, "NaN: numbers must be finite"),
-        ({"rate": {"t_s": [0.0], "bytes_per_s": []}}, "must be of one length"),
-        ({"policies": {"afr": {"qoi": 1.0, "received": [[6, 0.0, 0.0]], "dropped": []}}}, "a message 0..5"),
-        ({"policies": {"afr": {"received": [], "dropped": []}}}, "timeline.json: no policies.afr.qoi"),
-    ],
-)
-def test_a_broken_timeline_is_refused(folder: Path, changes: dict[str, Any], complaint: str) -> None:
-    (folder / "timeline.json").write_text(json.dumps({**TIMELINE, **changes}), encoding="utf-8")
+def test_broken_json_is_refused(folder: Path, name: str, text: str | dict[str, Any], complaint: str) -> None:
+    whole = {"manifest": MANIFEST, "timeline": TIMELINE}[name]
+    text = text if isinstance(text, str) else json.dumps(whole | text)
+    (folder / f"{name}.json").write_text(text, encoding="utf-8")
     found = refusal(folder)
-    assert complaint in found and "timeline.json" in found
+    assert complaint in found and f"{name}.json" in found
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "rows.csv", "timeline.json"])

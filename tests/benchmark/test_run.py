@@ -235,28 +235,23 @@ def test_other_endings_and_parquet_without_pyarrow_are_refused(tmp_path: Path, m
 
 
 @pytest.mark.parametrize(
-    ("column", "cell", "told"),
+    ("cells", "change", "told"),
     [
-        ("qoi", "many", "qoi = 'many': must be a number"),
-        ("seed", "1.5", "seed = '1.5': must be a number"),
-        ("certified", "yes", "certified = 'yes': must be True or False"),
+        ({"qoi": "many"}, str, "qoi = 'many': must be a number"),
+        ({"seed": "1.5"}, str, "seed = '1.5': must be a number"),
+        ({"certified": "yes"}, str, "certified = 'yes': must be True or False"),
+        ({}, lambda line: line.rsplit(",", 1)[0], f"must have {len(RUNS)} cells, as line 1 has"),
+        ({}, lambda line: f"{line},7", f"must have {len(RUNS)} cells, as line 1 has"),
     ],
 )
-def test_a_bad_cell_is_named_with_its_line(tmp_path: Path, column: str, cell: str, told: str) -> None:
-    """In the third row of a file whose first row's label spans two lines: line 1 + 2 + 1 + 1 = 5."""
-    path = write_rows([row(scenario="two\nlines"), row(), row(**{column: cell})], tmp_path / "rows.csv")
-    with pytest.raises(BufgymError) as caught:
-        read_rows(path)
-    assert str(caught.value) == f"{path}, line 5: {told}"
-
-
-@pytest.mark.parametrize("change", [lambda line: line.rsplit(",", 1)[0], lambda line: f"{line},7"])
-def test_a_line_of_another_length_is_named(tmp_path: Path, change: Any) -> None:
-    path = write_rows([row(), row()], tmp_path / "rows.csv")
+def test_a_broken_line_is_named(tmp_path: Path, cells: Row, change: Any, told: str) -> None:
+    """The third row of a file whose first row's label spans two lines: line 1 + 2 + 1 + 1 = 5."""
+    path = write_rows([row(scenario="two\nlines"), row(), row(**cells)], tmp_path / "rows.csv")
     *rest, last = path.read_text().splitlines()
     path.write_text("\n".join([*rest, change(last)]) + "\n")
-    with pytest.raises(BufgymError, match=rf"rows\.csv, line 3: must have {len(RUNS)} cells, as line 1 has"):
+    with pytest.raises(BufgymError) as caught:
         read_rows(path)
+    assert str(caught.value).startswith(f"{path}, line 5: {told}")
 
 
 @pytest.mark.parametrize(

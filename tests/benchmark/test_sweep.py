@@ -2,14 +2,13 @@
 
 import importlib.util
 import json
-import subprocess
 import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 from cli_cases import Capsys, Patch, shown
-from sweep_cases import THREE, TINY, bufgym, contents, interrupt
+from sweep_cases import THREE, TINY, contents, ended, interrupt
 
 from bufgym import policies
 from bufgym.benchmark import run, sweep
@@ -24,12 +23,6 @@ pytest.importorskip("joblib", reason="a sweep needs joblib")
 
 WORDS = ["bench", "--suite", "interruption-v1", "--policies", ",".join(THREE), "--capacity", "2,4", "--seeds", "3"]
 """The same as ``TINY``, typed."""
-
-
-def ended(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    process = bufgym(*words, **environment)
-    out, err = process.communicate()
-    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
 def rows_in(out: Path, form: str = "csv") -> str:
@@ -63,9 +56,8 @@ def test_other_processes_know_a_users_policy(tmp_path: Path, backend: str, mine:
     words = [word if word != ",".join(THREE) else ",".join(["mine", *THREE]) for word in WORDS]
     words += ["--policy-file", str(mine), "--backend", backend, "--jobs", "2", "--format", "csv"]
     out = tmp_path / "out"
-    done = ended(*words, "--out", out)
-    assert done.returncode == 0, done.stderr
-    assert "mine" in done.stdout and f"72 rows in {out}" in done.stdout
+    code, said, complaint = ended(*words, "--out", out)
+    assert code == 0 and "mine" in said and f"72 rows in {out}" in said, complaint
     rows = read_rows(out / "rows.csv")
     assert repr([row for row in rows if row["policy"] != "mine"]) == expected
     load_policies(str(mine))
@@ -161,9 +153,8 @@ def test_an_error_loses_no_finished_rows(tmp_path: Path, small: Sweep, backend: 
 @pytest.mark.nightly
 def test_a_mistake_in_a_users_policy_is_shown_where_it_is_even_from_other_processes(tmp_path: Path, mine: Path) -> None:
     words = ["--policies", "mine", "--policy-file", mine, "--capacity", "2,5", "--seeds", "1", "--jobs", "2"]
-    failed = ended("bench", "--suite", "interruption-v1", *words, "--out", tmp_path, TEST_FAIL="1")
-    assert failed.returncode == 2 and failed.stderr.count("\n") == 1
-    assert f"{mine}, line 8: ArithmeticError: on purpose" in failed.stderr
+    code, _, said = ended("bench", "--suite", "interruption-v1", *words, "--out", tmp_path, TEST_FAIL="1")
+    assert code == 2 and said.count("\n") == 1 and f"{mine}, line 8: ArithmeticError: on purpose" in said
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from sweep_cases import exactly
 from bufgym import policies
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
-from bufgym.benchmark.summary import Summary, plain
+from bufgym.benchmark.summary import plain
 from bufgym.benchmark.tasks import TASKS, topics
 from bufgym.benchmark.tasks.topics import ROWS
 from bufgym.model import qoi
@@ -108,10 +108,6 @@ def made(policy: str, seed: int, weighted_qoi: float, scenario: str = "s", **fir
     ]
 
 
-def summary(rows: list[Row], **options: Any) -> Summary:
-    return TASK.summary(rows, **options)
-
-
 HALF = [
     row
     for seed, h in enumerate((10.0, 40.0, 30.0))
@@ -121,7 +117,7 @@ HALF = [
 
 
 def test_a_summary_worked_by_hand() -> None:
-    found = summary(HALF)
+    found = TASK.summary(HALF)
     base, mine = found.overall
     assert (base.policy, mine.policy) == ("robofleet", "mine")
     assert found.cells == {("s", 4): [base, mine]}
@@ -139,9 +135,9 @@ def test_a_summary_worked_by_hand() -> None:
 
 def test_unknown_ages_are_left_out() -> None:
     rows = [*made("robofleet", 0, 1.0, mean_age_s=math.nan), *made("robofleet", 1, 1.0, mean_age_s=3.0)]
-    assert summary(rows).overall[0]["age_first_s"] == exactly(3.0)
+    assert TASK.summary(rows).overall[0]["age_first_s"] == exactly(3.0)
     same = [{**row, "priority": 1.0, "deadline_s": None} for row in made("robofleet", 0, 0.0)]
-    (standing,) = summary(same).overall
+    (standing,) = TASK.summary(same).overall
     assert math.isnan(standing["age_others_s"].value) and math.isnan(standing["late"].value)
     assert math.isnan(standing["relative"].value)  # of nothing
-    assert "  –  " in plain(summary(same))
+    assert "  –  " in plain(TASK.summary(same))

@@ -136,8 +136,10 @@ def test_decides_as_its_twin_compiled_and_not(case, v, made, capacity):
     case = replace(case, capacity=capacity)
     policy = learned.policy("random-weights", made)
     ours, again, memory = case.run(policy, v), case.senders(v), policy.new_memory(1, capacity)
-    memory[:] = np.nan  # what it held before does not matter, nor what the episode left
+    own = len(REMEMBERED) if made.thins else 0
+    memory[:] = np.nan  # what the scratch held before does not matter, nor what the episode left
     for _ in range(2):
+        memory[:, :own] = 0.0
         again.load(0, case.episode)
         again.run(policy, memory)
         assert same(ours, again)

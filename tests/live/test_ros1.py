@@ -2,7 +2,6 @@
 
 import json
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -16,6 +15,7 @@ import pytest
 from cli_cases import fails
 from live_cases import VALIDATE, as_simulated
 from loop_cases import compiled
+from ros1_cases import played
 
 from bufgym import ros1
 from bufgym.errors import BufgymError
@@ -34,27 +34,20 @@ REPO = Path(__file__).resolve().parents[2]
 FADE = REPO / "examples" / "ros1" / "fade.py"
 
 
-def python(ros: dict[str, str], *command: Any) -> str:
-    words = [sys.executable, *map(str, command)]
-    done = subprocess.run(words, env=ros, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 # --- in ROS ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.nightly
 def test_a_policy_in_an_untouched_node(ros: dict[str, str]) -> None:
     """6 s with a fade of 1.5 s. Over 20 s, quiet machine: H 1.47 times that of rospy's own queue, the gap a tenth."""
-    played = [python(ros, FADE, "--one", policy, "--seconds", 6) for policy in ("rospy", "afr")]
-    stock, afr = (json.loads(out.splitlines()[-1]) for out in played)
+    told = [played(ros, FADE, "--one", policy, "--seconds", 6) for policy in ("rospy", "afr")]
+    stock, afr = (json.loads(out.splitlines()[-1]) for out in told)
     print(stock, afr)
     assert afr["qoi"] > stock["qoi"] and afr["longest_gap"] < stock["longest_gap"]
 
 
 def test_each_subscriber_has_its_queue_and_each_topic_its_policy(ros: dict[str, str], tmp_path: Path) -> None:
-    seen = json.loads(python(ros, REPO / "tests" / "live" / "ros1_session.py", tmp_path).splitlines()[-1])
+    seen = json.loads(played(ros, REPO / "tests" / "live" / "ros1_session.py", tmp_path).splitlines()[-1])
     assert seen["came"] == {topic: [str(k) for k in range(60)] for topic in seen["came"]}
     assert {topic: sorted(kinds) for topic, kinds in seen["kinds"].items()} == {
         "chosen": ["PolicyConnection"] * 2,
@@ -77,7 +70,7 @@ def test_each_subscriber_has_its_queue_and_each_topic_its_policy(ros: dict[str, 
 
 @pytest.mark.nightly
 def test_an_episode_through_a_node_is_that_of_the_simulator(ros: dict[str, str], tmp_path: Path) -> None:
-    python(ros, *VALIDATE, "ros1", "--out", tmp_path)
+    played(ros, *VALIDATE, "ros1", "--out", tmp_path)
     assert as_simulated(tmp_path)
 
 

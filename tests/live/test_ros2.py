@@ -3,7 +3,6 @@
 import importlib.util
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from cli_cases import fails
 from hypothesis import given
 from hypothesis import strategies as st
 from live_cases import VALIDATE, as_simulated
+from ros1_cases import played
 
 from bufgym.errors import BufgymError
 from bufgym.kernel import JIT
@@ -27,12 +27,9 @@ NO_ROS = not JIT or importlib.util.find_spec("rclpy") is None
 in_ros = pytest.mark.skipif(NO_ROS, reason="needs rclpy (extra ros2), and compiled decisions")
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+def run(*words: object) -> str:
     where = {**os.environ, "PYTHONPATH": str(REPO), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    command = [sys.executable, *map(str, arguments)]
-    done = subprocess.run(command, env=where, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return done
+    return played(where, *words)
 
 
 # --- in ROS ----------------------------------------------------------------------------------------------------------
@@ -42,8 +39,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
 @pytest.mark.nightly
 def test_the_relay_over_a_fade_is_as_good_as_the_simulator() -> None:
     """6 s with a fade of 1.5 s. Over 20 s, quiet machine: 98 % of the simulator's QoI."""
-    done = run(REPO / "examples/ros2/fade.py", "--queues", "afr", "--seconds", 6)
-    cells = done.stdout.splitlines()[-1].split("|")
+    cells = run(REPO / "examples/ros2/fade.py", "--queues", "afr", "--seconds", 6).splitlines()[-1].split("|")
     print(cells)
     assert float(cells[3]) > 0.7 * float(cells[6])  # through the relay, in the simulator
 
@@ -52,7 +48,7 @@ def test_the_relay_over_a_fade_is_as_good_as_the_simulator() -> None:
 @pytest.mark.nightly
 def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None:
     numbers = [str(k) for k in range(100)]
-    seen = json.loads(run(REPO / "tests/live/ros2_session.py", tmp_path).stdout.splitlines()[-1])
+    seen = json.loads(run(REPO / "tests/live/ros2_session.py", tmp_path).splitlines()[-1])
     assert seen["came"] == {"camera": numbers, "status": ["up"], "own/echo": numbers, "commands": numbers[::10]}
     assert seen["told"][1] == "/commands: std_msgs/msg/String, reliable"
     assert seen["best_effort"] and seen["by"] == "bufgym_receive" and seen["faults"] == []

@@ -3,13 +3,13 @@
 import asyncio
 import itertools
 import json
-import re
 import socket
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from browser_cases import embedded
 from live_cases import OVER_TCP, in_order, meeting_port
 from loop_cases import compiled
 
@@ -177,9 +177,7 @@ def test_the_page_tells_all_runs(tmp_path: Path) -> None:
     assert "10 s of &lt;video&gt;." in page and "lte <b>" not in page
     assert "3 runs: QoI live and simulated 0.00% apart (median), 0.20% at most; delivered 0 and 1." in page
     assert "Of 1 pairs of policies that differ by more than 1%, 1 stand in the same order." in page
-    found = re.search(r'<script type="application/json" id="figures">(.*?)</script>', page)
-    assert found is not None
-    figures = json.loads(found[1])
+    figures = embedded(page)
     qoi, delivered = figures["apart"][""]
     lanes = {trace["y"][0]: trace["x"] for trace in qoi["data"]}
     assert lanes == {"afr": [-0.2, 0], "drop-oldest": [0]}

@@ -88,11 +88,7 @@ async def test_held_while_its_receiver_is_away(corner: Corner) -> None:
 
 
 async def test_the_same_session_takes_over(corner: Corner) -> None:
-    async with (
-        corner.client() as operator,
-        corner.client(session="a") as old,
-        corner.client(session="a") as new,
-    ):
+    async with corner.client() as operator, corner.client(session="a") as old, corner.client(session="a") as new:
         await old.socket.wait_closed()
         assert old.socket.close_reason == "taken over by another connection"
         await new.subscribe(f"^{corner.command}$")

@@ -86,11 +86,7 @@ def test_queues_and_topics_are_bounded() -> None:
 
 async def test_a_subscriber_that_reads_nothing_slows_nobody(corner: Corner) -> None:
     topic, before = corner.topic("camera"), corner.hub.status()["dropped"]
-    async with (
-        corner.client() as robot,
-        corner.client() as fast,
-        corner.client(receive_buffer_bytes=16_384) as stuck,
-    ):
+    async with corner.client() as robot, corner.client() as fast, corner.client(receive_buffer_bytes=16_384) as stuck:
         for one in (fast, stuck):
             await one.subscribe(f"^{topic}$", policy="robofleet")
         stuck.socket.transport.pause_reading()

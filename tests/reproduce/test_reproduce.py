@@ -137,12 +137,20 @@ def test_unknown_names_and_unusable_options_are_refused() -> None:
     for name, options, says in (
         ("afr-fig99", {}, "unknown figure 'afr-fig99'; known: afr-fig1, afr-fig2"),
         ("afr-fig5", {"rums": 3}, "afr-fig5: no option 'rums'; it has: runs, last_T, seed"),
-        *(("afr-fig5", {name: 0}, "must be|need") for name in ("runs", "last_T")),
-        *(
-            (name, {option: 0}, "must be|need")
-            for name, option in (("afr-fig2", "turn_degrees"), ("afr-fig9", "calls"))
-        ),
-        *(("afr-theorems", {"max_capacity": 0}, "must be|need"), ("afr-vs-random", {"last_T": 3}, "must be|need")),
+        ("afr-fig5", {"runs": 0}, "must be|need"),
+        ("afr-fig5", {"last_T": 0}, "must be|need"),
+        ("afr-fig2", {"turn_degrees": 0}, "must be|need"),
+        ("afr-fig9", {"calls": 0}, "must be|need"),
+        ("afr-theorems", {"max_capacity": 0}, "must be|need"),
+        ("afr-vs-random", {"last_T": 3}, "must be|need"),
+        ("afr-fig6", LTE | {"size_bytes": 0}, "size_bytes = 0"),
+        ("afr-fig7-qoi", SHORT | {"runs": 0}, "runs = 0"),
+        ("afr-fig7-qoi", SHORT | {"motion": "freiburg1_desk"}, "tum_rgbd/freiburg1_desk.groundtruth"),
+        ("afr-fig8-gap", SHORT | {"motion": ["drive-0"], "runs": 5, "more_runs": 4}, "runs = 5, more_runs = 4"),
+        *((f"robofleet-fig{k}", {"runs": 0}, "runs = 0: must be a whole number >= 1") for k in range(3, 8)),
+        *((f"robofleet-fig{k}", {"round_trip_ms": -1}, "round_trip_ms = -1: must be a n") for k in range(3, 8)),
+        ("robofleet-fig4", {"kinds": ("Laser",)}, "must be some of PointCloud2, CompressedImage, LaserScan"),
+        ("robofleet-fig6", {"queue_sizes": (1.5,)}, "queue_sizes = 1.5: must be a whole number >= 1"),
     ):
         with pytest.raises(BufgymError, match=says):
             run(name, **options)

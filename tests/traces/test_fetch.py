@@ -6,14 +6,13 @@ import re
 import shutil
 import threading
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cli_cases import Capsys, Patch, fails, shown
 from http_server import DATA, SHA256, Site, get, left, of
 
-from bufgym.cli import trace_fetch
-from bufgym.cli.options import Parser
+from bufgym.cli import main
 from bufgym.errors import BufgymError
 from bufgym.traces.datasets import table
 from bufgym.traces.datasets.fetch import cache_folder, fetch_dataset
@@ -106,32 +105,15 @@ def test_the_sums_are_those_of_the_recorded_files(shared_data: Path, tmp_path: P
         assert not known
 
 
-@pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., None]:
-    """`fetch` with its words, as a command of its own."""
+def test_the_command_lists_and_fetches(site: Site, tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    parser = Parser()
-    trace_fetch.add(parser.add_subparsers(required=True))
-
-    def run(*words: str) -> None:
-        options = parser.parse_args(["fetch", *words])
-        options.command(options)
-
-    return run
-
-
-def test_the_command_lists_and_fetches(
-    command: Callable[..., None], site: Site, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
     assert cache_folder().parts[-3:] == ("cache", "bufgym", "datasets")
-    command("--list")
-    out = capsys.readouterr().out
+    out = shown(["trace", "fetch", "--list"], capsys)
     assert all(name in out for name in datasets()) and "not known" in out
-    command("tum-rgbd", "--list")
-    out = capsys.readouterr().out
+    out = shown(["trace", "fetch", "tum-rgbd", "--list"], capsys)
     assert re.search("freiburg1_desk2-groundtruth.txt +sha256 not known", out) and "CC BY 4.0" in out
     monkeypatch.setitem(datasets(), "mine", of(Remote("data.bin", f"{site.address}/data.bin")))
-    command("mine")
+    assert main(["trace", "fetch", "mine"]) == 0
     said = capsys.readouterr()
     assert f"{SHA256}  data.bin (none known)" in said.out
     assert re.search("licence +not known", said.out) and re.search("please cite +nobody", said.out)
@@ -139,13 +121,12 @@ def test_the_command_lists_and_fetches(
     assert (cache_folder() / "mine" / "data.bin").read_bytes() == DATA
 
 
-def test_the_command_says_what_is_wrong(command: Callable[..., None]) -> None:
+def test_the_command_says_what_is_wrong(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     for words, says in (
-        ("", r"needs the NAME of a data set \(--list names them\)"),
+        ("", "needs the NAME of a data set (--list names them)"),
         ("belgium", "belgium: no such data set: must be one of belgium-4g"),
         ("ucc-4g", "address of its files is not known"),
         ("ucc-5g --from nowhere.zip", "nowhere.zip: no such file"),
     ):
-        with pytest.raises(BufgymError, match=says) as caught:
-            command(*words.split())
-        assert "\n" not in str(caught.value)
+        fails(["trace", "fetch", *words.split()], says, capsys)

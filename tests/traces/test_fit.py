@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_cases import Capsys, fails, shown
 
-from bufgym.cli import trace_fit
-from bufgym.cli.options import Parser
 from bufgym.errors import BufgymError
 from bufgym.scenario import suites
 from bufgym.scenario.suites.synthetic import both_values
@@ -122,31 +121,26 @@ def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory()
         assert other[name] < 0.05
 
 
-def fit(*arguments: str) -> None:
-    parser = Parser(prog="bufgym trace")
-    trace_fit.add(parser.add_subparsers(required=True))
-    options = parser.parse_args(["fit", *arguments])
-    options.command(options)
-
-
-def test_the_command_writes_parameters_and_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_parameters_and_a_page(tmp_path: Path, capsys: Capsys) -> None:
     pytest.importorskip("matplotlib")
     files = [str(tmp_path / f"report_known_{seed}.csv") for seed in range(3)]
     for seed, file in enumerate(files):
         write_csv(markov_link("known", seed, 200, links={"known": KNOWN}), file)
     out, page, figure = tmp_path / "links.json", tmp_path / "page.md", tmp_path / "figures" / "link-known.svg"
-    fit(*files[::-1], "-o", str(out), "--page", str(page), "--sets", "9")
-    assert "3 recordings" in capsys.readouterr().out and figure.exists()
+    fit = ["trace", "fit", "-o", out]
+    assert "3 recordings" in shown([*fit, *files[::-1], "--page", page, "--sets", "9"], capsys) and figure.exists()
     text, fitted = page.read_text(), read_links(out)
     assert "| autocorrelation at 30 s |" in text and str(tmp_path) not in text + out.read_text()
     assert "![known: recordings and generated links](figures/link-known.svg)" in text
-    fit(*files, "-o", str(out))  # in any order
+    shown([*fit, *files], capsys)  # in any order
     assert read_links(out) == fitted and fitted["known"].seconds == 600
-    fit(*files, "--mode", "walk", "-o", str(out))
+    shown([*fit, *files, "--mode", "walk"], capsys)
     assert list(read_links(out)) == ["walk"]
 
 
-def test_the_command_fits_what_a_suite_trains_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_command_fits_what_a_suite_trains_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Capsys
+) -> None:
     """The links of the train split alone, each once though it carries several scenarios."""
 
     def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
@@ -154,30 +148,31 @@ def test_the_command_fits_what_a_suite_trains_on(monkeypatch: pytest.MonkeyPatch
         return both_values(traces, ())
 
     monkeypatch.setitem(suites.SUITES, "two-v7", suites.Suite("two-v7", "two links", build))
-    fit("--suite", "two-v7", "-o", str(tmp_path / "two.json"))
+    shown(["trace", "fit", "--suite", "two-v7", "-o", tmp_path / "two.json"], capsys)
     ((mode, link),) = read_links(tmp_path / "two.json").items()
     assert (mode, link.recordings, link.seconds) == ("two", 2, 200)
     assert '"made_by": "bufgym trace fit --suite two-v7 -o two.json"' in (tmp_path / "two.json").read_text()
 
 
-def test_what_the_command_refuses(tmp_path: Path) -> None:
+def test_what_the_command_refuses(tmp_path: Path, capsys: Capsys) -> None:
     for words, says in (
-        ("", r"needs recordings, FILE ... or --suite NAME"),
-        ("a.csv --suite lte-v1", r"--suite: cannot go with FILE or --mode"),
-        ("a.csv --data .", r"--data: needs --suite"),
-        ("a.csv --page x.html", r"--page x.html: must end in .md"),
+        ("", "needs recordings, FILE ... or --suite NAME"),
+        ("a.csv --suite lte-v1", "--suite: cannot go with FILE or --mode"),
+        ("a.csv --data .", "--data: needs --suite"),
+        ("a.csv --page x.html", "--page x.html: must end in .md"),
     ):
-        with pytest.raises(BufgymError, match=says):
-            fit(*words.split(), "-o", str(tmp_path / "b.json"))
+        fails(["trace", "fit", *words.split(), "-o", tmp_path / "b.json"], says, capsys)
     assert not (tmp_path / "b.json").exists()
 
 
 @pytest.mark.nightly
-def test_the_committed_parameters_are_the_fit_of_the_recordings(shared_data: Path, tmp_path: Path) -> None:
+def test_the_committed_parameters_are_the_fit_of_the_recordings(
+    shared_data: Path, tmp_path: Path, capsys: Capsys
+) -> None:
     rows: dict[str, list[Float64Array]] = {}
     for file in sorted([*shared_data.glob("belgium_4g/csv/*.csv"), *shared_data.glob("solis_wifi/wifi_*.txt")]):
         rows.setdefault(mode_of(file), []).append(rates_of(file))
     assert fit_links(rows) == read_links(LINKS)
     names = "uplink-5g-v1,uplink-wifi-v1,uplink-mmwave-v1"
-    fit("--suite", names, "--data", str(shared_data), "-o", str(tmp_path / "uplinks.json"))
+    shown(["trace", "fit", "--suite", names, "--data", shared_data, "-o", tmp_path / "uplinks.json"], capsys)
     assert (tmp_path / "uplinks.json").read_bytes() == UPLINKS.read_bytes()

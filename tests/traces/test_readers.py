@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_cases import fails, shown
 from link_files import HEADER, SAMPLES, UCC_HEADER, knots, written
 
 from bufgym.cli import main
@@ -130,14 +131,6 @@ def test_runs_of_a_list_with_and_without_times(tmp_path: Path) -> None:
         read_trace(path, column="run 4")
 
 
-def failed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """What the command said on stderr, in its one line, when it ended with 2."""
-    assert main(arguments) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("bufgym: error: ") and said.count("\n") == 1
-    return said
-
-
 @pytest.fixture
 def archive(tmp_path: Path) -> str:
     with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:
@@ -150,25 +143,24 @@ def test_what_convert_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     first, second = str(written(tmp_path, "1\n", "a.up")), str(written(tmp_path, "2\n", "b.up"))
     out = tmp_path / "out"
     both = ["trace", "convert", first, second, "--to", "csv", "--out", str(out)]
-    assert "must be an existing folder" in failed(both, capsys)
+    fails(both, "must be an existing folder", capsys)
     out.mkdir()
-    assert main(both) == 0
+    shown(both, capsys)
     assert sorted(path.name for path in out.iterdir()) == ["a.up.csv", "b.up.csv"]
     for words, says in (
         ([str(out), "--to", "csv"], "a.up.csv is taken"),
         ([str(tmp_path / "x.up")], "must be one of csv, mahimahi"),
         ([first, "--to", "csv"], "must not be the file that is read"),
     ):
-        assert says in failed(["trace", "convert", first, "--out", *words], capsys)
+        fails(["trace", "convert", first, "--out", *words], says, capsys)
 
 
 def test_info_of_every_format(tmp_path: Path, archive: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["trace", "info", *(str(written(tmp_path, text, format)) for format, text in SAMPLES.items())]) == 0
-    for format, block in zip(SAMPLES, capsys.readouterr().out.split("\n\n"), strict=True):
+    files = [written(tmp_path, text, format) for format, text in SAMPLES.items()]
+    for format, block in zip(SAMPLES, shown(["trace", "info", *files], capsys).split("\n\n"), strict=True):
         assert block.startswith(f"{format}\n") and f"(format {format}, detected" in block
     # By format and column, out of a zip.
-    assert main(["trace", "info", f"{archive}:ucc.csv", "--format", "ucc", "--column", "UL_bitrate"]) == 0
-    out = capsys.readouterr().out
+    out = shown(["trace", "info", f"{archive}:ucc.csv", "--format", "ucc", "--column", "UL_bitrate"], capsys)
     assert "(format ucc, requested, column UL_bitrate," in out
     # 20 and 8 kbit/s are 2.5 and 1 KB/s.
     assert ["mean_KBps", "1.75"] in [line.split() for line in out.splitlines()]
@@ -176,8 +168,8 @@ def test_info_of_every_format(tmp_path: Path, archive: str, capsys: pytest.Captu
 
 def test_validate_tells_sound_files(tmp_path: Path, archive: str, capsys: pytest.CaptureFixture[str]) -> None:
     sound, broken = written(tmp_path, "1\n2\n", "sound.up"), written(tmp_path, "1\nx\n", "broken.up")
-    assert main(["trace", "validate", str(sound), "lte-synthetic-0"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["OK", "OK", "2"]
+    out = shown(["trace", "validate", sound, "lte-synthetic-0"], capsys)
+    assert [line.split()[0] for line in out.splitlines()] == ["OK", "OK", "2"]
     with pytest.raises(SystemExit) as ended:
         main(["trace", "validate", str(sound), str(broken), str(tmp_path / "missing"), archive])
     assert ended.value.code == 1
@@ -190,10 +182,8 @@ def test_validate_tells_sound_files(tmp_path: Path, archive: str, capsys: pytest
 def test_convert_states_what_was_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = written(tmp_path, SAMPLES["rates"], "link.csv")  # 2005 bytes in 3.75 s
     up, back = tmp_path / "link.up", tmp_path / "back.csv"
-    assert main(["trace", "convert", str(source), "--to", "mahimahi", "--out", str(up)]) == 0
+    out = shown(["trace", "convert", source, "--to", "mahimahi", "--out", up], capsys)
     assert up.read_text() == "1500\n3750\n"
-    out = capsys.readouterr().out
     assert out.startswith(f"wrote {up} (format mahimahi) from {source} (format rates, detected): total +995 bytes, ")
-    assert main(["trace", "convert", str(up), "--out", str(back)]) == 0  # .csv says the format
-    assert capsys.readouterr().out.endswith(": nothing lost\n")
+    assert shown(["trace", "convert", up, "--out", back], capsys).endswith(": nothing lost\n")  # .csv says the format
     assert read_trace(back).time_us.tolist() == read_trace(up).time_us.tolist()
