@@ -91,39 +91,6 @@ def test_shares_by_hand(robots, crossed):
 
 
 @kernels
-@pytest.mark.parametrize(("third_us", "dropped"), [(1_000, {}), (999, {2: 999})])
-def test_what_crosses_at_the_time_of_an_arrival_has_left_before_it(third_us, dropped):
-    # L = 1. Both first messages cross at 1000; A's second is taken then, so its third, which arrives then, finds room.
-    robots = [(0, 500), (0, 1), (third_us, 1)], [(0, 500)]
-    assert log(cell(*robots, policy=policies.get("drop-newest"), capacity=1).senders, 0)["dropped_us"] == dropped
-
-
-@kernels
-def test_a_link_that_stops_leaves_them_all_in_transmission():
-    fleet = cell([(0, 600), (1, 10)], [(0, 600)], trace=trace([(0, 0), (1_000, 1_000)], "stop"))
-    assert transmitted(fleet) == [{}, {}]
-    told = [outcome(fleet.senders, i) for i in fleet.rows(0)]
-    assert [(o.in_transmission, o.buffered, o.qoi) for o in told] == [(1, 1, 0.0), (1, 0, 0.0)]
-
-
-@kernels
-def test_a_robot_sees_what_is_left_of_its_own_message():
-    seen = {}
-
-    def look(buffer, arrival, memory):
-        seen[buffer.now_us] = (buffer.busy, buffer.left_bytes, buffer.left_fraction)
-        return ACCEPT
-
-    # A's 1000 bytes: all of the link until 500, half of it from then on: 750 us after the start 375 bytes are left,
-    # at 1250 us 125.
-    looking = policies.Policy("test-look", look)
-    cell([(0, 1_000), (750, 1), (1_250, 1)], [(500, 10_000)], policy=looking)
-    assert seen[750] == (1, 375, 0.375)
-    assert seen[1_250] == (1, 125, 0.125)
-    assert seen[0] == seen[500] == (0, 0, 0.0)
-
-
-@kernels
 @given(cases(max_messages=25), VALUES, st.sampled_from(POLICIES))
 def test_one_robot_is_a_sender_bit_for_bit(case, v, policy):
     episode = FleetEpisode((case.episode.arrivals,), case.episode.link)

@@ -5,7 +5,6 @@ import pytest
 from cases import newcomer, queue_of, trace
 
 from bufgym import policies
-from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
@@ -174,9 +173,3 @@ def test_policies_start_with_the_published_settings_and_an_empty_memory():
     assert {policy.name: dict(policy.parameters) for policy in built_in if policy.parameters} == SETTINGS
     memories = {policy.name: {key: number for key, number in policy.memory.items() if number} for policy in built_in}
     assert {name: memory for name, memory in memories.items() if memory} == BEGINNINGS
-
-
-@pytest.mark.parametrize("every", [0, -1, -0.5, float("nan"), float("inf")])
-def test_settings_are_numbers_above_0(every):
-    with pytest.raises(BufgymError, match=r"policy decimate: every = .*: must be a number > 0"):
-        policies.get("decimate").with_parameters(every=every)

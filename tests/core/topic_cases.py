@@ -88,6 +88,11 @@ class TopicCase:
             rows[rule] = getattr(self.client, rule)
         return senders
 
+    def run(self, policy: policies.Policy) -> Senders:
+        senders = self.senders()
+        senders.run(policy)
+        return senders
+
     def policy(self, *, compile: bool) -> policies.Policy:
         """One that answers as ``decision``, ``choice`` and ``unwanted`` do."""
         hooks: dict[str, Any] = {}

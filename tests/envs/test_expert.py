@@ -135,17 +135,6 @@ def test_values_are_those_of_all_action_sequences(case: tuple[Episode, int], v: 
     check_values(env, know.values())
 
 
-def test_the_value_at_the_start_is_the_clairvoyants() -> None:
-    """On real links, where the sweep leaves most successors out."""
-    n, duration_s = 16, 10.0
-    envs = SenderVectorEnv(n, "lte", 8, duration_s=duration_s, size_bytes=500_000, info="none")
-    envs.reset(seed=0)
-    values, senders = expert.clairvoyant(envs).values(), envs.rows.senders
-    for i, episode in enumerate(senders.episodes):
-        assert episode is not None
-        assert np.nanmax(values[i]) == pytest.approx(oracle.clairvoyant(episode, 8, senders.value_of(i)).qoi, abs=1e-9)
-
-
 FAMILIES = (SHORT, Interruption(t_max=90, law="fixed", value=V), replace(SHORT, rate_hz=60))
 
 

@@ -74,26 +74,6 @@ def test_a_mask_as_gymnasium_and_as_sb3_contrib_take_it(env_id: str) -> None:
             _, info = env.reset()
 
 
-@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
-def test_same_seed_same_episode(env_id: str) -> None:
-    """And the episodes that follow without a seed are the same, too; another seed gives another."""
-
-    def play(seed: int) -> list[Any]:
-        env = gym.make(env_id, **SMALL[env_id])
-        rng = np.random.default_rng(seed)
-        record = []
-        for k in range(3):
-            obs, info = env.reset(seed=seed if k == 0 else None)
-            ended = False
-            while not ended:
-                obs, reward, ended, _, info = env.step(int(rng.integers(10)))
-                record.append((reward, info["action_mask"].tolist(), {key: obs[key].tolist() for key in obs}))
-        return record
-
-    assert play(5) == play(5)
-    assert play(5) != play(6)
-
-
 def test_an_id_may_name_its_module() -> None:
     assert gym.make("bufgym:bufgym/Uplink-v0", capacity=3).action_space == gym.spaces.Discrete(5)
 
@@ -204,25 +184,6 @@ def test_an_episode_that_asks_for_no_decision_ends_with_the_first_step() -> None
 
 
 @kernels
-@pytest.mark.parametrize("options", [{}, BYTES])
-def test_an_invalid_action_does_what_a_queue_does(options: dict[str, Any]) -> None:
-    env, queue, rng = make(**options), make(**options), np.random.default_rng(0)
-    (_, info), _ = env.reset(seed=2), queue.reset(seed=2)
-    ended, invalid = False, 0
-    while not ended:
-        mask = info["action_mask"].astype(bool)
-        action = int(rng.choice(np.flatnonzero(~mask) if rng.random() < 0.5 and not mask.all() else np.arange(6)))
-        instead = action if mask[action] else 5 if mask[5] else 4
-        invalid += action != instead or not mask[action]
-        observation, reward, ended, _, info = env.step(action)
-        as_queue, reward_there, _, _, there = queue.step(instead)
-        assert same(observation, as_queue)
-        assert reward == reward_there
-        assert (info["invalid"], there["invalid"]) == (invalid, 0)
-    assert invalid > 5
-
-
-@kernels
 def test_observation_bounds_hold_where_nothing_moves_and_all_comes_at_once() -> None:
     """Arrivals at one moment, x that stands still: every reference length is 0."""
     arrivals = messages(np.zeros(9, np.int64), 1000, np.zeros(9))
@@ -237,21 +198,6 @@ def test_observation_bounds_hold_where_nothing_moves_and_all_comes_at_once() -> 
     assert info["qoi"] == 1.0
 
 
-def test_losses_stay_in_the_box_while_nothing_was_kept() -> None:
-    """Messages are rejected and the next one waits: V saturates, so its gap is worth less than the one behind it."""
-    env = gym.make("bufgym/Uplink-v0", value="saturating:0.5").unwrapped
-    observation, _ = env.reset(seed=0)
-    for _ in range(3):
-        assert env.observation_space.contains(observation)
-        observation, *_ = env.step(8)
-
-
-def test_a_given_episode_is_played() -> None:
-    env = make("interruption")
-    env.reset(options={"episode": Interruption(t_max=25).episode(3)})
-    assert [env.step(4)[2] for _ in range(3)] == [False, False, True]
-
-
 @pytest.mark.parametrize(
     ("info", "always"),
     [("full", {"action_mask", "qoi", "invalid", "reward_terms"}), ("mask", {"action_mask"}), ("none", set())],
@@ -263,12 +209,6 @@ def test_info_is_built_as_far_as_asked(info: str, always: set[str]) -> None:
     last, summary = env.step(5)[4], {"arrived": 4, "delivered": 4, "dropped": 0, "invalid": 0}
     assert last.keys() == always | summary.keys() | {"qoi"}
     assert {name: last[name] for name in summary} == summary and last["qoi"] == pytest.approx(1 + 3 * (1 - 0.618))
-
-
-def test_a_reset_rewards_nothing() -> None:
-    _, info = make().reset(seed=0)
-    assert info["reward_terms"] == {"delivered": 0.0, "retained": 0.0}
-    assert (info["qoi"], info["invalid"]) == (0.0, 0)
 
 
 WHOLE = r"must be a whole number in 0\.\.5 \(L = 4\)"
