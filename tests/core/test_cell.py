@@ -37,8 +37,6 @@ from bufgym.sim.metrics import outcome
 
 kernels = pytest.mark.kernels
 V = qoi.exponential(0.5)
-US = trace([(0, 0), (1_000_000, 1_000_000)], "loop")
-"""1 byte a microsecond."""
 
 
 def accept(buffer, arrival, memory):
@@ -54,17 +52,6 @@ def hesitant(buffer, memory):
 ACCEPTS = policies.Policy("test-accept", accept, compile=True)
 HESITANT = policies.Policy("test-hesitant", decide_anything, on_send=hesitant, memory={"asked": 0.0}, compile=True)
 POLICIES = [p for p in (*map(policies.get, policies.names()), HESITANT) if p.privileged is None and not any(p.work)]
-
-
-def cell(*robots, trace=US, policy=ACCEPTS, capacity=8):
-    """A fleet after robots met their messages, each a list of (arrival us, bytes)."""
-    arrivals = [messages(*np.array(mine, np.int64).T) for mine in robots]
-    return run_fleet(policy, [FleetEpisode(tuple(arrivals), Link(trace))], capacity, V)
-
-
-def transmitted(fleet):
-    """{sequence number: when it had crossed}, a dictionary for each robot."""
-    return [log(fleet.senders, i)["transmitted_us"] for i in range(len(fleet.senders))]
 
 
 @kernels
@@ -87,7 +74,11 @@ def transmitted(fleet):
     ],
 )
 def test_shares_by_hand(robots, crossed):
-    assert transmitted(cell(*robots)) == crossed
+    """``robots``: the messages of each, (arrival us, bytes); ``crossed``: {sequence number: when}, of each."""
+    arrivals = tuple(messages(*np.array(mine, np.int64).T) for mine in robots)
+    link = Link(trace([(0, 0), (1_000_000, 1_000_000)], "loop"))  # 1 byte a microsecond
+    fleet = run_fleet(ACCEPTS, [FleetEpisode(arrivals, link)], 8, V)
+    assert [log(fleet.senders, i)["transmitted_us"] for i in range(len(robots))] == crossed
 
 
 @kernels
@@ -122,8 +113,8 @@ def test_robots_that_are_alike_fare_as_one_on_its_share(case, n, policy):
 
 
 @st.composite
-def cells(draw, idle=True):
-    """(episode of 1..4 robots, its knots, L, B); ``idle``: arrivals may come so late that the cell falls idle."""
+def cells(draw):
+    """(episode of 1..4 robots, its knots, L, B); arrivals may come so late that the cell falls idle."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     knots, after = draw(traces())
     link = Link(trace(knots, after), draw(st.integers(0, 3 * knots[-1][0])), draw(st.integers(0, 30_000)))

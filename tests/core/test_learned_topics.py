@@ -7,7 +7,7 @@ import pytest
 from cases import VALUES, cases, log, order, same
 from hypothesis import given
 from hypothesis import strategies as st
-from topic_cases import topic_cases
+from topic_cases import observed, topic_cases
 from weight_cases import random_weights, score
 
 from bufgym import policies
@@ -15,14 +15,6 @@ from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
-from bufgym.observe import (
-    CONTEXT_FIELDS,
-    SLOT_FIELDS,
-    TOPIC_CONTEXT_FIELDS,
-    TOPIC_SLOT_FIELDS,
-    observe_topic_context,
-    observe_topic_slots,
-)
 from bufgym.policies import learned_topics
 from bufgym.policies.learned_topics import NAMES, TopicWeights
 from bufgym.policies.registry import ClientSettings, Policy
@@ -31,8 +23,6 @@ from bufgym.sim import run
 from bufgym.traces import Trace
 
 V = qoi.exponential(0.618)
-SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
-CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
 
 
 @st.composite
@@ -45,12 +35,9 @@ def schedulers(draw):
 
 def scores(whole, net, buffer, arrival, arriving):
     """Of every place of the queue, the newcomer's last."""
-    slots, context = np.zeros((len(SLOT_NAMES), buffer.capacity + 1)), np.zeros(len(CONTEXT_NAMES))
-    observe_topic_slots(buffer, arrival, arriving, slots)
-    observe_topic_context(buffer, arrival, arriving, context)
-    seen = dict(zip(SLOT_NAMES, slots, strict=True))
-    seen |= {name: np.full(buffer.capacity + 1, each) for name, each in zip(CONTEXT_NAMES, context, strict=True)}
-    return [score(net, [seen[name][k] for name in whole.fields]) for k in range(buffer.capacity + 1)]
+    n = buffer.capacity + 1
+    seen = {name: np.broadcast_to(each, n) for name, each in observed(buffer, arrival, arriving).items()}
+    return [score(net, [seen[name][k] for name in whole.fields]) for k in range(n)]
 
 
 def with_room(buffer, arrival, rest):

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from cases import newcomer, queue_of, trace
+from cases import trace
 
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
 from bufgym.oracle import beam, programme
-from bufgym.policies import ACCEPT, REJECT, aqm, webrtc
+from bufgym.policies import webrtc
 from bufgym.scenario import Episode, messages
 from bufgym.sim import NEVER, Senders, audit
 
@@ -111,18 +111,6 @@ def test_a_beam_keeps_to_the_room(capacity, max_bytes, width, plan):
 
 
 # --- policies --------------------------------------------------------------------------------------------------------
-
-
-def test_red_counts_from_the_first_arrival_above_the_threshold():
-    """Average 4 of L = 8, min_th 1/4, max_th 3/4, max_p 0.1: p_b = 0.05, and 0.05 / (1 - 0.05 count) in all."""
-    red = policies.get("red")
-    memory = red.new_memory()[0]
-    memory[:] = 0.0, 5.0
-    assert aqm.red(queue_of(0, 8, red.parameter_array), newcomer(), memory) == ACCEPT  # below: the count starts anew
-    draws = (0.0501, ACCEPT), (0.0527, ACCEPT), (0.0555, REJECT), (0.0527, ACCEPT), (0.0555, REJECT)
-    for uniform, decision in draws:
-        memory[0] = 4.0
-        assert aqm.red(queue_of(4, 8, red.parameter_array), newcomer(uniform), memory) == decision
 
 
 def test_webrtc_starts_a_new_pattern_when_the_bucket_gets_too_full_and_not_while_it_is():

@@ -84,25 +84,6 @@ def test_how_often_chance_keeps_each_message(name, decide_at, expected):
     assert (np.abs(share - expected) < 4.5 * np.sqrt(expected * (1 - expected) / RUNS)).all()
 
 
-@kernels
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("drop-oldest", [4, 5, 6]),
-        ("drop-newest", [1, 2, 3]),
-        ("replace-newest", [1, 2, 6]),
-        # Message 0 was the first of three; 1 and 2 are decimated, as are 4 and 5.
-        ("decimate", [1, 4]),
-        # 4 drops 1 (of equal gaps the oldest), 5 drops 3, 6 drops 5: the gaps stay 2.
-        ("min-gap", [2, 4, 6]),
-        # Message 0 left last. 4 drops 1 (between 0 and 2; of equals the first); 5 drops 3: 2 4 5; 6 drops 4.
-        ("orbbuf", [2, 5, 6]),
-    ],
-)
-def test_what_each_keeps_of_six_arrivals(name, expected):
-    assert kept(name, 3, 6) == expected
-
-
 def test_worst_gaps():
     # The first eviction at L = 8 leaves one gap of 2 where 10/9 would be ideal: 1.8 for whoever drops at all.
     assert worst_ratio("min-gap", 8, [9]) == pytest.approx(1.8)
@@ -170,6 +151,15 @@ def test_linear_keeps_times_that_grow_as_powers():
         ("ros-keep-last", 4, 30, [27, 28, 29, 30]),  # no more than L
         ("ros-keep-last:depth=2", 4, 30, [29, 30]),
         ("latest-only", 8, 30, [30]),
+        ("drop-oldest", 3, 6, [4, 5, 6]),
+        ("drop-newest", 3, 6, [1, 2, 3]),
+        ("replace-newest", 3, 6, [1, 2, 6]),
+        # Message 0 was the first of three; 1 and 2 are decimated, as are 4 and 5.
+        ("decimate", 3, 6, [1, 4]),
+        # 4 drops 1 (of equal gaps the oldest), 5 drops 3, 6 drops 5: the gaps stay 2.
+        ("min-gap", 3, 6, [2, 4, 6]),
+        # Message 0 left last. 4 drops 1 (between 0 and 2; of equals the first); 5 drops 3: 2 4 5; 6 drops 4.
+        ("orbbuf", 3, 6, [2, 5, 6]),
         ("foxglove-sdk", 8, 30, [*range(23, 31)]),
     ],
 )
@@ -253,20 +243,15 @@ def test_codel_goes_on_where_it_was_soon_after_a_dropping_state(intervals, count
     assert memory[aqm.DROPS] == memory[aqm.LAST_DROPS] == count
 
 
-def red_and_memory(spec):
-    """RED as a function of the occupancy of a queue with L = 8, the arrival's draw and the memory; a fresh memory."""
-    policy = policies.get(spec)
+@kernels
+def test_red_drops_with_p_over_1_minus_count_p():
+    # Half full, between 1/4 and 3/4: p_b = 0.1 x 1/2 = 0.05. Then 0.05 / (1 - 0.05 count): uniform over 20 arrivals.
+    policy = policies.get("red:weight=1")  # the average is the occupancy
+    memory = policy.new_memory()[0]
 
     def red(s, uniform, memory):
         return policy.on_arrival(queue_of(s, 8, policy.parameter_array), newcomer(uniform), memory)
 
-    return red, policy.new_memory()[0]
-
-
-@kernels
-def test_red_drops_with_p_over_1_minus_count_p():
-    # Half full, between 1/4 and 3/4: p_b = 0.1 x 1/2 = 0.05. Then 0.05 / (1 - 0.05 count): uniform over 20 arrivals.
-    red, memory = red_and_memory("red:weight=1")  # the average is the occupancy
     least, most = 0.0, 1 - 1e-9
     for count in range(19):
         p = 0.05 / (1 - 0.05 * count)
@@ -277,6 +262,11 @@ def test_red_drops_with_p_over_1_minus_count_p():
     # Below 1/4 none, from 3/4 on all.
     for s, uniform, decision in ((1, least, ACCEPT), (6, most, REJECT), (8, most, REJECT)):
         assert red(s, uniform, memory.copy()) == decision
+    # It counts from the first arrival above the threshold, or from the last drop.
+    memory[:] = 0.0, 5.0
+    assert red(0, 0.0, memory) == ACCEPT
+    draws = (0.0501, ACCEPT), (0.0527, ACCEPT), (0.0555, REJECT), (0.0527, ACCEPT), (0.0555, REJECT)
+    assert [red(4, uniform, memory) for uniform, _ in draws] == [decision for _, decision in draws]
 
 
 ROOT = Path(__file__).parents[2]

@@ -15,6 +15,16 @@ from bufgym import policies, sim
 from bufgym.model import qoi
 from bufgym.model.buffer import HOLD
 from bufgym.model.topics import Topic
+from bufgym.observe import (
+    CONTEXT_FIELDS,
+    SLOT_FIELDS,
+    TOPIC_CONTEXT_FIELDS,
+    TOPIC_SLOT_FIELDS,
+    observe_context,
+    observe_slots,
+    observe_topic_context,
+    observe_topic_slots,
+)
 from bufgym.policies.registry import ClientSettings
 from bufgym.sim import Senders
 
@@ -151,6 +161,24 @@ class TopicCase:
         if event == "send":
             return choice(twin.now, len(twin.slots()), len(twin.dequeued), self.case.capacity)
         return unwanted(twin.now, len(twin.slots())) if event == "dequeue" else None
+
+
+SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
+CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
+
+
+def observed(buffer: Any, arrival: Any, arriving: bool) -> dict[str, Any]:
+    """What the kernels observe, by field; the places are full of rubbish before."""
+    slots = np.full((len(SLOT_NAMES), buffer.capacity + 1), np.nan)
+    context = np.full(len(CONTEXT_NAMES), np.nan)
+    if len(buffer.topics) == 1:
+        slots, context = slots[: len(SLOT_FIELDS)], context[: len(CONTEXT_FIELDS)]
+        observe_slots(buffer, arrival, slots)
+        observe_context(buffer, arrival, context)
+    else:
+        observe_topic_slots(buffer, arrival, arriving, slots)
+        observe_topic_context(buffer, arrival, arriving, context)
+    return dict(zip(SLOT_NAMES, slots, strict=False)) | dict(zip(CONTEXT_NAMES, context, strict=False))
 
 
 def twin_rules(topic: Topic, v: qoi.Value) -> naive_sender.Rules:

@@ -41,24 +41,15 @@ def playing(episode: Episode, capacity: int, v: Any = V, **options: Any) -> Send
     return env
 
 
-def snapshot(env: SenderEnv) -> list[Any]:
-    rows = env.rows
-    return [array.copy() for array in (*rows.senders.batch[:5], *rows.output, rows.rewarded)]
-
-
-def restore(env: SenderEnv, kept: list[Any]) -> None:
-    rows = env.rows
-    for array, old in zip((*rows.senders.batch[:5], *rows.output, rows.rewarded), kept, strict=True):
-        array[...] = old
-
-
 def brute(env: SenderEnv) -> dict[int, float]:
     """The best H of all action sequences, by the first of them."""
-    kept, values = snapshot(env), {}
+    arrays = (*env.rows.senders.batch[:5], *env.rows.output, env.rows.rewarded)
+    kept, values = [array.copy() for array in arrays], {}
     for action in np.flatnonzero(env.action_masks()).tolist():
         _, _, ended, _, info = env.step(action)
         values[action] = info["qoi"] if ended else max(brute(env).values())
-        restore(env, kept)
+        for array, old in zip(arrays, kept, strict=True):
+            array[...] = old
     return values
 
 

@@ -131,14 +131,16 @@ def test_a_message_that_arrives_at_the_server_as_the_step_ends_is_rewarded_in_it
 @kernels
 @pytest.mark.parametrize(("scenario", "options"), VARIANTS)
 def test_every_step_of_random_play(scenario: str, options: dict[str, Any]) -> None:
-    """Conservation, masks, bounds and sums of rewards under actions of which many are invalid."""
+    """Masks, bounds, sums of rewards and what became of all, under actions of which many are invalid."""
     env, rng = make(scenario, **options), np.random.default_rng(1)
     L, most = env.rows.capacity, options.get("max_bytes", UNLIMITED_BYTES)
     for seed in (7, None):
         observation, info = env.reset(seed=seed)
         ended, total, invalid = False, np.zeros(2), 0
+        held: list[Any] = []
         while not ended:
             assert env.observation_space.contains(observation)
+            held.append((observation, {name: array.copy() for name, array in observation.items()}))
             allowed = [True] * (L + 2)  # an episode that asks for no decision: actions have no effect
             if env.rows.senders.batch.senders[0]["waiting"]:
                 buffer, arrival = seen(env)
@@ -154,17 +156,13 @@ def test_every_step_of_random_play(scenario: str, options: dict[str, Any]) -> No
             terms = info["reward_terms"]
             total += terms["delivered"], terms["retained"]
             assert reward == terms["retained"]
-            sender, log = env.rows.senders.batch.senders[0], env.rows.senders.batch.log[0]
-            arrived = int(sender["next"])
-            dropped = int((log["dropped_us"][:arrived] >= 0).sum())
-            transmitted = int((log["transmitted_us"][:arrived] >= 0).sum())
-            assert arrived == transmitted + sender["busy"] + sender["occupancy"] + dropped
-            assert 0 <= sender["backlog_bytes"] <= most and sender["occupancy"] <= L
-        assert info["arrived"] == arrived == len(env.rows.senders.episodes[0].arrivals)
-        assert (info["delivered"], info["dropped"]) == (transmitted, dropped)
+        sender, log, n = env.rows.senders.batch.senders[0], env.rows.senders.batch.log[0], info["arrived"]
+        assert n == len(env.rows.senders.episodes[0].arrivals)
+        assert n == info["delivered"] + info["dropped"] + sender["busy"] + sender["occupancy"]
+        assert all(same(*observations) for observations in held)  # never written again
         np.testing.assert_allclose(total, max(0.0, info["qoi"] - 1), atol=1e-9)
         # H by its definition, from what crossed.
-        x = env.rows.senders.episodes[0].arrivals["x"][: len(log)][log["transmitted_us"][:arrived] >= 0]
+        x = env.rows.senders.episodes[0].arrivals["x"][log["transmitted_us"][:n] >= 0]
         assert info["qoi"] == pytest.approx(env.rows.scenario.value.information(np.sort(x)))
     if scenario == "dying":
         assert sender["occupancy"] + sender["busy"] > 0  # stranded, and still all sums hold
