@@ -97,14 +97,14 @@ def check() -> list[Stage]:
 def measured(folder: Path) -> dict[str, str]:
     """Where coverage.py writes, and how it traces: cheaply where Python can."""
     core = {"COVERAGE_CORE": "sysmon"} if sys.version_info >= (3, 12) else {}
-    return {"COVERAGE_FILE": str(folder / "coverage"), **core}
+    return {"COVERAGE_FILE": str(folder / "lines"), **core}
 
 
 def uncompiled(folder: Path, arguments: list[str]) -> list[Stage]:
     """Tests of kernels as plain Python, and which of the kernels' lines ran."""
     named = any((REPO / word.partition("::")[0]).exists() for word in arguments)
     chosen = ["-m", "kernels and not nightly", *arguments, *([] if named else files_that_run_uncompiled())]
-    lines = [PYTHON, ".ci/kernel_lines.py", str(folder / "coverage")]
+    lines = [PYTHON, ".ci/kernel_lines.py", str(folder / "lines")]
     part = "pytest was given arguments, so only a part ran" if arguments else ""
     cov = [] if part else COVERAGE
     return [
@@ -245,7 +245,7 @@ def main(tier: str, arguments: list[str]) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     goes_on = tier == "nightly"
     if goes_on:
-        (folder / "coverage").unlink(missing_ok=True)
+        (folder / "lines").unlink(missing_ok=True)
     stages = {"check": lambda _: check(), "test": test, "nightly": nightly}[tier](arguments)
     results: list[Result] = []
     begun = time.monotonic()

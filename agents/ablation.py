@@ -176,9 +176,10 @@ def main(
     lines = [
         "# What each part is worth",
         "",
-        "Test splits; regret over that of AFR or Drop Oldest, whichever is better. "
-        f"{steps:,} decisions a seed, {base.warm_up:,} of them for the scorer of a still link; "
-        f'{seeds} seeds, whose range is in parentheses: differences within it are noise. "Everything" has '
+        "The figure is the regret on the test splits over the regret of AFR or Drop Oldest, whichever is better. "
+        f"Each seed trains on {steps:,} decisions, {base.warm_up:,} of them for the scorer of a still link. "
+        f"There are {seeds} seeds, and parentheses hold their range. Differences within the range are noise. "
+        '"Everything" has '
         f"{base.hidden} hidden units where the link moves and {base.still_hidden} where it stands still. Made by",
         "",
         f"`python -m agents.ablation --steps {steps} --seeds {seeds}{chosen}`",
@@ -188,7 +189,9 @@ def main(
     ]
     if runs:
         folders = [Path(run) for run in runs.split(",")]
-        about = "Best regret over AFR's on validation so far, mean over the suites; a run ends where it was stopped."
+        about = (
+            "The best regret over AFR's on validation so far, a mean over the suites. A run ends where it was stopped."
+        )
         lines += ["## How they learned", "", about, "", *learning(folders), "", "## What more seeds are worth", ""]
         for folder in folders:
             settings = read_settings(folder)

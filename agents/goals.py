@@ -90,7 +90,7 @@ class SuiteResults:
             ]
             if np.percentile(means, 97.5) < 0:
                 share = -gain.mean() / self.best[cell].mean()
-                lines.append(f"- {label}, L = {L}: H {share:.2%} of the clairvoyant's below {rival}")
+                lines.append(f"- {label}, L = {L}: H is below {rival}'s by {share:.2%} of the clairvoyant's")
         return lines
 
 
@@ -144,10 +144,12 @@ def section(results: SuiteResults) -> list[str]:
     shown = ", ".join(f"{name} {written(results.scores[name], '.3f')}" for name in (AGENTS, best, AFR))
     rivals = dict.fromkeys([AFR, BASELINE, best])
     behind = [line for rival in rivals for line in results.behind(rival, rng)]
+    below = f"the agents' mean H is below {' or '.join(rivals)} by more than the interval"
     return [
-        *(f"## {results.suite}", "", *table(head, rows), "", f"By scenario: {', '.join(scenarios)}.", ""),
-        *(f"Scores (0 is {BASELINE}, 1 the clairvoyant): {shown}.", ""),
-        *(f"Below {', '.join(rivals)} by more than the interval: {'' if behind else 'nowhere.'}", "", *behind, ""),
+        *(f"## {results.suite}", "", *table(head, rows), "", f"The ratio by scenario is: {', '.join(scenarios)}.", ""),
+        *(f"The scores are: {shown}. The score of {BASELINE} is 0 and the clairvoyant's is 1.", ""),
+        *([f"In these cells {below}:"] if behind else [f"In no cell {below}."]),
+        *("", *behind, ""),
     ]
 
 
@@ -170,7 +172,9 @@ def optimum(agents: Sequence[Policy]) -> list[str]:
     return [
         "## Against the online optimum",
         "",
-        "T log-uniform on 1..t_max. Excess: (agent's regret - optimum's) / (AFR's - optimum's), mean over the seeds.",
+        "T is log-uniform on 1..t_max. The excess is a mean over the seeds:",
+        "",
+        "    excess = (agent's regret - optimum's regret) / (AFR's regret - optimum's regret)",
         "",
         *table(["V", "L", "t_max", "AFR's regret", "optimum's", "agents'", "excess"], rows),
         "",
@@ -189,8 +193,8 @@ def exact(agents: Sequence[Policy]) -> list[str]:
     return [
         "## interruption-v1, exactly",
         "",
-        "Regret over AFR's, exact over the law of the test split's T (one run holds all lengths); mean, then the seeds'"
-        " range.",
+        "The figure is the regret over AFR's. It is exact over the law of the test split's T, as one run holds all "
+        "lengths. The mean over the seeds comes first, then their range.",
         "",
         *table(["V", *(f"L = {L}" for L in suite.capacities)], rows),
         "",
@@ -221,10 +225,10 @@ def main(
     if (run / "settings.json").exists():
         steps = [max(row[0] for row in columns_of(model.parent / "curve.csv", "steps")) / 1e6 for model in models]
         decisions = ", ".join(f"{million:.0f} M" for million in steps)
-        lines += [f"Made by `{read_settings(run)['command']}`; seeds stopped after {decisions} decisions.", ""]
+        lines += [f"Made by `{read_settings(run)['command']}`. The seeds stopped after {decisions} decisions.", ""]
     folder = " --data DIR" if data else ""
-    lines += [f"This page: `python -m agents.goals runs/{run.name} --suites {suites}{folder}`.", ""]
-    lines += ["The figure is the regret over AFR's, with its 95 % interval over training seeds and episodes.", ""]
+    lines += [f"This page is made by `python -m agents.goals runs/{run.name} --suites {suites}{folder}`.", ""]
+    lines += ["The figure is the regret over AFR's. Its 95 % interval is over training seeds and episodes.", ""]
     for suite in suites.split(","):
         lines += section(measure(suite, agents, run, data, seeds))
         if suite == "interruption-v1":

@@ -16,19 +16,22 @@ from bufgym.errors import BufgymError
 
 PAGE = """# Learned scheduling on topics-v1
 
-Eight topics of Robofleet's example client share an uplink that is slower than what they publish and drops out now
-and then (`bufgym list suites`). Agents are slot scorers over each queued message's features, its topic's among them;
-they decide at every arrival what is dropped and at every free socket what goes. In training links are 0.7 to 10 times
-as fast and topics are left out by chance. All training seeds are shown; `learned-scheduler` is seed {best}, the best
-on validation by what is trained for: QoI over Robofleet's, less what the topics of priority 20 are older than 0.9 of
-its age there.
+Eight topics of Robofleet's example client share an uplink. It is slower than the client publishes, and it drops out
+now and then (`bufgym list suites`). The agents are slot scorers. They read each queued message's features, including
+the features of its topic. They decide at every arrival which message to drop, and at every free socket which message
+to send. In training, links are 0.7 to 10 times as fast, and topics are left out by chance. The page shows all training
+seeds.
 
-Agents: `{command}`. This page: `python -m agents.scheduling runs/NAME --out docs/topics.md`.
-Without training: `bufgym topics --suite topics-v1`.
+Training rewards QoI over Robofleet's QoI. It subtracts the age of the topics of priority 20 beyond 0.9 of their age
+under Robofleet. `learned-scheduler` is seed {best}, the best on validation by this measure.
 
-Mean over the {settings} settings of the test split, {episodes} episodes each. QoI is the weighted sum of each topic's
-H; beside `robofleet`, as published, on the same episodes, with paired 95 % intervals over episodes. Age is that of
-information at the server, of the topics of priority 20 ("first") and of the others.
+The agents are made by `{command}`. This page is made by `python -m agents.scheduling runs/NAME --out docs/topics.md`.
+Without training, run `bufgym topics --suite topics-v1`.
+
+The figures are means over the {settings} settings of the test split, with {episodes} episodes each. QoI is the weighted
+sum of each topic's H. It is compared with `robofleet`, as published, on the same episodes, with paired 95 % intervals
+over episodes. Age is the age of information at the server. "First" are the topics of priority 20, and "others" are the
+rest.
 
 | policy | QoI / robofleet's | no_drop lost | age, first / robofleet's | age, first, s | age, others, s | late |
 |---|---|---:|---|---:|---:|---:|
@@ -66,9 +69,9 @@ def main(run: Positional[Path], out: Path | None = None) -> None:
     older = max(standing["age_relative"].high for standing in agents)
     lost = sum(standing["lost"].value for standing in agents)
     notes = (
-        f"Over all seeds: QoI {low:.2f} to {high:.2f} times Robofleet's, {lost:g} no_drop "
-        f"messages lost, the topics of priority 20 at most {older:.3f} times as old (upper end of the interval). "
-        "`rosbridge` has an unbounded queue: it loses nothing and delivers it long after."
+        f"Over all seeds QoI is {low:.2f} to {high:.2f} times Robofleet's. The seeds lose {lost:g} no_drop messages. "
+        f"Their topics of priority 20 are at most {older:.3f} times as old, by the upper end of the interval. "
+        "`rosbridge` has an unbounded queue. It loses nothing, and its messages arrive long after."
     )
     text = PAGE.format(
         best=best,

@@ -183,7 +183,7 @@ def markdown(board: Sequence[Entry]) -> str:
     out = [
         "# Leaderboard",
         "",
-        "Made by `bufgym leaderboard`; `bufgym validate SUITE/POLICY` checks a row. In brackets: 95 % bootstrap",
+        "Made by `bufgym leaderboard`. `bufgym validate SUITE/POLICY` checks a row. Brackets hold 95 % bootstrap",
         "intervals over test episodes.",
     ]
     for suite in dict.fromkeys(entry.suite for entry in board):
@@ -195,7 +195,8 @@ def markdown(board: Sequence[Entry]) -> str:
             values = [" ".join(filter(None, shown(entry.values[q.key], q))) for q in quantities]
             lines.append([str(entry.rank) if entry.rank else "–", entry.policy, *values, f"`{entry.command}`"])
         head = ["#", "policy", *(quantity.title for quantity in quantities), "command"]
-        meanings = "; ".join(f"{quantity.title}: {quantity.about}" for quantity in quantities)
-        out += ["", f"## {suite}", "", f"{suites.get(suite).about}. {meanings[0].upper()}{meanings[1:]}.", ""]
+        about = suites.get(suite).about
+        out += ["", f"## {suite}", "", f"{about[0].upper()}{about[1:]}.", ""]
+        out += [*(f"- {quantity.title}: {quantity.about}." for quantity in quantities), ""]
         out += table.markdown_table(head, lines, left=2)
     return "\n".join(out) + "\n"

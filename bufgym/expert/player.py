@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.step import action_of
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for, entry, local, located
+from bufgym.kernel import compile_for, entry, local, located, named
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.policies import Policy
 from bufgym.policies.registry import runs_compiled, signatures
@@ -23,7 +23,6 @@ from bufgym.sim import (
     Senders,
     answer_of,
     arrival_of,
-    named,
     python_arrival,
     python_view,
     view,

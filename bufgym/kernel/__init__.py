@@ -10,6 +10,7 @@ from bufgym.kernel.arrays import at, item, prefetch, records, stretch, table
 from bufgym.kernel.bundle import BundleType, bundle, local
 from bufgym.kernel.cache import FOLDER, NotKeptError, only_kept
 from bufgym.kernel.compile import compile_for, direct, entry, interruptible, kernel, located
+from bufgym.kernel.meanwhile import named
 from bufgym.kernel.switch import JIT
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "kernel",
     "local",
     "located",
+    "named",
     "only_kept",
     "prefetch",
     "records",

@@ -32,7 +32,7 @@ class _Announcer(event.Listener):
         self._depth += 1
         if self._depth == 1 and not self.done:
             self._began_s = time.perf_counter()
-            self._timer = threading.Timer(max(0.0, PATIENCE_S - self._spent_s), self._say)
+            self._timer = threading.Timer(max(0.0, PATIENCE_S - self._spent_s), self.say)
             self._timer.daemon = True
             self._timer.start()
 
@@ -45,7 +45,7 @@ class _Announcer(event.Listener):
             self._timer = None
             self._spent_s += time.perf_counter() - self._began_s
 
-    def _say(self) -> None:
+    def say(self) -> None:
         if not self.done and sys.stderr is not None:
             print(NOTICE, file=sys.stderr, flush=True)
         self.done = True
@@ -57,6 +57,11 @@ def _is_ours(compiling: Any) -> bool:
 
 _announcer = _Announcer()
 cast(Any, event).register("numba:compile", _announcer)
+
+
+def say() -> None:
+    """Write ``NOTICE`` now, unless it was written before."""
+    _announcer.say()
 
 
 def compile_silently() -> None:

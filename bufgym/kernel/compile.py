@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, wait
@@ -13,7 +14,8 @@ from numba.core import types
 from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
-from bufgym.kernel.cache import Code
+from bufgym.kernel.cache import Code, NotKeptError, only_kept
+from bufgym.kernel.meanwhile import FEW, Meanwhile
 from bufgym.kernel.pipeline import PartCompiler, WholeCompiler
 from bufgym.kernel.switch import JIT
 
@@ -87,19 +89,42 @@ def entry(compiled: Any) -> Any:
 
 
 class _Direct:
-    """A kernel whose first argument is a batch: calls with equal ``batch.several`` have arguments of equal types."""
+    """A kernel whose first argument is a batch: calls with equal ``batch.several`` have arguments of equal types.
+
+    Over few rows it runs as plain Python while another process compiles it.
+    """
 
     def __init__(self, compiled: Any) -> None:
         self.__doc__, self.py_func = compiled.__doc__, compiled.py_func
         self._compiled = compiled
         self._entries: dict[Any, Any] = {}
+        self._meanwhile: dict[Any, Meanwhile] = {}
 
     def __call__(self, batch: Any, *arguments: Any) -> Any:
-        found = self._entries.get(batch.several)
-        if found is None:
-            kinds = tuple(cast(Any, numba).typeof(argument) for argument in (batch, *arguments))
-            found = self._entries[batch.several] = self._compiled.compile(kinds)
+        found = self._entries.get(batch.several) or self._found(batch, *arguments)
         return found(batch, *arguments)
+
+    def compile(self, kinds: tuple[Any, ...]) -> Any:
+        """The code for arguments of these types."""
+        return self._compiled.compile(kinds)
+
+    def _found(self, batch: Any, *arguments: Any) -> Any:
+        meanwhile = self._meanwhile.get(batch.several)
+        is_small = len(batch[0]) <= FEW
+        if meanwhile is not None and is_small and not meanwhile.is_over:
+            return meanwhile
+        kinds = tuple(cast(Any, numba).typeof(argument) for argument in (batch, *arguments))
+        if meanwhile is None and is_small and sys.executable:
+            try:
+                with only_kept():
+                    self._entries[batch.several] = self.compile(kinds)
+            except NotKeptError:
+                self._meanwhile[batch.several] = Meanwhile(self._compiled, kinds)
+                return self._meanwhile[batch.several]
+        elif meanwhile is not None:
+            meanwhile.wait()
+        found = self._entries[batch.several] = self.compile(kinds)
+        return found
 
 
 def direct(compiled: Function) -> Function:

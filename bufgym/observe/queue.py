@@ -61,7 +61,7 @@ def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[A
     context[fields.ARRIVAL_TIME_GAP] = squash(time_gap, (arrival.arrival_us - buffer.dequeued_arrival_us) / spread)
     context[fields.ARRIVAL_MOTION_GAP] = squash(motion_gap, (arrival.x - buffer.dequeued_x) / spread)
     context[fields.EVEN_VALUE], even_loss = even_gap(buffer, arrival)
-    context[fields.BEND] = even_loss / max(context[fields.EVEN_VALUE], TINY)
+    context[fields.BEND] = even_loss / max(float(context[fields.EVEN_VALUE]), TINY)
 
 
 @kernel

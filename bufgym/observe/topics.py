@@ -114,10 +114,10 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
         rows[fields.LATENESS, column] = squash(age_us, topic.deadline_us) if topic.deadline_us < NO_DEADLINE_US else 0.0
         rows[fields.QUEUED, column] = topic.queued / capacity
         rows[fields.GAIN, column] = gain / weight
-        rows[fields.GAIN_PER_BYTE, column] = rows[fields.GAIN, column] / message.size_bytes
+        rows[fields.GAIN_PER_BYTE, column] = float(rows[fields.GAIN, column]) / message.size_bytes
         topic.mark = column
         size_sum += message.size_bytes
-        gain_sum += rows[fields.GAIN_PER_BYTE, column]
+        gain_sum += float(rows[fields.GAIN_PER_BYTE, column])
     for number in range(len(buffer.topics)):
         topic = buffer.topics[number]
         j = topic.mark

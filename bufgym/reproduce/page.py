@@ -26,18 +26,19 @@ VERDICTS = {True: "holds", False: "**differs**", None: "not checked"}
 HEAD = """\
 # The papers' claims
 
-Every sentence of the two papers that we know of and that can be checked, the command that tests it, our number, and
-whether it holds. Keys in brackets are those of [references.bib](references.bib).
+This page lists every sentence of the two papers that we know of and that can be checked. Each row has the command that
+tests the sentence, our number, and the verdict. Keys in brackets are from [references.bib](references.bib).
 
-Sentences are in our words. Those whose place names the abstract were checked against it; the wording of all others was
-not checked against the papers' text. "Our addition" marks what the papers do not say. Where a paper leaves a parameter
-open, ours is a stated default of the command's figure.
+The sentences are in our words. Where the place names the abstract, we checked the sentence against the abstract. The
+wording of all others was not checked against the papers' text. "Our addition" marks sentences that the papers do not
+have. Where a paper leaves a parameter open, ours is a stated default of the command's figure.
 
 This page is made by
 
     bufgym reproduce --claims docs/claims.md --data DIR
 
-with the folder of recordings; `make test` compares the rows marked † with what the code prints, `make claims` all.
+DIR is the folder of recordings. `make test` compares the rows marked † with the output of the code. `make claims`
+compares all rows.
 """
 
 

@@ -43,7 +43,6 @@ from bufgym.sim.state import (
     SEND,
     SOCKET_WAITS,
     Batch,
-    named,
 )
 from bufgym.sim.transition import next_event, offer
 from bufgym.sim.view import arrival_of, view
@@ -72,7 +71,6 @@ __all__ = [
     "credit",
     "decide",
     "has_room",
-    "named",
     "next_event",
     "offer",
     "padded",

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for, interruptible, local
+from bufgym.kernel import compile_for, interruptible, local, named
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
 from bufgym.policies.registry import Policy, runs_compiled, signatures
 from bufgym.sim.decisions import answer_dequeue, answer_send, decide
 from bufgym.sim.shared_link import Shares, shares_type
 from bufgym.sim.socket import credit
-from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type, named
+from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type
 from bufgym.sim.transition import move_on, next_event, sender_of
 from bufgym.sim.view import arrival_of, view
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.errors import BufgymError
-from bufgym.kernel import records
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.link import Knots
 from bufgym.model.qoi import Value
@@ -20,11 +19,16 @@ from bufgym.scenario import Episode
 from bufgym.sim.audit import check_untouched
 from bufgym.sim.rollout import roll_out
 from bufgym.sim.shared_link import Shares
-from bufgym.sim.state import LOAD, new_batch
-from bufgym.sim.transition import load_rows
+from bufgym.sim.state import FRESH, SENDER, beginning, new_batch
 
 Begun = tuple[int, Episode, np.random.Generator | None]
 """Which sender begins which episode, and what its uniform draws come from: the arguments of ``Senders.load``."""
+
+_EPISODE = ("arrivals", "first_decision", "last_decision")
+_TRACE = ("first_knot", "last_knot", "after", "segment_now", "segment_finish")
+_DELAYS = ("offset_us", "propagation_us", "window", "ack_delay_us", "v_start")
+_LOADED = np.array([list(cast(Any, SENDER.names)).index(name) for name in (*_EPISODE, *_TRACE, *_DELAYS)])
+"""Fields of SENDER that differ from episode to episode."""
 
 
 class Senders:
@@ -65,8 +69,20 @@ class Senders:
         self._uniforms: list[np.random.Generator | None] = [None] * n
         self._knots = Knots()
         self.batch = new_batch(n, self.capacity, max_messages, len(self._topic_table), values)
-        # Field by field, as NumPy copies records, loading would take five times as long.
-        self._words = self.batch.arrivals.view(np.int64)
+        batch = self.batch
+        self._arrivals, self._log, self._topics, self._senders = (
+            whole.view(np.int64) for whole in (batch.arrivals, batch.log, batch.topics, batch.senders)
+        )  # NumPy copies records field by field; as whole words it copies them five times as fast
+        self._rules = self._topic_table.view(np.int64)
+        self._unlogged = np.tile(FRESH, max_messages)
+        when_full = int(decide_at == "overflow")
+        self._beginning = beginning(
+            capacity=self.capacity,
+            max_bytes=self.max_bytes,
+            ask_when_full=when_full,
+            screens=int(when_full or self.max_bytes < UNLIMITED_BYTES),
+            topics=len(self._topic_table),
+        )
 
     def __len__(self) -> int:
         return len(self.episodes)
@@ -80,16 +96,13 @@ class Senders:
 
     def load_all(self, begun: Sequence[Begun]) -> None:
         """``load`` for each of ``begun`` at once."""
-        loads = records(len(begun), LOAD)
         v_starts = [self._checked(episode) for _, episode, _ in begun]  # before any of them is touched
-        for r, (i, episode, uniforms) in enumerate(begun):
-            loads[r] = self._loaded(i, episode, v_starts[r])
+        for (i, episode, uniforms), v_start in zip(begun, v_starts, strict=True):
+            self._begin(i, episode, v_start)
             self.episodes[i], self._uniforms[i] = episode, uniforms
             self.begun[i] += 1
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
-        ask_when_full = int(self.decide_at == "overflow")
-        load_rows(self.batch, loads, self._topic_table, self.capacity, self.max_bytes, ask_when_full)
 
     def _checked(self, episode: Episode) -> int:
         """Where the V of the episode begins in the array of all V; an error if these senders can't play it."""
@@ -105,13 +118,20 @@ class Senders:
             episode.check_one_queue()
         return 0 if episode.value is None else self._v_start(episode.value)
 
-    def _loaded(self, i: int, episode: Episode, v_start: int) -> tuple[int, ...]:
-        """LOAD of sender ``i``, which gets the episode's arrivals."""
-        link, words = episode.link, episode.arrivals.view(np.int64)
-        self._words[i, : len(words)] = words
-        decisions = (episode.first_decision, episode.last_decision)
-        delays = (link.offset_us, link.propagation_us, episode.window, episode.ack_delay_us)
-        return (i, len(episode.arrivals), *decisions, *self._knots.place(link.trace, i), *delays, v_start)
+    def _begin(self, i: int, episode: Episode, v_start: int) -> None:
+        """Put sender ``i`` at the beginning of ``episode``."""
+        link, n, words = episode.link, len(episode.arrivals), episode.arrivals.view(np.int64)
+        first_knot, last_knot, after = self._knots.place(link.trace, i)
+        self._arrivals[i, : len(words)] = words
+        self._log[i, : n * len(FRESH)] = self._unlogged[: n * len(FRESH)]
+        self._topics[i] = self._rules
+        beginning = self._beginning
+        beginning[_LOADED] = (
+            *(n, episode.first_decision, episode.last_decision),
+            *(first_knot, last_knot, after, first_knot, first_knot),
+            *(link.offset_us, link.propagation_us, episode.window, episode.ack_delay_us, v_start),
+        )
+        self._senders[i * len(beginning) : (i + 1) * len(beginning)] = beginning
 
     def value_of(self, i: int) -> Value:
         """The V that the QoI of sender ``i``'s episode is measured with; without topics."""

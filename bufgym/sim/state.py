@@ -128,26 +128,11 @@ LOG_ENTRY = np.dtype(
     ],
     align=True,
 )
-LOAD = np.dtype(
-    [
-        ("row", np.int64),  # which sender begins the episode; the rest goes into its record
-        ("arrivals", np.int64),
-        ("first_decision", np.int64),
-        ("last_decision", np.int64),
-        ("first_knot", np.int64),
-        ("last_knot", np.int64),
-        ("after", np.int64),
-        ("offset_us", np.int64),
-        ("propagation_us", np.int64),
-        ("window", np.int64),
-        ("ack_delay_us", np.int64),
-        ("v_start", np.int64),
-    ],
-    align=True,
-)
-
 NEVER = -1
 """A time in LOG_ENTRY: it has not happened."""
+
+_FRESH = {"dequeued_us": NEVER, "transmitted_us": NEVER, "dropped_us": NEVER}
+_BEGINNING = {"first": 1, "finish_us": FOREVER, "measures": 1}
 
 NOT_YET = FOREVER - 1
 """The arrival time of a message that a live row still waits for: the row stops there."""
@@ -210,7 +195,21 @@ def batch_type(several: bool) -> Any:
     return cast(Any, numba).typeof(new_batch(1, 1, 1, 2 if several else 1, exponential().array))
 
 
-def named(batch: Batch) -> Batch:
-    """The same memory, as records whose fields read as attributes in plain Python too."""
-    tables = ("senders", "slots", "arrivals", "log", "topics")
-    return batch._replace(**{name: getattr(batch, name).view(np.recarray) for name in tables})
+def words(dtype: np.dtype[Any], **values: float) -> NDArray[np.int64]:
+    """int64[fields]: one record with these values and 0 elsewhere, as whole words.
+
+    NumPy copies records field by field; it copies words five times as fast.
+    """
+    record = np.zeros(1, dtype)
+    for name, value in values.items():
+        record[name] = value
+    return record.view(np.int64)
+
+
+def beginning(**settings: int) -> NDArray[np.int64]:
+    """int64[fields]: SENDER at the beginning of an episode: empty buffer, idle socket, nothing arrived."""
+    return words(SENDER, **_BEGINNING, **settings)
+
+
+FRESH = words(LOG_ENTRY, **_FRESH)
+"""int64[fields]: LOG_ENTRY of a message that has not arrived yet."""

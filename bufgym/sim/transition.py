@@ -6,13 +6,7 @@ of ``bufgym.sim.shared_link``. Numba compiles each case for itself.
 
 from __future__ import annotations
 
-from typing import Any
-
-from numpy.typing import NDArray
-
-from bufgym.kernel import at, kernel, records
-from bufgym.model.buffer import UNLIMITED_BYTES
-from bufgym.model.link import FOREVER
+from bufgym.kernel import at, kernel
 from bufgym.sim.decisions import arrive, choose, oldest_sendable
 from bufgym.sim.shared_link import Shares, join, next_in_cell
 from bufgym.sim.socket import begin_transmission, dequeue, finish_transmission, may_dequeue, next_ack_us
@@ -27,53 +21,13 @@ from bufgym.sim.state import (
     FREED,
     HELD,
     IDLE,
-    NEVER,
     NOT_YET,
     NOTHING,
     SEND,
-    SENDER,
     SOCKET_WAITS,
     UNASKED,
     Batch,
 )
-
-
-def _beginning() -> NDArray[Any]:
-    """SENDER[1]: what every episode begins with; all fields that are not named here are 0."""
-    sender = records(1, SENDER)
-    sender["first"] = 1
-    sender["finish_us"] = FOREVER
-    sender["measures"] = 1
-    return sender
-
-
-_BEGINNING = _beginning()
-
-
-@kernel
-def load_rows(
-    batch: Batch, loads: NDArray[Any], topics: NDArray[Any], capacity: int, max_bytes: int, ask_when_full: int
-) -> None:
-    """Put each sender that ``loads`` (LOAD[rows]) names at the beginning of an episode, whose arrivals it has already:
-    empty buffer, idle socket, nothing arrived. ``topics``: TOPIC[topics], their settings."""
-    for r in range(len(loads)):
-        load = loads[r]
-        i = load.row
-        for k in range(load.arrivals):
-            entry = at(batch.log, i, k)
-            entry.dequeued_us, entry.transmitted_us, entry.dropped_us, entry.limited = NEVER, NEVER, NEVER, 0
-        for k in range(len(topics)):
-            batch.topics[i, k] = topics[k]
-        batch.senders[i] = _BEGINNING[0]
-        sender = batch.senders[i]
-        sender.capacity, sender.max_bytes, sender.ask_when_full = capacity, max_bytes, ask_when_full
-        sender.screens = 1 if ask_when_full == 1 or max_bytes < UNLIMITED_BYTES else 0
-        sender.first_decision, sender.last_decision = load.first_decision, load.last_decision
-        sender.first_knot, sender.last_knot, sender.after = load.first_knot, load.last_knot, load.after
-        sender.offset_us, sender.propagation_us = load.offset_us, load.propagation_us
-        sender.segment_now, sender.segment_finish = load.first_knot, load.first_knot
-        sender.window, sender.ack_delay_us = load.window, load.ack_delay_us
-        sender.arrivals, sender.topics, sender.v_start = load.arrivals, len(topics), load.v_start
 
 
 @kernel

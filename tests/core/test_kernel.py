@@ -135,13 +135,64 @@ def test_a_direct_call_is_the_call() -> None:
             if numbers.several is not None:
                 numbers.of[k] += 1
 
-    one, directly = np.arange(4.0), direct(double)
+    one, directly = np.arange(12.0), direct(double)
     several = one.copy()
     for _ in range(3):
         directly(Numbers(one), 1.0)
         directly(Numbers(several, True), 1.0)
-    assert one.tolist() == [0, 8, 16, 24] and several.tolist() == [7, 15, 23, 31]
+    assert one[:4].tolist() == [0, 8, 16, 24] and several[:4].tolist() == [7, 15, 23, 31]
     assert len(double.overloads) == 2  # type: ignore[attr-defined]
+
+
+SMALL = """
+from typing import Any, NamedTuple
+from bufgym.kernel import bundle, direct, kernel
+
+@bundle
+class Rows(NamedTuple):
+    cells: Any
+    several: bool | None = None
+
+@kernel
+def doubled(cell, factor):
+    return 2 * cell.number * factor
+
+@direct
+@kernel
+def double(rows, factor):
+    for k in range(len(rows.cells)):
+        rows.cells[k].number = doubled(rows.cells[k], factor)
+"""
+
+
+@needs_compilation
+@pytest.mark.parametrize("possible", [True, False], ids=["elsewhere", "nowhere else"])
+def test_few_rows_run_as_plain_python_while_another_process_compiles(tmp_path: Path, possible: bool) -> None:
+    """Where no other process can be started, the kernel is compiled here at the next call."""
+    (tmp_path / "small.py").write_text(SMALL)
+    asked = f"""
+import sys
+import numpy as np
+from small import Rows, double
+from bufgym.kernel import only_kept, records
+if not {possible}:
+    sys.executable = "/nowhere"
+rows = Rows(records(3, np.dtype([("number", np.int64)])))
+rows.cells["number"] = 1
+with only_kept():
+    double(rows, 3)  # nothing is compiled here
+assert rows.cells["number"].tolist() == [6, 6, 6] and not double._compiled.overloads
+double._meanwhile[None].wait()
+if {possible}:
+    with only_kept():
+        double(rows, 1)  # it lies on disk
+else:
+    double(rows, 1)
+assert len(double._compiled.overloads) == 1
+print(int(rows.cells["number"].sum()) + 6)
+"""
+    source = TALE.replace("print(double(21))", asked)
+    assert run(tmp_path, source=source, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == announce.NOTICE + "\n"
 
 
 def _no_kernel(numbers: Any) -> int:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from topic_cases import topic_cases
 
-from bufgym import policies, sim
+from bufgym import kernel, policies, sim
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, arrival_gain, before, is_first, loss, motion_gaps, time_gaps
 from bufgym.model.buffer import after as slot_after
 from bufgym.model.link import FOREVER
@@ -30,7 +30,7 @@ def test_agrees_with_twin_event_by_event(case):
         batch = senders.batch
         sim.credit(batch, 0, int(batch.senders[0]["now_us"]))
         agree(senders, twin)
-        view = sim.python_view(sim.named(batch), 0)
+        view = sim.python_view(kernel.named(batch), 0)
         assert (view.window, view.in_flight) == (case.case.episode.window, len(twin.in_flight))
         assert (view.busy, view.left_bytes) == (int(bool(twin.socket)), twin.left_bytes())
         if event == "decision":
@@ -89,7 +89,7 @@ def agree(senders, twin, until=None, to_the_end=False):
 
 def agree_on_gaps(senders, twin):
     """What a policy reads about the newcomer and every slot."""
-    seen = sim.named(senders.batch)
+    seen = kernel.named(senders.batch)
     buffer, arrival = sim.python_view(seen, 0), seen.arrivals[0, seen.senders[0].next]
     newcomer, slots = twin.newcomer, twin.slots()
     reference, last = twin.reference(), twin.kept_before(newcomer)

@@ -11,14 +11,18 @@ from gymnasium.utils.env_checker import check_env
 
 import bufgym
 from bufgym.envs import SenderEnv
+from bufgym.envs.step import step_cells, step_rows
 from bufgym.errors import BufgymError
+from bufgym.kernel import named
+from bufgym.kernel.meanwhile import Meanwhile
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
 from bufgym.model.link import Link
 from bufgym.observe import FIELDS
 from bufgym.scenario import Episode, Interruption, Scenario, Uplink, messages
-from bufgym.sim import named, python_view
+from bufgym.sim import python_view
 from bufgym.traces import Trace, drive_motion
+from tests.conftest import COMPILED
 
 kernels = pytest.mark.kernels
 SCENARIOS: dict[str, Scenario] = {
@@ -72,6 +76,40 @@ def test_a_mask_as_gymnasium_and_as_sb3_contrib_take_it(env_id: str) -> None:
         assert info["invalid"] == 0
         if ended:
             _, info = env.reset()
+
+
+def played(env_id: str, seed: int) -> list[Any]:
+    """What three episodes of random play hand out."""
+    env = gym.make(env_id, **SMALL[env_id])
+    rng = np.random.default_rng(seed)
+    record = []
+    for k in range(3):
+        obs, info = env.reset(seed=seed if k == 0 else None)
+        ended = False
+        while not ended:
+            obs, reward, ended, _, info = env.step(int(rng.integers(10)))
+            record.append((reward, info["action_mask"].tolist(), {key: obs[key].tolist() for key in obs}))
+    return record
+
+
+@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
+def test_same_seed_same_episode(env_id: str) -> None:
+    """And the episodes that follow without a seed are the same, too; another seed gives another."""
+    assert played(env_id, 5) == played(env_id, 5)
+    assert played(env_id, 5) != played(env_id, 6)
+
+
+@pytest.mark.skipif(not COMPILED, reason="all runs as plain Python")
+@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
+def test_while_the_kernel_is_compiled_elsewhere_the_steps_are_the_same(
+    env_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = played(env_id, 5)
+    monkeypatch.setattr(Meanwhile, "_compile", lambda self: None)
+    for step in (step_rows, step_cells):
+        python = Meanwhile(step, ())
+        monkeypatch.setattr(step, "_entries", {None: python, True: python})
+    assert played(env_id, 5) == compiled
 
 
 def test_an_id_may_name_its_module() -> None:

@@ -95,7 +95,7 @@ def test_broken_traces_and_arguments() -> None:
             make()
 
 
-@given(st.lists(st.tuples(st.integers(1, 10**7), st.integers(0, 10**9)), min_size=1, max_size=30), st.floats(1e-6, 1e3))
+@given(st.lists(st.tuples(st.integers(1, 10**7), st.integers(0, 10**8)), min_size=1, max_size=30), st.floats(1e-6, 1e3))
 def test_scaling_keeps_order_and_describe_keeps_its_bounds(rows: list[tuple[int, int]], factor: float) -> None:
     trace = Trace.from_intervals([r[0] for r in rows], [r[1] for r in rows], after="stop")
     scaled = trace.scaled(factor)

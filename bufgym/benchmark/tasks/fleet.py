@@ -80,13 +80,13 @@ class FleetTask(Task):
         def four_digits(number: float) -> str:
             return decimal(number, 4)
 
-        same = f"that of the same robot under {afr}"
+        same = f"the same robot's H under {afr}"
         above = f"robots whose H is above {same}"
-        below = f"robots whose H is below {same}; the rest are equal"
+        below = f"robots whose H is below {same}. The rest are equal"
         jain = "Jain's index of the robots' H, (sum H)^2 / (N sum H^2): 1 if all are equal, 1/N if one has everything"
         return (
             Quantity("team", "team QoI", score, "mean over the robots of H, mean over episodes", interval=False),
-            Quantity("gain", f"gain over {afr}", gained, f"team QoI minus that of {afr}", versus=afr, drawn=True),
+            Quantity("gain", f"gain over {afr}", gained, f"team QoI minus {afr}'s team QoI", versus=afr, drawn=True),
             Quantity("above", f"robots above {afr}'s", percent, above, versus=afr, drawn=True),
             Quantity("below", "below", percent, below, interval=False, versus=afr),
             Quantity("worst", "worst robot", score, "the least H of a robot, mean over episodes", interval=False),

@@ -71,13 +71,13 @@ class QueueTask(Task):
             ]
 
     def quantities(self, reference: str = "afr") -> tuple[Quantity, ...]:
-        means = "mean over the discriminative cells"
-        scale = f"0 is Drop Oldest, 1 the clairvoyant, which no policy can pass; {means}"
-        above = f"share of episodes on which H is above that of {reference}; equal ones count one half"
+        means = "It is the mean over the discriminative cells"
+        scale = f"0 is Drop Oldest and 1 the clairvoyant, which no policy can pass. {means}"
+        above = f"share of episodes with a larger H than under {reference}. Equal episodes count one half"
         return (
             Quantity("score", "score", score, scale, drawn=True),
             Quantity("iqm", "IQM", score, "interquartile mean of the scores on each discriminative cell and trace"),
-            Quantity("regret", "regret", percent, f"share of the clairvoyant's H that was lost; {means}"),
+            Quantity("regret", "regret", percent, f"share of the clairvoyant's H that was lost. {means}"),
             Quantity("improvement", f"better than {reference}", score, above, versus=reference, drawn=True),
         )
 

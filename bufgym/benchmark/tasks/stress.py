@@ -99,7 +99,9 @@ class StressTask(QueueTask):
 
 
 def _ratios(reference: str) -> tuple[Quantity, ...]:
-    over = f"regret over that of the better of {reference} and Drop Oldest, where that is over {LEAST_REGRET:.1%}"
+    over = (
+        f"regret over the regret of the better of {reference} and Drop Oldest, where theirs is over {LEAST_REGRET:.1%}"
+    )
     return (
         Quantity("worst", "worst cell", "{:.3f}".format, f"the largest {over}", interval=False),
         Quantity("ratio", "mean ratio", "{:.3f}".format, f"mean of the {over}", interval=False),

@@ -82,16 +82,16 @@ class TopicsTask(Task):
     def quantities(self, first: str = "first") -> tuple[Quantity, ...]:
         """``first``: what the topics of the highest priority are called."""
 
-        paired = "sum over sum, on the episodes that both met"
+        paired = "Both are sums over the episodes that both met"
         first_age = "mean age of information at the server of the topics with the highest priority, s"
-        relative_age = f"that age over the one under {BASELINE}: {paired}"
+        relative_age = f"age of the topics with the highest priority, divided by their age under {BASELINE}. {paired}"
         others_age = "mean age of information of all other topics, s"
         lost = "messages of no_drop topics that were dropped, in all episodes together"
-        late = "of the messages delivered on topics with a deadline, the share after it"
+        late = "share of messages delivered after their deadline, among all delivered on topics with a deadline"
         rate = "messages delivered a second, until the last arrival or receipt"
         return (
             Quantity("qoi", "QoI", _one_digit, "sum over topics of weight x H, mean over episodes", interval=False),
-            Quantity("relative", f"QoI / {BASELINE}", score, f"QoI over that of {BASELINE}: {paired}", drawn=True),
+            Quantity("relative", f"QoI / {BASELINE}", score, f"QoI divided by {BASELINE}'s QoI. {paired}", drawn=True),
             Quantity("lost", "no_drop lost", _messages, lost, interval=False, total=True),
             Quantity("age_first_s", f"age, {first} (s)", _seconds, first_age, interval=False),
             Quantity("age_relative", f"age / {BASELINE}", score, relative_age, drawn=True),

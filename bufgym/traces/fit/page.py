@@ -35,20 +35,27 @@ _INTRODUCTION: Final = """\
 
 Made by `{command}`; do not edit.
 
-The generator is `bufgym/traces/generate/markov.py`, with its parameters in `{file}` beside it;
+The generator is `bufgym/traces/generate/markov.py`. Its parameters are in `{file}` beside it, and
 `bufgym/traces/fit/fit.py` fits them.
 
-How to read the tables. A *set* is as many generated traces as there are recordings of that mode, each as long as its
-counterpart. *Generated* is the median of {sets} sets, *95 % of sets* the range of their middle 95 %, and *p* twice the
-smaller share of sets at or beyond the recordings' value (a Monte Carlo test: generated traces have their own
-correlation in time, so seconds need not be independent). Rows with p < {level} are in bold: there the model does not
-match. With so many rows, one in twenty is expected to be bold by chance; and because the parameters were fitted to
-these very recordings, a p near 1 means less than it seems. With few recordings the sets scatter widely, and much would
-pass. What the test can detect is shown by the last column of the first table: the rows that links of independent
-seconds without outages, with the same distribution of rates, do not match.
+How to read the tables:
 
-*Held out* is the honest test of the distribution: a recording against links fitted to the others of its mode.
-*Kolmogorov-Smirnov distance* is the greatest distance between two cumulative distributions.
+- A *set* has as many generated traces as the mode has recordings. Each trace is as long as its counterpart.
+- *Generated* is the median of {sets} sets. *95 % of sets* is the range of their middle 95 %.
+- *p* is twice the smaller share of sets at or beyond the recordings' value. This is a Monte Carlo test. Generated
+  traces have their own correlation in time, so seconds need not be independent.
+- Rows with p < {level} are in bold. There the model does not match.
+
+With so many rows, one in twenty is expected to be bold by chance. The parameters were fitted to these very recordings,
+so a p near 1 means less than it seems. With few recordings the sets scatter widely, and much would pass. The last
+column of the first table shows how much the test can detect. It counts the rows that links of independent seconds do
+not match. These links have the same distribution of rates and no outages.
+
+*Held out* is the honest test of the distribution. It compares a recording with links fitted to the other recordings of
+its mode. The *Kolmogorov-Smirnov distance* is the greatest distance between two cumulative distributions.
+
+Each mode begins with its parameters. The variance of the rates' normal scores has three parts. *Place* stays the same
+for a whole trace, *level* stays the same for a while, and *fast* changes every second.
 """
 
 
@@ -95,7 +102,7 @@ def _summary(
 ) -> str:
     lines = [
         "## In one table\n",
-        "| mode | recordings | seconds | outages | rows not matched | which | by independent seconds |",
+        "| mode | recordings | seconds | outages | rows not matched | which | not matched by independent seconds |",
         "|---|---|---|---|---|---|---|",
     ]
     for mode, rows in compared.items():
@@ -109,7 +116,8 @@ def _summary(
         lines.append("\n" + _leanings(compared))
     lines += [
         "\n## Recordings held out\n",
-        "| mode | parts | median distance of a recording | of a generated trace | recordings beyond 95 % of those |",
+        "| mode | parts | median distance of a recording | of a generated trace "
+        "| recordings beyond 95 % of generated traces |",
         "|---|---|---|---|---|",
     ]
     for mode, h in unseen.items():
@@ -132,8 +140,12 @@ def _leanings(compared: Mapping[str, Sequence[Row]]) -> str:
         if not math.isnan(row.p) and row.name != KS_DISTANCE and row.real != row.median:
             above.setdefault(row.name, []).append(row.real > row.median)
     leaning = {name: sides for name, sides in above.items() if len(sides) >= _MANY_MODES and len(set(sides)) == 1}
-    phrases = [f"{name.split(',')[0]} ({'too low' if sides[0] else 'too high'})" for name, sides in leaning.items()]
-    return f"Generated links lean to one side in every mode in: {', '.join(phrases) or 'nothing'}.\n"
+    sentences = []
+    for too_low, side in ((True, "low"), (False, "high")):
+        names = [name.split(",")[0] for name, sides in leaning.items() if sides[0] == too_low]
+        if names:
+            sentences.append(f"In every mode generated links have too {side} a value of: {', '.join(names)}.")
+    return f"{' '.join(sentences) or 'No statistic leans to one side in every mode.'}\n"
 
 
 def _without_memory(link: LinkParameters) -> LinkParameters:
@@ -158,18 +170,27 @@ def _section(mode: str, link: LinkParameters, rows: Sequence[Row], picture: str 
 def _words(link: LinkParameters) -> str:
     fast = max(0.0, 1 - link.place_share - link.level_share)
     variance = (
-        f"Variance of the scores: place {link.place_share:.2f}, level {link.level_share:.2f} (mean stay "
-        f"{link.level_stay_s:g} s), fast {fast:.2f} (memory {link.fast_memory:.2f} a second)."
+        f"Variance of the scores: {link.place_share:.2f} place, {link.level_share:.2f} level, {fast:.2f} fast. "
+        f"The level stays for {link.level_stay_s:g} s on average. "
+        f"The fast part has a memory of {link.fast_memory:.2f} a second."
     )
     o = link.outages
     if o is None:
-        return variance + " No outages."
-    clusters = f"a share of {o.short_gap_share:.2f} after {o.short_gap_s:g} s on average, " if o.short_gap_share else ""
-    borrowed = " Their lengths and depths are those of all modes, because there are too few." if o.borrowed else ""
-    gaps = f"{clusters}{'others' if clusters else 'each'} after {o.long_gap_s:g} s"
-    lengths = f"they last longer than k s with chance (1 + k / {o.length_scale_s:g})^-{o.length_tail:g}"
-    shoulder = f"Rates within {SHOULDER_S} s of one are {100 * o.shoulder:.0f} % of the others."
-    return f"{variance} {_count(o.spells, 'outage')}: {gaps}; {lengths}.{borrowed} {shoulder}"
+        return variance + " There are no outages."
+    count = f"There {'is' if o.spells == 1 else 'are'} {_count(o.spells, 'outage')}."
+    if o.short_gap_share:
+        gaps = (
+            f"A share of {o.short_gap_share:.2f} of the outages follows {o.short_gap_s:g} s after the one before on "
+            f"average, the others {o.long_gap_s:g} s."
+        )
+    else:
+        gaps = f"An outage follows {o.long_gap_s:g} s after the one before on average."
+    lengths = f"An outage lasts longer than k s with chance (1 + k / {o.length_scale_s:g})^-{o.length_tail:g}."
+    borrowed = (
+        " Lengths and depths come from the outages of all modes, because this mode has too few." if o.borrowed else ""
+    )
+    shoulder = f"Rates within {SHOULDER_S} s of an outage are {100 * o.shoulder:.0f} % of the others."
+    return f"{variance} {count} {gaps} {lengths}{borrowed} {shoulder}"
 
 
 def _count(n: int, what: str) -> str:
