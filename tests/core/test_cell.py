@@ -37,8 +37,6 @@ from bufgym.sim.metrics import outcome
 
 kernels = pytest.mark.kernels
 V = qoi.exponential(0.5)
-US = trace([(0, 0), (1_000_000, 1_000_000)], "loop")
-"""1 byte a microsecond."""
 
 
 def accept(buffer, arrival, memory):
@@ -54,17 +52,6 @@ def hesitant(buffer, memory):
 ACCEPTS = policies.Policy("test-accept", accept, compile=True)
 HESITANT = policies.Policy("test-hesitant", decide_anything, on_send=hesitant, memory={"asked": 0.0}, compile=True)
 POLICIES = [p for p in (*map(policies.get, policies.names()), HESITANT) if p.privileged is None and not any(p.work)]
-
-
-def cell(*robots, trace=US, policy=ACCEPTS, capacity=8):
-    """A fleet after robots met their messages, each a list of (arrival us, bytes)."""
-    arrivals = [messages(*np.array(mine, np.int64).T) for mine in robots]
-    return run_fleet(policy, [FleetEpisode(tuple(arrivals), Link(trace))], capacity, V)
-
-
-def transmitted(fleet):
-    """{sequence number: when it had crossed}, a dictionary for each robot."""
-    return [log(fleet.senders, i)["transmitted_us"] for i in range(len(fleet.senders))]
 
 
 @kernels
@@ -87,40 +74,11 @@ def transmitted(fleet):
     ],
 )
 def test_shares_by_hand(robots, crossed):
-    assert transmitted(cell(*robots)) == crossed
-
-
-@kernels
-@pytest.mark.parametrize(("third_us", "dropped"), [(1_000, {}), (999, {2: 999})])
-def test_what_crosses_at_the_time_of_an_arrival_has_left_before_it(third_us, dropped):
-    # L = 1. Both first messages cross at 1000; A's second is taken then, so its third, which arrives then, finds room.
-    robots = [(0, 500), (0, 1), (third_us, 1)], [(0, 500)]
-    assert log(cell(*robots, policy=policies.get("drop-newest"), capacity=1).senders, 0)["dropped_us"] == dropped
-
-
-@kernels
-def test_a_link_that_stops_leaves_them_all_in_transmission():
-    fleet = cell([(0, 600), (1, 10)], [(0, 600)], trace=trace([(0, 0), (1_000, 1_000)], "stop"))
-    assert transmitted(fleet) == [{}, {}]
-    told = [outcome(fleet.senders, i) for i in fleet.rows(0)]
-    assert [(o.in_transmission, o.buffered, o.qoi) for o in told] == [(1, 1, 0.0), (1, 0, 0.0)]
-
-
-@kernels
-def test_a_robot_sees_what_is_left_of_its_own_message():
-    seen = {}
-
-    def look(buffer, arrival, memory):
-        seen[buffer.now_us] = (buffer.busy, buffer.left_bytes, buffer.left_fraction)
-        return ACCEPT
-
-    # A's 1000 bytes: all of the link until 500, half of it from then on: 750 us after the start 375 bytes are left,
-    # at 1250 us 125.
-    looking = policies.Policy("test-look", look)
-    cell([(0, 1_000), (750, 1), (1_250, 1)], [(500, 10_000)], policy=looking)
-    assert seen[750] == (1, 375, 0.375)
-    assert seen[1_250] == (1, 125, 0.125)
-    assert seen[0] == seen[500] == (0, 0, 0.0)
+    """``robots``: the messages of each, (arrival us, bytes); ``crossed``: {sequence number: when}, of each."""
+    arrivals = tuple(messages(*np.array(mine, np.int64).T) for mine in robots)
+    link = Link(trace([(0, 0), (1_000_000, 1_000_000)], "loop"))  # 1 byte a microsecond
+    fleet = run_fleet(ACCEPTS, [FleetEpisode(arrivals, link)], 8, V)
+    assert [log(fleet.senders, i)["transmitted_us"] for i in range(len(robots))] == crossed
 
 
 @kernels
@@ -155,8 +113,8 @@ def test_robots_that_are_alike_fare_as_one_on_its_share(case, n, policy):
 
 
 @st.composite
-def cells(draw, idle=True):
-    """(episode of 1..4 robots, its knots, L, B); ``idle``: arrivals may come so late that the cell falls idle."""
+def cells(draw):
+    """(episode of 1..4 robots, its knots, L, B); arrivals may come so late that the cell falls idle."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     knots, after = draw(traces())
     link = Link(trace(knots, after), draw(st.integers(0, 3 * knots[-1][0])), draw(st.integers(0, 30_000)))

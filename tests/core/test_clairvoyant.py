@@ -111,38 +111,28 @@ def small(draw: st.DrawFn, equal: bool, windows: bool = False) -> Case:
     return Case(episode, twins, knots, draw(st.integers(1, 3)), max_bytes or None, decide_at)
 
 
-def best_of_all(case: Case, v: qoi.Value) -> float:
+SMALL = {
+    "equal sizes": small(equal=True),
+    "other sizes": small(equal=False),
+    "not every arrival asks": st.booleans().flatmap(lambda equal: small(equal, windows=True)),
+}
+
+
+@kernels
+@pytest.mark.parametrize("kind", SMALL)
+@given(st.data(), VALUES)
+def test_is_the_best_of_all_decisions_or_an_upper_bound(kind, data, v):
+    case = data.draw(SMALL[kind])
+    plan = clairvoyant(case.episode, case.capacity, v, max_bytes=case.max_bytes)
     link = naive_oracle.Link(case.knots, case.episode.link.trace.after, case.episode.link.offset_us)
     window = (case.episode.first_decision, case.episode.last_decision)
-    return naive_oracle.best(link, case.twin_messages, case.capacity, v, case.max_bytes, case.decide_at, *window)
-
-
-def plan_of(case: Case, v: qoi.Value):
-    return clairvoyant(case.episode, case.capacity, v, max_bytes=case.max_bytes)
-
-
-def played(case: Case, v: qoi.Value) -> float:
-    """H of the plan in the sender."""
-    return outcome(case.run(policies.get("clairvoyant"), v), 0).qoi
-
-
-@kernels
-@given(small(equal=True), VALUES)
-def test_is_the_best_of_all_decisions(case, v):
-    plan = plan_of(case, v)
-    assert plan.qoi == pytest.approx(best_of_all(case, v), abs=EXACT)
-    assert plan.certified
-    assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
-
-
-@kernels
-@given(small(equal=False), VALUES)
-def test_is_an_upper_bound_where_sizes_differ(case, v):
-    plan, best = plan_of(case, v), best_of_all(case, v)
+    best = naive_oracle.best(link, case.twin_messages, case.capacity, v, case.max_bytes, case.decide_at, *window)
     assert plan.qoi >= best - EXACT
-    if plan.certified:
+    assert plan.certified or kind != "equal sizes"
+    if plan.certified and case.decide_at == "arrival":
         assert plan.qoi == pytest.approx(best, abs=EXACT)
-        assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
+        played = outcome(case.run(policies.get("clairvoyant"), v), 0)
+        assert played.qoi == pytest.approx(plan.qoi, abs=EXACT)
 
 
 @kernels
@@ -184,16 +174,6 @@ def test_with_unequal_sizes_the_plan_comes_close_to_the_bound(L, limits):
             assert 0.98 * plan.qoi <= result.qoi <= plan.qoi + EXACT
             rivals = [policies.get(name) for name in ("drop-oldest", "afr", "min-gap", "min-motion-gap")]
             assert max(outcome(run(rival, [episode], L, lte.value, **limits), 0).qoi for rival in rivals) <= result.qoi
-
-
-@kernels
-@given(st.booleans().flatmap(lambda equal: small(equal, windows=True)), VALUES)
-def test_is_an_upper_bound_where_not_every_arrival_asks(case, v):
-    plan, best = plan_of(case, v), best_of_all(case, v)
-    assert plan.qoi >= best - EXACT
-    if plan.certified and case.decide_at == "arrival":
-        assert plan.qoi == pytest.approx(best, abs=EXACT)
-        assert played(case, v) == pytest.approx(plan.qoi, abs=EXACT)
 
 
 @kernels
@@ -267,27 +247,12 @@ def without_bounds(c, size, limit, x, v, ends) -> float:
 
 
 @kernels
-@pytest.mark.parametrize("grid", [1, 16, 400])
-def test_bounds_lose_nothing(grid, monkeypatch):
-    monkeypatch.setattr(labels, "GRID", grid)
-    for seed in range(12 if JIT else 2):
-        problem = middling(seed, 60 + 6 * seed if JIT else 25)
-        assert labels.best(*problem)[1] == pytest.approx(without_bounds(*problem), abs=EXACT), seed
-
-
-@kernels
-def test_a_coarse_grid_loses_nothing(monkeypatch):
-    problems = [middling(seed, 60 if JIT else 20) for seed in range(12 if JIT else 2)]
-    fine = [labels.best(*problem)[1] for problem in problems]
-    monkeypatch.setattr(programme, "MAX_CELLS", 64)
-    assert [labels.best(*problem)[1] for problem in problems] == pytest.approx(fine, abs=EXACT)
-
-
-@kernels
-def test_labels_get_more_room_when_they_need_it(monkeypatch):
-    problem = middling(1, 25)
-    plan, gain = labels.best(*problem)
-    monkeypatch.setattr(labels, "LABELS", 4)
-    again, same = labels.best(*problem)
-    assert same == gain and again.tolist() == plan.tolist()
-    assert len(plan) > 4  # four labels were too few indeed
+@pytest.mark.parametrize(
+    ("module", "setting", "number"),
+    [*((labels, "GRID", steps) for steps in (1, 16, 400)), (programme, "MAX_CELLS", 64), (labels, "LABELS", 4)],
+)
+def test_bounds_coarse_grids_and_little_room_lose_nothing(module, setting, number, monkeypatch):
+    problems = [middling(seed, 60 + 6 * seed if JIT else 25) for seed in range(12 if JIT else 2)]
+    best = [without_bounds(*problem) for problem in problems]
+    monkeypatch.setattr(module, setting, number)
+    assert [labels.best(*problem)[1] for problem in problems] == pytest.approx(best, abs=EXACT)

@@ -54,14 +54,6 @@ def test_a_message_that_breaks_a_rule(fields: dict[str, Any], message: str) -> N
         FleetEpisode((THREE, changed(**fields)), STEADY)
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_a_part_of_an_episode_is_none(name: str) -> None:
-    """Its messages no longer have the numbers by which kernels find what became of them."""
-    episode = scenario.get(name).draw(Streams.seeded(2))
-    with pytest.raises(BufgymError, match=r"^message 0: seq = 2: must be its place in the list of arrivals, 0"):
-        replace(episode, arrivals=episode.arrivals[2:])
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

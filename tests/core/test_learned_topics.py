@@ -7,23 +7,15 @@ import pytest
 from cases import VALUES, cases, log, order, same
 from hypothesis import given
 from hypothesis import strategies as st
-from topic_cases import topic_cases
-from weight_cases import ABOUT, made, random_weights, score
+from topic_cases import observed, topic_cases
+from weight_cases import random_weights, score
 
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
-from bufgym.observe import (
-    CONTEXT_FIELDS,
-    SLOT_FIELDS,
-    TOPIC_CONTEXT_FIELDS,
-    TOPIC_SLOT_FIELDS,
-    observe_topic_context,
-    observe_topic_slots,
-)
-from bufgym.policies import learned_topics, weights
+from bufgym.policies import learned_topics
 from bufgym.policies.learned_topics import NAMES, TopicWeights
 from bufgym.policies.registry import ClientSettings, Policy
 from bufgym.scenario import Episode, messages
@@ -31,8 +23,6 @@ from bufgym.sim import run
 from bufgym.traces import Trace
 
 V = qoi.exponential(0.618)
-SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
-CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
 
 
 @st.composite
@@ -45,12 +35,9 @@ def schedulers(draw):
 
 def scores(whole, net, buffer, arrival, arriving):
     """Of every place of the queue, the newcomer's last."""
-    slots, context = np.zeros((len(SLOT_NAMES), buffer.capacity + 1)), np.zeros(len(CONTEXT_NAMES))
-    observe_topic_slots(buffer, arrival, arriving, slots)
-    observe_topic_context(buffer, arrival, arriving, context)
-    seen = dict(zip(SLOT_NAMES, slots, strict=True))
-    seen |= {name: np.full(buffer.capacity + 1, each) for name, each in zip(CONTEXT_NAMES, context, strict=True)}
-    return [score(net, [seen[name][k] for name in whole.fields]) for k in range(buffer.capacity + 1)]
+    n = buffer.capacity + 1
+    seen = {name: np.broadcast_to(each, n) for name, each in observed(buffer, arrival, arriving).items()}
+    return [score(net, [seen[name][k] for name in whole.fields]) for k in range(n)]
 
 
 def with_room(buffer, arrival, rest):
@@ -96,23 +83,17 @@ def twin(whole):
     return Policy("twin", on_arrival, on_send=on_send)
 
 
-def played(case, policy):
-    senders = case.senders()
-    senders.run(policy)
-    return senders
-
-
 @pytest.mark.kernels
 @given(topic_cases(min_topics=2, max_messages=25), schedulers(), st.integers(1, 20))
 def test_decides_as_its_twin_compiled_and_not(case, whole, capacity):
     case = replace(case, case=replace(case.case, capacity=capacity), client=ClientSettings())
     policy = learned_topics.policy("random-weights", whole)
-    ours, again, memory = played(case, policy), case.senders(), policy.new_memory(1, capacity)
+    ours, again, memory = case.run(policy), case.senders(), policy.new_memory(1, capacity)
     memory[:] = np.nan  # what it held before does not matter
     again.run(policy, memory)
     assert same(ours, again)
-    assert same(ours, played(case, twin(whole)))
-    assert same(ours, played(case, replace(policy, compile=False)))
+    assert same(ours, case.run(twin(whole)))
+    assert same(ours, case.run(replace(policy, compile=False)))
     if case.case.episode.first_decision == 0 and case.case.episode.last_decision > 10**6:
         assert int(ours.batch.senders["invalid"][0]) == 0
 
@@ -160,16 +141,3 @@ def test_sends_and_drops_by_hand():
     # By the lowest priority sent: 8, and 7 last.
     other = linear(drop_priority=-1, drop_rank=-0.01, send_priority=-1)
     assert order(run(other, [ten_messages()], 4, V, topics=HIGH_AND_LOW)) == [0, 2, 5, 8, 7]
-
-
-def test_a_loaded_scheduler_is_a_policy_like_any_other(tmp_path):
-    whole, path = made(4, kind=TopicWeights), tmp_path / "small.safetensors"
-    weights.save(path, whole, ABOUT)
-    policy = policies.load(path)
-    assert (policy.name, policy.summary) == ("small", ABOUT["about"])
-    assert policy.schedules and policy.for_topics and policy.ranked
-    first, other = (
-        run(scheduler, [ten_messages()], 3, V, topics=HIGH_AND_LOW)
-        for scheduler in (policy, learned_topics.policy("x", whole))
-    )
-    assert same(first, other)

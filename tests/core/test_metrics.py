@@ -38,16 +38,14 @@ def test_ages_of_too_little():
     assert ages_s(us(5, 5), us(1, 2)) == (4.0, 4.0, 4.0)
 
 
-def queue_of_two():
+def test_outcome():
     """1 message a second; 0 goes out, 1 and 2 wait, 3 evicts 1: 0, 2, 3 cross at 1, 2, 3 s and arrive 0.1 s later."""
+    assert METRICS[0] == "qoi" and len(set(METRICS)) == len(METRICS)
     arrivals = messages(us(0, 0.5, 0.6, 0.7), 1_000, np.array([0.0, 1.0, 2.0, 4.0]))
     link = Link(trace([(0, 0), (S, 1_000)], "loop"), propagation_us=S // 10)
-    return run(policies.get("drop-oldest"), [Episode(arrivals, link)], 2, qoi.saturating(8))
-
-
-def test_outcome():
-    assert METRICS[0] == "qoi" and len(set(METRICS)) == len(METRICS)
-    result = outcome(queue_of_two(), 0)
+    senders = run(policies.get("drop-oldest"), [Episode(arrivals, link)], 2, qoi.saturating(8))
+    got, result = received(senders, 0), outcome(senders, 0)
+    assert (got["seq"].tolist(), got["x"].tolist()) == ([0, 2, 3], [0, 2, 4])
     assert (result.arrived, result.delivered, result.dropped) == (4, 3, 1)
     assert (result.in_transmission, result.buffered, result.invalid) == (0, 0, 0)
     assert result.qoi == 1 + 2 / 8 + 2 / 8
@@ -58,12 +56,6 @@ def test_outcome():
     assert result.p95_sojourn_s == pytest.approx(1.4 + 0.9 * 0.9)
     # 1.1 to 2.1 s: age 1.1 to 2.1; 2.1 to 3.1 s: age 1.5 to 2.5.
     assert (result.mean_age_s, result.peak_age_s, result.max_age_s) == pytest.approx((1.8, 2.3, 2.5))
-
-
-def test_received():
-    got = received(queue_of_two(), 0)
-    assert got["seq"].tolist() == [0, 2, 3]
-    assert got["x"].tolist() == [0, 2, 4]
 
 
 def test_nothing_received():

@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-from cases import newcomer, queue_of, trace
+from cases import trace
 
 from bufgym import policies
-from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
 from bufgym.oracle import beam, programme
-from bufgym.policies import ACCEPT, REJECT, aqm, webrtc
+from bufgym.policies import webrtc
 from bufgym.scenario import Episode, messages
 from bufgym.sim import NEVER, Senders, audit
 
@@ -114,18 +113,6 @@ def test_a_beam_keeps_to_the_room(capacity, max_bytes, width, plan):
 # --- policies --------------------------------------------------------------------------------------------------------
 
 
-def test_red_counts_from_the_first_arrival_above_the_threshold():
-    """Average 4 of L = 8, min_th 1/4, max_th 3/4, max_p 0.1: p_b = 0.05, and 0.05 / (1 - 0.05 count) in all."""
-    red = policies.get("red")
-    memory = red.new_memory()[0]
-    memory[:] = 0.0, 5.0
-    assert aqm.red(queue_of(0, 8, red.parameter_array), newcomer(), memory) == ACCEPT  # below: the count starts anew
-    draws = (0.0501, ACCEPT), (0.0527, ACCEPT), (0.0555, REJECT), (0.0527, ACCEPT), (0.0555, REJECT)
-    for uniform, decision in draws:
-        memory[0] = 4.0
-        assert aqm.red(queue_of(4, 8, red.parameter_array), newcomer(uniform), memory) == decision
-
-
 def test_webrtc_starts_a_new_pattern_when_the_bucket_gets_too_full_and_not_while_it_is():
     """1 byte/us: the bucket holds 500 kB, and 40 ms leak 40 kB."""
     memory = policies.get("webrtc-frame-dropper").new_memory()[0]
@@ -174,9 +161,3 @@ def test_policies_start_with_the_published_settings_and_an_empty_memory():
     assert {policy.name: dict(policy.parameters) for policy in built_in if policy.parameters} == SETTINGS
     memories = {policy.name: {key: number for key, number in policy.memory.items() if number} for policy in built_in}
     assert {name: memory for name, memory in memories.items() if memory} == BEGINNINGS
-
-
-@pytest.mark.parametrize("every", [0, -1, -0.5, float("nan"), float("inf")])
-def test_settings_are_numbers_above_0(every):
-    with pytest.raises(BufgymError, match=r"policy decimate: every = .*: must be a number > 0"):
-        policies.get("decimate").with_parameters(every=every)

@@ -3,31 +3,17 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from topic_cases import TWIN_V, TopicCase, topic_cases
+from topic_cases import CONTEXT_NAMES, SLOT_NAMES, TWIN_V, TopicCase, observed, topic_cases
 
 from bufgym.kernel import named
 from bufgym.model.buffer import ACCEPT, UNLIMITED_BYTES
 from bufgym.model.link import Link
 from bufgym.model.qoi import saturating
 from bufgym.model.topics import Topic
-from bufgym.observe import (
-    CONTEXT_FIELDS,
-    FIELDS,
-    SLOT_FIELDS,
-    TOPIC_CONTEXT_FIELDS,
-    TOPIC_FIELDS,
-    TOPIC_SLOT_FIELDS,
-    observe_context,
-    observe_slots,
-    observe_topic_context,
-    observe_topic_slots,
-)
+from bufgym.observe import FIELDS, TOPIC_FIELDS
 from bufgym.scenario import Episode, messages
 from bufgym.sim import DECISION, END, Senders, decide, next_event, python_view
 from bufgym.traces import Trace
-
-SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
-CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
 
 
 def per(g, r):
@@ -166,22 +152,6 @@ class Twin:
         return made
 
 
-def observed(batch, buffer, arriving):
-    """Both observations, by the kernels; the places are full of rubbish before."""
-    rows = np.full((len(SLOT_NAMES), buffer.capacity + 1), np.nan)
-    context = np.full(len(CONTEXT_NAMES), np.nan)
-    sender = batch.senders[0]
-    arrival = batch.arrivals[0, min(sender.next, sender.arrivals - 1)]
-    if sender.topics == 1:
-        rows, context = rows[: len(SLOT_FIELDS)], context[: len(CONTEXT_FIELDS)]
-        observe_slots(buffer, arrival, rows)
-        observe_context(buffer, arrival, context)
-    else:
-        observe_topic_slots(buffer, arrival, arriving, rows)
-        observe_topic_context(buffer, arrival, arriving, context)
-    return dict(zip(SLOT_NAMES, rows, strict=False)) | dict(zip(CONTEXT_NAMES, context, strict=False))
-
-
 @pytest.mark.kernels
 @given(topic_cases(max_messages=25).filter(lambda case: len(case.topics) != 1))
 def test_every_field_is_its_twins(case):
@@ -191,7 +161,8 @@ def test_every_field_is_its_twins(case):
             buffer = python_view(seen, 0)
             by_definition = Twin(case, twin, buffer)
             by_definition = by_definition.slots() | by_definition.context()
-            for name, numbers in observed(seen, buffer, event == "decision").items():
+            arrival = seen.arrivals[0, min(seen.senders[0].next, seen.senders[0].arrivals - 1)]
+            for name, numbers in observed(buffer, arrival, event == "decision").items():
                 what = f"{name} at a {event}"
                 np.testing.assert_allclose(numbers, by_definition[name], rtol=1e-6, atol=1e-6, err_msg=what)
                 assert ((numbers >= 0) & (numbers <= 1)).all(), name
@@ -213,7 +184,7 @@ def test_no_loss_is_rounded_below_nothing():
     while (event := next_event(senders.batch, None, 0)) != END:
         batch = named(senders.batch)
         if event == DECISION and batch.senders[0].next == 2:
-            loss = observed(batch, python_view(batch, 0), True)["loss"]
+            loss = observed(python_view(batch, 0), batch.arrivals[0, 2], True)["loss"]
             assert (loss >= 0).all() and loss[0] == 0
             break
         if event == DECISION:

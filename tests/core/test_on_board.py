@@ -116,27 +116,19 @@ def rows_of(buffer, arrival):
     return rows
 
 
-def slots_recorder(seen, decide):
-    def on_arrival(buffer, arrival, memory):
-        seen.append((buffer.dequeued_seq, rows_of(buffer, arrival)))
-        one_by_one = [
-            [f.function(buffer, arrival, k) for k in range(len(buffer.slots) + 1)] for f in ON_BOARD_SLOT_FIELDS
-        ]
-        where = [*range(len(buffer.slots)), buffer.capacity]
-        np.testing.assert_array_equal(seen[-1][1][:, where], one_by_one)
-        return decide(buffer, arrival, memory)
-
-    return policies.Policy("recorder", on_arrival)
-
-
 def test_gaps_in_messages_by_hand():
     # The socket takes message 0 at once and holds it; 1 is kept, 2 and 3 are rejected, 4 is kept, 5 asks. L = 2: the
     # even spacing is 5 / 3 messages, and a third of 1, 2.5 and so on comes of gap / (gap + spacing).
     seen = []
-    keep = {0, 1, 4}
-    line([0, 1, 1, 1, 1, 9], sizes=100_000).run(
-        slots_recorder(seen, lambda buffer, arrival, memory: ACCEPT if arrival.seq in keep else REJECT)
-    )
+
+    def on_arrival(buffer, arrival, memory):
+        seen.append((buffer.dequeued_seq, rows_of(buffer, arrival)))
+        s = len(buffer.slots)
+        one_by_one = [[f.function(buffer, arrival, k) for k in range(s + 1)] for f in ON_BOARD_SLOT_FIELDS]
+        np.testing.assert_array_equal(seen[-1][1][:, [*range(s), buffer.capacity]], one_by_one)
+        return ACCEPT if arrival.seq in (0, 1, 4) else REJECT
+
+    line([0, 1, 1, 1, 1, 9], sizes=100_000).run(policies.Policy("recorder", on_arrival))
     assert [seq for seq, _ in seen] == [0, 0, 0, 0, 0, 0]
     even = 5 / 3
     before, merged = np.array([1, 3, 1]), np.array([4, 4, 2])

@@ -4,7 +4,6 @@ import math
 from itertools import combinations
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from cases import VALUES, order, same
@@ -14,7 +13,6 @@ from hypothesis import strategies as st
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym.errors import BufgymError
-from bufgym.expert import Player
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.oracle import integer
@@ -179,21 +177,6 @@ def test_no_policy_beats_it_and_it_plays_as_it_promises(L, p, objective):
 @pytest.fixture(scope="module")
 def made() -> OnlineOptimum:
     return online_optimum(3, uniform(3, 16), V)
-
-
-@kernels
-def test_in_an_environment_it_plays_as_it_promises(made):
-    scenario = Interruption(t_max=16, value=V)
-    env: Any = gym.make("bufgym/Uplink-v0", scenario=scenario, capacity=3).unwrapped
-    player = Player(made.policy())
-    mean = 0.0
-    for T in range(4, 17):
-        env.reset(options={"episode": scenario.episode(T)})
-        ended, info = False, {}
-        while not ended:
-            _, _, ended, _, info = env.step(player.action(env.rows.senders))
-        mean += made.probabilities[T] * (info["qoi"] - 1) / integer(3, T, V)
-    assert mean == pytest.approx(made.value, abs=1e-12)
 
 
 @kernels

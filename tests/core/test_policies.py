@@ -1,19 +1,24 @@
-"""Drop policies by hand: AFR's figures step by step, what chance may do, and what each keeps."""
+"""Drop policies by hand: AFR's figures step by step, what chance may do, what each paper or program says it does."""
 
-from dataclasses import replace
-from types import SimpleNamespace
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
-from cases import newcomer, order, queue_of
+from cases import VALUES, cases, log, newcomer, order, queue_of, same
+from hypothesis import given
 from policy_cases import V, drops, interruption, kept, stream, worst_ratio
 
 from bufgym import policies
-from bufgym.policies import ACCEPT, REJECT, afr
-from bufgym.scenario import Interruption
-from bufgym.sim import Senders, run
+from bufgym.model.link import Link
+from bufgym.policies import ACCEPT, REJECT, afr, aqm
+from bufgym.policies.checkpointing import growing_gap
+from bufgym.scenario import Episode, Interruption, messages
+from bufgym.sim import run
 from bufgym.sim.metrics import outcome
+from bufgym.traces import Trace
 
+MS = 1_000
 kernels = pytest.mark.kernels
 
 
@@ -25,19 +30,6 @@ def test_figure_4(name):
     evens = [(arrival, 2 * arrival - 17) for arrival in range(9, 17)]
     assert drops(interruption(name, 8, 18)) == [*evens, (17, 17), (18, 2)]
     assert kept(name, 8, 16) == [2, 4, 6, 8, 10, 12, 14, 16]
-
-
-@kernels
-@pytest.mark.parametrize(
-    ("T", "r_c_p"), [(9, (1, 0, 1)), (15, (1, 0, 7)), (16, (2, 0, 0)), (17, (2, 1, 0)), (18, (2, 0, 1))]
-)
-def test_figure_4_memory(T, r_c_p):
-    senders = Senders(1, 8, V, max_messages=T + 2)
-    senders.load(0, Interruption(t_max=T).episode(T))
-    policy = policies.get("afr-paper")  # departures after the interruption leave its memory alone
-    memory = policy.new_memory()
-    senders.run(policy, memory)
-    assert tuple(memory[0]) == r_c_p
 
 
 @kernels
@@ -72,16 +64,6 @@ def test_the_bound_for_halving():
         assert ask(on_arrival, 3, 3, r=1, c=0, p=2) == (2, 2, 0, 0)  # the end of a pass
 
 
-@kernels
-@pytest.mark.parametrize(("p", "after"), [(3, 2), (1, 0), (0, 0)])
-def test_a_departure_moves_p(p, after):
-    memory = np.array([2.0, 1.0, p])
-    policies.get("afr").on_departure(SimpleNamespace(slots=[]), memory)
-    assert memory.tolist() == [2, 1, after]
-    assert policies.get("afr").hears_departures
-    assert not policies.get("afr-paper").hears_departures
-
-
 L, T, RUNS = 4, 12, 3_000
 
 
@@ -102,31 +84,6 @@ def test_how_often_chance_keeps_each_message(name, decide_at, expected):
     assert (np.abs(share - expected) < 4.5 * np.sqrt(expected * (1 - expected) / RUNS)).all()
 
 
-@kernels
-def test_the_uniform_draws_decide_and_nothing_else():
-    one, again, other = (drops(interruption("random", 3, 40, uniform)) for uniform in (1, 1, 2))
-    assert one == again != other
-
-
-@kernels
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("drop-oldest", [4, 5, 6]),
-        ("drop-newest", [1, 2, 3]),
-        ("replace-newest", [1, 2, 6]),
-        # Message 0 was the first of three; 1 and 2 are decimated, as are 4 and 5.
-        ("decimate", [1, 4]),
-        # 4 drops 1 (of equal gaps the oldest), 5 drops 3, 6 drops 5: the gaps stay 2.
-        ("min-gap", [2, 4, 6]),
-        # Message 0 left last. 4 drops 1 (between 0 and 2; of equals the first); 5 drops 3: 2 4 5; 6 drops 4.
-        ("orbbuf", [2, 5, 6]),
-    ],
-)
-def test_what_each_keeps_of_six_arrivals(name, expected):
-    assert kept(name, 3, 6) == expected
-
-
 def test_worst_gaps():
     # The first eviction at L = 8 leaves one gap of 2 where 10/9 would be ideal: 1.8 for whoever drops at all.
     assert worst_ratio("min-gap", 8, [9]) == pytest.approx(1.8)
@@ -138,18 +95,192 @@ def test_worst_gaps():
 
 
 @kernels
-def test_min_motion_gap_looks_at_motion():
-    # The camera stands still from message 3 to message 6: those are dropped first, whatever the time between them.
-    x = np.array([0.0, 1, 2, 3, 3, 3, 3, 4, 5])
-    base = Interruption(t_max=7).episode(7)
-    arrivals = base.arrivals.copy()
-    arrivals["x"] = x
-    senders = run(policies.get("min-motion-gap"), [replace(base, arrivals=arrivals)], 4, V)
-    assert np.unique(x[order(senders)[1:-1]]).tolist() == [1, 2, 3, 4]
-
-
-@kernels
 @pytest.mark.parametrize(("every", "accepted"), [(2, [0, 2, 4, 6, 8]), (2.5, [0, 3, 5, 8]), (1, list(range(10)))])
 def test_decimate_keeps_one_in_every(every, accepted):
     """An open link sends whatever is accepted; one in 2.5 alternates between steps of 3 and 2."""
     assert order(stream(f"decimate:every={every}", 10, 1_000_000, 4, size_bytes=1)) == accepted
+
+
+@kernels
+@given(cases(), VALUES)
+def test_linear_with_alpha_1_is_afr(case, v):
+    assert same(case.run(policies.get("linear-alpha:alpha=1"), v), case.run(policies.get("afr"), v))
+
+
+@kernels
+def test_linear_keeps_times_that_grow_as_powers():
+    # alpha = 2, L = 4: message i at i^2 / 4. The first pass waits 9/4, 11/4, 13/4, 15/4; the second four times as long.
+    assert [growing_gap(1.0, p, 4, 2.0) for p in range(4)] == [9 / 4, 11 / 4, 13 / 4, 15 / 4]
+    assert [growing_gap(2.0, p, 4, 2.0) for p in range(4)] == [9, 11, 13, 15]
+
+
+@kernels
+@pytest.mark.parametrize(
+    ("spec", "L", "T", "expected"),
+    [
+        # So after 1..4 alpha = 2 keeps arrivals 4 + 2.25, 5, 8.25, 12, each at the first whole number: 7, 9, 13, 16.
+        # Evicted are 1, 3, then 7 (the third of 2 4 7 9) and 13; the next is due at 16 + 9.
+        ("linear-alpha:alpha=2", 4, 15, [2, 4, 9, 13]),
+        ("linear-alpha:alpha=2", 4, 16, [2, 4, 9, 16]),
+        ("linear-alpha:alpha=2", 4, 24, [2, 4, 9, 16]),
+        ("linear-alpha:alpha=2", 4, 25, [4, 9, 16, 25]),
+        # S = 8: four of 1, 2, 4, ...; two of 3, 6, 12, ...; one each of 5, 10, ... and 7, 14, ...
+        ("steady", 8, 12, [1, 2, 4, 6, 7, 8, 10, 12]),
+        ("steady", 8, 16, [2, 4, 6, 8, 10, 12, 14, 16]),
+        ("steady", 8, 24, [2, 4, 8, 12, 14, 16, 20, 24]),
+        ("steady", 8, 31, [2, 4, 8, 12, 16, 20, 24, 28]),
+        ("steady", 8, 32, [4, 8, 12, 16, 20, 24, 28, 32]),
+        ("steady", 15, 16, [2, 4, 6, 8, 10, 12, 14, 16]),  # L = 15 has the 8 sites of L = 8
+        ("steady", 1, 63, [32]),  # one site keeps powers of two
+        # The socket took message 0. At 4: T = 4, beta T / (L + 1) = 1.3: message 4 is 1 from 3, rejected. At 5: 2
+        # against 1.625, so 5 enters and 1 goes (merged gaps 2, 2, 3). beta = 0.9: 1 against 0.9: 4 enters.
+        ("even-reject", 3, 4, [1, 2, 3]),
+        ("even-reject", 3, 5, [2, 3, 5]),
+        ("even-reject:beta=0.9", 3, 4, [2, 3, 4]),
+        # x is the frame index. The even spacing at T is T / 4, of which 0.7 count; slots 0, 1, 2 count 0.65, 0.767,
+        # 0.883. At 4: 1 against 0.7, and of the gaps 2, 2, 2 the oldest is the least: 1 goes. At 5: 1 against 0.875;
+        # gaps 3, 2, 2 count 1.95, 1.53, 1.77: 3 goes. At 6: 1 against 1.05: rejected. At 7: 2 against 1.225; gaps 4, 3,
+        # 3 count 2.6, 2.3, 2.65: 4 goes.
+        ("paced-motion-gap", 3, 4, [2, 3, 4]),
+        ("paced-motion-gap", 3, 5, [2, 4, 5]),
+        ("paced-motion-gap", 3, 6, [2, 4, 5]),
+        ("paced-motion-gap", 3, 7, [2, 5, 7]),
+        ("paced-motion-gap:discount=0.01", 3, 5, [2, 4, 5]),
+        ("paced-motion-gap:pace=0.9", 3, 5, [2, 3, 4]),
+        ("ros-keep-last", 16, 30, [*range(21, 31)]),  # 10 by default
+        ("ros-keep-last", 4, 30, [27, 28, 29, 30]),  # no more than L
+        ("ros-keep-last:depth=2", 4, 30, [29, 30]),
+        ("latest-only", 8, 30, [30]),
+        ("drop-oldest", 3, 6, [4, 5, 6]),
+        ("drop-newest", 3, 6, [1, 2, 3]),
+        ("replace-newest", 3, 6, [1, 2, 6]),
+        # Message 0 was the first of three; 1 and 2 are decimated, as are 4 and 5.
+        ("decimate", 3, 6, [1, 4]),
+        # 4 drops 1 (of equal gaps the oldest), 5 drops 3, 6 drops 5: the gaps stay 2.
+        ("min-gap", 3, 6, [2, 4, 6]),
+        # Message 0 left last. 4 drops 1 (between 0 and 2; of equals the first); 5 drops 3: 2 4 5; 6 drops 4.
+        ("orbbuf", 3, 6, [2, 5, 6]),
+        ("foxglove-sdk", 8, 30, [*range(23, 31)]),
+    ],
+)
+def test_what_is_kept(spec, L, T, expected):
+    assert kept(spec, L, T) == expected
+
+
+@kernels
+def test_greedy_is_a_trap():
+    # It thins evenly until the gaps are 2. Then a merger costs V(1) - (2 V(2) - V(4)) = 0, and the tail V(3) - V(2) is
+    # gained by replacing it: 2, 4, ..., 14 stay, and only the newest changes. H grows by V(T - 14) <= 1 at most.
+    for T in (16, 17, 40):
+        assert kept("greedy-qoi", 8, T) == [2, 4, 6, 8, 10, 12, 14, T]
+    greedy, afr = (outcome(interruption(name, 8, 40), 0).qoi for name in ("greedy-qoi", "afr"))
+    assert greedy == pytest.approx(1 + 7 * V(2) + V(26) + V(1), abs=1e-12) and greedy < afr - 0.14
+
+
+@kernels
+@pytest.mark.parametrize(("lifespan_s", "dropped"), [(0.499999, 1), (0.5, 0), (0.500001, 0)])
+def test_lifespan(lifespan_s, dropped):
+    # The second message waits until the first is transmitted, at 0.5 s. Exactly 0.5 s old is not too old.
+    episode = Episode(messages(np.array([0, 0]), 500_000), Link(Trace.constant(1e6, 20)))
+    assert len(log(run(policies.get(f"lifespan:lifespan_s={lifespan_s}"), [episode], 4, V))["dropped_us"]) == dropped
+
+
+@kernels
+def test_least_distances():
+    # 10 Hz at most: of 100 frames/s every tenth; of camera frames every fourth, for three periods are 99.999 ms.
+    assert order(stream("time-filter", 50, 10_000, 4)) == list(range(0, 50, 10))
+    assert order(stream("time-filter", 20, 33_333, 4)) == list(range(0, 20, 4))
+    # The camera moves 0.02 a frame: every third frame is 0.06 >= 0.05 on. Standing still, none is.
+    assert order(stream("keyframe", 20, 10_000, 4, x=np.arange(20) * 0.02)) == list(range(0, 20, 3))
+    assert order(stream("keyframe", 20, 10_000, 4, x=np.zeros(20))) == [0]
+
+
+@kernels
+def test_foxglove_backlog():
+    # 0.3 MB a message, nothing leaves: one in transmission (all of it unsent) and 32 queued make 9.9 MB; one more would
+    # reach 10.2 MB. With 0.4 MB: 1 + 23 make 9.6, the 25th would reach 10.0 exactly: dropped.
+    for size_bytes, accepted in ((300_000, 33), (400_000, 24)):
+        senders = stream("foxglove-backlog", 60, 1, 100, size_bytes=size_bytes, bytes_per_s=1.0)
+        assert len(log(senders)["dropped_us"]) == 60 - accepted
+    assert len(log(stream("foxglove-backlog", 60, 1, 8, bytes_per_s=1.0))["dropped_us"]) == 60 - 9  # L
+
+
+@kernels
+def test_codel_drops_ever_faster():
+    # Two messages arrive for each that leaves: the one taken at k ms is k/2 ms old. At 10 ms that is the target of 5;
+    # an interval later, at 110 ms, the first is dropped; from there on the gaps are 100 ms / sqrt(count).
+    senders = stream("codel", 600, 500, 1_000)
+    times_ms = sorted(us / MS for us in log(senders)["dropped_us"].values())[:3]
+    exact = 110 + np.cumsum([0, *(100 / np.sqrt(np.arange(1, 3)))])
+    assert exact == pytest.approx([110, 210, 280.7], abs=0.05)
+    assert times_ms == np.ceil(exact).tolist()  # the socket takes a message each ms
+
+
+@kernels
+def test_codel_leaves_a_good_queue_alone():
+    # Bursts of 4 each 10 ms: none waits for 5 ms. With a standing queue below two messages nothing is dropped either,
+    # however old they are: a message of 100 ms is never over target when one waits behind it at most.
+    arrivals = messages(np.repeat(np.arange(15) * 10 * MS, 4), 1_000)
+    episode = Episode(arrivals, Link(Trace.constant(1e6, 20)))
+    assert log(run(policies.get("codel"), [episode], 8, V))["dropped_us"] == {}
+    slow = stream("codel", 30, 100 * MS, 2, size_bytes=150_000)
+    assert int(slow.batch.senders["rejected"][0]) > 0
+    assert int(slow.batch.senders["evicted"][0]) == 0
+
+
+@kernels
+@pytest.mark.parametrize(("intervals", "count"), [(15.9, 4), (8, 4), (16, 1)])
+def test_codel_goes_on_where_it_was_soon_after_a_dropping_state(intervals, count):
+    # The last dropping state began with 2 drops and ended with 6. Up to 16 intervals of 100 ms after its next drop was
+    # due the new one begins with the 4 between, later with 1: the next drop follows 100 / sqrt(count) ms on.
+    now_us, memory = 10_000_000, policies.get("codel").new_memory()[0]
+    memory[[aqm.DROPS, aqm.LAST_DROPS, aqm.FIRST_ABOVE]] = 6, 2, 1
+    memory[aqm.DROP_NEXT] = now_us - intervals * 100 * MS
+    buffer = queue_of(3, 8, policies.get("codel").parameter_array)._replace(now_us=now_us, backlog_bytes=3)
+    buffer.slots["size_bytes"] = 1
+    assert policies.get("codel").on_dequeue(buffer, memory)
+    assert memory[aqm.DROP_NEXT] == now_us + 100 * MS / np.sqrt(count)
+    assert memory[aqm.DROPS] == memory[aqm.LAST_DROPS] == count
+
+
+@kernels
+def test_red_drops_with_p_over_1_minus_count_p():
+    # Half full, between 1/4 and 3/4: p_b = 0.1 x 1/2 = 0.05. Then 0.05 / (1 - 0.05 count): uniform over 20 arrivals.
+    policy = policies.get("red:weight=1")  # the average is the occupancy
+    memory = policy.new_memory()[0]
+
+    def red(s, uniform, memory):
+        return policy.on_arrival(queue_of(s, 8, policy.parameter_array), newcomer(uniform), memory)
+
+    least, most = 0.0, 1 - 1e-9
+    for count in range(19):
+        p = 0.05 / (1 - 0.05 * count)
+        for uniform, decision in ((p - 1e-9, REJECT), (p + 1e-9, ACCEPT)):
+            assert red(4, uniform, memory.copy()) == decision
+        assert red(4, most, memory) == ACCEPT
+    assert red(4, most, memory) == REJECT  # the 20th in any case
+    # Below 1/4 none, from 3/4 on all.
+    for s, uniform, decision in ((1, least, ACCEPT), (6, most, REJECT), (8, most, REJECT)):
+        assert red(s, uniform, memory.copy()) == decision
+    # It counts from the first arrival above the threshold, or from the last drop.
+    memory[:] = 0.0, 5.0
+    assert red(0, 0.0, memory) == ACCEPT
+    draws = (0.0501, ACCEPT), (0.0527, ACCEPT), (0.0555, REJECT), (0.0527, ACCEPT), (0.0555, REJECT)
+    assert [red(4, uniform, memory) for uniform, _ in draws] == [decision for _, decision in draws]
+
+
+ROOT = Path(__file__).parents[2]
+KEYS = set(re.findall(r"^@\w+\{(\w+),", (ROOT / "docs/references.bib").read_text(encoding="utf-8"), re.M))
+
+
+def test_keys_in_brackets_are_references():
+    for path in sorted((ROOT / "bufgym").rglob("*.py")):
+        cited = set(re.findall(r"\[([a-z]+(?:19|20)\d\d[a-z0-9]*)\]", path.read_text(encoding="utf-8")))
+        assert cited <= KEYS, path
+
+
+@pytest.mark.parametrize("name", [*policies.names()])
+def test_a_source_that_is_a_paper_has_its_key(name):
+    source = policies.get(name).source
+    if re.search(r"paper|et al\.|RFC|\b(19|20)\d\d\b|AFR \[|ORBBuf|Robofleet", source):
+        assert set(re.findall(r"\[(\w+)\]", source)) & KEYS, source

@@ -139,7 +139,7 @@ def test_parameters():
         ("lifo", "unknown policy 'lifo'; known: .*afr"),
         ("afr:speed=2", "policy afr: no parameter 'speed'; it has: none"),
         ("decimate:every=0", "policy decimate: every = 0.0: must be a number > 0"),
-        ("decimate:every=nan", "every = nan"),
+        *((f"decimate:every={wrong}", f"every = {wrong}: must be a number > 0") for wrong in ("-1.0", "nan", "inf")),
         ("decimate:every", "'every' is not of the form parameter=number"),
         ("decimate:every=often", "'every=often' is not of the form"),
     ],

@@ -141,18 +141,6 @@ def test_other_rates_jitters_and_sizes_meet_the_same_motion_and_link(changes, mo
     assert len(set(places)) == 4
 
 
-def test_an_episode_at_30_hz_draws_its_jitter_then_its_motion():
-    # As it always has: the episodes of the suites hang on it.
-    made = Uplink(traces=(STEADY,), motion=(WALK, replace(WALK, name="again")), duration_s=2)
-    episode, rng = made.draw(Streams.seeded(11)), Streams.seeded(11).arrival
-    arrival_us = ((np.arange(60) + 0.1 * rng.random(60)) * 1e6 / 30).astype(np.int64)
-    arrival_us -= arrival_us[0]
-    assert np.abs(episode.arrivals["arrival_us"] - arrival_us).max() <= 1
-    rng.integers(2)
-    x = WALK.at(arrival_us + int(rng.integers(WALK.time_us[-1])))
-    assert episode.arrivals["x"] == pytest.approx(x - x[0], abs=1e-4)
-
-
 @pytest.mark.parametrize(
     ("build", "rule"),
     [

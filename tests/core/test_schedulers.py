@@ -17,6 +17,7 @@ pytestmark = pytest.mark.kernels
 V = qoi.exponential(0.618)
 MS = 1_000
 NAMES = list(naive_schedulers.TWINS)
+RIVALS = ["rosbridge", "ros-native"]
 ALL = [name for name in policies.names() if policies.get(name).privileged is None]
 
 
@@ -133,89 +134,71 @@ def test_bytes():
 
 
 ROBOFLEET = "0 A, 10 B, 20 A, 30 B, 40 N, 50 N"
+LIMITED = topics({"rate_limit_hz": 10.0})
+OPEN = {"blocked_ms": 0}
+PONGS = {**OPEN, "window": 2, "ack_ms": 50}
+"""An open link, n_T = 2, pongs 50 ms after crossing."""
 
 
-def test_robofleet_as_published():
-    # 3 overwrites 1. When the link is free, N's two go first, then at 103 ms A has 1 x 103 (sent at 0) and B, which
-    # was never sent, 2 x 103: B.
-    senders = played("robofleet", ROBOFLEET, topics(1, 2))
-    assert dropped(senders) == [1]
-    assert order(senders) == [0, 4, 5, 3, 2]
-    assert dequeued_ms(senders) == {0: 0, 4: 101, 5: 102, 3: 103, 2: 104}
-
-
-def test_robofleet_as_released():
-    # n_T = 1 holds N's first back while 0 is on its way, but at 101 ms both go at once. They are across at 103 ms;
-    # then A goes, whose priority x wait is the smaller.
-    senders = played("robofleet-released", ROBOFLEET, topics(1, 2))
-    assert dropped(senders) == [1]
-    assert order(senders) == [0, 4, 5, 2, 3]
-    assert dequeued_ms(senders) == {0: 0, 4: 101, 5: 101, 2: 103, 3: 104}
-
-
-def test_robofleet_released_begins_no_pass_while_the_window_is_full():
-    # n_T = 2, pongs 50 ms after crossing, an open link. 0 fills half of the window, and each arrival is a pass
-    # of its own: 1 goes, 2 finds two on their way and waits for 0's pong at 51 ms, when 3 goes with it.
-    senders = played("robofleet-released", "0 A, 1 N, 2 N, 3 N", topics(), blocked_ms=0, window=2, ack_ms=50)
-    assert dequeued_ms(senders) == {0: 0, 1: 1, 2: 51, 3: 51}
-    # As published, n_T holds for no_drop too: 0's pong comes at 51, 1's at 52.
-    senders = played("robofleet", "0 A, 1 N, 2 N, 3 N", topics(), blocked_ms=0, window=2, ack_ms=50)
-    assert dequeued_ms(senders) == {0: 0, 1: 1, 2: 51, 3: 52}
-
-
-def test_robofleet_overwrites_what_waits_for_its_turn():
-    senders = played("robofleet", "0 A, 10 B, 20 A, 101.5 B, 101.6 A", topics(1, 1))
-    assert (order(senders), dropped(senders)) == ([0, 2, 3, 4], [1])
-
-
-def test_rate_limits_at_arrival_and_at_the_socket():
-    # 10 Hz. At arrival: 40 and 80 come too soon after 0; then 160 and 200 after 120. Exactly 100 ms later is not too
-    # soon: 220 is.
-    limited = topics({"rate_limit_hz": 10.0})
-    script = "0 A, 40 A, 80 A, 120 A, 160 A, 200 A, 220 A"
-    senders = played("robofleet", script, limited, blocked_ms=0)
-    assert (order(senders), dropped(senders)) == ([0, 3, 6], [1, 2, 4, 5])
-    # At the socket the latest waits for its time: 2 has overwritten 1, and at 105 something wakes the scheduler: 2
-    # goes, whose priority x wait is 105 against 2 x 105. 3 came at 120, sooner than 205: it is overwritten.
-    senders = played("robofleet-released", "0 A, 40 A, 80 A, 105 B, 120 A, 160 A, 205 A", limited, blocked_ms=0)
-    assert (order(senders), dropped(senders)) == ([0, 2, 3, 6], [1, 4, 5])
-    assert dequeued_ms(senders) == {0: 0, 2: 105, 3: 106, 6: 205}
-
-
-def test_the_released_client_sleeps_until_an_arrival_or_a_pong():
-    # 1 may go at 100 ms, but nothing happens then; nothing at all is to come, so it stays.
-    senders = played("robofleet-released", "0 A, 40 A", topics({"rate_limit_hz": 10.0}), blocked_ms=0)
-    assert order(senders) == [0]
-    assert count(senders, "occupancy") == 1
-
-
-def test_native_ros_drops_the_oldest_of_each_queue():
-    # A publisher's queue of 2: 1 goes for 4. At 101 ms A was sent from at 0, and C never, which counts as 0 too: A, the
-    # first topic; then C, then A again.
-    senders = played("ros-native", "0 A, 1 A, 2 A, 3 C, 4 A", topics({"limit": 2}))
-    assert (order(senders), dropped(senders)) == ([0, 2, 3, 4], [1])
-    # Where L = 3 is too small for all queues, the oldest of any goes, whatever its rank; no N does.
-    senders = played("ros-native", "0 A, 1 N, 2 C, 3 B, 4 A", topics(), capacity=3)
-    assert (sorted(order(senders)), dropped(senders)) == ([0, 1, 3, 4], [2])
-
-
-def test_native_ros_takes_turns_by_message():
-    # 1, of 5000 bytes, makes B wait for 5 ms, 2 for one.
-    senders = played("ros-native", "0 A, 1 A 5000, 2 A, 3 B, 4 B", topics())
-    assert dequeued_ms(senders) == {0: 0, 1: 101, 3: 106, 2: 107, 4: 108}
+@pytest.mark.parametrize(
+    ("name", "script", "rules", "settings", "lost", "sent_ms"),
+    [
+        # 3 overwrites 1. When the link is free, N's two go first, then at 103 ms A has 1 x 103 (sent at 0) and B, which
+        # was never sent, 2 x 103: B.
+        ("robofleet", ROBOFLEET, topics(1, 2), {}, [1], {0: 0, 4: 101, 5: 102, 3: 103, 2: 104}),
+        # n_T = 1 holds N's first back while 0 is on its way, but at 101 ms both go at once. They are across at 103 ms;
+        # then A goes, whose priority x wait is the smaller.
+        ("robofleet-released", ROBOFLEET, topics(1, 2), {}, [1], {0: 0, 4: 101, 5: 101, 2: 103, 3: 104}),
+        # 0 fills half of the window, and each arrival is a pass of its own: 1 goes, 2 finds two on their way and waits
+        # for 0's pong at 51 ms, when 3 goes with it: no pass begins while the window is full.
+        ("robofleet-released", "0 A, 1 N, 2 N, 3 N", topics(), PONGS, [], {0: 0, 1: 1, 2: 51, 3: 51}),
+        # As published, n_T holds for no_drop too: 0's pong comes at 51, 1's at 52.
+        ("robofleet", "0 A, 1 N, 2 N, 3 N", topics(), PONGS, [], {0: 0, 1: 1, 2: 51, 3: 52}),
+        # What waits for its turn is overwritten; A and B wait alike.
+        ("robofleet", "0 A, 10 B, 20 A, 101.5 B, 101.6 A", topics(1, 1), {}, [1], {0: 0, 2: 101, 3: 102, 4: 103}),
+        # 10 Hz. At arrival: 40 and 80 come too soon after 0; then 160 and 200 after 120. Exactly 100 ms later is not
+        # too soon: 220 is.
+        (
+            "robofleet",
+            "0 A, 40 A, 80 A, 120 A, 160 A, 200 A, 220 A",
+            LIMITED,
+            OPEN,
+            [1, 2, 4, 5],
+            {0: 0, 3: 120, 6: 220},
+        ),
+        # At the socket the latest waits for its time: 2 has overwritten 1, and at 105 something wakes the scheduler: 2
+        # goes, whose priority x wait is 105 against 2 x 105. 3 came at 120, sooner than 205: it is overwritten.
+        (
+            "robofleet-released",
+            "0 A, 40 A, 80 A, 105 B, 120 A, 160 A, 205 A",
+            LIMITED,
+            OPEN,
+            [1, 4, 5],
+            {0: 0, 2: 105, 3: 106, 6: 205},
+        ),
+        # The released client sleeps until an arrival or a pong. 1 may go at 100 ms, but nothing happens then; nothing
+        # at all is to come, so it stays.
+        ("robofleet-released", "0 A, 40 A", LIMITED, OPEN, [], {0: 0}),
+        # A publisher's queue of 2: 1 goes for 4. At 101 ms A was sent from at 0, and C never, which counts as 0 too: A,
+        # the first topic; then C, then A again.
+        ("ros-native", "0 A, 1 A, 2 A, 3 C, 4 A", topics({"limit": 2}), {}, [1], {0: 0, 2: 101, 3: 102, 4: 103}),
+        # Where L = 3 is too small for all queues, the oldest of any goes, whatever its rank; no N does.
+        ("ros-native", "0 A, 1 N, 2 C, 3 B, 4 A", topics(), {"capacity": 3}, [2], {0: 0, 4: 101, 3: 102, 1: 103}),
+        # Turns by message: 1, of 5000 bytes, makes B wait for 5 ms, 2 for one.
+        ("ros-native", "0 A, 1 A 5000, 2 A, 3 B, 4 B", topics(), {}, [], {0: 0, 1: 101, 3: 106, 2: 107, 4: 108}),
+        # The link is free each ms. Who keeps to n_T = 1 waits for a pong 50 ms after each crossing; rivals do not.
+        *((name, "0 A, 0 B, 0 C", topics(), PONGS | {"window": 1}, [], {0: 0, 1: 1, 2: 2}) for name in RIVALS),
+        ("fifo", "0 A, 0 B, 0 C", topics(), PONGS | {"window": 1}, [], {0: 0, 1: 51, 2: 102}),
+    ],
+)
+def test_when_it_goes_and_what_is_dropped(name, script, rules, settings, lost, sent_ms):
+    senders = played(name, script, rules, **settings)
+    assert (dropped(senders), dequeued_ms(senders)) == (lost, sent_ms)
 
 
 def test_rosbridge_keeps_everything():
     senders = played("rosbridge", ", ".join(f"{k} {'ABCN'[k % 4]}" for k in range(20)), topics(), capacity=2)
     assert order(senders) == list(range(20))
-
-
-@pytest.mark.parametrize("name", ["rosbridge", "ros-native"])
-def test_rivals_do_not_wait_for_pongs(name):
-    # The link is free each ms. Who keeps to n_T = 1 waits for a pong 50 ms after each crossing.
-    settings = {"blocked_ms": 0, "window": 1, "ack_ms": 50}
-    assert dequeued_ms(played(name, "0 A, 0 B, 0 C", topics(), **settings)) == {0: 0, 1: 1, 2: 2}
-    assert dequeued_ms(played("fifo", "0 A, 0 B, 0 C", topics(), **settings)) == {0: 0, 1: 51, 2: 102}
 
 
 def test_clients():

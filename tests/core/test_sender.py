@@ -1,19 +1,26 @@
-"""The sender: every event worked by hand. ``test_topics_twin`` and ``test_policy_twins`` hold it beside its twin."""
+"""The sender by hand; its byte limit B, under which a policy is asked again until the newcomer fits.
+
+``test_topics_twin`` and ``test_policy_registry`` hold it beside its twin.
+"""
+
+from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import log, order, trace
+from cases import log, order, same, trace
 
 from bufgym import policies
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.buffer import ACCEPT
 from bufgym.model.link import Link
+from bufgym.model.topics import Topic
+from bufgym.policies import ACCEPT, REJECT, Policy
 from bufgym.scenario import Episode, messages
-from bufgym.sim import DECISION, END, Senders, can_evict, decide, has_room, next_event, run
+from bufgym.sim import Senders, run
 from bufgym.sim.metrics import outcome
 
-pytestmark = pytest.mark.kernels
+kernels = pytest.mark.kernels
 V = qoi.exponential(0.5)
 MS = 1_000
 
@@ -32,14 +39,7 @@ def times(dequeued_ms, transmitted_ms, dropped_ms):
     return {name: {seq: ms * MS for seq, ms in entries.items()} for name, entries in made.items()}
 
 
-def test_order_of_things_at_an_arrival():
-    # Message 0 crosses from 0 to 1 ms. At 1 ms exactly, message 1 arrives: message 0 leaves first, the socket is idle,
-    # so message 1 is taken at once. Message 2 arrives at the same time and waits its turn.
-    senders = line([0, 1, 1])
-    senders.run(policies.get("drop-oldest"))
-    assert log(senders) == times({0: 0, 1: 1, 2: 2}, {0: 1, 1: 2, 2: 3}, {})
-
-
+@kernels
 @pytest.mark.parametrize(("third_us", "dropped"), [(1_000, {}), (999, {2: 999})])
 def test_a_departure_makes_room_for_the_arrival_at_its_instant(third_us, dropped):
     # L = 1. At 1 ms the socket takes message 1, so message 2, which arrives then, finds room.
@@ -47,16 +47,7 @@ def test_a_departure_makes_room_for_the_arrival_at_its_instant(third_us, dropped
     assert log(run(policies.get("drop-newest"), [episode], 1, V))["dropped_us"] == dropped
 
 
-def test_the_message_in_transmission_cannot_be_dropped():
-    # All arrive at once: 0 goes out, 1 and 2 fill the queue, then 3 evicts 1 and 4 evicts 2.
-    senders = line([0, 0, 0, 0, 0])
-    senders.run(policies.get("drop-oldest"))
-    assert order(senders) == [0, 3, 4]
-    assert log(senders)["dropped_us"] == {1: 0, 2: 0}
-    # H = 1 + V(3) + V(1) = 1 + 7/8 + 1/2
-    assert outcome(senders, 0).qoi == 2.375
-
-
+@kernels
 def test_a_link_that_stops_keeps_what_it_has():
     # 2500 bytes, then nothing ever: message 2 stays in transmission, message 3 in the buffer.
     senders = line([0, 0, 0, 1], knots=((0, 0), (2_500, 2_500)), after="stop")
@@ -66,6 +57,7 @@ def test_a_link_that_stops_keeps_what_it_has():
     assert log(senders)["dequeued_us"] == {0: 0, 1: 1 * MS, 2: 2 * MS}
 
 
+@kernels
 def test_start_offset():
     # The link rests for 5 ms; starting 3 ms into the trace, the first message waits 2 ms and crosses in 1.
     arrivals = messages(np.array([0]), 1_000)
@@ -74,34 +66,7 @@ def test_start_offset():
     assert log(senders)["transmitted_us"] == {0: 3 * MS}
 
 
-def test_bytes_limit():
-    # B = 2500: message 0 is in transmission, outside the buffer. 1 and 2 (1000 each) fit; 3 (1000) does not, though
-    # L = 5: the oldest goes. 4 (3000) cannot fit whatever goes: it is dropped unasked.
-    senders = line([0, 0, 0, 0, 0], capacity=5, sizes=[1_000, 1_000, 1_000, 1_000, 3_000], max_bytes=2_500)
-    asked = []
-    while (event := next_event(senders.batch, None, 0)) != END:
-        if event == DECISION:
-            seq, room = int(senders.batch.senders[0]["next"]), has_room(senders.batch, 0)
-            asked.append((seq, room, [k for k in range(5) if can_evict(senders.batch, 0, k)]))
-            decide(senders.batch, 0, ACCEPT if room else 0)
-    # (arrival, is there room, which slots may go)
-    assert asked == [(0, True, []), (1, True, []), (2, True, [0]), (3, False, [0, 1])]
-    assert order(senders) == [0, 2, 3]
-    assert outcome(senders, 0).invalid == 0
-
-
-@pytest.mark.parametrize(("decide_at", "asked"), [("arrival", [0, 1, 2, 3, 4]), ("overflow", [3, 4])])
-def test_decide_at(decide_at, asked):
-    seen = []
-
-    def note(buffer, arrival, memory):
-        seen.append(int(arrival.seq))
-        return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-    line([0, 0, 0, 0, 0], decide_at=decide_at).run(policies.Policy("note", note))
-    assert seen == asked
-
-
+@kernels
 def test_what_the_policy_sees():
     views = []
 
@@ -109,7 +74,7 @@ def test_what_the_policy_sees():
         views.append(buffer._replace(slots=buffer.slots["seq"].tolist()))
         return ACCEPT
 
-    line([0, 0, 4, 4], sizes=[8_000, 500, 700, 1], capacity=3).run(policies.Policy("note", note))
+    line([0, 0, 4, 4], sizes=[8_000, 500, 700, 1], capacity=3).run(Policy("note", note))
     last = views[3]
     assert last.slots == [1, 2]
     assert (last.capacity, last.backlog_bytes, last.dequeued, last.dequeued_x, last.busy) == (3, 1_200, 1, 0.0, 1)
@@ -119,6 +84,7 @@ def test_what_the_policy_sees():
     assert (views[0].busy, views[0].left_bytes, views[1].departures) == (0, 0, 1)
 
 
+@kernels
 def test_running_means_by_hand():
     # Arrivals at 0, 8, 10 and 10 ms. The first gap, 8 ms, is the period; then 8 + (2 - 8) / 8, 7.25 + (0 - 7.25) / 8.
     # Message 0 is dequeued before 1, then 1 before 2, and none before 3; each weighs a sixteenth in the service ratio.
@@ -128,7 +94,7 @@ def test_running_means_by_hand():
         views.append((buffer.period_us / MS, buffer.period_square / MS**2, buffer.service_ratio))
         return ACCEPT
 
-    line([0, 8, 10, 10], sizes=[1_000, 8_000, 1, 1], capacity=3).run(policies.Policy("note", note))
+    line([0, 8, 10, 10], sizes=[1_000, 8_000, 1, 1], capacity=3).run(Policy("note", note))
     ratio = 1 / 16 + (1 - 1 / 16) / 16
     assert views == [
         (0, 0, 0),
@@ -158,9 +124,10 @@ def all_of_them(buffer, memory):
 
 
 def head_dropper(on_dequeue, compiled=True):
-    return policies.Policy("test-head", take_all, on_dequeue=on_dequeue, memory={"heads": 0.0}, compile=compiled)
+    return Policy("test-head", take_all, on_dequeue=on_dequeue, memory={"heads": 0.0}, compile=compiled)
 
 
+@kernels
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize(
     ("drops", "times_ms", "sizes", "logged", "h"),
@@ -189,6 +156,7 @@ def test_heads_that_are_dropped(compiled, drops, times_ms, sizes, logged, h):
     assert (sender["evicted"], sender["retained_gain"]) == (told.dropped, max(0.0, h - 1))
 
 
+@kernels
 def test_the_bytes_after_a_dropped_head_follow_without_a_pause():
     # 700 bytes a microsecond. Message 0 ends at byte 1000, which crosses in 1.43 us: at 2 us. Then 1 is dropped;
     # 2 follows at byte 1000, not at the 1400 of 2 us: its last byte, 2000, crosses at 3 us and not at 4.
@@ -201,17 +169,7 @@ def test_the_bytes_after_a_dropped_head_follow_without_a_pause():
         assert log(senders)["dropped_us"] == {1: 2}
 
 
-def test_what_the_policy_sees_at_the_head():
-    seen = []
-
-    def note(buffer, memory):
-        seen.append((buffer.now_us, buffer.slots["seq"].tolist(), buffer.busy, buffer.left_bytes, buffer.dequeued))
-        return bool(buffer.slots[0].seq == 1)
-
-    line([0, 0, 0], capacity=5).run(head_dropper(note, compiled=False))
-    assert seen == [(0, [0], 0, 0, 0), (1 * MS, [1, 2], 0, 0, 1), (1 * MS, [2], 0, 0, 1)]
-
-
+@kernels
 def test_peak_backlog():
     # 0 is in transmission. 1 and 2 wait: 5000 bytes, the most of all, as 3 (500) takes the place of 1 (2000).
     senders = line([0, 0, 0, 0], sizes=[1_000, 2_000, 3_000, 500])
@@ -224,21 +182,7 @@ def test_peak_backlog():
     assert senders.batch.senders[0]["backlog_bytes"] == 0
 
 
-LINKS = [
-    Link(trace([(0, 0), (5_000, 4_000), (9_000, 4_000)], "loop"), 1_000),
-    Link(trace([(0, 0), (2_000, 0), (3_000, 3_000)], "hold")),
-]
-
-
-def test_rows_of_a_batch_do_not_meet():
-    episodes = [Episode(messages(np.arange(15) * (3 + k) * 100, 900 + k), LINKS[k % 2]) for k in range(4)]
-    together = run(policies.get("afr"), episodes, 4, V)
-    for k, episode in enumerate(episodes):
-        alone = run(policies.get("afr"), [episode], 4, V)
-        assert log(alone) == log(together, k)
-        assert order(alone) == order(together, k)
-
-
+@kernels
 @pytest.mark.parametrize(
     ("given_", "rule"),
     [
@@ -254,6 +198,108 @@ def test_errors(given_, rule):
         Senders(1, **{"capacity": 2, "v": V, "max_messages": 3, **given_})
 
 
+@kernels
 def test_no_episode():
     with pytest.raises(BufgymError, match="no episode to run"):
         run(policies.get("afr"), [], 2, V)
+
+
+SLOW = Link(trace([(0, 0), (1_000_000, 100), (2_000_000, 10_000_000)], "hold"))
+"""What arrives in its first second waits: message 0 alone is in the socket."""
+
+
+def blocked(sizes, limit, topic=None, **episode):
+    """(the episode in which these come at once while the link stands, its limits)."""
+    arrivals = messages(np.zeros(len(sizes), np.int64), np.array(sizes))
+    arrivals["topic"] = 0 if topic is None else topic
+    return Episode(arrivals, SLOW, **episode), {"capacity": 8, "v": V, "max_bytes": limit}
+
+
+def played(name, sizes, limit, **more):
+    policy = policies.get(name) if isinstance(name, str) else name
+    episode, limits = blocked(sizes, limit)
+    return run(policy, [episode], **limits, **more)
+
+
+@kernels
+def test_evicts_until_the_newcomer_fits():
+    # B = 2500. Message 0 is in transmission; 1, 2, 3 (1000, 1000, 500) are queued. 4 (2000) needs both of the oldest.
+    sizes = [100, 1_000, 1_000, 500, 2_000]
+    senders = played("drop-oldest", sizes, 2_500)
+    assert log(senders)["dropped_us"] == {1: 0, 2: 0}
+    assert order(senders) == [0, 3, 4]
+    assert outcome(senders, 0).invalid == 0
+    # The tail first: 3, then 2; beside 1 (1000) there is still no room.
+    assert order(played("replace-newest", sizes, 2_500)) == [0, 4]
+    assert order(played("drop-newest", sizes, 2_500)) == [0, 1, 2, 3]
+
+
+@kernels
+def test_asks_again_about_the_same_arrival():
+    asked = []
+
+    def on_arrival(buffer, arrival, memory):
+        asked.append((int(arrival.seq), buffer.slots.seq.tolist(), buffer.evictions))
+        if buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes:
+            return ACCEPT
+        return REJECT if arrival.seq == 5 and buffer.evictions == 1 else 0
+
+    senders = played(Policy("test-asked", on_arrival), [100, 1_000, 1_000, 500, 2_000, 2_400, 2_501], 2_500)
+    assert asked == [
+        (0, [], 0),
+        (1, [], 0),
+        (2, [1], 0),
+        (3, [1, 2], 0),
+        (4, [1, 2, 3], 0),
+        (4, [2, 3], 1),
+        (5, [3, 4], 0),
+        (5, [4], 1),  # and rejects: what it evicted is gone all the same
+    ]  # 6 is larger than B and is dropped unasked
+    told = outcome(senders, 0)
+    assert log(senders)["dropped_us"].keys() == {1, 2, 3, 5, 6}
+    assert (told.invalid, told.dropped, told.delivered) == (0, 5, 2)
+
+
+@kernels
+def test_a_no_drop_message_drives_out_as_many_as_it_needs():
+    # A policy that rejects them: the least important goes, oldest first, until the no_drop message 4 fits. 5 could not
+    # fit whatever went, as 4 stays: nothing goes for it.
+    topics = [Topic("low", priority=1), Topic("high", priority=2), Topic("kept", no_drop=True)]
+    reject = Policy("test-reject", lambda buffer, arrival, memory: REJECT if arrival.topic == 2 else ACCEPT)
+    episode, limits = blocked([100, 400, 400, 200, 700, 400], 1_000, topic=[0, 1, 0, 0, 2, 2])
+    for first in (0, 100):  # asked, or not
+        senders = run(reject, [replace(episode, first_decision=first)], **limits, topics=topics)
+        assert log(senders)["dropped_us"].keys() == {1, 2, 3, 5}
+        assert order(senders) == [0, 4]
+
+
+RANKED = [
+    policy for policy in map(policies.get, policies.names(for_topics=False)) if policy.ranked and not policy.weights
+]
+
+
+# steady has as many sites as L says.
+@pytest.mark.parametrize("policy", [p for p in RANKED if p.name != "steady"], ids=lambda p: p.name)
+def test_with_equal_sizes_it_is_a_limit_of_messages(policy):
+    rng = np.random.default_rng(5)
+    arrivals = messages(np.arange(300) * 33_333, 1_000, np.cumsum(rng.random(300) ** 4))
+    knots = [(0, 0), (1_000_000, 20_000), (4_000_000, 20_000), (6_000_000, 90_000), (10_000_000, 190_000)]
+    episode = Episode(arrivals, Link(trace(knots, "hold"))).with_uniforms(rng)
+    for k in (1, 4):
+        by_bytes = run(policy, [episode], 8, V, max_bytes=k * 1_000)
+        assert outcome(by_bytes, 0).invalid == 0
+        assert same(by_bytes, run(policy, [episode], k, V))
+
+
+def test_each_victim_is_a_draw_of_its_own():
+    # Random Drop, five queued, 1000 bytes each; the newcomer needs two of them to go. Rejected at once: 1/6. Else one
+    # of five goes; then itself with 1/5: 5/6 x 1/5 = 1/6. Else two of the five: 2/3.
+    n, rng = 3_000, np.random.default_rng(0)
+    episode, limits = blocked([100, 1_000, 1_000, 1_000, 1_000, 1_000, 2_000], 5_000)
+    senders = run(policies.get("random"), [episode.with_uniforms(rng) for _ in range(n)], **limits)
+    gone = Counter(tuple(sorted(log(senders, i)["dropped_us"])) for i in range(n))
+    assert gone[(6,)] / n == pytest.approx(1 / 6, abs=0.03)
+    single = [count / n for pair, count in gone.items() if len(pair) == 2 and 6 in pair]
+    double = [count / n for pair, count in gone.items() if len(pair) == 2 and 6 not in pair]
+    assert single == pytest.approx([1 / 30] * 5, abs=0.015)
+    assert double == pytest.approx([1 / 15] * 10, abs=0.02)

@@ -2,13 +2,11 @@
 
 from dataclasses import replace
 
-import fragment_cases
 import numpy as np
 import pytest
-from cases import VALUES, cases, queue_of, same
+from cases import VALUES, cases, newcomer, queue_of, same
+from gap_cases import Seen, approached, fits, least_gap, level, spared
 from hypothesis import given
-from target_cases import Seen, approached
-from thinning_cases import fits, least_gap, level, spared
 
 from bufgym import policies
 from bufgym.benchmark.run import by_trace, draw
@@ -28,10 +26,29 @@ POLICY = policies.get("target-gap")
 kernels = pytest.mark.kernels
 
 
+def frames_at_30_hz(*frames, sent=0, now=8, per_frame=1.0, **known):
+    """Frames of 1000 bytes at 30 Hz are queued, frame ``sent`` is in the socket, frame ``now`` arrives; x is
+    ``per_frame`` times the number of the frame. At 7500 bytes/s the link sends one frame every four."""
+    buffer = queue_of(len(frames), 8)
+    for name, scale in (("arrival_us", 33_333), ("x", per_frame), ("seq", 1)):
+        buffer.slots[name] = scale * np.array(frames)
+    arrival = newcomer()
+    arrival["arrival_us"], arrival["x"], arrival["seq"], arrival["size_bytes"] = (
+        33_333 * now,
+        per_frame * now,
+        now,
+        1000,
+    )
+    seen = {"busy": 1, "left_bytes": 1000, "backlog_bytes": 1000 * len(frames), "period_us": 33_333.0}
+    seen |= {"dequeued_arrival_us": 33_333 * sent, "dequeued_x": per_frame * sent, "dequeued_seq": sent}
+    seen |= {"previous_us": 33_333 * (now - 1), "previous_x": per_frame * (now - 1)}
+    return buffer._replace(**seen | known), arrival
+
+
 def fast(*frames, **known):
     """x is twice the number of the frame, and the stream has run for 10 s. The rate over 0.5 s is not to be used."""
     rates = {f"{span}_rate_bytes_per_s": rate for span, rate in (("short", 7500.0), ("medium", 77.0), ("long", 7500.0))}
-    return fragment_cases.waiting(*frames, per_frame=2.0, **rates | known)
+    return frames_at_30_hz(*frames, per_frame=2.0, **rates | known)
 
 
 def remembered(rate=7500e-6, pace=2 / 33_333, seen_us=10e6, square=33_333.0**2):
@@ -176,7 +193,7 @@ V = qoi.exponential(0.618)
 
 def waiting(*frames, rate_bytes_per_s=7500.0, **known):
     rates = {"medium_rate_bytes_per_s": rate_bytes_per_s, "long_rate_bytes_per_s": rate_bytes_per_s / 2}
-    return fragment_cases.waiting(*frames, **rates | known)
+    return frames_at_30_hz(*frames, **rates | known)
 
 
 @kernels

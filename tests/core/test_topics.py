@@ -1,17 +1,19 @@
-"""The sender with topics, worked by hand."""
+"""The sender with topics, worked by hand; settings of topics and of the in-flight window that are refused."""
 
 import numpy as np
 import pytest
 from cases import log, order, trace
 
 from bufgym import policies
+from bufgym.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, motion_gaps, time_gaps
+from bufgym.model.checks import check_window
 from bufgym.model.link import FOREVER, Link
-from bufgym.model.topics import Topic
+from bufgym.model.topics import Topic, check_topics
 from bufgym.policies.registry import ClientSettings
 from bufgym.scenario import Episode, messages
-from bufgym.sim import age_until, run
+from bufgym.sim import Senders, age_until, run
 
 pytestmark = pytest.mark.kernels
 V = qoi.exponential(0.5)
@@ -141,13 +143,6 @@ def test_an_impossible_answer_keeps_what_has_room(answer, topics, invalid):
     assert (order(senders), senders.batch.senders[0]["invalid"]) == ([0], invalid)
 
 
-def test_a_limit_of_one_topic():
-    # At most one camera message waits, though the buffer has room; status is not concerned.
-    topics = (Topic("camera", limit=1), Topic("status"))
-    senders = after_run(episode([0, 0, 0, 0], [0, 0, 0, 1]), topics)
-    assert log(senders)["dropped_us"] == {2: 0}
-
-
 def test_a_topic_is_sent_in_order():
     # Slots while 0 is in transmission: 1 (a), 2 (b), 3 (a), 4 (b). Asked for slot 2 (3, not a's oldest): impossible,
     # the oldest goes. Then 2 (b) and 3 (a), 4 wait: slot 1 (3) goes first, then the rest.
@@ -180,22 +175,6 @@ def test_flushing_no_drop():
             **hooks,
         )
         assert log(senders)["dequeued_us"] == {0: 0, 1: 0, 3: 0, 2: 53 * MS}
-
-
-def test_information_of_two_topics():
-    # V = 1 - 0.5^d. Topic a (weight 2) has x = 0, 1, 3: 2 x (V(1) + V(2)) = 2 x 1.25. Topic b (weight its priority,
-    # 0.5) has x = 2, 5: 0.5 x V(3) = 0.5 x 0.875. The first of each adds no V.
-    topics = (Topic("a", weight=2), Topic("b", priority=0.5))
-    senders = after_run(episode([0] * 5, [0, 0, 1, 0, 1], x=[0, 1, 2, 3, 5]), topics)
-    assert senders.batch.senders[0]["delivered_gain"] == senders.batch.senders[0]["retained_gain"] == 2.9375
-    # Without a's x = 1 the gap of x = 3 reaches back to 0: 2 x V(3).
-    senders = after_run(
-        episode([0] * 5, [0, 0, 1, 0, 1], x=[0, 1, 2, 3, 5]),
-        topics,
-        on_arrival=lambda b, a, m: 0 if a.seq == 4 else ACCEPT,
-    )
-    assert order(senders) == [0, 2, 3, 4]
-    assert senders.batch.senders[0]["delivered_gain"] == senders.batch.senders[0]["retained_gain"] == 2 * 0.875 + 0.4375
 
 
 def test_the_first_message_of_a_held_queue_is_evicted():
@@ -306,3 +285,42 @@ def test_a_rate_limit_since_the_last_sending():
     for client, dropped in (({}, {1, 3, 5}), ({"limit_since_sent": True}, {1, 5})):
         senders = after_run(episode(times, **blocked), pose, client=ClientSettings(**client))
         assert log(senders)["dropped_us"].keys() == dropped
+
+
+A_B = (Topic("a"), Topic("b"))
+
+
+@pytest.mark.parametrize(
+    ("build", "complaint"),
+    [
+        (lambda: Topic(""), "topic '': a name must be a non-empty text"),
+        *(
+            (lambda p=p: Topic("a", priority=p), "must be a number >= 0")
+            for p in (-1, None, True, float("inf"), 10**400)
+        ),
+        *((lambda hz=hz: Topic("a", rate_limit_hz=hz), "must be a number > 0") for hz in (0, "10")),
+        (lambda: Topic("a", weight=float("nan")), "weight = nan: must be a number >= 0"),
+        *((lambda s=s: Topic("a", deadline_s=s), r"deadline_s = .*: must be a number > 0") for s in (0, 1e300)),
+        (lambda: Topic("a", no_drop=1), "no_drop = 1: must be true or false"),
+        *((lambda n=n: Topic("a", limit=n), "must be a whole number from 1") for n in (0, 1.5)),
+        (lambda: Topic("a", value=0.618), "value = 0.618: must be a V of bufgym.model.qoi"),
+        (lambda: Topic("a", no_drop=True, limit=3), "limit = 3: a no_drop topic can't have a limit"),
+        (lambda: Senders(1, 2, V, max_messages=1, topics=[*A_B, Topic("a")]), "topic 'a': two topics have this name"),
+        (lambda: check_topics(["a"]), "'a' is not a bufgym"),
+        (lambda: check_topics([Topic(str(k)) for k in range(257)]), "257 topics: must be at most 256"),
+        (lambda: after_run(episode([0, 1], [0, 2]), A_B), "episode: unknown topic 2; the senders know 2, from 0 on"),
+        (lambda: after_run(episode([0, 1], [0, -1]), A_B), "message 1: topic = -1: must be >= 0"),
+        *((lambda n=n: check_window(n), "n_T must be a whole number from 1") for n in (0, 1.0, True, "2", 10**6 + 1)),
+        (lambda: after_run(episode([0], window=0)), "n_T must be a whole number from 1"),
+        *((lambda us=us: episode([0], ack_delay_us=us), "must be a whole number from 0 to") for us in (-1, 0.5, None)),
+    ],
+)
+def test_what_is_refused(build, complaint):
+    with pytest.raises(BufgymError, match=complaint) as caught:
+        build()
+    assert "\n" not in str(caught.value)
+
+
+def test_the_slowest_rate_limit():
+    # Slower than any episode is long: the first message and no other.
+    assert order(after_run(episode([0, 1, 10**9]), (Topic("a", rate_limit_hz=1e-300),))) == [0]

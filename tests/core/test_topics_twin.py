@@ -1,8 +1,9 @@
-"""The sender with topics: event by event against its twin, and what must hold whatever is decided."""
+"""The sender with topics and its schedulers: against their twins, and what must hold whatever is decided."""
 
 from dataclasses import replace
 from itertools import pairwise
 
+import naive_schedulers
 import numpy as np
 import pytest
 from cases import ANYTHING, VALUES, cases, log, order, same, twin_log
@@ -17,9 +18,10 @@ from bufgym.model.link import FOREVER
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
 
-pytestmark = pytest.mark.kernels
+kernels = pytest.mark.kernels
 
 
+@kernels
 @given(topic_cases(max_messages=40))
 def test_agrees_with_twin_event_by_event(case):
     L = case.case.capacity
@@ -118,11 +120,11 @@ def agree_on_log(senders, twin):
     assert order(senders) == twin.order
 
 
+@kernels
 @given(topic_cases(max_messages=25))
 def test_rollouts_agree_with_twin_compiled_and_not(case):
     twin, policy = case.run_twin(), case.policy(compile=True)
-    senders, again = case.senders(), case.senders()
-    senders.run(policy)
+    senders, again = case.run(policy), case.senders()
     agree_on_log(senders, twin)
     agree(senders, twin, FOREVER)
     again.run(replace(policy, compile=False))
@@ -135,6 +137,7 @@ def test_rollouts_agree_with_twin_compiled_and_not(case):
         again.run(policy)
 
 
+@kernels
 @given(topic_cases(max_messages=30), st.randoms(use_true_random=False))
 def test_what_the_masks_allow_is_carried_out_and_invariants_hold(case, chance):
     senders = case.senders()
@@ -220,6 +223,7 @@ PLAIN = [
 """All policies of one queue that know nothing beforehand, and one that decides at random."""
 
 
+@kernels
 @given(
     cases(max_messages=25),
     VALUES,
@@ -238,3 +242,41 @@ def test_one_topic_without_rules_is_a_plain_sender(case, v, on_send, policy, win
     only = [Topic("only")]
     topics = sim.run(scheduled, [replace(episode, arrivals=arrivals)], case.capacity, v, topics=only, **limits)
     assert same(plain, topics), policy.name
+
+
+@kernels
+@pytest.mark.parametrize("name", naive_schedulers.TWINS)
+@given(topic_cases(min_topics=2, max_messages=30))
+def test_schedulers_agree_with_their_twins(name, case):
+    policy = policies.get(name)
+    case = replace(case, client=policy.client, schedules=True, drops_heads=False)
+    twin, episode = case.twin(), case.case.episode
+    if not policy.client.awaits_acks:  # then the socket takes the next message when the last has crossed
+        twin.window, twin.ack_delay_us = 1, 0
+    naive_schedulers.TWINS[name](twin)
+    twin.run(case.case.twin_messages, episode.first_decision, episode.last_decision)
+    senders = case.run(policy)
+    assert log(senders) == twin_log(twin)
+    assert order(senders) == twin.order
+    assert senders.batch.senders["invalid"][0] == twin.invalid
+    assert twin.invalid == 0 or episode.first_decision > 0 or episode.last_decision < len(case.case.twin_messages)
+    assert same(senders, case.run(replace(policy, compile=False)))
+
+
+@pytest.mark.parametrize("name", [name for name in policies.names() if policies.get(name).privileged is None])
+@given(topic_cases(min_topics=2, max_messages=25))
+def test_every_policy_runs_on_topics_and_nothing_is_lost(name, case):
+    policy = policies.get(name)
+    capacity = len(case.case.twin_messages) if policy.unbounded else case.case.capacity
+    case = replace(case, client=policy.client, case=replace(case.case, capacity=capacity, max_bytes=None))
+    senders = case.run(policy)
+    hold(case, senders)
+    assert senders.batch.senders["next"][0] == len(case.case.twin_messages)
+    # No no_drop message goes while another that could go is queued.
+    rows, arrivals = np.asarray(senders.batch.log[0]), case.case.episode.arrivals
+    free = np.array([not topic.no_drop for topic in case.topics])[arrivals["topic"]]
+    for lost in np.flatnonzero(~free & (rows["dropped_us"] != sim.NEVER) & (rows["limited"] == 0)):
+        at_us = arrivals["arrival_us"][lost]
+        assert rows["dropped_us"][lost] == at_us  # rejected when it came: no_drop is never evicted
+        later = [(rows[field] == sim.NEVER) | (rows[field] > at_us) for field in ("dequeued_us", "dropped_us")]
+        assert not (free & later[0] & later[1])[:lost].any()

@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import naive
@@ -13,8 +14,17 @@ from hypothesis import strategies as st
 
 from bufgym import policies, sim
 from bufgym.model import qoi
-from bufgym.model.buffer import HOLD
 from bufgym.model.topics import Topic
+from bufgym.observe import (
+    CONTEXT_FIELDS,
+    SLOT_FIELDS,
+    TOPIC_CONTEXT_FIELDS,
+    TOPIC_SLOT_FIELDS,
+    observe_context,
+    observe_slots,
+    observe_topic_context,
+    observe_topic_slots,
+)
 from bufgym.policies.registry import ClientSettings
 from bufgym.sim import Senders
 
@@ -33,33 +43,18 @@ CLIENT_RULES = ("limit_at_send", "limit_since_sent", "flush_no_drop")
 """Settings of the client that change what a sender does."""
 
 
-def decision(uniform: float, capacity: int) -> int:
-    """Any decision, impossible ones included: -3 is none at all, then ACCEPT, REJECT, and slots beyond the last."""
-    return int(uniform * (capacity + 5)) - 3
-
-
-def choice(now_us: int, queued: int, dequeued: int, capacity: int) -> int:
-    """Any choice of what to send, HOLD and impossible ones included."""
-    return (now_us // 3 + 5 * queued + 11 * dequeued) % (capacity + 3) - 1
-
-
-def unwanted(now_us: int, queued: int) -> bool:
-    """Whether the head is to be dropped."""
-    return (now_us // 7 + queued) % 3 == 0
-
-
-assert HOLD == choice(0, 0, 0, 1)
-
-
 def decide_anything(buffer, arrival, memory):
+    """Any decision, impossible ones included: -3 is none at all, then ACCEPT, REJECT, and slots beyond the last."""
     return int(arrival.uniform * (buffer.capacity + 5)) - 3
 
 
 def send_anything(buffer, memory):
+    """Any choice of what to send, HOLD (-1) and impossible ones included."""
     return (buffer.now_us // 3 + 5 * len(buffer.slots) + 11 * buffer.dequeued) % (buffer.capacity + 3) - 1
 
 
 def drop_some(buffer, memory):
+    """Whether the head is to be dropped."""
     return (buffer.now_us // 7 + len(buffer.slots)) % 3 == 0
 
 
@@ -88,8 +83,13 @@ class TopicCase:
             rows[rule] = getattr(self.client, rule)
         return senders
 
+    def run(self, policy: policies.Policy) -> Senders:
+        senders = self.senders()
+        senders.run(policy)
+        return senders
+
     def policy(self, *, compile: bool) -> policies.Policy:
-        """One that answers as ``decision``, ``choice`` and ``unwanted`` do."""
+        """One that answers as ``decide_anything``, ``send_anything`` and ``drop_some`` do."""
         hooks: dict[str, Any] = {}
         if self.schedules:
             hooks["on_send"] = send_anything
@@ -141,11 +141,31 @@ class TopicCase:
         return twin.run(self.case.twin_messages, episode.first_decision, episode.last_decision)
 
     def answer(self, twin: Any, event: str) -> Any:
+        known = {"capacity": self.case.capacity, "now_us": twin.now, "dequeued": len(twin.dequeued)}
+        buffer = SimpleNamespace(slots=twin.slots(), **known)
         if event == "decision":
-            return decision(twin.newcomer["uniform"], self.case.capacity)
+            return decide_anything(buffer, SimpleNamespace(uniform=twin.newcomer["uniform"]), None)
         if event == "send":
-            return choice(twin.now, len(twin.slots()), len(twin.dequeued), self.case.capacity)
-        return unwanted(twin.now, len(twin.slots())) if event == "dequeue" else None
+            return send_anything(buffer, None)
+        return drop_some(buffer, None) if event == "dequeue" else None
+
+
+SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
+CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
+
+
+def observed(buffer: Any, arrival: Any, arriving: bool) -> dict[str, Any]:
+    """What the kernels observe, by field; the places are full of rubbish before."""
+    slots = np.full((len(SLOT_NAMES), buffer.capacity + 1), np.nan)
+    context = np.full(len(CONTEXT_NAMES), np.nan)
+    if len(buffer.topics) == 1:
+        slots, context = slots[: len(SLOT_FIELDS)], context[: len(CONTEXT_FIELDS)]
+        observe_slots(buffer, arrival, slots)
+        observe_context(buffer, arrival, context)
+    else:
+        observe_topic_slots(buffer, arrival, arriving, slots)
+        observe_topic_context(buffer, arrival, arriving, context)
+    return dict(zip(SLOT_NAMES, slots, strict=False)) | dict(zip(CONTEXT_NAMES, context, strict=False))
 
 
 def twin_rules(topic: Topic, v: qoi.Value) -> naive_sender.Rules:

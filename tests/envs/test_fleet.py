@@ -271,24 +271,6 @@ def test_cells_can_be_given_and_begun_one_by_one():
     assert envs.rows.senders.batch.senders["next"].tolist() == [10, 10, 0, 0]
 
 
-@pytest.mark.nightly
-def test_weights_shared_by_all_robots_learn():
-    pytest.importorskip("stable_baselines3", reason="the extra [train] is not installed")
-    maskable = pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
-    from bufgym.sb3 import GymVecEnv
-
-    envs = GymVecEnv(FleetVecEnv(2, 4, "lte", L, autoreset_mode=AutoresetMode.SAME_STEP, parameters=PARAMETERS))
-    envs.seed(0)
-    model = maskable.MaskablePPO("MultiInputPolicy", envs, n_steps=64, batch_size=128, n_epochs=2, seed=0, device="cpu")
-    before = {name: weights.clone() for name, weights in model.policy.state_dict().items()}
-    model.learn(1_024)
-    assert model.num_timesteps == 1_024
-    assert len(model.ep_info_buffer) == 16  # two episodes of 60 ticks of each of 8 robots
-    assert any((weights != before[name]).any() for name, weights in model.policy.state_dict().items())
-    actions, _ = model.predict(envs.reset(), action_masks=np.array(envs.env_method("action_masks")))
-    assert actions.shape == (8,)
-
-
 @pytest.mark.kernels
 def test_a_robot_that_is_asked_again_holds_the_others_up():
     # B = 2500. Robot 0: 1000, 1000 and 500 are queued behind its first message, then 2000 comes: both of the oldest go.

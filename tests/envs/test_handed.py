@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.envs import SenderEnv
 from bufgym.envs.observation import Handed, ObservationForm
 from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
 
@@ -47,20 +46,3 @@ def test_a_collector_gets_an_observation_of_its_own_each_time() -> None:
     assert len(handed._made) < 20
     collected[0].clear()  # a dict that its owner changes changes no other
     assert list(handed.of(row(2))) == list(FORM.space)
-
-
-def test_an_environment_hands_out_what_it_did_before() -> None:
-    """Collected or dropped at once, the observations of an episode are the same."""
-    env = SenderEnv("interruption", 3)
-    env.reset(seed=3)
-    kept, sums = [], []
-    for _ in range(30):
-        observation, _, ended, *_ = env.step(4)
-        kept.append(observation)
-        if ended:
-            break
-    env.reset(seed=3)
-    for _ in kept:
-        observation, *_ = env.step(4)
-        sums.append([float(array.sum()) for array in observation.values()])
-    assert sums == [[float(array.sum()) for array in observation.values()] for observation in kept]

@@ -3,7 +3,6 @@
 from collections import Counter
 from typing import Any
 
-import numpy as np
 import pytest
 
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
@@ -40,25 +39,6 @@ def test_the_set_is_the_same_for_every_row_and_seed() -> None:
         played = [*batch.rows.senders.episodes, *single.rows.senders.episodes]
         arrivals |= {episode.arrivals["arrival_us"].tobytes() for episode in played if episode is not None}
     assert len(arrivals) == 2
-
-
-def test_row_i_of_a_batch_is_the_single_environment() -> None:
-    batch = SenderVectorEnv(3, UPLINK, L, pool=4)
-    singles = [SenderEnv(UPLINK, L, pool=4) for _ in range(3)]
-    batch.reset(seed=7)
-    for i, env in enumerate(singles):
-        env.reset(seed=7 + i)
-    ended = np.zeros(3, np.bool_)
-    for _ in range(60):  # several episodes of 12 messages each
-        _, rewards, terminated, *_ = batch.step(np.full(3, L + 1))
-        for i, env in enumerate(singles):
-            if ended[i]:
-                env.reset()
-                continue
-            _, reward, ends, *_ = env.step(L + 1)
-            assert (reward, ends) == (rewards[i], terminated[i])
-        ended = terminated
-    assert batch.rows.senders.begun.min() > 3
 
 
 def test_fleets_have_one_too() -> None:

@@ -29,6 +29,7 @@ CASES: dict[str, tuple[Scenario, dict[str, Any]]] = {
     "suite": (SuiteScenario("interruption-v1"), {"bound": True}),  # three V side by side
     "topics": (client(duration_s=0.6, scale=2.0), {}),
     "topics in a window": (client(duration_s=0.6, window=3, round_trip_us=30_000), {"reward": "late"}),
+    "pooled": (Uplink(traces=(FADING,), jitter=0.8, duration_s=0.4), {"pool": 4}),  # several episodes of 12 messages
     "asks nothing": (Interruption(t_max=3), {"decide_at": "overflow"}),  # each episode ends with its first step
 }
 L, N = 4, 3
@@ -213,10 +214,9 @@ def test_seeds_are_told_as_gymnasium_tells_them() -> None:
     assert len(set(unseeded.np_random_seed)) == N
 
 
-@pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
-def test_make_vec(env_id: str, mode: str) -> None:
-    envs = gym.make_vec(env_id, num_envs=N, vectorization_mode=mode, capacity=3, **SMALL[env_id])
+def test_make_vec(env_id: str) -> None:
+    envs = gym.make_vec(env_id, num_envs=N, capacity=3, **SMALL[env_id])
     assert envs.num_envs == N
     assert envs.single_action_space == gym.spaces.Discrete(5)
     observations, _ = envs.reset(seed=2)
