@@ -142,7 +142,7 @@ def nightly(arguments: list[str]) -> list[Stage]:
         pytest("compiled", folder, *others, *add, environment=cov, limit_s=40 * MINUTE),
         pytest("servers", folder, *servers, *add, environment=cov, limit_s=20 * MINUTE),
         Stage("coverage", report, environment=measured(folder)),
-        pytest("all uncompiled", folder, *plain, compiled=False, environment=many, limit_s=25 * MINUTE),
+        pytest("all uncompiled", folder, *plain, compiled=False, limit_s=25 * MINUTE),
         pytest("fuzz", folder, "tests/fuzz", *arguments, environment=many, limit_s=15 * MINUTE),
         Stage("claims", [*make, "claims"], limit_s=15 * MINUTE),
         Stage("mutants", [PYTHON, *sample], limit_s=25 * MINUTE),

@@ -37,6 +37,7 @@ from bufgym.policies import learned, small_queue
 from bufgym.policies import weights as weights_file
 from bufgym.policies.learned import NAMES, Network, Weights
 from bufgym.policies.registry import Policy
+from bufgym.policies.target_gap import REMEMBERED
 from bufgym.scenario import Interruption
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome

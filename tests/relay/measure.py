@@ -212,9 +212,6 @@ async def page(robots: int, seconds: float) -> None:
     print(f"drawing takes {median:.1f} ms of a processor (median; p99 {late:.1f}, longest {longest:.1f})")
 
 
-ENGINE_HZ, COUNT, KEY = 100, 600, "bufgym.relay"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     verbs = parser.add_subparsers(required=True)
@@ -227,7 +224,6 @@ def main() -> None:
     of["load"].add_argument("--viewers", type=int, default=3)
     of["load"].add_argument("--slow", action="store_true", help="the first viewer reads 100 kB/s")
     of["idle"].add_argument("--connections", type=int, default=1000)
-    of["second"].add_argument("--port", type=int)
     options = vars(parser.parse_args())
     asyncio.run(options.pop("work")(**options))
 
