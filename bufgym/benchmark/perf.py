@@ -26,7 +26,7 @@ from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
 from bufgym.files import replaced
-from bufgym.kernel import JIT
+from bufgym.kernel import JIT, compile_here
 from bufgym.sim import Senders
 
 ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
@@ -77,6 +77,7 @@ class Sizes:
 def measure(sizes: Sizes | None = None) -> list[Figure]:
     """Measure everything."""
     sizes = sizes or Sizes()
+    compile_here()
     return [*_batches(sizes), *_singles(sizes), *_rollouts(sizes)]
 
 

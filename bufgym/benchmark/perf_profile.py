@@ -16,7 +16,7 @@ import numpy as np
 
 from bufgym.benchmark.perf import ENVIRONMENTS, SEED, TOPICS, Sizes, best_s, record
 from bufgym.envs.step import StepOutput, step_rows, write_mask, write_observation
-from bufgym.kernel import kernel
+from bufgym.kernel import compile_here, kernel
 from bufgym.sim import NOTHING_WAITS, Batch
 
 _TIMES = 20
@@ -74,6 +74,7 @@ class _Clock:
 def profile(sizes: Sizes | None = None) -> list[Part]:
     """The parts of a step of the native batches, then of the single environment, those of each adding up to it."""
     sizes = sizes or Sizes()
+    compile_here()
     parts = [part for id in ENVIRONMENTS for part in _batch(id, sizes.capacity, sizes)]
     return [*parts, *_batch(TOPICS, sizes.topic_slots, sizes), *_single(ENVIRONMENTS[0], sizes)]
 

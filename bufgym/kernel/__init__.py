@@ -9,7 +9,7 @@ from bufgym.kernel.announce import compile_silently
 from bufgym.kernel.arrays import at, item, prefetch, records, stretch, table
 from bufgym.kernel.bundle import BundleType, bundle, local
 from bufgym.kernel.cache import FOLDER, NotKeptError, only_kept
-from bufgym.kernel.compile import compile_for, direct, entry, interruptible, kernel, located
+from bufgym.kernel.compile import compile_for, compile_here, direct, entry, interruptible, kernel, located
 from bufgym.kernel.meanwhile import named
 from bufgym.kernel.switch import JIT
 
@@ -21,6 +21,7 @@ __all__ = [
     "at",
     "bundle",
     "compile_for",
+    "compile_here",
     "compile_silently",
     "direct",
     "entry",

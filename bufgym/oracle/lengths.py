@@ -33,12 +33,9 @@ class EveryLength:
         self.scenario, self._law = scenario, law(scenario)
         self._senders = Senders(len(capacities), max(capacities), scenario.value, max_messages=scenario.max_messages)
         longest = scenario.episode(scenario.t_max)
-        for row, capacity in enumerate(capacities):
-            # Loading writes L into the row, so rows of one batch can have different capacities.
-            self._senders.capacity = capacity
-            self._senders.load(row, longest)
-        self._senders.capacity = max(capacities)
+        self._senders.load_all([(row, longest, None) for row in range(len(capacities))])
         batch = self._senders.batch
+        batch.senders["capacity"] = capacities
         self._loaded = batch.senders.copy(), batch.log.copy()
         lengths = range(scenario.t_max + 1)
         self._best = [

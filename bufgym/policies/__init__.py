@@ -14,7 +14,6 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     fragments,
     gaps,
     middleware,
-    planner,
     robofleet,
     sampling,
     schedulers,

@@ -32,11 +32,11 @@ SIZE_BYTES = 100_000
 OPTIMUM, FULL, IDLE = "optimum", "optimum, only when full", "optimum, always asked"
 IDLE_UP_TO = 3
 """L up to which the programme is solved for ``IDLE`` too: it takes as long again."""
-NAMES = ("afr", "drop-oldest", "random", "min-gap", "min-motion-gap", "paced-motion-gap", "planner")
+NAMES = ("afr", "drop-oldest", "random", "min-gap", "min-motion-gap", "paced-motion-gap")
 """Played beside the optimum, AFR first."""
 LEARNED = ("learned-motion", "learned-time")
 """Agents, by name."""
-STYLES = {OPTIMUM: ("oracle", "-"), FULL: ("oracle", ":"), "planner": ("pink", "-"), "min-gap": ("random", "-")}
+STYLES = {OPTIMUM: ("oracle", "-"), FULL: ("oracle", ":"), "min-gap": ("random", "-")}
 STYLES |= {"learned-motion": ("sky", "--"), "paced-motion-gap": ("orange", "-")}
 
 

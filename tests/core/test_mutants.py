@@ -145,7 +145,6 @@ SETTINGS = {
     "foxglove-backlog": {"limit_mb": 10},
     "decimate": {"every": 3},
     "keyframe": {"step": 0.05},
-    "planner": {"budget_us": 200, "standstill_s": 1},
 }
 BEGINNINGS = {
     **{name: {"r": 1} for name in ("afr", "afr-paper", "linear-alpha")},
