@@ -28,12 +28,12 @@ PATIENCE_S = 1.0
 
 @functools.cache
 def end_with(parent: int) -> None:
-    """From now on this process, if ``parent`` (a process number) began it, ends soon after that has ended.
+    """From now on this process ends soon after ``parent`` (a process number), which began it, has ended.
 
-    A parent that is killed takes none of its workers along: they would hold its pipes and files for minutes.
+    A parent that is killed takes none of its workers along: they would hold its pipes and files for ever. It may be
+    gone already when a worker comes this far.
     """
-    if os.getppid() == parent:
-        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 
 
 def _watch(parent: int) -> None:

@@ -154,9 +154,8 @@ def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
     return run(sweep.policies, setting.scenario, sweep.capacities, shard.seeds, label=shard.label, **limits)
 
 
-def _attempt(number: int, shard: Shard, load: Load | None, parent: int) -> tuple[int, list[Row] | Exception]:
+def _attempt(number: int, shard: Shard, load: Load | None) -> tuple[int, list[Row] | Exception]:
     """The shard's number and its rows, or what went wrong: joblib throws finished shards away when one raises."""
-    cluster.end_with(parent)
     try:
         return number, run_shard(shard, load)
     except BufgymError as error:
@@ -318,7 +317,7 @@ def _spread(
     waiting, vain = dict(enumerate(shards)), 0
     while waiting and not failed:
         now = itertools.takewhile(lambda _: not failed, list(waiting.items()))
-        calls = ((_attempt, (k, shard, load, os.getpid())) for k, shard in now)
+        calls = ((_attempt, (k, shard, load)) for k, shard in now)
         before = len(waiting)
         try:
             for k, result in cluster.spread(calls, before, jobs, backend, address):

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -72,6 +74,11 @@ def test_workers_end_with_their_parent(how: signal.Signals, tmp_path: Path) -> N
         os.killpg(process.pid, signal.SIGKILL)
         pytest.fail("workers live on")
     assert "Traceback" not in process.communicate()[1]
+
+
+def test_a_worker_whose_parent_is_gone_before_it_begins_ends() -> None:
+    late = "import os, time; from bufgym.benchmark.cluster import end_with; end_with(os.getpid()); time.sleep(600)"
+    assert subprocess.run([sys.executable, "-c", late], check=False).returncode == 1
 
 
 @pytest.mark.nightly
