@@ -136,6 +136,8 @@ def nightly(arguments: list[str]) -> list[Stage]:
     report = [PYTHON, "-m", "coverage", "report", "--skip-covered", "--include=bufgym/*"]
     sample = [".ci/mutants", "--sample=150", "--minutes=12", f"--seed={time.strftime('%Y%m%d')}"]
     make = ["make", "--no-print-directory"]
+    data = Path(os.environ.get("BUFGYM_SHARED_DATA", REPO.parent / "shared" / "data"))
+    recordings = "" if data.is_dir() else "the recordings are not here, and without them many claims differ"
     return [
         *check(),
         *uncompiled(folder, arguments),
@@ -144,7 +146,7 @@ def nightly(arguments: list[str]) -> list[Stage]:
         Stage("coverage", report, environment=measured(folder)),
         pytest("all uncompiled", folder, *plain, compiled=False, limit_s=25 * MINUTE),
         pytest("fuzz", folder, "tests/fuzz", *arguments, environment=many, limit_s=15 * MINUTE),
-        Stage("claims", [*make, "claims"], limit_s=15 * MINUTE),
+        Stage("claims", [*make, "claims", f"DATA={data}"], limit_s=30 * MINUTE, unless=recordings),
         Stage("mutants", [PYTHON, *sample], limit_s=25 * MINUTE),
         Stage("dist", [*make, "dist"], limit_s=5 * MINUTE),
         Stage("sdist", [PYTHON, ".ci/sdist.py"], limit_s=10 * MINUTE),
