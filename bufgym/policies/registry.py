@@ -275,7 +275,7 @@ def _registration(
 
 
 def _owner(name: str, on_arrival: OnArrival) -> str:
-    """The other policy of this name, in words, or nothing. A function may replace itself: a notebook's cell runs again."""
+    """The other policy of this name, in words, or nothing. A function may replace itself, as a notebook runs again."""
     entry = _REGISTRY.get(name)
     if entry is None:
         return ""
