@@ -158,6 +158,17 @@ def test_unequal_sizes_by_hand():
     assert plan.qoi == pytest.approx(V.information(np.array([0.0, 2.0, 3.0])), abs=EXACT)
 
 
+@kernels
+@pytest.mark.parametrize(("L", "limits", "reached"), [(3, {}, 0.999), (9, {"max_bytes": 40}, 0.98)])
+def test_the_plan_for_sixteen_unequal_messages_comes_close_to_the_bound(L, limits, reached):
+    sizes = np.maximum(1, 12 * np.random.default_rng(2).lognormal(0, 0.9, 16)).astype(int)
+    episode = line(np.arange(16) * 5, sizes=sizes)
+    plan = clairvoyant(episode, L, V, **limits)
+    result = outcome(run(policies.get("clairvoyant"), [episode], L, V, **limits), 0)
+    assert not plan.certified and result.invalid == 0
+    assert result.qoi == V.information(np.flatnonzero(plan.kept).astype(float)) >= reached * plan.qoi
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize(("L", "limits"), [(5, {}), (15, {}), (15, {"max_bytes": 3_000_000})])
 def test_with_unequal_sizes_the_plan_comes_close_to_the_bound(L, limits):
