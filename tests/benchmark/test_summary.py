@@ -15,7 +15,7 @@ from bufgym import policies
 from bufgym.benchmark import leaderboard, report
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.leaderboard import Entry, entries
-from bufgym.benchmark.live_runs import margins
+from bufgym.live.margins import margins
 from bufgym.benchmark.score import scores
 from bufgym.benchmark.summary import Quantity, Run, Summary, plain, summarise
 from bufgym.benchmark.sweep import Sweep, run_sweep
