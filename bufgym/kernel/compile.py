@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, wait
@@ -15,7 +14,7 @@ from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
 from bufgym.kernel.cache import Code, NotKeptError, only_kept
-from bufgym.kernel.meanwhile import FEW, Meanwhile
+from bufgym.kernel.meanwhile import FEW, Meanwhile, is_possible
 from bufgym.kernel.pipeline import PartCompiler, WholeCompiler
 from bufgym.kernel.switch import JIT
 
@@ -116,7 +115,7 @@ class _Direct:
         if meanwhile is not None and is_small and not meanwhile.is_over:
             return meanwhile
         kinds = tuple(cast(Any, numba).typeof(argument) for argument in (batch, *arguments))
-        if meanwhile is None and is_small and sys.executable:
+        if meanwhile is None and is_small and is_possible():
             try:
                 with only_kept():
                     self._entries[batch.several] = self.compile(kinds)

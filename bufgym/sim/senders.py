@@ -69,10 +69,6 @@ class Senders:
         self._uniforms: list[np.random.Generator | None] = [None] * n
         self._knots = Knots()
         self.batch = new_batch(n, self.capacity, max_messages, len(self._topic_table), values)
-        batch = self.batch
-        self._arrivals, self._log, self._topics, self._senders = (
-            whole.view(np.int64) for whole in (batch.arrivals, batch.log, batch.topics, batch.senders)
-        )  # NumPy copies records field by field; as whole words it copies them five times as fast
         self._rules = self._topic_table.view(np.int64)
         self._unlogged = np.tile(FRESH, max_messages)
         when_full = int(decide_at == "overflow")
@@ -122,16 +118,17 @@ class Senders:
         """Put sender ``i`` at the beginning of ``episode``."""
         link, n, words = episode.link, len(episode.arrivals), episode.arrivals.view(np.int64)
         first_knot, last_knot, after = self._knots.place(link.trace, i)
-        self._arrivals[i, : len(words)] = words
-        self._log[i, : n * len(FRESH)] = self._unlogged[: n * len(FRESH)]
-        self._topics[i] = self._rules
-        beginning = self._beginning
+        # NumPy copies records field by field; as whole words it copies them five times as fast.
+        batch, beginning = self.batch, self._beginning
+        batch.arrivals.view(np.int64)[i, : len(words)] = words
+        batch.log.view(np.int64)[i, : n * len(FRESH)] = self._unlogged[: n * len(FRESH)]
+        batch.topics.view(np.int64)[i] = self._rules
         beginning[_LOADED] = (
             *(n, episode.first_decision, episode.last_decision),
             *(first_knot, last_knot, after, first_knot, first_knot),
             *(link.offset_us, link.propagation_us, episode.window, episode.ack_delay_us, v_start),
         )
-        self._senders[i * len(beginning) : (i + 1) * len(beginning)] = beginning
+        batch.senders.view(np.int64)[i * len(beginning) : (i + 1) * len(beginning)] = beginning
 
     def value_of(self, i: int) -> Value:
         """The V that the QoI of sender ``i``'s episode is measured with; without topics."""
