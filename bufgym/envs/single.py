@@ -70,10 +70,10 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - any further argument replaces a parameter of the scenario (``t_max=100``). It is an object or the text that the
       command line takes (``value="saturating:0.5"``, ``traces="lte-synthetic-0"``).
 
-    ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e. ``reset(options={"trace": t, "seed":
-    s})`` plays the episode behind that row of ``bufgym bench``, where ``trace`` is the row's label or number. On
-    ``bufgym/Suite-v0`` add the row's ``scenario``; ``trace`` may be left out, as the seed tells it. ``reset(seed=s)``
-    begins a different sequence of episodes.
+    ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e, and
+    ``reset(options={"trace": t, "seed": s})`` the episode behind that row of ``bufgym bench``, where ``trace`` is the
+    row's label or number. On ``bufgym/Suite-v0`` add the row's ``scenario``; ``trace`` may be left out, as the seed
+    tells it. ``reset(seed=s)`` begins a different sequence of episodes.
 
     Raises ``BufgymError`` for an unfit argument, option or action, and ``ResetNeeded`` for a step before a reset or
     after the end of the episode.
