@@ -42,7 +42,7 @@ def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
 
 @kernel
 def observe_link(buffer: Buffer, context: NDArray[np.floating[Any]]) -> None:
-    """Write what does not depend on the arrival into ``context``: how full the buffer is, how its link does."""
+    """Write the fields that do not depend on the arrival into ``context``: state of the buffer and its link."""
     context[fields.OCCUPANCY] = len(buffer.slots) / buffer.capacity
     context[fields.BACKLOG] = buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0
     context[fields.BUSY] = buffer.busy

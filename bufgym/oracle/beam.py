@@ -87,7 +87,7 @@ def search(p: Problem, room: Room, states: States, plan: NDArray[np.int64]) -> t
 
 @kernel
 def offer(p: Problem, room: Room, states: States, j: int, i: int, w: int) -> None:
-    """Send message j after state ``w`` of message i (-1: first of all), if it finds room and is among the best."""
+    """Add "message j after state ``w`` of message i" if j finds room and is among the best; i = -1 for none."""
     e = states.end[i, w] if i >= 0 else 0
     s = max(e, p.c[j])
     if s - p.c[j] > p.limit[j] or s + p.size[j] > p.ends:

@@ -179,7 +179,7 @@ def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int
 
 @kernel
 def possible(ahead: Ahead, work: Work, i: int, n: int, e: int, count: int, until: int, sent: int, target: int) -> bool:
-    """Whether a plan that sends so many of the queue and then ``target`` keeps the socket as busy as it has to be."""
+    """Whether a plan with ``sent`` of the queue's messages and then ``target`` keeps the socket busy enough."""
     b, m = ahead.link[i, 0], target
     for t in range(sent + 1, until + 1):
         if m < 0 or m - n > work.arrived[t] - (count - t):

@@ -114,7 +114,7 @@ def waiting_cost(p: Problem, room: Room, j: int, step: int) -> float:
 
 @kernel
 def find_future(p: Problem, room: Room | None) -> None:
-    """Fill ``future`` (zeros so far), from the last message back. Waiting costs what ``room`` says; None: nothing."""
+    """Fill ``future`` (zeros so far) from the last message back; waiting costs the prices of ``room``, if any."""
     n, steps = p.future.shape
     for i in range(n - 1, -1, -1):
         step_i, reach = p.c[i] // p.grid, p.c[i] + p.limit[i] + p.size[i]

@@ -43,9 +43,7 @@ def steady(buffer: Buffer) -> bool:
 
 @kernel
 def send_us(buffer: Buffer, arrival: Arrival) -> float:
-    """Time in which the link sends a message of mean size, us, at the fastest of its rates over 0.1 s, 0.5 s and 2 s; 0
-    while there is no rate.
-    """
+    """Time to send a message of mean size, us, at the fastest rate over 0.1 s, 0.5 s or 2 s; 0 without a rate."""
     rate = max(buffer.short_rate_bytes_per_s, buffer.medium_rate_bytes_per_s, buffer.long_rate_bytes_per_s)
     return 1e6 * mean_bytes(buffer, arrival) / rate if rate > 0 else 0.0
 

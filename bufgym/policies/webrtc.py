@@ -64,9 +64,7 @@ def leak(memory: Memory, period_us: float) -> None:
 
 @kernel
 def drops_frame(memory: Memory, period_us: float) -> bool:
-    """Whether to drop this frame. From a ratio of 1/2 on there are several drops for each frame kept, below it the
-    reverse.
-    """
+    """Whether to drop this frame: a ratio of 1/2 or more drops several for each frame kept."""
     ratio = memory[RATIO]
     if ratio >= 0.5:
         most = int(1e6 * MOST_DROPS_S / period_us)
