@@ -28,11 +28,11 @@ TOOLS = (
         b"".join((_HERE / f"{name}.py").read_bytes() for name in ("arrays", "bundle", "compile", "pipeline"))
     ).hexdigest(),
 )
-"""Versions of all that translates kernels, with the sources of this package that take part."""
+"""Versions of everything that translates kernels, with the sources of this package that take part."""
 
 
 def closure(function: Any) -> str:
-    """Hash of ``function``'s closure: equal where its machine code is, for equal types of its arguments."""
+    """Hash of ``function``'s closure; equal hashes mean equal machine code, for equal types of arguments."""
     told: dict[FunctionType, str] = {}
     waiting = [function]
     while waiting:
@@ -45,7 +45,7 @@ def closure(function: Any) -> str:
 
 @functools.cache
 def _of_one(function: FunctionType) -> tuple[str, list[FunctionType]]:
-    """(Hash of the function alone, the functions that it names)."""
+    """Hash of the function alone, and the functions that it names."""
     calls: list[FunctionType] = []
     parts = [function.__module__, function.__qualname__, *_code(function.__code__)]
     parts += [f"{name} = {_told(value, calls)}" for name, value in _read(function)]
@@ -54,7 +54,7 @@ def _of_one(function: FunctionType) -> tuple[str, list[FunctionType]]:
 
 @functools.cache
 def told_types(types: Any) -> str:
-    """``types``, a signature or several types, in words that name the fields of every tuple too."""
+    """``types``, a signature or several types, as text that names the fields of every tuple too."""
     found = [repr(types)]
     waiting = list(getattr(types, "args", types))
     while waiting:
@@ -87,7 +87,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _read(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """(name, value) of all that ``function`` reads from outside: globals, enclosing scopes, default arguments."""
+    """(name, value) of all outside values that ``function`` reads: globals, enclosing scopes, default arguments."""
     names = sorted(set(_names(function.__code__)))
     for name in names:
         if name in function.__globals__:
@@ -101,7 +101,7 @@ def _read(function: FunctionType) -> Iterator[tuple[str, Any]]:
 
 
 def _told(value: Any, waiting: list[Any]) -> str:
-    """``value`` in words that are equal for equal values in every process; functions go to ``waiting`` as well."""
+    """``value`` as text that is equal for equal values in every process; functions go to ``waiting`` as well."""
     function = getattr(value, "py_func", value)
     if isinstance(function, FunctionType):
         if hasattr(value, "py_func"):

@@ -23,7 +23,7 @@ from numba.core.registry import CPUDispatcher
 from bufgym.kernel.announce import say
 
 FEW = 8
-"""Rows of a batch that plain Python is fast enough for."""
+"""Most rows of a batch for which plain Python is fast enough."""
 _CHILD = "import sys; sys.path[:] = {path!r}; from bufgym.kernel.meanwhile import fill_cache; fill_cache()"
 
 Bundle = TypeVar("Bundle", bound=NamedTuple)
@@ -50,7 +50,7 @@ class Meanwhile:
 
     @property
     def is_over(self) -> bool:
-        """Whether the process has ended: then the code is on disk, or has to be compiled here."""
+        """Whether the process has ended: the code is then on disk, or must be compiled here."""
         return not self._thread.is_alive()
 
     def wait(self) -> None:
@@ -59,7 +59,7 @@ class Meanwhile:
 
     def __call__(self, *arguments: Any) -> Any:
         """Run the kernel as plain Python."""
-        with np.errstate(all="ignore"):  # as compiled code does
+        with np.errstate(all="ignore"):  # like compiled code
             return self._python(*(named(entry) if hasattr(entry, "_fields") else entry for entry in arguments))
 
     def _compile(self) -> None:
@@ -86,7 +86,7 @@ def plain(function: Any) -> Callable[..., Any]:
 
 
 def _plain_globals(module: str) -> dict[str, Any]:
-    """What the functions of ``module`` see, with plain Python in place of every kernel."""
+    """Globals of ``module``, with plain Python in place of every kernel."""
     if module not in _GLOBALS:
         found = _GLOBALS[module] = dict(vars(sys.modules[module]))
         for name, value in found.items():

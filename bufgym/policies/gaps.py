@@ -88,7 +88,7 @@ def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue rejects a newcomer nearer than beta even gaps T / (s + 1) to the tail, else as min-gap.
 
     T is the time since the arrival of the message dequeued last. The s queued messages should divide it evenly; s is L
-    unless B is what is full.
+    unless the byte limit B is full.
     """
     beta, s = buffer.parameters[0], len(buffer.slots)
     if has_space(buffer, arrival):

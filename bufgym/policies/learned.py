@@ -188,9 +188,7 @@ class Weights(ScorerWeights):
     """Whether the agent thins the queue to the link."""
 
     def parameters(self) -> NDArray[np.float64]:
-        """Numbers for the policy: the sum of its flags (such as ``LEAVES``), this scorer, the scorer for a link that
-        stands still, and the shortcuts' plans.
-        """
+        """The policy's numbers: flags, this scorer, the scorer for a standing link, and the shortcuts' plans."""
         scorers = [self] if self.still is None else [self, self.still]
         plans = [packed()] if self.shortcuts else []
         flags = LEAVES * self.shortcuts + THINS * self.thins + SEES_MOTION * ("motion_merged" in self.fields)

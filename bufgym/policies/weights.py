@@ -65,7 +65,7 @@ STILL = "still."
 def observation_hash(topics: bool = False, names: Sequence[str] = ()) -> str:
     """SHA-256 of the fields' definitions: weights trained on other definitions would decide nonsense.
 
-    ``topics`` adds the fields of several topics. Of the fields beside the tables, only those in ``names`` count.
+    ``topics`` adds the fields of several topics. Fields beside the tables count only if they are in ``names``.
     """
     beside = [field for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.name in names]
     fields = [*FIELDS, *(TOPIC_FIELDS if topics else ()), *beside]

@@ -114,7 +114,7 @@ def _array(parameter: Any) -> NDArray[np.float32]:
 
 
 def regrets(policy: Policy) -> dict[str, float]:
-    """Its exact regret in interruption-v1's test split, for a test to find again: in each V, at each of ``CHECKED``."""
+    """The policy's exact regret in interruption-v1's test split, for each V and L of ``CHECKED``, as a test value."""
     rounded = {}
     for label, setting in suites.get("interruption-v1").settings("test").items():
         for L, regret in zip(CHECKED, EveryLength(setting.scenario, CHECKED).regrets(policy), strict=True):

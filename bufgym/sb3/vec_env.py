@@ -271,5 +271,5 @@ def _row(info: Mapping[str, Any], i: int) -> dict[str, Any]:
 
 
 def _final_observation(final: Any, i: int) -> Any:
-    """Environment ``i``'s last observation from ``final_obs``: one array an environment, or a batched dict."""
+    """Environment ``i``'s last observation from ``final_obs``, an array per environment or a batched dict."""
     return _row(final, i) if isinstance(final, Mapping) else final[i]

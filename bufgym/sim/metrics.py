@@ -198,8 +198,7 @@ def ages_between_s(
 
 
 def ages_s(received_us: NDArray[np.int64], arrival_us: NDArray[np.int64]) -> tuple[float, float, float]:
-    """Mean, mean peak and largest age of information, s [Kaul, Yates and Gruteser 2012]; NaN with fewer than 2
-    receipts.
+    """Mean, mean peak and largest age of information, s (Kaul, Yates and Gruteser 2012); NaN below 2 receipts.
 
     Between two receipts the age grows with slope 1 from first receipt - newest arrival time so far: a trapezium.
     """
