@@ -181,9 +181,7 @@ def new_ppo(settings: Settings, env: VecEnv) -> MaskablePPO | PPO:
 
 
 def even_batch(decisions: int, most: int) -> int:
-    """The largest batch size up to ``most`` that divides the decisions, so that no update ends with a noisy small
-    batch.
-    """
+    """The largest batch size up to ``most`` that divides the decisions, so that no noisy rest is left."""
     batches = -(-decisions // most)
     while decisions % batches:
         batches += 1
