@@ -89,8 +89,7 @@ class LinkFigure(Figure):
 
     @property
     def streamed(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Lengths in us and rates in bytes/s of the link samples that begin while frames arrive, from the trace's
-        start."""
+        """Lengths in us and rates in bytes/s of the link samples that begin while frames arrive."""
         lengths_us, rates = self.link.samples()
         during = np.cumsum(lengths_us) - lengths_us < self.frames / RATE_HZ * 1e6
         return lengths_us[during], rates[during]

@@ -87,8 +87,7 @@ class Reproduction(FrameFigure):
         return facts
 
     def where_it_moves(self, rows: Rows) -> str:
-        """Correlate the camera's motion in Drop Oldest's longest gap with AFR's change of the error, over the
-        offsets."""
+        """Correlate camera motion in Drop Oldest's longest gap with AFR's change of the error, over the offsets."""
         moved, won = [], []
         x = self.stage(rows[0]["recording"]).whole.motion().at(self.stage(rows[0]["recording"]).whole.time_us)
         for k in rows.distinct("k"):
@@ -129,8 +128,7 @@ class Reproduction(FrameFigure):
         return np.column_stack([by_L, np.mean(by_L, axis=1)])
 
     def _maps(self, part: Any, recording: str) -> None:
-        """Draw the full map from above, once per policy and kind of pose, coloured by the distance to the policy's
-        map."""
+        """Draw the full map from above per policy and kind of pose, coloured by the distance to the policy's map."""
         on, L = self.stage(recording), min(self.capacities)
         limit_mm = 20.0
         panels = part.subplots(2, len(self.shown), squeeze=False, sharex=True, sharey=True)
