@@ -33,7 +33,7 @@ PAPER = {"afr": "< 10 us", "drop-oldest": "< 10 us", "random": "< 10 us", IMAGES
 NEAR_MS = (1.0, 100.0)
 """Times within these limits have the paper's order of magnitude, 10 ms."""
 LIMIT_COMPILED_US, LIMIT_PYTHON_US = 1.0, 10.0
-"""Our limits on the median for the paper's three fast policies: inside compiled code, and called from Python."""
+"""Our limits for the paper's three fast policies: in compiled code, and for the median call from Python."""
 HOW = "compiled loop" if JIT else "Python loop (compilation is off)"
 """Kind of loop that ``inside_us`` times."""
 REPEATS = 5

@@ -3,8 +3,7 @@
 Every run of Fig. 7 and 8 has its coverage and its information by time, by motion and by measured overlap. It also has
 the error of the map, the missing part of the map, and whether tracking broke. Correlation is Spearman's over the runs
 of a recording, and the bootstrap draws whole offsets of the fade. *Within* compares only runs of the same queue size
-and offset. It asks whether V tells policies apart, while the whole correlation may only say that a larger queue is
-better.
+and offset. It asks whether V tells policies apart; otherwise a correlation may only show that a larger queue is better.
 """
 
 from __future__ import annotations

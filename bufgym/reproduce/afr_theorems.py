@@ -5,8 +5,8 @@ with V(0) = 0 is a sum of V(d) = min(d, D), D = 1, 2, ..., with weights >= 0. H 
 holds for each min(d, D) holds for every V. All sums are then integers, and comparisons are exact.
 
 The ratio of Theorem 2 is not linear in V. But for gaps g that add up to T + 1 = (L + 1) m, the ratio sum V(g) / ((L +
-1) V(m)) is smallest for V(d) = min(1, d / m). To see this, let t = V(m); concavity gives V(g) >= t g / m for g <= m,
-and V does not fall, so V(g) >= t for g >= m. The worst ratio over all V is therefore sum min(1, g / m) / (L + 1).
+1) V(m)) is smallest for V(d) = min(1, d / m). With t = V(m), concavity gives V(g) >= t g / m for g <= m, and V(g) >= t
+for g >= m as V does not fall. The worst ratio over all V is therefore sum min(1, g / m) / (L + 1).
 
 We add two statements to the paper's theorems. The first is a sharper bound, 2(sqrt((2L + 1) / (L + 1)) - 1), the
 minimum of the same ratio. The second is about AFR's gaps. One pass of p merges gaps of r to gaps of 2r, so the largest
