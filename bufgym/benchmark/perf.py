@@ -1,88 +1,76 @@
-"""bufgym's own speed: each figure with its definition and its target, all from one run.
+"""bufgym's own speed: its environments, its rollouts, and the parts of a step.
 
-Every figure is the best of several repeats: other work on the machine can only slow a repeat down. Everything runs in
-one thread. Actions are drawn beforehand, uniform among the valid ones, by playing the same seeded episodes once; so the
-timed loop holds nothing but the environment's own work, its resets included.
+Every figure is the best of several repeats, because other work on the machine can only slow a repeat down. Everything
+runs in one thread. Actions are drawn beforehand, uniform among the valid ones, by playing the same seeded episodes
+once. So the timed loop holds only the environment's own work and its resets.
 """
 
 from __future__ import annotations
 
-import functools
+import importlib
 import json
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
+from bufgym.envs.step import StepOutput, write_mask, write_observation
 from bufgym.files import replaced
-from bufgym.kernel import JIT, compile_here
-from bufgym.sim import Senders
+from bufgym.kernel import JIT, compile_here, kernel
+from bufgym.sim import NOTHING_WAITS, Batch, Senders
 
-ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
+ENVIRONMENTS = {"bufgym/Uplink-v0": 10e6, "bufgym/Interruption-v0": 8e6}
+"""Decisions a second that their native batches aim at."""
 TOPICS = "bufgym/Topics-v0"
-_BATCH_GOALS = {"bufgym/Uplink-v0": 10e6, "bufgym/Interruption-v0": 8e6, TOPICS: 5e6}
 POLICIES = ("afr", "drop-oldest", "random", "min-gap")
+NATIVE = "vector_entry_point"
 SEED = 1
 
+PEERS = {
+    "gymnasium": f"gym.make_vec('CartPole-v1', vectorization_mode='{NATIVE}'), in numpy",
+    "envpool": "envpool.make('CartPole-v1', num_threads=1), in C++",
+    "pufferlib": "pufferlib.ocean's Cartpole, in C",
+}
+"""Other packages' batches of CartPole, the smallest task that every package has."""
 
-@dataclass(frozen=True)
-class Figure:
-    """One measured figure."""
+
+class Figure(NamedTuple):
+    """One measured figure. ``value`` and ``target`` are in ``unit``; ``definition`` says how it was measured."""
 
     name: str
-    """What was measured."""
     value: float
-    """Its result, in ``unit``."""
     unit: str
-    """Of ``value`` and ``target``."""
     target: float | None
-    """What bufgym aims at; None where there is no target."""
     definition: str
-    """How it was measured, in a sentence."""
 
 
 @dataclass(frozen=True)
 class Sizes:
     """How much is measured. The defaults take about half a minute."""
 
-    capacity: int = 16
-    """L, messages."""
-    batch: int = 1024
-    """Environments in a batch."""
-    steps: int = 1000
-    """Steps of the native batch."""
-    sync_steps: int = 30
-    """Steps of Gymnasium's SyncVectorEnv."""
-    single_steps: int = 20_000
-    """Steps of the single environment."""
-    episodes: int = 1000
-    """Episodes of a fixed-policy rollout."""
-    repeats: int = 3
-    """Repeats of each figure, of which the best counts."""
-    topic_slots: int = 32
-    """L of the batch with several topics."""
-
-
-def measure(sizes: Sizes | None = None) -> list[Figure]:
-    """Measure everything."""
-    sizes = sizes or Sizes()
-    compile_here()
-    return [*_batches(sizes), *_singles(sizes), *_rollouts(sizes)]
+    capacity: int = 16  # L, messages
+    batch: int = 1024  # environments in a batch
+    steps: int = 1000  # of the native batch
+    sync_steps: int = 30  # of Gymnasium's SyncVectorEnv
+    single_steps: int = 20_000  # of the single environment
+    episodes: int = 1000  # of a fixed-policy rollout
+    repeats: int = 3  # of each figure; the best one counts
+    topic_slots: int = 32  # L of the batch with several topics
 
 
 def best_s(repeats: int, prepare: Callable[[], Any], work: Callable[[], Any]) -> float:
-    """Shortest time of ``work``, s, over so many repeats; ``prepare`` runs before each, untimed."""
+    """Shortest time of ``work`` over the repeats, s. ``prepare`` runs before each, untimed."""
     times = []
     for _ in range(repeats):
         prepare()
@@ -92,113 +80,131 @@ def best_s(repeats: int, prepare: Callable[[], Any], work: Callable[[], Any]) ->
     return min(times)
 
 
-def random_actions(mask: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.int64]:
-    """int64[n]: one valid action a row, uniform; ``mask`` is bool[n, L + 2]."""
-    return np.asarray(np.argmax(rng.random(mask.shape) * mask, axis=1), np.int64)
+def _play(env: Any, actions: Iterable[Any], single: bool = False) -> None:
+    """Step through these actions. A single environment is reset where its episode ends."""
+    for action in actions:
+        ended = env.step(action)[2]
+        if single and ended:
+            env.reset()
 
 
-def record(vector: Any, steps: int) -> tuple[NDArray[np.int64], int]:
-    """(actions int64[steps, n] for ``reset(seed=SEED)``, how many of them are decisions and not resets)."""
-    rng = np.random.default_rng(SEED)
-    _, info = vector.reset(seed=SEED)
-    actions = np.zeros((steps, vector.num_envs), np.int64)
-    done = np.zeros(vector.num_envs, np.bool_)
-    decisions = 0
-    for k in range(steps):
-        actions[k] = random_actions(info["action_mask"], rng)
+def _record(env: Any, steps: int, single: bool = False) -> tuple[list[Any], int]:
+    """(one uniform valid action a row for each step after ``reset(seed=SEED)``, the number of decisions in them)."""
+    rng, actions, decisions = np.random.default_rng(SEED), [], 0
+    _, info = env.reset(seed=SEED)
+    done: Any = np.zeros(1 if single else env.num_envs, np.bool_)
+    for _ in range(steps):
+        mask = np.atleast_2d(info["action_mask"])
+        chosen = np.argmax(rng.random(mask.shape) * mask, axis=1)
+        actions.append(int(chosen[0]) if single else chosen)
         decisions += int((~done).sum())  # a row that has ended spends its next step on its reset
-        _, _, terminated, truncated, info = vector.step(actions[k])
-        done = terminated | truncated
+        _, _, terminated, truncated, info = env.step(actions[-1])
+        if not single:
+            done = terminated | truncated
+        elif terminated:
+            _, info = env.reset()
     return actions, decisions
 
 
-def _batch_rate(id: str, mode: str, steps: int, sizes: Sizes, capacity: int) -> float:
-    """Decisions a second of one kind of vector environment."""
-    vector: Any = gym.make_vec(id, sizes.batch, vectorization_mode=mode, capacity=capacity)
-
-    def play() -> None:
-        for row in actions:
-            vector.step(row)
-
-    try:
-        actions, decisions = record(vector, steps)
-        return decisions / best_s(sizes.repeats, lambda: vector.reset(seed=SEED), play)
-    finally:
-        vector.close()
+def _rate(env: Any, steps: int, repeats: int, single: bool = False) -> float:
+    """Decisions a second."""
+    actions, decisions = _record(env, steps, single)
+    best = best_s(repeats, partial(env.reset, seed=SEED), partial(_play, env, actions, single))
+    env.close()
+    return decisions / best
 
 
-def _batches(sizes: Sizes) -> Iterable[Figure]:
-    call, rest = "gym.make_vec(vectorization_mode=", "all observation fields, resets in the time"
-    batch = f"n = {sizes.batch}, L = {sizes.capacity}, {rest}"
+def measure(sizes: Sizes | None = None) -> list[Figure]:
+    """Speed of the batches, of the single environments and of rollouts."""
+    sizes = sizes or Sizes()
+    compile_here()
+    return [*_batches(sizes), *_singles(sizes), *_rollouts(sizes)]
+
+
+def _batches(sizes: Sizes) -> Iterator[Figure]:
+    def figure(of: str, id: str, mode: str, steps: int, capacity: int, goal: float | None, what: str) -> Figure:
+        vector = gym.make_vec(id, sizes.batch, vectorization_mode=mode, capacity=capacity)
+        definition = f"{what} a second of gym.make_vec(vectorization_mode='{mode}'), n = {sizes.batch}, L = {capacity}"
+        definition += ", all observation fields, resets in the time"
+        return Figure(f"{of}, {id}", _rate(vector, steps, sizes.repeats), "steps/s", goal, definition)
+
+    for id, goal in ENVIRONMENTS.items():
+        native = figure("native batch", id, NATIVE, sizes.steps, sizes.capacity, goal, "decisions")
+        sync = figure("SyncVectorEnv", id, "sync", sizes.sync_steps, sizes.capacity, None, "decisions")
+        yield from (native, sync)
+        ratio = native.value / sync.value
+        yield Figure(f"native / SyncVectorEnv, {id}", ratio, "times", 50.0, "the ratio of these two")
+    of, what = f"native batch of {len(scenarios.get('topics').topics)} topics", "decisions and choices of what to send"
+    yield figure(of, TOPICS, NATIVE, sizes.steps, sizes.topic_slots, 5e6, what)
+
+
+def _singles(sizes: Sizes) -> Iterator[Figure]:
+    definition = f"calls of Env.step a second, without wrappers, L = {sizes.capacity}, all observation fields, "
+    definition += "resets in the time"
     for id in ENVIRONMENTS:
-        native = _batch_rate(id, "vector_entry_point", sizes.steps, sizes, sizes.capacity)
-        sync = _batch_rate(id, "sync", sizes.sync_steps, sizes, sizes.capacity)
-        definition = f"decisions a second of {call}'vector_entry_point'), {batch}"
-        yield Figure(f"native batch, {id}", native, "steps/s", _BATCH_GOALS[id], definition)
-        yield Figure(f"SyncVectorEnv, {id}", sync, "steps/s", None, f"decisions a second of {call}'sync'), {batch}")
-        yield Figure(f"native / SyncVectorEnv, {id}", native / sync, "times", 50.0, "the ratio of these two")
-    topics = len(scenarios.get("topics").topics)
-    yield Figure(
-        f"native batch of {topics} topics, {TOPICS}",
-        _batch_rate(TOPICS, "vector_entry_point", sizes.steps, sizes, sizes.topic_slots),
-        "steps/s",
-        _BATCH_GOALS[TOPICS],
-        f"decisions and choices of what to send a second of {call}'vector_entry_point'), "
-        f"n = {sizes.batch}, L = {sizes.topic_slots}, {rest}",
-    )
+        rate = _rate(gym.make(id, capacity=sizes.capacity).unwrapped, sizes.single_steps, sizes.repeats, single=True)
+        yield Figure(f"single environment, {id}", rate, "steps/s", 3e5, definition)
 
 
-def _single_rate(id: str, sizes: Sizes) -> float:
-    """Calls of Env.step a second."""
-    env: Any = gym.make(id, capacity=sizes.capacity).unwrapped
-    rng = np.random.default_rng(SEED)
-    actions = []
-    _, info = env.reset(seed=SEED)
-    for _ in range(sizes.single_steps):
-        actions.append(int(random_actions(info["action_mask"][None], rng)[0]))
-        _, _, ended, _, info = env.step(actions[-1])
-        if ended:
-            _, info = env.reset()
-
-    def play() -> None:
-        for action in actions:
-            if env.step(action)[2]:
-                env.reset()
-
-    return len(actions) / best_s(sizes.repeats, lambda: env.reset(seed=SEED), play)
-
-
-def _singles(sizes: Sizes) -> Iterable[Figure]:
-    definition = (
-        f"calls of Env.step a second, without wrappers, L = {sizes.capacity}, all observation fields, "
-        "resets in the time"
-    )
-    for id in ENVIRONMENTS:
-        yield Figure(f"single environment, {id}", _single_rate(id, sizes), "steps/s", 3e5, definition)
-
-
-def _rollouts(sizes: Sizes) -> Iterable[Figure]:
+def _rollouts(sizes: Sizes) -> Iterator[Figure]:
     scenario = scenarios.get("lte")
     episodes = [draw(scenario, seed) for seed in range(sizes.episodes)]
     arrivals = sum(len(episode.arrivals) for episode in episodes)
     senders = Senders(len(episodes), sizes.capacity, scenario.value, max_messages=scenario.max_messages)
-    definition = (
-        f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {sizes.capacity};"
-        " drawing, loading and scoring them not in the time"
-    )
-
-    def load() -> None:
-        senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
-
+    definition = f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {sizes.capacity};"
+    definition += " drawing, loading and scoring them not in the time"
+    load = partial(senders.load_all, [(i, episode, None) for i, episode in enumerate(episodes)])
     for name in POLICIES:
-        run = functools.partial(senders.run, policies.get(name))
+        run = partial(senders.run, policies.get(name))
         load()
         run()  # compiled, or loaded from disk, before the clock starts
         rate = arrivals / best_s(sizes.repeats, load, run)
         yield Figure(f"rollout, {name}", rate, "arrivals/s", 4e7, definition)
 
 
-def human(number: float) -> str:
+def _peer(package: str, n: int) -> Any:
+    """``n`` CartPoles with ``reset()``, ``step(actions)`` and ``close()``."""
+    if package == "gymnasium":
+        return gym.make_vec("CartPole-v1", n, vectorization_mode=NATIVE)
+    if package == "envpool":
+        return importlib.import_module(package).make("CartPole-v1", env_type="gymnasium", num_envs=n, num_threads=1)
+    return importlib.import_module("pufferlib.ocean.cartpole.cartpole").Cartpole(num_envs=n)
+
+
+def measure_peers(sizes: Sizes, figures: Sequence[Figure]) -> tuple[list[Figure], list[str]]:
+    """(speeds of the PEERS and ratios of the native batches among ``figures`` to them; packages not here, and why)."""
+    ours = [figure for figure in figures if figure.name in [f"native batch, {id}" for id in ENVIRONMENTS]]
+    actions = np.random.default_rng(SEED).integers(2, size=(sizes.steps, sizes.batch)).astype(np.int32)
+    found, absent = [], []
+    for package, call in PEERS.items():
+        try:
+            envs = _peer(package, sizes.batch)
+        except (ImportError, OSError) as error:
+            absent.append(f"{package} ({error})")
+            continue
+        rate = actions.size / best_s(sizes.repeats, envs.reset, partial(_play, envs, actions))
+        envs.close()
+        call += f", {package} {version(package)}, n = {sizes.batch}, random actions, resets in the time"
+        found.append(Figure(f"CartPole, {package}", rate, "steps/s", None, f"steps a second of {call}"))
+        ratios = [(f"{figure.name} / {package}", figure.value / rate) for figure in ours]
+        found += [Figure(name, ratio, "times", None, "the ratio of these two") for name, ratio in ratios]
+    return found, absent
+
+
+def report(figures: Sequence[Figure], repeats: int) -> str:
+    """Figures beside their targets, then their definitions."""
+    rows = [
+        (f.name, f"{_human(f.value)} {f.unit}", f.target and f"(target {_human(f.target)} {f.unit})") for f in figures
+    ]
+    widths = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
+    lines = [f"{name:<{widths[0]}}  {value:>{widths[1]}}  {target or ''}".rstrip() for name, value, target in rows]
+    lines += ["", f"Best of {repeats} repeats each, one thread. Actions drawn beforehand among the valid ones."]
+    if not JIT:
+        lines.append("Compilation is off (NUMBA_DISABLE_JIT): these figures say nothing about bufgym's speed.")
+    return "\n".join([*lines, *dict.fromkeys(f"- {f.name.split(',')[0]}: {f.definition}" for f in figures)])
+
+
+def _human(number: float) -> str:
     """Three digits and a prefix: 3.14 M, 120 k, 57.3."""
     for size, prefix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if number >= size:
@@ -206,24 +212,8 @@ def human(number: float) -> str:
     return f"{number:.3g}"
 
 
-def report(figures: list[Figure], repeats: int) -> str:
-    """Figures beside their targets, then what each is."""
-    names, values = [figure.name for figure in figures], [f"{human(figure.value)} {figure.unit}" for figure in figures]
-    targets = ["" if f.target is None else f"(target {human(f.target)} {f.unit})" for f in figures]
-    widths = max(map(len, names)), max(map(len, values))
-    lines = [
-        f"{name:<{widths[0]}}  {value:>{widths[1]}}  {target}".rstrip()
-        for name, value, target in zip(names, values, targets, strict=True)
-    ]
-    lines += ["", f"Best of {repeats} repeats each, one thread. Actions drawn beforehand among the valid ones."]
-    if not JIT:
-        lines.append("Compilation is off (NUMBA_DISABLE_JIT): these figures say nothing about bufgym's speed.")
-    lines += dict.fromkeys(f"- {figure.name.split(',')[0]}: {figure.definition}" for figure in figures)
-    return "\n".join(lines)
-
-
-def write_json(figures: list[Figure], sizes: Sizes, path: Path) -> None:
-    """Figures, sizes and what they were measured on."""
+def write_json(figures: Sequence[Figure], sizes: Sizes, path: Path) -> None:
+    """Write figures, sizes, and the versions and machine they were measured on."""
     document = {
         "versions": {name: version(name) for name in ("bufgym", "numpy", "numba", "gymnasium")},
         "python": platform.python_version(),
@@ -231,7 +221,100 @@ def write_json(figures: list[Figure], sizes: Sizes, path: Path) -> None:
         "processors": os.cpu_count(),
         "compiled": JIT,
         "sizes": asdict(sizes),
-        "figures": [asdict(figure) for figure in figures],
+        "figures": [figure._asdict() for figure in figures],
     }
     with replaced(path) as temporary:
         temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+
+
+@kernel
+def _observe_all(batch: Batch, output: StepOutput) -> None:
+    """Every row's observation and mask."""
+    for i in range(len(batch.senders)):
+        write_observation(batch, i, False, output)
+
+
+@kernel
+def _mask_all(batch: Batch, output: StepOutput) -> None:
+    """Every row's mask."""
+    for i in range(len(batch.senders)):
+        if batch.senders[i].waiting != NOTHING_WAITS:
+            write_mask(batch, i, output.action_mask)
+
+
+def _parts_s(repeats: int, owner: Any, names: Sequence[str], reset: Any, play: Any) -> list[float]:
+    """Seconds of the best repeat of ``play``: the whole, then the time inside each of ``owner``'s methods ``names``."""
+    seconds = dict.fromkeys(names, 0.0)
+
+    def timed(name: str, method: Callable[..., Any], *arguments: Any) -> Any:
+        begin = time.perf_counter()
+        result = method(*arguments)
+        seconds[name] += time.perf_counter() - begin
+        return result
+
+    def begin() -> None:
+        reset(seed=SEED)
+        seconds.update(dict.fromkeys(names, 0.0))
+
+    for name in names:
+        setattr(owner, name, partial(timed, name, getattr(owner, name)))
+    return min([best_s(1, begin, play), *seconds.values()] for _ in range(repeats))
+
+
+def _shares(of: str, whole: float, parts: dict[str, float]) -> str:
+    return "\n".join([of, *(f"  {name:<45} {ns:8.0f} ns {ns / whole:6.0%}" for name, ns in parts.items())])
+
+
+def profile(sizes: Sizes) -> str:
+    """Where the time of a step goes, as tables: native batches, then the single environment.
+
+    Kernels that write are timed alone, over the batch as it stands after a while. The transition is the remainder.
+    """
+    compile_here()
+    batches = [_profile_batch(id, sizes.capacity, sizes) for id in ENVIRONMENTS]
+    tables = [*batches, _profile_batch(TOPICS, sizes.topic_slots, sizes), _profile_single("bufgym/Uplink-v0", sizes)]
+    return "\n\n".join(tables)
+
+
+def _profile_batch(id: str, capacity: int, sizes: Sizes) -> str:
+    vector: Any = gym.make_vec(id, sizes.batch, vectorization_mode=NATIVE, capacity=capacity)
+    actions, decisions = _record(vector, sizes.steps)
+    rows = vector.unwrapped.rows
+    best = _parts_s(sizes.repeats, rows, ("step", "reset"), vector.reset, lambda: _play(vector, actions))
+    whole, in_kernel, in_reset = (seconds / decisions * 1e9 for seconds in best)
+    batch, output = rows.senders.batch, rows.output
+    asks = max(1, int((batch.senders["waiting"] != NOTHING_WAITS).sum()))
+
+    def written(kernel: Callable[..., None]) -> float:
+        """ns a decision, of 20 passes."""
+        kernel(batch, output)
+        passes = [(batch, output)] * 20
+        return best_s(sizes.repeats * 20, lambda: None, lambda: [kernel(*one) for one in passes]) / 20 / asks * 1e9
+
+    masks = written(_mask_all)
+    fields = written(_observe_all) - masks
+    vector.close()
+    parts = {
+        f"observation ({output.flat.shape[1]} numbers)": fields,
+        "action mask": masks,
+        "decision, transition, rewards": in_kernel - fields - masks,
+        "episodes drawn and begun": in_reset,
+        "Python around the kernel": whole - in_kernel - in_reset,
+    }
+    return _shares(f"native batch of {sizes.batch}, {id}, L = {capacity}", whole, parts)
+
+
+def _profile_single(id: str, sizes: Sizes) -> str:
+    env: Any = gym.make(id, capacity=sizes.capacity).unwrapped
+    reject, rows, names = sizes.capacity, env.rows, ("step", "observation", "info", "reset")
+    play = partial(_play, env, [reject] * sizes.single_steps, True)
+    best = _parts_s(sizes.repeats, rows, names, env.reset, play)
+    whole, stepping, observing, informing, beginning = (seconds / sizes.single_steps * 1e9 for seconds in best)
+    parts = {
+        "handing the kernel its arrays, and the kernel": stepping,
+        "the observation's dict of views": observing,
+        "info": informing,
+        "episodes drawn and begun": beginning,
+        "the rest of Env.step, in Python": whole - stepping - observing - informing - beginning,
+    }
+    return _shares(f"single environment, {id}, L = {sizes.capacity}", whole, parts)

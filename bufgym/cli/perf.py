@@ -30,20 +30,16 @@ def _perf(options: argparse.Namespace) -> None:
     elif sys.stderr.isatty():
         print("measuring; this takes about half a minute ...", file=sys.stderr)
     if options.queue:
-        from bufgym.benchmark import perf_queue
+        from bufgym.live import cost
 
-        print(perf_queue.report([perf_queue.measure(name, 1 if options.quick else 20) for name in perf_queue.POLICIES]))
+        print(cost.report(1 if options.quick else 20))
         return
     if options.profile:
-        from bufgym.benchmark import perf_profile
-
-        print(perf_profile.report(perf_profile.profile(sizes)))
+        print(perf.profile(sizes))
         return
     figures, absent = perf.measure(sizes), list[str]()
     if options.peers:
-        from bufgym.benchmark import perf_peers
-
-        peers, absent = perf_peers.measure(sizes, figures)
+        peers, absent = perf.measure_peers(sizes, figures)
         figures += peers
     print(perf.report(figures, sizes.repeats))
     if absent:
