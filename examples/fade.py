@@ -1,6 +1,7 @@
-"""The link and the stream of ``ros1/fade.py`` and ``ros2/fade.py``, and what the simulator makes of them.
+"""Link and stream of ``ros1/fade.py`` and ``ros2/fade.py``, and their simulation.
 
-24 Mbit/s, and 2 Mbit/s for a quarter of the time, in the middle; frames of 230 kB at 30 Hz, a queue of 15.
+The link has 24 Mbit/s, but 2 Mbit/s for a quarter of the time in the middle. Frames of 230 kB come at 30 Hz into a
+queue of 15.
 """
 
 import contextlib
@@ -30,14 +31,14 @@ HEADINGS = """\
 
 
 def fade(seconds: float) -> Trace:
-    """The link: slow from 3/8 to 5/8 of the time."""
+    """Make the link, which is slow from 3/8 to 5/8 of the time."""
     times = seconds * np.array([0, 3, 5, 8]) / 8
     carried = np.append(0, np.cumsum(np.diff(times) * [FAST, SLOW, FAST]))
     return Trace("fade", np.rint(times * 1e6).astype(np.int64), np.rint(carried).astype(np.int64), "hold")
 
 
 def arrived(frames: Sequence[int]) -> dict[str, Any]:
-    """What a run is measured by; ``frames``: the numbers of those that came."""
+    """Measure a run by the numbers of the frames that came."""
     gaps = np.diff(sorted(frames))
     return {
         "delivered": len(frames),
@@ -47,7 +48,7 @@ def arrived(frames: Sequence[int]) -> dict[str, Any]:
 
 
 def simulated(policy: str, seconds: float) -> dict[str, Any]:
-    """The same in the simulator."""
+    """Run the same in the simulator."""
     times = np.arange(round(seconds * RATE_HZ)) * round(1e6 / RATE_HZ)
     episode = Episode(messages(times, SIZE_BYTES), Link(fade(seconds)))
     stats = outcome(run(policies.get(policy), [episode], QUEUE_SIZE, V), 0)
@@ -79,7 +80,7 @@ class Viewer:
             self.latest_s = time.monotonic()
 
     def wait(self, seconds: float) -> dict[str, Any]:
-        """What came until the stream had ended and nothing more came for 2 s."""
+        """Wait until the stream has ended and nothing has come for 2 s; measure the frames."""
         began_s = time.monotonic()
         while time.monotonic() < max(began_s + seconds + 1, self.latest_s + 2):
             time.sleep(0.05)
@@ -92,16 +93,16 @@ def ended(*processes: subprocess.Popen[str]) -> Iterator[None]:
         yield
     finally:
         for process in processes:
-            process.kill()  # a node that is stopped otherwise tells of its executor's end at length
+            process.kill()  # a node stopped otherwise prints a long trace
             process.wait()
 
 
 # --- a link of the kernel's ------------------------------------------------------------------------------------------
 
 ROBOT, BASE = (["ip", "netns", "exec", f"bufgym-{end}"] for end in ("robot", "base"))
-"""What runs a command in a namespace."""
+"""Prefixes that run a command in a namespace."""
 ADDRESSES = "10.99.0.1", "10.99.0.2"
-"""Of robot and base."""
+"""Addresses of robot and base."""
 
 
 def shell(command: str) -> None:
@@ -135,7 +136,7 @@ def shaped(bytes_per_s: int, verb: str = "change") -> None:
 
 
 def fade_away(viewer: Viewer, seconds: float) -> None:
-    """The link fades and comes back, as seen from the viewer's first frame on."""
+    """Fade the link and restore it, timed from the viewer's first frame."""
     deadline_s = time.monotonic() + 60
     while not viewer.frames and time.monotonic() < deadline_s:
         time.sleep(0.01)

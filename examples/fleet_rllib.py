@@ -1,10 +1,10 @@
-"""One policy for all robots of a cell, learned with Ray's RLlib (PPO, invalid actions masked).
+"""One policy for all robots of a cell, learned with PPO of Ray's RLlib and masked invalid actions.
 
     pip install "bufgym[rllib]" torch
     python examples/fleet_rllib.py --robots 4 --iterations 20
 
 Every robot decides from its own observation with the same weights, and is rewarded with the team's mean information.
-Written for Ray 2.60 (RLlib's RLModule API stack).
+The code is written for Ray 2.60 with RLlib's RLModule API stack.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SHARED = "every robot"
 
 
 class MaskedFleet(ParallelPettingZooEnv):
-    """The fleet as RLlib's action masking module wants it: {"observations": flat vector, "action_mask": floats}."""
+    """The fleet with observations for RLlib's action masking: {"observations": flat vector, "action_mask": floats}."""
 
     def __init__(self, config: dict[str, Any]) -> None:
         super().__init__(FleetEnv(**config))
@@ -65,7 +65,8 @@ class MaskedFleet(ParallelPettingZooEnv):
 
 
 def configuration(runners: int = 0, batch: int = 4_000, **fleet: Any) -> PPOConfig:
-    """PPO on a fleet; ``runners``: processes that sample, 0 for this one; ``batch``: ticks an iteration."""
+    """Configure PPO on a fleet with ``runners`` sampling processes, 0 for this one, and ``batch`` ticks an
+    iteration."""
     register_env("bufgym-fleet", MaskedFleet)
     return (
         PPOConfig()

@@ -1,4 +1,4 @@
-"""Imitating the clairvoyant by DAgger: a slot network learns what hindsight would have done, and plays without it.
+"""Imitating the clairvoyant by DAgger: a slot network learns decisions made in hindsight, and plays without it.
 
     pip install "bufgym[train]"
     python examples/imitation.py
@@ -7,11 +7,11 @@ It trains on six of the eight shipped links and is tested on the other two, on t
 
     bufgym bench --trace lte-synthetic-6 lte-synthetic-7 --seeds 40 --policies afr,min-motion-gap,drop-oldest
 
-DAgger (Ross, Gordon and Bagnell 2011): the network plays a batch of episodes, the clairvoyant labels every state that
-it comes to, and the network learns from all states so far. What is particular here:
+In DAgger (Ross, Gordon and Bagnell 2011) the network plays a batch of episodes, the clairvoyant labels every state
+visited, and the network learns from all states so far. Two points are special here.
 
-- **A label is a number for each action** (``bufgym.expert``): the H that it gives away for good. Most decisions are
-  close, so the network is taught probabilities, softmax(-regret / temperature). A close second costs it little.
+- **A label is a number for each action**: the H that the action loses for good, from ``bufgym.expert``. Most decisions
+  are close, so the network learns probabilities, softmax(-regret / temperature). A close second costs little.
 - **Hindsight knows the future.** Where the link decides later which action was right, labels of equal states disagree
   and the network learns their mean. That is worth more than AFR, but even a perfect pupil would not reach a score of 1.
 """
@@ -40,15 +40,15 @@ RIVALS = ("min-motion-gap", "afr", "drop-oldest")
 
 @dataclass
 class Settings:
-    """What ``main`` takes; the options of the command line."""
+    """Arguments of ``main`` and options of the command line."""
 
     seed: int = 0
     capacity: int = 8
     """L, messages."""
     rounds: int = 6
-    """How often the network plays."""
+    """Number of rounds in which the network plays."""
     episodes: int = 128
-    """Played side by side in each round."""
+    """Episodes played in parallel in each round."""
     duration_s: float = 10.0
     """Length of a training episode."""
     test_duration_s: float = 30.0
@@ -59,9 +59,9 @@ class Settings:
     minibatch: int = 2_048
     """States of one gradient step."""
     learning_rate: float = 2e-3
-    """In the first round; falls linearly to 0."""
+    """Learning rate in the first round; it falls linearly to 0."""
     temperature: float = 0.02
-    """QoI; an action that gives away so much more is e times less likely."""
+    """Difference in lost QoI that makes an action e times less likely."""
     width: int = 32
     """Hidden units a layer."""
 
@@ -92,12 +92,12 @@ class Pupil:
         self.network = SlotPolicy(*spaces, lambda _: settings.learning_rate, width=settings.width)
 
     def log_p(self, seen: np.ndarray, mask: np.ndarray) -> torch.Tensor:
-        """[n, L + 2]: the logarithm of the network's probability of each action; invalid ones have none."""
+        """Log-probability of each action, [n, L + 2]; invalid actions have probability 0."""
         observation = {name: torch.from_numpy(array) for name, array in self.rows.form.of(seen).items()}
         return self.network.get_distribution(observation, mask).distribution.logits
 
     def play(self, first: bool) -> States:
-        """An episode in each row. ``first``: half of them by the clairvoyant, half at random."""
+        """Play an episode in each row; ``first`` plays half of them by the clairvoyant and half at random."""
         states = []
         for _ in range(self.rows.scenario.max_messages):
             output = self.rows.output
@@ -114,7 +114,7 @@ class Pupil:
         return seen, mask, regrets
 
     def learn(self, states: States, learning_rate: float) -> float:
-        """Passes over ``states``; the mean regret that the network's probabilities have in the last of them."""
+        """Train on ``states``; return the mean regret of the network's probabilities in the last pass."""
         settings, optimizer = self.settings, self.network.optimizer
         optimizer.param_groups[0]["lr"] = learning_rate
         expected = []
@@ -134,7 +134,7 @@ class Pupil:
 
 
 def scores(network: SlotPolicy, settings: Settings) -> dict[str, float]:
-    """Policy -> score on the held-out links: 0 for Drop Oldest, 1 for the clairvoyant."""
+    """Score policies on the held-out links, from 0 for Drop Oldest to 1 for the clairvoyant."""
     uplink = scenario.get("lte", traces=TEST, duration_s=settings.test_duration_s)
     players = [as_policy(network, "imitation"), *map(policies.get, RIVALS)]
     rows = run(players, uplink, [settings.capacity], settings.test_seeds)
@@ -144,7 +144,7 @@ def scores(network: SlotPolicy, settings: Settings) -> dict[str, float]:
 
 
 def main(settings: Settings) -> dict[str, float]:
-    """Train and test; the scores by policy."""
+    """Train and test; return the scores by policy."""
     torch.manual_seed(settings.seed)
     torch.set_num_threads(1)
     pupil, seen, began = Pupil(settings), [], time.process_time()

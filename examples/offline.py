@@ -1,11 +1,11 @@
-"""Offline: a policy from a data set alone, by behaviour cloning and by conservative Q-learning (CQL) of d3rlpy.
+"""Offline learning of a policy from a data set, by behaviour cloning and by d3rlpy's conservative Q-learning.
 
     pip install "bufgym[offline]"
     python examples/offline.py --kinds medium mixed
 
-Reads data sets as ``bufgym dataset make`` writes them, and makes those that are not in ``--data`` yet. Both learners
-train the same slot network on six of the eight shipped links and never touch an environment; they are tested on the
-other two links, on the episodes of
+It reads data sets of ``bufgym dataset make``, and makes missing ones in ``--data``. Both learners train the same slot
+network on six of the eight shipped links and never touch an environment; they are tested on the other two links, on the
+episodes of
 
     bufgym bench --trace lte-synthetic-6 lte-synthetic-7 --seeds 40 --policies afr,min-motion-gap,drop-oldest
 
@@ -43,19 +43,19 @@ TEST = ["lte-synthetic-6", "lte-synthetic-7"]
 RIVALS = ("min-motion-gap", "afr", "drop-oldest")
 L = 8
 FORM = ObservationForm("dict", SLOT_FIELDS, CONTEXT_FIELDS, L)
-"""What the numbers of a flat observation mean."""
+"""Meaning of the numbers of a flat observation."""
 
 
 @dataclass
 class Settings:
-    """What ``main`` takes; the options of the command line."""
+    """Arguments of ``main`` and options of the command line."""
 
     kinds: list[str] = field(default_factory=lambda: ["medium", "mixed"])
-    """Who played in the data sets."""
+    """Kinds of data sets, named after their players."""
     data: str = "offline-data"
     """Folder of the data sets."""
     episodes: int = 300
-    """Of each data set."""
+    """Episodes of each data set."""
     duration_s: float = 10.0
     test_duration_s: float = 30.0
     test_seeds: int = 40
@@ -67,7 +67,7 @@ class Settings:
     gamma: float = 0.9
     """The reward pays at once what a decision costs, so a short sight keeps noise out."""
     alpha: float = 1.0
-    """CQL's weight of what pushes unseen actions down."""
+    """CQL's weight of the penalty on unseen actions."""
     reward_scale: float = 10.0
     """Rewards are hundredths of QoI; Q-learning likes them larger."""
     seed: int = 0
@@ -85,7 +85,7 @@ class Steps:
 
 
 def read(kind: str, settings: Settings) -> Steps:
-    """The data set of that kind; made first where there is none."""
+    """Read the data set of that kind; make it first if it is missing."""
     name, folder = f"bufgym/uplink/{kind}-v0", Path(settings.data)
     if not (folder / name).exists():
         options = {"capacity": L, "duration_s": settings.duration_s, "traces": TRAIN, "observation": "flat"}
@@ -104,7 +104,7 @@ def new_network(settings: Settings) -> SlotPolicy:
 
 
 def scored(network: SlotPolicy, seen: Tensor) -> Tensor:
-    """[n, L + 2]: the network's number for each action, very low where the action is invalid."""
+    """Network's number for each action, [n, L + 2], very low for an invalid action."""
     observation = FORM.of(seen)
     features = network.extract_features(observation)
     full = observation["occupied"][:, :L].min(dim=1, keepdim=True).values
@@ -113,7 +113,7 @@ def scored(network: SlotPolicy, seen: Tensor) -> Tensor:
 
 
 def batches(steps: Steps, settings: Settings) -> list[np.ndarray]:
-    """So many random minibatches, as indices."""
+    """Draw random minibatches as indices."""
     rng = np.random.default_rng(settings.seed)
     return [rng.integers(len(steps.action), size=settings.minibatch) for _ in range(settings.updates)]
 
@@ -193,7 +193,7 @@ def conservative(steps: Steps, settings: Settings) -> SlotPolicy:
 
 
 def main(settings: Settings) -> dict[str, float]:
-    """Learn from each data set and test; the scores by learner and data set, and those of fixed policies."""
+    """Learn from each data set and test; return scores by learner and data set, and of fixed policies."""
     torch.set_num_threads(1)
     players = [policies.get(name) for name in RIVALS]
     for kind in settings.kinds:

@@ -15,7 +15,7 @@ from bufgym.observe import field
 
 @field("waited_s", per="slot", high=1e4, compile=True)
 def waited_s(buffer: Any, arrival: Any, k: int) -> float:
-    """Seconds since message k arrived; the newcomer is k = len(buffer.slots)."""
+    """Seconds since message k arrived; k = len(buffer.slots) is the newcomer."""
     if k == len(buffer.slots):
         return 0.0
     return (buffer.now_us - buffer.slots[k].arrival_us) / 1e6
@@ -23,7 +23,7 @@ def waited_s(buffer: Any, arrival: Any, k: int) -> float:
 
 @field("standstill", per="context")
 def standstill(buffer: Any, arrival: Any) -> float:
-    """1 where the scene has not moved since the arrival before."""
+    """1 if the scene has not moved since the previous arrival."""
     return float(arrival.x == buffer.previous_x)
 
 
@@ -39,7 +39,7 @@ def main() -> None:
     print({name: array.shape for name, array in observation.items()})
     longest = 0.0
     for _ in range(options.steps):
-        # Evict the oldest message; where there is none, a plain queue accepts.
+        # Evict the oldest message; a queue without one accepts.
         observation, *_ = envs.step(np.zeros(options.seeds, np.int64))
         longest = max(longest, float(observation["slots"][..., 2].max()))
     print(f"a message waited {longest:.2f} s at most")

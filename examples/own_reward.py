@@ -1,4 +1,4 @@
-"""Reward terms: those that come with bufgym, weighted, and one of your own.
+"""Reward terms: bufgym's own terms with weights, and one of yours.
 
 python examples/own_reward.py
 """
@@ -15,7 +15,7 @@ from bufgym.observe import reward_term
 
 @reward_term("restless", unit="drops", memory={"drops": 0}, compile=True)
 def restless(step: Any, memory: Any) -> float:
-    """Minus the drops of this step beyond those of the step before."""
+    """Minus the increase in drops since the previous step."""
     more = max(step.drops - memory[0], 0)
     memory[0] = step.drops
     return -float(more)
@@ -35,7 +35,7 @@ def main() -> None:
         _, info = env.reset(seed=seed)
         total, terms = 0.0, Counter[str]()
         for _ in range(options.steps):
-            # Evict the oldest message; where there is none, a plain queue accepts.
+            # Evict the oldest message; a queue without one accepts.
             _, reward, ended, _, info = env.step(0)
             total += float(reward)
             for name, number in info["reward_terms"].items():

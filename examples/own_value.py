@@ -1,4 +1,4 @@
-"""A V of your own: what a message adds at a distance d from the one before it.
+"""A V of your own, the information that a message adds at a distance d from the one before it.
 
 python examples/own_value.py
 cd examples && bufgym bench --value own_value:doorways --policies min-motion-gap,afr,drop-oldest

@@ -8,13 +8,13 @@ It trains on six of the eight shipped links and tests on the other two, where ``
     bufgym bench --trace lte-synthetic-6 lte-synthetic-7 --seeds 40 --policies afr,min-motion-gap,drop-oldest
 
 Proximal policy optimisation (Schulman et al. 2017) with generalised advantage estimation (2016), as in CleanRL's
-``ppo.py``. What is particular to a buffer:
+``ppo.py``. Three points are special to a buffer.
 
 - **The observation** is ``observation="slots"``: [L + 1, slot fields] for the queued messages and the newcomer, and a
   vector of context. The same small network scores each slot, so a message's worth does not depend on its slot's number.
 - **Masks are logits**: an action that is not valid gets a logit of -1e9, in sampling and in learning.
-- **The reward** ``retained`` pays at once what a decision costs, so a short sight (gamma 0.9) keeps the noise of the
-  camera's motion out.
+- **The reward** ``retained`` charges a decision's cost at once, so gamma 0.9 is enough and keeps out the noise of the
+  camera's motion.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ TEST = ["lte-synthetic-6", "lte-synthetic-7"]
 
 @dataclass
 class Settings:
-    """What ``main`` takes; the options of the command line."""
+    """Arguments of ``main`` and options of the command line."""
 
     seed: int = 0
     capacity: int = 8
@@ -58,11 +58,11 @@ class Settings:
     epochs: int = 3
     """Passes over the decisions of an update."""
     learning_rate: float = 2e-3
-    """At the start; falls linearly to 0."""
+    """Learning rate at the start; it falls linearly to 0."""
     gamma: float = 0.9
     gae_lambda: float = 0.9
     clip: float = 0.2
-    """How far the new probability of an action may move from the old one."""
+    """Largest relative change of an action's probability in an update."""
     width: int = 32
     """Hidden units a layer."""
     test_seeds: int = 40
@@ -76,13 +76,13 @@ class SlotNetwork(nn.Module):
         super().__init__()
         self.slots = nn.Linear(slot_fields, 3 * width)
         self.context = nn.Linear(context_fields, 3 * width)
-        """The first layers of all three parts below, computed at once."""
+        """First layers of the three heads below, computed at once."""
         self.drop = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
-        """Of each slot; the newcomer's is that of rejecting it."""
+        """Logit of dropping each slot; the newcomer's is the logit of rejecting it."""
         self.accept = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
-        """Of the newcomer."""
+        """Logit of accepting the newcomer."""
         self.value = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
-        """Of the mean over slots."""
+        """Value from the mean over slots."""
         nn.init.constant_(self.accept[-1].bias, 2.0)  # dropping messages where there is room teaches little
 
     def forward(self, slots: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,12 +93,12 @@ class SlotNetwork(nn.Module):
 
 
 def masked(logits: Tensor, mask: Tensor) -> Tensor:
-    """The logits, those of invalid actions so low that they are never drawn and get no gradient."""
+    """Lower the logits of invalid actions so far that they are never drawn and get no gradient."""
     return logits.masked_fill(mask == 0, -1e9)
 
 
 def advantages_of(rewards: Tensor, values: Tensor, ended: Tensor, gamma: float, gae_lambda: float) -> Tensor:
-    """Generalised advantage estimation, [steps, n]; ``values`` [steps + 1, n], ``ended``: the step ended an episode."""
+    """Generalised advantage estimation, [steps, n], from ``values`` [steps + 1, n] and episode ends ``ended``."""
     advantages, after = torch.zeros_like(rewards), torch.zeros(rewards.shape[1])
     for t in reversed(range(len(rewards))):
         goes_on = 1 - ended[t]
@@ -138,7 +138,7 @@ class Test:
         self.envs = make(TEST, len(self.episodes), settings, gym.vector.AutoresetMode.NEXT_STEP)
 
     def play(self, network: SlotNetwork) -> float:
-        """Sum of H where the network always does what it finds best."""
+        """Sum of H if the network always takes its best action."""
         observation, info = self.envs.reset(options={"episodes": self.episodes})
         h, live = 0.0, np.ones(len(self.episodes), np.bool_)
         while live.any():
@@ -156,17 +156,17 @@ class Test:
         return 1 - h / self.best
 
     def score(self, h: float) -> float:
-        """0 for Drop Oldest, 1 for the clairvoyant."""
+        """Score of the agent, where Drop Oldest has 0 and the clairvoyant 1."""
         return (h - self.h["drop-oldest"]) / (self.best - self.h["drop-oldest"])
 
 
 def tensors(observation: dict[str, np.ndarray]) -> tuple[Tensor, Tensor]:
-    """(slots, context); the next step writes other arrays, so nothing is copied."""
+    """Make tensors of slots and context without a copy, because the next step writes other arrays."""
     return torch.from_numpy(observation["slots"]), torch.from_numpy(observation["context"])
 
 
 def main(settings: Settings) -> dict[str, float]:
-    """Train and test; the agent's regret and score and AFR's, and the CPU seconds of training."""
+    """Train and test; return regret and score of the agent and of AFR, and the CPU seconds of training."""
     torch.manual_seed(settings.seed)
     torch.set_num_threads(1)  # more only wait for one another on batches this small
     envs = make(TRAIN, settings.num_envs, settings, gym.vector.AutoresetMode.SAME_STEP)

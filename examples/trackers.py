@@ -3,8 +3,8 @@
     pip install small_gicp
     python examples/trackers.py [--recording FOLDER] [--frames 600] [--every 1 2 4 6 8 10]
 
-All are judged by the same rule (`bufgym.perception.tracking`): lost at the first step that is more than 10 cm or 5
-degrees off, or that they refuse. FOLDER is any that `open_sequence` reads; by default the made-up room.
+All follow one rule, from `bufgym.perception.tracking`: a tracker is lost at the first step that is more than 10 cm or 5
+degrees off, or that it refuses. FOLDER is any that `open_sequence` reads; by default the made-up room.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ Follow = Callable[[np.ndarray], "np.ndarray | None"]
 
 
 def ours(sequence: Sequence, depth: np.ndarray, pose: np.ndarray) -> Follow:
-    """Frame to model on a voxel grid."""
+    """Track frame to model on a voxel grid."""
     tracker = Tracker(sequence.camera, grid_of(sequence))
     tracker.begin(depth, pose)
     return tracker.follow
 
 
 def opencv(sequence: Sequence, depth: np.ndarray, pose: np.ndarray) -> Follow:
-    """cv2.Odometry, frame to frame, by depth alone."""
+    """Track with cv2.Odometry, frame to frame, by depth alone."""
     camera = sequence.camera
     settings = cv2.OdometrySettings()
     settings.setCameraMatrix(np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float32))
@@ -53,12 +53,12 @@ def opencv(sequence: Sequence, depth: np.ndarray, pose: np.ndarray) -> Follow:
 
 
 def with_gaps(depth: np.ndarray) -> np.ndarray:
-    """OpenCV marks what was not measured by NaN."""
+    """Replace unmeasured depths by NaN, as OpenCV expects."""
     return np.where(depth > 0, depth, np.nan).astype(np.float32)
 
 
 def gicp(sequence: Sequence, depth: np.ndarray, pose: np.ndarray) -> Follow:
-    """small_gicp's generalised ICP, frame to frame, on points thinned to 5 cm."""
+    """Track with small_gicp's generalised ICP, frame to frame, on points thinned to 5 cm."""
 
     def prepared(depth: np.ndarray) -> tuple[small_gicp.PointCloud, small_gicp.KdTree]:
         return small_gicp.preprocess_points(points_of(depth, sequence.camera), 0.05, num_neighbors=10)

@@ -1,4 +1,4 @@
-"""What a score means: how long the camera looked at something that the server never saw.
+"""Meaning of a score: the time that the camera looked at something that the server never saw.
 
     python examples/view_missed.py
 

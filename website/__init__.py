@@ -1,1 +1,1 @@
-"""The site's pages that are made from the code: environments, policies, suites, commands, papers."""
+"""Pages of the site made from the code: environments, policies, suites, commands, papers."""

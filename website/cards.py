@@ -1,4 +1,4 @@
-"""The cards of the agents that come with bufgym; their numbers are read from the pages of their results."""
+"""Cards of the agents that come with bufgym, with numbers read from the pages of their results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 
 @dataclass(frozen=True)
 class Card:
-    """What the results do not say."""
+    """Facts about an agent that its results do not contain."""
 
     results: str
     """The page of its results."""
@@ -23,7 +23,7 @@ class Card:
     limits: str
     fails: str
     rest: str = ""
-    """Who decides where the trained network does not."""
+    """Rule that decides where the trained network does not."""
 
 
 CARDS = {
@@ -86,7 +86,7 @@ def page() -> str:
 
 
 def trained_by(card: Card) -> str:
-    """The command that made it, as the page of its results has it."""
+    """Find the command that made it, on the page of its results."""
     found = re.search(r"`(python train\.py [^`]*)`", _text(card))
     assert found is not None
     return found[1]

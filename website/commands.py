@@ -17,7 +17,7 @@ def page() -> str:
 
 
 def _commands(parser: argparse.ArgumentParser, before: str = "bufgym") -> list[tuple[str, argparse.ArgumentParser]]:
-    """(name, parser) of every command below this one, its own commands after it."""
+    """List (name, parser) of every command below this one, each followed by its own subcommands."""
     found = []
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -29,7 +29,7 @@ def _commands(parser: argparse.ArgumentParser, before: str = "bufgym") -> list[t
 
 def _help(parser: argparse.ArgumentParser) -> str:
     width = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "84"  # where argparse reads the width from; so much fits beside the menu
+    os.environ["COLUMNS"] = "84"  # argparse reads the width here; 84 fits beside the menu
     try:
         return parser.format_help().rstrip()
     finally:

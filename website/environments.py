@@ -22,11 +22,11 @@ class Version:
     """One version of an environment."""
 
     name: str
-    """As at the end of its id."""
+    """Version as at the end of its id."""
     since: str
-    """The release of bufgym that brought it."""
+    """First release of bufgym with it."""
     what: str
-    """What it is, or what changed."""
+    """Description of the environment, or of the change."""
 
 
 HISTORY = {
@@ -40,7 +40,7 @@ HISTORY = {
 """Every environment's versions, newest first."""
 
 SCENARIOS = bufgym.ENVIRONMENTS | bufgym.ON_TASKS
-"""Id -> (name of the scenario, what it is)."""
+"""Id -> (name of the scenario, description)."""
 
 
 TOPICS = """\
@@ -48,23 +48,23 @@ Many topics share one uplink: decide at every arrival what to drop, and at every
 
 
 def made() -> dict[str, str]:
-    """Name on the site -> Markdown."""
+    """Map each page's name on the site to its Markdown."""
     found = {f"environments/{slug(id)}.md": page(id) for id in HISTORY}
     return {"environments/index.md": index(), **found}
 
 
 def slug(id: str) -> str:
-    """The last part of a page's address."""
+    """Make the last part of a page's address."""
     return "fleet" if id == FLEET else id.split("/")[1].split("-")[0].lower()
 
 
 def about(id: str) -> str:
-    """What it is, in a line."""
+    """Describe an environment in a line."""
     return "robots that share one cell (PettingZoo)" if id == FLEET else SCENARIOS[id][1]
 
 
 def title(id: str) -> str:
-    """How its page is headed."""
+    """Make the heading of its page."""
     return "FleetEnv" if id == FLEET else id.removeprefix("bufgym/")
 
 
@@ -116,7 +116,7 @@ def page(id: str) -> str:
 
 
 def sections(docstring: str) -> dict[str, str]:
-    """The paragraphs of a docstring under their bold headings; those before the first under ""."""
+    """Split a docstring at its bold headings; paragraphs before the first heading are under ""."""
     parts = re.split(r"^\*\*([^*]+)\*\*", docstring, flags=re.MULTILINE)
     bodies = [parts[0], *parts[2::2]]
     found = dict(zip(["", *parts[1::2]], (body.strip(" :\n") for body in bodies), strict=True))
@@ -147,7 +147,7 @@ def _made_by(film: str) -> str:
 
 
 def _films(id: str) -> list[str]:
-    """Its films, each with the command that makes it."""
+    """List its films, each with the command that makes it."""
     return [
         f"![{film.about}](../gallery/{name}.webp)\n\n*{film.about[0].upper()}{film.about[1:]}. {_made_by(name)}*"
         for name, film in FILMS.items()

@@ -1,4 +1,4 @@
-"""What MkDocs calls while it builds the site (``hooks`` in mkdocs.yml): adds the pages that are made from the code."""
+"""Hooks of MkDocs, set as ``hooks`` in mkdocs.yml, which add the pages made from the code."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ FROM_ROOT = {
     "README.md": "index.md",
     "SECURITY.md": "security.md",
 }
-"""Files beside the folder of documents, and what they are called on the site."""
+"""File outside docs/ -> its name on the site."""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add what is not a file in docs/."""
+    """Add all pages that are not files in docs/."""
     for name, page in FROM_ROOT.items():
         if page != "index.md":
             text = (REPO / name).read_text(encoding="utf-8")
@@ -41,8 +41,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Links to files beside docs/ lead to their copies on the site."""
-    for up in ("", "../"):  # from a page in docs/, from one in a folder of docs/
+    """Point links to files outside docs/ at their copies on the site."""
+    for up in ("", "../"):  # from docs/ and from a folder in docs/
         for name, page in FROM_ROOT.items():
             markdown = markdown.replace(f"]({up}../{name}", f"]({up}{page}")
         markdown = markdown.replace(f"]({up}../examples/", f"]({up}examples/")
@@ -50,5 +50,5 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def _of_root(text: str) -> str:
-    """A file of the root as a page: its links as they would be from docs/."""
+    """Rewrite the links of a file in the root as if it were in docs/."""
     return re.sub(r"\]\((?!https?:|#)(docs/)?", lambda link: "](" if link[1] else "](../", text)

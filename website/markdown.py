@@ -12,7 +12,7 @@ from typing import Any
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table, columns of numbers to the right; bars and line breaks in cells are made harmless."""
+    """Make a table with columns of numbers to the right; bars and line breaks in cells are escaped."""
     cells = [[_cell(cell) for cell in row] for row in rows]
     numbers = [
         all(re.fullmatch(r"[-\d.,%]+( \[.*\])?", cell) for cell in column) for column in zip(*cells, strict=True)
@@ -26,17 +26,17 @@ def _cell(text: str) -> str:
 
 
 def code(text: str) -> str:
-    """Text as code, single backquotes for the double ones of docstrings."""
+    """Replace the double backquotes of docstrings by single ones."""
     return re.sub(r"``([^`]+)``", r"`\1`", text)
 
 
 def cited(text: str, up: str = "") -> str:
-    """Keys of papers in brackets as links to the list of papers."""
+    """Turn keys of papers in brackets into links to the list of papers."""
     return re.sub(r"\[([a-z]+\d{4}[a-z]+|zenoh|fastdds|webrtc)\]", rf"[\1]({up}papers.md#\1)", text)
 
 
 def attributes(class_: type[Any]) -> dict[str, str]:
-    """Name -> the string below it, of a dataclass's fields, its bases' included."""
+    """Map each field of a dataclass and its bases to the string below it."""
     found: dict[str, str] = {}
     for base in reversed(class_.__mro__[:-1]):
         (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
@@ -56,7 +56,7 @@ def parameters(example: Any) -> str:
 
 
 def _value(value: Any) -> str:
-    """A default as text; objects by their names."""
+    """Write a default as text; objects by name."""
     names = _names(value) if isinstance(value, tuple) else []
     if names:
         return ", ".join(names if len(names) < 4 else [names[0], "...", names[-1]])
@@ -66,6 +66,6 @@ def _value(value: Any) -> str:
 
 
 def _names(entries: Iterable[Any]) -> list[str]:
-    """What the entries are called: traces and recordings, or the topics of streams."""
+    """List the names of the entries: traces and recordings, or topics of streams."""
     named = [getattr(entry, "topic", entry) for entry in entries]
     return [str(entry.name) for entry in named if hasattr(entry, "name")]

@@ -1,4 +1,4 @@
-"""All pages that are made from the code, by their names on the site."""
+"""All pages made from the code, by name on the site."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from website import cards, commands, environments, papers, policies, suites
 
 
 def made() -> dict[str, str]:
-    """Name -> Markdown."""
+    """Map each page's name to its Markdown."""
     return {
         **environments.made(),
         "policies.md": policies.page(),

@@ -1,4 +1,4 @@
-"""The page of policies, from the registry: each with what it keeps of one and the same interruption."""
+"""Page of policies from the registry, each with a picture of the messages that it keeps of one interruption."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bufgym.sim import metrics
 from website.markdown import cited, code
 
 T, CAPACITY = 60, 8
-"""The interruption of the pictures, messages; L."""
+"""Length of the pictures' interruption in messages, and L."""
 
 PARTS = {
     "For one queue": (
@@ -46,7 +46,7 @@ def _entry(policy: Policy, pictured: bool) -> list[str]:
 
 
 def picture(policy: Policy) -> str:
-    """What it keeps of the interruption, as an SVG, and H."""
+    """Draw the messages that the policy keeps of the interruption as an SVG, with H."""
     scenario = Interruption(law="fixed", t_max=T)
     senders = sim.run(policy, [draw(scenario, 0)], CAPACITY, scenario.value)
     dropped_us = np.asarray(senders.batch.log[0])["dropped_us"][: T + 2]

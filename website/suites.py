@@ -1,4 +1,4 @@
-"""The page of suites, from their registry."""
+"""Page of suites from their registry."""
 
 from __future__ import annotations
 

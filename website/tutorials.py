@@ -1,4 +1,4 @@
-"""The tutorials as pages and notebooks: from one Python file each, in docs/tutorials."""
+"""Tutorials as pages and notebooks, each made from one Python file in docs/tutorials."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ FOLDER = Path(__file__).resolve().parent.parent / "docs" / "tutorials"
 
 
 def sources() -> list[Path]:
-    """The tutorials' files, in percent format (jupytext)."""
+    """List the tutorials' files, in jupytext's percent format."""
     return sorted(FOLDER.glob("*.py"))
 
 
 def made() -> dict[str, bytes]:
-    """Name on the site -> page or notebook."""
+    """Map each name on the site to a page or a notebook."""
     import jupytext
 
     found: dict[str, bytes] = {}

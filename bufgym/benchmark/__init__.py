@@ -1,1 +1,1 @@
-"""Fixed policies side by side: the experiment (``run``), its table (``table``), how fast it all goes (``perf``)."""
+"""Comparison of policies: ``run`` plays the experiment, ``table`` prints it, ``perf`` measures bufgym's speed."""

@@ -18,10 +18,11 @@ from bufgym.errors import BufgymError
 
 
 class Interval(NamedTuple):
-    """A statistic and its bootstrap interval; all NaN where it is undefined, the bounds alone where none is known."""
+    """A statistic and its bootstrap interval. All are NaN if it is undefined; the bounds are if no interval is
+    known."""
 
     value: float
-    """Of the sample."""
+    """Statistic of the sample."""
     low: float
     """Lower bound of the interval."""
     high: float
@@ -32,7 +33,7 @@ UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
 
 def written(interval: Interval, write: Callable[[float], str]) -> tuple[str, str]:
-    """(value, interval in brackets) as text: 1.03 and [1.01, 1.05]; a dash and nothing where there is no value."""
+    """Format the value and its interval, as in 1.03 and [1.01, 1.05]; without a value, a dash and nothing."""
     if math.isnan(interval.value):
         return "–", ""
     if math.isnan(interval.low):
@@ -42,18 +43,18 @@ def written(interval: Interval, write: Callable[[float], str]) -> tuple[str, str
 
 
 def stream(seed: int, label: str) -> np.random.Generator:
-    """The random generator by which what is called ``label`` is resampled, whatever else is."""
+    """Make the random generator for resampling ``label``, independent of all other resampling."""
     return np.random.default_rng([seed, zlib.crc32(label.encode())])
 
 
 def times_drawn(n: int, resamples: int, rng: np.random.Generator) -> Numbers:
-    """[1 + resamples, n]: 1 each, then how often each of n is drawn in n draws with replacement."""
+    """Draw n of n with replacement; return row 0 of ones, then counts for each resample, [1 + resamples, n]."""
     drawn = rng.multinomial(n, np.full(n, 1 / n), size=resamples)
     return np.vstack([np.ones((1, n)), drawn])
 
 
 def percentile_interval(numbers: Numbers, confidence: float) -> Interval:
-    """The interval of [1 + resamples] numbers; resamples in which the statistic is undefined (NaN) are left out."""
+    """Compute the interval of [1 + resamples] numbers; resamples with an undefined statistic, NaN, are left out."""
     drawn = numbers[1:][~np.isnan(numbers[1:])]
     if np.isnan(numbers[0]) or not len(drawn):
         return UNKNOWN
@@ -62,13 +63,13 @@ def percentile_interval(numbers: Numbers, confidence: float) -> Interval:
 
 
 def ratio(above: Numbers, below: Numbers, defined: NDArray[np.bool_]) -> Numbers:
-    """above / below where that is defined, NaN elsewhere."""
+    """Divide ``above`` by ``below`` where ``defined``; NaN elsewhere."""
     quotient: Numbers = np.divide(above, below, out=np.full(below.shape, np.nan), where=defined)
     return quotient
 
 
 def check_resampling(resamples: int, confidence: float) -> None:
-    """An error for numbers that no interval can be made with."""
+    """Raise an error for numbers that cannot make an interval."""
     if resamples < 1:
         raise BufgymError(f"resamples = {resamples}: must be >= 1")
     if not 0 < confidence < 1:

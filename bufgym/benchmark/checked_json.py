@@ -1,4 +1,4 @@
-"""JSON files from outside: read and checked, with errors that name the file, the field and the rule."""
+"""Reader of untrusted JSON files; its errors name the file, the field and the rule."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from bufgym.errors import BufgymError, where
 from bufgym.files import read_utf8
 
 MAX_JSON_BYTES = 64 * 2**20
-"""A timeline of 100,000 messages has some 20 MB."""
+"""Size limit; a timeline of 100,000 messages has some 20 MB."""
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """The object that the file holds; numbers must be finite."""
+    """Read the object in a file; numbers must be finite."""
     text = read_utf8(path, MAX_JSON_BYTES)
     try:
         content = json.loads(text, parse_constant=_refuse, parse_float=_finite)
@@ -41,14 +41,14 @@ def _refuse(constant: str) -> NoReturn:
 
 
 def check(path: Path, place: str, content: Any, kinds: Mapping[str, Any]) -> None:
-    """Every entry of ``kinds`` is in the object ``content``, and of its kind; ``place`` says where the object is."""
+    """Check that the object ``content``, found at ``place``, has every entry of ``kinds`` with the right kind."""
     if not isinstance(content, dict):
         raise BufgymError(f"{path}: {place} must be an object")
     for name, kind in kinds.items():
         field = f"{place}.{name}" if place else name
         if name not in content:
             raise BufgymError(f"{path}: no {field}")
-        # True is an int of Python's, but no number.
+        # In Python True is an int, but here it is no number.
         if not isinstance(content[name], kind) or isinstance(content[name], bool):
             words = {str: "text", list: "a list", dict: "an object", int: "a whole number"}.get(kind, "a number")
             raise BufgymError(where(path, None, content[name], f"must be {words}", field=field))

@@ -1,7 +1,7 @@
-"""Where a benchmark runs: processes or threads of this machine, or a Ray or Dask cluster, all through joblib.
+"""Parallel execution through joblib: processes or threads of this machine, or a Ray or Dask cluster.
 
-What works with a cluster for hours, as training does, calls it directly (``begun``, ``connected``): joblib's Ray
-backend makes new processes at every call, and those of several programs may wait for one another for ever.
+Long work such as training calls a cluster directly through ``begun`` and ``connected``. joblib's Ray backend makes new
+processes at every call, and processes of several programs may wait for one another for ever.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ BACKENDS = ("loky", "threading", "sequential", "ray", "dask")
 
 
 PATIENCE_S = 1.0
-"""How often a worker looks whether the process that began it is still there."""
+"""Time between a worker's checks that its parent process is alive."""
 
 
 @functools.cache
 def end_with(parent: int) -> None:
-    """From now on this process ends soon after ``parent`` (a process number), which began it, has ended.
+    """End this process soon after ``parent``, the process number of its parent, has ended.
 
-    A parent that is killed takes none of its workers along: they would hold its pipes and files for ever. It may be
-    gone already when a worker comes this far.
+    A killed parent leaves its workers running, and they would hold its pipes and files for ever. The parent may be gone
+    already when a worker calls this.
     """
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 
@@ -43,22 +43,22 @@ def _watch(parent: int) -> None:
 
 
 class WorkerDiedError(BufgymError):
-    """A worker process ended in the middle of its work: killed, out of memory, or crashed by compiled code."""
+    """A worker process died during its work: killed, out of memory, or crashed in compiled code."""
 
 
 def spread(
     calls: Iterable[tuple[Any, tuple[Any, ...]]], count: int, jobs: int, backend: str, address: str | None
 ) -> Iterator[Any]:
-    """The results of these (function, arguments), ``count`` at most, in the order in which they become ready.
+    """Run these (function, arguments), at most ``count``; yield the results as they become ready.
 
-    ``address``: of the head of the Ray or Dask cluster; None: one on this machine, begun and ended here.
+    ``address`` names the head of the Ray or Dask cluster; None starts and ends a cluster on this machine.
 
-    Raises WorkerDiedError: what other workers had not handed over by then is lost.
+    Raises WorkerDiedError: results that other workers had not returned by then are lost.
     """
     joblib = _imported("joblib", "bench")
     wrapped = (joblib.delayed(function)(*arguments) for function, arguments in calls)
     with _connected(backend, address):
-        # joblib's Ray backend hands results over only when all are there: a few at a time.
+        # joblib's Ray backend returns results only when all are there, so it gets a few calls at a time.
         ray = backend == "ray"
         at_once = 4 * joblib.effective_n_jobs(jobs) if ray else count
         for _ in range(0, count, at_once):
@@ -74,8 +74,8 @@ def spread(
 
 
 def _own(backend: str) -> dict[str, Any]:
-    """What joblib's own worker processes are told: to end with this one, also before they have work, and not by
-    themselves, as loky loses work that comes to one at that moment."""
+    """Settings of joblib's worker processes: they end with this process, even before they have work. They never end by
+    themselves, because loky loses work that reaches a worker at that moment."""
     if backend != "loky":
         return {}
     return {"initializer": end_with, "initargs": (os.getpid(),), "idle_worker_timeout": 10**6}
@@ -83,7 +83,7 @@ def _own(backend: str) -> dict[str, Any]:
 
 @contextmanager
 def _connected(backend: str, address: str | None) -> Iterator[None]:
-    """joblib's backend of that name, connected."""
+    """Connect joblib's backend of that name."""
     joblib = _imported("joblib", "bench")
     with nullcontext() if backend != "dask" else _dask_client(address):
         if backend == "ray":
@@ -102,12 +102,12 @@ def _dask_client(address: str | None) -> Any:
 
 Call = Callable[..., Any]
 CallEach = Callable[[Call, Sequence[tuple[Any, ...]]], list[Any]]
-"""(function, arguments of each call) -> the results, in the order of the calls."""
+"""(function, arguments of each call) -> results in the order of the calls."""
 
 
 @contextmanager
 def begun(backend: str, address: str | None) -> Iterator[str]:
-    """The address of a ``ray`` or ``dask`` cluster: that one, or of one on this machine, which ends here.
+    """Yield the address of a ``ray`` or ``dask`` cluster; without one, run a cluster on this machine meanwhile.
 
     Raises BufgymError: the library is missing, or nothing answers at the address.
     """
@@ -117,25 +117,25 @@ def begun(backend: str, address: str | None) -> Iterator[str]:
 
 @contextmanager
 def connected(backend: str, address: str | None) -> Iterator[CallEach]:
-    """What calls a function on a ``ray`` or ``dask`` cluster, as often as wished. It must be importable there.
+    """Yield a caller that runs functions on a ``ray`` or ``dask`` cluster, where they must be importable.
 
-    A Ray task and a Dask worker with one thread have a process to themselves, which keeps what the function caches.
+    A Ray task, or a Dask worker with one thread, has a process to itself, which keeps the function's caches.
 
-    Raises BufgymError: as ``begun``; the calls raise WorkerDiedError.
+    Raises BufgymError as ``begun`` does. The calls raise WorkerDiedError.
     """
     with _client(backend, address) as client:
         if backend == "dask":
             died: tuple[type[Exception], ...] = (_imported("distributed", "dask").KilledWorker,)
 
             def call_each(function: Call, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-                # Not pure: a call with the same arguments is a call of its own.
+                # Not pure, so that equal arguments are called again.
                 futures = [client.submit(function, *own, pure=False) for own in arguments]
                 return list(client.gather(futures))
 
         else:
             errors = client.exceptions
             died = (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError)
-            remote_of = functools.cache(client.remote)  # each one made is sent to the cluster again
+            remote_of = functools.cache(client.remote)  # a new one would be sent to the cluster again
 
             def call_each(function: Call, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
                 return list(client.get([remote_of(function).remote(*own) for own in arguments]))
@@ -151,10 +151,10 @@ def connected(backend: str, address: str | None) -> Iterator[CallEach]:
 
 @contextmanager
 def _client(backend: str, address: str | None) -> Iterator[Any]:
-    """Dask's client, or the module ``ray`` while it is connected."""
+    """Yield Dask's client, or the connected module ``ray``."""
     try:
         client, own = (_dask_client(address), True) if backend == "dask" else _ray(address)
-    except OSError as error:  # Ray's ConnectionError is one, too
+    except OSError as error:  # includes Ray's ConnectionError
         raise BufgymError(f"{backend}: no cluster at {address}: {' '.join(str(error).split())}") from None
     try:
         yield client
@@ -164,7 +164,7 @@ def _client(backend: str, address: str | None) -> Iterator[Any]:
 
 
 def _ray(address: str | None) -> tuple[Any, bool]:
-    """The module ``ray``, connected; whether it was not before."""
+    """Connect the module ``ray``; also return whether it was unconnected before."""
     ray = _imported("ray", "ray")
     if own := not ray.is_initialized():
         ray.init(address=address, log_to_driver=False)

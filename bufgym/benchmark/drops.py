@@ -1,4 +1,4 @@
-"""What would this policy have dropped of my recording? Each dropped message of each run, one by one and by topic."""
+"""Messages of a recording that a policy would have dropped, one by one and by topic."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from bufgym.policies import Policy
 from bufgym.scenario import Uplink
 from bufgym.sim import NEVER
 
-# More topics than this make no readable table; the CSV file has them all.
+# Most topics for a readable table; the CSV file has all.
 _SHOWN_TOPICS = 6
 
 
 class Drop(NamedTuple):
     """One dropped message; the fields are the columns of the CSV file. Times are s since the recording's first message.
 
-    ``bytes`` as recorded; ``dropped_s`` is the arrival time where it was rejected, later where it was evicted.
+    ``bytes`` is as recorded. ``dropped_s`` is the arrival time of a rejected message; an evicted one is later.
     """
 
     policy: str
@@ -50,7 +50,7 @@ def drops(
     max_bytes: int | None = None,
     decide_at: str = "arrival",
 ) -> Iterator[Drop]:
-    """Every message that each policy drops in the runs that ``run.run`` makes of the same arguments, in time order.
+    """Yield in time order every message that each policy drops in the runs of ``run.run`` with these arguments.
 
     Raises:
         BufgymError: the scenario plays no recording.
@@ -83,7 +83,7 @@ def drops(
 
 
 def write_drops(drops: Iterable[Drop], path: Path | None) -> Counter[tuple[str, int, str]]:
-    """Write them as CSV (nowhere for None), one at a time; how many there were by (policy, capacity, topic)."""
+    """Write drops as CSV, or nowhere if ``path`` is None; count them by policy, capacity and topic."""
     counts: Counter[tuple[str, int, str]] = Counter()
 
     def counted() -> Iterator[Drop]:
@@ -102,7 +102,7 @@ def write_drops(drops: Iterable[Drop], path: Path | None) -> Counter[tuple[str, 
 
 
 def by_topic(counts: Counter[tuple[str, int, str]], scenario: Uplink, policies: Sequence[str], runs: int) -> str:
-    """A table: the share of each topic's messages that each policy dropped, over ``runs`` episodes a capacity."""
+    """Tabulate the share of each topic's messages that each policy dropped, over ``runs`` episodes per capacity."""
     assert scenario.workload is not None
     summary = sorted(scenario.workload.summary(), key=lambda line: (-line.messages, line.topic))[:_SHOWN_TOPICS]
     lines = [["dropped of", "L", *(line.topic for line in summary)]]

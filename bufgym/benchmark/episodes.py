@@ -1,4 +1,4 @@
-"""The rows of a benchmark as arrays, checked: every policy has met the same episodes."""
+"""Rows of a benchmark as arrays, checked that every policy met the same episodes."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Run = tuple[int | None, Episode]
 
 @dataclass(frozen=True)
 class Table:
-    """The rows as arrays, everything in sorted order."""
+    """Rows as arrays in sorted order."""
 
     cells: list[Cell]
     """Every (scenario, capacity)."""
     episodes: dict[str, list[Episode]]
-    """By scenario."""
+    """Episodes of each scenario."""
     training_seeds: dict[str, list[int | None]]
-    """By policy; [None] for one that was not trained."""
+    """Training seeds of each policy; [None] for an untrained one."""
     qoi: dict[tuple[str, Cell], Numbers]
     """H[training seeds, episodes] by policy and cell."""
     best: dict[Cell, Numbers]
@@ -40,11 +40,11 @@ class Table:
     exact: dict[Cell, bool]
     """Whether every clairvoyant H of the cell is certified."""
     unbounded: set[str]
-    """Policies whose rows have a clairvoyant's H but no regret: that bound does not hold for them."""
+    """Policies that the clairvoyant's H does not bound; their rows have no regret."""
 
 
 def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Run, Mapping[str, Any]]]:
-    """The rows by (policy, cell), then (training seed, episode)."""
+    """Group the rows by (policy, cell), then by (training seed, episode)."""
     if not rows:
         raise BufgymError("no rows to score")
     groups: dict[tuple[str, Cell], dict[Run, Mapping[str, Any]]] = {}
@@ -62,7 +62,7 @@ def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Ru
 
 
 def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Table:
-    """The rows as arrays, checked as ``score.scores`` says."""
+    """Make arrays of the rows, checked as ``score.scores`` says."""
     groups = _by_run(rows)
     cells = sorted({cell for _, cell in groups})
     met: dict[str, set[Episode]] = {scenario: set() for scenario, _ in cells}
@@ -100,7 +100,7 @@ def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Table:
 
 
 def _clairvoyant(row: Mapping[str, Any]) -> float:
-    """The clairvoyant H of the row's episode, NaN where unknown."""
+    """Clairvoyant H of the row's episode, NaN where unknown."""
     best = row.get("clairvoyant")
     return math.nan if best is None else float(best)
 

@@ -1,4 +1,4 @@
-"""What ``bufgym bench --suite`` left in a folder, read and checked: manifest, rows, the timeline of one episode."""
+"""Reader of a folder of ``bufgym bench --suite``: manifest, rows and the timeline of one episode, all checked."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ class Run:
     """One finished run of a suite."""
 
     folder: Path
-    """Where it lies."""
+    """Folder of the run."""
     manifest: Mapping[str, Any]
-    """What was run."""
+    """Settings of the run."""
     rows: list[Row]
-    """All of them."""
+    """All rows."""
     rows_file: Path
-    """Their file, for errors to name."""
+    """File of the rows, for error messages."""
     timeline: Mapping[str, Any] | None
-    """One episode, message by message; None where none was written."""
+    """One episode, message by message; None if none was written."""
 
     @property
     def task(self) -> Task:
@@ -40,17 +40,17 @@ class Run:
 
     @property
     def abouts(self) -> dict[str, str]:
-        """What each scenario is, by its label."""
+        """Map each scenario's label to its description."""
         return {label: str(entry.get("about", "")) for label, entry in self.manifest["scenarios"].items()}
 
     def place(self, scenario: str) -> tuple[int, str]:
-        """Sorts scenarios as the manifest lists them; any others come after, by name."""
+        """Sort key: scenarios in the manifest's order, then any others by name."""
         listed = list(self.manifest["scenarios"])
         return (listed.index(scenario) if scenario in listed else len(listed), scenario)
 
 
 def read(folder: Path) -> Run:
-    """The run in ``folder``; an error that names the file and the rule where it is not one."""
+    """Read the run in ``folder``; an error names the file and the broken rule."""
     if not folder.is_dir():
         raise BufgymError(f"{folder}: must be a folder that `bufgym bench --suite` wrote")
     entries = manifest.read(folder / "manifest.json")

@@ -1,4 +1,4 @@
-"""The leaderboard: what each policy reached on each suite, with the command that makes it again, and a check of it."""
+"""Leaderboard: results of each policy on each suite, with the command that repeats and checks them."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from bufgym.files import read_utf8, replaced
 from bufgym.scenario import suites
 
 COLUMNS = ("suite", "policy", "rank", "cells", "quantity", "value", "low", "high", "bufgym", "command")
-"""Of the file, which has one line for each quantity of an entry."""
+"""Columns of the file, which has one line for each quantity of an entry."""
 
 MAX_BYTES = 16 * 2**20
-"""Of the file; each line has some 200."""
+"""Size limit of the file; each line has some 200 bytes."""
 
 _ROUNDING = 1e-9
 
@@ -38,35 +38,35 @@ class Entry:
     suite: str
     """Its name."""
     policy: str
-    """As ``bufgym bench --policies`` takes it."""
+    """Policy as ``bufgym bench --policies`` takes it."""
     rank: int
     """1 for the best; 0 for a policy that is not ranked."""
     cells: int
-    """How many cells the values are over; of one queue, those that are discriminative."""
+    """Number of cells that the values are over; for one queue only discriminative cells count."""
     values: Mapping[str, Interval]
     """The quantities that the suite's task lists, by key."""
     bufgym: str
-    """The version that made it."""
+    """Version of bufgym that made it."""
 
     @property
     def name(self) -> str:
-        """What ``bufgym validate`` calls it."""
+        """Name that ``bufgym validate`` takes."""
         return f"{self.suite}/{self.policy}"
 
     @property
     def command(self) -> str:
-        """What makes it again."""
+        """Command that makes it again."""
         needs = " --data DIR" if suites.get(self.suite).needs else ""
         return f"bufgym bench --suite {self.suite} --policies {self.policy}{needs}"
 
 
 def task_of(suite: str) -> Task:
-    """The task of the suite."""
+    """Find the task of the suite."""
     return TASKS[suites.get(suite).kind]
 
 
 def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> list[Entry]:
-    """One entry for each policy of a suite's rows, best first."""
+    """Make one entry for each policy of a suite's rows, best first."""
     task = task_of(suite)
     summary = task.summary(rows, unranked)
     board = []
@@ -92,9 +92,9 @@ def _run(suite: str, specs: Sequence[str], data: str | None = None, jobs: int | 
 
 
 def validate(entry: Entry, **options: Any) -> Entry:
-    """The entry made anew; an error if a value or an interval of the file is not what comes out.
+    """Make the entry anew; raise an error if a value or an interval of the file differs.
 
-    The file's interval is no measure of the file's value: a row could state any width.
+    The file's value is not checked against the file's own interval, whose width a row could choose freely.
     """
     specs = dict.fromkeys([entry.policy, task_of(entry.suite).reference])
     (again,) = (e for e in _run(entry.suite, list(specs), **options) if e.policy == entry.policy)
@@ -106,7 +106,7 @@ def validate(entry: Entry, **options: Any) -> Entry:
 
 
 def _agree(stated: Interval, now: Interval) -> bool:
-    """Whether the value lies in the interval computed now, and the interval is that one within a tenth of its width."""
+    """Whether the value lies in the new interval, and the two intervals agree within a tenth of the width."""
     if math.isnan(now.value):
         return math.isnan(stated.value)
     if math.isnan(now.low):
@@ -124,7 +124,7 @@ def _in_full(interval: Interval) -> str:
 
 
 def write(board: Sequence[Entry], path: Path) -> None:
-    """A CSV file, and beside it the same as Markdown."""
+    """Write a CSV file, and beside it the same as Markdown."""
     if path.suffix != ".csv":
         raise BufgymError(f"{path}: a leaderboard is written to a .csv file")
     with replaced(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
@@ -139,7 +139,7 @@ def write(board: Sequence[Entry], path: Path) -> None:
 
 
 def read(path: Path) -> dict[str, Entry]:
-    """The entries by name; an error that names the file, the line and the value if one can't be read."""
+    """Read the entries by name; an error names the file, the line and the unreadable value."""
     kinds = {**dict.fromkeys(COLUMNS, str), "rank": int, "cells": int, "value": float, "low": float, "high": float}
     board: dict[str, Entry] = {}
     reader = csv.DictReader(io.StringIO(read_utf8(path, MAX_BYTES), newline=""), strict=True)
@@ -171,7 +171,7 @@ def read(path: Path) -> dict[str, Entry]:
 
 
 def find(path: Path, name: str) -> Entry:
-    """The entry of that name."""
+    """Find the entry of that name."""
     board = read(path)
     if name not in board:
         raise BufgymError(f"{path}: no row {name!r}; rows are named suite/policy, such as {next(iter(board), 'none')}")
@@ -179,7 +179,7 @@ def find(path: Path, name: str) -> Entry:
 
 
 def markdown(board: Sequence[Entry]) -> str:
-    """A table for each suite."""
+    """Write a table for each suite."""
     out = [
         "# Leaderboard",
         "",

@@ -1,4 +1,4 @@
-"""The JSON files of a run's folder: what was run (``manifest.json``), so that no other run's rows get mixed in."""
+"""JSON files of a run's folder; ``manifest.json`` records the settings, so that runs do not mix their rows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bufgym.errors import BufgymError, where
 from bufgym.files import replaced
 
 FORMAT = 2
-"""The version of the folder's layout: raised when manifest, rows or timeline change their meaning."""
+"""Version of the folder's layout, raised when manifest, rows or timeline change their meaning."""
 
 _KINDS = {
     **dict.fromkeys(("task", "suite", "split", "about", "episodes", "bufgym", "command"), str),
@@ -24,11 +24,11 @@ _SAME = [
     *("format", "bufgym", "suite", "split", "policies", "policy_file", "sources"),
     *("capacities", "seeds", "changes", "scenarios"),
 ]
-"""What two runs that share a folder must have in common."""
+"""Entries that must be equal in two runs that share a folder."""
 
 
 def claim(out: Path, manifest: dict[str, Any]) -> None:
-    """Write the manifest into the folder, or an error if another run's rows are in it."""
+    """Write the manifest into the folder; raise an error if another run's rows are in it."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / "manifest.json"
     if not file.exists():
@@ -46,7 +46,7 @@ def claim(out: Path, manifest: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> Mapping[str, Any]:
-    """What was run; an error that names the file and the rule where it is not a manifest of this version."""
+    """Read a manifest of this version; an error names the file and the broken rule."""
     if not path.exists():
         raise BufgymError(f"{path.parent}: no {path.name}; it must be a folder that `bufgym bench --suite` wrote")
     manifest = read_object(path)

@@ -30,17 +30,17 @@ RUNS: Layout = {
 }
 """One row for each run of one queue.
 
-``clairvoyant`` is the best possible H of this episode at this capacity, ``certified`` whether that is exact (else an
-upper bound), ``regret`` = 1 - H / clairvoyant. They are None where the bound was not asked for; ``regret`` also for a
-policy that is not bound by L.
+``clairvoyant`` is the best possible H of this episode at this capacity. ``certified`` says whether that is exact or an
+upper bound, and ``regret`` = 1 - H / clairvoyant. They are None if no bound was requested. ``regret`` is also None for
+a policy that is not bound by L.
 """
 
 _MORE: Layout = {"training_seed": int}
-"""Columns that rows of any layout may have besides; those of other names hold numbers with a fraction."""
+"""Optional columns of any layout; columns of other names hold floats."""
 
 
 def checked_target(path: str | os.PathLike[str]) -> Path:
-    """The path, or an error if rows can't be written to a file of that kind here."""
+    """Return the path; raise an error if rows can't be written to a file of that kind here."""
     target = Path(path)
     if target.suffix not in (".csv", ".parquet"):
         raise BufgymError(f"{target}: rows are written to .csv or .parquet files")
@@ -50,7 +50,7 @@ def checked_target(path: str | os.PathLike[str]) -> Path:
 
 
 def write_rows(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str], layout: Layout = RUNS) -> Path:
-    """Write rows to a ``.csv`` or ``.parquet`` file, whole or not at all; None is an empty cell (CSV) or null."""
+    """Write rows to a ``.csv`` or ``.parquet`` file, whole or not at all; None becomes an empty cell or null."""
     target = checked_target(path)
     columns = list(rows[0]) if rows else list(layout)
     if target.suffix == ".parquet":
@@ -70,14 +70,14 @@ def write_rows(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str], 
 
 
 def read_rows(path: str | os.PathLike[str], layout: Layout = RUNS) -> list[Row]:
-    """The rows that ``write_rows`` wrote."""
+    """Read the rows that ``write_rows`` wrote."""
     source = Path(path)
     if source.exists() and not source.is_file():
         raise BufgymError(f"{source}: must be a regular file")
     if source.suffix == ".parquet":
         return _read_parquet(source)
     with open(source, encoding="utf-8", newline="") as file:
-        # What a line has too much comes under the name None, what it lacks as the value None.
+        # Extra cells of a line have the name None, and missing cells the value None.
         reader = csv.DictReader(file, strict=True)
         try:
             lines = [(reader.line_num, line) for line in reader]
@@ -95,7 +95,7 @@ def _read_parquet(source: Path) -> list[Row]:
     _, parquet = _pyarrow()
     with open(source, "rb") as file:
         try:
-            # pyarrow looks at a page's checksum only if asked.
+            # pyarrow checks a page's checksum only on request.
             rows: list[Row] = parquet.read_table(file, page_checksum_verification=True).to_pylist()
         except Exception as error:  # pyarrow's own errors are OSErrors and ValueErrors of many kinds
             raise BufgymError(f"{source}: no rows that can be read: {str(error).splitlines()[0]}") from None

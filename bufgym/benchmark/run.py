@@ -1,8 +1,8 @@
-"""The experiment of ``bufgym bench``: every policy meets the same episodes; each run becomes rows.
+"""Experiment of ``bufgym bench``: every policy meets the same episodes, and each run becomes rows.
 
-Seed s stands for one episode and one sequence of uniform draws, whatever the policy, the capacity and the order in
-which they run (common random numbers): two runs with the same trace and seed differ by their policy and capacity alone,
-so their difference carries no noise of the draw. Each trace of a scenario has the full set of seeds.
+The method is common random numbers. Seed s stands for one episode and one sequence of uniform draws, whatever the
+policy, the capacity and the order of runs. Two runs with the same trace and seed differ only in policy and capacity, so
+their difference has no noise from the draw. Each trace of a scenario has the full set of seeds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bufgym.scenario.numbered import by_trace, draw
 __all__ = ["bar", "by_trace", "check_distinct", "draw", "run"]
 
 _BATCH_MESSAGES = 1_000_000
-"""Messages held at a time (88 bytes each): many seeds run in several batches."""
+"""Messages held at a time, 88 bytes each; many seeds run in several batches."""
 
 
 def run(
@@ -35,16 +35,16 @@ def run(
     progress: bool = False,
     **settings: Any,
 ) -> list[Row]:
-    """Every policy at every capacity on every trace and seed; the rows of the scenario's task, in its ``layout``.
+    """Run every policy at every capacity on every trace and seed; return rows in the task's ``layout``.
 
     Args:
         policies: each a ``Policy``, a name or a policy function, as ``bufgym.policies.get`` takes them.
         scenario: a ``Scenario`` or a ``FleetScenario``; each of its traces is met on its own.
         capacities: L, messages.
-        seeds: so many (0, 1, ...), or these.
-        label: what the rows call the scenario.
+        seeds: a number of seeds counted from 0, or a list of seeds.
+        label: name of the scenario in the rows.
         progress: show a bar on stderr, where that is a terminal and tqdm is installed.
-        settings: of the task; for one queue ``max_bytes``, ``decide_at`` and ``bound`` (see ``QueueTask``).
+        settings: settings of the task; for one queue ``max_bytes``, ``decide_at`` and ``bound``, see ``QueueTask``.
     """
     task = tasks.of(scenario, **settings)
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
@@ -77,7 +77,7 @@ def run(
 
 
 def check_distinct(policies: Sequence[Policy]) -> None:
-    """An error if two have one name: their rows could not be told apart."""
+    """Raise an error if two policies have one name, because their rows could not be told apart."""
     given = [policy.name for policy in policies]
     for name in given:
         if given.count(name) > 1:
@@ -88,14 +88,14 @@ def check_distinct(policies: Sequence[Policy]) -> None:
 
 @contextmanager
 def bar(total: int, show: bool, unit: str = "run", done: int = 0) -> Iterator[Any]:
-    """A function to call with the number of runs (or other units) just finished; ``done`` were finished before."""
+    """Yield a function to call with the number of units just finished; ``done`` units were finished before."""
     if show and sys.stderr.isatty():
         try:
             from tqdm import tqdm
         except ImportError:
             pass
         else:
-            # What is done within a second needs no bar.
+            # Work shorter than a second needs no bar.
             with tqdm(total=total, initial=done, unit=unit, delay=1.0, leave=False, file=sys.stderr) as progress:
                 yield progress.update
                 return

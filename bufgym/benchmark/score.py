@@ -1,15 +1,15 @@
-"""What the rows of a benchmark say: scores between Drop Oldest (0) and the clairvoyant (1), ranks, and intervals.
+"""Scores of a benchmark's rows, from 0 for Drop Oldest to 1 for the clairvoyant, with ranks and intervals.
 
-A *cell* is (scenario, capacity); an *episode* of it is (trace, seed). Every policy has met the same episodes, at every
-capacity of the scenario (common random numbers), so policies are compared episode by episode.
+A *cell* is a scenario with a capacity, and an *episode* of it is a trace with a seed. Every policy meets the same
+episodes at every capacity of the scenario, so policies are compared episode by episode.
 
-Every interval is a paired percentile bootstrap over episodes (Efron and Tibshirani 1993, chapter 13): the episodes of
-a scenario are drawn with replacement, the same draw for all its capacities and all policies, and the statistic is
-computed again. For a policy trained several times its training seeds are drawn as well, before the episodes. The draws
-depend on the seed and the names alone: neither the order of the rows nor the other policies change an interval. It
-speaks of fresh episodes on the traces at hand, not of other traces.
+Every interval is a paired percentile bootstrap over episodes (Efron and Tibshirani 1993, chapter 13). The episodes of a
+scenario are drawn with replacement, with the same draw for all its capacities and all policies, and the statistic is
+computed again. For a policy trained several times, training seeds are drawn first. The draws depend only on the seed
+and the names, so neither the order of the rows nor the other policies change an interval. An interval describes fresh
+episodes on the same traces, not other traces.
 
-Interquartile mean and probability of improvement are those of Agarwal et al. (NeurIPS 2021) and their library rliable.
+Interquartile mean and probability of improvement follow Agarwal et al. (NeurIPS 2021) and their library rliable.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ class CellScore:
     policy: str
     """Its name."""
     episodes: int
-    """How many it has met."""
+    """Number of episodes met."""
     qoi: Interval
     """Mean H."""
     score: Interval
-    """See ``normalised_score``; NaN where a clairvoyant H is missing, or the baseline is already that good."""
+    """See ``normalised_score``; NaN where a clairvoyant H is missing or no better than the baseline."""
     regret: Interval
     """See ``regret``; NaN where a clairvoyant H is missing."""
     difference: Interval
@@ -69,20 +69,20 @@ class CellScore:
 
 @dataclass(frozen=True)
 class Standing:
-    """One policy over all discriminative cells; NaN where there is none. Resampling does not choose cells anew."""
+    """One policy over all discriminative cells, NaN without such cells. Resampling does not choose cells anew."""
 
     policy: str
     """Its name."""
     score: Interval
     """Mean of its scores in the discriminative cells."""
     iqm: Interval
-    """Interquartile mean of its scores on (discriminative cell, trace), each computed on sums over seeds. Pairs on
-    which nothing can be gained have no score and are left out; in a resample a pair weighs as often as it was drawn."""
+    """Interquartile mean of its scores on (discriminative cell, trace), each computed on sums over seeds. Pairs without
+    possible gain have no score and are left out. In a resample a pair is weighted by its number of draws."""
     regret: Interval
     """Mean of its regrets in the discriminative cells."""
     improvement: Interval
-    """Paired probability of improvement over the reference: the share of episodes with H above the reference's, plus
-    half of those with the same H, mean over the discriminative cells."""
+    """Paired probability of improvement over the reference, mean over the discriminative cells: the share of episodes
+    with H above the reference's, plus half the share with the same H."""
     cells: int
     """How many cells are discriminative."""
     ranked: bool
@@ -91,7 +91,7 @@ class Standing:
 
 @dataclass(frozen=True)
 class Scores:
-    """What ``scores`` makes of the rows."""
+    """Result of ``scores``."""
 
     standings: list[Standing]
     """Ranked policies first, best score first."""
@@ -100,11 +100,11 @@ class Scores:
     baseline: str
     """The policy whose score is 0."""
     reference: str
-    """The policy that improvements and differences are over."""
+    """The policy that improvements and differences compare with."""
     confidence: float
-    """Of the intervals."""
+    """Confidence of the intervals."""
     resamples: int
-    """Of the bootstrap."""
+    """Resamples of the bootstrap."""
 
     @property
     def exact(self) -> bool:
@@ -116,13 +116,13 @@ class Scores:
 
 
 def regret(h: Numbers, best: Numbers) -> Numbers:
-    """1 - sum H / sum H_clairvoyant, from the two sums; NaN where the clairvoyant's is 0 or unknown."""
+    """Compute 1 - sum H / sum H_clairvoyant from the two sums; NaN if the clairvoyant's is 0 or unknown."""
     return 1 - ratio(h, best, best > 0)
 
 
 def interquartile_mean(x: ArrayLike) -> float:
-    """Mean of what is left of n numbers without the floor(n / 4) smallest and largest (``trim_mean(x, 0.25)`` in
-    SciPy, as in rliable). NaN counts as missing; NaN for nothing."""
+    """Mean of n numbers without the floor(n / 4) smallest and largest, as in rliable; NaN counts as missing. It equals
+    SciPy's ``trim_mean(x, 0.25)``, and is NaN without numbers."""
     values = np.ravel(np.asarray(x, np.float64))[np.newaxis]
     return float(_interquartile_means(values, np.ones_like(values))[0])
 
@@ -130,7 +130,7 @@ def interquartile_mean(x: ArrayLike) -> float:
 def paired_difference(
     h: ArrayLike, h_ref: ArrayLike, *, resamples: int = 2000, confidence: float = 0.95, seed: int = 0
 ) -> Interval:
-    """Mean of H - H_ref over the episodes that both met, in the same order; NaN for none."""
+    """Mean of H - H_ref over episodes that both met, given in the same order; NaN without episodes."""
     values, reference = (np.asarray(numbers, np.float64) for numbers in (h, h_ref))
     if values.ndim != 1 or values.shape != reference.shape:
         raise BufgymError(
@@ -156,18 +156,18 @@ def scores(
     """Scores of every policy in every cell, and the standings over the discriminative cells.
 
     Args:
-        rows: from ``bufgym.benchmark.run``. Those of a trained agent may carry a "training_seed": the H of an episode
-            is then the mean over its training seeds.
-        unranked: policies that are shown but not ranked (such as an unbounded queue, or the clairvoyant).
-        baseline: whose score is 0.
-        reference: what improvements and differences are over; NaN where no row is of that policy.
-        resamples: of the bootstrap.
-        confidence: of the intervals, such as 0.95.
-        seed: of the draws.
+        rows: from ``bufgym.benchmark.run``. Rows of a trained agent may have a "training_seed"; the H of an episode is
+            then the mean over training seeds.
+        unranked: policies that are shown but not ranked, such as an unbounded queue or the clairvoyant.
+        baseline: policy whose score is 0.
+        reference: policy that improvements and differences compare with; without its rows they are NaN.
+        resamples: resamples of the bootstrap.
+        confidence: confidence of the intervals, such as 0.95.
+        seed: seed of the draws.
 
     Raises:
-        BufgymError: for no rows, incomplete or duplicate ones, a cell without the baseline, policies that have not
-            met the same episodes (or whose rows do not agree on the clairvoyant).
+        BufgymError: there are no rows, rows are incomplete or duplicate, a cell lacks the baseline, or policies met
+            different episodes or disagree on the clairvoyant.
     """
     check_resampling(resamples, confidence)
     table = episodes.read(rows, baseline)
@@ -209,20 +209,20 @@ def scores(
 
 @dataclass(frozen=True)
 class _Sample:
-    """The episodes of one cell as they were drawn: what the statistics of every policy there are computed from."""
+    """Drawn episodes of one cell, from which the statistics of every policy are computed."""
 
     weights: Numbers
-    """[1 + resamples, episodes]: how often each episode was drawn."""
+    """Number of draws of each episode, [1 + resamples, episodes]."""
     starts: NDArray[np.intp]
-    """[traces]: each one's first episode."""
+    """First episode of each trace, [traces]."""
     base: Numbers
-    """[1 + resamples, traces]: sum H of the baseline."""
+    """Sum of H of the baseline, [1 + resamples, traces]."""
     best: Numbers
-    """The same of the clairvoyant; NaN where unknown."""
+    """Sum of H of the clairvoyant, same shape; NaN where unknown."""
 
     @classmethod
     def of(cls, table: Table, cell: Cell, base: Numbers, weights: Numbers) -> _Sample:
-        """``base``: H of the baseline, [1 or 1 + resamples, episodes]."""
+        """Make a sample; ``base`` is H of the baseline, [1 or 1 + resamples, episodes]."""
         starts = np.unique([trace for trace, _ in table.episodes[cell[0]]], return_index=True)[1]
         best = table.best[cell][np.newaxis]
         return cls(weights, starts, *(np.add.reduceat(weights * h, starts, axis=1) for h in (base, best)))
@@ -233,12 +233,12 @@ class _Sample:
         return bool(regret(self.base[:1].sum(axis=1), self.best[:1].sum(axis=1))[0] >= DISCRIMINATIVE)
 
     def sums(self, h: Numbers) -> Numbers:
-        """[1 + resamples, traces]: sum H over the episodes drawn, from h[1 or 1 + resamples, episodes]."""
+        """Sum h[1 or 1 + resamples, episodes] over the drawn episodes, to [1 + resamples, traces]."""
         return np.asarray(np.add.reduceat(self.weights * h, self.starts, axis=1))
 
 
 class _Statistics(NamedTuple):
-    """One policy in one cell, [1 + resamples] each but for ``by_trace``."""
+    """Statistics of one policy in one cell, [1 + resamples] each except ``by_trace``."""
 
     qoi: Numbers
     score: Numbers
@@ -246,10 +246,10 @@ class _Statistics(NamedTuple):
     difference: Numbers
     improvement: Numbers
     by_trace: Numbers
-    """[1 + resamples, traces]: scores."""
+    """Scores, [1 + resamples, traces]."""
 
     def without_bound(self) -> _Statistics:
-        """The same for a policy that the clairvoyant's L does not bind: no score, no regret."""
+        """Remove score and regret, for a policy that the clairvoyant's L does not bind."""
         none = {name: np.full_like(getattr(self, name), np.nan) for name in ("score", "regret", "by_trace")}
         return self._replace(**none)
 
@@ -269,7 +269,7 @@ def _statistics(h: Numbers, h_ref: Numbers | None, sample: _Sample) -> _Statisti
 
 
 def _overall(cells: Sequence[_Statistics], samples: Sequence[_Sample]) -> tuple[Numbers, Numbers, Numbers, Numbers]:
-    """(score, IQM, regret, improvement) over the discriminative cells, [1 + resamples] each."""
+    """Compute score, IQM, regret and improvement over the discriminative cells, [1 + resamples] each."""
     if not cells:
         none = np.full(1, np.nan)
         return none, none, none, none
@@ -283,8 +283,8 @@ def _overall(cells: Sequence[_Statistics], samples: Sequence[_Sample]) -> tuple[
 
 
 def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:
-    """[n] from [n, tasks]: the interquartile mean of each row, a task counting ``weights`` times. Row 0 sets the share
-    that is cut off at either end; NaN weighs nothing."""
+    """Interquartile mean of each row of [n, tasks], a task counting ``weights`` times. Row 0 sets the share that is cut
+    off at either end; NaN weighs nothing."""
     unknown = np.isnan(values)
     values, weights = (np.where(unknown, 0.0, numbers) for numbers in (values, weights))
     order = np.argsort(values, axis=1)
@@ -299,9 +299,9 @@ def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:
 
 
 def _resampled(table: Table, policy: str, resamples: int, seed: int) -> dict[Cell, Numbers]:
-    """H of each episode by cell, [1, episodes], or its means over the training seeds drawn, [1 + resamples, episodes].
+    """H of each episode by cell, [1, episodes], or its means over drawn training seeds, [1 + resamples, episodes].
 
-    An agent's training seed is the same agent in every cell: one draw serves all.
+    A training seed is the same agent in every cell, so one draw serves all cells.
     """
     trained = len(table.training_seeds[policy])
     if trained == 1:

@@ -1,12 +1,12 @@
-"""Policies that are not registered: a model's file, or a function of a module. Loading one registers it.
+"""Policies from a model's file or a module's function. Loading a policy registers it.
 
     mine.zip           a model of stable-baselines3 or sb3-contrib (``bufgym.sb3.as_policy``); it can run any code
     mine.safetensors   a learned policy (``bufgym.policies.load``); no code is run
     module:function    a policy function, a ``Policy``, or a function without arguments that makes either; the module
                        is imported, from the current folder too
 
-A file's policy is called by the file's stem, a function's by its own name. ``bufgym.policies.get`` itself reads no
-file: names also come from leaderboards and results of strangers.
+A file's policy is named after the file's stem, a function's after the function. ``bufgym.policies.get`` reads no files,
+because names also come from other people's leaderboards and results.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ _FILES = (".zip", ".safetensors")
 
 
 def is_source(spec: str) -> bool:
-    """Whether ``spec`` is to be loaded; else it is a name, perhaps with settings."""
+    """Whether ``spec`` must be loaded; otherwise it is a name, perhaps with settings."""
     return spec.endswith(_FILES) or (modules.is_named(spec) and spec.partition(":")[0] not in policies.names())
 
 
 _NAMES: dict[tuple[str, str], str] = {}
-"""Name of the policy by (folder, source), for those that this process has loaded."""
+"""(folder, source) -> name of the policy, for policies that this process has loaded."""
 
 
 def load(source: str, folder: str | None = None) -> str:
-    """Register the policy in ``source``; its name. What is registered already stays as it is.
+    """Register the policy in ``source`` and return its name; a registered policy stays as it is.
 
-    ``folder``: where a relative path begins and modules are looked for, besides Python's own places; None for the
-    current one.
+    ``folder`` is where relative paths begin and where modules are found, besides Python's own places. None means the
+    current folder.
 
     Raises:
-        BufgymError: there is none, or another policy has its name.
+        BufgymError: there is no such policy, or another policy has its name.
     """
     place = folder or os.getcwd()
     known = _NAMES.get((place, source))
@@ -57,7 +57,7 @@ def load(source: str, folder: str | None = None) -> str:
 
 
 def digests(sources: Iterable[str], folder: str) -> dict[str, str]:
-    """What tells one version of each from another: of its file, or of its module's."""
+    """Digest of each source's file or module, which identifies its version."""
     files = {
         source: Path(folder, source) if source.endswith(_FILES) else _module_file(source, folder) for source in sources
     }

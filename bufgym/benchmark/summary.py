@@ -1,8 +1,8 @@
-"""What the rows of a benchmark say of each policy: quantities with intervals, by cell and over all cells.
+"""Summary of a benchmark's rows: quantities with intervals for each policy, by cell and over all cells.
 
-A *cell* is (scenario, capacity). Within a cell a statistic is computed over its episodes; over all cells it is the mean
-of theirs. Every interval is the paired bootstrap over episodes that ``score`` describes: one draw serves all policies
-and all capacities of a scenario.
+A *cell* is a scenario with a capacity. Within a cell a statistic is computed over episodes; over all cells it is the
+mean of the cells' values. Every interval is the paired bootstrap over episodes that ``score`` describes: one draw
+serves all policies and all capacities of a scenario.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ class Quantity(NamedTuple):
     title: str
     """Its heading."""
     write: Callable[[float], str]
-    """A number of it as text."""
+    """Function that formats a number."""
     about: str
-    """Its definition, for the reader of a report."""
+    """Definition, for the reader of a report."""
     interval: bool = True
     """Whether printed tables show the interval; a report always does."""
     versus: str = ""
-    """The policy it compares with, which has none of its own."""
+    """Policy that it compares with, which has no value itself."""
     total: bool = False
-    """Whether it adds up over cells; else it is the mean over them."""
+    """Whether it is summed over cells instead of averaged."""
     drawn: bool = False
     """Whether a report draws it beside the ranking."""
 
@@ -60,7 +60,7 @@ class Standing:
     ranked: bool
     """Whether it competes with the others."""
     values: Mapping[str, Interval]
-    """By ``Quantity.key``."""
+    """``Quantity.key`` -> value."""
 
     def __getitem__(self, key: str) -> Interval:
         return self.values[key]
@@ -68,10 +68,10 @@ class Standing:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a task makes of its rows."""
+    """Summary of a task's rows."""
 
     quantities: tuple[Quantity, ...]
-    """What is shown, in this order."""
+    """Quantities shown, in this order."""
     rank_by: str
     """The key of the quantity that orders the policies, largest first."""
     overall: list[Standing]
@@ -81,9 +81,9 @@ class Summary:
     baseline: str
     """The policy that the others are measured against."""
     confidence: float
-    """Of the intervals."""
+    """Confidence of the intervals."""
     resamples: int
-    """Of the bootstrap."""
+    """Resamples of the bootstrap."""
     scores: Scores | None = None
     """Scores between the baseline and the clairvoyant, where one is known."""
     notes: tuple[str, ...] = ()
@@ -91,7 +91,7 @@ class Summary:
 
     @property
     def counted_cells(self) -> int:
-        """How many cells ``overall`` is over: where there are scores the discriminative ones."""
+        """Number of cells that ``overall`` covers; with scores only discriminative cells count."""
         if self.scores is None:
             return len(self.cells)
         return len({(cell.scenario, cell.capacity) for cell in self.scores.cells if cell.discriminative})
@@ -104,17 +104,17 @@ class Summary:
 
 KEY = ("scenario", "capacity", "policy", "trace", "seed")
 Run = tuple[str, int, str, str, int]
-"""What ``KEY`` names."""
+"""Values of the columns ``KEY``."""
 Statistics = Callable[[Numbers, Numbers, Numbers], dict[str, Numbers]]
 """(a policy's numbers, the baseline's, weights) -> each statistic of the sample and its resamples, [1 + resamples].
 
-The numbers are [episodes, entries], the same episodes of both; weights[1 + resamples, episodes] say how often each
-episode was drawn.
+The numbers are [episodes, entries] over the same episodes. weights[1 + resamples, episodes] count the draws of each
+episode.
 """
 
 
 def by_run(rows: Rows, part: str, value: str) -> dict[Run, dict[Any, Mapping[str, Any]]]:
-    """The rows of each run by their column ``part``; an error where one has no ``value``, or a part has two rows."""
+    """Group each run's rows by column ``part``; raise an error for a row without ``value`` or a repeated part."""
     runs: dict[Run, dict[Any, Mapping[str, Any]]] = {}
     for number, row in enumerate(rows):
         for name in (*KEY, part, value):
@@ -139,21 +139,21 @@ def summarise(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> Summary:
-    """Every policy beside ``baseline``, by cell and over all cells.
+    """Compare every policy with ``baseline``, by cell and over all cells.
 
     Args:
-        runs: the numbers that ``statistics`` takes of each run, with as many entries each in one cell.
+        runs: numbers of each run for ``statistics``, with equally many entries within a cell.
         statistics: computes the quantities of one policy in one cell.
-        quantities: what the statistics are called and how they are shown.
+        quantities: names and formats of the statistics.
         rank_by: the key of the quantity that orders the policies.
         baseline: the policy that the others are measured against.
         unranked: policies that come last, such as an unbounded queue.
-        resamples: of the bootstrap.
-        confidence: of the intervals, such as 0.95.
-        seed: of the draws.
+        resamples: resamples of the bootstrap.
+        confidence: confidence of the intervals, such as 0.95.
+        seed: seed of the draws.
 
     Raises:
-        BufgymError: for no runs, a cell without the baseline, policies that have not met the same episodes.
+        BufgymError: there are no runs, a cell lacks the baseline, or policies met different episodes.
     """
     check_resampling(resamples, confidence)
     # ``read`` makes sure that all met the same episodes, and orders them.
@@ -173,7 +173,7 @@ def summarise(
     }
 
     def standings(over: Sequence[Cell]) -> list[Standing]:
-        # Each resample of a single episode is that episode, which says nothing of chance.
+        # Resamples of a single episode are all equal, so there is no interval.
         alone = any(len(table.episodes[scenario]) == 1 for scenario, _ in over)
         entries = []
         for policy, by_cell in by_policy.items():
@@ -193,25 +193,25 @@ def summarise(
 
 
 def pair(standing: Standing, quantity: Quantity) -> tuple[str, str]:
-    """(value, interval in brackets) as text; a dash and nothing where the policy has no value."""
+    """Format the policy's value and its interval in brackets; without a value, a dash and nothing."""
     return shown(UNKNOWN if standing.policy == quantity.versus else standing[quantity.key], quantity)
 
 
 def shown(interval: Interval, quantity: Quantity) -> tuple[str, str]:
-    """The same of a number; nothing in brackets where a quantity has no intervals at all."""
+    """Format a value and its interval; the interval is empty for a quantity without intervals."""
     value, brackets = written(interval, quantity.write)
     return value, "" if math.isnan(interval.low) and not quantity.interval else brackets
 
 
 def title(cell: Cell, abouts: Mapping[str, str]) -> str:
-    """What one cell is; ``abouts``: what each scenario is, by its label."""
+    """Describe a cell; ``abouts`` maps each scenario's label to its description."""
     scenario, capacity = cell
     scenario = ": ".join(filter(None, (scenario, abouts.get(scenario, ""))))
     return ", ".join(filter(None, (scenario, f"L = {capacity}")))
 
 
 def plain(summary: Summary, abouts: Mapping[str, str] | None = None) -> str:
-    """Aligned text: a block for each cell, and one over all where there are several."""
+    """Write aligned text: a block for each cell, and one over all cells if there are several."""
     blocks = [(title(cell, abouts or {}), standings) for cell, standings in summary.cells.items()]
     if len(blocks) > 1:
         blocks.append((f"mean of these {len(blocks)}", summary.overall))

@@ -1,9 +1,9 @@
-"""A suite's benchmark: many runs over all cores or a cluster, safe against a kill.
+"""Benchmark of a suite: many runs over all cores or a cluster, safe against a kill.
 
-The work is cut into shards (one scenario, one trace, some seeds; all policies and capacities). The rows of a finished
-shard lie in a file of their own under ``parts/``; a run that is started again skips them. When all are there, they
-become ``rows.parquet`` (or ``rows.csv``) beside ``manifest.json``, which says what was run, and for one queue
-``timeline.json``, one episode in full. The rows do not depend on where or in which order the shards ran.
+The work is cut into shards. A shard has one scenario, one trace and some seeds, with all policies and capacities. The
+rows of a finished shard are in a file of their own under ``parts/``, and a restarted run skips them. At the end they
+become ``rows.parquet`` or ``rows.csv`` beside ``manifest.json``, which records the settings. For one queue,
+``timeline.json`` has one episode in full. The rows do not depend on where or in which order the shards ran.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from bufgym.scenario.suites import Setting
 _SEEDS_PER_SHARD = 25
 
 Load = Callable[[str | None], None]
-"""Runs a policy file."""
+"""Function that runs a policy file."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What to run of a suite."""
+    """Settings of a suite's benchmark."""
 
     suite: str
     """Its name."""
@@ -49,17 +49,17 @@ class Sweep:
     split: str = "test"
     """"train", "validation" or "test"."""
     capacities: tuple[int, ...] = ()
-    """L, messages; empty: those of the suite."""
+    """L, messages; empty for the suite's own."""
     seeds: int | None = None
-    """Episodes on each trace; None: as many as the suite says."""
+    """Episodes on each trace; None for the suite's own number."""
     data: str | None = None
     """Folder of recordings, for suites that need one."""
     policy_file: str | None = None
-    """A Python file that registers policies; it is run wherever shards run."""
+    """A Python file that registers policies, run wherever shards run."""
     sources: tuple[str, ...] = ()
     """Files of models and functions of modules (``bufgym.benchmark.sources``), loaded wherever shards run."""
     folder: str = field(default_factory=os.getcwd)
-    """Where the sources lie."""
+    """Folder of the sources."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
 
@@ -70,7 +70,7 @@ class Sweep:
 
     @property
     def policies(self) -> list[policies.Policy]:
-        """Those of ``specs``."""
+        """Policies of ``specs``."""
         return [policies.get(spec) for spec in self.specs]
 
     def settings(self) -> dict[str, Setting]:
@@ -84,12 +84,12 @@ class Sweep:
         }
 
     def setting(self, label: str, trace: int) -> Setting:
-        """One of them, its scenario on one trace alone."""
+        """Return one setting with its scenario on one trace alone."""
         setting = self.settings()[label]
         return replace(setting, scenario=by_trace(setting.scenario)[trace][1])
 
     def checked(self) -> Sweep:
-        """The same with nothing left open; a mistake in it ends in an error here, before any work."""
+        """Fill in all defaults and check everything, so that errors come before any work."""
         suite, task = suites.get(self.suite), self.task
         self.settings()
         seeds = suite.seeds if self.seeds is None else self.seeds
@@ -105,7 +105,7 @@ class Sweep:
         return complete
 
     def shards(self) -> list[Shard]:
-        """All pieces of a checked sweep, in the order of the rows."""
+        """List all shards of a checked sweep, in the order of the rows."""
         shards = []
         for label, setting in self.settings().items():
             for trace in range(len(by_trace(setting.scenario))):
@@ -120,29 +120,29 @@ class Shard:
     """One piece of a sweep: one scenario on one trace, with some seeds."""
 
     sweep: Sweep
-    """What it is a piece of."""
+    """The whole sweep."""
     label: str
-    """Of the scenario."""
+    """Label of the scenario."""
     trace: int
     """The number of the trace in the scenario."""
     seeds: tuple[int, ...]
-    """Of its episodes."""
+    """Seeds of its episodes."""
 
     @property
     def name(self) -> str:
-        """Of its file."""
+        """Name of its file."""
         return f"{self.label}-{self.trace}-{self.seeds[0]}"
 
 
 _TRIES = 3
-"""So many times in a row a worker may die without a shard finished."""
+"""Worker deaths in a row, without a finished shard between them, that end the run."""
 
 _LOADED: set[str] = set()
 """Policy files that this process has run for a shard."""
 
 
 def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
-    """The rows of one shard; ``load`` runs the sweep's policy file where that has not been done yet."""
+    """Run one shard and return its rows; ``load`` runs the sweep's policy file once in each process."""
     sweep = shard.sweep
     if load is not None and sweep.policy_file is not None and sweep.policy_file not in _LOADED:
         load(sweep.policy_file)
@@ -155,13 +155,13 @@ def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
 
 
 def _attempt(number: int, shard: Shard, load: Load | None) -> tuple[int, list[Row] | Exception]:
-    """The shard's number and its rows, or what went wrong: joblib throws finished shards away when one raises."""
+    """Return the shard's number with its rows or its error, because joblib discards finished shards when one raises."""
     try:
         return number, run_shard(shard, load)
     except BufgymError as error:
         return number, error
     except Exception as error:
-        # A traceback stays behind in the process; where in the user's own file it was must be said here.
+        # The traceback stays in this process, so the place in the user's file is added here.
         place = modules.line_of(error, shard.sweep.policy_file)
         return number, error if place is None else BufgymError(f"{place}: {type(error).__name__}: {error}")
 
@@ -181,17 +181,17 @@ def run_sweep(
     load: Load | None = None,
     progress: bool = True,
 ) -> list[Row]:
-    """Run what of the sweep is not yet in ``out``, and write the folder's files; all its rows.
+    """Run the missing shards of the sweep, write the files in ``out`` and return all rows.
 
     Args:
         sweep: what to run.
-        out: a folder that does not exist, is empty, or holds an earlier (perhaps unfinished) run of the same sweep.
-        jobs: processes side by side; -1: one for each core; None: the same, or one where joblib is missing.
+        out: a folder that does not exist, is empty, or holds an earlier run of the same sweep, finished or not.
+        jobs: parallel processes; -1 starts one per core, and None does too if joblib is installed.
         backend: one of ``BACKENDS`` (joblib's); "ray" and "dask" use the cluster at ``address``, or a local one.
-        address: of the cluster's head.
-        command: what the report shows as the way to run it again.
-        form: "parquet" or "csv"; by default parquet if pyarrow is there.
-        load: runs a policy file (``Sweep.policy_file``) in a worker.
+        address: address of the cluster's head.
+        command: command that the report shows to run it again.
+        form: "parquet" or "csv"; by default parquet if pyarrow is installed.
+        load: function that runs ``Sweep.policy_file`` in a worker.
         progress: show a bar on stderr, where that is a terminal.
     """
     sweep = sweep.checked()
@@ -231,7 +231,7 @@ def run_sweep(
 
 
 def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, Any]:
-    """What ``manifest.json`` says about a checked sweep."""
+    """Make the content of ``manifest.json`` for a checked sweep."""
     suite, settings = suites.get(sweep.suite), sweep.settings()
     episodes = sum(len(shard.seeds) for shard in shards)
     code = sweep.policy_file and Path(sweep.policy_file).read_bytes()
@@ -265,7 +265,7 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
 
 
 def _fingerprint(scenario: Any) -> str:
-    """Tells recordings apart that go by the same names."""
+    """Fingerprint that tells recordings of the same name apart."""
     stream = getattr(scenario, "uplink", scenario)
     digest = hashlib.sha256()
     for trace in getattr(stream, "traces", ()):
@@ -276,13 +276,13 @@ def _fingerprint(scenario: Any) -> str:
 
 
 def _form(out: Path) -> str:
-    """That of the rows which are there already, else the best that can be written."""
+    """Format of the rows already in the folder, or else the best format available."""
     held = {file.suffix for pattern in ("rows.*", "parts/*") for file in out.glob(pattern)}
     return "csv" if not has_pyarrow() or (".csv" in held and ".parquet" not in held) else "parquet"
 
 
 def _read(file: Path, shard: Shard) -> list[Row]:
-    """The rows of a finished shard; an error if the file is not what this sweep would have written."""
+    """Read the rows of a finished shard; raise an error if this sweep cannot have written the file."""
     again = "delete this file and run the command again: only its rows are made anew"
     sweep, layout = shard.sweep, shard.sweep.task.layout
     try:
@@ -303,9 +303,9 @@ def _read(file: Path, shard: Shard) -> list[Row]:
 def _spread(
     shards: Sequence[Shard], jobs: int, backend: str, address: str | None, load: Load | None
 ) -> Iterator[tuple[int, list[Row]]]:
-    """(number, rows) of each shard, as they become ready; after an error no further ones are begun.
+    """Yield each shard's number and rows as they become ready; after an error start no more.
 
-    Where a worker dies, what is not there yet is run again, as long as that brings it nearer to its end.
+    When a worker dies, unfinished shards run again, as long as each attempt finishes some.
     """
     if backend == "sequential" or (backend == "loky" and jobs == 1):
         for k, shard in enumerate(shards):

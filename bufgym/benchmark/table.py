@@ -16,7 +16,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def decimal(number: float, digits: int) -> str:
-    """With a true minus sign, and none before a zero; a dash for NaN."""
+    """Format with a true minus sign, but none before a zero; NaN is a dash."""
     if math.isnan(number):
         return "–"
     text = f"{abs(number):.{digits}f}"
@@ -24,18 +24,18 @@ def decimal(number: float, digits: int) -> str:
 
 
 def score(number: float) -> str:
-    """0.713, or a dash where there is none."""
+    """Format a score as 0.713, or NaN as a dash."""
     return decimal(number, 3)
 
 
 def percent(number: float) -> str:
-    """Three digits: 12.3 %, 1.23 %, 0.123 %."""
+    """Format with three digits: 12.3 %, 1.23 %, 0.123 %."""
     size = float(f"{abs(number * 100):.3g}")  # rounded first: 9.999 % is 10.0 %
     return decimal(number * 100, 1 if size >= 10 else 2 if size >= 1 else 3) + ("" if math.isnan(number) else " %")
 
 
 def mean(numbers: Sequence[float | None]) -> float:
-    """Over what is known: None and NaN are left out; NaN for nothing."""
+    """Mean without None and NaN; NaN if nothing is left."""
     known = [number for number in numbers if number is not None and not math.isnan(number)]
     return math.fsum(known) / len(known) if known else math.nan
 
@@ -44,7 +44,7 @@ def mean(numbers: Sequence[float | None]) -> float:
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Rows of cells as lines of text: the first column to the left, the others to the right."""
+    """Align rows of cells as lines of text: the first column to the left, the others to the right."""
     lines = [list(map(printable, line)) for line in lines]
     widths = [max(len(line[c]) for line in lines) for c in range(len(lines[0]))]
     out = []
@@ -72,7 +72,7 @@ def markdown_table(head: Sequence[str], lines: Sequence[Sequence[str]], *, left:
 
 
 def invalid(rows: Rows) -> list[str]:
-    """A note for each policy whose decisions could not all be carried out; one row for each sender."""
+    """Write a note for each policy that made invalid decisions; ``rows`` has one row per sender."""
     counts: dict[str, int] = {}
     for row in rows:
         if row.get("invalid"):
@@ -89,9 +89,9 @@ class Column(NamedTuple):
     title: str
     """Its heading."""
     key: str
-    """The entry of the rows that it averages."""
+    """Column of the rows that it averages."""
     write: Callable[[float], str]
-    """The mean as text."""
+    """Function that formats the mean."""
 
 
 COLUMNS = (
@@ -112,17 +112,17 @@ COLUMNS = (
 
 
 REGRET_AT_MOST = "regret, at most"
-"""The title of regrets of which some rest on a bound that is not certified."""
+"""Title of regrets if some rest on an uncertified bound."""
 UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exact here: it is at most this"
 """The note below them."""
 
 
 def means(rows: Rows, floor: Rows = ()) -> list[dict[str, Any]]:
-    """One entry for each (policy, capacity): means over its rows; capacity ascending, then QoI descending.
+    """Average the rows of each policy and capacity, sorted by capacity ascending, then QoI descending.
 
-    Policies that do not compete (see ``unranked``) come after the others of a capacity. None and NaN count as missing;
-    a mean over nothing but missing numbers is NaN. The score is computed on sums (``measure.normalised_score``); NaN
-    without a clairvoyant's H. ``floor``: rows of Drop Oldest on the same episodes, where it is not among ``rows``.
+    Policies that do not compete, see ``unranked``, come last within a capacity. None and NaN count as missing, and a
+    mean of missing numbers is NaN. ``measure.normalised_score`` computes the score on sums; it is NaN without a
+    clairvoyant's H. ``floor`` holds rows of Drop Oldest on the same episodes if it is not among ``rows``.
     """
     groups: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
     for row in rows:
@@ -146,7 +146,7 @@ def _episode(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _score(group: Rows, base: Mapping[tuple[Any, ...], float]) -> float:
-    """Of one policy at one capacity; NaN where one of the three sums is not known, or L does not bind the policy."""
+    """Score of one policy at one capacity; NaN if one of the three sums is unknown or L does not bind the policy."""
     if any(row.get("regret") is None or _episode(row) not in base for row in group):
         return math.nan
     sums = [
@@ -157,7 +157,7 @@ def _score(group: Rows, base: Mapping[tuple[Any, ...], float]) -> float:
 
 
 def same(rows: Rows) -> dict[str, list[str]]:
-    """Policies that no row tells apart: the first of them (Drop Oldest, where it is one) -> the others."""
+    """Group policies with equal rows: map the first, or Drop Oldest if it is among them, to the others."""
     fates: dict[str, list[str]] = {}
     for row in rows:
         fates.setdefault(row["policy"], []).append(repr({**row, "policy": ""}))
@@ -169,25 +169,25 @@ def same(rows: Rows) -> dict[str, list[str]]:
 
 
 def told_once(alike: Mapping[str, Sequence[str]]) -> list[str]:
-    """A note for each line that stands for several policies (see ``same``)."""
+    """Write a note for each line that stands for several policies, see ``same``."""
     return [f"note: {', '.join(others)}: the same rows here as {first}" for first, others in alike.items()]
 
 
 def unranked(rows: Rows) -> dict[str, str]:
-    """Policies among the rows that do not compete, and why."""
+    """Find the policies that do not compete, with the reasons."""
     reasons = {}
     for name in dict.fromkeys(row["policy"] for row in rows):
         try:
             reason = policies.get(name).unranked_because
         except BufgymError:
-            continue  # an agent of a run, which no registry knows
+            continue  # a run's agent that is not registered
         if reason:
             reasons[name] = reason
     return reasons
 
 
 def plain(rows: Rows, floor: Rows = ()) -> str:
-    """Aligned text, an empty line between capacities; ``floor`` as in ``means``."""
+    """Write aligned text with an empty line between capacities; ``floor`` as in ``means``."""
     cells = _cells(rows, floor)
     out = []
     for k, line in enumerate(aligned(cells)):
@@ -198,26 +198,26 @@ def plain(rows: Rows, floor: Rows = ()) -> str:
 
 
 def markdown(rows: Rows, floor: Rows = ()) -> str:
-    """A Markdown table; numbers to the right; ``floor`` as in ``means``."""
+    """Write a Markdown table with numbers to the right; ``floor`` as in ``means``."""
     head, *body = _cells(rows, floor)
     lines = notes(rows)
     return "\n".join([*markdown_table(head, body), *(["", *lines] if lines else [])])
 
 
 def notes(rows: Rows) -> list[str]:
-    """What the reader of the means must know besides."""
+    """Write notes that a reader of the means needs."""
     apart = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked(rows).items()]
     return [*apart, *told_once(same(rows)), *([f"note: {UPPER_BOUND}"] if _inexact(rows) else []), *invalid(rows)]
 
 
 def _inexact(rows: Rows) -> bool:
-    """Whether a regret rests on a bound that is not certified to be exact."""
+    """Whether a regret rests on an uncertified bound."""
     return any(row.get("certified") is False and row.get("regret") is not None for row in rows)
 
 
 def _cells(rows: Rows, floor: Rows) -> list[list[str]]:
-    """Titles, then a line for each entry of ``means``, one for policies that are the ``same``; no score or regret where
-    no row has one."""
+    """Make titles and a line for each entry of ``means``, with one line for policies that are the ``same``. Score and
+    regret are left out if no row has them."""
     others = {name for alike in same(rows).values() for name in alike}
     entries = [entry for entry in means(rows, floor) if entry["policy"] not in others]
     bounded = {key for key in ("score", "regret") if any(not math.isnan(entry[key]) for entry in entries)}
@@ -227,5 +227,5 @@ def _cells(rows: Rows, floor: Rows) -> list[list[str]]:
 
 
 def written(number: Any, column: Column) -> str:
-    """An entry as text; a hyphen where it is not known."""
+    """Format an entry; an unknown one is a hyphen."""
     return "-" if isinstance(number, float) and math.isnan(number) else column.write(number)

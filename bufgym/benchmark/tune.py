@@ -1,11 +1,11 @@
-"""``bufgym tune``: which setting of a policy does best on a suite's validation episodes.
+"""``bufgym tune``: search for a policy's best setting on a suite's validation episodes.
 
 Many policies have a parameter that their source chose for another stream than a robot's. To judge them fairly, each
-meets a suite in two forms: with its source's parameters, and with those that a grid search finds on the validation
-split. The test split is never used here.
+meets a suite twice: with its source's parameters, and with parameters from a grid search on the validation split. The
+test split is never used here.
 
-A setting replaces the default only if its score is higher by more than chance: if the paired bootstrap interval of the
-difference (see ``score``) lies above 0. The choices are kept in ``tuned.json`` (see ``tuned``).
+A setting replaces the default only if its score is higher by more than chance. The test is that the paired bootstrap
+interval of the difference, see ``score``, lies above 0. The choices are kept in ``tuned.json``, see ``tuned``.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from bufgym.scenario import suites
 
 @dataclass(frozen=True)
 class Grid:
-    """Settings to try for one policy: every combination, and the default."""
+    """Settings to try for one policy: every combination and the default."""
 
     axes: Mapping[str, tuple[float, ...]]
     """Values by parameter."""
     why: str
-    """Where the range comes from."""
+    """Source of the range."""
 
 
 GRIDS = {
@@ -77,7 +77,7 @@ GRIDS = {
         "24 to 1.5 frames/s of 30",
     ),
 }
-"""What is tuned. Towards one end some turn into drop-oldest (a long lifespan, a small step), where that is better."""
+"""Grids of the tuned policies. At one end, such as a long lifespan or a small step, some become drop-oldest."""
 
 FIXED = {
     "ros-keep-last": "it stands for ROS 2 as delivered, with its default depth of 10",
@@ -87,11 +87,11 @@ FIXED = {
     "ros2-reliable-udp": "it stands for Fast DDS over UDP; the link's queue is a fact, not a choice",
     "foxglove-backlog": "it stands for ros-foxglove-bridge as delivered, with its default limit of 10 MB",
 }
-"""What has parameters and is not tuned, and why."""
+"""Policies that have parameters and are not tuned, with the reason."""
 
 
 def settings(policy: str) -> list[str]:
-    """The default of a policy of ``GRIDS``, as its plain name, then every other setting of its grid."""
+    """List a policy's default as its plain name, then every other setting of its grid."""
     if policy in FIXED:
         raise BufgymError(f"policy {policy}: is not tuned: {FIXED[policy]}")
     if policy not in GRIDS:
@@ -113,23 +113,23 @@ class Tried:
     """One setting on the validation episodes."""
 
     spec: str
-    """As ``bufgym.policies.get`` takes it."""
+    """Setting as ``bufgym.policies.get`` takes it."""
     score: Interval
     """Mean over the discriminative cells; NaN where there is none."""
     regret: Interval
     """Mean over the same cells, or over all where none is discriminative."""
     gain: Interval
-    """How much better it is than the default, paired: in score, or in regret where no cell is discriminative."""
+    """Paired gain over the default in score, or in regret if no cell is discriminative."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What was tried for one policy."""
+    """Settings tried for one policy."""
 
     policy: str
     """Its plain name."""
     tried: tuple[Tried, ...]
-    """The default first."""
+    """Settings with their results, the default first."""
 
     @property
     def default(self) -> Tried:
@@ -138,14 +138,14 @@ class Choice:
 
     @property
     def best(self) -> Tried:
-        """The first of those with the highest score (lowest regret, where no cell is discriminative)."""
+        """First setting with the highest score, or with the lowest regret if no cell is discriminative."""
         return max(self.tried, key=lambda tried: tried.gain.value)
 
     @property
     def chosen(self) -> Tried:
-        """The best, if it is better than the default by more than chance; else the default.
+        """Best setting if it beats the default by more than chance, otherwise the default.
 
-        The interval is that of one comparison: it knows nothing of how many settings were tried.
+        The interval is for a single comparison and does not account for the number of settings tried.
         """
         return self.best if self.best.gain.low > TIE else self.default
 
@@ -159,18 +159,18 @@ def tune(
     seeds: int | None = None,
     jobs: int | None = None,
 ) -> list[Choice]:
-    """Try the grids of the policies (default: of all that have one) on a suite; one choice for each policy.
+    """Try the grids of the policies, by default of all that have one, on a suite; return a choice for each.
 
     Args:
         suite: its name.
         names: policies of ``GRIDS``.
         split: "validation" or "train".
         data: folder of recordings, for suites that need one.
-        seeds: episodes on each trace; None: as many as the suite says.
+        seeds: episodes on each trace; None for the suite's own number.
         jobs: see ``run_sweep``.
 
     Raises:
-        BufgymError: for the split "test", a policy without a grid, and as for ``run_sweep``.
+        BufgymError: the split is "test", a policy has no grid, or as for ``run_sweep``.
     """
     if split == "test":
         raise BufgymError("split = 'test': must be validation or train; parameters are never chosen on test episodes")
@@ -184,7 +184,7 @@ def tune(
 
 
 def compare(policy: str, rows: Sequence[Row], specs: Sequence[str]) -> Choice:
-    """Score the settings ``specs`` of one policy, the default first, from rows that hold theirs and the baseline's."""
+    """Score the settings ``specs`` of one policy, the default first; ``rows`` also hold the baseline."""
     rows = [row for row in rows if row["policy"] in (*specs, BASELINE)]
     scored = scores(rows)
     discriminative = any(cell.discriminative for cell in scored.cells)
@@ -199,11 +199,11 @@ def compare(policy: str, rows: Sequence[Row], specs: Sequence[str]) -> Choice:
 
 
 def _gains(rows: Sequence[Row], specs: Sequence[str], discriminative: bool) -> list[Row]:
-    """Rows whose score is that of a setting less that of the default, so that ``scores`` gives its paired interval.
+    """Make rows whose score is a setting's score less the default's, so that ``scores`` gives the paired interval.
 
-    (H - H_baseline) / (H_clairvoyant - H_baseline) is linear in H: for H = H_baseline + H_setting - H_default it is the
-    difference of the two scores. Likewise the regret for H = H_clairvoyant + H_setting - H_default. The baseline's own
-    rows come first, as they are.
+    The score (H - H_baseline) / (H_clairvoyant - H_baseline) is linear in H, so H = H_baseline + H_setting - H_default
+    gives the difference of the two scores. Likewise H = H_clairvoyant + H_setting - H_default gives the difference of
+    the regrets. The baseline's own rows come first, unchanged.
     """
     h = {(row["policy"], *_episode(row)): row["qoi"] for row in rows}
     gains = [row for row in rows if row["policy"] == BASELINE]
@@ -219,10 +219,10 @@ def _episode(row: Row) -> tuple[Any, ...]:
 
 
 def _overall(scored: Scores, policy: str) -> tuple[Interval, Interval]:
-    """(score, regret) of one policy.
+    """Score and regret of one policy.
 
-    Where no cell is discriminative there is no standing: the regret is then the mean over all cells, and so are the
-    bounds of its interval, which makes that one a little too wide.
+    Without discriminative cells there is no standing. The regret and its bounds are then means over all cells, which
+    makes the interval a little too wide.
     """
     standing = next(s for s in scored.standings if s.policy == policy)
     if standing.cells:
@@ -235,7 +235,7 @@ def _overall(scored: Scores, policy: str) -> tuple[Interval, Interval]:
 
 
 def plain(choices: Sequence[Choice]) -> str:
-    """A table for each policy: every setting, best first."""
+    """Write a table for each policy with every setting, best first."""
 
     def text(interval: Interval, digits: int) -> str:
         return " ".join(filter(None, written(interval, lambda number: table.decimal(number, digits))))
@@ -256,7 +256,7 @@ def _mark(choice: Choice, tried: Tried) -> str:
 
 
 def write(suite: str, choices: Sequence[Choice], *, split: str, command: str) -> Path:
-    """Keep the choices in ``tuned.json``, in place of earlier ones for the same policies; the file's path."""
+    """Write the choices to ``tuned.json``, replacing earlier ones for the same policies; return its path."""
     entries = {
         choice.policy: {
             "setting": choice.chosen.spec,

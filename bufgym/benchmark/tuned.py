@@ -1,4 +1,4 @@
-"""What ``bufgym tune`` chose: ``tuned.json``, from which ``bufgym bench --suite`` takes its variants of policies."""
+"""Choices of ``bufgym tune`` in ``tuned.json``, which ``bufgym bench --suite`` uses as variants of policies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FILE = Path(__file__).with_name("tuned.json")
 
 
 def read() -> dict[str, dict[str, dict[str, Any]]]:
-    """What ``tuned.json`` holds; an error that names the file and the rule that it breaks."""
+    """Read ``tuned.json``; an error names the file and the broken rule."""
     suites = read_object(FILE)
     if not all(isinstance(entries, dict) for entries in suites.values()):
         raise BufgymError(f"{FILE}: must be a JSON object of suites, each an object of policies")
@@ -31,7 +31,7 @@ def read() -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def tuned(suite: str) -> list[str]:
-    """The settings chosen for this suite that differ from the policies' defaults."""
+    """List the settings chosen for this suite that differ from the policies' defaults."""
     settings = []
     for policy, entry in read().get(suite, {}).items():
         try:
@@ -44,7 +44,7 @@ def tuned(suite: str) -> list[str]:
 
 
 def write(suite: str, entries: Mapping[str, Mapping[str, Any]]) -> Path:
-    """Put the entries, by policy, in place of earlier ones of this suite; the file's path."""
+    """Replace this suite's entries by policy; return the file's path."""
     suites = read() if FILE.exists() else {}
     suites.setdefault(suite, {}).update({policy: dict(entry) for policy, entry in entries.items()})
     # Sorted, so that the file does not depend on the order of the runs.

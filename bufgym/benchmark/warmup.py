@@ -1,4 +1,4 @@
-"""What ``bufgym warmup`` compiles: each part is run once on as little as will do."""
+"""Parts that ``bufgym warmup`` compiles by running each once on a tiny input."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ PARTS: dict[str, Callable[[], None]] = {
     "the clairvoyant": _bound,
     "fleets": _fleets,
 }
-"""What each compiles -> what does it."""
+"""Description of a part -> function that compiles it."""
 
 
 def compile_part(what: str) -> float:
-    """Compile one of ``PARTS``; the time that it took, s."""
+    """Compile one of ``PARTS``; return the time taken in s."""
     kernel.compile_silently()
     kernel.compile_here()
     began_s = time.perf_counter()

@@ -1,8 +1,8 @@
-"""A policy as one C99 header, for programs that have no room for Python: ``bufgym export AGENT --to c --out policy.h``.
+"""A policy as one C99 header for programs without Python, made by ``bufgym export AGENT --to c --out policy.h``.
 
-``parts/`` holds the queue, V, the features and the scorer in C, ``rules/`` a file for each rule that can be exported;
-``header`` puts them together with the policy's numbers. ``calls`` records what an episode calls and what Python
-decides: some of that goes into the header (``bufgym_parity``), and the tests compare millions of decisions.
+``parts/`` holds the queue, V, the features and the scorer in C, and ``rules/`` a file for each exportable rule.
+``header`` puts them together with the policy's numbers. ``calls`` records an episode's calls and Python's decisions.
+Some of them go into the header as ``bufgym_parity``, and the tests compare millions.
 """
 
 from bufgym.c.calls import CALL, random_episode, recorded

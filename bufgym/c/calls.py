@@ -1,4 +1,4 @@
-"""What a program calls in an episode, and what the policy decides in the simulator: the truth for the header's C."""
+"""Calls of a program in an episode with the simulator's decisions, the reference for the header's C."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CALL = np.dtype(
 
 @kernel
 def _note(calls: NDArray[Any], n: int, kind: int, at_us: int, size_bytes: int) -> int:
-    """Write call ``n``; how many there are then."""
+    """Write call ``n``; return the new number of calls."""
     call = calls[n]
     call.kind, call.at_us, call.size_bytes = kind, at_us, size_bytes
     call.left_bytes, call.decision, call.x = 0, 0, 0.0
@@ -54,7 +54,7 @@ def _record(
     hears_departures: bool,
     calls: NDArray[Any],
 ) -> int:
-    """Run every sender of the batch to its end and write down the calls; how many they are."""
+    """Run every sender of the batch to its end, record the calls and return their number."""
     n = 0
     for i in range(len(batch.senders)):
         n = _note(calls, n, INIT, 0, 0)
@@ -84,7 +84,7 @@ def _record(
 
 @functools.cache
 def _compiled_record() -> Any:
-    """``_record`` for every compiled policy."""
+    """Compile ``_record`` for every compiled policy."""
     arrives, departs, _, _ = (numba.types.FunctionType(signature) for signature in signatures())
     memory = numba.types.Array(numba.types.float64, 2, "C")
     calls = numba.types.Array(numba.from_dtype(CALL), 1, "C")
@@ -95,9 +95,9 @@ def _compiled_record() -> Any:
 def recorded(
     policy: Policy, episodes: Sequence[Episode], capacity: int, value: Value, max_bytes: int | None = None
 ) -> NDArray[Any]:
-    """CALL[calls] of the episodes, one after another, under a policy that decides at arrivals alone.
+    """Record CALL[calls] of the episodes in turn, under a policy that decides at arrivals alone.
 
-    No message may be larger than B: such a one is dropped unasked, and no call would say so.
+    No message may be larger than B, because such a message is dropped without a call.
     """
     if policy.drops_at_dequeue or policy.schedules:
         raise BufgymError(f"policy {policy.name}: is asked when the socket is free: must decide at arrivals alone")
@@ -105,7 +105,7 @@ def recorded(
     senders = Senders(len(episodes), capacity, value, max_messages=longest, max_bytes=max_bytes)
     senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
     senders.follow(policy)
-    # An arrival may have to wait for as many evictions as the queue holds, but each message is evicted only once.
+    # An arrival may need as many evictions as the queue holds, but each message is evicted only once.
     most = sum(1 + 4 * len(episode.arrivals) for episode in episodes)
     calls = records(most, CALL)
     on_arrival, on_departure, _, _ = policy.compiled
@@ -116,7 +116,7 @@ def recorded(
 
 
 def random_episode(rng: np.random.Generator, n: int, largest_bytes: int | None = None) -> Episode:
-    """n messages of any rhythm, size (up to the largest) and motion on a link now faster, now slower, now still."""
+    """Draw n messages with random times, sizes up to the largest and motion, on a link of changing rate."""
     period_us, size_bytes = rng.choice([10_000, 33_333, 100_000]), int(rng.choice([2_000, 60_000, 230_000]))
     jitter, spread = rng.choice([0.0, 0.3, 3.0]), rng.choice([0.0, 0.5])
     step_us = rng.gamma(1 / jitter, period_us * jitter, n) if jitter > 0 else np.full(n, period_us)

@@ -1,4 +1,4 @@
-"""Puts a policy's header together: its parts in C, and the policy's numbers as constants."""
+"""Builder of a policy's header from parts in C and the policy's numbers as constants."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bufgym.policies.scoring import end_of, unpack
 
 _PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
 SUPPORTED = tuple(sorted(path.stem for path in _RULES.glob("*.h")))
-"""Names of the rules that can be exported; learned agents for one queue can be as well."""
+"""Names of the exportable rules; learned agents for one queue are exportable too."""
 _HELPERS = {
     "bufgym_gaps_of(": "gaps.h",
     "bufgym_smallest_time_gap(": "time_gap.h",
@@ -30,21 +30,21 @@ _HELPERS = {
     "bufgym_approach(": "target_gap.h",
     "bufgym_thin(": "thin.h",
 }
-"""Parts that rules share, each before those that call it."""
+"""Parts that rules share, each before its callers."""
 _LEARNED = (*("gaps.h", "thinning.h", "target_gap.h"), *("features.h", "greedy.h", "small_queue.h", "scorer.h"))
-"""Parts of a learned agent; the target gap of one that thins alone."""
+"""Parts of a learned agent; only an agent that thins uses the target gap."""
 _TARGET = (
     *("HORIZON_US", "SHORT", "LONG", "REST", "LINK_US", "PACED", "PACE_US", "NEAR", "DISCOUNT"),
     *("LEAST", "BURSTY", "LATE", "WITHIN"),
 )
-"""The numbers of ``target_gap`` that its C has."""
+"""Parameters of ``target_gap`` in C."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
-"""Of the calls in the header."""
+"""Seed, episodes and messages of the calls in the header."""
 
 
 def write(policy: Policy, out: str | Path, capacity: int, value: Value, max_bytes: int | None = None) -> Path:
-    """``header`` into the file ``out``, whole or not at all.
+    """Write ``header`` to the file ``out``, whole or not at all.
 
     Raises:
         BufgymError: as ``header``, or the file cannot be written.
@@ -59,10 +59,10 @@ def write(policy: Policy, out: str | Path, capacity: int, value: Value, max_byte
 
 
 def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = None) -> str:
-    """The policy as one C99 header, for L = ``capacity`` and B = ``max_bytes``, with V = ``value``.
+    """Make the policy's C99 header for L = ``capacity`` and B = ``max_bytes`` with V = ``value``.
 
     Raises:
-        BufgymError: a policy that has no C, or a limit that is none.
+        BufgymError: the policy has no C, or a limit is invalid.
     """
     check_limits(capacity, max_bytes)
     learns = policy.on_arrival is learned.on_arrival
@@ -108,12 +108,12 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
 
 
 def _agent(policy: Policy) -> str:
-    """The C of a learned agent."""
+    """Write the C of a learned agent."""
     return "".join(_part(part) for part in _LEARNED if part != "target_gap.h" or policy.memory)
 
 
 def _rule(policy: Policy) -> str:
-    """The C of a rule, after what it shares with others."""
+    """Write the C of a rule after the parts that it shares."""
     name = policy.name.partition(":")[0]
     if name not in SUPPORTED or policies.get(name).on_arrival is not policy.on_arrival:
         known = ", ".join(SUPPORTED)
@@ -127,7 +127,7 @@ def _rule(policy: Policy) -> str:
 
 
 def _scorers(policy: Policy) -> dict[str, Any]:
-    """What a learned policy's C is filled with: its scorers, their scratch and the fields."""
+    """Collect the values for a learned policy's C: its scorers, their scratch and the fields."""
     parameters, begin, networks = np.array(policy.weights), 1, len(learned.Weights.NETWORKS)
     entries: list[str] = []
     flags = int(parameters[0])
@@ -167,7 +167,7 @@ def _scorers(policy: Policy) -> dict[str, Any]:
 
 
 def _plans(value: Value) -> dict[str, Any]:
-    """What the plans for small queues are filled with, besides themselves."""
+    """Collect the values for the plans of small queues, besides the plans themselves."""
     log_base = float(value.array[1]) if value.array[0] == EXPONENTIAL else 0.0
     return {
         "PLAN_LOG_BASE": repr(log_base),
@@ -182,7 +182,7 @@ def _plans(value: Value) -> dict[str, Any]:
 
 
 def _calls(policy: Policy, capacity: int, value: Value, max_bytes: int | None) -> NDArray[Any]:
-    """The calls in the header, whose messages all fit into B."""
+    """Record the calls in the header, whose messages all fit into B."""
     rng = np.random.default_rng(_SEED)
     episodes = [random_episode(rng, _MESSAGES, max_bytes) for _ in range(_EPISODES)]
     return recorded(policy, episodes, capacity, value, max_bytes)
@@ -196,25 +196,25 @@ def _part(name: str) -> str:
 
 
 def _filled(text: str, numbers: dict[str, Any]) -> str:
-    """The text with each @NAME@ replaced, those in what is filled in as well."""
+    """Replace each @NAME@, also inside inserted text."""
     while re.search("@[A-Z_]+@", text):
         text = re.sub("@([A-Z_]+)@", lambda found: str(numbers[found[1]]), text)
     return text
 
 
 def _comment(text: str) -> str:
-    """As it may stand in a comment, or in a line that is filled."""
+    """Escape text for a comment or an inserted line."""
     return printable(text).replace("*/", "* /").replace("@", "(at)")
 
 
 def _array(kind: str, name: str, numbers: Iterable[Any]) -> str:
-    """``static const kind name[] = {...};``, numbers to the last bit."""
+    """Write ``static const kind name[] = {...};`` with numbers exact to the last bit."""
     words = _lines(repr(float(number) if kind == "double" else int(number)) for number in numbers)
     return f"static const {kind} {name}[] = {{\n    {words}\n}};\n"
 
 
 def _lines(words: Iterable[str]) -> str:
-    """The words with commas between them, five in a line."""
+    """Join the words with commas, five in a line."""
     found = list(words)
     return ",\n    ".join(", ".join(found[k : k + 5]) for k in range(0, len(found), 5))
 

@@ -1,8 +1,8 @@
-"""The command ``bufgym``. Thin: each command reads its options and calls the room that does the work.
+"""The command ``bufgym``, a thin layer: each command reads its options and calls the package that does the work.
 
-One module a command: its ``add`` puts the command and its options into the parser, and ``_parser`` calls each ``add``.
-Heavy modules are imported inside the function that needs them. A mistake of the caller's (an option, a file) ends in
-one line on stderr and exit code 2; Ctrl-C in 130.
+Each command has a module whose ``add`` puts the command and its options into the parser; ``_parser`` calls each
+``add``. Heavy modules are imported inside the function that needs them. A user's mistake in an option or a file gives
+one line on stderr and exit code 2. Ctrl-C gives exit code 130.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ __all__ = ["KINDS", "_LISTS", "environments", "main", "split_policies"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code."""
+    """Run one command; return the exit code."""
     options: argparse.Namespace = argparse.Namespace()
     _open_output()
     try:
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _open_output() -> None:
-    """Output that is closed is dropped; what its encoding lacks (a dash in ASCII) is written as ``\\u2013``."""
+    """Replace closed output by a null device, and write unencodable characters as escapes such as ``\\u2013``."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None or stream.closed:
@@ -87,7 +87,7 @@ def _open_output() -> None:
 
 
 def _drop_output() -> None:
-    """What the interpreter flushes at its exit has nowhere to go."""
+    """Discard output that the interpreter flushes at its exit."""
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
@@ -96,7 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(prog="bufgym", description="A robot's send buffer is full: which message should go?")
     parser.add_argument("--version", action="version", version=f"bufgym {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    # In the order in which --help shows them.
+    # In the order of --help.
     for module in (
         listing,
         bench,
@@ -132,10 +132,10 @@ def _failed(message: str, code: int = 2) -> int:
 
 
 def _gist(error: Exception) -> str:
-    """The part of Numba's long message that helps: what it could not compile, and the line of the source."""
+    """Extract from Numba's long message the construct that it could not compile and the source line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    # "File "mine.py", line 4:" comes last of all.
+    # The message ends with "File "mine.py", line 4:".
     place = [line.rstrip(":") for line in lines if line.startswith("File ")][-1:]
     reason = [line for line in lines if not line.startswith(("Failed in", "During:", "File ", "-", "^", "<"))][:1]
-    # Written out, the type of a buffer has some twenty fields.
+    # The full type of a buffer has some twenty fields.
     return re.sub(r"\bBuffer\(.*\)", "Buffer", "; ".join([*reason, *place]))

@@ -35,7 +35,7 @@ _FROZEN = (
     *("max_bytes", "decide_at", "interruption", "trace", "motion", "fps", "bytes", "size_cv", "seconds", "jitter"),
     *("scale", "value", "law", "t_min", "t_max", "t_mean", "workload", "drops", *WORKLOAD_OPTIONS, *OWN),
 )
-"""A suite has these of its own."""
+"""Options that a suite sets itself."""
 
 
 def _bench(options: argparse.Namespace) -> None:
@@ -70,7 +70,7 @@ def _scenario(options: argparse.Namespace) -> None:
     form = options.format or ("parquet" if files.has_pyarrow() else "csv")
     stream, about = scenario(options)
     if options.out is not None:
-        # Before the long work, so that a folder that cannot be made is known at once.
+        # Before the long work, so that an impossible folder is reported at once.
         out = Path(options.out)
         out.mkdir(parents=True, exist_ok=True)
         if (out / "manifest.json").exists():
@@ -95,7 +95,7 @@ def _scenario(options: argparse.Namespace) -> None:
 
 
 def _bound_notes(rows: Sequence[Mapping[str, Any]], stream: Scenario, decide_at: str) -> list[str]:
-    """What the clairvoyant could have had of a recording, and whether that is exact."""
+    """State the clairvoyant's result on a recording, and whether it is exact."""
     sizes = getattr(stream, "workload").size_bytes  # noqa: B009  (only an uplink has one)
     why = "message sizes differ" if sizes.min() < sizes.max() else f"decisions are asked at {decide_at}"
     notes = []
@@ -111,7 +111,7 @@ def _bound_notes(rows: Sequence[Mapping[str, Any]], stream: Scenario, decide_at:
 
 
 def _dropped(options: argparse.Namespace, chosen: Sequence[Policy], stream: Scenario, order: Sequence[str]) -> None:
-    """The messages that were dropped: by topic where there are several (policies in ``order``), each into --drops."""
+    """Print drops by topic if there are several, with policies in ``order``, and write each drop to --drops."""
     from bufgym.benchmark import drops
     from bufgym.scenario import Uplink
 

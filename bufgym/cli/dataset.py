@@ -1,4 +1,4 @@
-"""``bufgym dataset``: episodes of an expert, a fixed policy or chance, as a Minari data set."""
+"""``bufgym dataset``: episodes of an expert, a fixed policy or random actions as a Minari data set."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _make(options: argparse.Namespace) -> None:
 
 
 def _setting(text: str) -> tuple[str, Any]:
-    """``"t_max=60"`` -> ("t_max", 60): JSON where it is any, else text."""
+    """Parse ``"t_max=60"`` to ("t_max", 60); a value that is not JSON stays text."""
     name, sign, value = text.partition("=")
     if not (name.isidentifier() and sign):
         raise BufgymError(f"--option {text}: must be NAME=VALUE")

@@ -1,4 +1,4 @@
-"""``bufgym reproduce``: the papers' figures and tables again."""
+"""``bufgym reproduce``: reproductions of the papers' figures and tables."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _claims(page: Path, names: list[str], out: Path, data: Path | None) -> None:
 
 
 def _text(name: str, out: Path, data: Path | None, *, named: bool, live: bool) -> str:
-    """The figure; one that was not asked for by name is left out where it can't be made, such as without a library."""
+    """Make the figure; if it was not named, leave it out where it can't be made, such as without a library."""
     from bufgym import reproduce
 
     needs = reproduce.NEEDS_DATA.get(name)
@@ -81,7 +81,7 @@ def _text(name: str, out: Path, data: Path | None, *, named: bool, live: bool) -
 
 @contextmanager
 def _steps(name: str, runs: int, takes_s: float) -> Iterator[Callable[[], None]]:
-    """How far the live runs are: a bar, or lines where there is no terminal."""
+    """Show the progress of live runs as a bar, or as lines without a terminal."""
     from bufgym.benchmark.run import bar
 
     def note(text: str) -> None:

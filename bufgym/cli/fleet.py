@@ -1,4 +1,4 @@
-"""``bufgym fleet``: policies side by side on robots that share one cell; a short form of ``bufgym bench``."""
+"""``bufgym fleet``, short for ``bufgym bench`` with a fleet suite: policies compared on robots that share one cell."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def _list(options: argparse.Namespace) -> None:
 
 
 def environments() -> dict[str, str]:
-    """Id -> scenario of every environment that bufgym has registered with Gymnasium."""
+    """Map the id of every environment that bufgym registers with Gymnasium to its scenario."""
     import gymnasium
 
     specs = [spec for spec in gymnasium.registry.values() if spec.namespace == "bufgym"]
@@ -111,7 +111,7 @@ _SEVERAL = "with several topics besides"
 
 
 def _in_parts(parts: Mapping[str, Sequence[Sequence[str]]]) -> str:
-    """The rows of all parts in the same columns, each part under its title; those that every environment has first."""
+    """Print each part under its title in shared columns, first the rows that every environment has."""
     lines = columns([row for rows in parts.values() for row in rows]).split("\n")
     text: list[str] = []
     for title, rows in parts.items():
@@ -143,4 +143,4 @@ _LISTS: dict[str, Callable[[], str]] = {
 }
 
 KINDS = tuple(_LISTS)
-"""The arguments of ``list``, in the order in which it prints them all."""
+"""Arguments of ``list``, in the order of its full output."""

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from bufgym.live.validate import Play
 
 PORT = 7410
-"""Of a receiver, where none is named."""
+"""Default port of a receiver."""
 TRANSPORTS = ("tcp", "websocket", "zenoh", "mqtt", "dds")
 VALIDATED = (*TRANSPORTS[:3], "ros1", "ros2")
-"""What goes through a shaped link."""
+"""Transports that can go through a shaped link."""
 DEFAULT_POLICIES = ("drop-oldest", "afr", "min-motion-gap", "learned-motion")
 
 
@@ -94,7 +94,7 @@ def _add_ends(parts: Commands) -> None:
 
 
 def address(text: str) -> tuple[str, int]:
-    """Of ``HOST:PORT``."""
+    """Split ``HOST:PORT``."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_535:
         raise BufgymError(f"{text}: must be HOST:PORT")
@@ -102,7 +102,7 @@ def address(text: str) -> tuple[str, int]:
 
 
 def run_async(work: Coroutine[Any, Any, None]) -> None:
-    """Run it to its end, or to Ctrl-C."""
+    """Run until the end or Ctrl-C."""
     import asyncio
 
     asyncio.run(work)
@@ -166,7 +166,7 @@ def _validate(options: argparse.Namespace) -> None:
 
 
 def _play_over(transport: str) -> Play:
-    """How an episode is played there; an error where that is not installed."""
+    """Find the player for a transport; raise an error if it is not installed."""
     if transport == "ros1":
         from bufgym.ros1 import episode as ros1
 
@@ -181,7 +181,7 @@ def _play_over(transport: str) -> Play:
 
 
 def _command(options: argparse.Namespace) -> str:
-    """The command that validates this again."""
+    """Write the command that repeats this validation."""
     names = ("trace", "policies", "policy_file", "capacity", "seeds", "duration", "size", "scale", "transport", "speed")
     words = ["bufgym live validate"]
     for name, value in given(options, names).items():
@@ -207,11 +207,11 @@ def _replay(options: argparse.Namespace) -> None:
 
 
 REDRAW_S = 0.25
-"""A view is drawn again so often."""
+"""Time between two drawings of a view."""
 
 
 def _redraw(text: str) -> None:
-    """Over what stood there, on a terminal; below it in a file."""
+    """Redraw in place on a terminal; append to a file."""
     print(f"\x1b[H\x1b[J{text}" if sys.stdout.isatty() else f"{text}\n", flush=True)
 
 

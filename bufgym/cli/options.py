@@ -1,4 +1,4 @@
-"""What the commands share: the parser, the types of options, policies by name and from files, columns to print."""
+"""Parts shared by commands: the parser, types of options, policies by name and from files, printed columns."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ T = TypeVar("T")
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that raises BufgymError, like every other mistake of the caller's."""
+    """A parser that raises BufgymError, as for any other mistake of the user."""
 
     def error(self, message: str) -> NoReturn:
         raise BufgymError(f"{message} (see {self.prog} --help)")
 
 
 MAX_EPISODES = 100_000
-"""On each trace. Each is a row of every policy and capacity, all of them held in memory."""
+"""Limit on episodes of each trace; memory holds a row for each, times policies and capacities."""
 
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
-"""What ``add_subparsers`` returns: where commands are added."""
+"""Result of ``add_subparsers``, to which commands are added."""
 
 
 def command(commands: Commands, name: str, function: Callable[[argparse.Namespace], None], help: str) -> Parser:
-    """Add the command ``name``, which calls ``function`` with its options; its own parser, to add them to."""
+    """Add the command ``name``, which calls ``function`` with its options; return its parser."""
     parser = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
     parser.set_defaults(command=function)
     return parser
@@ -38,7 +38,7 @@ def command(commands: Commands, name: str, function: Callable[[argparse.Namespac
 
 
 def _checked(convert: Callable[[str], T], holds: Callable[[T], bool], rule: str) -> Callable[[str], T]:
-    """The type of an option: what ``convert`` makes of its text, if that ``holds``; ``rule`` says what it must be."""
+    """Make the type of an option: it converts the text, tests it with ``holds``, and names ``rule`` in errors."""
 
     def parse(text: str) -> T:
         try:
@@ -60,7 +60,7 @@ natural = _checked(int, lambda number: number >= 0, "a whole number >= 0")
 
 
 def episodes(text: str) -> int:
-    """How many seeds: a whole number from 1 to ``MAX_EPISODES``."""
+    """Parse a number of seeds, an integer from 1 to ``MAX_EPISODES``."""
     seeds = count(text)
     if seeds > MAX_EPISODES:
         raise argparse.ArgumentTypeError(f"{text}: must be at most {MAX_EPISODES}")
@@ -68,7 +68,7 @@ def episodes(text: str) -> int:
 
 
 def capacities(text: str) -> list[int]:
-    """Whole numbers >= 1, no two alike: ``"4,8,16"``."""
+    """Parse distinct integers >= 1, as in ``"4,8,16"``."""
     numbers = [count(part) for part in text.split(",")]
     for capacity in numbers:
         if numbers.count(capacity) > 1:
@@ -77,7 +77,7 @@ def capacities(text: str) -> list[int]:
 
 
 def split_policies(text: str) -> list[str]:
-    """``"afr,decimate:every=2,random"`` -> its three policies; a setting belongs to the policy before it."""
+    """Split a list such as ``"afr,decimate:every=2,random"``; a setting belongs to the policy before it."""
     specs: list[str] = []
     for part in text.split(","):
         if "=" in part and ":" not in part and specs:
@@ -91,11 +91,11 @@ SOURCES = (
     "; also mine.safetensors, mine.zip of stable-baselines3 or sb3-contrib, and module:function (a policy, or what"
     " makes one; from the current folder too): a zip and a module run code, so use only what you trust"
 )
-"""What ``--policies`` takes besides names, for commands that use ``loaded``."""
+"""Help text on sources that ``--policies`` takes besides names, in commands that use ``loaded``."""
 
 
 def policies_option(parser: argparse._ActionsContainer, default: str, also: str = "") -> None:
-    """Add the option ``--policies``; ``policy_specs`` reads it, or ``loaded``."""
+    """Add the option ``--policies``, which ``policy_specs`` or ``loaded`` reads."""
     parser.add_argument(
         "--policies",
         nargs="+",
@@ -105,12 +105,12 @@ def policies_option(parser: argparse._ActionsContainer, default: str, also: str 
 
 
 def policy_specs(texts: Sequence[str] | None) -> list[str]:
-    """The policies that ``--policies`` names, with commas or as several words; none if it was not given."""
+    """List the policies of ``--policies``, separated by commas or spaces; empty if it was not given."""
     return [spec for text in texts or () for spec in split_policies(text)]
 
 
 def loaded(texts: Sequence[str] | None) -> tuple[list[str], tuple[str, ...]]:
-    """The policies that ``--policies`` names, all of them registered now, and which of the words had to be loaded."""
+    """Register the policies of ``--policies``; return their names and the words that had to be loaded."""
     from bufgym.benchmark import sources
 
     words = policy_specs(texts)
@@ -122,13 +122,13 @@ def loaded(texts: Sequence[str] | None) -> tuple[list[str], tuple[str, ...]]:
 
 
 def given(options: argparse.Namespace, names: tuple[str, ...]) -> dict[str, Any]:
-    """Those of the options that the user gave."""
+    """Select the options that the user gave."""
     values = {name: getattr(options, name) for name in names}
     return {name: value for name, value in values.items() if value is not None and value is not False}
 
 
 def refuse(options: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
-    """An error for the first of these options that the user gave: ``--name why``."""
+    """Raise the error ``--name why`` for the first of these options that the user gave."""
     for name in given(options, names):
         raise BufgymError(f"--{name.replace('_', '-')} {why}")
 
@@ -155,7 +155,7 @@ def load_policies(path: str | None) -> None:
 
 
 def columns(lines: Sequence[Sequence[str]]) -> str:
-    """Left-aligned columns, indented; the last is not padded."""
+    """Align columns to the left, indented; the last is not padded."""
     lines = [list(map(printable, line)) for line in lines]
     widths = [max((len(line[c]) for line in lines), default=0) for c in range(max(map(len, lines), default=0))]
     return "\n".join(

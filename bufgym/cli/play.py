@@ -1,4 +1,4 @@
-"""``bufgym play``: a policy decides, in the terminal."""
+"""``bufgym play``: shows a policy's decisions in the terminal."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _play(options: argparse.Namespace) -> None:
     env: Any = gymnasium.make(id, capacity=options.capacity, render_mode="ansi").unwrapped
     player = Player(policy)
     env.reset(options={"episode": draw(env.rows.scenario, options.seed)})
-    # On a terminal each picture replaces the one before, unless the user wants no escape codes (no-color.org).
+    # On a terminal each picture replaces the one before, unless NO_COLOR (no-color.org) forbids escape codes.
     plain = not sys.stdout.isatty() or bool(os.environ.get("NO_COLOR"))
     clear = "" if plain else "\x1b[H\x1b[J"
 
@@ -54,7 +54,7 @@ def _play(options: argparse.Namespace) -> None:
         print(f"{clear}{policy.name}, decision {step + 1}\n{picture()}", flush=True)
         if options.speed:
             time.sleep(1 / options.speed)
-        # An episode that asks for no decision ends with its first step, whatever the action.
+        # An episode without decisions ends at its first step, whatever the action.
         due = env.rows.senders.batch.senders[0]["waiting"] != 0
         _, _, ended, _, info = env.step(player.action(env.rows.senders, 0) if due else options.capacity)
         if ended:

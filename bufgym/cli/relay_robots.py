@@ -113,7 +113,7 @@ def _demo(options: argparse.Namespace) -> None:
     async def show() -> None:
         shown, chosen = options.no_browser, registry.get(policy)
         if options.port and not await asyncio.to_thread(policies.kept, chosen):
-            # Seen at once is worth more than fast: a while later the fast ones take over.
+            # The uncompiled demo shows at once; compiled robots take over later.
             async with demo.uncompiled(_words(options)):
                 await asyncio.to_thread(policies.compiled, chosen)
             shown = True
@@ -135,7 +135,7 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _words(options: argparse.Namespace) -> list[str]:
-    """What a demonstration is called with that lasts only until this one begins: so it records nothing."""
+    """List the arguments of the interim demonstration, which records nothing and ends when this one begins."""
     words = ["--robots", str(options.robots), "--port", str(options.port)]
     words += [] if options.policies is None else ["--policies", options.policies]
     words += [] if options.foxglove is None else ["--foxglove", str(options.foxglove)]

@@ -1,4 +1,4 @@
-"""``bufgym report``: the page of a suite's run."""
+"""``bufgym report``: page of a suite's run."""
 
 from __future__ import annotations
 

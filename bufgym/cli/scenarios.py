@@ -1,4 +1,4 @@
-"""The scenario that options describe: a stream over traces, or one interruption."""
+"""Scenario that options describe: a stream over traces, or one interruption."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 _UPLINK_ONLY = ("trace", "motion", "seconds", "jitter", "size_cv", "scale", "workload", *WORKLOAD_OPTIONS)
 _STREAM_ONLY = ("fps", "bytes", "size_cv", "seconds", "jitter")
 OWN = ("scenario_file", "scenario")
-"""Options that name a scenario of one's own, which has all the others' answers itself."""
+"""Options that name a user's scenario, which replaces all other options."""
 _INTERRUPTION_ONLY = ("t_min", "t_max", "t_mean", "law")
 
 SCORE = "Score: 0 is Drop Oldest, 1 the clairvoyant; regret = 1 - QoI / the clairvoyant's."
-"""What the table's first columns are."""
+"""Legend of the table's first columns."""
 
 _PARAMETERS = {"fps": "rate_hz", "bytes": "size_bytes", "seconds": "duration_s"}
-"""Options whose parameter of the scenario has another name. Those that are not given have the scenario's defaults."""
+"""Options whose scenario parameter has another name. Options not given take the scenario's defaults."""
 
 
 def scenario_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that ``scenario`` reads, ``--seeds`` apart."""
+    """Add the options that ``scenario`` reads, except ``--seeds``."""
     about = "what is not given is as in bufgym/Uplink-v0; the first lines of the output say how that is"
     add = parser.add_argument_group("the stream and its link", about).add_argument
     links = "bandwidth traces: files, shipped names, or module:function, a seed -> Trace (default: shipped LTE)"
@@ -73,7 +73,7 @@ def scenario_options(parser: argparse.ArgumentParser) -> None:
 
 
 def scenario(options: argparse.Namespace) -> tuple[Scenario, str]:
-    """The scenario that the options describe, and a few lines about it."""
+    """Make the scenario that the options describe, and a few lines about it."""
     if given(options, OWN):
         return _own(options)
     unused = _UPLINK_ONLY if options.interruption else _INTERRUPTION_ONLY
@@ -89,12 +89,12 @@ def scenario(options: argparse.Namespace) -> tuple[Scenario, str]:
 
 
 def _given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Those of the options that the user gave, as parameters of the scenario."""
+    """Select the options that the user gave, as parameters of the scenario."""
     return {_PARAMETERS.get(name, name): value for name, value in given(options, names).items()}
 
 
 def _own(options: argparse.Namespace) -> tuple[Scenario, str]:
-    """A scenario by its name, after the file that registers it was run."""
+    """Find a scenario by name after running the file that registers it."""
     from bufgym import scenario as scenarios
     from bufgym.benchmark.run import by_trace
 
@@ -162,7 +162,7 @@ def _uplink(options: argparse.Namespace) -> tuple[Scenario, str]:
 
 
 def _recording(options: argparse.Namespace) -> tuple[Scenario, str]:
-    """A workload as it was recorded; with --seeds, from random places on each trace."""
+    """Make a workload as recorded; with --seeds it starts at random places of each trace."""
     from bufgym.scenario import Uplink
     from bufgym.traces import read_workload
 
@@ -194,7 +194,7 @@ def _recording(options: argparse.Namespace) -> tuple[Scenario, str]:
 
 
 def _value(options: argparse.Namespace, by_motion: bool) -> Value:
-    """V as the options say, or the default over a recording's motion or over frame indices."""
+    """Choose V by the options, or the default over a recording's motion or over frame indices."""
     from bufgym.model import qoi
 
     if options.value is not None:
@@ -225,12 +225,12 @@ def _links(options: argparse.Namespace) -> tuple[Trace, ...]:
 
 
 def _motions(names: Sequence[str], options: argparse.Namespace) -> tuple[Motion, ...]:
-    """Motions by their shipped names or from files; none for ``["none"]``."""
+    """Load motions by shipped name or from files; ``["none"]`` gives none."""
     return () if list(names) == ["none"] else tuple(_motion(name, options) for name in names)
 
 
 def _motion(name: str, options: argparse.Namespace) -> Motion:
-    """A motion by its shipped name or from a file, measured as the options say."""
+    """Load a motion by shipped name or from a file, measured as the options say."""
     from bufgym import traces
     from bufgym.traces.formats.motions import MOTION_HEADER
 
@@ -244,7 +244,7 @@ def _motion(name: str, options: argparse.Namespace) -> Motion:
 
 
 def _with_gaps(motion: Motion) -> str:
-    """Its name, and how much of it is guessed."""
+    """Write its name and the interpolated share."""
     if not motion.gaps:
         return motion.name
     return f"{motion.name} (gaps bridged: {len(motion.gaps)}, the longest {motion.longest_gap_s:.1f} s)"

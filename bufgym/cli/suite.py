@@ -1,4 +1,4 @@
-"""What the commands that run a suite share: ``bufgym bench --suite``, ``bufgym topics`` and ``bufgym fleet``."""
+"""Parts shared by commands that run a suite: ``bufgym bench --suite``, ``bufgym topics`` and ``bufgym fleet``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SUITE_OPTIONS = ("split", "data", "jobs", "backend", "address")
 
 
 def suite_options(parser: argparse.ArgumentParser, default: str = "") -> None:
-    """Add the options that choose a suite and where it runs."""
+    """Add the options that choose a suite and its machines."""
     option = parser.add_argument_group("a suite: frozen episodes, scored, with a report").add_argument
     which = f"which (default: {default})" if default else "which ('bufgym list suites')"
     option("--suite", metavar="NAME", help=f"{which}; --out DIR keeps it, a second call resumes it")
@@ -40,7 +40,7 @@ def suite_options(parser: argparse.ArgumentParser, default: str = "") -> None:
 
 
 def who_options(parser: argparse.ArgumentParser, policies: str, capacity: str, seeds: str) -> None:
-    """Add the options that say who runs; the arguments tell the defaults."""
+    """Add the options for policies, capacities and seeds; the arguments describe the defaults."""
     group = parser.add_argument_group("who runs")
     policies_option(group, policies, SOURCES)
     group.add_argument("--capacity", type=capacities, metavar="L,...", help=f"capacities L, messages ({capacity})")
@@ -49,7 +49,7 @@ def who_options(parser: argparse.ArgumentParser, policies: str, capacity: str, s
 
 
 def out_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """Add the options that say where results go; their group."""
+    """Add the options for the output; return their group."""
     group = parser.add_argument_group("where results go")
     target = "write rows and what was run into this folder, or rows alone into this .csv or .parquet file"
     group.add_argument("--out", metavar="DIR", help=target)
@@ -58,7 +58,7 @@ def out_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
 
 
 def target(options: argparse.Namespace) -> Path | None:
-    """The file that ``--out`` names; None for a folder or nothing. An error for another kind of file."""
+    """Find the file of ``--out``; None for a folder or nothing. Another kind of file is an error."""
     from bufgym.benchmark.rows import checked_target, has_pyarrow
 
     if options.format == "parquet" and options.out is not None and not has_pyarrow():
@@ -74,13 +74,13 @@ def target(options: argparse.Namespace) -> Path | None:
 def run_suite(
     options: argparse.Namespace, command: str, changes: tuple[str, ...] = (), kind: str | None = None
 ) -> list[Row]:
-    """Run the suite that the options name and print its summary; its rows.
+    """Run the suite that the options name, print its summary and return its rows.
 
     Args:
-        options: with all that the functions above add.
-        command: of bufgym, such as "topics".
+        options: must have all options that the functions above add.
+        command: subcommand of bufgym, such as "topics".
         changes: options that change parameters of the suite's scenarios.
-        kind: of task; an error for a suite of another.
+        kind: kind of task; a suite of another kind is an error.
     """
     from bufgym.benchmark import report
     from bufgym.benchmark.rows import write_rows
@@ -126,7 +126,7 @@ def run_suite(
 
 
 def _command(options: argparse.Namespace, command: str, changes: tuple[str, ...]) -> str:
-    """The command that runs this again."""
+    """Write the command that repeats this run."""
     words = [f"bufgym {command} --suite", options.suite]
     names = ("split", "policies", "capacity", "seeds", *changes, "policy_file", "data", "out")
     for name, value in given(options, names).items():

@@ -1,4 +1,4 @@
-"""``bufgym topics``: policies side by side on clients with several topics; a short form of ``bufgym bench``."""
+"""``bufgym topics``, short for ``bufgym bench`` with a topics suite: policies compared on clients with topics."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _own_client(options: argparse.Namespace, specs: list[str]) -> list[dict[str,
         motion=() if motions == ["none"] else tuple(traces.load_motion(name) for name in motions),
         scale=options.scale or 1.0,
     )
-    # Not with the file's own, whose name an error would blame.
+    # Outside the file's own block, whose error would name the file.
     client = replace(client, **given(options, CHANGES))
     chosen = [policies.get(spec) for spec in (specs if task.baseline in specs else [*specs, task.baseline])]
     seeds, label = options.seeds or SEEDS, Path(options.config).stem

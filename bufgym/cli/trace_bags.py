@@ -62,7 +62,7 @@ def _motion_options(parser: argparse._ActionsContainer) -> None:
 
 
 def motion_settings(options: argparse.Namespace) -> MotionSettings | None:
-    """The options on how motion is measured; None if none of them was given."""
+    """Read the options for measuring motion; None if none was given."""
     from bufgym.traces import MotionSettings
 
     values = {name: getattr(options, name) for name in MOTION_OPTIONS if getattr(options, name) is not None}
@@ -70,7 +70,7 @@ def motion_settings(options: argparse.Namespace) -> MotionSettings | None:
 
 
 def workload_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    """The workload options that were given, as arguments of ``read_workload``; those on motion only with odometry."""
+    """Collect the given workload options for ``read_workload``; motion options need odometry."""
     arguments: dict[str, Any] = {}
     if options.topics is not None:
         arguments["topics"] = [name for text in options.topics for name in text.split(",") if name]
@@ -89,7 +89,7 @@ def refuse_motion(options: argparse.Namespace, why: str) -> None:
 
 
 def workload_lines(workload: Workload) -> list[str]:
-    """A table of its topics, and what there is to know about its motion."""
+    """Write a table of its topics and a description of its motion."""
     from bufgym.benchmark.table import aligned
 
     cells = [["topic", "messages", "rate (1/s)", "bytes", "mean bytes", "share"]]
@@ -146,7 +146,7 @@ def _from_poses(options: argparse.Namespace) -> None:
 
 
 def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
-    """Every topic of a recording with its type, those without messages at the end."""
+    """List every topic of a recording with its type, topics without messages last."""
     from bufgym.benchmark.table import aligned
     from bufgym.traces.formats.bag_poses import carries_poses
 

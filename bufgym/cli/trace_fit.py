@@ -58,7 +58,7 @@ def _fit(options: argparse.Namespace) -> None:
 
 
 def _of_files(options: argparse.Namespace) -> dict[str, list[Float64Array]]:
-    """Rates by mode, of the files that the options name."""
+    """Collect rates by mode from the files that the options name."""
     from bufgym.traces.fit.fit import mode_of, rates_of
 
     if not options.files:
@@ -73,7 +73,7 @@ def _of_files(options: argparse.Namespace) -> dict[str, list[Float64Array]]:
 
 
 def _of_suites(options: argparse.Namespace) -> dict[str, list[Float64Array]]:
-    """Rates by mode, of the links in the training splits of suites; validation and test stay unseen."""
+    """Collect rates by mode from links in suites' training splits; validation and test stay unseen."""
     from bufgym.scenario import suites
     from bufgym.traces.trace import US_PER_S
 
@@ -88,7 +88,7 @@ def _of_suites(options: argparse.Namespace) -> dict[str, list[Float64Array]]:
 
 
 def _command(options: argparse.Namespace) -> str:
-    """The command to repeat it: each folder's files as a pattern, relative to the folder that all have in common."""
+    """Write the command to repeat it, with each folder's files as a pattern relative to their common folder."""
     if options.suite is not None:
         data = "" if options.data is None else " --data DIR"
         return f"bufgym trace fit --suite {','.join(options.suite)}{data} -o {Path(options.out).name}"

@@ -1,6 +1,6 @@
 """``bufgym trace generate``: links, motions and frame sizes from a seed.
 
-The options of a link have the names of its generator's parameters (`dest`), and are passed on to it.
+A link's options have its generator's parameter names as `dest` and are passed on to the generator.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _range(text: str) -> tuple[float, float]:
 
 
 def _generate(options: argparse.Namespace) -> None:
-    """Write the link that `options.generator` makes of the options that bear its parameters' names."""
+    """Write the link that `options.generator` makes from the options named like its parameters."""
     from bufgym import traces
 
     generator = getattr(traces, options.generator)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _PICTURES = (".png", ".svg", ".pdf")
 _MOST_DRAWN = 5_000
-"""Rates in a picture, which is some 1300 pixels wide; more are drawn as means over as many windows."""
+"""Most rates in a picture some 1300 pixels wide; more rates are averaged over this many windows."""
 
 
 def add(commands: Commands) -> None:
@@ -105,7 +105,7 @@ def _with_members(names: list[str]) -> list[str]:
         try:
             members = traces.members(name) if Path(name).is_file() else []
         except TraceError:
-            members = []  # reading it says what is wrong
+            members = []  # reading it reports the error
         expanded += [f"{name}:{member}" for member in members] if len(members) > 1 else [name]
     return expanded
 
@@ -129,7 +129,7 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
-    """Each file with its target: ``out`` for a single one, else a file of its name in the folder ``out``."""
+    """Pair each file with its target: ``out`` for a single file, else a file of its name in the folder ``out``."""
     if len(names) == 1 and not out.is_dir():
         if out.exists() and Path(names[0]).exists() and out.samefile(names[0]):
             raise BufgymError(f"--out {out}: must not be the file that is read")

@@ -33,7 +33,7 @@ def _tune(options: argparse.Namespace) -> None:
 
 
 def _command(options: argparse.Namespace) -> str:
-    """The command that runs this again; the folder of recordings lies elsewhere on another machine."""
+    """Write the command that repeats this; another machine has its own folder of recordings."""
     words = ["bufgym tune", options.suite]
     for name, default in (("policies", None), ("split", "validation"), ("seeds", None)):
         value = getattr(options, name)

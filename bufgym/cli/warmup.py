@@ -1,4 +1,4 @@
-"""``bufgym warmup``: compile beforehand, so that nothing waits for it later."""
+"""``bufgym warmup``: compiles everything beforehand, so that nothing waits for it later."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _warmup(options: argparse.Namespace) -> None:
         return
     began_s = time.perf_counter()
     print(f"compiling {len(warmup.PARTS)} parts: {', '.join(warmup.PARTS)}", flush=True)
-    # A process for each core. What two of them need is compiled by both; the code is the same.
+    # A process for each core. Code that two of them need is compiled twice, with equal results.
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
         parts = {processes.submit(warmup.compile_part, what): what for what in warmup.PARTS}
         for number, part in enumerate(as_completed(parts), 1):

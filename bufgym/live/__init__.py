@@ -1,8 +1,8 @@
-"""The simulator's sender on a real link: the same compiled transition, with a clock as its argument.
+"""The simulator's sender on a real link: the same compiled transition function, driven by a clock.
 
-``PolicyQueue`` is a queue that any registered policy rules. Transports send what it hands out and tell it when that
-has left; ``Receiver`` is the other end, ``ShapedLink`` a trace between the two. What happened is logged, and
-``replay`` runs a log through the simulator, which makes the same decisions, bit for bit.
+``PolicyQueue`` is a queue ruled by any registered policy. A transport sends its messages and reports when each has
+left. ``Receiver`` is the other end, and ``ShapedLink`` plays a trace between the two. ``replay`` runs the queue's log
+through the simulator, which makes the same decisions, bit for bit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ __all__ = ["Item", "LogFile", "PolicyQueue", "Replay", "read_log", "replay"]
 
 
 def __getattr__(name: str) -> Any:
-    """Not at start-up: these need the compiler, and a relay that wants the sockets is up in a third of the time."""
+    """Import the compiled parts at first use, so that a relay, which needs only the sockets, starts three times
+    faster."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from bufgym.live import log, queue, replaying

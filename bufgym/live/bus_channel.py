@@ -1,8 +1,8 @@
-"""Frames over a publish-subscribe library, which hides its socket: each frame is one message of its.
+"""Frames over a publish-subscribe library, one library message per frame; the library hides its socket.
 
 A sender has a name of its own for every connection. It publishes to the receiver under that name and hears what the
-receiver publishes for it. What is gone when a connection breaks, no library of these tells: so a receiver shows that it
-is there, and a sender that sees it go gives the connection up. An empty message hangs up.
+receiver publishes for it. None of these libraries tells which messages a broken connection lost. So a receiver
+announces its presence, and a sender that sees it go gives the connection up. An empty message hangs up.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from typing import Any, Final, Protocol
 from bufgym.live.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, header, whole
 
 _MOST_WAITING: Final = 1024
-"""Frames that came and were not taken: more than a sender ever has unacked."""
+"""Limit on frames waiting to be taken, more than a sender ever has unacked."""
 
 
 class Bus(Protocol):
-    """One end in such a library."""
+    """One end of a connection in such a library."""
 
     def publish(self, name: str, data: bytes) -> None:
-        """Send it, to or from the sender of this name. May block while the link is busy."""
+        """Send data to or from the sender of this name; may block while the link is busy."""
 
     def close(self) -> None:
-        """Leave. May block."""
+        """Leave; may block."""
 
 
 Hear = Callable[[str, bytes], None]
-"""(name, data): called from the library's threads with what came to or from the sender of this name."""
+"""Called with (name, data) from the library's threads when data to or from the sender of this name arrive."""
 Peer = Callable[[bool], None]
-"""Called from the library's threads: the receiver is there, or no more."""
+"""Called from the library's threads with True when the receiver appears and False when it goes."""
 Open = Callable[[str, int, str, Hear, Peer], Bus]
-"""(host, port, the sender's name or "" for the receiver, hear, peer) -> ``Bus``; an OSError where it can't."""
+"""(host, port, sender's name or "" for the receiver, hear, peer) -> ``Bus``; raises an OSError if it can't."""
 
 
 class BusChannel:
@@ -52,7 +52,7 @@ class BusChannel:
 
     @classmethod
     async def connect(cls, opening: Open, host: str, port: int, *, small: bool = True) -> BusChannel:
-        """A sender's connection, once the receiver is there. Its buffers are the library's, whatever ``small`` says."""
+        """Connect a sender once the receiver is there; ``small`` has no effect on the library's buffers."""
         channel = cls(os.urandom(8).hex())
         made = asyncio.ensure_future(
             asyncio.to_thread(
@@ -78,11 +78,11 @@ class BusChannel:
             self._loop.call_soon_threadsafe(do, *arguments)
 
     def take(self, data: bytes) -> None:
-        """What came."""
+        """Take data that arrived."""
         self._came.put_nowait(data if self._came.qsize() < _MOST_WAITING else b"")
 
     def peer(self, there: bool) -> None:
-        """The receiver is there, or no more: that ends what was begun with it."""
+        """Note that the receiver is there or gone; its going ends the connection."""
         self.soon(self._there.set if there else self._lost)
 
     def _lost(self) -> None:
@@ -115,17 +115,17 @@ class BusServer:
         self._loop = asyncio.get_running_loop()
         self._bus: Bus | None = None
         self._early: list[tuple[str, bytes]] | None = []
-        """What came before ``listen`` had the bus in its hands."""
+        """Data that arrived before ``listen`` had the bus."""
 
     async def listen(self, opening: Open, host: str, port: int) -> None:
-        """Be there."""
+        """Announce the receiver and listen."""
         self._bus = await asyncio.to_thread(opening, host, port, "", self._hear, lambda there: None)
         early, self._early = self._early or [], None
         for name, data in early:
             self._take(name, data)
 
     async def close(self) -> None:
-        """Be there no more."""
+        """Withdraw the receiver and close."""
         bus, self._bus = self._bus, None
         if bus is not None:
             await asyncio.to_thread(bus.close)
@@ -153,7 +153,7 @@ class BusServer:
 
 
 def _abandoned(made: asyncio.Future[Bus]) -> None:
-    """Close what was opened for nobody."""
+    """Close a bus whose opener has given up."""
     if not made.cancelled() and made.exception() is None:
         _close(made.result())
 
@@ -163,7 +163,7 @@ def _close(bus: Bus) -> None:
 
 
 def _aside(do: Callable[..., None], *arguments: Any) -> None:
-    """Do it in a thread of its own: it may block as long as the link does, and nobody waits for it."""
+    """Call it in a thread of its own, because it may block as long as the link does."""
 
     def quietly() -> None:
         with contextlib.suppress(Exception):

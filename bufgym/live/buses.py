@@ -24,16 +24,16 @@ from bufgym.live.sockets import DEAD_AFTER_S, small_buffers
 
 ROOT: Final = "bufgym"
 MQTT_PORT: Final = 1883
-"""Of a broker, by its standard."""
+"""Standard port of an MQTT broker."""
 CONNECT_S: Final = 1.0
-"""For a receiver of Zenoh's to answer."""
+"""Time for a Zenoh receiver to answer."""
 
 
 # --- Zenoh ------------------------------------------------------------------------------------------------------------
 
 
 class ZenohBus:
-    """A session of Zenoh. A full queue of its holds the sender up; by default it would drop."""
+    """A Zenoh session. Its full queue blocks the sender; by default it would drop."""
 
     def __init__(self, host: str, port: int, name: str, hear: Hear, peer: Peer) -> None:
         with needs("zenoh", "zenoh"):
@@ -48,7 +48,7 @@ class ZenohBus:
             "connect/endpoints": [f"tcp/{host}:{port}"] if name else [],
             "connect/timeout_ms": round(CONNECT_S * 1000),
             "connect/exit_on_failure": True,
-            "transport/shared_memory/enabled": False,  # it would carry bodies past the link, on one machine
+            "transport/shared_memory/enabled": False,  # on one machine it would carry bodies past the link
             "transport/link/tx/lease": round(DEAD_AFTER_S * 1000),
             "transport/link/tx/queue/congestion_control/block/wait_before_close": round(DEAD_AFTER_S * 1e6),
         }.items():
@@ -86,7 +86,7 @@ class ZenohBus:
 
 
 class MqttBus:
-    """A client of an MQTT broker. That the receiver is there is a retained message, and its going the broker's will."""
+    """A client of an MQTT broker. A retained message announces the receiver, and the broker's will its end."""
 
     def __init__(self, host: str, port: int, name: str, hear: Hear, peer: Peer) -> None:
         with needs("paho"):
@@ -147,7 +147,7 @@ class MqttBus:
 
 
 def _prompt(connection: Any) -> None:
-    """Little waits in the system, and small packets are not held back."""
+    """Keep the system's buffers small, and send small packets at once."""
     small_buffers(connection)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -160,13 +160,13 @@ _DDS: Final = """<CycloneDDS><Domain Id="any">
 <Peers><Peer Address="{host}"/></Peers><LeaseDuration>{lease_s:g}s</LeaseDuration>
 <Ports><Base>{base}</Base><DomainGain>0</DomainGain></Ports></Discovery></Domain></CycloneDDS>"""
 _FIRST_PORT: Final = 10
-"""From DDS's base port to that of the first participant."""
+"""Offset of the first participant's port from DDS's base port."""
 _domains: Final[dict[int, Any]] = {}
-"""By number; its settings hold for the process."""
+"""Domains by number; a domain's settings hold for the process."""
 
 
 class DdsBus:
-    """A participant of DDS. The port decides the domain's number, so that other domains do not hear it."""
+    """A DDS participant. The port sets the domain's number, so that other domains do not hear it."""
 
     def __init__(self, host: str, port: int, name: str, hear: Hear, peer: Peer) -> None:
         with needs("cyclonedds", "dds"):
@@ -194,10 +194,10 @@ class DdsBus:
         threading.Thread(target=self._listen, args=(name, hear, peer), daemon=True).start()
 
     def _listen(self, name: str, hear: Hear, peer: Peer) -> None:
-        """Hand on what comes, and whether the other end is there.
+        """Hand on messages and the other end's presence.
 
-        A listener of the library's would do so in a thread of the library's. But there Python's garbage collector may
-        delete an end that was closed before, which waits for that very thread.
+        A listener of the library would run in the library's thread. Python's garbage collector may delete a closed end
+        there, and that deletion waits for the same thread.
         """
         from cyclonedds.core import DDSStatus, ReadCondition, SampleState, WaitSet
         from cyclonedds.util import duration
@@ -236,4 +236,4 @@ class DdsBus:
 
 
 BUSES: Final[dict[str, Open]] = {"zenoh": ZenohBus, "mqtt": MqttBus, "dds": DdsBus}
-"""Both ends of each."""
+"""Name of a library -> class that opens either end."""

@@ -1,4 +1,4 @@
-"""Connections that hide no queue: TCP as it is, WebSocket, and the table of all transports."""
+"""Connections that hide no queue: TCP, WebSocket, and the table of all transports."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from bufgym.live.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, 
 from bufgym.live.sockets import connected, unacked_bytes
 
 PIECE_BYTES: Final = 16_384
-"""Written at a time, so that ``left_bytes`` is known while a large message is under way."""
+"""Bytes written at a time, so that ``left_bytes`` is known while a large message is under way."""
 
 
 class Channel(Protocol):
     """A connection on which frames go both ways."""
 
     async def send(self, frame: Frame) -> None:
-        """Returns when the system has taken the last byte."""
+        """Send a frame; return when the system has taken the last byte."""
 
     async def receive(self) -> Frame:
-        """The next frame; a ConnectionError when there is none any more."""
+        """Receive the next frame; raise a ConnectionError when there are no more."""
 
     def left_bytes(self) -> int | None:
-        """Bytes given to ``send`` that the peer's system has not acked; None where nobody can tell."""
+        """Bytes given to ``send`` that the peer's system has not acked; None if unknown."""
 
     def close(self) -> None:
-        """At once."""
+        """Close at once."""
 
 
 class TcpChannel:
@@ -45,7 +45,7 @@ class TcpChannel:
 
     @classmethod
     async def connect(cls, host: str, port: int, *, small: bool = True) -> TcpChannel:
-        """A sender's connection; ``small=False`` leaves the system's buffers as they are."""
+        """Connect a sender; ``small=False`` leaves the system's buffers as they are."""
         return cls(await connected(host, port, small))
 
     async def send(self, frame: Frame) -> None:
@@ -88,7 +88,7 @@ class WebSocketChannel:
 
     @classmethod
     async def connect(cls, host: str, port: int, *, small: bool = True) -> WebSocketChannel:
-        """A sender's connection; ``small=False`` leaves the library's and the system's buffers as they are."""
+        """Connect a sender; ``small=False`` leaves the library's and the system's buffers as they are."""
         with needs("websockets"):
             from websockets.asyncio.client import connect
             from websockets.exceptions import WebSocketException
@@ -128,7 +128,7 @@ class WebSocketChannel:
 
 @contextlib.contextmanager
 def _as_connection_errors() -> Any:
-    """What ``websockets`` raises when a connection ends, as a ConnectionError."""
+    """Convert errors of ``websockets`` at a connection's end to a ConnectionError."""
     from websockets.exceptions import WebSocketException
 
     try:
@@ -142,4 +142,4 @@ TRANSPORTS: Final[dict[str, Callable[..., Any]]] = {
     "websocket": WebSocketChannel.connect,
     **{name: partial(BusChannel.connect, opening) for name, opening in BUSES.items()},
 }
-"""How a sender connects: (host, port, small=True) -> a ``Channel``."""
+"""Transport -> function that connects a sender: (host, port, small=True) -> a ``Channel``."""

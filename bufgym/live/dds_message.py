@@ -1,4 +1,4 @@
-"""What goes over DDS, as the library wants it described. (It reads the types at once, so they can't be strings.)"""
+"""Message type for DDS; the library reads the annotations at import, so they can't be strings."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +22,6 @@ class Message(IdlStruct, typename="bufgym.Message"):  # type: ignore[misc, call-
 _RELIABLE = Policy.Reliability.Reliable(duration(seconds=20))
 QUALITY: dict[str, Any] = {
     "up": Qos(_RELIABLE, Policy.History.KeepAll),
-    # The sender may hear later than it is heard: what it was answered is kept for it.
+    # The sender may discover the receiver late, so answers are kept for it.
     "down": Qos(_RELIABLE, Policy.History.KeepLast(1024), Policy.Durability.TransientLocal),
 }

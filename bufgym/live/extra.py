@@ -1,4 +1,4 @@
-"""What the extras ``live``, ``zenoh`` and ``dds`` bring, imported where it is used."""
+"""Libraries of the extras ``live``, ``zenoh`` and ``dds``, imported where they are used."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bufgym.errors import BufgymError, install
 
 @contextmanager
 def needs(library: str, extra: str = "live", room: str = "bufgym.live") -> Iterator[None]:
-    """An error that names ``room`` and ``extra`` if ``library`` is missing, which the block imports."""
+    """Raise an error that names ``room`` and ``extra`` if the block can't import ``library``."""
     try:
         yield
     except ModuleNotFoundError as error:

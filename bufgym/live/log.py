@@ -1,7 +1,7 @@
-"""What happened at a live queue, record by record: enough to decide it all again in the simulator.
+"""Log of a live queue's events, with enough detail to repeat every decision in the simulator.
 
-Records are small dictionaries; in a file each is a JSON message of an MCAP recording (extra ``live``), on a channel of
-its event:
+Records are small dictionaries. In a file each is a JSON message of an MCAP recording on the channel of its event. Files
+need the extra ``live``.
 
 | event | fields besides ``us``, the time |
 |---|---|
@@ -33,7 +33,7 @@ Record = dict[str, Any]
 EVENTS: Final = ("settings", "put", "dequeued", "gone", "dropped")
 MAX_RECORD_BYTES: Final = 2**20
 _FLUSH_US: Final = 500_000
-"""A sender that is killed loses what it logged in the time since the last flush."""
+"""Time between flushes; a killed sender loses its log since the last one."""
 
 
 def settings(
@@ -45,7 +45,7 @@ def settings(
     topics: Sequence[Topic],
     window: int,
 ) -> Record:
-    """The first record of a log: all that a queue was made with. V stands there by its numbers, which are exact."""
+    """Make the first record of a log, with all settings of the queue; V is stored as its exact numbers."""
     return {
         "event": "settings",
         "us": 0,
@@ -67,12 +67,12 @@ def _numbers(value: Value) -> Record:
 
 
 def value_of(v: Record) -> Value:
-    """V, of what ``settings`` wrote of it."""
+    """Restore V from the record that ``settings`` made."""
     return Value(v["name"], np.array(v["numbers"], np.float64))
 
 
 class LogFile:
-    """A log in an MCAP file: call it with each record, and close it."""
+    """A log in an MCAP file; call it with each record, then close it."""
 
     def __init__(self, path: str | Path) -> None:
         with needs("mcap"):
@@ -100,7 +100,7 @@ class LogFile:
             self._flushed_us = now_us
 
     def close(self) -> None:
-        """Finish the file. A log that was not closed can be read as well."""
+        """Finish the file; a log that was not closed can also be read."""
         if not self._file.closed:
             cast(Any, self._writer).finish()
             self._file.close()
@@ -113,10 +113,10 @@ class LogFile:
 
 
 def read_log(path: str | Path) -> list[Record]:
-    """The records of a log file, also of one that breaks off.
+    """Read the records of a log file, which may be cut short.
 
     Raises:
-        BufgymError: no such file, no MCAP file, or a record that is not one of ``EVENTS``.
+        BufgymError: there is no such file, it is not MCAP, or a record is not one of ``EVENTS``.
     """
     with needs("mcap"):
         from mcap.records import Message
@@ -131,7 +131,7 @@ def read_log(path: str | Path) -> list[Record]:
         raise BufgymError(f"{path}: {error.strerror or error}") from None
     except BufgymError:
         raise
-    except Exception as error:  # mcap meets the end of a file cut short in many ways
+    except Exception as error:  # mcap raises many kinds of errors at the end of a cut file
         if not records:
             raise BufgymError(f"{path}: no log of a live queue: {type(error).__name__}") from None
     if not records or records[0]["event"] != "settings":
@@ -150,5 +150,5 @@ def _record(path: str | Path, k: int, data: bytes) -> Record:
 
 
 def of(records: Sequence[Record], event: str) -> Iterator[Record]:
-    """The records of one event."""
+    """Select the records of one event."""
     return (record for record in records if record["event"] == event)

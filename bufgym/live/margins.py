@@ -1,4 +1,4 @@
-"""By how much a policy beats another on real sockets, and by how much in the simulator, over the same episodes."""
+"""Margins between policies on real sockets and in the simulator, over the same episodes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bufgym.live.runs import Run, by_policy
 
 @dataclass(frozen=True)
 class Margin:
-    """How much lower a policy's regret is than the reference's, with intervals over the episodes that both met."""
+    """Reduction of a policy's regret relative to the reference, with intervals over the episodes that both met."""
 
     policy: str
     reference: str
@@ -31,7 +31,7 @@ class Margin:
     live: Interval
     simulated: Interval
     share: Interval
-    """Live over simulated."""
+    """Live margin over simulated margin."""
 
     def __str__(self) -> str:
         live, simulated, share = map(_percent, (self.live, self.simulated, self.share))
@@ -47,10 +47,11 @@ def _percent(interval: Interval) -> str:
 def margins(
     runs: Sequence[Run], reference: str = "afr", *, resamples: int = 2000, confidence: float = 0.95, seed: int = 0
 ) -> list[Margin]:
-    """Of each other policy, the best in the simulator first; none without the reference or with a single episode.
+    """Compute each policy's margin over ``reference``, the best in the simulator first; [] without data.
 
-    Regret is on sums over the episodes. Intervals are paired percentile bootstraps over them (see ``score``): live and
-    simulated runs of an episode, and those over several transports, are drawn together.
+    The list is empty without the reference or with a single episode. Regret is computed on sums over the episodes.
+    Intervals are paired percentile bootstraps over episodes, as in ``score``. All runs of an episode, live and
+    simulated and over any transport, are drawn together.
     """
     check_resampling(resamples, confidence)
     policies = by_policy(runs)
@@ -70,7 +71,7 @@ def margins(
 
 
 def _sums(ours: Sequence[Run], theirs: Sequence[Run]) -> Numbers:
-    """[episodes, 3] over the transports of each: H less the other's H, live and simulated, and the clairvoyant's."""
+    """Sum over transports: H less the other's H, live and simulated, and the clairvoyant's H; [episodes, 3]."""
     episodes: dict[tuple[str, int], list[float]] = {}
     others = {(one.transport, one.link, one.seed): one for one in theirs}
     for one in ours:

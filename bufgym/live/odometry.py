@@ -1,6 +1,6 @@
-"""x on board: how far the scene has moved on, summed from a robot's odometry as it comes.
+"""x on board: the scene's motion, summed from a robot's odometry as it arrives.
 
-The same sum over the same poses as ``bufgym.traces.motion_from_poses`` makes of a recording.
+For the same poses the sum equals that of ``bufgym.traces.motion_from_poses`` over a recording.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from bufgym.traces import MotionSettings
 from bufgym.traces.poses import angles
 
 _NORM = 0.9, 1.1
-"""Of a quaternion that is one: some drivers send zeros until they know better."""
+"""Norms of a valid quaternion; some drivers send zeros at first."""
 
 
 class Odometry:
@@ -24,11 +24,11 @@ class Odometry:
     def __init__(self, settings: MotionSettings | None = None) -> None:
         self.settings = settings or MotionSettings()
         self.x = 0.0
-        """Units of the view, from 0; it never falls."""
+        """Motion so far in fields of view; it starts at 0 and never falls."""
         self._last: tuple[float, Any, Any] | None = None
 
     def __call__(self, time_s: float, position_m: Sequence[float], quaternion: Sequence[float]) -> None:
-        """A pose. One that comes sooner than the settings' rate allows, or that is no pose, counts for nothing.
+        """Take a pose; ignore an invalid one, and one that comes sooner than the settings' rate allows.
 
         Args:
             time_s: its time; if it falls (a restarted simulation), the sum goes on from this pose.
@@ -41,7 +41,7 @@ class Odometry:
             return
         turn /= norm
         if self._last is not None and time_s >= self._last[0]:
-            # Odometry at just this rate jitters by some percent.
+            # Odometry at this very rate jitters by some percent.
             if time_s - self._last[0] < 0.9 / self.settings.rate_hz:
                 return
             turned_rad = float(angles(self._last[2], turn)[0])
@@ -50,7 +50,7 @@ class Odometry:
         self._last = time_s, position, turn
 
     def take(self, message: Any) -> None:
-        """A ROS message with a header and a pose: Odometry, PoseStamped, PoseWithCovarianceStamped; of ROS 1 or 2."""
+        """Take an Odometry, PoseStamped or PoseWithCovarianceStamped of ROS 1 or 2."""
         stamp, pose = message.header.stamp, message.pose
         while hasattr(pose, "pose"):
             pose = pose.pose

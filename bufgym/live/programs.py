@@ -1,6 +1,6 @@
-"""The programs of an episode on ROS: nodes and relays, each a process of its own.
+"""Programs of an episode on ROS: nodes and relays, each in a process of its own.
 
-They are forked from this one, so that any policy comes along as it is, and nothing is compiled again.
+They are forked from this process, so that any policy comes along unchanged and nothing is compiled again.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from bufgym.traces import MotionSettings
 CAMERA, ODOMETRY = "/camera", "/odom"
 """The topics: ``CompressedImage``, whose ``format`` is the frame's number, and ``PoseStamped``."""
 SILENCE_S: Final = 120.0
-"""Nothing is waited for longer than this."""
+"""Longest wait for anything."""
 LEAD_S: Final = 0.01
-"""A pose goes before its frame by so much: it crosses a socket of its own."""
+"""Time by which a pose is sent before its frame, because the two use different sockets."""
 START_S: Final = 0.3
-"""From the word to begin to the beginning."""
+"""Time from the command to begin to the beginning."""
 _POLL_S: Final = 0.02
 
 
 class Program:
-    """``work`` in a process of its own, which is given its end of the conversation."""
+    """A process that runs ``work`` with one end of a pipe to this process."""
 
     def __init__(self, name: str, work: Callable[[Connection], None], begun: list[Program]) -> None:
-        """``begun``: all of a run."""
+        """``begun`` lists all programs of a run."""
         self._name, self._begun = name, begun
         self._words, words = Pipe()
         self._failures, failures = Pipe(duplex=False)
@@ -50,14 +50,14 @@ class Program:
         failures.close()
 
     def tell(self, words: Any) -> None:
-        """Say it."""
+        """Send words to the program."""
         self._words.send(words)
 
     async def told(self, patience_s: float = SILENCE_S) -> Any:
-        """What it says next.
+        """Wait for the program's next words.
 
         Raises:
-            BufgymError: one of the programs has failed or ended; or this one said nothing for so long.
+            BufgymError: one of the programs failed or ended, or this one stayed silent for ``patience_s``.
         """
         deadline_s = time.monotonic() + patience_s
         while not self._words.poll():
@@ -73,7 +73,7 @@ class Program:
             raise
 
     def check(self) -> None:
-        """An error if it has ended."""
+        """Raise an error if it has ended."""
         if self._failures.poll():
             try:
                 failure = self._failures.recv()
@@ -82,7 +82,7 @@ class Program:
             raise BufgymError(f"{self._name}: {failure}")
 
     def end(self) -> None:
-        """At once."""
+        """End it at once."""
         self._process.kill()
         self._process.join()
         self._words.close()
@@ -90,19 +90,19 @@ class Program:
 
 
 def _run(work: Callable[[Connection], None], words: Connection, failures: Connection, parent: int) -> None:
-    """In the program. ``parent``: who began it; asked for here, it may have been killed already, and be another."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's, who ends us
+    """Run in the program; ``parent`` comes from the caller, as a killed parent may already have been replaced."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends us
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     os.environ["PYTHONWARNINGS"] = "ignore"
     try:
         work(words)
     except Exception as error:
         failures.send(str(error) if isinstance(error, BufgymError) else f"{type(error).__name__}: {error}")
-    os._exit(0)  # the threads of ROS have nothing left to say
+    os._exit(0)  # skips waiting for ROS's threads
 
 
 def _end_with(parent: int) -> None:
-    """A program does not outlive a parent that was killed."""
+    """End this program when its parent is killed."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os._exit(1)
@@ -110,7 +110,7 @@ def _end_with(parent: int) -> None:
 
 @contextmanager
 def programs(**works: Callable[[Connection], None]) -> Iterator[list[Program]]:
-    """Programs by name, as long as the block runs."""
+    """Run programs by name while the block runs."""
     if not hasattr(os, "fork"):
         raise BufgymError("episodes on ROS need a system whose processes fork, such as Linux")
     begun: list[Program] = []
@@ -124,7 +124,7 @@ def programs(**works: Callable[[Connection], None]) -> Iterator[list[Program]]:
 
 
 def check_messages(mark: str) -> None:
-    """Import the messages' packages; an error where they are those of the other ROS: ``mark`` is what these have."""
+    """Import the message packages; raise an error if they lack ``mark`` and so belong to the other ROS."""
     for package, name in (("geometry_msgs", "PoseStamped"), ("sensor_msgs", "CompressedImage")):
         if not hasattr(getattr(importlib.import_module(f"{package}.msg"), name), mark):
             raise BufgymError(f"{package}: is the other ROS's here: each ROS wants a Python of its own")
@@ -141,7 +141,7 @@ def publish_in_time(
 ) -> None:
     """Call ``move(frame, metres along a straight way)`` and ``show(frame, bytes)`` when the episode's messages arrive.
 
-    Whoever sums these poses, as ``live.odometry`` does, has the episode's x when the frame comes.
+    The sum of these poses, as ``live.odometry`` computes it, is the episode's x when the frame comes.
     """
     scale_m = MotionSettings().scene_scale_m
     for k, message in enumerate(episode.arrivals):
@@ -153,39 +153,39 @@ def publish_in_time(
 
 
 def pose_stamp(k: int) -> tuple[int, int]:
-    """(s, ns) of the pose of frame ``k``: as far apart as ``MotionSettings`` wants poses to be."""
+    """Time stamp (s, ns) of frame ``k``'s pose, spaced as ``MotionSettings`` requires."""
     whole_s, rest = divmod(k, round(MotionSettings().rate_hz))
     return 100 + whole_s, round(rest * 1e9 / MotionSettings().rate_hz)
 
 
 def drained(queue: PolicyQueue, put: int) -> int:
-    """Wait until all that was put has left or was dropped; how many have left."""
+    """Wait until every message put has left or been dropped; return how many have left."""
     while len(queue) or queue.in_flight:
         time.sleep(_POLL_S)
     return put - queue.dropped
 
 
 class Seen:
-    """Which frames came, and when."""
+    """Frames received, with their times."""
 
     def __init__(self) -> None:
         self.frames: list[tuple[int, int]] = []
         self._latest_s = time.monotonic()
 
     def take(self, frame: Any) -> None:
-        """A subscriber's callback."""
+        """Note a frame; a subscriber's callback."""
         self.frames.append((int(frame.format), time.monotonic_ns()))
         self._latest_s = time.monotonic()
 
     def wait(self, frames: int, patience_s: float = SILENCE_S) -> None:
-        """Until so many have come, or none for so long."""
+        """Wait until this many frames have come, or none has come for ``patience_s``."""
         self._latest_s = time.monotonic()
         while len(self.frames) < frames and time.monotonic() - self._latest_s < patience_s:
             time.sleep(_POLL_S)
 
 
 def received(frames: list[tuple[int, int]], episode: Episode, began_s: float) -> list[Received]:
-    """The episode's messages that came."""
+    """List the episode's messages that were received."""
     found = []
     for number, (k, at_ns) in enumerate(frames):
         message = episode.arrivals[k]

@@ -1,6 +1,6 @@
 """A send queue ruled by a policy, for threads and for asyncio.
 
-The program puts messages in; a transport takes out what the policy's socket dequeues, and says when it has left:
+The program puts messages in. A transport takes out each message that the socket dequeues, and reports when it has left.
 
     queue = PolicyQueue("afr", capacity=8)
     queue.put(frame, len(frame))              # in the camera's callback: never blocks
@@ -38,9 +38,9 @@ from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
 
 FIRST_US: Final = 2
-"""The earliest time of a call: before it lie the two knots that a link begins with."""
+"""Earliest time of a call; the two first knots of a link lie before it."""
 MAX_SIZE_BYTES: Final = 2**40
-"""Of one message: with what a link carries in months it stays within 64 bits."""
+"""Size limit of a message; sums over months then stay within 64 bits."""
 
 
 @dataclass(frozen=True)
@@ -48,22 +48,22 @@ class Item:
     """A message on its way to the socket."""
 
     message: Any
-    """What was put."""
+    """The object that was put."""
     seq: int
-    """Its number among all that were put, from 0."""
+    """Index among all messages put, from 0."""
     number: int
-    """Its number among all that were dequeued, from 0."""
+    """Index among all messages dequeued, from 0."""
     at_us: int
-    """When it was put, by the queue's clock."""
+    """Time of the put by the queue's clock."""
     size_bytes: int
     x: float
     topic: int
 
 
 class PolicyQueue:
-    """At most L = ``capacity`` messages, of which ``policy`` decides which go. See the module's text.
+    """A queue of at most L = ``capacity`` messages, ruled by ``policy``. See the module's text.
 
-    Memory is bounded: by the messages queued, those in the socket (at most ``window``), and a few MB of bookkeeping.
+    Memory holds the messages queued, at most ``window`` messages in the socket, and a few MB of bookkeeping.
     """
 
     def __init__(
@@ -81,20 +81,20 @@ class PolicyQueue:
         clock: Callable[[], float] = time.monotonic,
         room: int = ROOM,
     ) -> None:
-        """An empty queue.
+        """Make an empty queue.
 
         Args:
-            policy: a registered policy by name, or a ``Policy``; not one that is unbounded or knows the future.
+            policy: name of a registered policy, or a ``Policy``; it must be bounded and not privileged.
             capacity: L, messages.
             max_bytes: B, bytes.
-            value: V that QoI is measured with (default: 1 - 0.618^d).
+            value: V of the QoI; 1 - 0.618^d by default.
             decide_at: "arrival" or "overflow", as in the simulator.
-            topics: the rules of each topic, by the topic numbers of the messages; none for one queue without rules.
-            window: n_T, messages handed out and not yet gone, at most.
-            log: takes a record of all that happens: a ``LogFile``, or any function.
-            seed: of the draws of randomised policies.
+            topics: rules of each topic, by topic number; empty for one queue without rules.
+            window: n_T, most messages handed out and not yet gone.
+            log: a ``LogFile`` or any function, called with a record of each event.
+            seed: seed of randomised policies' draws.
             clock: seconds; steps backwards are ignored.
-            room: messages between two tidyings of the bookkeeping, at least 8.
+            room: messages between two cleanups of the bookkeeping, at least 8.
         """
         check_limits(capacity, max_bytes)
         self.policy = get(policy)
@@ -110,7 +110,8 @@ class PolicyQueue:
             room=whole("room", room, 8, 2**30),
         )
         self.left_bytes: Callable[[], int | None] = lambda: None
-        """Asked at each ``put``: bytes handed out that have not left yet, None if unknown. A transport sets it."""
+        """Called at each ``put``: returns the bytes handed out that have not left, None if unknown. A transport sets
+        it."""
         self._topics = max(1, len(topics))
         self._one_scene = not topics
         self._clock = clock
@@ -125,7 +126,7 @@ class PolicyQueue:
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
         self._waiting: set[tuple[asyncio.AbstractEventLoop, asyncio.Future[None]]] = set()
-        self._number = 0  # messages dequeued so far that were handed on
+        self._number = 0  # dequeued messages handed on so far
         self._closed = False
         self.dropped = 0
         """Messages dropped so far."""
@@ -141,14 +142,14 @@ class PolicyQueue:
         topic: int = 0,
         at_us: int | None = None,
     ) -> int:
-        """A message arrives; the policy decides at once. Its ``seq``. Never blocks.
+        """Put a message; the policy decides at once. Returns its ``seq`` and never blocks.
 
         Args:
-            message: any object; the queue lets go of it when it is dropped, or has left.
-            size_bytes: what the link has to carry.
-            x: how far the scene has moved on; it must not fall. None: 1 more than the last (on its topic), from 0.
-            topic: its number in ``topics``; without topics any number.
-            at_us: the time, us, for those who keep a clock of their own; it counts from any beginning.
+            message: any object; the queue releases it when it is dropped or has left.
+            size_bytes: bytes that the link has to carry.
+            x: coordinate of the scene, which must not fall; None means 1 more than the last on its topic, from 0.
+            topic: index in ``topics``; any number without topics.
+            at_us: time in us from any origin, for callers with their own clock.
         """
         size_bytes = whole("size_bytes", size_bytes, 1, MAX_SIZE_BYTES)
         topic = whole("topic", topic, 0, 2**31 if self._one_scene else self._topics - 1)
@@ -180,7 +181,7 @@ class PolicyQueue:
         return seq
 
     def close(self) -> None:
-        """Nothing is put any more: what is queued is still handed out, then ``get`` returns None."""
+        """Accept no more messages; queued ones are still handed out, then ``get`` returns None."""
         with self._lock:
             if not self._closed:
                 self._closed = True
@@ -191,10 +192,10 @@ class PolicyQueue:
     # --- out ----------------------------------------------------------------------------------------------------------
 
     def get(self, timeout_s: float | None = None) -> Item | None:
-        """The next message that the socket dequeues; None once all have been handed out and the queue is closed.
+        """Wait for the next message that the socket dequeues; None once the queue is closed and empty.
 
         Raises:
-            TimeoutError: there was none for so long.
+            TimeoutError: there was no message for ``timeout_s``.
         """
         with self._changed:
             if not self._changed.wait_for(lambda: self._ready or self._drained, timeout_s):
@@ -202,7 +203,7 @@ class PolicyQueue:
             return self._hand_out()
 
     async def aget(self) -> Item | None:
-        """``get`` for asyncio. A task that is cancelled here takes no message with it."""
+        """Do ``get`` for asyncio; a task cancelled here takes no message with it."""
         loop = asyncio.get_running_loop()
         while True:
             with self._lock:
@@ -217,13 +218,13 @@ class PolicyQueue:
                     self._waiting.discard(entry)
 
     def __iter__(self) -> Iterator[Item]:
-        """All messages that ``get`` returns; each has left (``gone``) when the next is asked for."""
+        """Iterate over ``get``; asking for the next message calls ``gone`` for the last."""
         while (item := self.get()) is not None:
             yield item
             self.gone()
 
     def gone(self) -> None:
-        """The oldest message that was handed out has left: it was acked, or all its bytes are on their way."""
+        """Report that the oldest message handed out has left: it was acked, or all its bytes are on their way."""
         with self._lock:
             if not self._away:
                 raise BufgymError("no message was handed out that has not left yet")
@@ -243,7 +244,7 @@ class PolicyQueue:
 
     @property
     def in_flight(self) -> int:
-        """Messages that the socket has dequeued and that have not left."""
+        """Messages dequeued by the socket that have not left."""
         with self._lock:
             return len(self._ready) + len(self._away)
 
@@ -251,12 +252,12 @@ class PolicyQueue:
 
     @property
     def _drained(self) -> bool:
-        """Whether nothing will ever be handed out any more."""
+        """Whether no message will be handed out any more."""
         return self._closed and not self._held and not self._ready
 
     @contextmanager
     def _deciding(self) -> Iterator[None]:
-        """A policy that raises an error ends its queue: whoever waits for a message is told that none comes."""
+        """End the queue if the policy raises an error, so that nobody waits for a message in vain."""
         try:
             yield
         except BaseException:
@@ -266,7 +267,7 @@ class PolicyQueue:
             raise
 
     def _stamp(self, at_us: int | None) -> int:
-        """A time for what happens now: after all others, whatever the clock does."""
+        """Time stamp an event, later than all before, whatever the clock does."""
         if at_us is None:
             now_us = int((self._clock() - self._began_s) * 1e6)
         else:
@@ -275,7 +276,7 @@ class PolicyQueue:
         return self._now_us
 
     def _next_x(self, scene: int, x: float | None) -> float:
-        """The coordinate of a message; an error if x fell."""
+        """Determine the coordinate of a message; raise an error if x fell."""
         latest = self._latest_x[scene]
         if x is None:
             return 0.0 if latest == -math.inf else latest + 1
@@ -284,7 +285,7 @@ class PolicyQueue:
         return float(x)
 
     def _unsent(self) -> int | None:
-        """Bytes handed out, or to be, that have not left."""
+        """Bytes dequeued that have not left."""
         left_bytes = self.left_bytes()
         return None if left_bytes is None else left_bytes + sum(item.size_bytes for item in self._ready)
 
@@ -296,7 +297,7 @@ class PolicyQueue:
         return item
 
     def _settle(self, now_us: int, newcomer: int | None) -> None:
-        """Hand on what the socket has dequeued, and let go of what was dropped."""
+        """Hand on dequeued messages and release dropped ones."""
         dequeued = self._row.dequeued
         number = self._number
         while number < dequeued:

@@ -1,4 +1,4 @@
-"""The receiving end: takes messages from any number of senders, acks each, and gives none twice."""
+"""The receiving end: takes messages from any number of senders, acks each, and delivers none twice."""
 
 from __future__ import annotations
 
@@ -23,42 +23,42 @@ from bufgym.live.sockets import free_port
 from bufgym.live.tasks import Tasks
 
 MAX_STREAMS: Final = 64
-"""Senders that are remembered, the latest."""
+"""Number of latest senders that are remembered."""
 _GREETING_S: Final = 20.0
-"""Who has not greeted by then is no sender."""
+"""Time for a sender's greeting; later the connection is closed."""
 
 
 class Received(NamedTuple):
-    """A message that came."""
+    """A received message."""
 
     stream: str
-    """Whose, in hexadecimal digits."""
+    """Sender's stream in hexadecimal digits."""
     number: int
-    """Its place among those that the sender's socket dequeued."""
+    """Index among all messages that the sender's socket dequeued."""
     seq: int
-    """Its place among those that were put."""
+    """Index among all messages put."""
     at_us: int
-    """When it was put, by the sender's clock."""
+    """Time of the put by the sender's clock."""
     x: float
     topic: int
     body: bytes | memoryview
     received_ns: int
-    """By this system's clock."""
+    """Time of receipt by this system's clock."""
 
 
 class _Stream:
-    """What is known of one sender."""
+    """State of one sender's stream."""
 
     def __init__(self, expected: int) -> None:
         self.expected = expected
         self.task: asyncio.Task[Any] | None = None
-        """That of its connection. To close a socket on which a task waits is no way to end it."""
+        """Task of its connection, ended by cancelling; closing the socket would not end it."""
 
 
 class Receiver:
-    """Listens, and calls ``on_message`` with each ``Received``, in each sender's order. It acks when that has returned.
+    """Listens and calls ``on_message`` with each ``Received`` in its sender's order, then acks it.
 
-    A peer that does not speak as it should, or sends a frame of more than ``max_body_bytes``, is hung up on.
+    It closes the connection of a peer that breaks the protocol or sends a body larger than ``max_body_bytes``.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Receiver:
         self._bus: BusServer | None = None
 
     async def listen(self, port: int = 0, host: str = "127.0.0.1", transport: str = "tcp") -> int:
-        """Begin to listen; the port (0: any that is free). Over MQTT these are the broker's (0: the standard's)."""
+        """Begin to listen and return the port; 0 takes any free port, or the standard one of an MQTT broker."""
         if transport == "tcp":
             self._listener = await listener(host, port)
             self._tasks.begin(self._accept(self._listener))
@@ -104,7 +104,7 @@ class Receiver:
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
     async def close(self) -> None:
-        """Hang up, and listen no more."""
+        """Close all connections and stop listening."""
         if self._bus is not None:
             await self._bus.close()
         await self._tasks.end()
@@ -122,7 +122,7 @@ class Receiver:
             self._tasks.begin(self._serve(TcpChannel(connection, self._max_body_bytes)))
 
     async def _serve(self, channel: Channel) -> None:
-        """One connection, to its end."""
+        """Serve one connection to its end."""
         try:
             await self._take(channel, await asyncio.wait_for(channel.receive(), _GREETING_S))
         except (OSError, TimeoutError) as error:
@@ -174,7 +174,7 @@ class Receiver:
 
 
 async def listener(host: str, port: int, receive_buffer_bytes: int | None = None) -> socket.socket:
-    """A listening TCP socket."""
+    """Open a listening TCP socket."""
     found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
     family, kind, protocol, _, address = found[0]
     listening = socket.socket(family, kind, protocol)
@@ -192,7 +192,8 @@ async def listener(host: str, port: int, receive_buffer_bytes: int | None = None
 
 
 class Recording(contextlib.AbstractContextManager["Recording"]):
-    """What was received, in an MCAP file: bodies on ``/topic_0`` and so on, the rest of each on ``/received``."""
+    """Recording of received messages in an MCAP file, with bodies on ``/topic_0`` and so on, the rest on
+    ``/received``."""
 
     def __init__(self, path: str | Path) -> None:
         with needs("mcap"):

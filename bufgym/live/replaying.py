@@ -1,4 +1,4 @@
-"""A live queue's log through the simulator: the same arrivals over the link that the log measured."""
+"""Replay of a live queue's log in the simulator: the same arrivals over the link that the log measured."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from bufgym.traces import Trace
 
 @dataclass(frozen=True)
 class Replay:
-    """What the simulator made of a log."""
+    """Result of a replay."""
 
     senders: Senders
-    """The one sender, after its run."""
+    """The single sender after its run."""
     episode: Episode
-    """The arrivals, and as the link's trace what it really carried."""
+    """Arrivals, and a trace of the bytes that the link really carried."""
     differences: tuple[str, ...]
-    """Decisions that the live queue made otherwise, a sentence each; none if the log is whole."""
+    """Decisions that differ from the live queue's, a sentence each; empty if the log is complete."""
 
     @property
     def outcome(self) -> Outcome:
-        """The statistics of the live run."""
+        """Statistics of the live run."""
         return outcome(self.senders, 0)
 
 
 def replay(log: str | Path | Sequence[Record], policy: Policy | None = None) -> Replay:
     """Run the messages of a log (a file, or its records) through the simulator, over the link that it measured.
 
-    ``policy``: the one that decided, where the registry does not know it by the name in the log.
+    ``policy`` is needed if the registry does not know the log's policy by name.
     """
     records = log if isinstance(log, Sequence) and not isinstance(log, str) else read_log(log)
     name = "the log" if records is log else str(log)
@@ -72,7 +72,7 @@ def _replayed(records: Sequence[Record], policy: Policy | None) -> Replay:
 
 
 def _arrivals(records: Sequence[Record]) -> np.ndarray[Any, Any]:
-    """MESSAGE[n] of the log."""
+    """Arrivals of the log, MESSAGE[n]."""
     puts = list(of(records, "put"))
     arrivals = zeroed(len(puts), MESSAGE)
     for name, column in (("seq", "seq"), ("arrival_us", "us"), ("size_bytes", "size_bytes"), ("topic", "topic")):
@@ -82,7 +82,7 @@ def _arrivals(records: Sequence[Record]) -> np.ndarray[Any, Any]:
 
 
 def _trace(records: Sequence[Record]) -> Trace:
-    """What the link carried: a knot at each arrival, and wherever a message had left."""
+    """Trace of the bytes carried, with a knot at each arrival and each departure."""
     told = [record for record in records if "carried" in record]
     return Trace(
         "live", np.array([0, 1, *(r["us"] for r in told)]), np.array([0, 0, *(r["carried"] for r in told)]), "stop"
@@ -90,7 +90,7 @@ def _trace(records: Sequence[Record]) -> Trace:
 
 
 def _differences(records: Sequence[Record], senders: Senders) -> list[str]:
-    """What became of each message, live and here; of what happened last a log that breaks off may not tell all."""
+    """Compare each message's outcome live and here; a log cut short may lack the last events."""
     log, last_us = senders.batch.log[0], records[-1]["us"]
     found = []
     for event, column in (("dequeued", "dequeued_us"), ("gone", "transmitted_us"), ("dropped", "dropped_us")):

@@ -22,7 +22,7 @@ from bufgym.live.runs import COLUMNS, Run, agreement, by_policy, cells
 
 MAX_BYTES = 2**28
 _POINTS = 200
-"""Of a curve of delivery times."""
+"""Points of a curve of delivery times."""
 
 
 def write(runs_file: Path) -> Path:
@@ -75,7 +75,7 @@ def apart(runs: Sequence[Run], colours: dict[str, str]) -> Chart:
 
 
 def _dots(runs: Sequence[Run], colours: dict[str, str], title: str, numbers: Sequence[float], goal: float) -> Figure:
-    """A lane for each policy; the band says within what the two should be."""
+    """Draw a lane for each policy; the band shows the tolerated difference."""
     most = 1.15 * max(2 * goal, *(abs(number) for number in numbers))
     data = []
     for policy in reversed(by_policy(runs)):
@@ -124,7 +124,7 @@ def _regret(runs: Sequence[Run], colours: dict[str, str]) -> Figure:
 
 
 def delivery(runs: Sequence[Run], colours: dict[str, str]) -> Chart:
-    """What share of the messages came within how long: lines live, dots simulated."""
+    """Draw the share of messages delivered within a time: lines live, dots simulated."""
     panels, choices = _chosen(runs, lambda chosen: _shares(chosen, colours))
     return Chart("delivery", "Share of the messages delivered within a time, live and simulated", choices, panels)
 
@@ -147,7 +147,7 @@ def _shares(runs: Sequence[Run], colours: dict[str, str]) -> Figure:
 
 
 def _chosen(runs: Sequence[Run], draw: Any) -> tuple[dict[tuple[str, ...], list[Figure]], list[tuple[str, list[str]]]]:
-    """A figure for each link and transport, and what can be chosen."""
+    """Draw a figure for each link and transport, and list the choices."""
     links = list(dict.fromkeys(one.link for one in runs))
     transports = list(dict.fromkeys(one.transport for one in runs))
     panels: dict[tuple[str, ...], list[Figure]] = {}

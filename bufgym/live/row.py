@@ -1,14 +1,14 @@
-"""A sender whose messages and whose link are told as they come: one row of the simulator's batch.
+"""A sender that learns of its messages and its link as they happen: one row of the simulator's batch.
 
-What crossed a real link is known only afterwards, as points (time, bytes carried so far). These points are the knots
-of a trace, and a trace is all that the simulator knows of a link. So a live run *is* a simulation over the trace that
-it measures: here the row holds the last two knots; a log holds them all, and with it the simulator makes the same
-decisions again. Two rules make that exact:
+A real link's progress is known only afterwards, as points (time, bytes carried so far). These points are the knots of a
+trace, and a trace is all that the simulator knows of a link. So a live run *is* a simulation over the trace that it
+measures. The row holds the last two knots. A log holds them all, and from it the simulator makes the same decisions
+again. Two rules make that exact:
 
-* What happens at time t is told after the knot of time t: nothing then depends on a knot that is still to come.
+* An event at time t is told after the knot of time t, so that nothing depends on a future knot.
 * A message has left at the knot at which the link has carried exactly its last byte, and not before.
 
-Memory is bounded: messages whose fate is settled are forgotten when their columns are needed.
+Memory is bounded: settled messages are forgotten when their columns are needed.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from bufgym.sim.state import CARRIES, NEVER, NOT_YET, Batch
 from bufgym.traces import Trace
 
 ROOM = 2**16
-"""Columns of a new row: so many messages before those that are settled are forgotten (7 MB)."""
+"""Columns of a new row, 7 MB. After this many messages the settled ones are forgotten."""
 
 
 class Row:
-    """One sender under one policy. Times never fall from one call to the next, and rise where a knot is told."""
+    """One sender under one policy. Times never fall between calls, and rise at a knot."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Row:
         self.senders = Senders(
             1, capacity, value, max_messages=room, max_bytes=max_bytes, decide_at=decide_at, topics=topics
         )
-        # An episode of no account, which puts the row at its beginning; its link has two knots and carries nothing.
+        # A dummy episode resets the row; its link has two knots and carries nothing.
         nothing = Trace("live", np.array([0, 1]), np.array([0, 0]), "stop")
         self.senders.load(0, Episode(messages(np.array([0]), 1), Link(nothing), window=window))
         self.senders.follow(policy)
@@ -67,7 +67,7 @@ class Row:
         self._rollout: Any = entry(compiled_rollout(False, bool(self.batch.several))) if self._functions else None
 
     def _use(self, batch: Batch, room: int) -> None:
-        """Go on with these arrays, of which the messages that have not come yet are free."""
+        """Switch to these arrays; columns of future messages are free."""
         self.batch = self.senders.batch = batch._replace(parameters=self.policy.parameter_array)
         self.sender = batch.senders[0]
         self.room = self.sender["arrivals"] = room
@@ -77,7 +77,7 @@ class Row:
     # --- what happened ------------------------------------------------------------------------------------------------
 
     def put(self, now_us: int, size_bytes: int, x: float, topic: int, uniform: float) -> int:
-        """A message arrives; its ``seq``."""
+        """Add a message; return its ``seq``."""
         if self.sender["next"] + 1 >= self.room:
             self._make_room()
         sender = self.sender
@@ -91,9 +91,9 @@ class Row:
         return seq
 
     def carried(self, now_us: int, left_bytes: int | None) -> int:
-        """The link has still to carry ``left_bytes`` of what the socket holds (None: unknown); bytes carried so far.
+        """Note that the link has ``left_bytes`` of the socket still to carry; return the bytes carried so far.
 
-        A message has left when ``gone`` says so: until then at least one byte of it is left.
+        None means unknown. A message has left only when ``gone`` says so; until then at least one byte of it is left.
         """
         position = self._knot_bytes
         if left_bytes is not None and self.sender["link"] == CARRIES:
@@ -103,7 +103,7 @@ class Row:
         return position
 
     def gone(self, now_us: int) -> int:
-        """The oldest message in the socket has left; bytes carried so far."""
+        """Note that the oldest message in the socket has left; return the bytes carried so far."""
         if self.sender["link"] != CARRIES:
             raise BufgymError("no message is in transmission: none can have left")
         self._tell(now_us, int(self.sender["position"]))
@@ -112,7 +112,7 @@ class Row:
         return self._knot_bytes
 
     def close(self) -> None:
-        """No message comes any more."""
+        """Note that no message follows."""
         self.sender["arrivals"] = self.sender["next"]
         self._advance()
 
@@ -120,7 +120,7 @@ class Row:
 
     @property
     def queued(self) -> list[int]:
-        """``seq`` of the queued messages, the oldest first."""
+        """List ``seq`` of the queued messages, the oldest first."""
         first = int(self.sender["first"])
         seqs: list[int] = self.batch.slots["seq"][0, first : first + self.occupancy].tolist()
         return seqs
@@ -136,12 +136,12 @@ class Row:
         return int(self.sender["dequeued"]) + int(self.sender["forgotten"])
 
     def dequeued_seq(self, number: int) -> int:
-        """``seq`` of the message that the socket dequeued as its ``number``-th, from 0; one of the last."""
+        """Find ``seq`` of the ``number``-th dequeued message, from 0; it must be a recent one."""
         place = self.batch.order[0, number - int(self.sender["forgotten"])]
         return int(place) + int(self.sender["first_seq"])
 
     def limited(self, seq: int) -> bool:
-        """Whether a rate limit dropped this message, which must not be long settled."""
+        """Whether a rate limit dropped this message, which must be recent."""
         return bool(self.batch.log["limited"][0, seq - int(self.sender["first_seq"])])
 
     @property
@@ -151,30 +151,30 @@ class Row:
 
     @property
     def _waiting_bytes(self) -> int:
-        """Bytes of the messages in the socket that the link has not begun with."""
+        """Bytes of messages in the socket that the link has not begun to carry."""
         waiting = self.batch.order[0, int(self.sender["transmitted"]) + 1 : int(self.sender["dequeued"])]
         return int(self.batch.arrivals["size_bytes"][0, waiting].sum())
 
     # --- its arrays ---------------------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
-        """Carry out all that is due."""
+        """Process everything that is due."""
         if self._functions is None:
             python_rollout(self.batch, None, self.memory, self.policy)
         else:
             self._rollout(self.batch, None, self.memory, *self._functions, self.policy.hears_departures)
 
     def _tell(self, now_us: int, position: int) -> None:
-        """A knot. Those before the last one are looked up no more."""
+        """Add a knot; the simulator looks up only the last two."""
         here = self._first_knot
         us, size = self.batch.knot_us, self.batch.knot_bytes
         us[here], size[here] = us[here + 1], size[here + 1]
         us[here + 1], size[here + 1] = now_us, position
 
     def _make_room(self) -> None:
-        """Forget settled messages; where too few are, twice as many columns."""
+        """Forget settled messages; if they are too few, double the columns."""
         sender, batch = self.sender, self.batch
-        # A policy may look back: the last dequeued message and the last two arrivals stay.
+        # The last dequeued message and the last two arrivals stay, because a policy may look back.
         dequeues = max(0, int(sender["credited"]) - 1)
         kept = batch.order[0, dequeues : int(sender["dequeued"])].tolist()
         queued = [seq - int(sender["first_seq"]) for seq in self.queued]
@@ -197,7 +197,7 @@ class Row:
 
 
 def _wider(array: NDArray[Any], columns: int) -> NDArray[Any]:
-    """The row with so many columns, the new ones 0."""
+    """Extend the row to this many columns with zeros."""
     wide: NDArray[Any] = np.zeros_like(array, shape=(1, columns))
     wide[:, : array.shape[1]] = array
     return wide

@@ -1,4 +1,4 @@
-"""Runs on real sockets beside the same in the simulator: how far apart they are, in figures and as a file."""
+"""Runs on real sockets compared with the same runs in the simulator, as numbers and as a file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bufgym.files import replaced
 from bufgym.oracle.measure import regret
 
 DIFFER: Final = 0.01
-"""Policies whose simulated H differs by more than this share ought to stand in the same order live."""
+"""Relative difference in simulated H beyond which two policies should rank alike live."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Run:
     """The clairvoyant's H."""
     transport: str = "tcp"
     live_s: tuple[float, ...] = ()
-    """Delivery times: from a message's arrival at the queue to its receipt, in the order of receipt."""
+    """Times from a message's arrival at the queue to its receipt, in order of receipt."""
     simulated_s: tuple[float, ...] = ()
 
     @property
@@ -46,17 +46,17 @@ class Run:
 
     @property
     def qoi_difference(self) -> float:
-        """Live over simulated H, less 1."""
+        """Live H over simulated H, less 1."""
         return self.live_qoi / self.simulated_qoi - 1 if self.simulated_qoi else 0.0
 
     @property
     def delivered_difference(self) -> int:
-        """Messages, live less simulated."""
+        """Messages delivered live less those delivered in the simulator."""
         return self.live_delivered - self.simulated_delivered
 
     @property
     def live_median_s(self) -> float:
-        """Half of the messages were delivered within this."""
+        """Median delivery time."""
         return statistics.median(self.live_s) if self.live_s else 0.0
 
     @property
@@ -65,7 +65,7 @@ class Run:
 
 
 def by_policy(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """The runs of each policy, the best in the simulator first."""
+    """Group the runs by policy, the best in the simulator first."""
     found: dict[str, list[Run]] = {}
     for one in runs:
         found.setdefault(one.policy, []).append(one)
@@ -73,12 +73,13 @@ def by_policy(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 def mean(name: str, runs: Sequence[Run]) -> float:
-    """Of a number of theirs."""
+    """Mean of a field over the runs."""
     return statistics.fmean(getattr(one, name) for one in runs)
 
 
 def orders(runs: Sequence[Run]) -> tuple[int, int]:
-    """(pairs in the same order, pairs): two policies on one episode whose simulated H differ by more than 1 %."""
+    """Count pairs of policies whose simulated H on an episode differ by over ``DIFFER``: in the same order live,
+    all."""
 
     def episode(one: Run) -> tuple[str, str, int]:
         return one.transport, one.link, one.seed
@@ -94,7 +95,7 @@ def orders(runs: Sequence[Run]) -> tuple[int, int]:
 
 
 def agreement(runs: Sequence[Run]) -> str:
-    """How far apart live and simulated are, in one line."""
+    """Summarize the difference of live and simulated in one line."""
     apart = [abs(one.qoi_difference) for one in runs]
     counts = [abs(one.delivered_difference) for one in runs]
     same, pairs = orders(runs)
@@ -111,11 +112,11 @@ COLUMNS: Final = (
     ("regret", "regret", "{:.2%}"),
     ("median delivery, s", "median_s", "{:.3f}"),
 )
-"""(title, number of a run, how it is written); each live and simulated."""
+"""Title, field of a run and format; each column is shown live and simulated."""
 
 
 def cells(runs: Sequence[Run]) -> dict[str, list[str]]:
-    """The table's cells by policy: means of ``COLUMNS``, live and simulated in turn."""
+    """Make the table's cells by policy: means of ``COLUMNS``, live and simulated in turn."""
     return {
         name: [
             write.format(mean(f"{side}_{key}", chosen)) for _, key, write in COLUMNS for side in ("live", "simulated")
@@ -125,7 +126,7 @@ def cells(runs: Sequence[Run]) -> dict[str, list[str]]:
 
 
 def table(runs: Sequence[Run]) -> str:
-    """The runs in Markdown: means by policy, then how far apart live and simulated are."""
+    """Write the runs as Markdown: means by policy, then the difference of live and simulated."""
     head = " | ".join(f"{title}, live | simulated" for title, _, _ in COLUMNS)
     lines = [f"| policy | {head} |", "|---|" + "---:|" * (2 * len(COLUMNS))]
     lines += [f"| {name} | {' | '.join(row)} |" for name, row in cells(runs).items()]
@@ -133,7 +134,7 @@ def table(runs: Sequence[Run]) -> str:
 
 
 def save(runs: Sequence[Run], about: str, command: str, folder: Path) -> Path:
-    """Write ``runs.json``: every run with every delivery time, what was run, and the command; the file's path."""
+    """Write ``runs.json`` with all runs, delivery times, settings and the command; return its path."""
     target = folder / "runs.json"
     kept: dict[str, Any] = {"about": about, "command": command, "runs": [asdict(one) for one in runs]}
     try:

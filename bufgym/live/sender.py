@@ -1,4 +1,4 @@
-"""The sending end: takes from a ``PolicyQueue``, sends, says when a message has left, and connects again by itself."""
+"""The sending end: sends a ``PolicyQueue``'s messages, reports when each has left, and reconnects by itself."""
 
 from __future__ import annotations
 
@@ -15,44 +15,44 @@ from bufgym.live.queue import Item, PolicyQueue
 from bufgym.live.tasks import until_one_ends
 
 Leaves = Literal["acked", "sent", "written"]
-"""When a message has left: the receiver has acked it; the receiver's system has (SIOCOUTQ); this system has taken it.
-The last hides a queue in the system's buffers, and is here to show what that costs."""
+"""Event at which a message has left: acked by the receiver, acked by the receiver's system (SIOCOUTQ), or taken by this
+system. "written" hides a queue in the system's buffers; it serves to measure the cost of that."""
 
 RETRY_S: Final = 0.5
 PATIENCE_S: Final = 20.0
-"""For the receiver's answer to the greeting."""
+"""Time for the receiver's answer to the greeting."""
 _POLL_S: Final = 0.001
 _MOST_UNACKED: Final = 256
-"""Messages that wait for the receiver's ack, at most, where they count as left before it."""
+"""Limit on messages that await the receiver's ack, where they count as left before it."""
 
 
 class Sender:
-    """Sends what the queue hands out, in order, each message once.
+    """Sends the queue's messages in order, each once.
 
-    After a broken connection it connects again and goes on where the receiver says. Memory holds the queue, and the
-    messages that the receiver has not acked: as many as the queue's window.
+    After a broken connection it reconnects and resumes where the receiver says. Memory holds the queue and the messages
+    that the receiver has not acked, at most the queue's window.
     """
 
     def __init__(self, queue: PolicyQueue, connect: Callable[[], Awaitable[Channel]], leaves: Leaves = "acked") -> None:
-        """``connect`` makes a connection to the receiver, again and again if need be."""
+        """``connect`` makes a new connection to the receiver at each call."""
         if leaves not in ("acked", "sent", "written"):
             raise BufgymError(f"leaves = {leaves!r}: must be 'acked', 'sent' or 'written'")
         self.queue = queue
         self.connected = asyncio.Event()
-        """Set once the receiver has answered for the first time."""
+        """Set at the receiver's first answer."""
         self.faults: deque[str] = deque(maxlen=100)
-        """Why connections ended, the last 100."""
+        """Reasons of the last 100 ends of a connection."""
         self._connect, self._leaves = connect, leaves
         self._stream = os.urandom(STREAM_BYTES)
         self._unacked: deque[Item] = deque()
         self._acked = asyncio.Event()
         self._max_body_bytes = 0
         self._next = 0  # the number of the message that the queue hands out next
-        self._left = 0  # messages of which the queue knows that they have left
-        self._said_goodbye = False  # all is acked: the receiver hangs up, perhaps before our goodbye is known as sent
+        self._left = 0  # messages reported to the queue as left
+        self._said_goodbye = False  # then the receiver may hang up before we know that our goodbye was sent
 
     async def run(self) -> None:
-        """Send until the queue is closed and all that it held is acked. Cancel it to give up.
+        """Send until the queue is closed and all its messages are acked, or until cancelled.
 
         Raises:
             BufgymError: a message is larger than the receiver takes.
@@ -81,7 +81,7 @@ class Sender:
         self.faults.append(f"{type(error).__name__}: {error}")
 
     async def _greet(self, channel: Channel) -> None:
-        """Say which stream this is; what the receiver has already got needs no second sending."""
+        """Name the stream; skip messages that the receiver already has."""
         first = self._unacked[0].number if self._unacked else self._next
         await channel.send(Frame(GREETING, first, body=self._stream))
         answer = await asyncio.wait_for(channel.receive(), PATIENCE_S)

@@ -1,8 +1,8 @@
-"""A link of a trace's capacity between real sockets: a TCP proxy in user space, without root.
+"""A link with a trace's capacity between real sockets: a TCP proxy in user space that needs no root.
 
-Towards the receiver it forwards as the simulator's link carries, byte position by byte position; what comes back is
-only delayed. Its own buffers are small, so that it hides no queue. The receiver is whom the sender calls, or (``back``)
-who calls the sender, as a subscriber of ROS 1 does.
+Towards the receiver it forwards each byte when the simulator's link would have carried it; the way back is only
+delayed. Its own buffers are small, so that it hides no queue. Normally the sender connects to the receiver. With
+``back`` the receiver connects to the sender, as a ROS 1 subscriber does.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from bufgym.model.link import FOREVER, Link
 RECEIVE_BUFFER_BYTES: Final = 16_384
 _PIECE_BYTES: Final = 16_384
 _MOST_PIECES: Final = 4096
-"""On their way to the receiver at a time, at most."""
+"""Limit on pieces on their way to the receiver at a time."""
 _SLACK_S: Final = 0.005
-"""A link that waits no longer than this for the next bytes counts as busy: an ack and the next message take their turns
-in programs, which is not the link's doing."""
+"""Longest wait for the next bytes during which the link counts as busy. Programs need this time between an ack and the
+next message, so it is not charged to the link."""
 _STALL_S: Final = 0.1
-"""Nor is it that a busy machine stops this program: a busy link makes up for so much time at most."""
+"""Longest stall of this program, on a busy machine, that a busy link makes up for."""
 
 
 class ShapedLink:
-    """Forwards connections to ``target`` (host, port) at the pace of ``link``; ``speed``: how much faster time runs.
+    """Forwards connections to ``target``, a (host, port), at the pace of ``link``.
 
-    ``back``: the pace of what comes back from the target.
+    Time runs ``speed`` times faster. ``back`` applies the pace to data that come back from the target.
     """
 
     def __init__(
@@ -57,31 +57,31 @@ class ShapedLink:
         self._tasks = Tasks()
         self._turn = asyncio.Lock()
         self.carried_bytes = 0
-        """Towards the receiver, so far."""
+        """Bytes carried to the receiver so far."""
 
     async def listen(self, port: int = 0, host: str = "127.0.0.1") -> int:
-        """Begin to listen; the port (0: any that is free)."""
+        """Begin to listen and return the port; 0 takes any free port."""
         listening = await listener(host, port, RECEIVE_BUFFER_BYTES)
         self._sockets.add(listening)
         self._tasks.begin(self._accept(listening))
         return int(listening.getsockname()[1])
 
     def begin(self) -> None:
-        """The trace begins now."""
+        """Begin the trace now."""
         self._began_s = self._clock()
         self._position = 0
 
     def cut(self) -> None:
-        """Break all connections, and take no new ones until ``mend``."""
+        """Break all connections and accept no new ones until ``mend``."""
         self._open.clear()
         self._tasks.cancel("connection")
 
     def mend(self) -> None:
-        """Take connections again."""
+        """Accept connections again."""
         self._open.set()
 
     async def close(self) -> None:
-        """Break all connections, and listen no more."""
+        """Break all connections and stop listening."""
         await self._tasks.end()
         for one in self._sockets:
             one.close()
@@ -98,7 +98,7 @@ class ShapedLink:
                 near.close()
 
     async def _forward(self, near: socket.socket) -> None:
-        """One connection, to its end."""
+        """Forward one connection to its end."""
         loop = asyncio.get_running_loop()
         far = socket.socket()
         tasks = []
@@ -116,7 +116,7 @@ class ShapedLink:
             ]
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         except OSError:
-            pass  # who listens no more: the sender connects again
+            pass  # the target does not listen: the sender reconnects
         finally:
             for task in tasks:
                 task.cancel()
@@ -127,7 +127,7 @@ class ShapedLink:
                 far.close()
 
     async def _up(self, sender: socket.socket, receiver: socket.socket) -> None:
-        """Towards the receiver, piece by piece when it has crossed; connections take turns."""
+        """Forward to the receiver each piece once it has crossed; connections take turns."""
         crossed: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_MOST_PIECES)
         delivery = asyncio.create_task(self._deliver(crossed, receiver))
         try:
@@ -145,7 +145,7 @@ class ShapedLink:
             delivery.cancel()
 
     async def _deliver(self, crossed: asyncio.Queue[tuple[float, bytes]], receiver: socket.socket) -> None:
-        """What has crossed arrives a propagation delay later."""
+        """Deliver pieces a propagation delay after they have crossed."""
         while True:
             arrives_s, piece = await crossed.get()
             await self._until(arrives_s)
@@ -153,7 +153,7 @@ class ShapedLink:
             crossed.task_done()
 
     async def _down(self, receiver: socket.socket, sender: socket.socket) -> None:
-        """Back to the sender."""
+        """Forward data back to the sender."""
         loop = asyncio.get_running_loop()
         while piece := await loop.sock_recv(receiver, 65_536):
             await asyncio.sleep(self._link.propagation_us / 1e6 / self._speed)
@@ -166,7 +166,7 @@ class ShapedLink:
         return (self._clock() - self._began_s) * self._speed
 
     def _crossed_s(self, size_bytes: int, waited_s: float) -> float:
-        """When so many more bytes have crossed, in the link's time; ``waited_s``: so long it has waited for them."""
+        """Link time at which these bytes have crossed; ``waited_s`` is how long the link waited for them."""
         if waited_s > 0:
             late_s = _SLACK_S if waited_s > _SLACK_S else _STALL_S
             idle_us = max(0, int((self._now_s() - late_s * self._speed) * 1e6))
@@ -176,13 +176,13 @@ class ShapedLink:
         return float("inf") if crossed_us == FOREVER else crossed_us / 1e6
 
     async def _until(self, time_s: float) -> None:
-        """Sleep until then, in the link's time; for ever on a link that has stopped."""
+        """Sleep until a link time; for ever if the link has stopped."""
         while (rest_s := (time_s - self._now_s()) / self._speed) > 0:
             await asyncio.sleep(min(rest_s, 1.0))
 
 
 async def _piece(connection: socket.socket) -> tuple[float, bytes]:
-    """(how long it had to wait, the next bytes; none at the end). To wait for a processor is not to wait for bytes."""
+    """Receive the next bytes, none at the end; also return the wait for them, without waits for a processor."""
     try:
         return 0.0, connection.recv(_PIECE_BYTES)
     except BlockingIOError:
@@ -192,7 +192,7 @@ async def _piece(connection: socket.socket) -> tuple[float, bytes]:
 
 
 def _starved_s() -> float:
-    """How long this thread has been ready and had no processor; 0 where the system does not tell."""
+    """Time that this thread was ready without a processor; 0 where the system does not tell."""
     try:
         return int(Path("/proc/thread-self/schedstat").read_text(encoding="ascii").split()[1]) / 1e9
     except (OSError, ValueError, IndexError):

@@ -1,8 +1,8 @@
 """A sender's TCP socket that hides no queue.
 
-With the system's default buffers it takes megabytes at once, and what lies there no policy can drop. So it gets a small
-send buffer, the kernel keeps little beyond what is on its way (TCP_NOTSENT_LOWAT), and ``unacked_bytes`` says how much
-the peer's kernel has not acked yet (SIOCOUTQ).
+The system's default buffers take megabytes at once, and no policy can drop messages in them. So the socket gets a small
+send buffer, and TCP_NOTSENT_LOWAT limits unsent bytes in the kernel. ``unacked_bytes`` reads from SIOCOUTQ how much the
+peer's kernel has not acked.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Final
 
 SEND_BUFFER_BYTES: Final = 32_768
 UNSENT_BYTES: Final = 16_384
-"""TCP_NOTSENT_LOWAT: so much may wait in the kernel beyond what is on its way."""
+"""TCP_NOTSENT_LOWAT, the unsent bytes that may wait in the kernel."""
 DEAD_AFTER_S: Final = 20.0
-"""A connection on which nothing was acked for so long is given up, where the system can tell."""
+"""Time without acks after which a connection is given up, where the system can tell."""
 
 
 def unacked_bytes(connection: socket.socket) -> int | None:
-    """Bytes in the kernel's send queue, on their way or not (SIOCOUTQ); None where the system has no such call."""
+    """Bytes in the kernel's send queue, sent or not; None where the system lacks SIOCOUTQ."""
     if not sys.platform.startswith("linux"):
         return None
     import fcntl
@@ -46,7 +46,7 @@ def set_option(connection: socket.socket, option: str, number: int) -> None:
 
 
 async def connected(host: str, port: int, small: bool = True) -> socket.socket:
-    """A connected TCP socket of a sender."""
+    """Connect a sender's TCP socket."""
     loop = asyncio.get_running_loop()
     family, kind, protocol, _, address = (await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM))[0]
     connection = socket.socket(family, kind, protocol)
@@ -64,7 +64,7 @@ async def connected(host: str, port: int, small: bool = True) -> socket.socket:
 
 
 def free_port(host: str) -> int:
-    """A port on which nobody listens."""
+    """Find a port on which nobody listens."""
     with socket.socket() as free:
         free.bind((host, 0))
         return int(free.getsockname()[1])

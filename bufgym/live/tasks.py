@@ -1,4 +1,4 @@
-"""Tasks of asyncio that belong to one end of a connection, and end with it."""
+"""Asyncio tasks that belong to one end of a connection and end with it."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from typing import Any
 
 
 class Tasks:
-    """Those that are under way."""
+    """Tasks still running."""
 
     def __init__(self) -> None:
         self._running: set[asyncio.Task[None]] = set()
 
     def begin(self, work: Coroutine[Any, Any, None], name: str = "") -> None:
-        """Do ``work`` beside everything else; the loop itself would forget a task that nobody holds."""
+        """Start ``work`` as a task and hold it, because the loop forgets a task without references."""
         task = asyncio.create_task(work, name=name)
         self._running.add(task)
         task.add_done_callback(self._running.discard)
 
     def cancel(self, name: str) -> None:
-        """Those of this name."""
+        """Cancel the tasks of this name."""
         for task in self._running:
             if task.get_name() == name:
                 task.cancel()
 
     async def end(self) -> None:
-        """All of them; returns when they have ended."""
+        """Cancel all tasks and wait for their end."""
         for task in self._running:
             task.cancel()
         await asyncio.gather(*self._running, return_exceptions=True)
 
 
 async def until_one_ends(*works: Coroutine[Any, Any, None]) -> None:
-    """Do all side by side until one has ended, whose error is raised; the others are cancelled, and have ended then."""
+    """Run all until one ends, cancel the others and wait for them, then raise the first one's error."""
     tasks = [asyncio.create_task(work) for work in works]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

@@ -44,20 +44,20 @@ async def play(
     port: int = 0,
     until_s: float = math.inf,
 ) -> list[Received]:
-    """What arrives at the other end of real sockets, when ``policy`` sends the messages of ``episode`` over its link.
+    """Send the messages of ``episode`` with ``policy`` over real sockets and its link; return the messages received.
 
-    ``received_ns`` counts from the episode's beginning, as ``at_us`` does, but as this system's time runs.
+    ``received_ns`` counts from the episode's beginning like ``at_us``, but in this system's time.
 
     Args:
-        topics: the rules for each; none for one queue without rules.
+        topics: rules of each topic; empty for one queue without rules.
         transport: one of ``TRANSPORTS`` over TCP.
-        leaves: when a message has left, see ``Sender``.
-        small: small buffers in the system; else its default ones.
-        speed: how much faster time runs for queue and link alike; bytes are as they are.
-        seed: of the draws of randomised policies.
-        log: takes the queue's records.
-        port: the receiver's (0: any); over MQTT the broker's.
-        until_s: after the last message, what arrives later is not waited for; in the episode's time.
+        leaves: event at which a message has left, see ``Leaves``.
+        small: whether the system's buffers are small instead of default.
+        speed: speed-up of time for queue and link alike; bytes stay the same.
+        seed: seed of randomised policies' draws.
+        log: list to which the queue's records are appended.
+        port: the receiver's port, 0 for any; over MQTT the broker's.
+        until_s: episode time after which later messages are not awaited.
     """
     if transport not in TRANSPORTS:
         raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
@@ -108,7 +108,7 @@ async def play(
 
 
 def warm(queue: PolicyQueue) -> None:
-    """One message through the queue, so that nothing is compiled while the episode's time runs."""
+    """Send one message through the queue, so that nothing is compiled while the episode runs."""
     queue.put(b"", 1)
     queue.get()
     queue.gone()
@@ -116,7 +116,7 @@ def warm(queue: PolicyQueue) -> None:
 
 
 class Play(Protocol):
-    """How an episode is played live; what comes, as ``play`` has it."""
+    """A function that plays an episode live and returns the messages received, as ``play`` does."""
 
     def __call__(
         self, policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
@@ -124,7 +124,7 @@ class Play(Protocol):
 
 
 def over(transport: str) -> Play:
-    """``play`` over one of ``TRANSPORTS``."""
+    """Make a ``Play`` over one of ``TRANSPORTS``."""
 
     def played(
         policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
@@ -143,7 +143,8 @@ def validate(
     plays: Mapping[str, Play] | None = None,
     speed: float = 1.0,
 ) -> list[Run]:
-    """Every policy on ``seeds`` episodes of every trace: live by ``plays`` in turn (default: TCP), and simulated."""
+    """Run every policy on ``seeds`` episodes of every trace, simulated and live by each of ``plays``, by default
+    TCP."""
     plays = {"tcp": over("tcp")} if plays is None else plays
     runs = []
     for trace in scenario.traces:

@@ -1,4 +1,4 @@
-"""A live queue at a glance, as text: made from its log's records as they happen, or from a log's file."""
+"""Text view of a live queue, made from its log's records as they happen or from a log file."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from typing import Final
 from bufgym.live.log import Record, value_of
 
 RATE_US: Final = 1_000_000
-"""Rates are over the time so long before now."""
+"""Time before now over which rates are computed."""
 HISTORY_S: Final = 60
 _BARS: Final = " ▁▂▃▄▅▆▇█"
 
 
 class View:
-    """Call it with each record, as a queue calls its log; ``text`` says how things are."""
+    """View of a queue. Call it with each record, as a queue calls its log; ``text`` shows the state."""
 
     def __init__(self, records: Iterable[Record] = ()) -> None:
         self.now_us = 0
-        """Of the latest record."""
+        """Time of the latest record."""
         self._settings: Record = {"policy": "?", "capacity": 1, "topics": []}
-        self._held: dict[int, Record] = {}  # puts of what is queued, the oldest first
-        self._away: dict[int, Record] = {}  # of what the socket has dequeued
+        self._held: dict[int, Record] = {}  # put records of queued messages, the oldest first
+        self._away: dict[int, Record] = {}  # put records of messages in the socket
         self._counts: Counter[str] = Counter()
         self._why: Counter[str] = Counter()
         self._lately: deque[tuple[int, str, int]] = deque()  # (time, event, bytes)
-        self._xs: list[float] = []  # of what has left
-        self._longest: deque[int] = deque([0], HISTORY_S)  # messages queued at most, in each second
+        self._xs: list[float] = []  # x of departed messages
+        self._longest: deque[int] = deque([0], HISTORY_S)  # most messages queued, in each second
         self._left_bytes: deque[int] = deque([0], HISTORY_S)  # in each second
         self._second = 0
         for record in records:
@@ -54,11 +54,11 @@ class View:
             self._why["evicted" if record["why"].startswith("evicted") else record["why"]] += 1
         self._counts[event] += 1
         self._lately.append((self.now_us, event, put["size_bytes"]))
-        # A newcomer that takes a dropped one's place stands beside it for the time between two records.
+        # Between two records a newcomer may stand beside the dropped message that it replaces.
         self._longest[-1] = max(self._longest[-1], min(len(self._held), self._settings["capacity"]))
 
     def _reach(self, now_us: int) -> None:
-        """Time goes on."""
+        """Advance the time."""
         self.now_us = max(self.now_us, now_us)
         while self._second < self.now_us // 10**6:
             self._second += 1
@@ -66,7 +66,7 @@ class View:
             self._left_bytes.append(0)
 
     def text(self, now_us: int | None = None) -> str:
-        """How things are, at ``now_us`` of the queue's clock (default: when the last record was made)."""
+        """Show the state at ``now_us`` of the queue's clock, by default the time of the last record."""
         if now_us is not None:
             self._reach(now_us)
         while self._lately and self._lately[0][0] <= self.now_us - RATE_US:
@@ -106,6 +106,6 @@ class View:
 
 
 def _bars(numbers: Iterable[int], most: int) -> str:
-    """A character for each number; what is more than nothing can be seen."""
+    """Draw a character for each number; any number above 0 is visible."""
     steps = len(_BARS) - 1
     return "".join(_BARS[min(steps, -(-number * steps // most)) if most else 0] for number in numbers)

@@ -1,4 +1,4 @@
-"""What the extra ``perception`` brings, imported where it is used."""
+"""Libraries of the extra ``perception``, imported where they are used."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bufgym.errors import BufgymError, install
 
 
 def library(name: str) -> Any:
-    """The module of that name; an error that names the extra if it is not installed."""
+    """Import the module of that name; raise an error that names the extra if it is not installed."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:

@@ -1,8 +1,8 @@
-"""Iterated closest points by projection, point to plane: where the camera is, given the surface that it should see.
+"""Camera pose from the surface that it should see: point-to-plane iterated closest points by projection.
 
 R. A. Newcombe et al., "KinectFusion: Real-Time Dense Surface Mapping and Tracking", ISMAR 2011, Sec. 3.5. A measured
-point belongs to the model's point that is seen through the same pixel; the pose moves so that the measured points come
-to lie in the model's planes.
+point is paired with the model's point behind the same pixel. The pose moves so that the measured points lie in the
+model's planes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from bufgym.kernel import kernel
 
 @kernel
 def smooth(depth: Any, radius: int, same_surface: float, result: Any) -> None:
-    """Each depth's mean with its neighbours on the same surface: those within that share of the depth."""
+    """Average each depth with its neighbours on the same surface, within the share ``same_surface`` of the depth."""
     height, width = depth.shape
     for v in range(height):
         for u in range(width):
@@ -32,7 +32,7 @@ def smooth(depth: Any, radius: int, same_surface: float, result: Any) -> None:
 
 @kernel
 def unproject(depth: Any, far_m: float, lens: Any, vertices: Any) -> None:
-    """The points of a depth image, in the camera's frame: float32[height, width, 3], NaN where there is none."""
+    """Write the points of a depth image in the camera's frame, float32[height, width, 3], NaN without a point."""
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             z = depth[v, u]
@@ -94,18 +94,18 @@ def normal_equations(
     jacobian: Any,
     sums: Any,
 ) -> int:
-    """What least squares needs to move ``pose`` by a small rotation and translation (rx, ry, rz, tx, ty, tz).
+    """Sum the normal equations that move ``pose`` by a small rotation and translation (rx, ry, rz, tx, ty, tz).
 
     Args:
-        points, point_normals: of the frame, in its camera's frame.
-        stride: every so many pixels and rows are used.
+        points, point_normals: points of the frame and their normals, in its camera's frame.
+        stride: step between the pixels and rows used.
         pose: float64[4, 4], camera to world, the estimate so far.
         model, model_normals: the surface as seen from another pose, in the world.
         to_model_camera: float64[4, 4], world to the camera of that pose.
-        lens: of the model's camera.
+        lens: lens of the model's camera.
         apart_m: pairs farther apart are none, m.
         cosine: pairs whose normals differ by more than the angle of this cosine are none.
-        jacobian: float64[8], scratch: of one pair the 6 derivatives of the distance to the plane, that distance, and 1.
+        jacobian: float64[8], scratch: one pair's 6 derivatives of the distance to the plane, that distance, and 1.
         sums: float64[8, 8], written: the sum of jacobian^T jacobian over all pairs; its last element is their number.
 
     Returns the number of points with a normal, paired or not.
@@ -135,7 +135,7 @@ def normal_equations(
                 continue
             nx, ny, nz = model_normals[row, col, 0], model_normals[row, col, 1], model_normals[row, col, 2]
             dx, dy, dz = x - model[row, col, 0], y - model[row, col, 1], z - model[row, col, 2]
-            if not dx * dx + dy * dy + dz * dz < apart_m * apart_m:  # nor if it is NaN
+            if not dx * dx + dy * dy + dz * dz < apart_m * apart_m:  # also rejects NaN
                 continue
             wx = m[0, 0] * lx + m[0, 1] * ly + m[0, 2] * lz
             wy = m[1, 0] * lx + m[1, 1] * ly + m[1, 2] * lz
@@ -147,6 +147,6 @@ def normal_equations(
             jacobian[7] = 1.0
             for a in range(8):
                 factor = jacobian[a]
-                for b in range(8):  # all eight, though the sums are symmetric: so it is vectorised
+                for b in range(8):  # all eight although the sums are symmetric, so that the loop is vectorised
                     sums[a, b] += factor * jacobian[b]
     return count

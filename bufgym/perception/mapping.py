@@ -1,6 +1,6 @@
-"""A map of the frames that arrived, and how far it is from the map of all frames.
+"""Map of the frames that arrived, and its distance from the map of all frames.
 
-Frames are fused with their true poses, so what the map lacks is due to the frames that are missing and to nothing else.
+Frames are fused with their true poses, so all errors of the map come from missing frames.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from bufgym.traces.trace import Float64Array
 VOXEL_M: Final = 0.04
 """Edge of a voxel by default, m: at 160x120 pixels are 1.4 cm apart on a wall at 2 m."""
 TRUNCATION_VOXELS: Final = 3.0
-"""How far from the surface its distance is kept, in voxels."""
+"""Distance from the surface up to which the function is kept, in voxels."""
 FAR_M: Final = 4.5
-"""Nothing farther is used, m: there a Kinect's depth is off by 6 cm already."""
+"""Largest depth used, m; a Kinect's depth there is off by 6 cm already."""
 COVERED_M: Final = 0.05
 """A part of the reference is uncovered if the map has no point within this distance, m."""
 MOST_VOXELS: Final = 2**25
 """A larger grid would take more than 256 MB."""
 
 _BOX_STRIDE: Final = 8
-"""The box is measured by every 8th frame and pixel."""
+"""Step between the frames and pixels that measure the box."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Where the voxels are.
+    """Positions of the voxels.
 
     Raises:
         BufgymError: no voxel, too many, or a size that is not above 0.
@@ -59,12 +59,12 @@ class Grid:
 
     @property
     def truncation_m(self) -> float:
-        """How far from the surface its distance is kept, m."""
+        """Distance from the surface up to which the function is kept, m."""
         return TRUNCATION_VOXELS * self.voxel_m
 
 
 def grid_of(sequence: Sequence, voxel_m: float = VOXEL_M) -> Grid:
-    """The box around what all frames of a recording saw, with a margin of the truncation."""
+    """Grid of the box around all points of a recording, with a margin of the truncation."""
     stride = _BOX_STRIDE if min(sequence.camera.width, sequence.camera.height) >= 4 * _BOX_STRIDE else 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for k in range(0, len(sequence), _BOX_STRIDE):
@@ -96,17 +96,17 @@ class Map:
     tsdf: npt.NDArray[np.float32]
     """float32[grid.shape], -1..1, in units of the truncation."""
     weight: npt.NDArray[np.float32]
-    """float32[grid.shape], how many frames each voxel's value is the mean of."""
+    """float32[grid.shape], number of frames averaged in each voxel."""
 
     @staticmethod
     def empty(grid: Grid) -> Map:
-        """A map of nothing."""
+        """Make an empty map."""
         return Map(grid, np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32))
 
     def add(
         self, depth: npt.NDArray[np.float32], camera: Camera, pose: Float64Array, most_weight: float = math.inf
     ) -> None:
-        """Fuse one frame, seen from ``pose`` (camera to world); weights grow up to ``most_weight``."""
+        """Fuse one frame seen from ``pose``, camera to world; weights grow up to ``most_weight``."""
         to_camera = np.linalg.inv(pose)
         grid = self.grid
         origin_m, reach_m = np.array(grid.origin_m), grid.truncation_m
@@ -116,7 +116,7 @@ class Map:
         )
 
     def points(self) -> Float64Array:
-        """Where the surface crosses the edges between voxels, float64[m, 3], world coordinates, m."""
+        """Points where the surface crosses edges between voxels, float64[m, 3], world coordinates, m."""
         origin_m, voxel_m = np.array(self.grid.origin_m), self.grid.voxel_m
         count = tsdf.surface(self.tsdf, self.weight, origin_m, voxel_m, np.empty((0, 3)))
         points = np.empty((count, 3))
@@ -125,17 +125,17 @@ class Map:
 
 
 def lens_of(camera: Camera) -> Float64Array:
-    """float64[4] as the kernels want it."""
+    """Make the kernels' lens, float64[4]."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
 def fuse(sequence: Sequence, frames: Iterable[int], grid: Grid | None = None) -> Map:
-    """The map of these frames, fused in the given order with their true poses.
+    """Fuse these frames into a map, in the given order with their true poses.
 
     Args:
         sequence: the recording; `Sequence.reduced` to about 160x120 is fast and fine enough for the default voxels.
-        frames: the indices of those that arrived.
-        grid: by default `grid_of` the whole recording, so that maps of different frames can be compared.
+        frames: indices of the frames that arrived.
+        grid: by default `grid_of` the whole recording, so that maps of different frames are comparable.
     """
     result = Map.empty(grid or grid_of(sequence))
     for k in frames:
@@ -145,29 +145,29 @@ def fuse(sequence: Sequence, frames: Iterable[int], grid: Grid | None = None) ->
 
 @dataclass(frozen=True)
 class MapError:
-    """How far a map is from a reference, cloud to cloud."""
+    """Distance of a map from a reference, cloud to cloud."""
 
     to_reference_m: float
-    """Root mean square distance from the map's points to the nearest of the reference, m: what is wrong."""
+    """Root mean square distance from the map's points to the nearest reference points, m; shows wrong parts."""
     from_reference_m: float
-    """The same from the reference's points to the map's, m: what is missing as well."""
+    """The same from the reference's points to the map's, m; shows missing parts too."""
     uncovered: float
-    """Share of the reference's points without one of the map's within `COVERED_M`."""
+    """Share of the reference's points without a point of the map within `COVERED_M`."""
 
     @property
     def rmse_m(self) -> float:
-        """Both ways together, each with the same weight, m."""
+        """Root mean square of both directions with equal weight, m."""
         return math.sqrt((self.to_reference_m**2 + self.from_reference_m**2) / 2)
 
 
 def distances(points: Float64Array, reference: Float64Array) -> Float64Array:
-    """float64[m]: how far each point is from the nearest of the reference, m."""
+    """Distance of each point from the nearest reference point, float64[m], m."""
     nearest, _ = library("scipy.spatial").cKDTree(reference).query(points)
     return np.asarray(nearest, np.float64)
 
 
 def error(found: Map, reference: Map) -> MapError:
-    """How far the map is from the reference, usually the map of all frames.
+    """Measure the map's distance from the reference, usually the map of all frames.
 
     Raises:
         BufgymError: one of the two has no surface.

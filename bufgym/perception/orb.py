@@ -1,9 +1,9 @@
-"""ORBBuf as its paper describes it [wang2021orbbuf]: which message goes is decided by what their images have in common.
+"""ORBBuf as its paper describes it [wang2021orbbuf]: the similarity of images decides which message to drop.
 
-Similarity is that of ORB features (Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011): the
-share of one image's features that match one of the other's, each being the other's nearest. The released code has a
-random number in this place, and the wording of the paper's formula was not at hand: the formula is ours. The rule
-around it is that of the policy `orbbuf`, which compares recorded motion.
+Similarity is the share of an image's ORB features that match a feature of the other image, each being the other's
+nearest (Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011). The formula is ours, because the
+released code has a random number in its place and the paper's wording was not at hand. The rest of the rule is the
+policy `orbbuf`, which compares recorded motion.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.scenario import Episode
 
 FEATURES: Final = 500
-"""Features of an image at most, as OpenCV has it by default."""
+"""Most features of an image, OpenCV's default."""
 NEAR_BITS: Final = 64
-"""Descriptors of 256 bits match where at most so many differ (ORB-SLAM2's TH_LOW is 50, its TH_HIGH 100)."""
+"""Most differing bits of matching 256-bit descriptors; ORB-SLAM2's TH_LOW is 50 and its TH_HIGH 100."""
 
 
 class OrbSimilarity:
@@ -40,7 +40,7 @@ class OrbSimilarity:
         self._known: dict[tuple[int, int], float] = {}
 
     def __call__(self, i: int, j: int) -> float:
-        """In [0, 1]; the same whichever comes first. An image without features is like no other."""
+        """Compare two frames, in either order, in [0, 1]; an image without features is like no other."""
         pair = (i, j) if i < j else (j, i)
         if pair not in self._known:
             first, second = self._of(pair[0]), self._of(pair[1])
@@ -57,14 +57,14 @@ class OrbSimilarity:
 
 
 def orbbuf_by(similar: Callable[[int, int], float], episode: Episode, name: str = "orbbuf-images") -> Policy:
-    """`orbbuf` for one episode, by a similarity of two frames that are given by their places in it."""
+    """Make `orbbuf` for one episode from a similarity of two frames, given by their indices in the episode."""
     frames = {int(time_us): k for k, time_us in enumerate(episode.arrivals["arrival_us"].tolist())}
 
     def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         L = len(buffer.slots)
         if has_space(buffer, arrival):
             return ACCEPT
-        # The head's older neighbour is the message that left last; while none has left, the head stays.
+        # The head's older neighbour is the last departed message; before any departure the head stays.
         queue = [frames[int(buffer.dequeued_arrival_us)], *(int(seq) for seq in buffer.slots["seq"])]
         victim, most_similar = L - 1, -np.inf
         for k in range(0 if buffer.dequeued > 0 and L > 2 else 1, L - 1):
@@ -77,19 +77,19 @@ def orbbuf_by(similar: Callable[[int, int], float], episode: Episode, name: str 
 
 
 def orbbuf_with_images(sequence: Sequence, episode: Episode) -> Policy:
-    """`orbbuf` by the ORB features of the frames, which must be the episode's messages in their order."""
+    """Make `orbbuf` by the ORB features of the frames, which must be the episode's messages in order."""
     return orbbuf_by(OrbSimilarity(sequence.grey), episode)
 
 
 COMPARED: Final = 3
-"""Further images that the last of so many decisions compares."""
+"""Number of further images that the last decision compares."""
 
 
 def decision_ms(sequence: Sequence, decisions: int = 50, features: int = FEATURES) -> NDArray[np.float64]:
-    """float64[decisions]: times of one decision as the paper has it, ms.
+    """Time single decisions as the paper describes them, float64[decisions], ms.
 
-    A message went and one came: the features of the new image are computed, and the similarity of each neighbour of
-    the gap to the one now beside it. Reading the images takes no part.
+    After an eviction and an arrival, a decision computes the new image's features and the similarities of the gap's
+    neighbours to their new neighbours. Reading the images is not timed.
     """
     images = [sequence.grey(k) for k in range(decisions + COMPARED)]
     similar = OrbSimilarity(images.__getitem__, features)

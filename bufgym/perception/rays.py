@@ -1,9 +1,9 @@
-"""A depth camera in a made-up room: which box or ball each pixel sees, and what a Kinect would measure there.
+"""Depth camera in a made-up room: finds the box or ball that each pixel sees and a Kinect's measurement of it.
 
 A Kinect finds disparities in steps of 1/8 pixel by matching windows against the dots of a projector beside it [K.
 Khoshelham, S. Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 2012].
-So its depth comes in steps that grow with the square of the depth, neighbours share their errors, and what the
-projector does not reach, at the edges of things, is missing. Noise is a hash of seed, frame and place: no state.
+So its depth has steps that grow with the square of the depth, and neighbours share their errors. Places at the edges of
+things that the projector does not reach are missing. Noise is a stateless hash of seed, frame and place.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 from bufgym.kernel import kernel
 
 BASELINE_M = 0.075
-"""From the camera to the projector, along x, m."""
+"""Distance from the camera to the projector along x, m."""
 STEPS_PER_PIXEL = 8.0
 """Steps of the disparity."""
 NOISE_STEPS = 0.5
@@ -26,7 +26,7 @@ NEAREST_M, FARTHEST_M = 0.4, 5.0
 GRAZING = 0.12
 """Cosine of the angle to the surface's normal below which the dots are too stretched."""
 SLACK = 1e-3
-"""Things are looked for beyond their bounds by so much, pixels and m, so that rounding hides none."""
+"""Margin around the bounds of things, in pixels and m, so that rounding hides none."""
 
 _MASK = 0xFFFFFFFF
 
@@ -47,7 +47,7 @@ def _uniform(seed: int, a: int, b: int, c: int) -> float:
 
 @kernel
 def _hit(box: Any, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, face: Any) -> float:
-    """How far along the ray a turned box is entered, -1 if it is not; where it is left if the ray starts inside.
+    """Distance along the ray at which it enters a turned box, or leaves it if it starts inside; -1 without a hit.
 
     box: float64[8] = centre, half sizes, cosine and sine of its turn about z. ``face`` float64[3]: the normal, written.
     """
@@ -84,7 +84,7 @@ def _hit(box: Any, ox: float, oy: float, oz: float, dx: float, dy: float, dz: fl
 
 @kernel
 def _hit_ball(ball: Any, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, face: Any) -> float:
-    """The same for a ball: float64[8] = centre, radius, and nothing."""
+    """Do the same for a ball, float64[8] = centre, radius and zeros."""
     px, py, pz = ox - ball[0], oy - ball[1], oz - ball[2]
     a = dx * dx + dy * dy + dz * dz
     b = px * dx + py * dy + pz * dz
@@ -131,10 +131,10 @@ def cull(things: Any, balls: int, lens: Any, width: int, height: int, to_camera:
 def bound(
     things: Any, balls: int, seen: Any, count: int, lens: Any, to_camera: Any, aside_m: float, bounds: Any
 ) -> None:
-    """Write to ``bounds`` float64[n, 5] between which columns and rows each thing lies, and its least depth.
+    """Write to ``bounds`` float64[n, 5] the range of columns and rows of each thing, and its least depth.
 
-    It is seen by an eye that is ``aside_m`` right of the camera and looks along with it. A box's corners bound it, and
-    those of a cube bound a ball; what reaches behind the eye, as the room does, may be anywhere.
+    The eye is ``aside_m`` right of the camera and looks in the same direction. A box is bounded by its corners and a
+    ball by the corners of a cube. A thing that reaches behind the eye, as the room does, may be anywhere.
     """
     m = to_camera
     for i in range(count):
@@ -162,7 +162,7 @@ def bound(
 
 @kernel
 def _within(bounds: Any, i: int, u: float, v: float, z: float) -> bool:
-    """Whether what the eye sees at this column and row, up to this depth, may be thing ``i`` of those seen."""
+    """Whether thing ``i`` may be seen at this column and row, up to this depth."""
     columns = bounds[i, 0] <= u <= bounds[i, 1]
     return bool(columns and bounds[i, 2] <= v <= bounds[i, 3] and bounds[i, 4] <= z)
 
@@ -184,13 +184,13 @@ def render(
     depth: Any,
     grey: Any,
 ) -> None:
-    """Every ``stride``-th pixel of every ``stride``-th row of a frame.
+    """Render every ``stride``-th pixel of every ``stride``-th row of a frame.
 
     Args:
         things: float64[n, 8], boxes and from number ``balls`` on balls; the first box is the room, seen from inside.
-        seen, count: those that the camera may see (see `cull`).
-        bounds: float64[2, n, 5], where they lie for the camera, and for the projector (see `bound`).
-        lens: of the whole camera.
+        seen, count: things that the camera may see, from `cull`.
+        bounds: float64[2, n, 5], their bounds for the camera and for the projector, from `bound`.
+        lens: lens of the whole camera.
         to_world: float64[4, 4], camera to world.
         noisy: measure as a Kinect does; otherwise the true depth of every pixel.
         face: float64[6], scratch.
@@ -227,7 +227,7 @@ def render(
                 continue
             if -(nx * dx + ny * dy + nz * dz) < GRAZING * math.sqrt(dx * dx + dy * dy + dz * dz):
                 continue
-            # Does the projector reach the place? A ray from there, one long up to it.
+            # Does the projector reach the place? The ray from it has length 1 at the place.
             lit, lit_u = True, u - lens[0] * BASELINE_M / z
             for i in range(1, count):
                 if not _within(bounds[1], i, lit_u, v, z):
@@ -258,7 +258,7 @@ def _distance(
 
 @kernel
 def _shade(x: float, y: float, z: float, nx: float, ny: float, nz: float, seed: int, thing: int) -> int:
-    """The grey of a place: a colour for each thing, tiles of three sizes cut out of the space, light from above."""
+    """Grey of a place: a colour for each thing, tiles of three sizes cut from space, and light from above."""
     # A little below the surface, so that a wall does not lie on the border between two tiles.
     x, y, z = x - 0.003 * nx, y - 0.003 * ny, z - 0.003 * nz
     value = 0.35 * _uniform(seed, -1, thing, 0)

@@ -30,25 +30,25 @@ from bufgym.traces.poses import Poses, rotations
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 
 TUM_CAMERA: Final = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-"""The publishers advise these numbers of ROS for all their sequences: the depth was registered with them."""
+"""ROS's default numbers, which the publishers advise for all sequences because the depth was registered with them."""
 SEVEN_SCENES_CAMERA: Final = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 TUM_UNITS_PER_M: Final = 5000.0
 MM_PER_M: Final = 1000.0
 SEVEN_SCENES_HZ: Final = 30.0
 SAME_MOMENT_S: Final = 0.02
-"""Depth and picture belong together if they are at most so far apart (the publishers' associate.py), s."""
+"""Most time between a depth and its picture, as in the publishers' associate.py, s."""
 POSE_GAP_S: Final = 0.1
-"""Across a longer gap in the ground truth no pose is made up; frames in it are left out, s."""
+"""Longest gap in the ground truth across which poses are interpolated, s; frames in longer gaps are left out."""
 
 _MOST_IMAGE_BYTES: Final = 16 * 2**20
 _MOST_TEXT_BYTES: Final = 2**26
 _ROTATION_TOLERANCE: Final = 0.01
 _ENDS: Final = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
-"""How an image file begins -> how it ends if it is whole."""
+"""First bytes of an image file -> last bytes of a complete one."""
 
 
 def opened(folder: Path) -> Sequence:
-    """The recording in a folder; the layout is known by its files."""
+    """Open the recording in a folder, whose files tell the layout."""
     if not folder.is_dir():
         raise BufgymError(f"{folder}: no such folder")
     if (folder / "depth.txt").is_file():
@@ -68,7 +68,7 @@ class _Files(Sequence):
 
     @abstractmethod
     def _bytes(self, kind: Literal["depth", "image"], k: int) -> tuple[object, bytes]:
-        """What to call the file in messages, and all it holds."""
+        """Read a file; return its name for messages and its content."""
 
     def depth(self, k: int) -> Depth:
         file, data = self._bytes("depth", k)
@@ -91,7 +91,7 @@ def _decoded(file: object, data: bytes, camera: Camera) -> np.ndarray:
     if end is None:
         raise BufgymError(f"{file}: must be a PNG or JPEG image")
     pixels = None
-    if end in data[-64:]:  # else the library writes to the terminal, or guesses the rest
+    if end in data[-64:]:  # of a cut file the library would guess the rest, or write to the terminal
         cv2 = library("cv2")
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
@@ -132,7 +132,7 @@ class Tum(_Files):
 
 
 def _listed(path: Path) -> tuple[Int64Array, list[str]]:
-    """Times in microseconds and files of a list of TUM's: `time file` a line."""
+    """Read a TUM list with `time file` per line; return times in microseconds and files."""
     times: list[int] = []
     names: list[str] = []
     with open_text(path) as file:
@@ -229,7 +229,7 @@ def _archive(path: Path) -> zipfile.ZipFile:
 
 
 def _pose(path: Path, text: str, line: int | None = None) -> Float64Array:
-    """A 4x4 matrix row by row; its rotation, which recorders let drift, made one again."""
+    """Read a 4x4 matrix row by row; its rotation, which recorders let drift, is made orthonormal again."""
     rule = "must be a 4x4 matrix: 16 finite numbers, the left upper 3x3 a rotation within 1 %, the last row 0 0 0 1"
     try:
         matrix = np.array([float(number) for number in text.split()]).reshape(4, 4)

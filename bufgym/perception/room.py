@@ -1,6 +1,6 @@
-"""A made-up room for those without recordings: walls, furniture and texture, seen by a Kinect that moves.
+"""Made-up room in place of a recording: walls, furniture and texture, seen by a moving Kinect.
 
-All is drawn from a seed beforehand; each frame is ray-cast when it is asked for, so a reduced frame costs only its own
+Everything is drawn from a seed beforehand. Each frame is ray-cast on demand, so a reduced frame costs only its own
 pixels.
 """
 
@@ -27,15 +27,15 @@ SIZE_M: Final = (5.0, 4.2, 2.6)
 EYE_M: Final = 1.3
 """Mean height of the camera, m."""
 FREE_M: Final = 0.45
-"""No thing is nearer to the camera's way, m."""
+"""Least distance of things from the camera's path, m."""
 WALL_M: Final = 1.2
-"""Nor is a wall nearer to a given trajectory, m."""
+"""Least distance of walls from a given trajectory, m."""
 BOXES: Final = 80
 BALLS: Final = 8
 MOTION: Final = "drive-0"
-"""The shipped recording whose motion the camera has where no trajectory is given."""
+"""Shipped recording whose motion the camera follows without a given trajectory."""
 PACE: Final = 0.5
-"""How fast it is played: then the view changes as fast as in 7-Scenes (11.6 fields of view in 1000 frames)."""
+"""Its speed. The view then changes as fast as in 7-Scenes, 11.6 fields of view in 1000 frames."""
 
 _LAP_POINTS: Final = 4000
 _TRIES: Final = 60
@@ -43,13 +43,13 @@ _TRIES: Final = 60
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stands in a room whose floor is z = 0 and one of whose corners is the origin."""
+    """Walls and furniture of a room. The floor is z = 0 and one corner is the origin."""
 
     things: Float64Array
-    """float64[n, 8]: boxes (centre, half sizes, cosine and sine of the turn about z; the first is the room itself),
-    then balls (centre, radius, zeros)."""
+    """Boxes, then balls, float64[n, 8]. A box has centre, half sizes, cosine and sine of its turn about z; the first is
+    the room itself. A ball has centre, radius and zeros."""
     balls: int
-    """The number of the first ball."""
+    """Index of the first ball."""
 
 
 class Room(Sequence):
@@ -60,11 +60,11 @@ class Room(Sequence):
     ) -> None:
         """
         Args:
-            name: in tables.
-            scene: what there is to see.
-            time_us, poses: of the frames, as `Sequence` has them.
-            seed: of noise and texture.
-            stride: every so many pixels and rows are rendered.
+            name: name in tables.
+            scene: walls and furniture.
+            time_us, poses: times and poses of the frames, as in `Sequence`.
+            seed: seed of noise and texture.
+            stride: step between the pixels and rows rendered.
         """
         self.name, self.scene, self.time_us, self.poses = name, scene, time_us, poses
         self.camera = SEVEN_SCENES_CAMERA.every(stride)
@@ -116,16 +116,15 @@ def room(
     rate_hz: float = 30.0,
     motion: Motion | None = None,
 ) -> Room:
-    """A recording of a made-up room, 640x480; `Sequence.reduced` renders fewer pixels.
+    """Make a recording of a made-up room, 640x480; `Sequence.reduced` renders fewer pixels.
 
     Args:
-        seed: of furniture, texture and noise.
+        seed: seed of furniture, texture and noise.
         poses: where the camera is, z up (such as TUM's); moved into the middle of the room, which grows to hold it. By
             default it walks round in the room and looks at the walls, turning this way and that.
-        frames: how many, if the trajectory lasts so long; by default as many as AFR's recording has.
-        rate_hz: of the camera.
-        motion: how fast it goes where no `poses` are given; by default that of the shipped recording
-            `drive-0` at half its speed.
+        frames: number of frames, if the trajectory is long enough; by default as many as AFR's recording has.
+        rate_hz: rate of the camera.
+        motion: speed of the camera without `poses`; by default the shipped recording `drive-0` at half speed.
 
     Raises:
         BufgymError: a seed below 0, less than 2 frames, a rate that is not above 0.
@@ -151,7 +150,7 @@ def room(
 
 
 def _walk(time_us: Int64Array, motion: Motion, pace: float, size_m: Float64Array) -> Float64Array:
-    """Poses on a closed way through the room, float64[n, 4, 4], gone along as fast as the motion's coordinate grows."""
+    """Poses on a closed path through the room, float64[n, 4, 4], at the pace of the motion's coordinate."""
     phase = np.linspace(0, 2 * np.pi, _LAP_POINTS + 1)
     centre = size_m / 2
     place = np.stack(
@@ -162,7 +161,7 @@ def _walk(time_us: Int64Array, motion: Motion, pace: float, size_m: Float64Array
         ],
         axis=1,
     )
-    # Outwards, but swaying: it returns to what it has just seen.
+    # It looks outwards but sways, so that it returns to places just seen.
     yaw, pitch = phase + 0.5 * np.sin(4 * phase), np.radians(-12.0 + 9.0 * np.sin(3 * phase))
     lap = np.tile(np.eye(4), (len(phase), 1, 1))
     ahead = np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], axis=1)
@@ -180,12 +179,12 @@ def _walk(time_us: Int64Array, motion: Motion, pace: float, size_m: Float64Array
 
 
 def furnished(rng: np.random.Generator, size_m: Float64Array, way: Float64Array) -> Scene:
-    """A room of this size with furniture along its walls, on the floor, and pictures and balls above.
+    """Furnish a room of this size with furniture along the walls and on the floor, and pictures and balls above.
 
     Args:
-        rng: drawn from in a fixed order.
+        rng: generator, used in a fixed order.
         size_m: float64[3].
-        way: float64[n, 3], where the camera goes; no thing stands there.
+        way: float64[n, 3], the camera's path, which stays free.
     """
     boxes = [np.array([*size_m / 2, *size_m / 2, 1.0, 0.0])]
     balls: list[Float64Array] = []
@@ -203,7 +202,7 @@ def furnished(rng: np.random.Generator, size_m: Float64Array, way: Float64Array)
 
 
 def _box(rng: np.random.Generator, size_m: Float64Array, n: int) -> Float64Array:
-    """Of four things one stands at a wall, one on the floor, and two hang at a wall."""
+    """Draw box ``n``. In each group of four, one stands at a wall, one on the floor, and two hang at a wall."""
     half = np.array([0.15 + 0.4 * rng.random(), 0.12 + 0.2 * rng.random(), 0.2 + 0.75 * rng.random()])
     turn = 0.5 * np.pi * int(rng.integers(4))
     if n % 4 == 1:

@@ -1,4 +1,4 @@
-"""A recording sent over a link: its frames as an episode, and which of them arrive under a policy."""
+"""A recording sent over a link: its frames as an episode, and the frames that arrive under a policy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bufgym.sim import metrics
 from bufgym.traces import Trace
 
 SIZED_EVERY = 10
-"""Every so many frames one is encoded; the size of those between lies between theirs."""
+"""Distance between frames that are encoded; sizes between them are interpolated."""
 
 
 class First(Sequence):
@@ -41,31 +41,31 @@ class First(Sequence):
 
 
 def first(sequence: Sequence, frames: int) -> Sequence:
-    """The recording's first frames; all of them where there are no more."""
+    """Select the recording's first frames, or all if there are no more."""
     return sequence if len(sequence) <= frames else First(sequence, frames)
 
 
 @lru_cache(maxsize=8)
 def sizes(sequence: Sequence, every: int = SIZED_EVERY) -> NDArray[np.int64]:
-    """int64[frames]: bytes of each frame as it is sent."""
+    """Bytes of each frame as it is sent, int64[frames]."""
     return between([sequence.size_bytes(int(k)) for k in encoded(len(sequence), every)], len(sequence), every)
 
 
 def encoded(frames: int, every: int = SIZED_EVERY) -> NDArray[np.int64]:
-    """The frames whose sizes are measured: every so many, and the last."""
+    """Select the frames whose sizes are measured: one in ``every``, and the last."""
     return np.unique(np.append(np.arange(0, frames, every), frames - 1))
 
 
 def between(measured: Seq[int], frames: int, every: int = SIZED_EVERY) -> NDArray[np.int64]:
-    """int64[frames]: the sizes of all frames from those of ``encoded``."""
+    """Interpolate all frames' sizes from the measured sizes of ``encoded``, int64[frames]."""
     return np.rint(np.interp(np.arange(frames), encoded(frames, every), measured)).astype(np.int64)
 
 
 def fading(stream_us: int, trace: Trace, offset_us: int = 0) -> Link:
-    """The link that is met when a stream of this length begins ``offset_us`` into the trace's stretch of that length.
+    """Make the link of a stream that begins ``offset_us`` into a stretch of the trace as long as the stream.
 
-    What follows the stretch is the stretch again. So whatever the offset, the link carries the same while the stream
-    lasts, and a fade is only met at another place of the camera's way: earlier by the offset.
+    The stretch then repeats. So for any offset the link carries the same while the stream lasts, and a fade only meets
+    another place on the camera's path, earlier by the offset.
     """
     until_us = min(int(stream_us), int(trace.duration_us))
     inside = trace.time_us < until_us
@@ -76,13 +76,13 @@ def fading(stream_us: int, trace: Trace, offset_us: int = 0) -> Link:
 
 
 def episode(sequence: Sequence, size_bytes: NDArray[np.int64], link: Link, seed: int = 0) -> Episode:
-    """The frames as they come, x being the camera's motion; ``seed``: of what randomised policies draw."""
+    """Make the episode of the frames, with the camera's motion as x; ``seed`` feeds randomised policies."""
     x = sequence.motion().at(sequence.time_us)
     arrivals = messages(sequence.time_us, size_bytes, x - x[0])
     return Episode(arrivals, link).with_uniforms(np.random.Generator(np.random.PCG64(seed)))
 
 
 def received(policy: str | Policy, one: Episode, capacity: int) -> tuple[int, ...]:
-    """The frames that arrive, by their numbers, with a queue of ``capacity`` messages under ``policy``."""
+    """Return the indices of the frames that arrive, with a queue of ``capacity`` messages under ``policy``."""
     senders = sim.run(policies.get(policy), [one], capacity, motion_value())
     return tuple(metrics.received(senders, 0)["seq"].tolist())

@@ -1,8 +1,8 @@
-"""Where a camera is, from its frames alone: KinectFusion on the frames that arrived, and where it fails.
+"""Camera tracking by KinectFusion on the frames that arrived alone, and where it fails.
 
-The model begins with the first frame at its true pose. Each further frame is aligned with the model as seen from the
-frame before (coarse to fine) and then fused into it at the pose found. There is no model of motion and no relocation:
-a camera that moved on too far between two frames that arrived is lost, as it is for the robot's server.
+The model begins with the first frame at its true pose. Each further frame is aligned, coarse to fine, with the model as
+seen from the frame before, and then fused into it at the pose found. There is no model of motion and no relocation. A
+camera that moves too far between two frames that arrived is lost, as it is for the robot's server.
 """
 
 from __future__ import annotations
@@ -22,28 +22,29 @@ from bufgym.traces.poses import rotations
 from bufgym.traces.trace import Float64Array
 
 LEVELS: Final = ((4, 10), (2, 5), (1, 2))
-"""(stride, most steps) from coarse to fine. KinectFusion takes four at the finest; two change no result here, and save
-a millisecond."""
+"""(stride, most steps) from coarse to fine. KinectFusion takes four steps at the finest; with two the results here are
+the same, a millisecond faster."""
 MODEL_WIDTH: Final = 80
-"""The model is looked at through about so many pixels a row: of 160 every second, which are 2.7 cm apart at 2 m, finer
+"""About the pixels per row through which the model is seen: every second of 160. They are 2.7 cm apart at 2 m, finer
 than voxels."""
 SMALL_STEP: Final = 3e-4
-"""A level ends early at a smaller step, rad and m."""
+"""Step below which a level ends early, rad and m."""
 SAME_SURFACE: Final = 0.05
-"""Neighbouring pixels are of one surface if their distances differ by at most this share."""
+"""Largest relative difference of neighbouring pixels' distances on one surface."""
 SMOOTH_RADIUS: Final = 2
 """Depths are smoothed over 5x5 pixels, within one surface, before normals are taken."""
 MOST_WEIGHT: Final = 64.0
-"""The model forgets as KinectFusion's does, by a running mean of at most so many frames."""
+"""Limit on frames in the model's running mean, which forgets as in KinectFusion."""
 
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """When two points belong together, and when tracking has failed.
+    """Criteria for pairs of points and for a tracking failure.
 
-    The papers do not say what a tracking failure is. Here a run fails at its first frame at which the alignment finds
-    too few pairs (the tracker knows that it is lost), or at which the step from the frame before is too far from the
-    true step (it is lost and does not know). Slow drift is no failure: it depends on the recording's camera model.
+    The papers do not define a tracking failure. Here a run fails at the first frame where the alignment finds too few
+    pairs, so that the tracker knows that it is lost. It also fails where the step from the frame before is too far from
+    the true step, so that the tracker is lost without knowing. Slow drift is no failure, because it depends on the
+    recording's camera model.
     """
 
     apart_m: float = 0.1
@@ -55,7 +56,7 @@ class TrackingSettings:
     most_error_m: float = 0.1
     """Lost if one step is off by more, m."""
     most_error_deg: float = 5.0
-    """Lost if one step turns by so much more or less than it should, degrees."""
+    """Lost if the turn of one step is off by more, degrees."""
 
     def __post_init__(self) -> None:
         for name in ("apart_m", "apart_deg", "most_error_m", "most_error_deg"):
@@ -67,10 +68,10 @@ class TrackingSettings:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """How far tracking got."""
+    """Result of tracking."""
 
     frames: npt.NDArray[np.int64]
-    """int64[m], those that arrived, indices of the sequence."""
+    """int64[m], indices of the frames that arrived."""
     poses: Float64Array
     """float64[m, 4, 4], the poses found, camera to world; NaN from the failure on."""
     error_m: Float64Array
@@ -80,7 +81,7 @@ class Track:
     where: int | None
     """The frame (index of the sequence) at which tracking failed; None if it never did."""
     model: Map
-    """What it made of the frames until then, at the poses found."""
+    """Map of the frames until then, at the poses found."""
 
     @property
     def failed(self) -> bool:
@@ -89,7 +90,7 @@ class Track:
 
 
 def smoothed(depth: Depth) -> Depth:
-    """The depth image whose normals are taken."""
+    """Smooth a depth image for its normals."""
     result = np.empty_like(depth)
     icp.smooth(depth, SMOOTH_RADIUS, SAME_SURFACE / 2, result)
     return result
@@ -106,10 +107,10 @@ def track(
 
     Args:
         sequence: the recording; `Sequence.reduced` to about 160x120 is meant.
-        frames: the indices of those that arrived, in order.
-        grid: of the model; by default `grid_of` the whole recording.
+        frames: indices of the frames that arrived, in order.
+        grid: grid of the model; by default `grid_of` the whole recording.
         settings: by default `TrackingSettings()`.
-        smooth: `smoothed` of frame k, for those who track one recording again and again and keep it.
+        smooth: returns `smoothed` of frame k, for callers that cache it.
 
     Raises:
         BufgymError: no frame, or frames that are not in order.
@@ -141,7 +142,7 @@ def _jumped(
 
 
 def difference(pose: Float64Array, truth: Float64Array) -> tuple[float, float]:
-    """How far two poses are apart, m and degrees."""
+    """Distance between two poses, m and degrees."""
     turn = pose[:3, :3].T @ truth[:3, :3]
     sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     angle = np.arctan2(sine, np.trace(turn) - 1)  # the arc cosine would lose small angles
@@ -149,7 +150,7 @@ def difference(pose: Float64Array, truth: Float64Array) -> tuple[float, float]:
 
 
 class Tracker:
-    """A model that grows and the pose of the camera in it."""
+    """A growing model and the camera's pose in it."""
 
     def __init__(self, camera: Camera, grid: Grid, settings: TrackingSettings | None = None) -> None:
         self.settings = settings or TrackingSettings()
@@ -167,13 +168,13 @@ class Tracker:
         self._hint: Depth = np.zeros(model_shape[:2], np.float32)
 
     def begin(self, depth: Depth, pose: Float64Array) -> None:
-        """The first frame, at a known pose."""
+        """Start with the first frame at a known pose."""
         self._fuse(depth, pose)
 
     def follow(self, depth: Depth, smooth: Depth | None = None) -> Float64Array | None:
-        """The pose of the next frame, camera to world, which is then part of the model; None if it is lost.
+        """Find the pose of the next frame, camera to world, and add it to the model; None if it is lost.
 
-        ``smooth``: `smoothed` of it, where that is known.
+        ``smooth`` is the frame's `smoothed` depth, if known.
         """
         pose = self._aligned(smoothed(depth) if smooth is None else smooth)
         if pose is not None:
@@ -232,12 +233,12 @@ class Tracker:
             return None
         try:
             return np.asarray(np.linalg.solve(self._sums[:6, :6], -self._sums[:6, 6]), np.float64)
-        except np.linalg.LinAlgError:  # a view that leaves a direction open, such as a single wall
+        except np.linalg.LinAlgError:  # the view leaves a direction open, such as a single wall
             return None
 
 
 def _moved(pose: Float64Array, step: Float64Array) -> Float64Array:
-    """The pose after a small rotation about the world's origin (rad) and a translation (m)."""
+    """Apply a small rotation about the world's origin, rad, and a translation, m."""
     angle = float(np.linalg.norm(step[:3]))
     axis = step[:3] / angle if angle > 0 else step[:3]
     quaternion = np.append(np.sin(angle / 2) * axis, np.cos(angle / 2))

@@ -1,10 +1,10 @@
-"""A truncated signed distance function on a voxel grid: depth images fused, and the surface seen from a pose.
+"""Truncated signed distance function on a voxel grid: fuses depth images and renders the surface from a pose.
 
 B. Curless, M. Levoy, "A Volumetric Method for Building Complex Models from Range Images", SIGGRAPH 1996, as in
 R. A. Newcombe et al., "KinectFusion: Real-Time Dense Surface Mapping and Tracking", ISMAR 2011. A voxel holds the mean
 distance to the surface along the viewing direction, in units of the truncation: 1 = free, 0 = surface, below = behind.
 
-Kernels take ``lens`` = float64[4], (fx, fy, cx, cy), and poses as float64[4, 4]; sums are taken in a fixed order.
+Kernels take ``lens`` = (fx, fy, cx, cy) as float64[4] and poses as float64[4, 4]. Sums are taken in a fixed order.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 from bufgym.kernel import kernel
 
 NEAR_M = 0.3
-"""Nothing nearer is used, m; a Kinect measures from 0.4 m on."""
+"""Least depth used, m; a Kinect measures from 0.4 m on."""
 
 
 @kernel
@@ -31,7 +31,7 @@ def integrate(
     tsdf: Any,
     weight: Any,
 ) -> None:
-    """Add one depth image, seen from ``to_camera``, to every voxel that it says something about.
+    """Add one depth image, seen from ``to_camera``, to every voxel that it informs.
 
     Along a column of voxels the image coordinates' numerators and the depth are linear, so the stretch inside the
     field of view follows from six inequalities, and no other voxel is touched.
@@ -60,13 +60,13 @@ def integrate(
                 u = int(fx * (x + k * dx) / pz + cx + 0.5)
                 v = int(fy * (y + k * dy) / pz + cy + 0.5)
                 if u >= width or v >= height:
-                    continue  # by rounding alone
+                    continue  # outside by rounding alone
                 measured = depth[v, u]
                 if measured < NEAR_M or measured > far_m:
                     continue
                 distance = measured - pz
                 if distance < -truncation_m:
-                    continue  # hidden: nothing is known
+                    continue  # hidden, so unknown
                 value = min(1.0, distance / truncation_m)
                 w = weight[i, j, k]
                 tsdf[i, j, k] = (tsdf[i, j, k] * w + value) / (w + 1.0)
@@ -75,7 +75,7 @@ def integrate(
 
 @kernel
 def _clipped(low: float, high: float, start: float, step: float) -> tuple[float, float]:
-    """The part of low..high where start + k step >= 0; empty (1, 0) if there is none."""
+    """Clip low..high to where start + k step >= 0; the empty range is (1, 0)."""
     if step > 0.0:
         return max(low, -start / step), high
     if step < 0.0:
@@ -85,9 +85,9 @@ def _clipped(low: float, high: float, start: float, step: float) -> tuple[float,
 
 @kernel
 def surface(tsdf: Any, weight: Any, origin_m: Any, voxel_m: float, points: Any) -> int:
-    """Write where the surface crosses the edges between seen voxels to ``points`` float64[m, 3], as far as it has room.
+    """Write the crossings of the surface with edges between seen voxels to ``points`` float64[m, 3], while it has room.
 
-    Returns how many such places there are.
+    Returns the number of crossings.
     """
     count = 0
     for i in range(tsdf.shape[0]):
@@ -114,7 +114,7 @@ def surface(tsdf: Any, weight: Any, origin_m: Any, voxel_m: float, points: Any) 
 
 @kernel
 def _trilinear(tsdf: Any, weight: Any, x: float, y: float, z: float) -> float:
-    """The function between voxels, in grid coordinates; 2 where one of the eight voxels around was never seen."""
+    """Interpolate the function at grid coordinates; 2 where one of the eight voxels around was never seen."""
     i, j, k = int(x), int(y), int(z)
     if x < 0.0 or y < 0.0 or z < 0.0:
         return 2.0
@@ -145,12 +145,12 @@ def raycast(
     hint: Any,
     vertices: Any,
 ) -> None:
-    """The surface as seen from ``to_world``: float32[height, width, 3] in the world, NaN where none is seen.
+    """Render the surface as seen from ``to_world``, float32[height, width, 3] in the world, NaN where none is seen.
 
-    ``hint`` float32[height, width] is a depth that was fused from there, 0 where none: what lies in front of it by more
-    than the truncation was found free, so the ray begins there. It goes on by what the function says is free, from a
-    voxel to 0.8 of the truncation, as much where nothing is known; where it passes from positive to negative, both
-    sides known, lies the surface.
+    ``hint`` float32[height, width] is a depth that was fused from this pose, or 0. Space in front of it by more than
+    the truncation is free, so the ray begins there. Each step is as long as the function says is free, from a voxel to
+    0.8 of the truncation, and equally long in unknown space. The surface lies where the function passes from positive
+    to negative with both sides known.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     m = to_world

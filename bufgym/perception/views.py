@@ -1,10 +1,10 @@
-"""What a frame shows of the scene that others have shown: the V that the AFR paper assumes, measured.
+"""Overlap of a frame with other frames: a measurement of the V that the AFR paper assumes.
 
-Each depth pixel of frame j is put where it lies in the world and looked for in frame i. It was *seen* there if it falls
-into the picture and the depth measured at that place agrees. Where frame i measured nothing, nobody can tell: such
-pixels count neither way. V(i, j) = 1 - seen(i, j) is the part of frame j that is new to one who has frame i.
+Each depth pixel of frame j is placed in the world and looked for in frame i. It was *seen* there if it falls into the
+picture and the depth measured there agrees. Pixels where frame i measured nothing do not count. V(i, j) = 1 - seen(i,
+j) is the part of frame j that is new after frame i.
 
-That is a V of two frames. The paper's is a V of the distance between them; `afr-views` holds one against the other.
+This V depends on two frames, while the paper's depends on the distance between them; `afr-overlap` compares the two.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from bufgym.perception.frames import Sequence
 from bufgym.traces.trace import Float64Array
 
 AGREE: Final = 0.05
-"""Two depths agree within this part of the distance: ten times a Kinect's noise at 3 m."""
+"""Largest relative difference of agreeing depths, ten times a Kinect's noise at 3 m."""
 POINTS_ACROSS: Final = 20
-"""Pixels of a row that are looked for: views overlap in large pieces, and few points tell."""
+"""Pixels per row that are looked for; few are enough, because views overlap in large pieces."""
 CELL_M: Final = 0.1
 """Side of the cells in which coverage is counted, m."""
 LEAST_VIEWS: Final = 3
-"""So many of all frames must have seen a cell for it to count: what fewer saw is mostly noise at edges."""
+"""Frames that must have seen a cell for it to count; cells seen by fewer are mostly noise at edges."""
 
 
 @kernel
@@ -39,14 +39,14 @@ def seen_share(
     j: int,
     stride: int,
 ) -> float:
-    """The part of frame j that frame i has seen, in [0, 1]; 0 where frame i measured none of it.
+    """Part of frame j that frame i has seen, in [0, 1]; 0 if frame i measured none of it.
 
     Args:
         depths: float32[frames, height, width], m.
         poses: float64[frames, 4, 4], camera to world.
         lens: fx, fy, cx, cy of both, pixels.
         i, j: the two frames.
-        stride: every so many pixels of every so many rows of frame j are looked for.
+        stride: step between the pixels and rows of frame j that are looked for.
     """
     height, width = depths.shape[1], depths.shape[2]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -57,11 +57,11 @@ def seen_share(
             if z <= 0.0:
                 continue
             x, y = (u - cx) * z / fx, (v - cy) * z / fy
-            # To the world by pose j, less where camera i stands ...
+            # To the world by pose j, relative to camera i's position ...
             dx = poses[j, 0, 0] * x + poses[j, 0, 1] * y + poses[j, 0, 2] * z + poses[j, 0, 3] - poses[i, 0, 3]
             dy = poses[j, 1, 0] * x + poses[j, 1, 1] * y + poses[j, 1, 2] * z + poses[j, 1, 3] - poses[i, 1, 3]
             dz = poses[j, 2, 0] * x + poses[j, 2, 1] * y + poses[j, 2, 2] * z + poses[j, 2, 3] - poses[i, 2, 3]
-            # ... and into its axes, by the transposed rotation.
+            # ... and into camera i's axes by the transposed rotation.
             away = poses[i, 0, 2] * dx + poses[i, 1, 2] * dy + poses[i, 2, 2] * dz
             if away <= 0.0:
                 known += 1
@@ -87,14 +87,14 @@ def _all_shares(
     stride: int,
     seen: NDArray[np.float32],
 ) -> None:
-    """Write ``seen_share`` of every frame and each that came after it."""
+    """Write ``seen_share`` of every frame and each later one."""
     for i in range(len(depths)):
         for j in range(i + 1, len(depths)):
             seen[i, j] = seen_share(depths, poses, lens, i, j, stride)
 
 
 def seen_shares(sequence: Sequence) -> NDArray[np.float32]:
-    """float32[frames, frames]: [i, j] is the part of frame j that frame i has seen, for i <= j (0 below).
+    """Part of frame j that frame i has seen, at [i, j] of float32[frames, frames] for i <= j; 0 below.
 
     About 10 us a pair: some seconds for a thousand frames.
     """
@@ -107,7 +107,7 @@ def seen_shares(sequence: Sequence) -> NDArray[np.float32]:
 
 
 def overlap_information(seen: NDArray[np.float32], frames: Iterable[int]) -> float:
-    """H of these frames with the measured V: 1 + the sum of V(before, frame) over them in order; 0 for none."""
+    """H of these frames by the measured V, 1 + the sum of V(before, frame) in order; 0 without frames."""
     kept = np.fromiter(frames, np.int64)
     if not len(kept):
         return 0.0
@@ -115,20 +115,20 @@ def overlap_information(seen: NDArray[np.float32], frames: Iterable[int]) -> flo
 
 
 def least_overlap(seen: NDArray[np.float32], frames: Iterable[int]) -> float:
-    """The least part of a frame that the one before it has seen, over these frames in order; 1 for fewer than two.
+    """Least overlap of consecutive frames: the part of a frame that the one before it has seen.
 
-    No information: what a tracker needs, which is lost by the worst step and not by the sum of all.
+    It is 1 for fewer than two frames. A tracker needs this rather than H, because the worst step loses it, not the sum.
     """
     kept = np.fromiter(frames, np.int64)
     return float(seen[kept[:-1], kept[1:]].min()) if len(kept) > 1 else 1.0
 
 
 class Coverage:
-    """What part of the scene some frames have seen at all, in whatever order: a measure for robots that come back.
+    """Part of the scene that some frames have seen, in any order: a measure for robots that revisit places.
 
-    H counts a view that is new since the frame *before*, so a place that the robot returns to counts twice. Coverage
-    counts the cells of the scene, and each once. It is no sum over gaps: what a frame adds depends on all others, and
-    the queue's policies cannot be told of it message by message. It measures runs, and rewards them at their end.
+    H counts a view that is new since the frame *before*, so a revisited place counts twice. Coverage counts each cell
+    of the scene once. It is no sum over gaps: a frame's contribution depends on all others, so policies cannot learn it
+    message by message. Coverage measures runs and rewards them at their end.
     """
 
     def __init__(self, sequence: Sequence, cell_m: float = CELL_M, least_views: int = LEAST_VIEWS) -> None:
@@ -147,25 +147,25 @@ class Coverage:
         saw[frame, number] = True
         self._saw = np.packbits(saw[:, counts], axis=1)
         self.cells = int(counts.sum())
-        """That count."""
+        """Number of cells that count."""
 
     def seen(self, frames: Iterable[int]) -> NDArray[np.uint8]:
-        """The cells that some of these frames have seen, a bit for each."""
+        """Cells that these frames have seen, a bit for each."""
         return np.asarray(np.bitwise_or.reduce(self._saw[np.fromiter(frames, np.int64)], axis=0), np.uint8)
 
     def share(self, frames: Iterable[int]) -> float:
-        """The part of all cells that some of these frames have seen, in [0, 1]."""
+        """Part of all cells that these frames have seen, in [0, 1]."""
         return int(np.bitwise_count(self.seen(frames)).sum()) / self.cells
 
 
 def _cells(sequence: Sequence, k: int, cell_m: float) -> NDArray[np.int64]:
-    """int64[points]: the cell of each point that frame k measured, 20 bits for each of x, y and z."""
+    """Cell of each point that frame k measured, 20 bits for each of x, y and z, int64[points]."""
     x, y, z = np.floor(world_points(sequence, k) / cell_m).astype(np.int64).T + 2**19
     return np.asarray((x << 40) + (y << 20) + z, np.int64)
 
 
 def world_points(sequence: Sequence, k: int) -> Float64Array:
-    """float64[points, 3]: where in the world what frame k measured lies, m."""
+    """World coordinates of the points that frame k measured, float64[points, 3], m."""
     depth, camera, pose = sequence.depth(k), sequence.camera, sequence.poses[k]
     v, u = np.nonzero(depth > 0)
     z = depth[v, u].astype(np.float64)

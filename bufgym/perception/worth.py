@@ -1,16 +1,16 @@
-"""What `bufgym/Mapping-v0` plays and pays: a made-up room is filmed, and the reward is what the frames are worth.
+"""Scenario and rewards of `bufgym/Mapping-v0`: a made-up room is filmed, and the reward is the frames' worth.
 
-The episode is a recording of a made-up room, always the same one, over a part of a shipped link that differs from
-episode to episode. At its end each of these terms says what the frames that arrived are worth, in [0, 1]:
+Every episode sends the same recording of a made-up room over a different part of a shipped link. At its end each of
+these terms rates the frames that arrived, in [0, 1]:
 
-| term | what it is | for |
+| term | meaning | for |
 |---|---|---|
 | `covered` | the part of the scene that some frame has seen | a map; the default |
-| `followed` | the least part of a frame that the one before it has seen | tracking: a stand-in that takes no time |
-| `tracked` | how far tracking gets along the frames, as a part of all | tracking itself: seconds an episode |
+| `followed` | the least part of a frame that the one before it has seen | fast stand-in for tracking |
+| `tracked` | how far tracking gets along the frames, as a part of all | tracking, seconds an episode |
 
-To train on tracking take `followed`, to evaluate `tracked`: ``reward={"followed": 1, "tracked": 0}`` reports the second
-without counting it.
+Train on `followed` and evaluate with `tracked`: ``reward={"followed": 1, "tracked": 0}`` reports `tracked` without
+counting it.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from bufgym.traces.workload import Workload
 
 SEED: Final = 0
 FRAMES: Final = 240
-"""Of the recording: 8 s."""
+"""Frames of the recording, 8 s."""
 SIZES: Final = (
     *(188_078, 188_294, 189_843, 195_316, 199_698, 205_064, 210_528, 215_847, 222_067, 224_835, 224_970, 228_515),
     *(221_105, 219_960, 220_765, 218_843, 216_128, 215_568, 215_483, 216_212, 214_161, 210_834, 207_500, 205_819),
     198_726,
 )
-"""Bytes of every tenth frame and the last, measured once (a test measures them again): so episodes begin at once, and
-are the same whichever JPEG library is installed."""
+"""Bytes of every tenth frame and the last, measured once and checked by a test. So episodes begin at once and do not
+depend on the JPEG library installed."""
 WIDTH, VIEW_WIDTH = 160, 80
-"""Frames are tracked at 160 x 120; how far views overlap is counted at 80 x 60."""
+"""Image widths: frames are tracked at 160 x 120, and views are compared at 80 x 60."""
 SCALE: Final = 0.25
-"""Of the shipped links: then they carry about half of the frames."""
+"""Scale of the shipped links, which then carry about half of the frames."""
 
 
 class Scene(NamedTuple):
-    """The recording, and what the terms need of it."""
+    """The recording and the data that the terms need."""
 
     whole: Sequence
     film: Sequence
@@ -60,13 +60,13 @@ class Scene(NamedTuple):
 
 @functools.cache
 def recording() -> Sequence:
-    """The made-up room's, not yet filmed."""
+    """Make the recording of the room, not yet rendered."""
     return room.room(SEED, frames=FRAMES)
 
 
 @functools.cache
 def scene() -> Scene:
-    """Filmed once a process, in some seconds."""
+    """Render the room once per process, in some seconds."""
     whole = recording()
     film = whole.reduced(whole.camera.width // WIDTH).loaded()
     small = film.reduced(WIDTH // VIEW_WIDTH)
@@ -75,7 +75,7 @@ def scene() -> Scene:
 
 @functools.cache
 def mapping() -> Uplink:
-    """The scenario: the recording over the shipped links, begun anywhere."""
+    """Make the scenario: the recording over the shipped links from any starting point."""
     whole = recording()
     x = whole.motion().at(whole.time_us)
     film = Workload("room", whole.time_us, streams.between(SIZES, FRAMES), x=x - x[0])
@@ -83,20 +83,20 @@ def mapping() -> Uplink:
 
 
 def coverage_of(frames: NDArray[np.int64]) -> float:
-    """The part of the scene that these frames have seen."""
+    """Part of the scene that these frames have seen."""
     return scene().coverage.share(frames)
 
 
 def least_followed(frames: NDArray[np.int64]) -> float:
-    """The least part of a frame that the one before it has seen.
+    """Least part of a frame that the one before it has seen.
 
-    From the recording's first frame to its last: who sends little must not seem to have lost little.
+    It includes the recording's first and last frame, so that sending few frames does not look good.
     """
     return views.least_overlap(scene().seen, np.union1d(frames, [0, FRAMES - 1]))
 
 
 def tracked_part(frames: NDArray[np.int64]) -> float:
-    """How far tracking gets along these frames, as a part of the recording."""
+    """Part of the recording up to which tracking along these frames gets."""
     if not len(frames):
         return 0.0
     track = tracking.track(scene().film, frames, scene().grid)
@@ -108,7 +108,7 @@ def tracked_part(frames: NDArray[np.int64]) -> float:
 
 
 def _arrived(step: Any) -> NDArray[np.int64]:
-    """int64[frames]: those that were transmitted, by their numbers."""
+    """Indices of the frames transmitted, int64[frames]."""
     n = len(step.log)
     if n != FRAMES:
         raise BufgymError(f"episode of {n} messages: this reward term is for bufgym/Mapping-v0, of {FRAMES}")
@@ -129,5 +129,5 @@ def followed(step: Any, memory: Memory) -> float:
 
 @reward_term("tracked", unit="part of the recording", one_queue=True)
 def tracked(step: Any, memory: Memory) -> float:
-    """at the end, how far tracking gets along the frames that arrived (`bufgym/Mapping-v0`); some seconds"""
+    """at the end, how far tracking gets along the frames that arrived in `bufgym/Mapping-v0`; takes some seconds"""
     return tracked_part(_arrived(step)) if step.ended else 0.0

@@ -1,5 +1,6 @@
-"""A relay for fleets: robots and viewers connect out to it, publish and subscribe by topic, and rules say who may.
+"""A relay for fleets: robots and viewers connect to it, and publish and subscribe by topic as its rules allow.
 
-Robofleet [sikand2021robofleet] is a client on each robot, one server and a web page. This is the server, on
-bufgym's own queues: ``server.Server`` serves what ``config.Config`` allows; ``wire`` is what goes over its WebSockets.
+Robofleet [sikand2021robofleet] is a client on each robot, one server and a web page. This package is the server, built
+on bufgym's queues. ``server.Server`` serves what ``config.Config`` allows, and ``wire`` defines the protocol on its
+WebSockets.
 """

@@ -1,6 +1,6 @@
-"""Who came, what was refused: JSON lines in files that take turns.
+"""Audit log of connections and refusals: JSON lines in rotated files.
 
-A client that is refused the same thing a thousand times a second makes one line a second, with how often.
+A client that is refused the same thing a thousand times a second makes one line a second, with the count.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bufgym.relay.config import Rotation
 
 FILE: Final = "audit.jsonl"
 _MOST_CHARACTERS: Final = 300
-"""Of a text of a stranger's."""
+"""Length limit of a text from outside."""
 _RECENT: Final = 1_000
 
 
@@ -47,7 +47,7 @@ class Audit:
             self._lines = _Lines(path, maxBytes=rotation.bytes, backupCount=rotation.files, encoding="utf-8")
 
     def __call__(self, event: str, **fields: Any) -> None:
-        """One entry."""
+        """Write one entry."""
         entry = {"at": round(time.time(), 6), "event": event}
         entry |= {name: _short(value) for name, value in fields.items()}
         self.recent.append(entry)
@@ -57,9 +57,9 @@ class Audit:
             self._lines.write(json.dumps(entry, separators=(",", ":")))
 
     def repeated(self, **fields: str) -> bool:
-        """A refusal that may come often: the first is written at once, and how many followed with ``flush``.
+        """Log a refusal that may come often: write the first at once, and leave the count of the rest to ``flush``.
 
-        Whether it is the first.
+        Return whether it is the first.
         """
         key = tuple(item for pair in sorted(fields.items()) for item in pair)
         first = key not in self._repeated
@@ -71,7 +71,7 @@ class Audit:
         return first
 
     def flush(self) -> None:
-        """Write how often each refusal was repeated since the last time."""
+        """Write how often each refusal was repeated since the last flush."""
         repeated, self._repeated = self._repeated, Counter()
         for key, times in repeated.items():
             if times:

@@ -1,4 +1,4 @@
-"""A recording as a robot: its messages again, as far apart as they were recorded."""
+"""A recording played as a robot: its messages are sent again with their recorded spacing."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from bufgym.scenario import Stream
 from bufgym.traces.formats.bags import messages, read_bag
 
 _LATE_S = 1.0
-"""Who is behind by more does not catch up: time goes on from there."""
+"""Delay beyond which playback does not catch up but continues from the present."""
 
 
 class Recorded:
-    """The recording in ``path``, an MCAP file, a ROS 1 bag or a rosbag2; again from its beginning if it ``loops``.
+    """The recording in ``path``, an MCAP file, a ROS 1 bag or a rosbag2; ``loops`` repeats it.
 
-    ``streams``: which of its topics, with the rules for each; None: all of them, without rules.
+    ``streams`` selects topics and gives their rules; None plays all topics without rules.
     """
 
     def __init__(self, path: str | Path, streams: Sequence[Stream] | None = None, *, loops: bool = True) -> None:
@@ -67,4 +67,4 @@ class Recorded:
         return {"recording": Path(self.path).name}
 
     async def on_command(self, command: Any) -> None:
-        """A recording does what it did."""
+        """Ignore the command, because a recording cannot change."""

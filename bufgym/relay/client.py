@@ -1,4 +1,4 @@
-"""A relay's client, for robots and any Python program: connects out, publishes through a policy's queue, subscribes.
+"""A relay's client for robots and other Python programs: publishes through a policy's queue, and subscribes.
 
     client = Client("ws://relay.example:7420", "robot-3", topics=(Topic("/robots/robot-3/camera"),), policy="afr")
     client.subscribe("^/robots/robot-3/command$", on_command, durable=True)
@@ -7,7 +7,8 @@
     await client.command("/robots/robot-4/command", {"command": "stop"})  # returns once the relay holds it
 
 Little waits outside the queue: the system's buffers are small, and a message counts as on its way until the relay's
-system has acked its last byte. Those that a broken connection leaves so go again, with the numbers that they had.
+system has acked its last byte. After a reconnect, messages still on their way are sent again under their original
+numbers.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from bufgym.relay import wire
 from bufgym.relay.session import Session
 
 _POLL_S: Final = (0.001, 0.016)
-"""Between two looks at what has left: at first, and when nothing moves."""
+"""Time between two checks for departures: at first, and when nothing moves."""
 
 
 @dataclass(eq=False)
@@ -64,20 +65,20 @@ class Client(Session):
     ) -> None:
         """
         Args:
-            topics: what is published, and the rules for each; none: ordinary messages can't be published.
+            topics: topics to publish on and their rules; without any, ordinary messages can't be published.
             policy: a drop rule for one topic, a scheduler for several.
             capacity: L, messages of all topics together.
             window: n_T, messages handed to the system and not yet acked by the relay's, at most.
             value: V of topics that have none of their own.
-            log: takes the number of the queue, which ``change`` counts, and a record of all that happens there.
-            url, name, token, tls, say: as a ``Session`` has them.
+            log: called with the number of the queue, which ``change`` counts, and each record of its events.
+            url, name, token, tls, say: as for ``Session``.
         """
         super().__init__(url, name, token=token, tls=tls, say=say)
         self._topics = tuple(topics)
         self._numbers = {topic.name: k for k, topic in enumerate(topics)}
         self._capacity, self._window, self._value, self._log = capacity, window, value, log
         self._queues: deque[PolicyQueue] = deque()
-        """The last is put into; those before it hand out what they still hold, under the policy they were made with."""
+        """Queues by age: messages go into the last; the others hand out their rest under their own policies."""
         self._changes = 0
         self._away: deque[_Away] = deque()
         self._moved = asyncio.Event()
@@ -88,7 +89,7 @@ class Client(Session):
     # --- what it publishes --------------------------------------------------------------------------------------------
 
     def change(self, policy: str | Policy) -> None:
-        """Another policy rules the queue from now on; what is queued goes first, by the one before."""
+        """Change the policy from now on; messages already queued go first, under the previous policy."""
         log, number = self._log, self._changes
         queue = PolicyQueue(
             policy,
@@ -107,7 +108,7 @@ class Client(Session):
 
     @property
     def queue(self) -> PolicyQueue:
-        """That which messages are put into."""
+        """The queue that messages are put into."""
         return self._queues[-1]
 
     def publish(
@@ -125,7 +126,7 @@ class Client(Session):
             topic: one of ``topics``.
             payload: in that ``encoding`` (json, cdr, ros1, jpeg, png, or a name that the receivers know).
             type: as in ROS, ``sensor_msgs/msg/LaserScan``.
-            x: how far the scene has moved on; None: 1 more than the last.
+            x: coordinate of the scene; None means 1 more than the last.
             stamp_us: us since 1970; None: now.
         """
         if topic not in self._numbers:
@@ -149,14 +150,14 @@ class Client(Session):
     # --- out ----------------------------------------------------------------------------------------------------------
 
     async def _send_all(self) -> None:
-        """What the queues hand out, in order; first what the last connection left."""
+        """Send what the queues hand out, in order, after the messages that the last connection left."""
         for away in self._away:
             away.written = False
         for away in list(self._away):
             await self._send(away)
         while self._queues:
             item = await self._queues[0].aget()
-            if item is None:  # it is closed: another policy follows
+            if item is None:  # the queue is closed: another policy follows
                 self._queues.popleft()
                 continue
             away = _Away(self._queues[0], item)
@@ -175,7 +176,7 @@ class Client(Session):
         self._moved.set()
 
     async def _leave_all(self) -> None:
-        """Tell each queue what has left: in order, as soon as no more bytes are left than belong to those behind it."""
+        """Tell the queues in order which messages have left; bytes still left belong to the messages behind them."""
         while True:
             await self._moved.wait()
             self._moved.clear()
@@ -191,7 +192,7 @@ class Client(Session):
                 away.queue.gone()
 
     async def _left(self) -> None:
-        """Returns when the oldest message away has left."""
+        """Wait until the oldest message away has left."""
         poll_s, most_s = _POLL_S
         while (left_bytes := self._left_bytes()) is not None:
             behind = sum(away.item.size_bytes for away in list(self._away)[1:] if away.written)

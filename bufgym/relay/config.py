@@ -1,6 +1,6 @@
-"""A relay's configuration: who may do what, and how much of it. ``examples/relay.toml`` has every table.
+"""A relay's configuration: permissions and limits. ``examples/relay.toml`` has every table.
 
-Everything is denied that no rule allows: a configuration without rules serves nobody.
+Whatever no rule allows is denied, so a configuration without rules serves nobody.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from bufgym.relay.patterns import pattern
 PORT: Final = 7420
 NO_DROP: Final = ("/robots/[^/]+/command",)
 POLICIES: Final = ("robofleet", "skip-pending", "drop-oldest", "drop-newest", "afr", "min-motion-gap", "ros-native")
-"""What a viewer may choose; each is compiled when it is first asked for."""
+"""Policies that a viewer may choose; each is compiled at its first use."""
 DEFAULT_CAPACITY: Final = 32
 ALGORITHMS: Final = ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512", "EdDSA")
-"""Signatures by a private key alone: with a shared secret every verifier could sign."""
+"""Accepted signatures, all by private key; with a shared secret every verifier could sign."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """Robofleet's rule: an identity, send or receive, a pattern of whole topics. What no rule allows is denied."""
+    """Robofleet's rule: an identity, send or receive, and a pattern that matches whole topics."""
 
     address: str = ""
     """An IP address, or a range as ``10.0.0.0/8``."""
     email: str = ""
-    """That of a token or a client's certificate."""
+    """E-mail of a token or of a client's certificate."""
     recorder: bool = False
-    """The relay's own recorder."""
+    """Whether the rule is for the relay's own recorder."""
     foxglove: bool = False
-    """Whoever connects to the relay's Foxglove server."""
+    """Whether the rule is for everybody who connects to the relay's Foxglove server."""
     send: bool = False
     receive: bool = False
     topic: str = ".*"
@@ -61,28 +61,28 @@ class Rule:
 
     @property
     def own(self) -> str:
-        """Which of the relay's own it is for; empty for those of strangers."""
+        """The relay's own part that the rule is for, "recorder" or "foxglove"; empty for a client."""
         return "recorder" if self.recorder else "foxglove" if self.foxglove else ""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one identity, over all its connections, where not said otherwise."""
+    """Limits of one identity over all its connections, unless a field says otherwise."""
 
     message_bytes: int = 2**23
-    """Of a frame."""
+    """Size of a frame."""
     topics: int = 256
-    """It publishes on."""
+    """Topics that it publishes on."""
     subscriptions: int = 64
     sessions: int = 64
-    """The relay keeps, with what is held for them."""
+    """Sessions that the relay keeps, with the messages held for them."""
     connections: int = 32
     messages_per_s: int = 2_000
     bytes_per_s: int = 10**8
     all_connections: int = 4_096
-    """Of everybody."""
+    """Connections of all identities together."""
     hello_s: float = 5.0
-    """From the connection to its hello."""
+    """Time from the connection to its hello."""
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -93,14 +93,14 @@ class Limits:
 
 @dataclass(frozen=True)
 class Store:
-    """Where no_drop messages are held until their receivers have acked them."""
+    """Limits of the store, which holds no_drop messages until their receivers have acked them."""
 
     messages: int = 1_000
-    """For one session; what comes then is refused to its sender."""
+    """Messages held for one session; further messages are refused to their sender."""
     bytes: int = 2**26
-    """In all."""
+    """Bytes held in total."""
     keep_s: float = 86_400.0
-    """A session that has been away for so long is forgotten, with what is held for it."""
+    """Absence after which a session is forgotten, with the messages held for it."""
     window: int = 5
     """n_T, no_drop messages on their way to or from a client and not acked, at most."""
 
@@ -118,7 +118,7 @@ class Tls:
     certificate: str
     key: str
     clients: str = ""
-    """The authority that signs clients' certificates; without it they are not asked for."""
+    """Authority that signs clients' certificates; if empty, clients are not asked for certificates."""
 
 
 @dataclass(frozen=True)
@@ -128,10 +128,10 @@ class Tokens:
     issuer: str
     audience: str
     keys: str
-    """Its key set (JWKS): https://..., or a file, which is read again when a token names a key that is not in it."""
+    """The issuer's key set (JWKS), a URL or a file. It is read again when a token names an unknown key."""
     algorithms: tuple[str, ...] = ("RS256", "ES256", "EdDSA")
     leeway_s: float = 10.0
-    """Clocks may differ by so much."""
+    """Allowed difference between clocks."""
 
     def __post_init__(self) -> None:
         for name in ("issuer", "audience", "keys"):
@@ -147,11 +147,11 @@ class Mesh:
     """Other relays that share topics with this one (extra ``zenoh``)."""
 
     listen: str
-    """HOST:PORT for them. Who connects there is believed as a relay is."""
+    """HOST:PORT for other relays. Whoever connects there is trusted as a relay."""
     connect: tuple[str, ...] = ()
-    """Where others listen; each needs to know one."""
+    """Addresses where others listen; each relay needs to know one."""
     certificate: str = ""
-    """PEM files: its own certificate and key, and the authority that must have signed the others'. Else no TLS."""
+    """PEM files: own certificate and key, and the authority that signs the others' certificates; empty for no TLS."""
     key: str = ""
     authority: str = ""
 
@@ -167,7 +167,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Foxglove:
-    """Where Foxglove and Lichtblick connect to (extra ``foxglove``), who see what rules with ``foxglove`` allow."""
+    """Address for Foxglove and Lichtblick (extra ``foxglove``); they see what rules with ``foxglove`` allow."""
 
     host: str = "127.0.0.1"
     port: int = 8765
@@ -180,7 +180,7 @@ class Foxglove:
 
 @dataclass(frozen=True)
 class Rotation:
-    """Files of a log: when one is full the next begins, and the oldest goes."""
+    """Rotation of a log: a full file is followed by the next, and the oldest is deleted."""
 
     bytes: int = 2**26
     files: int = 16
@@ -192,29 +192,29 @@ class Rotation:
 
 @dataclass(frozen=True)
 class Config:
-    """All of it."""
+    """The whole configuration."""
 
     host: str = "127.0.0.1"
     port: int = PORT
-    """0 for any that is free."""
+    """Port; 0 for any that is free."""
     rules: tuple[Rule, ...] = ()
     no_drop: tuple[str, ...] = NO_DROP
-    """Patterns of the topics of which nothing may be lost, each for a whole topic."""
+    """Patterns of lossless topics; each must match the whole topic."""
     policies: tuple[str, ...] = POLICIES
-    """Of subscribers' queues; the first is the default."""
+    """Policies of subscribers' queues; the first is the default."""
     origins: tuple[str, ...] = ()
     """Web pages of other servers that may connect, as ``https://example.org``."""
     robofleet: bool = False
-    """Whether clients that Robofleet released may connect, on any path but ours. The same rules hold for them."""
+    """Whether Robofleet's released clients may connect, on any path but ours, under the same rules."""
     folder: Path | None = None
-    """For what is held, the audit log and recordings; without it nothing of them outlives the relay."""
+    """Folder for held messages, the audit log and recordings; without it they end with the relay."""
     small_buffers: bool = True
-    """Whether the system keeps little of what goes to a client: what lies there no policy can drop."""
+    """Whether the system's buffers to clients are small; no policy can drop the messages in them."""
     limits: Limits = Limits()
     store: Store = Store()
     audit: Rotation = Rotation()
     recording: Rotation = field(default_factory=lambda: Rotation(bytes=2**30))
-    """Of MCAP files with all that a rule for the recorder allows."""
+    """Rotation of the recorder's MCAP files."""
     tls: Tls | None = None
     tokens: Tokens | None = None
     mesh: Mesh | None = None
@@ -248,9 +248,9 @@ _TABLES: Final[Mapping[str, Any]] = {
 
 
 def load(path: str | Path) -> Config:
-    """The configuration of a TOML file; files that it names lie beside it.
+    """Read the configuration from a TOML file; paths in it are relative to its folder.
 
-    Raises BufgymError, one line that names the file, for one that can't be read or breaks a rule.
+    Raises BufgymError with one line that names the file if it can't be read or breaks a rule.
     """
     beside = Path(path).parent
     try:
@@ -278,13 +278,13 @@ def load(path: str | Path) -> Config:
 
 
 def _beside(folder: Path, table: Any, *names: str) -> Any:
-    """The table, with the files that it names in this folder."""
+    """Resolve the table's file names in this folder."""
     files = {name: _text(name, getattr(table, name)) for name in names}
     return replace(table, **{name: str(folder / file) if file else "" for name, file in files.items()})
 
 
 def _made(kind: Any, name: str, table: Any) -> Any:
-    """A table as its dataclass."""
+    """Make the dataclass of a table."""
     if not isinstance(table, Mapping):
         raise BufgymError(f"{name} = {table!r}: must be a table")
     where = name and f"{name}: "

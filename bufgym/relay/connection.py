@@ -1,4 +1,4 @@
-"""One client's connection: who it is, and what it says, checked. What goes to it is in its ``outbox``."""
+"""One client's connection: its identity and its checked requests. Its ``outbox`` sends to it."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import WireError
 
 HELLO_BYTES: Final = 2**16
-"""Of a frame from a client that has not yet said who it is."""
+"""Size limit of a frame from a client that has not yet said hello."""
 MAX_PRIORITY: Final = 1e6
 MAX_CAPACITY: Final = 1_000
-"""Of a subscriber's queue."""
+"""Largest L of a subscriber's queue."""
 _SESSION: Final = re.compile(r"[\w.-]{1,64}", re.ASCII)
 _POLICY_VIOLATION: Final = 1008
 _ORDERS: Final = ("subscribe", "unsubscribe", "publish", "ack", "recordings", "replay")
@@ -45,7 +45,7 @@ class Connection:
     session: Session
     permissions: Permissions
     name: str
-    """What others see as the sender."""
+    """Sender's name as others see it."""
     acks = True
 
     def __init__(self, hub: Hub, socket: ServerConnection, verifier: Verifier | None) -> None:
@@ -60,7 +60,7 @@ class Connection:
     # --- in -----------------------------------------------------------------------------------------------------------
 
     async def serve(self, greeted: Callable[[], None]) -> None:
-        """From hello to the end; ``greeted`` is called in between."""
+        """Serve the client from hello to the end; call ``greeted`` after the hello."""
         try:
             async with asyncio.timeout(self._hub.config.limits.hello_s):
                 await self._hello()

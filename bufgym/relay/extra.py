@@ -1,4 +1,4 @@
-"""What the extra ``relay`` brings, imported where it is used."""
+"""Libraries of the extra ``relay``, imported where they are used."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from bufgym.live import extra
 
 
 def needs(library: str) -> AbstractContextManager[None]:
-    """An error that names the extra if ``library`` is missing, which the block imports."""
+    """Raise an error that names the extra if the block can't import ``library``."""
     return extra.needs(library, "relay", "bufgym.relay")

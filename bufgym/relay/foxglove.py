@@ -1,4 +1,4 @@
-"""What a relay or a viewer there sees, in Foxglove's own WebSocket protocol (``foxglove-sdk``, extra ``foxglove``).
+"""Messages of a relay in Foxglove's WebSocket protocol (``foxglove-sdk``, extra ``foxglove``).
 
 Foxglove and Lichtblick connect to it as to any robot. Messages of ROS go through as they are, with their definitions;
 pictures become CompressedImage, and poses also transforms, so that the map shows every robot where it is.
@@ -21,14 +21,14 @@ from bufgym.relay.rules import FOXGLOVE, Permissions
 from bufgym.relay.session import Session
 
 MAX_CHANNELS: Final = 10_000
-"""Strangers make them, by topics and types; beyond them nothing new is shown."""
+"""Limit on channels, which clients open by topic and type; further channels are not shown."""
 _TRANSFORMS: Final = ("/tf", "", "")
 _PICTURES: Final = ("jpeg", "png")
 _ROBOT: Final = re.compile(r"/robots/([^/]+)/")
 
 
 class Screen:
-    """Foxglove's server, which shows what ``show`` is given to all that connect."""
+    """Foxglove's server; each message given to ``show`` goes to everybody connected."""
 
     def __init__(self, host: str, port: int) -> None:
         with needs("foxglove", "foxglove", "bufgym.relay"):
@@ -37,18 +37,18 @@ class Screen:
         self._context = foxglove.Context()
         try:
             self._server = foxglove.start_server(name="bufgym relay", host=host, port=port, context=self._context)
-        except Exception as error:  # of its own kinds
+        except Exception as error:  # the library has its own error types
             raise BufgymError(f"{host}:{port}: Foxglove's server: {error}") from None
         self.address = f"{host}:{self._server.port}"
-        """Where it listens."""
+        """Address where it listens."""
         self._channels: dict[tuple[str, str, str], Any] = {}
 
     def close(self) -> None:
-        """Nobody is connected any more."""
+        """Disconnect everybody and stop."""
         self._server.stop()
 
     def show(self, message: wire.Message) -> None:
-        """One message."""
+        """Show one message."""
         key = message.topic, message.encoding, message.type
         if key not in self._channels:
             if len(self._channels) >= MAX_CHANNELS:
@@ -65,7 +65,7 @@ class Screen:
             return
         self._channels[key].log(payload, log_time=time_ns)
         if message.encoding == "cdr" and message.type in ros_messages.POSES:
-            with suppress(BufgymError):  # it says what it is not
+            with suppress(BufgymError):  # its type and its content differ
                 self._transform(ros_messages.read(payload, message.type), message.topic, time_ns)
 
     def _channel(self, message: wire.Message) -> Any:
@@ -108,7 +108,7 @@ class Screen:
 
 
 class Bridge:
-    """A screen for what ``session`` receives on topics in which ``pattern`` is found."""
+    """A screen for the messages that ``session`` receives on topics that contain ``pattern``."""
 
     def __init__(self, session: Session, port: int, host: str = "127.0.0.1", pattern: str = "^/") -> None:
         self._screen = Screen(host, port)
@@ -117,7 +117,7 @@ class Bridge:
         session.subscribe(pattern, self._screen.show)
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Show messages until cancelled."""
         try:
             await self.session.run()
         finally:
@@ -125,20 +125,20 @@ class Bridge:
 
 
 class Window(Screen):
-    """The relay's own screen: who looks there sees what rules with ``foxglove`` allow."""
+    """The relay's own screen, which shows what rules with ``foxglove`` allow."""
 
     def __init__(self, settings: Foxglove, rules: Sequence[Rule]) -> None:
         super().__init__(settings.host, settings.port)
         self._permissions = Permissions(rules, FOXGLOVE)
 
     def __call__(self, message: wire.Message) -> None:
-        """Show it, if a rule allows it."""
+        """Show a message if a rule allows it."""
         if self._permissions.allow("receive", message.topic):
             self.show(message)
 
 
 def _frame(topic: str) -> str:
-    """The frame of the robot whose topic this is."""
+    """Name the coordinate frame of the topic's robot."""
     match = _ROBOT.match(topic)
     return f"{match[1]}/base" if match else "base"
 

@@ -1,4 +1,4 @@
-"""Who is connected, and what goes to whom: the relay without its sockets."""
+"""Members of a relay and the routing between them, without sockets."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from bufgym.relay.store import Session, Settled, Store
 from bufgym.relay.subscriber import Subscription
 
 OWN: Final = "relay"
-"""The relay's name as a sender, and the beginning of its topics."""
+"""The relay's name as a sender, and the prefix of its topics."""
 STATUS: Final = f"/{OWN}/status"
 ROBOFLEET: Final = "robofleet"
-"""The encoding of a flatbuffer of Robofleet's, and the form in which its clients get messages: that alone."""
+"""Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""
 MAX_ROUTES: Final = 10_000
 MAX_JSON_BYTES: Final = 2**20
-"""Of a text frame, and of a payload that says that it is JSON: to read it takes time."""
+"""Size limit of a text frame and of a JSON payload, which take time to read."""
 
 
 class Frame:
-    """A message as it goes out, in each form made once however many receive it."""
+    """An outgoing message; each of its forms is made once for all receivers."""
 
     def __init__(self, message: wire.Message) -> None:
         self.message = message
@@ -43,7 +43,7 @@ class Frame:
         return wire.to_json(self.message)
 
     def form(self, name: str) -> bytes | str:
-        """As a client of this form gets it."""
+        """Give the form that a client asked for."""
         if name == ROBOFLEET:
             return bytes(self.message.payload)
         return self.json if name == "json" else self.binary
@@ -54,26 +54,26 @@ class Frame:
 
 
 class Member(Protocol):
-    """A connection that has said who it is."""
+    """A connection that has said hello."""
 
     session: Session
     permissions: Permissions
     subscriptions: dict[str, Subscription]
     acks: bool
-    """Whether its client acks no_drop messages; if not, they go to it as all others."""
+    """Whether its client acks no_drop messages; otherwise it gets them like all others."""
 
     @property
     def sent(self) -> int:
-        """Messages that have gone to it."""
+        """Number of messages sent to it."""
 
     def offer(self, subscription: Subscription, frame: Frame) -> None:
-        """A message that its queues decide on."""
+        """Offer a message to its queues."""
 
     def wake(self) -> None:
-        """The store has something for it."""
+        """Say that the store has something for it."""
 
     def tell(self, op: str, **fields: Any) -> None:
-        """Say this to its client, before any message."""
+        """Tell its client this before any message."""
 
     def end(self, why: str) -> None:
         """Close it."""
@@ -83,21 +83,21 @@ class Others(Protocol):
     """Other relays."""
 
     async def hold(self, sender: Session, message: wire.Message) -> int | None:
-        """How many receivers they hold it for; None: not all have answered."""
+        """Ask them to hold a message; return the number of receivers, or None if not all have answered."""
 
 
 class Own(Protocol):
-    """One of the relay's own that gets messages besides its clients: the recorder, the Foxglove server."""
+    """A receiver inside the relay, such as the recorder or the Foxglove server."""
 
     def __call__(self, message: wire.Message) -> None:
-        """Take it, if a rule allows it."""
+        """Take a message if a rule allows it."""
 
     def close(self) -> None:
-        """It was the last."""
+        """Finish; no message follows."""
 
 
 class Hub:
-    """All that the connections share."""
+    """State shared by the connections."""
 
     def __init__(self, config: Config, clock: Callable[[], float] = time.monotonic) -> None:
         self.config = config
@@ -120,7 +120,7 @@ class Hub:
     # --- who is here --------------------------------------------------------------------------------------------------
 
     def join(self, member: Member) -> None:
-        """It has said who it is; another connection of its session ends."""
+        """Add a member that has said hello; end any other connection of its session."""
         other = self.members.get(member.session)
         if other is not None:
             self._detach(other)
@@ -128,7 +128,7 @@ class Hub:
         self.members[member.session] = member
 
     def leave(self, member: Member) -> None:
-        """Its connection has ended."""
+        """Remove a member whose connection has ended."""
         if self.members.get(member.session) is member:
             self._detach(member)
             self.settled(self.store.left(member.session))
@@ -140,7 +140,7 @@ class Hub:
         self._routes.clear()
 
     def subscribe(self, member: Member, subscription: Subscription) -> None:
-        """It wants what matches; a subscription of the same id goes."""
+        """Add a subscription; it replaces one with the same id."""
         old = member.subscriptions.pop(subscription.id, None)
         self._dropped += old.dropped if old else 0
         member.subscriptions[subscription.id] = subscription
@@ -149,7 +149,7 @@ class Hub:
         self.store.want(member.session, subscription.id, wanted)
 
     def unsubscribe(self, member: Member, id: str) -> bool:
-        """It wants this no longer; whether it had it."""
+        """Remove a subscription; return whether it existed."""
         self.store.want(member.session, id, None)
         old = member.subscriptions.pop(id, None)
         self._dropped += old.dropped if old else 0
@@ -159,11 +159,11 @@ class Hub:
     # --- messages -----------------------------------------------------------------------------------------------------
 
     def is_no_drop(self, topic: str) -> bool:
-        """Whether nothing of the topic may be lost."""
+        """Whether the topic is lossless."""
         return _any_whole(self.config.no_drop, topic)
 
     def publish(self, sender: Member | None, message: wire.Message) -> None:
-        """To each subscriber's queue but its sender's."""
+        """Offer a message to each subscriber's queue except its sender's."""
         self.received += 1
         for each in self.own:
             each(message)
@@ -173,7 +173,7 @@ class Hub:
                 member.offer(subscription, frame)
 
     def _route(self, topic: str) -> list[tuple[Member, Subscription]]:
-        """Who gets it: each member once, by the first of its subscriptions that matches."""
+        """Find the receivers: each member once, by its first matching subscription."""
         route = self._routes.get(topic)
         if route is None:
             if len(self._routes) >= MAX_ROUTES:
@@ -188,13 +188,14 @@ class Hub:
     def hold(
         self, sender: Member, message: wire.Message, elsewhere: int = 0, taken: tuple[Session, int] | None = None
     ) -> int:
-        """Keep a no_drop message until its receivers have acked it; how many they are.
+        """Keep a no_drop message until its receivers have acked it; return their number.
 
         Args:
-            elsewhere: its receivers at other relays, which hold it already.
-            taken: from whom, and under which number; None: the sender's session, and the message's.
+            elsewhere: number of receivers at other relays, which hold it already.
+            taken: session and number under which it was taken; None means the sender's session and the message's
+                number.
 
-        Raises RefusedError: nobody is to get it, or there is no room.
+        Raises RefusedError: it has no receiver, or there is no room.
         """
         receivers = self._holders(sender, message.topic)
         if not receivers and not elsewhere:
@@ -214,7 +215,7 @@ class Hub:
         return len(receivers)
 
     def _holders(self, sender: Member, topic: str) -> list[Session]:
-        """The sessions that are to get a no_drop message: here, away, or back and about to subscribe again."""
+        """Find the sessions that should get a no_drop message: here, away, or back and about to subscribe again."""
         here = [member.session for member, _ in self._route(topic) if member is not sender and member.acks]
         away = [
             session
@@ -228,7 +229,7 @@ class Hub:
         return here + away
 
     def settled(self, messages: Sequence[Settled]) -> None:
-        """Tell the senders of these what became of them."""
+        """Tell the senders of these messages their outcome."""
         for sender, seq, receivers, lost in messages:
             if sender in self.members:
                 self.members[sender].tell("delivered", seq=seq, receivers=receivers, lost=lost)
@@ -249,7 +250,7 @@ class Hub:
         }
 
     def tick(self) -> None:
-        """Once a second: tell how it is, and forget what is over."""
+        """Publish the relay's state once a second, and forget what has expired."""
         payload = json.dumps(self.status()).encode()
         self.publish(None, wire.Message(STATUS, payload, sender=OWN, stamp_us=time.time_ns() // 1000))
         self.audit.flush()
@@ -272,5 +273,5 @@ def _any_whole(patterns: tuple[str, ...], topic: str) -> bool:
 
 
 def matching(member: Member, topic: str) -> Subscription | None:
-    """The first of its subscriptions that wants this topic."""
+    """Find the member's first subscription that matches this topic."""
     return next((each for each in member.subscriptions.values() if each.pattern.part(topic)), None)

@@ -1,4 +1,4 @@
-"""Who is at the other end: JSON web tokens against an issuer's keys, clients' certificates."""
+"""Proofs of identity: JSON web tokens checked against an issuer's keys, and clients' certificates."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from bufgym.relay.quota import RefusedError
 MAX_KEYS_BYTES: Final = 2**20
 MAX_TOKEN_CHARACTERS: Final = 2**14
 KEYS_AGE_S: Final = 300.0
-"""A key that the issuer withdrew is trusted for so long at most."""
+"""Longest time for which a key is still trusted after the issuer withdrew it."""
 AGAIN_S: Final = 1.0
-"""Tokens that name unknown keys make the relay ask the issuer no more often than this."""
+"""Shortest time between two requests to the issuer because of tokens with unknown keys."""
 _FETCH_S: Final = 5.0
 
 
@@ -49,7 +49,7 @@ class Verifier:
                 raise BufgymError(f"tokens: keys = {tokens.keys!r}: must be an https address")
 
     async def email(self, token: str) -> tuple[str, float]:
-        """(the e-mail that the token proves, until when, s since 1970).
+        """Return the e-mail that the token proves and the token's end, s since 1970.
 
         Raises RefusedError: it proves none.
         """
@@ -117,20 +117,20 @@ def _is_loopback(host: str | None) -> bool:
 
 
 def server_context(tls: Tls) -> ssl.SSLContext:
-    """TLS for the relay's side; certificates of clients are asked for if an authority for them is given."""
+    """Set up TLS for the relay; clients are asked for certificates if an authority for them is given."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_cert_chain(tls.certificate, tls.key)
         if tls.clients:
             context.load_verify_locations(tls.clients)
-            context.verify_mode = ssl.CERT_OPTIONAL  # one without a certificate may have a token, or an address
+            context.verify_mode = ssl.CERT_OPTIONAL  # else a token or an address may do
     except (OSError, ssl.SSLError) as error:
         raise BufgymError(f"tls: {tls.certificate}, {tls.key}, {tls.clients}: {error}") from None
     return context
 
 
 def certificate_email(certificate: Mapping[str, Any] | None) -> str:
-    """The e-mail in a client's verified certificate (subject alternative name, or subject); empty if there is none."""
+    """Read the e-mail from the subject alternative name or subject of a client's verified certificate, or ""."""
     for kind, value in (certificate or {}).get("subjectAltName", ()):
         if kind == "email" and isinstance(value, str) and value.isprintable():
             return value

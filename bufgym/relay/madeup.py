@@ -1,4 +1,4 @@
-"""A robot for those who have none: it drives through a made-up room, with odometry, a laser, a camera and a battery."""
+"""A made-up robot that drives through a made-up room, with odometry, a laser, a camera and a battery."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from bufgym.relay.room import cast, jpeg, picture, pose_at
 from bufgym.scenario import Stream, read_client
 
 CONFIG: Final = Path(str(files("bufgym.relay").joinpath("madeup.toml")))
-"""Its topics, as a client's configuration has them."""
+"""Configuration of its topics, in the format of a client's."""
 BEAMS: Final = np.radians(np.arange(-180, 180, 2.0))
 _DRAIN_S: Final = 3600.0
-"""From a full battery to an empty one."""
+"""Time for a full battery to run empty."""
 _TURN_S: Final = 0.05
 
 
@@ -59,7 +59,7 @@ class MadeUp:
         robot.publish("camera", jpeg(picture(pose_at(self.number, self._now()[0]))), "jpeg")
 
     def _now(self) -> tuple[float, int]:
-        """(s since it began, us since 1970)."""
+        """Return the time in s since it began and in us since 1970."""
         return time.monotonic() - self._began_s, time.time_ns() // 1000
 
     def status(self) -> dict[str, Any]:
@@ -67,4 +67,4 @@ class MadeUp:
         return {"battery": round(max(0.0, charge), 3)}
 
     async def on_command(self, command: Any) -> None:
-        """It knows none of its own."""
+        """Ignore the command; this robot knows none."""

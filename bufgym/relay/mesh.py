@@ -1,11 +1,12 @@
-"""Relays that share topics, over Zenoh: robots at one of them, viewers at another.
+"""Relays that share topics over Zenoh, so that robots at one of them reach viewers at another.
 
-What is published at one goes to all others, through a queue of its own, and there to whom *their* rules allow. Each
-knows one of the others, hears of the rest from it, and is connected with all: one that dies takes nothing but its own.
+A message published at one relay goes through a queue to all others, and from there to clients that *their* rules allow.
+Each relay knows one other, hears of the rest from it, and connects to all. So a relay that dies cuts off only its own
+clients.
 
-A no_drop message is first offered to the others (a query of Zenoh's). Those that have a receiver hold it on their disks
-and say so; only then does the sender's relay ack it. If one does not answer, the sender is asked to connect again and
-sends it again; who held it knows it by its fingerprint, so that it still arrives once.
+A no_drop message is first offered to the other relays by a Zenoh query. Relays that have a receiver hold it on disk and
+say so; only then does the sender's relay ack it. If a relay does not answer, the sender must reconnect and send the
+message again. Relays that already hold it recognize its fingerprint, so it still arrives once.
 """
 
 from __future__ import annotations
@@ -29,17 +30,17 @@ from bufgym.relay.subscriber import Subscription, next_lane
 
 ROOT: Final = "bufgym/relay"
 ANSWER_S: Final = 3.0
-"""For another relay to say whether it holds a message."""
+"""Time for another relay to say whether it holds a message."""
 PATIENCE_S: Final = 0.2
-"""For a relay that takes no more; then a message to it is dropped, so that it holds up no other."""
+"""Time to wait for a busy relay; then its message is dropped so that it delays no other."""
 _MAX_FRAME_BYTES: Final = 2**26
 _MOST_HEARD: Final = 64
-"""Messages that were heard and not yet given to the queues; Zenoh's thread waits at more."""
+"""Messages received and not yet given to the queues; with more, Zenoh's thread waits."""
 _SELF: Final = Identity(email="relay mesh")
 
 
 class Others:
-    """A ``hub.Member``: all the other relays."""
+    """All other relays as one ``hub.Member``."""
 
     acks = False
 
@@ -55,7 +56,7 @@ class Others:
         self._sending: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
-        """Listen, and connect to those that are known."""
+        """Listen, and connect to the known relays."""
         policy = await asyncio.to_thread(policies.warm, self._hub.config.policies[0])
         self.subscriptions = {"all": Subscription("all", pattern(""), policy, DEFAULT_CAPACITY)}
         self._loop = asyncio.get_running_loop()
@@ -102,14 +103,14 @@ class Others:
         if self._sending is not None:
             self._sending.cancel()
             self._hub.leave(self)
-        self._room.release(1_000)  # none waits any more; a million would take a second
+        self._room.release(1_000)  # wakes every waiting thread; a million would take a second
         if self._zenoh is not None:
             await asyncio.to_thread(self._zenoh.close)
 
     # --- ordinary messages --------------------------------------------------------------------------------------------
 
     def offer(self, subscription: Subscription, frame: Frame) -> None:
-        """A message of this relay's."""
+        """Offer a message of this relay."""
         topic = frame.message.topic
         if not frame.message.no_drop and not topic.startswith(f"/{OWN}/"):
             subscription.offer(topic, frame, frame.size_bytes)
@@ -149,9 +150,9 @@ class Others:
     # --- what may not be lost -----------------------------------------------------------------------------------------
 
     async def hold(self, sender: Session, message: wire.Message) -> int | None:
-        """How many receivers other relays hold it for; None: not all have answered.
+        """Ask the other relays to hold a message; return the number of receivers, or None if not all have answered.
 
-        Raises RefusedError: one has no room, and no other holds it.
+        Raises RefusedError: a relay has no room, and no other holds it.
         """
         origin = json.dumps({"session": sender.name, "of": sender.identity.key}).encode()
         replies = await asyncio.to_thread(self._ask, wire.encode(message), origin)
@@ -200,12 +201,12 @@ class Others:
         message = wire.decode(frame, _MAX_FRAME_BYTES)
         session = self._session(str(origin["session"]), str(origin["of"]))
         fingerprint = int.from_bytes(hashlib.blake2b(frame, digest_size=6).digest())
-        if session.received == fingerprint:  # it was sent again: our answer was lost
+        if session.received == fingerprint:  # sent again because our answer was lost
             return {"held": 1}
         return {"held": self._hub.hold(self, message, taken=(session, fingerprint))}
 
     def _session(self, name: str, key: str) -> Session:
-        """Stands here for a sender at another relay; ``received`` is the fingerprint of its last message."""
+        """Find the session of a sender at another relay; ``received`` is the fingerprint of its last message."""
         store, identity = self._hub.store, Identity(email=f"{_SELF.email}: {key}")
         try:
             return store.open(name, identity, False, 0, 0)
@@ -217,10 +218,10 @@ class Others:
     # --- what a member has besides ------------------------------------------------------------------------------------
 
     def wake(self) -> None:
-        """Nothing is held for it."""
+        """Do nothing; no message is held for it."""
 
     def tell(self, op: str, **fields: Any) -> None:
-        """Nothing is said to it."""
+        """Do nothing; it is told nothing."""
 
     def end(self, why: str) -> None:
-        """It ends with the relay."""
+        """Do nothing; it ends with the relay."""

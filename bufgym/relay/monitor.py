@@ -1,4 +1,4 @@
-"""How a robot's queue is, in numbers that fit into a message: made from its records as they happen."""
+"""State of a robot's queue in numbers that fit into a message, computed from its records as they happen."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 
 RATE_S: Final = 1.0
-"""Rates are over the time so long before now."""
+"""Time before now over which rates are computed."""
 QOI_S: Final = 30.0
-"""QoI is that of the messages put in so long before now."""
+"""Time before now whose messages count for QoI."""
 _MOST: Final = 10_000
 """Messages of a topic that are remembered for its QoI."""
 
 
 class _Put:
-    """A message: when it was put, where the scene was, and what became of it."""
+    """A message: its time, its coordinate x and its outcome."""
 
     __slots__ = ("left", "put_s", "size_bytes", "topic", "x")
 
@@ -31,17 +31,17 @@ class _Put:
 
 
 class _Counts:
-    """Of one topic."""
+    """Counts of one topic."""
 
     def __init__(self) -> None:
         self.put = self.left = self.dropped = 0
         self.latest_s: float | None = None
-        """When the last one that has left was put."""
+        """Time at which the latest departed message was put."""
         self.lately: deque[_Put] = deque(maxlen=_MOST)
 
 
 class Monitor:
-    """Of one robot's queues: call it with each record of each; the policy is that of the latest."""
+    """Monitor of one robot's queues. Call it with every record; it reports the policy of the latest queue."""
 
     def __init__(
         self, topics: Sequence[Topic], value: Value | None = None, clock: Callable[[], float] = time.monotonic
@@ -80,7 +80,7 @@ class Monitor:
             self._counts[put.topic].dropped += 1
 
     def state(self) -> dict[str, Any]:
-        """How it is now: see ``docs/guide/relay-robots.md``."""
+        """Return the current state; ``docs/guide/relay-robots.md`` lists the fields."""
         now_s = self._clock()
         while self._left and self._left[0][0] < now_s - RATE_S:
             self._left.popleft()
@@ -112,7 +112,7 @@ class Monitor:
         }
 
     def _qoi(self, topic: int, now_s: float) -> float | None:
-        """H of what has left, as a part of H of all that was put, of the last ``QOI_S``; None where nothing was."""
+        """H of departed messages over H of all messages put in the last ``QOI_S``; None without messages."""
         lately = self._counts[topic].lately
         while lately and lately[0].put_s < now_s - QOI_S:
             lately.popleft()
@@ -120,7 +120,7 @@ class Monitor:
         settled = [put for put in list(lately) if put.left is not None]
         if not settled:
             return None
-        # Another queue's x begins anew where its program lets it count: only the sum of ever growing x is a distance.
+        # A new queue may count x from 0 again: only the sum of rising x is a distance.
         most, got = (value.information(_grown([put.x for put in some])) for some in (settled, _kept(settled)))
         return min(1.0, got / most)
 
@@ -130,7 +130,7 @@ def _kept(puts: list[_Put]) -> list[_Put]:
 
 
 def _grown(xs: list[float]) -> list[float]:
-    """From where x falls (a new queue that counts from 0) it goes on from where it was."""
+    """Make x continue where it falls because a new queue counts from 0."""
     grown, offset, before = [], 0.0, float("-inf")
     for x in xs:
         if x < before:

@@ -1,6 +1,6 @@
-"""What goes to one client, the most urgent first.
+"""Messages to one client, the most urgent first.
 
-First what the relay answers, then no_drop messages while fewer than n_T are not acked, then what the queues hand out.
+The relay's answers go first, then no_drop messages while fewer than n_T are unacked, then messages from the queues.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from bufgym.relay.subscriber import next_lane
 from bufgym.relay.wire import WireError
 
 MAX_ANSWERS: Final = 4_096
-"""Not yet sent: a client that asks and asks and reads nothing is closed."""
+"""Limit on unsent answers; a client that asks on without reading is closed."""
 
 
 class Outbox:
-    """The one task that writes to a connection, and what it writes."""
+    """The only task that writes to a connection, and its answers waiting to be sent."""
 
     def __init__(self, hub: Hub, socket: ServerConnection) -> None:
         self._hub = hub
@@ -34,25 +34,25 @@ class Outbox:
         self._sent_number = 0
         self._in_flight: deque[int] = deque()
         self.sent = 0
-        """Messages so far."""
+        """Messages sent so far."""
 
     def begin(self, member: Member, form: str, received: int) -> None:
-        """Its client has said hello, and has had no_drop messages to this number."""
+        """Begin for a client that has said hello and has no_drop messages up to ``received``."""
         self._member, self._form = member, form
         self._sent_number = received
 
     def tell(self, op: str, **fields: Any) -> bool:
-        """Say this, before any message; whether there is room for more."""
+        """Tell the client this before any message; return whether there is room for more."""
         self._answers.append(wire.say(op, **fields))
         self._awake.set()
         return len(self._answers) <= MAX_ANSWERS
 
     def wake(self) -> None:
-        """There may be something to send."""
+        """Look for something to send."""
         self._awake.set()
 
     def acked(self, number: int) -> None:
-        """The client has processed all no_drop messages to this number."""
+        """Note that the client has processed all no_drop messages up to this number."""
         if number > self._sent_number:
             raise WireError(f"ack of {number}: must be at most {self._sent_number}, the last sent")
         while self._in_flight and self._in_flight[0] <= number:
@@ -60,7 +60,7 @@ class Outbox:
         self._awake.set()
 
     async def run(self) -> None:
-        """Send what is to be sent, one after the other."""
+        """Send messages one after the other."""
         try:
             while True:
                 await self._awake.wait()
@@ -74,12 +74,12 @@ class Outbox:
             raise
 
     async def answers(self) -> None:
-        """Send all that the relay has said."""
+        """Send all of the relay's answers."""
         while self._answers:
             await self._socket.send(self._answers.popleft())
 
     async def one(self) -> bool:
-        """Send what goes next; whether there was something."""
+        """Send the next message; return whether there was one."""
         await self.answers()
         member = self._member
         if member is None:

@@ -1,4 +1,4 @@
-"""The page, over HTTP on the same port: files of one folder, and nothing else."""
+"""The relay's page over HTTP on the same port; it serves the files of one folder and nothing else."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HEADERS: Final = {
 
 
 def answer(path: str, folder: Path = FOLDER) -> Response:
-    """What a GET of this path gets."""
+    """Answer a GET of this path."""
     name = path.partition("?")[0].removeprefix("/") or "index.html"
     files = {file.name: file for file in folder.iterdir() if file.is_file()} if folder.is_dir() else {}
     if name not in files:  # a name that was not listed is never opened: no "..", no absolute path
@@ -34,7 +34,7 @@ def answer(path: str, folder: Path = FOLDER) -> Response:
 
 
 def response(status: HTTPStatus, body: bytes | str, type: str = "text/plain") -> Response:
-    """An answer that ends the connection."""
+    """Make an answer that ends the connection."""
     data = body.encode() if isinstance(body, str) else body
     charset = "; charset=utf-8" if type.startswith("text/") else ""
     headers = Headers(HEADERS)

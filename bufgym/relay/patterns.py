@@ -1,7 +1,7 @@
-"""Regular expressions from strangers: RE2 matches in time linear in the text, within bounded memory.
+"""Regular expressions from untrusted clients, matched by RE2 in linear time and bounded memory.
 
-An expression of Python's own, such as ``(a+)+$``, can take longer than the sun shines; RE2 leaves out what needs that
-(back references, look-around). Syntax: https://github.com/google/re2/wiki/Syntax.
+Python's own ``re`` can take exponential time on an expression such as ``(a+)+$``. RE2 lacks the features that need
+this, such as back references and look-around. Its syntax is at https://github.com/google/re2/wiki/Syntax.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from bufgym.relay.extra import needs
 
 MAX_CHARACTERS: Final = 512
 MAX_MEMORY_BYTES: Final = 2**18
-"""Of one expression's automaton."""
+"""Memory limit of one expression's automaton."""
 _KEPT: Final = 1024
-"""Expressions that stay compiled; the same one of many viewers is one."""
+"""Expressions kept compiled; viewers with the same expression share it."""
 
 
 class Pattern:
@@ -27,17 +27,17 @@ class Pattern:
         self._compiled = compiled
 
     def whole(self, topic: str) -> bool:
-        """Whether it matches all of the topic: a rule."""
+        """Whether it matches the whole topic, as rules do."""
         return self._compiled.fullmatch(topic) is not None
 
     def part(self, topic: str) -> bool:
-        """Whether it matches anywhere in it: a subscription."""
+        """Whether it matches anywhere in the topic, as subscriptions do."""
         return self._compiled.search(topic) is not None
 
 
 @functools.lru_cache(_KEPT)
 def pattern(text: str) -> Pattern:
-    """The expression, compiled; an error for one that RE2 does not take."""
+    """Compile an expression; raise an error if RE2 does not accept it."""
     if not isinstance(text, str) or len(text) > MAX_CHARACTERS:
         raise BufgymError(f"pattern {str(text)[:60]!r}: must be a text of at most {MAX_CHARACTERS} characters")
     with needs("re2"):

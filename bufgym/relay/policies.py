@@ -1,6 +1,6 @@
-"""How a subscriber's queue decides: any of the relay's policies by name, and what Robofleet's server does.
+"""Policies of subscribers' queues: any of the relay's policies by name, including Robofleet's server rule.
 
-A relay listens before it knows any: what compiles is imported where it is used, first by ``warm`` in a thread.
+A relay listens before any policy is loaded. Modules that compile are imported at first use, by ``warm`` in a thread.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ SKIP_PENDING: Final = "skip-pending"
 PLACES: Final = 32
 """Topics that share a queue, where the policy knows topics."""
 ROOM: Final = 64
-"""Messages between two tidyings of a queue's bookkeeping: little, as there are many queues."""
+"""Messages between two cleanups of a queue's bookkeeping; few, because there are many queues."""
 _COMPILING: Final = threading.Lock()
 
 
 def policy(name: str) -> Policy:
-    """The policy of this name, with settings as ``decimate:every=2``."""
+    """Find the policy of this name; it may have settings, as in ``decimate:every=2``."""
     from bufgym.policies import registry
     from bufgym.relay import skip_pending
 
@@ -37,13 +37,13 @@ def policy(name: str) -> Policy:
 
 
 def check(names: Iterable[str]) -> None:
-    """All of these are policies."""
+    """Raise an error unless all of these are policies."""
     for name in names:
         policy(name)
 
 
 def new_queue(chosen: Policy, capacity: int) -> PolicyQueue:
-    """A queue for the messages of up to ``PLACES`` topics, or of one for a policy that knows none."""
+    """Make a queue for up to ``PLACES`` topics, or for one topic if the policy knows none."""
     from bufgym.live import PolicyQueue
     from bufgym.model.topics import Topic
 
@@ -53,15 +53,15 @@ def new_queue(chosen: Policy, capacity: int) -> PolicyQueue:
 
 @functools.lru_cache(256)
 def warm(name: str) -> Policy:
-    """The policy, after one message has gone through a queue of it: now it is compiled."""
+    """Compile the policy of this name by sending one message through a queue; return the policy."""
     return compiled(policy(name))
 
 
 def compiled(chosen: Policy) -> Policy:
-    """The same for one that has no name here.
+    """Compile a policy that is given as an object.
 
-    What is not kept yet is compiled by another process, which knows all policies but one's own: for tens of seconds the
-    compiler would hold this one's lock, and nobody be welcomed.
+    Another process compiles a policy that is not cached yet, because the compiler would hold this process's lock for
+    tens of seconds and no client could connect. That process knows all policies except user-defined ones.
     """
     with _COMPILING:
         if not kept(chosen):
@@ -72,7 +72,7 @@ def compiled(chosen: Policy) -> Policy:
 
 
 def kept(chosen: Policy) -> bool:
-    """Whether nothing has to be compiled for it; if so, it is loaded."""
+    """Whether the policy is in the compiler's cache; if so, load it."""
     from bufgym.kernel import NotKeptError, only_kept
 
     try:
@@ -84,7 +84,7 @@ def kept(chosen: Policy) -> bool:
 
 
 def _used(chosen: Policy) -> Policy:
-    """One message goes through a queue of it."""
+    """Send one message through a queue with this policy."""
     queue = new_queue(chosen, PLACES)
     queue.put(b"", 1)
     queue.get(0)
@@ -94,5 +94,5 @@ def _used(chosen: Policy) -> Policy:
 
 if __name__ == "__main__":  # compiles the policy of this name
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    with contextlib.suppress(BufgymError):  # one's own: whoever has it compiles it
+    with contextlib.suppress(BufgymError):  # a user-defined policy is compiled by its own process
         _used(policy(sys.argv[1]))

@@ -1,4 +1,4 @@
-"""How much one identity may do, over all its connections."""
+"""Limits of one identity over all its connections."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bufgym.relay.config import Limits
 
 
 class RefusedError(BufgymError):
-    """What a client asked for is not done; ``code`` says why in a word."""
+    """A request that the relay refuses; ``code`` gives the reason in a word."""
 
     def __init__(self, code: str, why: str) -> None:
         super().__init__(why)
@@ -18,7 +18,7 @@ class RefusedError(BufgymError):
 
 
 class Bucket:
-    """A token bucket: ``rate`` a second, and a second's worth at once."""
+    """A token bucket that fills at ``rate`` a second and holds a second's worth."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
@@ -26,7 +26,7 @@ class Bucket:
         self._at_s: float | None = None
 
     def take(self, amount: float, now_s: float) -> bool:
-        """Whether so much was left. More than a second's worth may go where a whole second's worth is left."""
+        """Take ``amount`` and return True if enough was left; a full bucket allows any amount."""
         if self._at_s is not None:
             self._left = min(self._rate, self._left + (now_s - self._at_s) * self._rate)
         self._at_s = now_s
@@ -38,7 +38,7 @@ class Bucket:
 
 @dataclass
 class Quota:
-    """What one identity has taken of its limits."""
+    """Use that one identity has made of its limits."""
 
     limits: Limits
     messages: Bucket = field(init=False)
@@ -52,9 +52,9 @@ class Quota:
         self.messages, self.bytes = Bucket(self.limits.messages_per_s), Bucket(self.limits.bytes_per_s)
 
     def message(self, size_bytes: int, now_s: float) -> None:
-        """It publishes a message.
+        """Count a published message.
 
-        Raises RefusedError: beyond a limit, as all of these functions.
+        Raises RefusedError: beyond a limit, as do all methods here.
         """
         limits = self.limits
         if not (self.messages.take(1, now_s) and self.bytes.take(size_bytes, now_s)):
@@ -62,32 +62,32 @@ class Quota:
             raise RefusedError("too_fast", rule)
 
     def topic(self, topic: str) -> None:
-        """It publishes on this topic."""
+        """Count a topic that it publishes on."""
         if topic not in self.topics:
             if len(self.topics) >= self.limits.topics:
                 raise RefusedError("too_many", f"topic {topic}: must be at most {self.limits.topics} topics")
             self.topics.add(topic)
 
     def connect(self) -> None:
-        """One more connection."""
+        """Count a connection."""
         if self.connections >= self.limits.connections:
             raise RefusedError("too_many", f"must be at most {self.limits.connections} connections")
         self.connections += 1
 
     def subscribe(self) -> None:
-        """One more subscription."""
+        """Count a subscription."""
         if self.subscriptions >= self.limits.subscriptions:
             raise RefusedError("too_many", f"must be at most {self.limits.subscriptions} subscriptions")
         self.subscriptions += 1
 
 
 KEPT_S = 60.0
-"""A quota whose last connection has gone is remembered for so long: who comes back meets the same limits."""
+"""Time for which a quota outlives its last connection, so that reconnecting does not reset it."""
 MAX_QUOTAS = 100_000
 
 
 class Quotas:
-    """Those of all identities."""
+    """Quotas of all identities."""
 
     def __init__(self, limits: Limits, clock: Callable[[], float]) -> None:
         self._limits = limits
@@ -95,7 +95,7 @@ class Quotas:
         self._quotas: dict[str, Quota] = {}
 
     def of(self, key: str) -> Quota:
-        """That of an identity."""
+        """Find the quota of an identity."""
         if key not in self._quotas:
             if len(self._quotas) >= MAX_QUOTAS:
                 self.tidy(kept_s=0.0)
@@ -103,12 +103,12 @@ class Quotas:
         return self._quotas[key]
 
     def left(self, quota: Quota) -> None:
-        """A connection of it has ended."""
+        """Note that a connection with this quota has ended."""
         quota.connections -= 1
         quota.idle_since_s = self._clock()
 
     def tidy(self, kept_s: float = KEPT_S) -> None:
-        """Forget those that were long not used."""
+        """Forget quotas that have not been used for ``kept_s``."""
         now_s = self._clock()
         for key, quota in list(self._quotas.items()):
             if quota.connections == 0 and now_s - quota.idle_since_s >= kept_s:

@@ -1,4 +1,4 @@
-"""Everything that a rule for the recorder allows, in MCAP files; ``bufgym bench --workload`` reads them."""
+"""Recorder of the messages that its rules allow, in MCAP files that ``bufgym bench --workload`` reads."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from bufgym.relay.rules import RECORDER, Permissions
 
 FOLDER: Final = "recordings"
 _FLUSH_S: Final = 0.5
-"""A relay that is killed loses what it recorded in the time since the last flush."""
+"""Time between flushes; a killed relay loses its recording since the last one."""
 SCHEMAS: Final = {"json": "jsonschema", "cdr": "ros2msg", "ros1": "ros1msg"}
-"""How MCAP's schemas of an encoding are written."""
+"""Encoding -> format of its schemas in MCAP."""
 
 
 class Recorder:
-    """Writes each message that it may receive; a file of ``rotation.bytes`` is followed by the next."""
+    """Writes each message that it may receive; after ``rotation.bytes`` it begins the next file."""
 
     def __init__(self, folder: Path, rotation: Rotation, permissions: Permissions) -> None:
         self.folder = folder
@@ -34,14 +34,14 @@ class Recorder:
 
     @classmethod
     def of(cls, config: Config) -> Recorder | None:
-        """The recorder of a relay that has a folder, and a rule that lets it record."""
+        """Make the recorder if the relay has a folder and a rule that lets it record."""
         permissions = Permissions(config.rules, RECORDER)
         if config.folder is None or not permissions.rules:
             return None
         return cls(config.folder / FOLDER, config.recording, permissions)
 
     def __call__(self, message: wire.Message) -> None:
-        """Write it, if a rule allows it."""
+        """Write a message if a rule allows it."""
         if not self._permissions.allow("receive", message.topic):
             return
         if self._file is not None and self._file.tell() + len(message.payload) > self._rotation.bytes:
@@ -62,13 +62,13 @@ class Recorder:
             self._flushed_s = time.monotonic()
 
     def _begin(self) -> None:
-        """The next file; the oldest go."""
+        """Begin the next file and delete the oldest."""
         with needs("mcap"):
             from mcap.writer import Writer
         files = sorted(self.folder.glob("*.mcap"))
         for path in files[: max(0, len(files) + 1 - self._rotation.files)]:
             path.unlink()
-        now_s, now_ns = divmod(time.time_ns(), 10**9)  # one time: names are in the order of their files
+        now_s, now_ns = divmod(time.time_ns(), 10**9)  # a single clock reading keeps names in the order of the files
         path = self.folder / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime(now_s))}-{now_ns:09}.mcap"
         self._file = path.open("xb")
         # Chunks would be lost with the process.

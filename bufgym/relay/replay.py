@@ -1,7 +1,7 @@
-"""A relay's recordings for its page, piece by piece, as JSON: only topics that the viewer may receive.
+"""A relay's recordings for its page, in JSON pieces with only the topics that the viewer may receive.
 
-A recorder's file is a plain row of MCAP records, which may still grow. It is walked once, and where its messages lie in
-time is remembered, so that a piece from its middle is read from there.
+A recorder's file is a plain sequence of MCAP records, which may still grow. The file is walked once and an index of
+times is kept, so that a piece from its middle can be read directly.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from bufgym.errors import BufgymError
 from bufgym.relay.extra import needs
 
 MOST_BYTES: Final = 4 * 2**20
-"""Of a piece's payloads."""
+"""Limit on the payloads of a piece."""
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")
-"""Channel, sequence number, when it was logged and when it was published, ns."""
+"""Channel, sequence number, log time and publish time in ns."""
 _SCHEMA, _CHANNEL, _MESSAGES, _CHUNK = 3, 4, 5, 6
 _STEP_BYTES: Final = 2**18
-"""Between two places of a file that are remembered."""
+"""Distance between two indexed places of a file."""
 
 
 def recordings(folder: Path | None) -> list[dict[str, Any]]:
-    """The files of a relay's recordings, the latest first."""
+    """List the files of a relay's recordings, the latest first."""
     paths = [] if folder is None or not folder.is_dir() else folder.glob("*.mcap")
     stats = [(path.name, path.stat()) for path in paths]
     files = [{"name": name, "bytes": stat.st_size, "modified_us": stat.st_mtime_ns // 1000} for name, stat in stats]
@@ -41,7 +41,7 @@ def recordings(folder: Path | None) -> list[dict[str, Any]]:
 def piece(
     folder: Path | None, file: str, from_us: int, most_bytes: int, may_receive: Callable[[str], bool]
 ) -> dict[str, Any]:
-    """Messages of the recording ``file`` from that time on, with payloads of ``most_bytes`` or one message more.
+    """Read messages of the recording ``file`` from ``from_us`` until payloads exceed ``most_bytes``.
 
     ``next_us`` is where the next piece begins, None at the end.
     """
@@ -80,7 +80,7 @@ def piece(
 
 
 class _Recording:
-    """What is known of a file."""
+    """Index of one file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -93,7 +93,7 @@ class _Recording:
         self._end = len(_MAGIC)
 
     def walk(self) -> None:
-        """Look at what has been written since the last time."""
+        """Index the records written since the last call."""
         for kind, offset, content in self._records(self._end):
             if kind in (_SCHEMA, _CHANNEL):
                 self._declare(kind, content)
@@ -109,7 +109,7 @@ class _Recording:
             self._end = offset + _RECORD.size + len(content)
 
     def messages(self, from_us: int) -> Iterator[tuple[int, int, int, bytes]]:
-        """(channel, number, when it was recorded in us, payload) of each message from that time on."""
+        """Yield channel, number, recording time in us and payload of each message from that time on."""
         if not self._offsets:
             return
         place = max(0, bisect.bisect_left(self._times, from_us) - 1)
@@ -132,7 +132,7 @@ class _Recording:
             self.channels[channel.id] = channel.topic, self._schemas[channel.schema_id], channel.message_encoding
 
     def _records(self, offset: int) -> Iterator[tuple[int, int, bytes]]:
-        """(kind, where it begins, content) of each whole record from there on."""
+        """Yield kind, offset and content of each whole record from ``offset`` on."""
         size = self.path.stat().st_size
         with self.path.open("rb") as file:
             if file.read(len(_MAGIC)) != _MAGIC:
@@ -141,7 +141,7 @@ class _Recording:
             while offset + _RECORD.size <= size:
                 kind, length = _RECORD.unpack(file.read(_RECORD.size))
                 if offset + _RECORD.size + length > size:
-                    return  # it is being written, or broke off
+                    return  # the record is still being written, or was cut off
                 yield kind, offset, file.read(length)
                 offset += _RECORD.size + length
 

@@ -1,12 +1,14 @@
-"""Robofleet's own protocol, for its released clients (github ut-amrl/robofleet_client, robofleet_webviz).
+"""Robofleet's own protocol for its released clients, robofleet_client and robofleet_webviz of ut-amrl on GitHub.
 
-Each binary frame is one flatbuffer. Its schema (msg2fbs/schema.fbs in ut-amrl/robofleet) begins every message's table
-with ``__metadata``, a table of ``type`` and ``topic``; the rest is the message, which the relay passes on as it came.
-One of type ``amrl_msgs/RobofleetSubscription`` (``topic_regex``, ``action``: 1 to subscribe, 0 to unsubscribe) is an
-order to the relay. Text frames are JSON: ``{"id_token": ...}`` says who it is. There is no hello, and no ack.
+Each binary frame is one flatbuffer. By its schema, msg2fbs/schema.fbs in ut-amrl/robofleet, every message's table
+begins with ``__metadata``, a table of ``type`` and ``topic``. The rest is the message, which the relay passes on
+unchanged. A message of type ``amrl_msgs/RobofleetSubscription`` is a request to the relay: ``action`` 1 subscribes to
+``topic_regex`` and 0 unsubscribes. Text frames are JSON, and ``{"id_token": ...}`` gives the identity. There is no
+hello and no ack.
 
-Here the same rules hold as for everybody; Robofleet's server lets all receive topics that end in ``/status``. What its
-clients get is what came from its clients: flatbuffers are not made from other encodings, nor they from them.
+The same rules hold as for all clients, while Robofleet's server lets everybody receive topics that end in ``/status``.
+Robofleet's clients receive only messages of Robofleet's clients: flatbuffers are not converted to or from other
+encodings.
 """
 
 from __future__ import annotations
@@ -30,23 +32,23 @@ from bufgym.relay.wire import WireError
 
 SUBSCRIPTION_TYPES: Final = ("amrl_msgs/RobofleetSubscription", "RobofleetSubscription")
 _FIRST: Final = 4
-"""Where field 0 of a table stands in its vtable; each further one 2 bytes on."""
+"""Offset of a table's field 0 in its vtable; each further field is 2 bytes on."""
 
 
 class Flat(NamedTuple):
-    """What the relay reads of a flatbuffer."""
+    """Fields of a flatbuffer that the relay reads."""
 
     type: str
     topic: str
     pattern: str = ""
-    """Of a subscription."""
+    """Pattern of a subscription."""
     subscribe: bool = False
 
 
 def read(data: bytes) -> Flat:
-    """The metadata of a message, and what a subscription asks for.
+    """Read a message's metadata and a subscription's request.
 
-    Raises WireError: none of Robofleet's.
+    Raises WireError: it is not one of Robofleet's messages.
     """
     with needs("flatbuffers"):
         from flatbuffers.number_types import Uint8Flags, UOffsetTFlags
@@ -77,12 +79,12 @@ def read(data: bytes) -> Flat:
 
 
 class RobofleetConnection(Connection):
-    """A client that Robofleet released."""
+    """Connection of a client that Robofleet released."""
 
     acks = False
 
     async def _hello(self) -> None:
-        """There is none: it is let in by its address or certificate, or once it has said its token."""
+        """Admit the client by its address or certificate, or once it has sent its token; it sends no hello."""
         self.identity = await self._identified(None)
         while not Permissions(self._hub.config.rules, self.identity).rules:
             data = await self._socket.recv()
@@ -91,7 +93,7 @@ class RobofleetConnection(Connection):
         self._admit({}, ROBOFLEET)
 
     async def _signed_in(self, text: str) -> bool:
-        """Take a token, if it is one that proves something."""
+        """Accept a token if it proves an identity."""
         try:
             said = json.loads(text)
         except (ValueError, RecursionError):
@@ -123,7 +125,7 @@ class RobofleetConnection(Connection):
             await self._answer(message)
 
     async def _ordered(self, flat: Flat) -> None:
-        """Subscribe, or no longer; as in its server, a client with bytes pending is skipped."""
+        """Subscribe or unsubscribe; as at Robofleet's server, a client with bytes pending is skipped."""
         if not flat.subscribe:
             if self._hub.unsubscribe(self, flat.pattern):
                 self._quota.subscriptions -= 1
@@ -140,9 +142,9 @@ class RobofleetConnection(Connection):
         self._hub.subscribe(self, Subscription(flat.pattern, chosen, warmed, DEFAULT_CAPACITY, left_bytes=left_bytes))
 
     def offer(self, subscription: Subscription, frame: Frame) -> None:
-        """It reads flatbuffers alone."""
+        """Offer a message if it is a flatbuffer, the only encoding that the client reads."""
         if frame.message.encoding == ROBOFLEET:
             super().offer(subscription, frame)
 
     def tell(self, op: str, **fields: Any) -> None:
-        """Its client would not understand."""
+        """Say nothing, because the client would not understand."""

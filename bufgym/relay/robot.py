@@ -1,8 +1,8 @@
-"""A robot at a relay: what a source publishes, how its queue is, and the commands that come to it.
+"""A robot at a relay: it publishes its source's messages and its queue's state, and takes commands.
 
-A robot's topics lie under ``/robots/NAME/``. Besides its source's it publishes ``queue`` five times a second and
-``status`` once: battery, location, network, queue, and what it publishes. A command ``{"command": "policy", "policy":
-"afr"}`` on its topic ``command`` puts another policy over its queue.
+A robot's topics lie under ``/robots/NAME/``. Besides its source's topics it publishes ``queue`` five times a second and
+``status`` once a second, with battery, location, network, queue and the list of topics. The command ``{"command":
+"policy", "policy": "afr"}`` on its topic ``command`` changes its queue's policy.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from bufgym.scenario import Stream
 STATUS_S: Final = 1.0
 QUEUE_S: Final = 0.2
 POLICIES: Final = ("robofleet", "afr", "min-motion-gap", "drop-oldest", "drop-newest", "fifo", "learned-scheduler")
-"""What a viewer may choose of, where the robot says nothing else."""
+"""Policies that a viewer may choose by default."""
 _OWN: Final = tuple(
     Stream(Topic(name, priority=20.0, weight=0.0), rate_hz, 1000) for name, rate_hz in (("status", 1.0), ("queue", 5.0))
 )
 
 
 class Source(Protocol):
-    """What a robot publishes: the made-up one, a recording, ROS, or any program."""
+    """Source of a robot's messages: the made-up robot, a recording, ROS, or any program."""
 
     @property
     def streams(self) -> Sequence[Stream]:
         """Its topics, with the rules for each."""
 
     async def run(self, robot: Robot) -> None:
-        """Publish with ``robot.publish``; returns when there is no more."""
+        """Publish with ``robot.publish`` until there is no more."""
 
     def status(self) -> dict[str, Any]:
-        """What it knows of ``battery`` (0 to 1), and of ``location``."""
+        """Return ``battery``, from 0 to 1, and ``location``, as far as they are known."""
 
     async def on_command(self, command: Any) -> None:
-        """A command that is not the robot's own."""
+        """Take a command that is not the robot's own."""
 
 
 class Robot:
@@ -67,7 +67,7 @@ class Robot:
         policies: Sequence[str] = POLICIES,
         **session: Any,
     ) -> None:
-        """As a ``Client``; ``policies``: what commands may choose of."""
+        """Arguments as for ``Client``; a command may choose one of ``policies``."""
         if not name or "/" in name:
             raise BufgymError(f"robot {name!r}: a name must be a text without '/'")
         self.name = name
@@ -97,7 +97,7 @@ class Robot:
         self.client.subscribe(f"^{self.topic('command')}$", self._command)
 
     def topic(self, name: str) -> str:
-        """With the robot's name before it."""
+        """Put the robot's prefix before a topic's name."""
         return f"/robots/{self.name}/{name.lstrip('/')}"
 
     # --- what it says -------------------------------------------------------------------------------------------------
@@ -112,7 +112,7 @@ class Robot:
         self.client.publish(self.topic(topic), payload, encoding, type, x, stamp_us)
 
     def locate(self, payload: bytes, type: str, encoding: str = "cdr") -> None:
-        """Take a pose, which says where the robot is and gives x to the topics that move."""
+        """Take a pose, which gives the robot's location and x of the topics that move."""
         message = ros_messages.read(payload, type, encoding)
         self._odometry.take(message)
         pose = message.pose
@@ -125,7 +125,7 @@ class Robot:
         self.publish(topic, json.dumps(data, separators=(",", ":"), allow_nan=False).encode(), "json")
 
     def status(self) -> dict[str, Any]:
-        """How it is."""
+        """Return the robot's state."""
         queue = self.monitor.state()
         round_trip_s = self.client.round_trip_s
         return {
@@ -144,7 +144,7 @@ class Robot:
     # --- what it does -------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Until the source has no more, or cancelled."""
+        """Run until the source has no more, or until cancelled."""
         own = [self.client.run(), self._every(STATUS_S, self._say_status), self._every(QUEUE_S, self._say_queue)]
         try:
             await until_one_ends(self.source.run(self), *own)

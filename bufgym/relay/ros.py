@@ -1,7 +1,7 @@
-"""A robot's own ROS as a source: topics of ROS 1 or ROS 2 go to the relay, and what the relay sends comes back.
+"""A robot's own ROS as a source: topics of ROS 1 or ROS 2 go to the relay, and messages come back from it.
 
-What others publish on ``/robots/NAME/to/TOPIC``, in CDR and with its type, is published on ``/TOPIC`` here, if that is
-one of the topics that the robot was told to receive.
+A message that others publish on ``/robots/NAME/to/TOPIC``, in CDR and with its type, is published on ``/TOPIC`` here if
+the robot was told to receive that topic.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Outlet = Callable[[bytes], None]
 
 
 class _Ros:
-    """What both versions share."""
+    """Code shared by both versions of ROS."""
 
     def __init__(self, streams: Sequence[Stream], odometry: str | None = None, receive: Sequence[str] = ()) -> None:
-        """``odometry``: poses, which need not be among the streams; ``receive``: topics that may be published here."""
+        """``odometry`` is a topic of poses, in the streams or not; ``receive`` lists topics to publish here."""
         self.streams = tuple(streams)
         self._names = {resolved(stream.topic.name): stream.topic.name for stream in streams}
         self._odometry = None if odometry is None else resolved(odometry)
@@ -38,14 +38,14 @@ class _Ros:
         return {*self._names, *([] if self._odometry is None else [self._odometry])}
 
     def _take(self, robot: Robot, name: str, payload: bytes, encoding: str, type: str) -> None:
-        """A message of this ROS, in any thread."""
+        """Publish a message of this ROS at the relay, from any thread."""
         if name in self._names:
             robot.publish(self._names[name], payload, encoding, type)
         elif type in ros_messages.POSES:
             robot.locate(payload, type, encoding)
 
     def _listen(self, robot: Robot, advertise: Callable[[Published], Awaitable[Outlet]]) -> None:
-        """Hand on what comes for the topics that this robot receives; what cannot be handed on is noted."""
+        """Publish messages for the topics that this robot receives; note messages that fail."""
         before = robot.topic("to")
         outlets: dict[Published, Outlet] = {}
 
@@ -58,18 +58,18 @@ class _Ros:
                 if topic not in outlets:
                     outlets[topic] = await advertise(topic)
                 outlets[topic](bytes(message.payload))
-            except Exception as error:  # strangers' messages; and ROS has errors of its own kinds
+            except Exception as error:  # messages are untrusted, and ROS has its own error types
                 robot.client.note(f"{message.topic}: not published: {error}")
 
         if self._receive:
             robot.client.subscribe(f"^{before}/", take)
 
     def status(self) -> dict[str, Any]:
-        """ROS has no one place for a battery."""
+        """Return nothing, because ROS has no standard topic for a battery."""
         return {}
 
     async def on_command(self, command: Any) -> None:
-        """Commands of ROS come on topics."""
+        """Ignore the command, because ROS takes commands on topics."""
 
 
 class Ros2(_Ros):
@@ -106,7 +106,7 @@ class Ros2(_Ros):
                 await asyncio.gather(spinning, return_exceptions=True)
 
     async def _look(self, here: Any, robot: Robot) -> None:
-        """Subscribe to each topic once somebody publishes it."""
+        """Subscribe to each topic once it has a publisher."""
         wanted = self._wanted
         while wanted:
             for name in list(wanted):
@@ -171,4 +171,4 @@ class Ros1(_Ros):
 
 
 SOURCES: Final = {"1": Ros1, "2": Ros2}
-"""By the version of ROS."""
+"""Version of ROS -> its source."""

@@ -18,12 +18,12 @@ from bufgym.relay.room import Pose
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 SCAN: Final = "sensor_msgs/msg/LaserScan"
 POSES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
-"""Types that say where a robot is."""
+"""Types that contain a robot's pose."""
 
 
 @functools.cache
 def store() -> Any:
-    """The types of ROS 2."""
+    """Load the types of ROS 2."""
     with needs("rosbags"):
         from rosbags.typesys import Stores, get_typestore
     return get_typestore(Stores.ROS2_JAZZY)
@@ -31,7 +31,7 @@ def store() -> Any:
 
 @functools.cache
 def _store_1() -> Any:
-    """Those of ROS 1."""
+    """Load the types of ROS 1."""
     with needs("rosbags"):
         from rosbags.typesys import Stores, get_typestore
     return get_typestore(Stores.ROS1_NOETIC)
@@ -44,7 +44,7 @@ def _header(time_us: int, frame: str) -> Any:
 
 
 def odometry(time_us: int, robot: str, pose: Pose, speed_m_s: float) -> bytes:
-    """A ``nav_msgs/msg/Odometry``."""
+    """Make a ``nav_msgs/msg/Odometry``."""
     kinds, zeros = store().types, np.zeros(36)
     vector = kinds["geometry_msgs/msg/Vector3"]
     turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(pose.yaw / 2), math.cos(pose.yaw / 2))
@@ -60,7 +60,7 @@ def odometry(time_us: int, robot: str, pose: Pose, speed_m_s: float) -> bytes:
 
 
 def scan(time_us: int, robot: str, angles: NDArray[np.float64], ranges_m: NDArray[np.float64]) -> bytes:
-    """A ``sensor_msgs/msg/LaserScan`` of these equally spaced angles."""
+    """Make a ``sensor_msgs/msg/LaserScan`` of these equally spaced angles."""
     step = float(angles[1] - angles[0])
     ends = float(angles[0]), float(angles[-1])
     ranges, intensities = ranges_m.astype(np.float32), np.zeros(0, np.float32)
@@ -71,7 +71,7 @@ def scan(time_us: int, robot: str, angles: NDArray[np.float64], ranges_m: NDArra
 
 
 def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:
-    """The message; a BufgymError if it is none of this type."""
+    """Decode a message; raise a BufgymError if it is not of this type."""
     try:
         if encoding == "ros1":
             return _store_1().deserialize_ros1(payload, type)
@@ -83,23 +83,23 @@ def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:
 
 
 def planar(pose: Any) -> dict[str, float]:
-    """A ``geometry_msgs/msg/Pose`` seen from above."""
+    """Project a ``geometry_msgs/msg/Pose`` to the plane."""
     place, turn = pose.position, pose.orientation
     yaw = math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
     return {"x": round(place.x, 3), "y": round(place.y, 3), "yaw": round(yaw, 4)}
 
 
 def modern(payload: bytes, type: str, encoding: str) -> tuple[str, bytes]:
-    """(encoding, payload) in CDR where it was ROS 1's and the type is common to both; else as it is."""
+    """Convert a ROS 1 payload of a type common to both versions to CDR; return (encoding, payload)."""
     if encoding == "ros1" and type in store().types:
-        with contextlib.suppress(Exception):  # a type of this name, but not this form
+        with contextlib.suppress(Exception):  # same type name, but another definition
             message = _moulded(_store_1().deserialize_ros1(payload, type), store())
             return "cdr", bytes(store().serialize_cdr(message, type))
     return encoding, payload
 
 
 def _moulded(value: Any, types: Any) -> Any:
-    """The message as the other version of ROS has it: the same fields, but for a header's number."""
+    """Convert a message to the other version of ROS; only a header's sequence number differs."""
     if isinstance(value, list):
         return [_moulded(one, types) for one in value]
     if not is_dataclass(value):
@@ -109,7 +109,7 @@ def _moulded(value: Any, types: Any) -> Any:
 
 
 def as_ros1(payload: bytes, type: str) -> bytes:
-    """A message in CDR as ROS 1 has it."""
+    """Convert a message from CDR to ROS 1."""
     try:
         message = _moulded(store().deserialize_cdr(payload, type), _store_1())
         return bytes(_store_1().serialize_ros1(message, type))
@@ -118,7 +118,7 @@ def as_ros1(payload: bytes, type: str) -> bytes:
 
 
 def definition(type: str) -> str | None:
-    """The type's definition with all that it uses, as recordings carry it; None for a type that is not known here."""
+    """Write the type's definition with all types that it uses, as in recordings; None for an unknown type."""
     if type not in store().types:
         return None
     return str(store().generate_msgdef(type, ros_version=2)[0])

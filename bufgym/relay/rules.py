@@ -1,7 +1,7 @@
-"""Who may do what: Robofleet's Algorithm 3. Denied is all that no rule allows.
+"""Permissions by Robofleet's Algorithm 3: whatever no rule allows is denied.
 
-for each rule of the identity (its address, a range that holds it, its e-mail):
-    if the rule allows the verb, and its pattern matches the whole topic: allowed
+for each rule of the identity, by address, address range or e-mail: if the rule allows the verb, and its pattern matches
+    the whole topic: allowed
 denied
 """
 
@@ -18,28 +18,28 @@ from bufgym.relay.patterns import pattern
 
 Verb = Literal["send", "receive"]
 _REMEMBERED: Final = 4_096
-"""Answers that are kept of one identity."""
+"""Answers cached for one identity."""
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Who is at the other end of a connection, as far as that is proven."""
+    """Proven identity of the other end of a connection."""
 
     address: str = ""
     email: str = ""
-    """Of a token or a certificate that was verified."""
+    """E-mail of a verified token or certificate."""
     own: str = ""
-    """One of the relay's own, as ``Rule.own``."""
+    """The relay's own part, as in ``Rule.own``."""
     until_s: float = math.inf
-    """Its token ends then, s since 1970."""
+    """End of its token, s since 1970."""
 
     @property
     def key(self) -> str:
-        """What limits are counted by."""
+        """Key under which limits are counted."""
         return self.email or self.address
 
     def as_json(self) -> dict[str, Any]:
-        """Without what is its own business."""
+        """Return the fields that others may see."""
         return {name: value for name, value in asdict(self).items() if name in ("address", "email")}
 
 
@@ -47,14 +47,14 @@ RECORDER, FOXGLOVE = Identity(own="recorder"), Identity(own="foxglove")
 
 
 def plain_address(text: str) -> str:
-    """An IPv4 address that came over IPv6 (``::ffff:10.0.0.1``), and an address with a scope, as rules have them."""
+    """Normalize an address for rules: unwrap IPv4 in IPv6, as in ``::ffff:10.0.0.1``, and strip a scope."""
     address = ipaddress.ip_address(text.partition("%")[0])
     mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
     return str(mapped or address)
 
 
 def means(rule: Rule, identity: Identity) -> bool:
-    """Whether the rule's identity is this one."""
+    """Whether the rule is for this identity."""
     if rule.own or identity.own:
         return rule.own == identity.own
     if rule.email:
@@ -63,14 +63,14 @@ def means(rule: Rule, identity: Identity) -> bool:
 
 
 class Permissions:
-    """What one identity may do."""
+    """Permissions of one identity."""
 
     def __init__(self, rules: Sequence[Rule], identity: Identity) -> None:
         self.rules = tuple(rule for rule in rules if means(rule, identity))
         self._answers: dict[tuple[Verb, str], bool] = {}
 
     def allow(self, verb: Verb, topic: str) -> bool:
-        """Whether a rule allows it."""
+        """Whether a rule allows this on the topic."""
         answer = self._answers.get((verb, topic))
         if answer is None:
             answer = any(getattr(rule, verb) and pattern(rule.topic).whole(topic) for rule in self.rules)

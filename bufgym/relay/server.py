@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 
 _PING_S: Final = 20.0
 _PONG_S: Final = 60.0
-"""A pong waits behind the message that is under way, which on a slow link takes long."""
+"""Time for a pong, which on a slow link waits long behind the message being sent."""
 TICK_S: Final = 1.0
-"""Between two times at which the relay tells how it is, and forgets what is over."""
+"""Time between two ticks, which publish the relay's state and forget what has expired."""
 _QUIET: Final = logging.getLogger("bufgym.relay.websockets")
-"""What strangers do wrong is in the audit log, not in tracebacks."""
+"""Silenced logger; clients' faults go to the audit log, not to tracebacks."""
 _QUIET.setLevel(logging.CRITICAL + 1)
 
 
@@ -49,16 +49,16 @@ def _is_ours(request: Request | None) -> bool:
 
 
 class Door:
-    """Who may come as far as the handshake."""
+    """Admission of connections to the handshake."""
 
     def __init__(self, hub: Hub) -> None:
         self.hub = hub
         self.waiting: Counter[str] = Counter()
-        """Connections of an address that have not said hello."""
+        """Address -> its connections that have not said hello."""
         self.open = 0
 
     def enter(self, address: str) -> None:
-        """One more connection.
+        """Count a new connection.
 
         Raises RefusedError: too many.
         """
@@ -71,13 +71,13 @@ class Door:
         self.waiting[address] += 1
 
     def greeted(self, address: str) -> None:
-        """It has said hello, or has gone without."""
+        """Note that a connection has said hello, or has ended without."""
         self.waiting[address] -= 1
         if self.waiting[address] <= 0:
             del self.waiting[address]
 
     def refusal(self, address: str, request: Request) -> RefusedError | None:
-        """Why this request is denied; None if it may go on."""
+        """Give the reason to deny this request, or None."""
         config = self.hub.config
         by_address = Permissions(config.rules, Identity(address)).rules
         proves_more = config.tokens is not None or (config.tls is not None and config.tls.clients != "")
@@ -89,10 +89,10 @@ class Door:
         return None
 
     def _is_own(self, origin: str, request: Request) -> bool:
-        """Whether the page that connects is ours, or one that the configuration names.
+        """Whether the connecting page is ours or named in the configuration.
 
-        A page of any server that somebody looks at could otherwise use the address of the browser's machine. Its name
-        can be made to mean our address; so without being named only an address or localhost is our own.
+        Otherwise a page of any server could use the address of its viewer's machine. A foreign name can resolve to our
+        address, so a host counts as our own only if it is an address, localhost or named in the configuration.
         """
         if origin in self.hub.config.origins:
             return True
@@ -121,7 +121,7 @@ class Accepted(ServerConnection):
         try:
             self._address = plain_address(transport.get_extra_info("peername")[0])
             self._door.enter(self._address)
-        except (TypeError, IndexError):  # it has gone already
+        except (TypeError, IndexError):  # the peer has gone already
             self.transport.abort()
             return
         except RefusedError as refused:
@@ -136,7 +136,7 @@ class Accepted(ServerConnection):
                 small_buffers(connection)
 
     def greeted(self) -> None:
-        """It has said hello, or it has gone."""
+        """Note that the client has said hello, or has gone."""
         if self._waits:
             self._waits = False
             self._door.greeted(self._address)
@@ -173,10 +173,10 @@ class Server:
         self._ticking: asyncio.Task[None] | None = None
         self._others: Others | None = None
         self.window: Window | None = None
-        """Where Foxglove connects to, if the configuration has such a place."""
+        """Foxglove's server, if the configuration has one."""
 
     async def start(self) -> int:
-        """Listen; the port. What the policies need is imported, and the first compiled, while robots connect again."""
+        """Listen and return the port; policies are imported and compiled while robots reconnect."""
         limits = self.config.limits
         if self.config.mesh is not None:
             self.hub.others = self._others = Others(self.hub, self.config.mesh)
@@ -216,7 +216,7 @@ class Server:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """Port on which it listens."""
         assert self._server is not None
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
@@ -225,14 +225,14 @@ class Server:
         policies.warm(self.config.policies[0])
 
     async def warm(self) -> None:
-        """Returns when the first policy is compiled.
+        """Wait until the first policy is compiled.
 
-        Raises BufgymError: the configuration names one that there is not.
+        Raises BufgymError: the configuration names an unknown policy.
         """
         await asyncio.shield(self._warming)
 
     async def close(self) -> None:
-        """Close all connections; what is held stays on disk."""
+        """Close all connections; held messages stay on disk."""
         if self._ticking is not None:
             self._ticking.cancel()
         if self._server is not None:
@@ -256,7 +256,7 @@ class Server:
         return Subprotocol(wire.SUBPROTOCOL)
 
     def _request(self, socket: ServerConnection, request: Request) -> Response | None:
-        """Deny it, answer it with a page, or let it go on to be a WebSocket."""
+        """Deny a request, answer it with a page, or let it become a WebSocket."""
         try:
             address = plain_address(socket.remote_address[0])
         except (TypeError, IndexError):

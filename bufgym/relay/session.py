@@ -1,6 +1,6 @@
-"""A session at a relay: connects out, again and again if need be; subscribes; sends commands that arrive exactly once.
+"""A session at a relay: keeps a connection, subscribes, and sends commands that arrive exactly once.
 
-This is all that a viewer needs. ``client.Client`` adds a queue, for what a robot publishes.
+This is all that a viewer needs. ``client.Client`` adds a queue for a robot's messages.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from bufgym.relay.unanswered import Unanswered
 TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
 RETRY_S: Final = 0.5
 PATIENCE_S: Final = 5.0
-"""For a connection, and for the relay's welcome."""
+"""Time to wait for a connection, and for the relay's welcome."""
 _MAX_TOKEN_BYTES: Final = 2**16
 _MAX_FRAME_BYTES: Final = 2**26
 
@@ -43,7 +43,7 @@ class RefusedError(BufgymError):
 
 @dataclass(frozen=True)
 class Subscription:
-    """What is wanted of the relay."""
+    """A subscription requested from the relay."""
 
     pattern: re.Pattern[str]
     on_message: OnMessage
@@ -51,14 +51,14 @@ class Subscription:
 
 
 def token(path: str | Path | None = None) -> str | None:
-    """The token in this file, or in the environment's ``BUFGYM_RELAY_TOKEN``; None without either."""
+    """Read the token from this file or from the environment's ``BUFGYM_RELAY_TOKEN``; None without either."""
     if path is not None:
         return read_utf8(path, _MAX_TOKEN_BYTES).strip()
     return os.environ.get(TOKEN_VARIABLE) or None
 
 
 def security(authority: str | None = None, certificate: str | None = None) -> ssl.SSLContext | None:
-    """For ``wss``: who signs the relay's certificate, the client's own with its key, PEM files; None for neither."""
+    """Set up TLS for ``wss`` from PEM files: the relay's authority, and the client's certificate with its key."""
     if authority is None and certificate is None:
         return None
     try:
@@ -71,7 +71,7 @@ def security(authority: str | None = None, certificate: str | None = None) -> ss
 
 
 class Session:
-    """One name at a relay, over as many connections as it takes."""
+    """One name at a relay, over as many connections as needed."""
 
     def __init__(
         self,
@@ -85,25 +85,25 @@ class Session:
         """
         Args:
             url: the relay's, ``ws://HOST:PORT`` or ``wss://HOST:PORT``.
-            name: what others see as the sender.
-            token: says who this is, where the relay wants one; ``token()`` finds it.
+            name: sender's name as others see it.
+            token: proof of identity if the relay wants one; ``token()`` finds it.
             tls: for ``wss``, with a client's certificate if the relay knows it by that (default: the system's).
-            say: takes a line for what the relay refuses, and why connections ended.
+            say: called with a line for each refusal and each connection's end.
         """
         self.address = urlsplit(url)
         if self.address.scheme not in ("ws", "wss") or not self.address.hostname:
             raise BufgymError(f"{url}: must be ws://HOST:PORT or wss://HOST:PORT")
         self.name = name
         self.connected = asyncio.Event()
-        """Set while the relay has said welcome."""
+        """Set while the relay has accepted the connection."""
         self.ready = asyncio.Event()
-        """Set while the relay has taken all subscriptions too."""
+        """Set while the relay has also accepted all subscriptions."""
         self.welcome: dict[str, Any] = {}
-        """What it said, the last time."""
+        """The relay's last welcome."""
         self.faults: deque[str] = deque(maxlen=100)
-        """Why connections ended, and what was refused, the last 100."""
+        """The last 100 refusals and reasons for a connection's end."""
         self.round_trip_s: float | None = None
-        """To the relay and back, behind what is on its way, as ``ping`` last measured it."""
+        """Round trip to the relay as ``ping`` last measured it, including messages on their way."""
         self._token, self._tls, self._report = token, tls, say
         self._session = f"{re.sub('[^A-Za-z0-9._-]', '-', name)[:40]}-{os.urandom(8).hex()}"
         self._no_drop: tuple[re.Pattern[str], ...] = ()
@@ -116,12 +116,13 @@ class Session:
         self._tasks = Tasks()
 
     async def command(self, topic: str, data: Any, type: str = "") -> None:
-        """Send ``data`` on a no_drop topic; returns once the relay holds it. It arrives exactly once.
+        """Send ``data`` on a no_drop topic and wait until the relay holds it; it arrives exactly once.
 
-        With a ``type`` of ROS, as ``geometry_msgs/msg/Twist``, it is bytes in CDR; else it is sent as JSON.
+        With a ROS ``type``, such as ``geometry_msgs/msg/Twist``, data are bytes in CDR; otherwise they are sent as
+        JSON.
 
         Raises:
-            BufgymError: the relay refused it, and why.
+            BufgymError: the relay refused it; the error says why.
         """
         encoding = "cdr" if type else "json"
         payload = data if type else json.dumps(data, separators=(",", ":"), allow_nan=False).encode()
@@ -139,10 +140,10 @@ class Session:
         capacity: int | None = None,
         durable: bool = False,
     ) -> None:
-        """``on_message`` gets what is published on topics in which ``pattern`` is found, as far as the rules allow.
+        """Call ``on_message`` for each message on topics that contain ``pattern``, as far as the rules allow.
 
-        ``policy`` and ``capacity``: of the relay's queue for it. ``durable``: no_drop messages are held while this
-        client is away.
+        ``policy`` and ``capacity`` describe the relay's queue for this subscription. With ``durable`` the relay holds
+        no_drop messages while this client is away.
         """
         id = str(len(self._subscriptions))
         chosen = {"policy": policy, "capacity": capacity, "durable": durable or None}
@@ -173,7 +174,7 @@ class Session:
                         await self._greet()
                     await self._converse()
                 except (OSError, TimeoutError, wire.WireError, WebSocketException) as error:
-                    # A relay that does not even talk to this address says why in its page.
+                    # A relay that refuses this address says why in its HTTP answer.
                     page = getattr(getattr(error, "response", None), "body", None) or b""
                     self.note(f"{type(error).__name__}: {error} {page.decode(errors='replace')}".strip())
                 finally:
@@ -189,7 +190,7 @@ class Session:
             await self._tasks.end()
 
     def note(self, fault: str) -> None:
-        """What went wrong, said once however often it comes in a row."""
+        """Report a fault, once however often it comes in a row."""
         if not self.faults or self.faults[-1] != fault:
             self._report(f"{self.name}: {fault}")
         self.faults.append(fault)
@@ -239,11 +240,11 @@ class Session:
             self.ready.set()
 
     def _works(self) -> list[Coroutine[Any, Any, None]]:
-        """What goes on while there is a connection."""
+        """List the tasks that run while there is a connection."""
         return [self._send_no_drop(), self._take_all()]
 
     async def _converse(self) -> None:
-        """Send, and take what comes, until the connection ends."""
+        """Send and receive until the connection ends."""
         tasks = [asyncio.create_task(work) for work in self._works()]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -270,7 +271,7 @@ class Session:
             await self._wanted.wait()
 
     async def ping(self) -> None:
-        """Measure ``round_trip_s``; returns when the relay has answered."""
+        """Measure ``round_trip_s``."""
         if self._connection is not None:
             self.round_trip_s = await (await self._connection.ping())
 

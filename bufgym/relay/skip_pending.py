@@ -1,4 +1,4 @@
-"""What Robofleet's server does with a receiver that has bytes pending, as a policy."""
+"""Robofleet's server rule for a receiver with bytes pending, as a policy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bufgym.relay.policies import SKIP_PENDING
 
 
 def skip_pending(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """It is skipped: nothing is queued."""
+    """Skip the receiver: queue nothing."""
     return REJECT if buffer.busy else ACCEPT
 
 

@@ -1,8 +1,9 @@
-"""What may not be lost: no_drop messages on disk until each of their receivers has acked them.
+"""Store of no_drop messages, kept on disk until each of their receivers has acked them.
 
-A session outlives its connections. The relay numbers what it sends to a session, and knows the highest number that came
-from it; both are committed with the message itself, before anything is acked. So a message is taken once however often
-it is sent again, and a relay that is killed goes on where it was. Bounded: what has no room is refused to its sender.
+A session outlives its connections. The relay numbers the messages that it sends to a session, and knows the highest
+number received from it. Both are committed with the message itself, before anything is acked. So a message is taken
+once however often it is sent again, and a killed relay resumes where it was. Space is bounded: a message that has no
+room is refused to its sender.
 """
 
 from __future__ import annotations
@@ -41,38 +42,38 @@ class Session:
     name: str
     identity: Identity
     temporary: bool
-    """Ends with its connection."""
+    """Whether the session ends with its connection."""
     received: int = 0
-    """Highest number of a no_drop message of its own that was taken."""
+    """Highest number of a no_drop message taken from it."""
     numbered: int = 0
-    """Highest number of a no_drop message to it."""
+    """Highest number of a no_drop message for it."""
     held: int = 0
-    """Messages to it that are not acked."""
+    """Number of messages for it that are not acked."""
     durable: dict[str, str] = field(default_factory=dict)
-    """id -> pattern: what is held for it while it is away."""
+    """id -> pattern of the messages held for it while it is away."""
     seen_s: float = 0.0
-    """When it was last connected, s since 1970."""
+    """Time of its last connection, s since 1970."""
     id: int | None = None
-    """In the store; None while there is nothing to remember."""
+    """Id in the store; None while there is nothing to remember."""
 
     @property
     def key(self) -> tuple[str, str]:
-        """A name belongs to who uses it: another identity's session of this name is another session."""
+        """Identity and name; the same name under another identity is another session."""
         return self.identity.key, self.name
 
 
 class Settled(NamedTuple):
-    """A message that nobody waits for any more."""
+    """A message that no receiver waits for any more."""
 
     sender: Session
     seq: int
     receivers: int
     lost: int
-    """Receivers whose sessions were forgotten before they acked it."""
+    """Number of receivers whose sessions were forgotten before they acked it."""
 
 
 class Store:
-    """Sessions, and what is held for them; in memory alone without a folder."""
+    """Sessions and the messages held for them; without a folder they are in memory only."""
 
     def __init__(self, folder: Path | None, limits: config.Store, sessions: int = 64) -> None:
         self.limits = limits
@@ -101,15 +102,15 @@ class Store:
             self.sessions[session.key] = self._by_id[id] = session
         (self.bytes,) = self._db.execute("SELECT coalesce(sum(length(frame)), 0) FROM message").fetchone()
         for session in list(self.sessions.values()):
-            if session.temporary:  # of a relay that was killed
+            if session.temporary:  # left by a relay that was killed
                 self.forget(session)
 
     # --- sessions -----------------------------------------------------------------------------------------------------
 
     def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> Session:
-        """The session of this name; a new one goes on from what the client knows.
+        """Open the session of this name; a new session begins at the client's numbers.
 
-        Raises RefusedError: the identity has too many.
+        Raises RefusedError: the identity has too many sessions.
         """
         session = self.sessions.get((identity.key, name))
         if session is None:
@@ -125,7 +126,7 @@ class Store:
         return session
 
     def left(self, session: Session) -> list[Settled]:
-        """Its connection has ended; what nobody will ever ask for is forgotten."""
+        """Note the end of a session's connection; forget messages that nobody will ask for."""
         session.seen_s = time.time()
         if session.temporary or session.id is None:
             return self.forget(session)
@@ -134,7 +135,7 @@ class Store:
         return []
 
     def forget(self, session: Session) -> list[Settled]:
-        """It is no more; what was held for it is lost."""
+        """Forget a session; messages held for it are lost."""
         self.sessions.pop(session.key, None)
         if session.id is None:
             return []
@@ -146,7 +147,7 @@ class Store:
         return settled
 
     def want(self, session: Session, id: str, pattern: str | None) -> None:
-        """Hold for it what matches while it is away; None: no longer."""
+        """Hold matching messages while the session is away; the pattern None ends that."""
         if pattern is None and session.durable.pop(id, None) is None:
             return
         self._remember(session)
@@ -160,7 +161,7 @@ class Store:
     # --- messages -----------------------------------------------------------------------------------------------------
 
     def hold(self, sender: Session, seq: int, topic: str, frame: bytes, receivers: Sequence[Session]) -> None:
-        """Take the sender's message number ``seq`` for these receivers; it is on disk when this returns.
+        """Store the sender's message number ``seq`` on disk for these receivers.
 
         Without receivers, whom other relays have, the number alone is taken.
 
@@ -197,7 +198,7 @@ class Store:
             receiver.held += 1
 
     def waiting(self, session: Session, after: int, most: int) -> list[tuple[int, str, bytes]]:
-        """(number, topic, frame) of the next messages to it."""
+        """List number, topic and frame of the session's next messages."""
         if session.id is None:
             return []
         query = (
@@ -207,25 +208,25 @@ class Store:
         return self._db.execute(query, (session.id, after, most)).fetchall()
 
     def acked(self, session: Session, number: int) -> list[Settled]:
-        """It has processed all to this number; the messages that nobody waits for any more."""
+        """Note that the session has processed all messages up to this number; return the settled ones."""
         if session.id is None or session.held == 0:
             return []
         with self._transaction():
             return self._settle(session, 0, number, lost=0)
 
     def denied(self, session: Session, number: int) -> list[Settled]:
-        """No rule lets it have this message any more."""
+        """Drop a message that no rule lets the session have any more; return the settled ones."""
         with self._transaction():
             return self._settle(session, number, number, lost=1)
 
     def expired(self, connected: Sequence[Session]) -> list[Session]:
-        """The sessions that have been away for too long."""
+        """List the sessions that have been away for too long."""
         before_s = time.time() - self.limits.keep_s
         here = set(map(id, connected))
         return [each for each in self.sessions.values() if id(each) not in here and each.seen_s < before_s]
 
     def close(self) -> None:
-        """Everything is on disk anyway."""
+        """Close the file; everything is on disk already."""
         self._db.close()
 
     # --- on disk ------------------------------------------------------------------------------------------------------
@@ -260,7 +261,7 @@ class Store:
         return settled
 
     def _remember(self, session: Session) -> None:
-        """Give it a place in the store, in a transaction of its own: its id is not taken back."""
+        """Give the session an id in a transaction of its own, so that the id is never rolled back."""
         if session.id is None:
             cursor = self._db.execute(
                 "INSERT INTO session (name, address, email, temporary, received, numbered, seen_s) "

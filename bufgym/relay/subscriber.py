@@ -1,8 +1,8 @@
-"""What waits for one subscriber: queues under its policy, made when the first message comes.
+"""Messages waiting for one subscriber, in queues under its policy that are made at the first message.
 
-A policy that knows topics (``robofleet``, the default, keeps the newest message of each) has one queue for some thirty
-of them; any other has a queue for each topic. Between queues the one goes next whose priority x wait is largest,
-Robofleet's own rule.
+A policy that knows topics has one queue for some thirty topics; the default, ``robofleet``, keeps the newest message of
+each. Any other policy has a queue for each topic. The queue with the largest priority x wait goes next, as in
+Robofleet.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from bufgym.policies.registry import Policy
 
 MAX_QUEUES: Final = 64
-"""Of a subscription: topics beyond them share queues."""
+"""Limit on the queues of a subscription; further topics share queues."""
 
 
 class Lane:
-    """A queue, and whether the connection is carrying a message of it."""
+    """A queue, with a flag for a message of it on the connection."""
 
     def __init__(self, queue: PolicyQueue, left_bytes: Callable[[], int]) -> None:
         self.queue = queue
@@ -33,22 +33,22 @@ class Lane:
 
     @property
     def ready(self) -> bool:
-        """Whether a message can go."""
+        """Whether a message can be sent."""
         return not self.carried and self.queue.in_flight > 0
 
     def take(self, now_s: float) -> Item | None:
-        """The message that goes next."""
+        """Take the next message."""
         self.carried, self.served_s = True, now_s
         return self.queue.get(0)
 
     def gone(self) -> None:
-        """It has left."""
+        """Note that the message has left."""
         self.queue.gone()
         self.carried = False
 
 
 class Subscription:
-    """What one subscriber asked for under one id."""
+    """One subscriber's request under one id, with its queues."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class Subscription:
         self._topics: dict[str, int] = {}
 
     def offer(self, topic: str, frame: Any, size_bytes: int) -> None:
-        """A message comes; the policy decides."""
+        """Put a message into its queue, where the policy decides."""
         number = self._topics.get(topic)
         if number is None:
             places = MAX_QUEUES * (PLACES if self.policy.for_topics else 1)
@@ -86,7 +86,7 @@ class Subscription:
 
     @property
     def dropped(self) -> int:
-        """Messages so far."""
+        """Messages dropped so far."""
         return sum(lane.queue.dropped for lane in self.lanes)
 
     def __len__(self) -> int:
@@ -95,7 +95,7 @@ class Subscription:
 
 
 def next_lane(subscriptions: Sequence[Subscription], now_s: float) -> Lane | None:
-    """The lane that goes next; None if nothing waits."""
+    """Choose the lane that sends next; None if nothing waits."""
     ready = list(_ready(subscriptions, now_s))
     return max(ready, key=lambda each: each[0])[1] if ready else None
 

@@ -1,7 +1,7 @@
-"""What a client has under way on no_drop topics: numbered, held until the relay answers, numbered anew if refused.
+"""A client's unanswered no_drop messages: numbered, held until the relay answers, renumbered if refused.
 
-The relay takes number k only after k - 1, and answers each once, in order. A refused number was not used: so once all
-that are under way are answered, those behind it go again, from that number on.
+The relay takes number k only after k - 1, and answers each once, in order. A refused number stays unused. So once all
+messages under way are answered, the messages behind the refused one are sent again from that number on.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from bufgym.errors import BufgymError
 from bufgym.relay import wire
 
 AGAIN = "out_of_order"
-"""Why a message behind a refused one is refused itself: it goes again."""
+"""Code with which a message behind a refused one is refused too; it is sent again."""
 
 
 @dataclass
@@ -23,7 +23,7 @@ class Pending:
 
     message: wire.Message
     answered: asyncio.Future[None]
-    """Done when the relay holds it; a BufgymError when it was refused."""
+    """Done when the relay holds the message; a BufgymError if it was refused."""
 
 
 class Unanswered:
@@ -31,34 +31,34 @@ class Unanswered:
 
     def __init__(self) -> None:
         self.acked = 0
-        """The highest number that the relay holds."""
+        """Highest number that the relay holds."""
         self.window = 1
-        """n_T: so many may be unanswered."""
+        """n_T, the most messages unanswered at a time."""
         self._waiting: deque[Pending] = deque()
         self._sent: deque[Pending] = deque()
         self._again: list[Pending] = []
         self._refused = 0
-        """Refusals since the last answer that was none, while there are more to come."""
+        """Refusals since the last ack, while more are to come."""
 
     def __len__(self) -> int:
-        """Messages that the relay has not answered."""
+        """Number of messages that the relay has not answered."""
         return len(self._waiting) + len(self._sent) + len(self._again)
 
     def put(self, message: wire.Message) -> asyncio.Future[None]:
-        """A message; done once the relay holds it."""
+        """Add a message; the future is done once the relay holds it."""
         pending = Pending(message, asyncio.get_running_loop().create_future())
         self._waiting.append(pending)
         return pending.answered
 
     def next(self) -> wire.Message | None:
-        """The next to send, with its number; None where nothing waits, the window is full, or refusals are to come."""
+        """Number the next message to send; None if nothing waits, the window is full or refusals are to come."""
         if not self._waiting or self._refused or len(self._sent) >= self.window:
             return None
         self._sent.append(self._waiting.popleft())
         return self._sent[-1].message._replace(seq=self.acked + len(self._sent))
 
     def ack(self, seq: int) -> None:
-        """The relay holds this one and all before it."""
+        """Note that the relay holds this message and all before it."""
         while self._sent and self.acked < seq and not self._refused:
             self.acked += 1
             _settle(self._sent.popleft())
@@ -70,7 +70,7 @@ class Unanswered:
         )
 
     def refuse(self, code: str, why: str) -> None:
-        """The relay has not taken the oldest that is unanswered."""
+        """Note that the relay refused the oldest unanswered message."""
         if not self._sent:
             return
         pending = self._sent.popleft()
@@ -78,7 +78,7 @@ class Unanswered:
             self._again.append(pending)
         else:
             _settle(pending, BufgymError(f"topic {pending.message.topic}: refused: {code}: {why}"))
-        # Whatever is under way behind a refused one is refused as well: nothing new goes before all of it is back.
+        # Messages behind a refused one are refused too: nothing new is sent until all their answers are in.
         self._refused += 1
         if not self._sent:
             self._refused = 0
@@ -86,7 +86,7 @@ class Unanswered:
             self._again.clear()
 
     def resume(self, received: int, window: int) -> None:
-        """After a new connection: the relay holds all up to ``received``; the rest goes again."""
+        """Resume after a reconnect: the relay holds all up to ``received``, and the rest is sent again."""
         self.window = window
         self.ack(received)
         self._waiting.extendleft(reversed([*self._again, *self._sent]))
@@ -96,16 +96,16 @@ class Unanswered:
         self.acked = received
 
     def give_up(self, why: str) -> None:
-        """Nothing will be answered any more."""
+        """Fail all messages, because no answer will come."""
         for pending in (*self._again, *self._sent, *self._waiting):
             _settle(pending, BufgymError(why))
 
 
 def _settle(pending: Pending, error: BufgymError | None = None) -> None:
-    if pending.answered.done():  # who waited has given up
+    if pending.answered.done():  # the waiting task has given up
         return
     if error is None:
         pending.answered.set_result(None)
     else:
         pending.answered.set_exception(error)
-        pending.answered.exception()  # it may be that nobody asks, which is no fault of theirs
+        pending.answered.exception()  # marks the error as seen, because nobody may await it

@@ -1,8 +1,8 @@
-"""What goes over a relay's WebSockets: binary frames are a message each, text frames are JSON objects with an ``op``.
+"""Protocol on a relay's WebSockets: a binary frame is one message, a text frame is a JSON object with an ``op``.
 
-A binary message, big endian (``docs/guide/relay.md`` has the table): a header of 32 bytes, then topic, type, encoding
-and sender in UTF-8, then the payload. In JSON the same message is an object whose ``data`` is the value itself
-where the encoding is ``json``, and base64 of the payload where it is not.
+A binary message is big endian and has a header of 32 bytes, then topic, type, encoding and sender in UTF-8, then the
+payload. ``docs/guide/relay.md`` has the table. In JSON the same message is an object whose ``data`` is the value itself
+for the encoding ``json``, and otherwise the payload in base64.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ VERSION: Final = 1
 MESSAGE: Final = 1
 """The one kind of binary frame."""
 NO_DROP: Final = 1
-"""A flag."""
+"""Flag of a no_drop message."""
 MAX_NAME_BYTES: Final = 255
-"""Of a topic, a type, an encoding, a sender."""
+"""Length limit of a topic, type, encoding or sender."""
 MAX_SEQ: Final = 2**53
-"""Numbers are exact in JavaScript up to this."""
+"""Largest number; JavaScript's numbers are exact up to this."""
 MAX_STAMP_US: Final = 2**53
 
 _HEADER: Final = struct.Struct("!2s7B3sIQq")
@@ -36,7 +36,7 @@ _MAGIC: Final = b"bR"
 
 
 class WireError(BufgymError):
-    """What came is no frame of this protocol."""
+    """Data that is not a frame of this protocol."""
 
 
 class Message(NamedTuple):
@@ -47,18 +47,18 @@ class Message(NamedTuple):
     encoding: str = "json"
     """How to read the payload: json, cdr, ros1, jpeg, png, or a name that sender and receivers know."""
     type: str = ""
-    """As in ROS, ``sensor_msgs/msg/LaserScan``; empty if unknown."""
+    """Type as in ROS, such as ``sensor_msgs/msg/LaserScan``; empty if unknown."""
     sender: str = ""
-    """The relay fills it in."""
+    """Sender's name, filled in by the relay."""
     seq: int = 0
-    """A no_drop message's number on its way; any other's is its sender's own business."""
+    """Number of a no_drop message; free for the sender's use in any other message."""
     stamp_us: int = 0
-    """When it was put, us since 1970, by its sender's clock."""
+    """Time of the put by its sender's clock, us since 1970."""
     no_drop: bool = False
 
 
 def encode(message: Message) -> bytes:
-    """The binary frame; the names are checked, as those of ``decode`` are."""
+    """Make the binary frame; names are checked as in ``decode``."""
     _check(message)
     names = [name.encode() for name in (message.topic, message.type, message.encoding, message.sender)]
     return b"".join(
@@ -81,9 +81,9 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes, max_bytes: int = 2**26) -> Message:
-    """The message of a binary frame of at most ``max_bytes``.
+    """Read the message of a binary frame of at most ``max_bytes``.
 
-    Raises WireError: it is none.
+    Raises WireError: it is not such a frame.
     """
     if not HEADER_BYTES <= len(data) <= max_bytes:
         raise WireError(f"frame of {len(data)} bytes: must be from {HEADER_BYTES} to {max_bytes}")
@@ -120,14 +120,14 @@ def _check(message: Message) -> None:
 
 
 def check_topic(topic: str) -> None:
-    """A topic's name begins with ``/``."""
+    """Check that a topic's name is valid and begins with ``/``."""
     check_name("topic", topic)
     if not topic.startswith("/"):
         raise WireError(f"topic {topic!r}: must begin with '/'")
 
 
 def check_name(what: str, name: str) -> None:
-    """A name is short, and prints as it stands."""
+    """Check that a name is short and printable."""
     if not name.isprintable() or (not name.isascii() and _utf8_bytes(what, name) > MAX_NAME_BYTES):
         raise WireError(f"{what} {name!r}: must be printable, at most {MAX_NAME_BYTES} bytes")
     if len(name) > MAX_NAME_BYTES:
@@ -183,19 +183,19 @@ FIELDS: Final[Mapping[str, Mapping[str, tuple[Any, bool]]]] = {
     "delivered": {"seq": (int, True), "receivers": (int, True), "lost": (int, True)},
     "refused": {"what": (str, True), "code": (str, True), "why": (str, True)},
 }
-"""op -> field -> (its kind, whether it must be there). Other fields are let pass: a later version may have more."""
+"""op -> field -> (its kind, whether it is required). Other fields are allowed, as a later version may have more."""
 FORMS: Final = ("binary", "json")
 
 
 def say(op: str, **fields: Any) -> str:
-    """The text frame of an ``op``."""
+    """Make the text frame of an ``op``."""
     return json.dumps({"op": op, **fields}, separators=(",", ":"), allow_nan=False)
 
 
 def heard(text: str) -> dict[str, Any]:
-    """The object of a text frame: its ``op`` is known, its fields are of their kinds.
+    """Read a text frame and check its ``op`` and the kinds of its fields.
 
-    Raises WireError: it is none of this protocol.
+    Raises WireError: it is not a frame of this protocol.
     """
     try:
         said = json.loads(text, parse_constant=no_constant)
@@ -228,7 +228,7 @@ def no_constant(name: str) -> NoReturn:
 
 
 def to_json(message: Message, op: str = "message") -> str:
-    """The message as a text frame: ``message`` from the relay, ``publish`` to it."""
+    """Make a message's text frame: ``message`` from the relay, ``publish`` to it."""
     data: Any
     if message.encoding == "json":
         try:
@@ -243,7 +243,7 @@ def to_json(message: Message, op: str = "message") -> str:
 
 
 def from_json(said: Mapping[str, Any]) -> Message:
-    """The message of a ``publish`` or ``message`` that was heard."""
+    """Read the message of a received ``publish`` or ``message``."""
     encoding = said.get("encoding", "json")
     if encoding == "json":
         payload = json.dumps(said["data"], separators=(",", ":")).encode()

@@ -1,9 +1,9 @@
-"""The AFR and Robofleet papers' figures, tables and theorems again: our number beside the paper's.
+"""Reproductions of the figures, tables and theorems of the AFR and Robofleet papers.
 
-``run("afr-fig5", Path("out"))`` returns a text to print and saves the numbers (CSV) and the picture (PNG) under
-``out``. Each figure is one module with a class ``Reproduction``, imported only when it is asked for. The numbers need
-nothing beyond bufgym (those of robofleet-table1 its extra ``robofleet``, those on frames ``perception`` and ``bench``);
-the picture needs matplotlib, which comes with ``bufgym[plot]``. Keys in brackets, such as [wang2022afr], are those of
+``run("afr-fig5", Path("out"))`` returns a text with our numbers beside the paper's, and saves a CSV and a PNG under
+``out``. Each figure is one module with a class ``Reproduction``, imported only when the figure is asked for. Most
+numbers need bufgym alone. The figure robofleet-table1 needs the extra ``robofleet``, and the figures on frames need
+``perception`` and ``bench``. Pictures need ``bufgym[plot]``. Keys in brackets, such as [wang2022afr], refer to
 docs/references.bib.
 """
 
@@ -21,20 +21,20 @@ from bufgym.reproduce.figure import Figure, report, save_picture, statements
 from bufgym.reproduce.rows import Rows
 
 FIGURES: dict[str, str] = {name: texts["title"] for name, texts in statements().items() if "title" in texts}
-"""Name -> what it shows, in one line."""
+"""Name of a figure -> its title."""
 
 NEEDS_DATA: dict[str, str] = {name: texts["needs"] for name, texts in statements().items() if "needs" in texts}
-"""Figures over recordings -> what the folder given as their option ``data`` must hold."""
+"""Figure that needs recordings -> the files that its option ``data``, a folder, must hold."""
 
 TAKES_DATA = (*NEEDS_DATA, *(name for name, texts in statements().items() if "data" in texts))
-"""Those, and the ones that show more with such a folder than without."""
+"""Figures with an option ``data``, whether they need it or only show more with it."""
 
 STORE = "frame-runs.jsonl"
-"""Runs on frames take minutes: those that are finished are kept here, for other figures and against a kill."""
+"""File of finished runs on frames. Each run takes minutes; figures share them, and they survive a kill."""
 
 
 def figure(name: str, **options: Any) -> Figure:
-    """The figure ``name`` with these options.
+    """Make the figure ``name`` with these options.
 
     Raises:
         BufgymError: an unknown name or option, or an option's value that cannot be used.
@@ -55,7 +55,7 @@ def _kind(name: str) -> Any:
 
 
 def kept_under(out: Path | None, name: str, **options: Any) -> Figure:
-    """The figure ``name``; if it takes minutes, what is finished of it is kept in this folder."""
+    """Make the figure ``name``; a figure on frames keeps its finished runs in the folder ``out``."""
     made = figure(name, **options)
     if out is not None and getattr(made, "store", out) is None:
         return figure(name, **options, store=out / STORE)
@@ -63,11 +63,11 @@ def kept_under(out: Path | None, name: str, **options: Any) -> Figure:
 
 
 def run(name: str, out: Path | None = None, **options: Any) -> str:
-    """Reproduce one figure; the text compares our numbers with the paper's.
+    """Reproduce one figure; return a text that compares our numbers with the paper's.
 
     Args:
         name: a key of ``FIGURES``.
-        out: folder for ``<name>.csv`` and ``<name>.png``, made where absent; None saves nothing.
+        out: folder for ``<name>.csv`` and ``<name>.png``, made if absent; None saves nothing.
         options: fields of that figure's ``Reproduction``, such as ``runs`` for afr-fig5.
     """
     reproduction = kept_under(out, name, **options)
@@ -77,30 +77,30 @@ def run(name: str, out: Path | None = None, **options: Any) -> str:
 
 
 def _saved(reproduction: Figure, rows: Rows, out: Path | None, stem: str) -> Iterator[str]:
-    """Save the numbers and the picture in the folder, if there is one; where they are."""
+    """Save the numbers and the picture in ``out``, unless it is None; yield lines that say where."""
     if out is None:
         return
     yield f"numbers: {rows.save(out / f'{stem}.csv')}"
     try:
         yield f"figure: {save_picture(reproduction, rows, out / f'{stem}.png')}"
-    except BufgymError as error:  # the numbers stand without it
+    except BufgymError as error:  # the numbers are useful without the picture
         yield f"no figure: {error}"
 
 
 Watch: TypeAlias = Callable[[int, float], AbstractContextManager[Callable[[], None]]]
-"""Called with how many runs are to be played and how long that takes, s; gives what is called after each."""
+"""Starts a progress display from the number of runs and their total time in s; gives a function to call per run."""
 
 
 def run_live(name: str, out: Path | None = None, watch: Watch | None = None, **options: Any) -> str:
-    """One figure on real sockets and simulated, with the options of its ``LIVE``, which are fewer and shorter runs.
+    """Run one figure both simulated and on real sockets, with the fewer and shorter runs of its ``LIVE`` options.
 
     Args:
         name: one of robofleet-fig3 to -fig7.
-        out: folder for CSV and PNG of both; None saves nothing.
-        watch: who waits is told how far the live runs are.
-        options: as for ``run``, instead of those of ``LIVE``.
+        out: folder for the CSV and PNG files of both; None saves nothing.
+        watch: shows the progress of the live runs.
+        options: as for ``run``; they replace the options of ``LIVE``.
     """
-    from bufgym.reproduce.on_sockets import apart  # sockets, threads: not for those who only simulate
+    from bufgym.reproduce.on_sockets import apart  # sockets and threads, not needed to simulate
 
     if not hasattr(_kind(name), "LIVE"):
         raise BufgymError(f"{name}: is not played on sockets; robofleet-fig3 to robofleet-fig7 are")

@@ -1,15 +1,15 @@
-"""What Fig. 6, 7 and 8 of the AFR paper share: the camera stream, the link, the camera's motion, the policies.
+"""Camera stream, link, camera motion and policies shared by Fig. 6, 7 and 8 of the AFR paper.
 
-The paper streams 794 RGB-D frames at 30 Hz over the Belgium 4G log car_0002 [vanderhooft2016http2], ten times a policy
-and queue size, and looks at the map (Fig. 7) and at tracking (Fig. 8) that SLAM makes of the frames received. Here no
-SLAM runs: what is counted is the Quantity of Information and the longest motion gap. The cameras are of [sturm2012tum].
+The paper streams 794 RGB-D frames at 30 Hz over the Belgium 4G log car_0002 [vanderhooft2016http2], ten times for each
+policy and queue size. It evaluates mapping (Fig. 7) and tracking (Fig. 8) on the frames received. No SLAM runs here: we
+count the Quantity of Information and the longest motion gap. The camera motions come from [sturm2012tum].
 
-The paper does not state the size of a frame. With about 160 kB its own numbers come out (see `afr_frame_size`); the
-figures show a sweep of sizes beside it.
+The paper does not state the size of a frame. A size of about 160 kB reproduces the paper's numbers (see
+`afr_frame_size`). The figures also show a sweep of sizes.
 
-The ten runs differ by where on the camera's recording they begin, by when within a tenth of its period each frame
-comes, and by the uniform draws of Random. Every policy meets the same ten. The link begins at the trace's start in all
-of them. Frames are of equal size unless asked otherwise: only then is the clairvoyant exact.
+The ten runs differ in three ways: where in the camera's recording they begin, the jitter of each frame within a tenth
+of its period, and the uniform draws of Random. Every policy meets the same ten runs. In all of them the link begins at
+the trace's start. Frames have equal sizes by default, because the clairvoyant is exact only for equal sizes.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from bufgym.traces import Motion, Trace
 PAPER_FRAMES = 794
 PAPER_RUNS = 10
 FRAME_BYTES = 160_000
-"""About what reproduces the paper's recalculations and frame rates."""
+"""Size of a frame that roughly reproduces the paper's recalculations and frame rates."""
 SWEEP_KB = (140, 180, 200, 230)
-"""Further sizes of a frame that the figures show."""
+"""Further frame sizes that the figures show, kB."""
 
 LINK = "belgium_4g/csv/report_car_0002.csv"
 CAMERA = "tum_rgbd/{}.groundtruth.txt.gz"
 CAMERAS = ("freiburg1_desk", "freiburg2_desk")
-"""A camera in the hand over a desk, brisk (0.8 fields of view a second) and slow (0.27)."""
+"""A hand-held camera over a desk, moving at 0.8 and at 0.27 fields of view a second."""
 JITTER = 0.1
-"""Frames come late by up to so much of a period."""
+"""Largest delay of a frame, as a fraction of its period."""
 
 STYLES = {
     "afr": ("AFR", COLOURS["afr"], "o"),
@@ -58,24 +58,24 @@ STYLES = {
 
 @dataclass(frozen=True)
 class Setting:
-    """What meets the policies in one part of a figure."""
+    """Scenario that the policies meet in one part of a figure."""
 
     camera: str
-    """The recording; "time" where x is the frame index."""
+    """Name of the recording; "time" where x is the frame index."""
     size_kb: float
-    """Of a frame."""
+    """Size of a frame, kB."""
     uplink: Uplink
-    """The scenario."""
+    """Uplink scenario."""
 
 
 @dataclass(frozen=True)
 class LinkFigure(Figure):
-    """A figure of ``frames`` frames of ``size_bytes`` that meet the link."""
+    """A figure in which ``frames`` frames of ``size_bytes`` are sent over the link."""
 
     data: Path | None = None
     """Folder of recordings, with belgium_4g/csv/report_car_0002.csv."""
     trace: str | None = None
-    """Another trace in place of car_0002, a shipped name or a file."""
+    """Trace to use in place of car_0002: a shipped name or a file."""
     frames: int = PAPER_FRAMES
     size_bytes: int = FRAME_BYTES
 
@@ -89,29 +89,29 @@ class LinkFigure(Figure):
 
     @property
     def streamed(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """(lengths in us, bytes/s) of the link's samples that begin while the frames come, from the trace's start."""
+        """Lengths in us and rates in bytes/s of the link samples that begin while frames arrive."""
         lengths_us, rates = self.link.samples()
         during = np.cumsum(lengths_us) - lengths_us < self.frames / RATE_HZ * 1e6
         return lengths_us[during], rates[during]
 
     def share_carried(self) -> float:
-        """Part of the demand that the link can carry while the frames come."""
+        """Fraction of the demand that the link can carry while the frames arrive."""
         lengths_us, rates = self.streamed
         return float(np.average(rates, weights=lengths_us)) / (RATE_HZ * self.size_bytes)
 
 
 @dataclass(frozen=True)
 class StreamFigure(LinkFigure):
-    """A figure of ``runs`` runs of every policy, over each link and camera."""
+    """A figure with ``runs`` runs of every policy over each link and camera."""
 
     motion: str | Sequence[str] = CAMERAS
     """TUM RGB-D sequences in ``data`` (tum_rgbd/*.groundtruth.txt.gz), shipped motions or files."""
     size_cv: float = 0.0
-    """Coefficient of variation of the frames' sizes; above 0 the clairvoyant is an upper bound only."""
+    """Coefficient of variation of the frame sizes. Above 0 the clairvoyant is only an upper bound."""
     capacities: Sequence[int] = CAPACITIES
     runs: int = PAPER_RUNS
     sweep_kb: Sequence[float] = SWEEP_KB
-    """Further sizes of a frame, kB."""
+    """Further frame sizes, kB."""
 
     RULES = {"size_cv": at_least_0, "sweep_kb": several(above_0)}
 
@@ -122,11 +122,11 @@ class StreamFigure(LinkFigure):
 
     @property
     def size_kb(self) -> float:
-        """Of a frame, in the main part of the figure."""
+        """Size of a frame in the main part of the figure, kB."""
         return self.size_bytes / 1000
 
     def settings(self, *, timed: bool) -> list[Setting]:
-        """Every size of a frame with every camera (and with time-based QoI, if ``timed``)."""
+        """List every frame size with every camera, and with time-based QoI if ``timed``."""
         settings = []
         for size_kb in sorted({self.size_kb, *self.sweep_kb}):
             uplink = Uplink(
@@ -147,7 +147,7 @@ class StreamFigure(LinkFigure):
         return settings
 
     def play(self, settings: Sequence[Setting], runs: int, *, bound: bool) -> Rows:
-        """A row for each run of every policy in every setting; with the clairvoyant's H and regret if ``bound``."""
+        """Return a row for each setting, policy and run; ``bound`` adds the clairvoyant's H and the regret."""
         chosen = [policies.get(name) for name in STYLES]
         rows = Rows()
         for setting in settings:
@@ -169,7 +169,7 @@ class StreamFigure(LinkFigure):
         return rows
 
     def about(self) -> str:
-        """What meets the policies, in sentences."""
+        """Describe the scenario in sentences."""
         sizes = "equal in size" if self.size_cv == 0 else f"sizes with cv {self.size_cv:g} (regret is an upper bound)"
         return (
             f"{self.frames} frames of {self.size_bytes / 1000:g} kB at {RATE_HZ:g} Hz, {sizes}, over {self.link.name} "
@@ -180,7 +180,7 @@ class StreamFigure(LinkFigure):
 
 
 def load_camera(name: str, data: Path | None) -> Motion:
-    """A TUM RGB-D sequence from the folder of recordings; or a shipped motion or file, where one has that name."""
+    """Load a shipped motion or a file with this name, or else a TUM RGB-D sequence from the folder of recordings."""
     if name in traces.shipped() or Path(name).is_file():
         return traces.load_motion(name)
     return replace(traces.read_motion(_recording(data, CAMERA.format(name))), name=name)

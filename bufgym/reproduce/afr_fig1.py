@@ -1,8 +1,8 @@
-"""The queue in one interruption under Drop Oldest, Random and AFR: what each of them still holds when the link returns.
+"""Messages that Drop Oldest, Random and AFR still hold when the link returns after one interruption.
 
-A picture of the problem, as the AFR paper's first figures have it: Drop Oldest forgets the whole beginning, Random
-leaves gaps of chance, AFR thins evenly. The message sent before the interruption (0) and the one after it (T + 1) are
-received in any case.
+The picture shows the problem, as the AFR paper's first figures do. Drop Oldest loses the whole beginning, Random leaves
+random gaps, and AFR thins evenly. Message 0, sent before the interruption, and message T + 1, sent after it, are always
+received.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ POLICIES = {"drop-oldest": "Drop Oldest", "random": "Random", "afr": "AFR"}
 
 @dataclass(frozen=True)
 class Reproduction(Figure):
-    """An interruption of T = ``last_T`` messages, L = ``capacity``."""
+    """Figure of one interruption of T = ``last_T`` messages with L = ``capacity``."""
 
     capacity: int = 8
     last_T: int = 26
     seed: int = 0
-    """Of Random's draws."""
+    """Seed of Random's draws."""
 
     RULES = {"capacity": whole(), "last_T": whole(2), "seed": whole(0)}
     SIZE_INCHES = (10.0, 4.2)
 
     def simulate(self) -> Rows:
-        """A row for each policy and message: the arrival with which it was dropped; None if it never was."""
+        """Return a row for each policy and message: the arrival at which the message was dropped, or None."""
         interruption = Interruption(law="fixed", t_max=self.last_T)
         rng = np.random.Generator(np.random.PCG64(self.seed))
         episode = interruption.episode(self.last_T).with_uniforms(rng)
@@ -47,7 +47,7 @@ class Reproduction(Figure):
         return rows
 
     def received(self, rows: Rows, policy: str) -> list[int]:
-        """Numbers of the messages received, message 0 and T + 1 included."""
+        """List the numbers of the messages received, including 0 and T + 1."""
         return [row["message"] for row in rows.where(policy=policy, dropped_at=None)]
 
     def tables(self, rows: Rows) -> list[str]:

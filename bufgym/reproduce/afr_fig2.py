@@ -1,13 +1,13 @@
-"""What a camera sees of a scene as it moves in the three ways that the AFR paper derives V from.
+"""Camera views under the three motions from which the AFR paper derives V.
 
-| motion | the view | V(d), the part of a view that is new d messages later |
+| motion | the view | V(d), the fraction of a view that is new d messages later |
 |---|---|---|
 | moving back from a wall | a square of the wall that grows by the same factor with each message | 1 - b^d |
 | turning in place | an angle that turns by the same angle with each message | min(1, d / D) |
 | along a corridor | a stretch of the side wall that moves on by the same length with each message | min(1, d / D) |
 
-The overlap of two views is computed from their edges, not from the formula; the two are compared, and V is checked
-against Eq. 3-6 (it starts at 0, does not fall, stays at most 1, is concave).
+The overlap of two views is computed from their edges and compared with the formula. V is also checked against Eq. 3-6:
+it starts at 0, does not fall, stays at most 1 and is concave.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ MESSAGES = 20
 
 @dataclass(frozen=True)
 class Motion:
-    """One way of moving."""
+    """One motion of the camera."""
 
     label: str
-    """What the picture calls it."""
+    """Label in the picture."""
     view: Callable[[float], tuple[float, float]]
-    """(left edge, right edge) of the view of a message, by its number."""
+    """Left and right edge of a message's view, given the message's number."""
     dimensions: int
-    """Edges in one direction alone (1), or the same in both (2)."""
+    """1 if the view has edges in one direction, 2 if it has the same edges in both."""
     formula: Value
-    """V as the paper has it."""
+    """V as the paper gives it."""
 
     def new(self, d: float) -> float:
-        """Part of a view that the one ``d`` messages before did not have."""
+        """Fraction of a view that was not in the view ``d`` messages earlier."""
         (left, right), (from_, until) = self.view(d), self.view(0)
         overlap = max(0.0, min(right, until) - max(left, from_)) / (right - left)
         return 1 - float(overlap**self.dimensions)
@@ -58,22 +58,22 @@ class Motion:
 
 @dataclass(frozen=True)
 class GeometryFigure(Figure):
-    """The three motions."""
+    """A figure of the three motions."""
 
     base: float = 0.618
-    """Part of a wall's view that the view of one message before already had (Fig. 5 of the paper)."""
+    """Fraction of a wall's view that was in the previous message's view (Fig. 5 of the paper)."""
     turn_degrees: float = 7.5
-    """Turned between two messages."""
+    """Angle turned between two messages."""
     step_m: float = 0.15
-    """Driven along the corridor between two messages."""
+    """Distance driven along the corridor between two messages."""
     wall_m: float = 1.5
-    """To the corridor's side wall, and to the wall at the start."""
+    """Distance to the corridor's side wall, and to the other wall at the start."""
 
     RULES = {"base": above_0, "turn_degrees": above_0, "step_m": above_0, "wall_m": above_0}
     SIZE_INCHES = (10.0, 3.9)
 
     def motions(self) -> dict[str, Motion]:
-        """Column -> motion."""
+        """Map a column name to its motion."""
         half, width = math.tan(VIEW_ANGLE / 2), 2 * self.wall_m * math.tan(VIEW_ANGLE / 2)
         turn = math.radians(self.turn_degrees)
 
@@ -98,7 +98,7 @@ class GeometryFigure(Figure):
         }
 
     def simulate(self) -> Rows:
-        """A row for each motion and distance d: V from the views, and by the formula."""
+        """Return a row for each motion and distance d with V from the views and V from the formula."""
         return Rows(
             {"motion": name, "d": d, "V": float(v), "formula": motion.formula(d)}
             for name, motion in self.motions().items()
@@ -115,10 +115,10 @@ class GeometryFigure(Figure):
 
 @dataclass(frozen=True)
 class Reproduction(GeometryFigure):
-    """What the camera sees with the first messages of each motion, from above."""
+    """Picture of the camera's first views in each motion, seen from above."""
 
     shown: int = 4
-    """Messages drawn."""
+    """Number of messages drawn."""
 
     RULES = {"shown": whole()}
 

@@ -1,4 +1,4 @@
-"""V of the three motions of `afr_fig2`, from the overlap of views, beside the formulas that the AFR paper gives."""
+"""V of the three motions of `afr_fig2`, computed from the overlap of views, beside the AFR paper's formulas."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bufgym.reproduce.rows import Rows
 
 @dataclass(frozen=True)
 class Reproduction(GeometryFigure):
-    """V(d) of the three motions."""
+    """Plot of V(d) for the three motions."""
 
     SIZE_INCHES = (7.0, 4.2)
 

@@ -1,8 +1,8 @@
 """Fig. 4 of the AFR paper [wang2022afr]: which messages AFR keeps as an interruption grows, step by step.
 
-Message 0 is in transmission when the link stops; message T is the T-th to arrive since. With L = 8 messages 9 to 16
-push out 1, 3, ..., 15: one pass of the dropping position p over the queue. Then the dropping rate r doubles: every
-second arrival is rejected by the counter c, and the next pass begins.
+Message 0 is in transmission when the link stops; message T is the T-th to arrive after that. With L = 8, the messages 9
+to 16 evict 1, 3, ..., 15, which is one pass of the dropping position p over the queue. Then the dropping rate r
+doubles. The counter c now rejects every second arrival, and the next pass begins.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ PAPER_L = 8
 PAPER_T = (8, 18)
 """First and last T of the figure."""
 PAPER_DROPS = {9: 1, 10: 3, 11: 5, 12: 7, 13: 9, 14: 11, 15: 13, 16: 15, 17: 17, 18: 2}
-"""T -> the message that the figure strikes out (17 is the newcomer itself)."""
+"""T -> the message that the figure strikes out; 17 is the newcomer itself."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """What AFR did with one arrival, and its state afterwards."""
+    """AFR's decision on one arrival and its state afterwards."""
 
     T: int
-    """Number of the arrival, and of the messages that came since the link stopped."""
+    """Number of the arrival, counted from the link's stop."""
     dropped: int | None
-    """Number of the dropped message; T itself if the newcomer was rejected, None if all fitted."""
+    """Number of the dropped message: T if the newcomer was rejected, None if nothing was dropped."""
     r: int
     """Dropping rate."""
     c: int
@@ -47,7 +47,7 @@ class Step:
 
 
 def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr") -> list[Step]:
-    """AFR's decisions 1..``last_T`` with L = ``capacity``, taken from a run of the simulator."""
+    """Run the simulator and return AFR's decisions 1..``last_T`` with L = ``capacity``."""
     afr = policies.get(policy)
     watched: list[Step] = []
 
@@ -64,7 +64,7 @@ def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr"
         watched.append(Step(T, dropped, int(memory[R]), int(memory[C]), int(memory[P]), tuple(kept)))
         return decision
 
-    # Uncompiled, so that the watcher sees each decision; the transition is the same.
+    # Runs uncompiled so that the watcher sees each decision; the transition function is the same.
     watcher = replace(afr, name=f"{afr.name}-watched", on_arrival=watch, compile=False)
     episode = Interruption(law="fixed", t_max=last_T).episode(last_T)
     sim.run(watcher, [episode], capacity, Interruption().value)
@@ -73,7 +73,7 @@ def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr"
 
 @dataclass(frozen=True)
 class Reproduction(Figure):
-    """Fig. 4 for L = ``capacity`` and T from L to ``last_T`` (the paper: 8, and 8 to 18)."""
+    """Fig. 4 for L = ``capacity`` and T from L to ``last_T``; the paper has L = 8 and T from 8 to 18."""
 
     capacity: int = PAPER_L
     last_T: int = PAPER_T[1]
@@ -91,7 +91,7 @@ class Reproduction(Figure):
 
     @property
     def paper_drops(self) -> dict[int, int]:
-        """T -> the message that the paper's figure strikes out, where it has this L."""
+        """Map T to the message that the paper's figure strikes out; empty for another L than the paper's."""
         return PAPER_DROPS if self.capacity == PAPER_L else {}
 
     def tables(self, rows: Rows) -> list[str]:

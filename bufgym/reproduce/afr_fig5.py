@@ -1,10 +1,10 @@
-"""Fig. 5 of the AFR paper [wang2022afr]: information gained during an interruption, against its length T.
+"""Fig. 5 of the AFR paper [wang2022afr]: information gained in an interruption against its length T.
 
-L = 8, V(d) = 1 - 0.618^d (a camera moving back from a wall). The information gained is H - 1: as in the paper,
-message 0, sent before, is left out. Random's band is one standard deviation to either side over its runs.
+L = 8 and V(d) = 1 - 0.618^d, a camera moving back from a wall. The information gained is H - 1, because the paper
+leaves out message 0, which was sent before. Random's band is one standard deviation over its runs.
 
-AFR equals oracle-ideal where its L + 1 gaps are equal: T + 1 = (L + 1) 2^k, which is T = 17, 35, 71 for L = 8. The
-paper prints 18, 36, 72 for T; at those AFR is strictly below.
+AFR equals oracle-ideal where its L + 1 gaps are equal, that is T + 1 = (L + 1) 2^k. For L = 8 these are T = 17, 35 and
+71. The paper prints 18, 36 and 72, where AFR is strictly below oracle-ideal.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ PAPER_L = 8
 PAPER_RUNS = 10_000
 """Runs of Random for each T."""
 PAPER_PEAKS = (18, 36, 72)
-"""Where the paper says that AFR equals the oracle, as printed there (for T; it holds for T + 1)."""
+"""T at which the paper says that AFR equals the oracle. The equality holds for these values of T + 1."""
 
 MEAN_OVER = (9, 399)
-"""First and last T of the printed mean of (H - 1) / oracle: every T from L + 1 on that a table of 400 reaches."""
+"""First and last T of the printed mean of (H - 1) / oracle: from L + 1 to the end of a table of 400."""
 EQUAL = 1e-12
-"""Relative difference up to which two sums of V count as equal: rounding only."""
+"""Relative difference up to which two sums of V count as equal; it covers rounding only."""
 BATCH = 1000
-"""Senders run at a time: a batch that fits in the processor's cache."""
+"""Senders per batch; a batch fits in the processor's cache."""
 
 CURVES = {
     "oracle-ideal": ("oracle-ideal", ":"),
@@ -48,7 +48,7 @@ CURVES = {
 
 
 def gained(policy: str, episodes: Sequence[Episode], capacity: int, v: Value) -> NDArray[np.float64]:
-    """H - 1 of each episode under ``policy``, float64[episodes]."""
+    """Return H - 1 of each episode under ``policy``, float64[episodes]."""
     senders = sim.run(policies.get(policy), episodes, capacity, v)
     return np.array(senders.batch.senders["delivered_gain"])
 
@@ -56,7 +56,7 @@ def gained(policy: str, episodes: Sequence[Episode], capacity: int, v: Value) ->
 def gained_at_random(
     interruption: Interruption, T: int, capacity: int, runs: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """H - 1 of ``runs`` independent runs of Random over an interruption of T messages, float64[runs]."""
+    """Return H - 1 of ``runs`` independent runs of Random over an interruption of T messages, float64[runs]."""
     parts = []
     episode = interruption.episode(T)
     for start in range(0, runs, BATCH):
@@ -66,7 +66,7 @@ def gained_at_random(
 
 
 def mean_score(policy: str, capacity: int, first: int, last: int) -> float:
-    """Mean of (H - 1) / oracle over T = ``first``..``last``, V(d) = 1 - 0.618^d."""
+    """Return the mean of (H - 1) / oracle over T = ``first``..``last`` for V(d) = 1 - 0.618^d."""
     v = qoi.exponential(0.618)
     interruption = Interruption(law="fixed", t_max=last, value=v)
     lengths = range(first, last + 1)
@@ -156,5 +156,5 @@ class Reproduction(Figure):
 
 
 def equal_lengths(rows: Rows) -> list[int]:
-    """The T above L at which AFR equals oracle-ideal."""
+    """Find the T above L at which AFR equals oracle-ideal."""
     return [r["T"] for r in rows if r["T"] > PAPER_L and r["oracle-ideal"] - r["afr"] <= EQUAL * r["oracle-ideal"]]

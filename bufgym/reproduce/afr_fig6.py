@@ -1,7 +1,7 @@
-"""Fig. 6 of the AFR paper: the bandwidth of the Belgium 4G log car_0002 against what the camera demands.
+"""Fig. 6 of the AFR paper: bandwidth of the Belgium 4G log car_0002 against the camera's demand.
 
-Samples are numbered from 0, as the paper counts seconds. The paper's "about 15 MB/s" is what 4G reaches in general, not
-a ceiling of this trace, and is no claim about it.
+Samples are numbered from 0, as the paper counts seconds. The paper's "about 15 MB/s" describes 4G in general. It is no
+claim about this trace.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from bufgym.scenario.checks import above_0
 from bufgym.scenario.suites import RATE_HZ
 
 PAPER_LOW = [21, 23]
-"""The seconds under 500 KB/s that the paper names, counted from 0."""
+"""Seconds under 500 KB/s according to the paper, counted from 0."""
 LOW = 500e3
 """Bytes/s."""
 
 
 @dataclass(frozen=True)
 class Reproduction(LinkFigure):
-    """Fig. 6; the picture shows the first ``show_s`` seconds and the whole."""
+    """Fig. 6; the picture shows the first ``show_s`` seconds and the whole trace."""
 
     show_s: float = 60.0
 

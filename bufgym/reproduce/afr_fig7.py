@@ -1,8 +1,8 @@
-"""Fig. 7 of the AFR paper: the error of the map that is made of the frames received, against the queue size.
+"""Fig. 7 of the AFR paper: error of the map made of the frames received, against the queue size.
 
-The frames are fused with their true poses (``bufgym.perception.mapping``) and the map is compared with that of all
-frames. A second map has the poses that tracking finds along the frames received, up to where it breaks: the paper's
-maps are made by SLAM, which knows no true poses. If that explains the difference, the second shows it.
+``bufgym.perception.mapping`` fuses the frames with their true poses, as the paper does, and compares the map with the
+map of all frames. A second map uses the poses that tracking finds along the frames received, up to where tracking
+breaks. It shows whether tracked poses would explain a difference from the paper.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from bufgym.reproduce.rows import Rows
 RESAMPLES = 2000
 CONFIDENCE = 0.95
 PAPER = {"drop-oldest": -0.20, "random": -0.10, "orbbuf-images": -0.10}
-"""What AFR's error is less than that of others, about."""
+"""Policy -> AFR's error relative to the policy's error, less 1, as the paper roughly gives it."""
 SHOWN = ("drop-oldest", "random", "afr", "learned-motion")
 """Policies whose maps are drawn, at the smallest L and the paper's alignment."""
 SLICE = 30_000
-"""Points of a map that are drawn."""
+"""Number of points drawn of a map."""
 
 
 def change(rows: Rows, column: str, policy: str, other: str) -> Interval:
-    """Mean of the column under ``policy`` over that under ``other``, less 1; the interval is over offsets.
+    """Divide the column's mean under ``policy`` by its mean under ``other`` and subtract 1.
 
-    The bootstrap is paired: an offset is drawn with all its runs, of both policies.
+    The interval comes from a paired bootstrap over offsets: a drawn offset brings all its runs of both policies.
     """
     ours, theirs = (
         np.array([rows.mean(column, k=k, policy=name) for k in rows.distinct("k")]) for name in (policy, other)
@@ -43,13 +43,13 @@ def change(rows: Rows, column: str, policy: str, other: str) -> Interval:
 
 
 def spelled(interval: Interval) -> str:
-    """-7 % [-9, -4]."""
+    """Format an interval as in -7 % [-9, -4]."""
     return f"{interval.value:+.1%} [{interval.low:+.1%}, {interval.high:+.1%}]"
 
 
 @dataclass(frozen=True)
 class Reproduction(FrameFigure):
-    """Error of the map under each policy at each L, on each recording."""
+    """Map error of each policy at each L on each recording."""
 
     def simulate(self) -> Rows:
         return self.play("map", "track")
@@ -87,8 +87,7 @@ class Reproduction(FrameFigure):
         return facts
 
     def where_it_moves(self, rows: Rows) -> str:
-        """Spearman's correlation, over the offsets, of how far the camera moves in Drop Oldest's longest gap and AFR's
-        change of the error."""
+        """Correlate camera motion in Drop Oldest's longest gap with AFR's change of the error, over the offsets."""
         moved, won = [], []
         x = self.stage(rows[0]["recording"]).whole.motion().at(self.stage(rows[0]["recording"]).whole.time_us)
         for k in rows.distinct("k"):
@@ -124,13 +123,12 @@ class Reproduction(FrameFigure):
             self._maps(part, recording)
 
     def _errors(self, rows: Rows) -> NDArray[np.float64]:
-        """mm[policies, L and their mean]."""
+        """Errors in mm, [policies, L and their mean]."""
         by_L = [[rows.mean("rmse_mm", policy=policy, L=L) for L in self.capacities] for policy in self.policies]
         return np.column_stack([by_L, np.mean(by_L, axis=1)])
 
     def _maps(self, part: Any, recording: str) -> None:
-        """The maps of some policies from above, each point by its distance to the map of all frames: with true poses,
-        and with those that tracking finds, up to where it breaks."""
+        """Draw the full map from above per policy and kind of pose, coloured by the distance to the policy's map."""
         on, L = self.stage(recording), min(self.capacities)
         limit_mm = 20.0
         panels = part.subplots(2, len(self.shown), squeeze=False, sharex=True, sharey=True)
@@ -141,7 +139,7 @@ class Reproduction(FrameFigure):
             for axes, policy in zip(line, self.shown, strict=True):
                 kept = self.kept(Setting(recording, 0, L, policy))
                 made = on.map_of(kept) if poses == "true poses" else on.track_of(kept).model
-                # From the reference's points to the map: what the map lacks is far from it, and shows.
+                # Distances run from the reference's points to the map, so that missing parts stand out.
                 far_mm = np.minimum(1e3 * mapping.distances(every[few], made.points()), limit_mm)
                 painted = axes.scatter(*(every[few] @ plan).T, s=0.4, c=far_mm, cmap="inferno_r", vmin=0, vmax=limit_mm)
                 axes.set_aspect("equal")
@@ -152,12 +150,12 @@ class Reproduction(FrameFigure):
 
 
 def _some(points: int) -> NDArray[np.int64]:
-    """Which points are drawn, the same for every map."""
+    """Choose the points to draw, the same for every map."""
     return np.random.Generator(np.random.PCG64(0)).permutation(points)[:SLICE]
 
 
 def _plan(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """float64[3, 2]: the two directions in which they spread most, those of the plan."""
+    """Find the two directions in which the points spread most, float64[3, 2]; they span the plan."""
     some = points[_some(len(points))[:2000]]
     _, _, axes = np.linalg.svd(some - some.mean(axis=0), full_matrices=False)
     return np.asarray(axes[:2].T, np.float64)

@@ -1,7 +1,7 @@
-"""Fig. 7 of the AFR paper, in information instead of map error: what each policy loses, against the queue size.
+"""Fig. 7 of the AFR paper in information instead of map error: each policy's loss against the queue size.
 
-The paper's ordinate is the RMSE of the map that SLAM builds of the frames received. Ours is regret, 1 - H / H of the
-clairvoyant: the part of the Quantity of Information that a better policy could have had over the same link.
+The paper plots the RMSE of the map built from the frames received. We plot regret, 1 - H / H of the clairvoyant. It is
+the fraction of the Quantity of Information that the best policy would have gained over the same link.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bufgym.reproduce.rows import Rows, listed
 
 @dataclass(frozen=True)
 class Reproduction(StreamFigure):
-    """QoI lost by each policy at each L, over each link and camera, and with time-based QoI."""
+    """QoI lost by each policy at each L over each link and camera, also with time-based QoI."""
 
     def simulate(self) -> Rows:
         return self.play(self.settings(timed=True), self.runs, bound=True)
@@ -62,7 +62,7 @@ class Reproduction(StreamFigure):
         legend_below(figure, 5, figure.axes[0])
 
     def _boxes(self, axes: Any, rows: Rows) -> None:
-        """One group of boxes a queue size: median, quartiles, extremes; a mark at the mean."""
+        """Draw one group of boxes per queue size with median, quartiles and extremes, and mark the mean."""
         width, ticks = 0.8 / len(STYLES), np.arange(len(self.capacities))
         for k, (policy, (label, colour, marker)) in enumerate(STYLES.items()):
             line = {"color": colour}
@@ -85,5 +85,5 @@ class Reproduction(StreamFigure):
 
 
 def _change(regret: float, other: float) -> float:
-    """Relative to the other's; 0 where that is 0."""
+    """Return the change relative to ``other``, or 0 where ``other`` is 0."""
     return regret / other - 1 if other > 0 else 0.0

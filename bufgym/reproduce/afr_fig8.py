@@ -1,7 +1,7 @@
-"""Fig. 8 of the AFR paper: runs in which tracking breaks, along the frames received.
+"""Fig. 8 of the AFR paper: runs in which tracking breaks on the frames received.
 
-Tracking is frame-to-model (``bufgym.perception.tracking``, which also states when it counts as broken). The paper
-repeats one alignment ten times; here a run has the fade at each of ten places, fixed beforehand.
+``bufgym.perception.tracking`` aligns each frame to the model and states when tracking counts as broken. The paper
+repeats one alignment ten times; we place the fade at ten places that were fixed beforehand.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from bufgym.reproduce.frame_runs import POLICIES, FrameFigure
 from bufgym.reproduce.rows import Rows, table
 
 THIRD = 1 / 3
-"""Of Drop Oldest's failures AFR may have at most so many, by our own yardstick."""
+"""Largest ratio of AFR's failures to Drop Oldest's that passes our own check."""
 COLUMNS = 4
-"""Of the small pictures of the camera's way."""
+"""Columns of small pictures of the camera's path."""
 
 
 @dataclass(frozen=True)
 class Reproduction(FrameFigure):
-    """Failures under each policy at each L, on each recording."""
+    """Tracking failures under each policy at each L on each recording."""
 
     def simulate(self) -> Rows:
         return self.play("track")
@@ -59,7 +59,7 @@ class Reproduction(FrameFigure):
         )
 
         def each(spec: str, policies: tuple[str, ...], of: int = 1) -> str:
-            """Of every recording, what breaks under these policies."""
+            """Format the failures of these policies for every recording."""
             return "; ".join(
                 f"{name} {' against '.join(format(counts[policy] / of, spec) for policy in policies)}"
                 for name, counts in broken.items()
@@ -75,7 +75,7 @@ class Reproduction(FrameFigure):
             large = Rows(row for row in rows if row["L"] > 10)
             facts["large_count"] = failures(large, policy="afr")
             facts |= dict.fromkeys(("afr", "third", "large"))
-            if everywhere(lambda counts: counts["drop-oldest"] > 0):  # else there is nothing that AFR could improve
+            if everywhere(lambda counts: counts["drop-oldest"] > 0):  # else AFR has nothing to improve
                 facts["afr"] = everywhere(lambda counts: counts["afr"] / runs < 0.1)
                 facts["third"] = everywhere(lambda counts: counts["afr"] <= THIRD * counts["drop-oldest"])
                 facts["large"] = failures(large, policy="afr") == 0 if large else None
@@ -95,7 +95,7 @@ class Reproduction(FrameFigure):
             self._broken(right, recording, shown)
 
     def _counts(self, axes: Any, recording: str, shown: Rows) -> None:
-        """A field for each policy and L: how many runs break."""
+        """Draw a table of how many runs break for each policy and L."""
         counts = np.array([[failures(shown, policy=policy, L=L) for L in self.capacities] for policy in self.policies])
         labels = [POLICIES[policy][0] for policy in self.policies]
         heat_table(axes, counts, "d", labels, list(map(str, self.capacities)), vmin=0, vmax=1.25 * self.offsets)
@@ -107,7 +107,7 @@ class Reproduction(FrameFigure):
         axes.set_xlabel("queue size L")
 
     def _broken(self, part: Any, recording: str, shown: Rows) -> None:
-        """The camera's way from above, for each policy, and where tracking broke along it."""
+        """Draw the camera's path from above for each policy, and where tracking broke along it."""
         places = self.stage(recording).whole.poses[:, :3, 3]
         across, along = np.argsort(np.ptp(places, axis=0))[:0:-1]
         lines = math.ceil(len(self.policies) / COLUMNS)
@@ -127,5 +127,5 @@ class Reproduction(FrameFigure):
 
 
 def failures(rows: Rows, **where: object) -> int:
-    """Runs in which tracking broke."""
+    """Count the runs in which tracking broke."""
     return sum(bool(row["failed"]) for row in rows.where(**where))

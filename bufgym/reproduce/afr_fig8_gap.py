@@ -1,11 +1,11 @@
-"""Fig. 8 of the AFR paper, by a stand-in for tracking: how often a run has a motion gap too long to track across.
+"""Fig. 8 of the AFR paper with a stand-in for tracking: how often a run has a motion gap too long to track across.
 
-The paper runs visual tracking on the frames received and counts the runs that lose it. Here a run fails if, between two
-messages received one after the other, the camera moved on by more than ``threshold`` fields of view. At 0.5 half of the
-last view is gone: matching has half of its points left, at the image's far side. At 0.25 ORB-SLAM2 would already want a
-new keyframe of an RGB-D camera (NeedNewKeyFrame: under 75 % of the reference keyframe's points tracked). Where tracking
-really breaks depends on scene, blur and matcher, hence three thresholds, and one that knows none of it: the threshold
-at which Drop Oldest fails in half of the runs, as it does in the paper.
+The paper runs visual tracking on the frames received and counts the runs that lose it. Here a run fails if the camera
+moved by more than ``threshold`` fields of view between two consecutive messages received. At 0.5 half of the last view
+is gone, so matching has half of its points left, at the image's far side. At 0.25 ORB-SLAM2 would already want a new
+keyframe of an RGB-D camera: NeedNewKeyFrame asks for one under 75 % of the reference keyframe's points tracked. Where
+tracking really breaks depends on scene, blur and matcher, so we use three thresholds. A fourth is fitted: there Drop
+Oldest fails in half of the runs, as in the paper.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from bufgym.scenario.checks import above_0
 from bufgym.scenario.suites import RATE_HZ
 
 MORE_RUNS = 100
-"""Ten runs tell 0 from 50 %, not 0 from 10 %; simulated ones are cheap."""
+"""Ten runs can tell 0 from 50 %, but not 0 from 10 %. Simulated runs are cheap."""
 IDLE = 10.0
-"""Percent of the runs: where Drop Oldest and Random fail less often, AFR cannot be told from them."""
+"""Failures in % of the runs below which Drop Oldest and Random cannot be told from AFR."""
 
 
 @dataclass(frozen=True)
 class Reproduction(StreamFigure):
-    """Failure rates of each policy at each L, over each camera; the picture shows the first."""
+    """Failure rates of each policy at each L for each camera; the picture shows the first camera."""
 
     threshold: float = 0.5
     """Motion gap above which a run fails, fields of view."""
     others: Sequence[float] = (0.25, 0.75)
-    """Further thresholds, to see what depends on it."""
+    """Further thresholds, which show how the result depends on the threshold."""
     more_runs: int = MORE_RUNS
-    """Runs of the second count, of which the first ``runs`` are the first."""
+    """Runs of the second count; its first ``runs`` runs are the first count."""
 
     RULES = {"threshold": above_0, "others": several(above_0)}
 
@@ -55,11 +55,11 @@ class Reproduction(StreamFigure):
         return self.play(self.settings(timed=False), self.more_runs, bound=False)
 
     def first(self, rows: Rows) -> Rows:
-        """The paper's number of runs."""
+        """Select as many runs as the paper has."""
         return Rows(row for row in rows if row["run"] < self.runs)
 
     def tables(self, rows: Rows) -> list[str]:
-        """Failures in % with each camera: of the first runs at each L, of all runs at each threshold and size."""
+        """List failures in % per camera: the first runs by L, and all runs by threshold and frame size."""
         lines: list[str] = []
         for camera in rows.distinct("camera"):
             played = rows.where(camera=camera, size_kb=self.size_kb)
@@ -79,18 +79,18 @@ class Reproduction(StreamFigure):
         return lines[:-1]
 
     def worst(self, rows: Rows, above: int) -> float:
-        """AFR's failures in % at its worst L > ``above``."""
+        """Return AFR's failures in % at its worst L > ``above``."""
         rates = (failures(rows, self.threshold, policy="afr", L=L) for L in self.capacities if above < L)
         return max(rates, default=0.0)
 
     def claims(self, rows: Rows) -> dict[str, Any]:
-        """The paper's three statements, with the first camera; the larger number of runs decides."""
+        """Test the paper's three statements with the first camera; the larger number of runs decides."""
         camera = self.cameras[0].name
         many = rows.where(camera=camera, size_kb=self.size_kb)
         few = self.first(many)
         oldest, random = (failures(many, self.threshold, policy=p) for p in ("drop-oldest", "random"))
         few_oldest, few_random = (failures(few, self.threshold, policy=p) for p in ("drop-oldest", "random"))
-        # Where nobody loses track, AFR earns no credit for keeping it.
+        # Where no policy loses track, AFR earns no credit for keeping it.
         tested = max(oldest, random) >= IDLE
         sizes = {kb: rows.where(camera=camera, size_kb=kb) for kb in rows.distinct("size_kb")}
         compared = [
@@ -153,5 +153,5 @@ def _swept(rates: dict[float, float]) -> str:
 
 
 def failures(rows: Rows, threshold: float, **where: object) -> float:
-    """Percent of these runs whose longest motion gap exceeds the threshold."""
+    """Return the percentage of these runs whose longest motion gap exceeds the threshold."""
     return 100 * float((rows.column("longest_gap_views", **where) > threshold).mean())

@@ -1,10 +1,10 @@
-"""Fig. 9 of the AFR paper: how long one decision takes.
+"""Fig. 9 of the AFR paper: duration of one decision.
 
-Each built-in policy decides for a full queue, in two ways: inside compiled code, as in rollouts and training, and
-called from Python one decision at a time, as a live queue does. The paper's numbers are from its own machine and ROS
-program; ORBBuf's is with ORB features recomputed from images. Ours is there twice: `orbbuf` compares recorded motion,
-`orbbuf-images` the images of a made-up room at 640x480 (with the extra ``perception``). Times are of this machine and
-differ from run to run; what is to be compared is the order of magnitude.
+Each built-in policy decides for a full queue in two ways. Inside compiled code, decisions run as in rollouts and
+training. Called from Python, they run one at a time, as in a live queue. The paper's numbers come from its own machine
+and ROS program, and its ORBBuf recomputes ORB features from images. We show ORBBuf twice: `orbbuf` compares recorded
+motion, and `orbbuf-images` compares images of a made-up room at 640x480 and needs the extra ``perception``. Times
+depend on this machine and differ from run to run, so compare orders of magnitude.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from bufgym.scenario import Interruption
 
 IMAGES = "orbbuf-images"
 PAPER = {"afr": "< 10 us", "drop-oldest": "< 10 us", "random": "< 10 us", IMAGES: "~ 10 ms"}
-"""The paper's figure; ORBBuf's with features recomputed."""
+"""Decision times in the paper's figure; ORBBuf recomputes its features."""
 NEAR_MS = (1.0, 100.0)
-"""A time between these is of the paper's order of magnitude, 10 ms."""
+"""Times within these limits have the paper's order of magnitude, 10 ms."""
 LIMIT_COMPILED_US, LIMIT_PYTHON_US = 1.0, 10.0
-"""Ours for the paper's three fast policies: inside compiled code, and called from Python (median)."""
+"""Our limits for the paper's three fast policies: in compiled code, and for the median call from Python."""
 HOW = "compiled loop" if JIT else "Python loop (compilation is off)"
-"""What ``inside_us`` times."""
+"""Kind of loop that ``inside_us`` times."""
 REPEATS = 5
-"""Compiled loops timed; the fastest counts, as the others shared the machine with something else."""
+"""Compiled loops timed. The fastest counts, because the others shared the machine with other work."""
 
 
 def decide_often(
@@ -48,10 +48,10 @@ def decide_often(
     on_arrival: Any,
     rounds: int,
 ) -> int:
-    """Decide ``rounds`` times on each of ``arrivals``; the sum of the decisions, so that none can be left out."""
+    """Decide ``rounds`` times on each of ``arrivals``; return the decisions' sum so that none is optimized away."""
     total = 0
     for _ in range(rounds):
-        # Each round is an interruption of its own: else r of AFR would double without end.
+        # Each round is a new interruption; otherwise AFR's r would double without end.
         for j in range(len(start)):
             memory[j] = start[j]
         for k in range(len(arrivals)):
@@ -61,7 +61,7 @@ def decide_often(
 
 @functools.cache
 def compiled_loop() -> Any:
-    """``decide_often`` compiled once for every policy, as the rollout is."""
+    """Compile ``decide_often`` once for all policies, as the rollout is."""
     arrival, *_ = signatures()
     view, message, reals = arrival.args
     messages = numba.types.Array(message, 1, "C")
@@ -70,7 +70,7 @@ def compiled_loop() -> Any:
 
 
 def full_queue(capacity: int, arrivals: int) -> tuple[Buffer, NDArray[Any]]:
-    """A full queue in an interruption, as a policy sees it, and MESSAGE[``arrivals``], the next to come."""
+    """Make a full queue in an interruption, as a policy sees it, and the next messages, MESSAGE[``arrivals``]."""
     interruption = Interruption(law="fixed", t_max=capacity + arrivals)
     episode = interruption.episode(capacity + arrivals).with_uniforms(np.random.Generator(np.random.PCG64(0)))
     captured: list[Buffer] = []
@@ -80,7 +80,7 @@ def full_queue(capacity: int, arrivals: int) -> tuple[Buffer, NDArray[Any]]:
             return ACCEPT
         if not captured:
             slots = records(capacity, MESSAGE)
-            slots[:] = buffer.slots  # a copy: the sender goes on
+            slots[:] = buffer.slots  # a copy, because the sender goes on
             scalars = {f: v.item() for f, v in buffer._asdict().items() if isinstance(v, np.generic)}
             captured.append(buffer._replace(slots=slots, topics=buffer.topics.copy(), **scalars))
         return 0
@@ -90,7 +90,7 @@ def full_queue(capacity: int, arrivals: int) -> tuple[Buffer, NDArray[Any]]:
 
 
 def inside_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], decisions: int) -> float:
-    """Time of one decision in a compiled loop (in a Python loop where compilation is off), us."""
+    """Time one decision in a compiled loop, in us; the loop is Python where compilation is off."""
     loop, on_arrival = compiled_loop(), policy.compiled[0]
     buffer = buffer._replace(parameters=policy.parameter_array)
     rounds = max(1, decisions // len(arrivals))
@@ -105,7 +105,7 @@ def inside_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], decisions:
 
 
 def called_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], calls: int) -> tuple[float, float]:
-    """Median and 99th percentile of one call from Python, the clock's own time included, us."""
+    """Time one call from Python: median and 99th percentile in us, including the clock's own time."""
     on_arrival, (start, memory) = policy.compiled[0], policy.new_memory(2, buffer.capacity)
     buffer = buffer._replace(parameters=policy.parameter_array)
     one_by_one = [arrivals[k] for k in range(len(arrivals))]
@@ -121,7 +121,7 @@ def called_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], calls: int
 
 
 def with_images_us(decisions: int) -> tuple[float, float] | None:
-    """Median and 99th percentile of ORBBuf's decision by images, us; None without the libraries."""
+    """Time ORBBuf's decision by images: median and 99th percentile in us, or None without the libraries."""
     try:
         from bufgym.perception import orb, room
 
@@ -133,7 +133,7 @@ def with_images_us(decisions: int) -> tuple[float, float] | None:
 
 @dataclass(frozen=True)
 class Reproduction(Figure):
-    """Fig. 9 with L = ``capacity``: ``decisions`` in the compiled loop and ``calls`` from Python for each policy."""
+    """Fig. 9 with L = ``capacity``, ``decisions`` in the compiled loop and ``calls`` from Python per policy."""
 
     capacity: int = 8
     decisions: int = 1_000_000
@@ -147,7 +147,7 @@ class Reproduction(Figure):
         buffer, arrivals = full_queue(self.capacity, 400)
         rows = Rows()
         for policy in map(policies.get, policies.names(for_topics=False)):
-            # Built-in ones alone: a user's policy names no source.
+            # Only built-in policies, because a user's policy names no source.
             if policy.compile and policy.source and policy.privileged is None:
                 inside = inside_us(policy, buffer, arrivals, self.decisions)
                 median, p99 = called_us(policy, buffer, arrivals, self.calls)
@@ -186,7 +186,7 @@ class Reproduction(Figure):
         return 7.0, 0.34 * len(rows) + 2.2
 
     def draw(self, rows: Rows, figure: Any) -> None:
-        """The paper's four above, ours below."""
+        """Draw the paper's four policies above and ours below."""
         papers = Rows(row for row in rows if row["policy"] in PAPER)
         others = Rows(row for row in rows if row["policy"] not in PAPER)
         panels = figure.subplots(2, 1, sharex=True, height_ratios=[len(papers), max(1, len(others))])

@@ -1,8 +1,8 @@
-"""The size of a frame in the AFR paper's evaluation, from two numbers that the paper gives.
+"""Size of a frame in the AFR paper's evaluation, inferred from two numbers that the paper gives.
 
-The size itself is not stated. The paper counts about 400 recalculations of ORB features in 794 frames: ORBBuf
-recalculates with each eviction. And AFR keeps 8 frames a second at L = 5 while the link is under 500 KB/s, in the 21st
-and 23rd second. Both are counted here for a sweep of sizes, over the link as recorded.
+The paper does not state the size. It counts about 400 recalculations of ORB features in 794 frames, one with each
+eviction by ORBBuf. It also says that AFR keeps 8 frames a second at L = 5 in the 21st and 23rd second, while the link
+is under 500 KB/s. We count both for a sweep of sizes over the recorded link.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from bufgym.reproduce.rows import Row, Rows, listed, table
 SECONDS = (21, 23)
 PAPER_RECALCULATIONS, PAPER_HZ = 400, 8.0
 NEAR = 0.05
-"""Recalculations within so much of the paper's, at every L, count as about as many."""
+"""Recalculations within this fraction of the paper's, at every L, count as "about" the paper's."""
 WITHIN_HZ = 1.0
-"""A rate within so much of the paper's 8 Hz counts as the same."""
+"""A rate this near to the paper's 8 Hz counts as the same."""
 
 
 @dataclass(frozen=True)
 class Reproduction(StreamFigure):
-    """Recalculations and frame rates for each size; of the cameras none is needed."""
+    """Recalculations and frame rates for each size; no camera is needed."""
 
     motion: Sequence[str] = ()
     runs: int = PAPER_RUNS
@@ -38,7 +38,7 @@ class Reproduction(StreamFigure):
     SIZE_INCHES = (9.0, 3.8)
 
     def simulate(self) -> Rows:
-        """A row for each size, policy, L and run."""
+        """Return a row for each size, policy, L and run."""
         rows = Rows()
         for setting in self.settings(timed=True):
             uplink = setting.uplink
@@ -58,12 +58,12 @@ class Reproduction(StreamFigure):
         return rows
 
     def recalculations(self, rows: Rows, size_kb: float) -> tuple[float, float]:
-        """(fewest, most) over L, mean over runs."""
+        """Return the fewest and the most recalculations over L; each is a mean over runs."""
         counts = [rows.mean("dropped", size_kb=size_kb, policy="orbbuf", L=L) for L in self.capacities]
         return min(counts), max(counts)
 
     def rates_hz(self, rows: Rows, size_kb: float) -> list[float]:
-        """Frames kept of each of the two seconds at the smallest L, by `afr` and `afr-paper`; mean over runs."""
+        """Frames kept in each of the two seconds at the smallest L by `afr` and `afr-paper`, mean over runs."""
         shown = rows.where(size_kb=size_kb, L=min(self.capacities))
         return [shown.mean(f"kept_in_second_{s}", policy=p) for p in ("afr", "afr-paper") for s in SECONDS]
 

@@ -1,13 +1,13 @@
-"""Eq. 3-6 of the AFR paper against views of real frames: is V as it is assumed to be, and does it matter?
+"""Eq. 3-6 of the AFR paper tested on views of real frames: do the assumptions on V hold, and does it matter?
 
-The paper's V is a function of the distance d between two frames: 0 at 0 (Eq. 3), at most 1 (Eq. 4), non-decreasing (Eq.
-5), concave (Eq. 6), the last of which it calls "a little strong". Here V(i, j) is measured for every pair of frames of
-a recording (``bufgym.perception.views``): the part of frame j that frame i has not seen. Eq. 3 and 4 then hold by
-definition; the other two are asked at each frame i, with distances d and 2 d: V(i, i + 2d) >= V(i, i + d), and
-V(i, i + 2d) <= 2 V(i, i + d). The distance is a number of frames, or motion of the camera.
+The paper's V is a function of the distance d between two frames. It is 0 at 0 (Eq. 3), at most 1 (Eq. 4),
+non-decreasing (Eq. 5) and concave (Eq. 6). The paper calls Eq. 6 "a little strong". Here ``bufgym.perception.views``
+measures V(i, j), the fraction of frame j that frame i has not seen, for every pair of frames of a recording. Eq. 3 and
+4 then hold by definition. Eq. 5 is tested at each frame i as V(i, i + 2d) >= V(i, i + d), and Eq. 6 as V(i, i + 2d) <=
+2 V(i, i + d). The distance is a number of frames or the camera's motion.
 
-Whether it matters is asked as the paper's theorems ask: one interruption of T frames begins at frame i, a queue of L
-messages; H of what AFR keeps, of what Drop Oldest keeps, and of the best L frames in hindsight, all by the measured V.
+To see whether it matters, we follow the paper's theorems: an interruption of T frames begins at frame i, with a queue
+of L messages. By the measured V we compare H of AFR, of Drop Oldest and of the best L frames in hindsight.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from bufgym.reproduce.rows import Row, Rows, table
 from bufgym.scenario.checks import above_0
 
 NOISE = 0.05
-"""What V may fall or rise too much and still count as keeping a rule: edges and noise of the depth."""
+"""Violation of a rule that still counts as keeping it, because depth has noise and edges."""
 EVERY = 10
-"""Interruptions begin at every so many frames."""
+"""Distance between the starts of interruptions, frames."""
 
 
 @dataclass(frozen=True)
 class Reproduction(FrameFigure):
-    """How often Eq. 5 and 6 are broken at each distance, and what the policies gain by the measured V."""
+    """Rate of violations of Eq. 5 and 6 at each distance, and the policies' gain by the measured V."""
 
     capacity: int = 8
     distances: Sequence[int] = (1, 2, 4, 8, 12, 18, 27, 40, 60, 90)
-    """d, and T of the interruptions where it is above L; messages."""
+    """Distances d in messages; those above L are also the lengths T of interruptions."""
     motions: Sequence[float] = (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5)
-    """d in fields of view."""
+    """Distances d in fields of view."""
 
     RULES = {"capacity": whole(), "distances": several(whole()), "motions": several(above_0)}
     SIZE_INCHES = (11.0, 3.8)
@@ -124,11 +124,11 @@ _NOTHING: Row = {"behind": None, "afr_of_best": None, "oldest_of_best": None}
 
 
 def _rules(v: NDArray[np.float64], at: NDArray[np.float64], d: float) -> Row | None:
-    """V at distance ``d`` from each frame, and how often a rule is broken from there on to 2 d; None if nothing is.
+    """Measure V at distance ``d`` from each frame and how often 2 d breaks a rule; None if no frame is so far.
 
     Args:
         v: float64[frames, frames], V(i, j).
-        at: float64[frames], where each frame lies; non-decreasing.
+        at: float64[frames], position of each frame, non-decreasing.
         d: the distance.
     """
     once, twice = (np.searchsorted(at, at + distance - 1e-9) for distance in (d, 2 * d))
@@ -149,7 +149,7 @@ def _rules(v: NDArray[np.float64], at: NDArray[np.float64], d: float) -> Row | N
 
 
 def _gained(v: NDArray[np.float64], seen: NDArray[np.float32], L: int, T: int) -> Row:
-    """H of AFR and of Drop Oldest over that of the best, by the measured V, over interruptions of T frames."""
+    """Compare H of AFR and Drop Oldest with the best H by the measured V, over interruptions of T frames."""
     starts = np.arange(0, len(v) - T - 1, EVERY)
     if not len(starts):
         return _NOTHING
@@ -167,7 +167,7 @@ _POLICIES = {"afr": "afr", "oldest": "drop-oldest"}
 
 
 def best_gain(v: NDArray[np.float64], L: int) -> float:
-    """The most that ``L`` frames at most can gain between the first and the last one, by V(i, j) = ``v[i, j]``."""
+    """Largest gain of at most ``L`` frames between the first and the last frame, by V(i, j) = ``v[i, j]``."""
     later = np.triu(np.ones(v.shape, np.bool_), 1)
     step = np.where(later, v, -np.inf)
     reached = step[0].copy()

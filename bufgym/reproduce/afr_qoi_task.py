@@ -1,9 +1,9 @@
-"""Quantity of Information against what it stands for: which V tells best how good the map is, and who keeps track?
+"""Quantity of Information against the robot's task: which V best predicts the map's quality and lost tracking?
 
-Every run of Fig. 7 and 8 has its information by time, by motion, by measured overlap, and its coverage, and beside it
-the error of the map, what the map lacks, and whether tracking broke. Correlation is Spearman's over the runs of a
-recording; the bootstrap draws whole offsets of the fade. *Within* compares runs of the same queue size and offset
-alone: it asks whether V tells policies apart, where the whole correlation may just say that a larger queue is better.
+Every run of Fig. 7 and 8 has its coverage and its information by time, by motion and by measured overlap. It also has
+the error of the map, the missing part of the map, and whether tracking broke. Correlation is Spearman's over the runs
+of a recording, and the bootstrap draws whole offsets of the fade. *Within* compares only runs of the same queue size
+and offset. It asks whether V tells policies apart; otherwise a correlation may only show that a larger queue is better.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ MEASURES = {
     "coverage": "coverage",
     "least_overlap": "least overlap",
 }
-"""Column -> by which V, or what in its place; the last is the worst of all steps, where the others are sums."""
+"""Column -> name of the measure. The last measure is the minimum over all steps; the others are sums."""
 TASKS = {
     "rmse_mm": "map error",
     "uncovered": "map's holes",
     "failed": "tracking failure",
     "slam_rmse_mm": "error with tracked poses",
 }
-"""Column -> what is bad for the robot; a good measure falls where it grows."""
+"""Column -> name of a harm to the robot; a good measure falls where the harm grows."""
 ACROSS, WITHIN = "all runs", "within"
 
 
@@ -44,11 +44,11 @@ class Reproduction(FrameFigure):
 
     @cached_property
     def runs(self) -> Rows:
-        """Those of Fig. 7 and 8."""
+        """Runs of Fig. 7 and 8."""
         return self.play("map", "track")
 
     def simulate(self) -> Rows:
-        """A row for each recording, measure and task; the runs themselves are in the figures of which they are."""
+        """Return a row for each recording, measure and task; the runs themselves are saved with Fig. 7 and 8."""
         rows = Rows()
         for recording in self.recordings:
             shown = self.runs.where(recording=recording)
@@ -139,13 +139,13 @@ class Reproduction(FrameFigure):
 
 
 def ranked(runs: Rows, column: str) -> list[str]:
-    """The policies by their mean over all runs, best first: the most of a measure, the least of what is bad."""
+    """Rank the policies by their mean over all runs, best first: a measure's highest, or a harm's lowest."""
     sign = -1 if column in MEASURES else 1
     return sorted(runs.distinct("policy"), key=lambda policy: sign * runs.mean(column, policy=policy))
 
 
 def _means(runs: Rows) -> list[list[object]]:
-    """Of every policy, those with the best maps first."""
+    """List the means of every policy, with the best maps first."""
     cells: list[list[object]] = [["policy", *MEASURES.values(), *TASKS.values()]]
     for policy in ranked(runs, "rmse_mm"):
         means = [f"{runs.mean(column, policy=policy):.3f}" for column in (*MEASURES, *TASKS)]
@@ -154,7 +154,7 @@ def _means(runs: Rows) -> list[list[object]]:
 
 
 def _less_mean(numbers: NDArray[np.float64], cell: list[Any]) -> NDArray[np.float64]:
-    """Each less the mean of those of its cell."""
+    """Subtract from each number the mean of its cell."""
     _, place = np.unique(np.array(cell), axis=0, return_inverse=True)
     means = np.bincount(place, numbers) / np.bincount(place)
     return np.asarray(numbers - means[place], np.float64)

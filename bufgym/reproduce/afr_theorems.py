@@ -1,16 +1,17 @@
-"""The theorems of the AFR paper [wang2022afr], checked on the simulator for every L, T and V of a grid.
+"""Theorems of the AFR paper [wang2022afr], checked on the simulator for every L, T and V of a grid.
 
-"Every V" is checked exactly, not by sample. H depends on V at whole-numbered gaps alone, and there a concave V with
-V(0) = 0 that does not fall is a sum of V(d) = min(d, D), D = 1, 2, ..., with weights >= 0. H is linear in V: what holds
-for each of these holds for every V. With them all sums are whole numbers, and comparisons are exact.
+"Every V" is checked exactly, not by sampling. H depends on V at integer gaps only. There a concave, non-decreasing V
+with V(0) = 0 is a sum of V(d) = min(d, D), D = 1, 2, ..., with weights >= 0. H is linear in V, so an inequality that
+holds for each min(d, D) holds for every V. All sums are then integers, and comparisons are exact.
 
-The ratio of Theorem 2 is not linear in V. But for gaps g that add up to T + 1 = (L + 1) m, sum V(g) / ((L + 1) V(m)) is
-smallest for V(d) = min(1, d / m): with t = V(m), concavity gives V(g) >= t g / m for g <= m, and V(g) >= t for g >= m.
-The worst ratio over all V is therefore sum min(1, g / m) / (L + 1).
+The ratio of Theorem 2 is not linear in V. But for gaps g that add up to T + 1 = (L + 1) m, the ratio sum V(g) / ((L +
+1) V(m)) is smallest for V(d) = min(1, d / m). With t = V(m), concavity gives V(g) >= t g / m for g <= m, and V(g) >= t
+for g >= m as V does not fall. The worst ratio over all V is therefore sum min(1, g / m) / (L + 1).
 
-What is added to the paper's theorems: a sharper bound, 2(sqrt((2L + 1) / (L + 1)) - 1), the minimum of the same ratio;
-and AFR's gaps: one pass of p merges gaps of r to gaps of 2r, so among the kept messages the largest gap is at most
-twice the smallest, and the gap at the edge, from the newest kept to message T + 1, is at most the smallest of these.
+We add two statements to the paper's theorems. The first is a sharper bound, 2(sqrt((2L + 1) / (L + 1)) - 1), the
+minimum of the same ratio. The second is about AFR's gaps. One pass of p merges gaps of r to gaps of 2r, so the largest
+gap between kept messages is at most twice the smallest. The gap at the edge, from the newest kept message to message T
++ 1, is at most the smallest of these gaps.
 """
 
 from __future__ import annotations
@@ -31,58 +32,58 @@ from bufgym.scenario import Interruption
 from bufgym.sim import metrics
 
 ROUNDING = 1e-12
-"""Relative tolerance where numbers are not whole."""
+"""Relative tolerance of comparisons that are not between integers."""
 
 FALLS = (35, 36)
-"""Two T, one after the other, at which H of AFR falls (L = 8, V(d) = 1 - 0.618^d)."""
+"""Consecutive T between which H of AFR falls, for L = 8 and V(d) = 1 - 0.618^d."""
 
 VIOLATIONS = ("above_oracle", "oracle_above_ideal", "below_bound", "below_sharper", "below_oldest", "uneven", "unequal")
-"""Columns that count violations of a statement each."""
+"""Columns that each count the violations of one statement."""
 
 
 def bound(capacity: int) -> float:
-    """Theorem 2 of the paper: AFR / oracle-ideal is at least this, for every T and V."""
+    """Lower bound on AFR / oracle-ideal for every T and V, Theorem 2 of the paper."""
     return 2 * (math.sqrt(2) - 1) * capacity / (capacity + 1)
 
 
 def sharper_bound(capacity: int) -> float:
-    """A bound above the paper's that holds as well; the two meet as L grows."""
+    """Lower bound above the paper's; the two meet as L grows."""
     return 2 * (math.sqrt((2 * capacity + 1) / (capacity + 1)) - 1)
 
 
 def gaps_of(policy: str, capacity: int, lengths: Sequence[int]) -> list[NDArray[np.int64]]:
-    """The gaps between the messages received, 0 and T + 1 included, for each T; they don't depend on V."""
+    """Return the gaps between the messages received, including 0 and T + 1, for each T; V does not matter."""
     interruption = Interruption(law="fixed", t_max=max(lengths))
     senders = sim.run(policies.get(policy), [interruption.episode(T) for T in lengths], capacity, interruption.value)
     return [np.diff(metrics.received(senders, i)["seq"]) for i in range(len(lengths))]
 
 
 def best_gaps(capacity: int, T: int) -> NDArray[np.int64]:
-    """The gaps of the integer oracle: as equal as whole numbers can be."""
+    """Return the gaps of the integer oracle, which are as equal as integers can be."""
     q, longer = divmod(T + 1, min(capacity, T) + 1)
     return np.array([q + 1] * longer + [q] * (min(capacity, T) + 1 - longer), np.int64)
 
 
 def extremes(gaps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """int64[gaps.sum()]: H - 1 for V(d) = min(d, D), D = 1, 2, ..., which stand for every concave V."""
+    """Return H - 1 for V(d) = min(d, D), D = 1, 2, ..., which stand for every concave V; int64[gaps.sum()]."""
     longer = np.bincount(gaps, minlength=int(gaps.sum()) + 1)[::-1].cumsum()[::-1]  # gaps of each size and longer
     return np.asarray(longer[1:].cumsum())
 
 
 def worst_ratio(gaps: NDArray[np.int64]) -> float:
-    """The smallest (H - 1) / oracle-ideal that these gaps have under any V that keeps Eq. 3-6 (see the module)."""
+    """Smallest (H - 1) / oracle-ideal of these gaps under any V that satisfies Eq. 3-6; see the module."""
     return float(np.minimum(1, gaps / gaps.mean()).mean())
 
 
 def even_enough(gaps: NDArray[np.int64]) -> bool:
-    """Largest gap between kept messages <= 2 x the smallest, and the edge's gap <= the smallest."""
+    """Check that the largest gap between kept messages is <= 2 x the smallest and the edge's gap <= the smallest."""
     inner, edge = gaps[:-1], gaps[-1]
     return bool(gaps.max() <= 2 * inner.min() and edge <= inner.min())
 
 
 @dataclass(frozen=True)
 class Reproduction(Figure):
-    """The theorems over L = 1..``max_capacity``, T = 1..``last_T`` and every V."""
+    """Check of the theorems over L = 1..``max_capacity``, T = 1..``last_T`` and every V."""
 
     max_capacity: int = 32
     last_T: int = 400
@@ -90,7 +91,7 @@ class Reproduction(Figure):
     RULES = {"max_capacity": whole(), "last_T": whole(2)}
 
     def simulate(self) -> Rows:
-        """A row for each L: comparisons, violations of each statement, and AFR's worst ratio to oracle-ideal."""
+        """Return a row for each L: comparisons, violations by statement, and AFR's worst ratio to oracle-ideal."""
         lengths = range(1, self.last_T + 1)
         rows = Rows()
         for L in range(1, self.max_capacity + 1):

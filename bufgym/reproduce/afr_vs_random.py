@@ -1,12 +1,13 @@
-"""AFR against the expectation of Random, over every concave V, which the AFR paper claims and does not prove.
+"""AFR against Random's expectation over every concave V, a claim that the AFR paper does not prove.
 
-Random drops one of the L queued messages and the newcomer, each with probability 1 / (L + 1) (Eq. 9). So the fate of a
-pair of messages i < j is a Markov chain: how many of those between them are still kept. A drop hits i or j with
-probability 2 / (L + 1), one of m between with m / (L + 1). From it follow the probability that i and j are neighbours
-among the kept, the expected number of gaps of each size, and E[H], without sampling.
+Random drops the newcomer or one of the L queued messages, each with probability 1 / (L + 1) (Eq. 9). For a pair of
+messages i < j, the number m of messages still kept between them is therefore a Markov chain. A drop hits i or j with
+probability 2 / (L + 1), and a message between them with probability m / (L + 1). The chain gives the probability that i
+and j are neighbours among the kept messages. From that follow the expected number of gaps of each size and E[H],
+without sampling.
 
-As in `afr_theorems`, V(d) = min(d, D) for every D stands for every concave V: H is linear in V, and a concave V with
-V(0) = 0 that does not fall is a sum of these on whole-numbered gaps, with weights >= 0.
+As in `afr_theorems`, V(d) = min(d, D) for every D stands for every concave V. H is linear in V, and on integer gaps a
+concave, non-decreasing V with V(0) = 0 is a sum of these with weights >= 0.
 """
 
 from __future__ import annotations
@@ -22,27 +23,27 @@ from bufgym.reproduce.figure import COLOURS, Figure, finish, whole
 from bufgym.reproduce.rows import Row, Rows, table
 
 ROUNDING = 1e-9
-"""Relative: the expectations are sums of some ten thousand products."""
+"""Relative tolerance; the expectations are sums of some ten thousand products."""
 COUNTEREXAMPLE = (1, 4, 2)
-"""L, T, D."""
+"""L, T and D at which AFR falls short of Random's expectation."""
 DRAWN_L, DRAWN_D = 8, (2, 5, 20)
-"""Of the picture's left panel."""
+"""L and D of the picture's left panel."""
 
 
 def expected_gaps(capacity: int, last_T: int) -> NDArray[np.float64]:
-    """float64[last_T + 1, last_T + 2]: under Random, the expected number of gaps of each size at each T."""
+    """Return Random's expected number of gaps of each size at each T, float64[last_T + 1, last_T + 2]."""
     L, width = capacity, min(capacity, last_T) + 2
     counts = np.zeros((last_T + 1, last_T + 2))
     counts[0, 1] = 1
     between = np.arange(width)
-    # alive[i, m]: message i is kept, and m of those after it. Message 0 was sent before: nothing drops it.
+    # alive[i, m]: message i and m messages after it are kept. Message 0 was sent before and is never dropped.
     alive = np.zeros((last_T + 1, width))
     alive[0, 0] = 1
     mortal = np.ones((last_T + 1, 1))
     mortal[0] = 0
     closing = {end: _all_dropped(L, end, last_T) for end in (1, 2)}
     for t in range(1, last_T + 1):
-        # Message t is the pair's second: what is kept of those between must go in the drops that follow.
+        # Message t is the pair's second: the messages kept between the two must go in the drops that follow.
         pairs = alive[:t]
         if t > L:
             pairs = pairs * np.maximum(0, 1 - (mortal[:t] + 1 + between) / (L + 1))
@@ -61,13 +62,13 @@ def expected_gaps(capacity: int, last_T: int) -> NDArray[np.float64]:
             kept = alive[: t + 1] * np.maximum(0, 1 - (mortal[: t + 1] + between) / (L + 1))
             kept[:, :-1] += alive[: t + 1, 1:] * between[1:] / (L + 1)
             alive[: t + 1] = kept
-        # The gap at the edge: from i to message t + 1, nothing between.
+        # The gap at the edge runs from i to message t + 1 with nothing between.
         counts[t, t + 1 - np.arange(t + 1)] += alive[: t + 1, 0]
     return counts
 
 
 def _all_dropped(capacity: int, ends: int, last_T: int) -> NDArray[np.float64]:
-    """float64[drops + 1, m]: that after so many drops all m between are gone, and neither of ``ends`` messages is."""
+    """Probability that after some drops all m messages between are gone and the ``ends`` are kept, [drops + 1, m]."""
     m = np.arange(min(capacity, last_T) + 2)
     gone = np.zeros((last_T + 1, len(m)))
     gone[0, 0] = 1
@@ -78,7 +79,7 @@ def _all_dropped(capacity: int, ends: int, last_T: int) -> NDArray[np.float64]:
 
 
 def expected_extremes(capacity: int, last_T: int) -> NDArray[np.float64]:
-    """float64[last_T + 1, last_T + 1]: E[H - 1] of Random at each T for V(d) = min(d, D), D = 1..last_T + 1."""
+    """Return Random's E[H - 1] at each T for V(d) = min(d, D), D = 1..last_T + 1; float64[last_T + 1, last_T + 1]."""
     counts = expected_gaps(capacity, last_T)
     at_least = counts[:, ::-1].cumsum(axis=1)[:, ::-1]  # gaps of each size and longer
     return np.asarray(at_least[:, 1:].cumsum(axis=1))
@@ -86,7 +87,7 @@ def expected_extremes(capacity: int, last_T: int) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Reproduction(Figure):
-    """AFR and E[Random] for L = 1..``max_capacity``, T = L + 1..``last_T`` and V(d) = min(d, D), D = 1..T."""
+    """AFR beside E[Random] for L = 1..``max_capacity``, T = L + 1..``last_T`` and V(d) = min(d, D), D = 1..T."""
 
     max_capacity: int = 32
     last_T: int = 160
@@ -95,7 +96,7 @@ class Reproduction(Figure):
     SIZE_INCHES = (10.0, 4.4)
 
     def simulate(self) -> Rows:
-        """A row for each L: how often E[Random] is above AFR, and the highest and lowest ratio of the two."""
+        """Return a row for each L: how often E[Random] is above AFR, and the highest and lowest ratio of the two."""
         rows = Rows()
         for L in range(1, self.max_capacity + 1):
             random = expected_extremes(L, self.last_T)
@@ -113,7 +114,7 @@ class Reproduction(Figure):
                     afr, expected = extremes(gaps)[:T], random[T, :T]
                     row["cases"] += T
                     row["violations"] += int((expected > afr * (1 + ROUNDING)).sum())
-                    # D = 1 and D at least as long as every gap: equal whatever is dropped.
+                    # With D = 1, or D at least as long as every gap, both are equal whatever is dropped.
                     inner = slice(1, max(2, T - L))
                     ratios = expected[inner] / afr[inner]
                     row["lowest_ratio"] = min(row["lowest_ratio"], float(ratios.min()))

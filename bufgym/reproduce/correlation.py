@@ -1,4 +1,4 @@
-"""Spearman's rank correlation, and how sure of it a few groups make us."""
+"""Spearman's rank correlation with a bootstrap interval over groups."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ CONFIDENCE = 0.95
 
 
 def spearman(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """In [-1, 1]; NaN where one of them does not vary."""
+    """Correlate two samples; the result is in [-1, 1], or NaN if one sample does not vary."""
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return math.nan
     return float(library("scipy.stats").spearmanr(a, b).statistic)
 
 
 def spearman_over(a: NDArray[np.float64], b: NDArray[np.float64], group: NDArray[np.int64], label: str) -> Interval:
-    """The same with its bootstrap interval: whole groups are drawn, as what is in one was met together."""
+    """Correlate with a bootstrap interval that draws whole groups, because members of a group are dependent."""
     members = [np.flatnonzero(group == g) for g in np.unique(group)]
     rng = stream(0, label)
     numbers = [spearman(a, b)]

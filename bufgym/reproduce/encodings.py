@@ -1,6 +1,6 @@
-"""How many bytes a ROS message takes: as ROS 1 and ROS 2 have it, in Robofleet's flatbuffer, in rosbridge's JSON.
+"""Bytes of a ROS message in ROS 1, ROS 2, Robofleet's flatbuffer and rosbridge's JSON.
 
-| encoding | what it is |
+| encoding | format |
 |---|---|
 | `ros1` | ROS 1 binary |
 | `cdr` | ROS 2 CDR, encapsulation header included |
@@ -9,11 +9,10 @@
 | `json` | rosbridge's publish operation as rosbridge_suite writes it: spaces after `,` and `:`, uint8[] in base64 |
 | `json-numbers` | the same as JSON.stringify writes it: no spaces, uint8[] as a list of numbers, 0.0 as 0 |
 
-Robofleet generates its schema from ROS 1 message definitions (msg2fbs in github.com/ut-amrl/robofleet): each message
-is a table with its metadata in slot 0 and its fields after it in their order, those of nested messages too; time is a
-struct of two uint32; arrays, fixed or not, are vectors. `flatc` writes the larger fields of a table first. We derive
-the tables from the same definitions, which come with `rosbags` (extra ``ros``); the flatbuffers themselves are written
-by `flatbuffers` (extra ``robofleet``, which brings both).
+Robofleet generates its schema from ROS 1 message definitions with msg2fbs in github.com/ut-amrl/robofleet. Each
+message, nested or not, is a table with its metadata in slot 0 and then its fields in order. Time is a struct of two
+uint32, and every array is a vector. `flatc` writes the larger fields of a table first. We derive the tables from the
+same definitions, which come with `rosbags`, and write them with `flatbuffers`. The extra ``robofleet`` installs both.
 """
 
 from __future__ import annotations
@@ -32,11 +31,11 @@ import numpy as np
 from bufgym.errors import BufgymError, install
 
 Content = dict[str, Any]
-"""A message's fields by the names of ROS 2; nested messages are Contents, or lists of them, arrays are numpy's."""
+"""Fields of a message by their ROS 2 names. Nested messages are Contents or lists of them; arrays are numpy's."""
 
 ENCODINGS: Final = ("ros1", "cdr", "robofleet", "robofleet-bare", "json", "json-numbers")
 MAX_BYTES: Final = 2**28
-"""Larger messages are refused: JSON of one this long is already 1 GB."""
+"""Size limit of a message; its JSON is already 1 GB."""
 
 _STATUS_TYPE: Final = "amrl_msgs/msg/RobofleetStatus"
 _STATUS_FIELDS: Final = "string status\nbool is_ok\nfloat32 battery_level\nstring location\n"
@@ -84,7 +83,7 @@ def nav_sat_fix(frame_id: str = "gps", seed: int = 0) -> Content:
 
 
 def compressed_image(data_bytes: int = 75_000, format: str = "jpeg", frame_id: str = "cam", seed: int = 0) -> Content:
-    """A JPEG by its bytes: a marker at each end, and between them noise in which 0 follows each 255, as JPEG has it."""
+    """A JPEG-like image: markers at both ends, and between them noise in which 0 follows each 255, as in JPEG."""
     _whole("data_bytes", data_bytes, 1, least=4)
     data = _uniform(seed).integers(0, 256, data_bytes).astype(np.uint8)
     data[1:][data[:-1] == 255] = 0
@@ -131,7 +130,7 @@ def odometry(frame_id: str = "odom", child_frame_id: str = "base_link", seed: in
 
 
 def robofleet_status(status: str = "autonomous", location: str = "building 1, floor 2", seed: int = 0) -> Content:
-    """What a robot tells the fleet about itself."""
+    """A robot's report to the fleet about its own state."""
     battery = float(np.float32(_uniform(seed).uniform(0, 1)))
     status, location = _text("status", status), _text("location", location)
     return {"status": status, "is_ok": True, "battery_level": battery, "location": location}
@@ -146,11 +145,11 @@ KINDS: Final[dict[str, tuple[str, Callable[..., Content]]]] = {
     "Odometry": ("nav_msgs/msg/Odometry", odometry),
     "RobofleetStatus": (_STATUS_TYPE, robofleet_status),
 }
-"""Kind -> its ROS type, and what builds its content."""
+"""Kind -> its ROS type and the function that builds its content."""
 
 
 def content(kind: str, **parameters: Any) -> Content:
-    """A message of ``kind`` with seeded content; ``parameters`` are those of its builder, such as ``beams``."""
+    """Build a message of ``kind`` with seeded content; ``parameters`` go to its builder, such as ``beams``."""
     build = _kind(kind)[1]
     known = inspect.signature(build).parameters
     for name in parameters:
@@ -163,7 +162,7 @@ def content(kind: str, **parameters: Any) -> Content:
 
 
 def encode(kind: str, message: Content, encoding: str, topic: str = "/robot/topic") -> bytes:
-    """The bytes of ``message``.
+    """Encode ``message`` as bytes.
 
     Args:
         kind: a key of ``KINDS``.
@@ -189,7 +188,7 @@ def encode(kind: str, message: Content, encoding: str, topic: str = "/robot/topi
 
 
 def sizes(kind: str, topic: str = "/robot/topic", **parameters: Any) -> dict[str, int]:
-    """Encoding -> bytes of a message of ``kind``, for every one of ``ENCODINGS``; arguments as in ``content``."""
+    """Count the bytes of a message of ``kind`` in each of ``ENCODINGS``; arguments as in ``content``."""
     message = content(kind, **parameters)
     return {encoding: len(encode(kind, message, encoding, topic)) for encoding in ENCODINGS}
 
@@ -233,7 +232,7 @@ def _flatbuffer(type_name: str, message: Content, topic: str | None) -> bytes:
 
 
 def _table(builder: Any, type_name: str, value: Content, metadata: int = 0) -> int:
-    """Write one message as a table, what it refers to before it; its offset."""
+    """Write one message as a table, after the objects that it refers to; return its offset."""
     slots: list[tuple[int, str, Any]] = [(4, "UOffsetTRelative", metadata)]
     for name, (node, of) in stores()["ros1"].fielddefs[type_name][1]:
         item = value[name]
@@ -269,7 +268,7 @@ def _table(builder: Any, type_name: str, value: Content, metadata: int = 0) -> i
 
 
 def _json(value: Any, numbers: bool) -> Any:
-    """What json.dumps is to write; times by the names of ROS 1, infinity and not-a-number as null."""
+    """Convert for json.dumps: times get ROS 1 names, infinity and not-a-number become null."""
     if isinstance(value, dict):
         names = {"sec": "secs", "nanosec": "nsecs"}
         return {names.get(name, name): _json(item, numbers) for name, item in value.items()}

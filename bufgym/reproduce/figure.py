@@ -1,8 +1,9 @@
-"""What every reproduction has in common: options, three steps, a text and a picture.
+"""Base of all reproductions: options, three steps, a text and a picture.
 
 A ``Figure`` is a figure, table or theorem of a paper. Its dataclass fields are its options. ``simulate`` returns the
-numbers, ``claims`` what they say about the paper's sentences, ``draw`` makes the picture. The sentences themselves are
-in ``afr.toml`` and ``robofleet.toml``, ours in ``own.toml``, one section a figure, with what is said around them.
+numbers, ``claims`` tests the paper's sentences with them, and ``draw`` makes the picture. The sentences are in
+``afr.toml`` and ``robofleet.toml``, and our own in ``own.toml``. Each figure has a section with its sentences and the
+text around them.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ COLOURS = {
     "orange": "#e69f00",
     "sky": "#56b4e9",
 }
-"""One colour a policy, the same in every figure, told apart by colour-blind readers too (Okabe and Ito)."""
+"""Colour of each policy in every figure, from Okabe and Ito's palette for colour-blind readers."""
 
 VERDICTS = {True: "holds", False: "DIFFERS", None: "not tested here"}
 WIDTH = 120
-"""Of the printed text, letters."""
+"""Width of the printed text in letters."""
 
 
 # --- options ---------------------------------------------------------------------------------------------------------
@@ -45,7 +46,7 @@ Rule = Callable[[str, Any], None]
 
 
 def whole(least: int = 1, most: int | None = None) -> Rule:
-    """A whole number from ``least`` to ``most`` (None: no limit)."""
+    """Rule for an integer from ``least`` to ``most``; None means no limit."""
 
     def check(name: str, number: Any) -> None:
         if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= (most or number):
@@ -56,13 +57,13 @@ def whole(least: int = 1, most: int | None = None) -> Rule:
 
 
 def at_least_0(name: str, number: Any) -> None:
-    """A finite number >= 0."""
+    """Check that an option is a finite number >= 0."""
     if isinstance(number, bool) or not isinstance(number, int | float) or not 0 <= number < math.inf:
         raise BufgymError(f"{name} = {number!r}: must be a number >= 0")
 
 
 def several(rule: Rule) -> Rule:
-    """At least one number, each of which keeps ``rule``."""
+    """Rule for a list of at least one number, each checked by ``rule``."""
 
     def check(name: str, numbers: Any) -> None:
         if isinstance(numbers, str) or not isinstance(numbers, Sequence) or not numbers:
@@ -98,7 +99,7 @@ class Figure(ABC):
 
     @abstractmethod
     def claims(self, rows: Rows) -> Mapping[str, Any]:
-        """What the rows say: claim -> True, False or None (not tested), and the numbers that the texts quote."""
+        """Map each claim to True, False or None if it was not tested; also give the numbers that the texts quote."""
 
     @abstractmethod
     def draw(self, rows: Rows, figure: Any) -> None:
@@ -115,7 +116,7 @@ class Figure(ABC):
 
 @functools.cache
 def statements() -> dict[str, dict[str, Any]]:
-    """Name of a figure -> its texts: title, setup, notes, and under claims the paper's sentences."""
+    """Map each figure's name to its texts: title, setup, notes, and the paper's sentences under claims."""
     texts: dict[str, dict[str, Any]] = {}
     for part in ("afr", "robofleet", "own"):
         with (Path(__file__).parent / f"{part}.toml").open("rb") as file:
@@ -124,7 +125,7 @@ def statements() -> dict[str, dict[str, Any]]:
 
 
 def facts_of(figure: Figure, rows: Rows) -> dict[str, Any]:
-    """What the texts may quote: the figure's options and what its claims return."""
+    """Collect what the texts may quote: the figure's options and the results of its claims."""
     return {option.name: getattr(figure, option.name) for option in fields(figure)} | dict(figure.claims(rows))
 
 
@@ -141,14 +142,14 @@ def report(name: str, figure: Figure, rows: Rows) -> list[str]:
 
 
 def source(text: Mapping[str, Any]) -> str:
-    """Where the paper says so; or that we do."""
+    """Name the claim's place in the paper, or say that the claim is ours."""
     if text.get("own"):
         return "Our addition"
     return str(text["place"]) if text.get("abstract") else f"{text['place']} (wording not checked)"
 
 
 def _filled(text: str, facts: Mapping[str, Any]) -> list[str]:
-    """The paragraphs of a text, each wrapped; those that begin with spaces stay indented."""
+    """Fill in the facts and wrap each paragraph; paragraphs that begin with spaces stay indented."""
     lines: list[str] = []
     for paragraph in text.format(**facts).rstrip().split("\n\n"):
         indent = " " * (len(paragraph) - len(paragraph.lstrip(" ")))
@@ -167,7 +168,7 @@ def save_picture(reproduction: Figure, rows: Rows, path: Path) -> Path:
         from matplotlib.figure import Figure as Picture
     except ImportError:
         raise BufgymError(f"drawing needs matplotlib: {install('plot')}") from None
-    # Not through pyplot: no window, no state that outlives the file.
+    # Avoids pyplot, which opens windows and keeps global state.
     picture = Picture(figsize=reproduction.size_inches(rows), layout="constrained")
     FigureCanvasAgg(picture)
     reproduction.draw(rows, picture)
@@ -187,7 +188,7 @@ def finish(axes: Any, title: str = "", **settings: Any) -> None:
 def heat_table(
     axes: Any, numbers: Any, spec: str, lines: Sequence[str], columns: Sequence[str], **limits: float
 ) -> None:
-    """A table of numbers, each on a field that is the darker the larger it is: ``vmin`` white, ``vmax`` darkest."""
+    """Draw a table of numbers on coloured fields, from white at ``vmin`` to darkest at ``vmax``."""
     axes.imshow(numbers, cmap="OrRd", aspect="auto", **limits)
     for n, line in enumerate(numbers):
         for k, number in enumerate(line):
@@ -199,6 +200,6 @@ def heat_table(
 
 
 def legend_below(figure: Any, columns: int, axes: Any = None) -> None:
-    """One legend below all panels, of all of them or of ``axes`` alone."""
+    """Put one legend below all panels; it describes all panels, or ``axes`` alone."""
     entries = () if axes is None else axes.get_legend_handles_labels()
     figure.legend(*entries, loc="outside lower center", ncols=columns, frameon=False)

@@ -1,12 +1,12 @@
-"""What Fig. 7 and 8 of the AFR paper share when frames are really mapped and tracked: recordings, link, runs.
+"""Recordings, link and runs shared by Fig. 7 and 8 of the AFR paper when frames are really mapped and tracked.
 
-The paper streams 794 RGB-D frames at 30 Hz over car_0002. Here the same number of frames comes from a recording of a
-Kinect (7-Scenes, with ``--data``) and from a made-up room, each as long as it really is when encoded. The link is that
-of the paper (with ``--data``; a made-up fade without) for as long as the stream lasts, and then again.
+The paper streams 794 RGB-D frames at 30 Hz over car_0002. Here the same number of frames comes from a made-up room and,
+with ``--data``, from a Kinect recording of 7-Scenes. Each frame has its real encoded size. With ``--data`` the link is
+the paper's; otherwise it is a made-up fade. The link lasts as long as the stream and then repeats.
 
-Where the fade meets the camera's motion decides much. The paper shows one *alignment*: the link begins with the stream.
-Beside it stands a sweep that was fixed before anything had been run: the link begins k tenths of the stream later, so
-the fade comes earlier by as much, k = 0 .. ``offsets`` - 1; k = 0 is the paper's.
+Results depend strongly on where the fade meets the camera's motion. The paper shows one *alignment*, in which the link
+begins with the stream. We add a sweep that was fixed before any run: the stream begins k tenths of its length into the
+link, so the fade comes earlier by as much. k runs from 0, the paper's alignment, to ``offsets`` - 1.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from bufgym.scenario.suites import CAPACITIES, motion_value, time_value
 from bufgym.traces import Trace
 
 RECORDINGS = {"room": "a made-up room", "7-scenes": "7-Scenes, Kinect"}
-"""Name -> what it is; the second needs a folder of recordings."""
+"""Name -> description of the recording; 7-scenes needs a folder of recordings."""
 
 POLICIES = {
     "drop-oldest": STYLES["drop-oldest"],
@@ -57,12 +57,12 @@ POLICIES = {
 
 
 def fade() -> Trace:
-    """In place of the paper's link: 2.2 MB/s, which is about its mean, and 0.4 from second 21 to second 24."""
+    """Stand-in for the paper's link: 2.2 MB/s, about its mean, and 0.4 MB/s from second 21 to second 24."""
     return Trace.steps([(21, 2.2e6), (3, 0.4e6), (30, 2.2e6)], name="fade")
 
 
 class Setting(NamedTuple):
-    """One run: which policy, with which queue, on which recording, with the fade where."""
+    """One run: the recording, the fade's offset k, the queue size L and the policy."""
 
     recording: str
     k: int
@@ -72,31 +72,31 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class FrameFigure(Figure):
-    """A figure of runs of every policy at each L, on each recording and with the fade at each offset."""
+    """A figure with a run of every policy at each L and fade offset on each recording."""
 
     data: Path | None = None
-    """Folder of recordings; without one the made-up room and a made-up fade alone."""
+    """Folder of recordings; None uses only the made-up room and fade."""
     frames: int = PAPER_FRAMES
     capacities: Sequence[int] = CAPACITIES
     policies: Sequence[str] = tuple(POLICIES)
     offsets: int = OFFSETS
-    """Runs of the sweep; the fade comes a tenth of the stream earlier in each."""
+    """Runs of the sweep; each shifts the fade earlier by a tenth of the stream."""
     jobs: int = -1
-    """Processes side by side; -1: one a core."""
+    """Parallel processes; -1 starts one per core."""
     store: Path | None = None
-    """File of the tasks that have been carried out; None keeps nothing."""
+    """File of the finished tasks' results; None keeps nothing."""
 
     RULES = {"frames": whole(30), "capacities": several(whole()), "offsets": whole(1, OFFSETS)}
 
     @property
     def recordings(self) -> list[str]:
-        """Those that are there."""
+        """Names of the recordings available."""
         real = self.data is not None and (self.data / SEVEN_SCENES).is_dir()
         return ["room", *(["7-scenes"] if real else [])]
 
     @cached_property
     def link(self) -> Trace:
-        """The paper's where it is there."""
+        """The paper's link if its recording is available, otherwise the made-up fade."""
         path = None if self.data is None else self.data / LINK
         return fade() if path is None or not path.is_file() else traces.read_trace(path)
 
@@ -116,11 +116,11 @@ class FrameFigure(Figure):
 
     @cached_property
     def done(self) -> Store:
-        """What has been carried out."""
+        """Results of the finished tasks."""
         return Store(self.store)
 
     def task(self, kind: Kind, setting: Setting) -> Task:
-        """What is to be found out of this run."""
+        """Make the task of this kind for a run."""
         data = None if self.data is None else str(self.data)
         about = (setting.k, setting.L) if kind == "kept" else self.kept(setting)
         return Task(kind, setting.recording, data, self.frames, about, setting.policy, self.link)
@@ -141,7 +141,7 @@ class FrameFigure(Figure):
         return {}
 
     def play(self, *kinds: Kind) -> Rows:
-        """A row for each run: its frames, its information by each V, and what the tasks of these kinds gave."""
+        """Return a row for each run: its frame count, its information by each V and its results of these tasks."""
         settings = self.settings()
         carry_out([self.task("kept", one) for one in settings if one.policy in SLOW], self.done, self.jobs)
         carry_out([self.task(kind, setting) for kind in kinds for setting in settings], self.done, self.jobs)
@@ -154,7 +154,7 @@ class FrameFigure(Figure):
         return rows
 
     def information(self, setting: Setting) -> Row:
-        """H of the run's frames by time, by motion and by measured overlap, and what of the scene they cover."""
+        """Compute H of the run's frames by time, motion and measured overlap, and their coverage of the scene."""
         kept, on = self.kept(setting), self.stage(setting.recording)
         x = on.episode(self.link, 0).arrivals["x"][list(kept)]
         return {
@@ -166,7 +166,7 @@ class FrameFigure(Figure):
         }
 
     def about(self) -> str:
-        """What meets the policies, in sentences."""
+        """Describe the recordings and the link in sentences."""
         parts = []
         for recording in self.recordings:
             whole = self.stage(recording).whole

@@ -1,7 +1,7 @@
-"""Runs on frames, one task each: which frames of a recording arrive, and what map and what track they make.
+"""Tasks on frames: find which frames of a recording arrive, and build their map and their track.
 
-What a task gave is kept in a file by what it was asked, and by nothing else. So figures share their runs, equal runs
-are run once, and what was killed goes on where it was.
+A file keeps each task's result under a key made of the task's inputs alone. So figures share their runs, equal runs are
+played once, and a killed run resumes where it stopped.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from bufgym.traces import Trace
 
 SEVEN_SCENES = "rgbd_7scenes"
 WIDTH, VIEW_WIDTH = 160, 80
-"""Frames are mapped and tracked at 160 x 120; how far views overlap is counted at 80 x 60. Tracking there would take
-two thirds of the time, and loses runs that are followed at 160 x 120."""
+"""Image widths: frames are mapped and tracked at 160 x 120, and views are compared at 80 x 60. Tracking at 80 x 60
+would take two thirds of the time, but it loses runs that are tracked at 160 x 120."""
 OFFSETS = 10
-"""Places of the fade: it comes a tenth of the stream earlier at each."""
+"""Number of fade offsets; each shifts the fade earlier by a tenth of the stream."""
 
 IMAGES = "orbbuf-images"
-"""ORBBuf by the images themselves: a policy of each episode, not registered."""
+"""ORBBuf that compares images; the policy is made for each episode and is not registered."""
 SLOW = (IMAGES, "clairvoyant")
-"""Policies that take seconds for a run; which frames they keep is a task of its own."""
+"""Policies that take seconds for a run; finding the frames that they keep is a task of its own."""
 
 Kind = Literal["kept", "map", "track"]
 
@@ -46,7 +46,7 @@ Kind = Literal["kept", "map", "track"]
 
 
 class Stage:
-    """A recording at the size at which it is mapped and tracked, and what every run on it needs."""
+    """A recording reduced to ``WIDTH``, with everything that runs on it share."""
 
     def __init__(self, name: str, data: str | None, frames: int) -> None:
         if name == "room":
@@ -61,7 +61,7 @@ class Stage:
 
     @cached_property
     def grid(self) -> mapping.Grid:
-        """Of every map."""
+        """Grid of every map."""
         return mapping.grid_of(self.sequence)
 
     @cached_property
@@ -76,50 +76,50 @@ class Stage:
 
     @cached_property
     def smooth(self) -> Callable[[int], depth_frames.Depth]:
-        """Each frame's depth as tracking smooths it: the same in every run."""
+        """Depth of each frame as tracking smooths it, the same in every run."""
         return functools.cache(lambda k: tracking.smoothed(self.sequence.depth(k)))
 
     @cached_property
     def similar(self) -> orb.OrbSimilarity:
-        """Of the images, as the sender has them."""
+        """Similarity of the images at the sender's full size."""
         return orb.OrbSimilarity(self.whole.grey)
 
     @cached_property
     def seen(self) -> NDArray[np.float32]:
-        """See ``views.seen_shares``."""
+        """Overlap of views; see ``views.seen_shares``."""
         return views.seen_shares(self.small)
 
     @cached_property
     def coverage(self) -> views.Coverage:
-        """Of its scene."""
+        """Coverage of the scene."""
         return views.Coverage(self.small)
 
     def episode(self, trace: Trace, k: int) -> Episode:
-        """The stream over this link, the fade k tenths of it earlier than in the paper."""
+        """Make the episode of the stream over this link, with the fade k tenths of the stream earlier."""
         stream_us = int(self.whole.time_us[-1])
         link = streams.fading(stream_us, trace, k * stream_us // OFFSETS)
         return streams.episode(self.whole, streams.sizes(self.whole), link, seed=k)
 
     def kept(self, policy: str, trace: Trace, k: int, L: int) -> tuple[int, ...]:
-        """The frames that arrive."""
+        """Play a policy; return the frames that arrive."""
         one = self.episode(trace, k)
         return streams.received(orb.orbbuf_by(self.similar, one) if policy == IMAGES else policy, one, L)
 
     def map_of(self, kept: Sequence[int]) -> mapping.Map:
-        """That of these frames with their true poses."""
+        """Build the map of these frames with their true poses."""
         return mapping.fuse(self.sequence, kept, self.grid)
 
     def track_of(self, kept: Sequence[int]) -> tracking.Track:
-        """Along these frames, with the map that it made till it broke."""
+        """Track along these frames; the track includes the map made until tracking broke."""
         return tracking.track(self.sequence, kept, self.grid, smooth=self.smooth)
 
     def mapped(self, kept: Sequence[int]) -> Row:
-        """Error of the map of these frames with their true poses."""
+        """Measure the error of the map of these frames with their true poses."""
         return errors(mapping.error(self.map_of(kept), self.reference))
 
     def tracked(self, kept: Sequence[int]) -> Row:
-        """Where tracking along these frames breaks, and how far the map that it made till then is from that which it
-        makes of all frames: both drift alike, so what differs is due to the frames that are missing."""
+        """Track along these frames; report where tracking breaks and the error of its map until then. The reference is
+        the tracked map of all frames: both maps drift alike, so they differ by the missing frames."""
         track = self.track_of(kept)
         found = errors(mapping.error(track.model, self.tracked_reference))
         row: Row = {"failed": track.failed, "failed_at": track.where}
@@ -127,7 +127,7 @@ class Stage:
 
 
 def errors(error: mapping.MapError) -> Row:
-    """A map's error in mm, and what of the scene it lacks."""
+    """Convert a map's error to mm, with the fraction of the scene that it lacks."""
     return {
         "rmse_mm": 1e3 * error.rmse_m,
         "to_reference_mm": 1e3 * error.to_reference_m,
@@ -138,7 +138,7 @@ def errors(error: mapping.MapError) -> Row:
 
 @functools.lru_cache(maxsize=2)
 def stage(name: str, data: str | None, frames: int) -> Stage:
-    """One for each process: to open a recording takes seconds."""
+    """Open a recording once per process, because opening takes seconds."""
     return Stage(name, data, frames)
 
 
@@ -146,28 +146,28 @@ def stage(name: str, data: str | None, frames: int) -> Stage:
 
 
 class Task(NamedTuple):
-    """What is to be found out: the map or the track of some frames of a recording, or which ones a policy keeps."""
+    """A question about a recording: the map or the track of some frames, or the frames that a policy keeps."""
 
     kind: Kind
     recording: str
     data: str | None
     frames: int
     about: tuple[int, ...]
-    """The frames; of ``kept`` (k, L): the offset of the fade, and the queue."""
+    """Frames of a map or track; for the kind "kept", the fade's offset k and the queue size L."""
     policy: str
     trace: Trace
     """The link."""
 
     @property
     def key(self) -> str:
-        """Tells it from all others, wherever the data lie; maps and tracks depend on their frames alone."""
+        """Unique key, independent of the data's folder; maps and tracks depend on their frames alone."""
         run = {"kept": f"{self.policy} {self.trace.name}", "track": f"{WIDTH}", "map": ""}[self.kind]
         text = f"{__version__} {self.kind} {self.recording} {self.frames} {self.about} {run}"
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
 def carried_out(task: Task) -> tuple[str, Row]:
-    """The task's key and what it gave."""
+    """Carry out one task; return its key and result."""
     on = stage(task.recording, task.data, task.frames)
     if task.kind == "kept":
         return task.key, {"kept": on.kept(task.policy, task.trace, *task.about)}
@@ -175,7 +175,7 @@ def carried_out(task: Task) -> tuple[str, Row]:
 
 
 class Store:
-    """Results of tasks by their keys, in memory and, if ``path`` is given, a line each in a file."""
+    """Results of tasks by key, held in memory and, if ``path`` is given, in a file with a line per result."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
@@ -188,7 +188,7 @@ class Store:
                 try:
                     key, row = json.loads(line)
                 except ValueError:
-                    continue  # the line that a kill cut short
+                    continue  # a line cut short by a kill
                 self._held[key] = row
 
     def __contains__(self, task: Task) -> bool:
@@ -198,7 +198,7 @@ class Store:
         return self._held[task.key]
 
     def add(self, key: str, row: Row) -> None:
-        """Keep what a task gave."""
+        """Keep the result of a task."""
         self._held[key] = row
         if self._path is not None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -208,7 +208,7 @@ class Store:
 
 
 def carry_out(tasks: Iterable[Task], store: Store, jobs: int) -> None:
-    """Carry out what the store does not have yet; each task once."""
+    """Carry out once each task that the store lacks."""
     missing = list({task.key: task for task in tasks if task not in store}.values())
     if not missing:
         return

@@ -1,4 +1,4 @@
-"""Figures on real sockets: the messages of a simulated run through live queues, over links shaped as it has them."""
+"""Figures on real sockets: a simulated run's messages pass live queues and links shaped like the simulated ones."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from bufgym.reproduce.rows import Rows
 from bufgym.sim import Senders
 
 UNITS = ("_s", "_ms", "_hz")
-"""Columns with these are compared."""
+"""Suffixes of the columns that are compared."""
 
 
 def received_s(
     policy: Policy, senders: Senders, value: Value, speed: float, until_s: float = math.inf
 ) -> NDArray[np.float64]:
-    """float64[messages]: when each message of the first sender arrived, NaN for never; ``senders`` has simulated them.
+    """Send the first sender's messages over sockets; return the receipt times in s, NaN for never, float64[messages].
 
-    A program that awaits no acks sends the next message when the other end of its connection has the last. What arrives
-    after ``until_s`` is not waited for.
+    ``senders`` holds the simulated run. A program that awaits no acks sends the next message when the other end of its
+    connection has the last. Messages after ``until_s`` are not awaited.
     """
     episode = senders.episodes[0]
     assert episode is not None
-    bounded = replace(policy, unbounded=False)  # there is room for all messages
+    bounded = replace(policy, unbounded=False)  # the queue has room for all messages
     leaves: Leaves = "acked" if policy.client.awaits_acks else "sent"
     settings: dict[str, Any] = {"topics": senders.topics, "leaves": leaves, "speed": speed, "until_s": until_s}
     came = asyncio.run(play(bounded, episode, senders.capacity, value, **settings))

@@ -1,7 +1,7 @@
-"""The page docs/claims.md: every sentence of the papers that we know of, the command that tests it, what comes out.
+"""Writer of docs/claims.md, which lists every claim of the papers, the command that tests it, and the result.
 
-``bufgym reproduce --claims docs/claims.md --data DIR`` writes it. Without recordings the figures that need them are
-left as not checked. ``bufgym reproduce afr-fig7 --claims docs/claims.md`` renews the rows of one figure.
+``bufgym reproduce --claims docs/claims.md --data DIR`` writes it. Figures that need recordings are marked as not
+checked without them. ``bufgym reproduce afr-fig7 --claims docs/claims.md`` renews the rows of one figure.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PAPERS = {
     "robofleet": "Robofleet [sikand2021robofleet]",
     "small": "Beside the papers: a link small enough to be solved",
 }
-"""Start of a section's name -> the paper, with its key in references.bib, or what is ours."""
+"""Prefix of a section's name -> the paper with its key in references.bib, or our own claims."""
 
 VERDICTS = {True: "holds", False: "**differs**", None: "not checked"}
 
@@ -43,10 +43,10 @@ compares all rows.
 
 
 def claim_rows(name: str, out: Path | None = None, **options: Any) -> list[str]:
-    """The rows of one section of ``afr.toml`` or ``robofleet.toml``, in Markdown; ``out`` as in ``kept_under``.
+    """Return the Markdown rows of one section of ``afr.toml`` or ``robofleet.toml``; ``out`` as in ``kept_under``.
 
     Raises:
-        BufgymError: the figure cannot be made, such as without recordings.
+        BufgymError: the figure cannot be made, for example without recordings.
     """
     texts = statements()[name]
     facts: dict[str, Any] = {}
@@ -74,7 +74,7 @@ def _rows(name: str, data: Path | None, out: Path | None) -> list[str]:
 
 
 def claims_page(data: Path | None = None, out: Path | None = None) -> str:
-    """The whole page; it runs every figure."""
+    """Run every figure and return the whole page."""
     lines = [HEAD]
     for paper, title in PAPERS.items():
         lines += [f"## {title}", ""]
@@ -90,10 +90,10 @@ def claims_page(data: Path | None = None, out: Path | None = None) -> str:
 
 
 def renewed(page: str, names: Iterable[str], data: Path | None = None, out: Path | None = None) -> str:
-    """The page with the rows of these figures made again; it runs no other.
+    """Run only these figures and return the page with their rows renewed.
 
     Raises:
-        BufgymError: the page has no row of one of them.
+        BufgymError: the page has no row for one of the figures.
     """
     lines = page.splitlines()
     for name in names:

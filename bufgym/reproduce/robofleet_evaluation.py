@@ -1,12 +1,12 @@
-"""What Robofleet's Fig. 3 to 7 share: the messages, the programs that send them, and what became of each.
+"""Messages, sending programs and outcomes shared by Robofleet's Fig. 3 to 7.
 
-The paper [sikand2021robofleet] sends with n_T = 1 in its experiments; so do we. What it leaves open is an option of
-each figure. Arrivals are jittered by up to a tenth of their period, which is what differs from run to run; every sender
-meets the same ones.
+The paper [sikand2021robofleet] sends with n_T = 1 in its experiments, and so do we. Parameters that it leaves open are
+options of each figure. Runs differ only in the arrival jitter, up to a tenth of the period. Every sender meets the same
+arrivals.
 
 With ``live`` the same messages go over real sockets (``on_sockets``), in the fewer and shorter runs of a figure's
-``LIVE``. Left out of the simulation on purpose: TCP (a link that stands still is found again at once, unless a figure
-takes a silence as option), the bytes of pings and pongs, encoding time, and whatever lies behind the server.
+``LIVE``. The simulation leaves out TCP, the bytes of pings and pongs, encoding time, and everything behind the server.
+Without TCP, sending resumes as soon as the link returns, unless a figure has an option for a silence.
 """
 
 from __future__ import annotations
@@ -30,38 +30,38 @@ from bufgym.scenario.checks import above_0
 from bufgym.traces import Trace
 
 POINTS = 10_000
-"""Of a PointCloud2, each of ``POINT_BYTES``; the paper gives no size."""
+"""Points of a PointCloud2, each of ``POINT_BYTES``; the paper gives no size."""
 POINT_BYTES = 16
 BYTES = {
     "LaserScan": (7_260, 7_328, 28_000),
     "CompressedImage": (75_188, 75_224, 267_650),
     "PoseStamped": (75, 240, 281),
 }
-"""Bytes as ROS binary, Robofleet flatbuffer and JSON: the paper's Table I, and for PoseStamped what robofleet-table1
-has for ``ros1``, ``robofleet`` and ``json-numbers`` (the JSON that the paper's images have)."""
+"""Bytes as ROS binary, Robofleet flatbuffer and JSON, from the paper's Table I. PoseStamped is not in it and comes from
+robofleet-table1 with ``ros1``, ``robofleet`` and ``json-numbers``, the JSON of the paper's images."""
 _CLOUD_EXTRA = (111, 344)
 _CLOUD_JSON = 562_376 / POINTS
-"""A PointCloud2 likewise, by robofleet-table1: bytes besides its points, and bytes of JSON a point."""
+"""Bytes of a PointCloud2 besides its points, and its JSON bytes per point, both from robofleet-table1."""
 
 JITTER = 0.1
 ROUND_TRIP_MS = 10.0
-"""Our choice. With n_T = 1 it bounds the throughput: one message per (transmission + round trip)."""
+"""Round trip, our choice. With n_T = 1 it limits throughput to one message per transmission plus round trip."""
 QUEUE_SIZE = 10
-"""Of a native ROS publisher, messages; our choice, as in ROS's own tutorials."""
+"""Queue of a native ROS publisher in messages, our choice after ROS's own tutorials."""
 MBIT = 125_000
 """Bytes/s in a Mbit/s."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """Who sends: a policy, and what its operator asks of the topics."""
+    """A sending program: its policy and its operator's settings of the topics."""
 
     policy: str
     """Its name in ``bufgym.policies``."""
     label: str
-    """What legends call it."""
+    """Label in legends."""
     short: str
-    """What tables call it."""
+    """Label in tables."""
     colour: str
     marker: str
     all_no_drop: bool = False
@@ -89,34 +89,34 @@ SHORT = {name: program.short for name, program in PROGRAMS.items()}
 
 @dataclass(frozen=True)
 class Sent:
-    """What became of every message of one run, in order of arrival; arrays of shape [messages]."""
+    """Outcome of every message of one run, in order of arrival; arrays have shape [messages]."""
 
     topic: NDArray[np.int64]
     """Index of the message's stream."""
     consumer: NDArray[np.int64]
-    """Whose copy it is, where the sender makes copies; else 0."""
+    """Consumer of this copy if the sender makes copies, otherwise 0."""
     arrival_s: NDArray[np.float64]
-    """At the sender."""
+    """Arrival time at the sender."""
     received_s: NDArray[np.float64]
-    """At the server; NaN for a message that was dropped."""
+    """Receipt time at the server; NaN for a dropped message."""
 
     @property
     def latency_s(self) -> NDArray[np.float64]:
-        """From arrival at the sender to the server; NaN for a message that was dropped."""
+        """Time from arrival at the sender to receipt at the server; NaN for a dropped message."""
         return self.received_s - self.arrival_s
 
     @property
     def received(self) -> Sent:
-        """Those that reached the server, in the order in which they did."""
+        """Messages that reached the server, in order of receipt."""
         in_order = np.argsort(self.received_s, kind="stable")  # NaN comes last
         return self._only(in_order[: int((~np.isnan(self.received_s)).sum())])
 
     def on(self, topic: int) -> Sent:
-        """Those of one stream."""
+        """Select the messages of one stream."""
         return self._only(np.flatnonzero(self.topic == topic))
 
     def between(self, from_s: float, until_s: float) -> Sent:
-        """Those that arrived at the sender in this time."""
+        """Select the messages that arrived at the sender in this time."""
         return self._only(np.flatnonzero((from_s <= self.arrival_s) & (self.arrival_s < until_s)))
 
     def received_hz(self, until_s: float) -> float:
@@ -131,7 +131,7 @@ class Sent:
 
 
 def stream(kind: str, rate_hz: float, *, points: int = POINTS, jitter: float = JITTER, **topic: Any) -> Stream:
-    """What publishes messages of this kind; ``topic``: what ``Topic`` takes."""
+    """Make a stream of messages of this kind; ``topic`` holds fields of ``Topic``."""
     ros, flatbuffer, json = cloud_bytes(points) if kind == "PointCloud2" else BYTES[kind]
     return Stream(Topic(kind, **topic), rate_hz, flatbuffer, jitter=jitter, encodings={"ros": ros, "json": json})
 
@@ -156,10 +156,10 @@ def send(
     live: float = 0.0,
     watched_s: float = math.inf,
 ) -> Sent:
-    """What becomes of the streams' messages when one of ``PROGRAMS`` sends them; ``link`` begins with the first.
+    """Send the streams' messages with one of ``PROGRAMS``; ``link`` begins at the first message.
 
-    ``live``: they go over real sockets, so many times as fast; 0: they are simulated. ``watched_s``: what is received
-    later does not matter, and live it is not waited for.
+    ``live`` above 0 sends over real sockets, sped up by that factor; 0 simulates. Messages received after ``watched_s``
+    do not matter, and a live run does not wait for them.
     """
     program = PROGRAMS[name]
     rules: dict[str, Any] = {"no_drop": True} if program.all_no_drop else {}
@@ -175,7 +175,7 @@ def send(
         round_trip_us=round_trip_us,
         consumers=consumers,
     )
-    # Room for all: a no_drop queue knows no limit.
+    # Room for all messages, because a no_drop queue has no limit.
     room = client.max_messages * consumers
     policy = policies.get(program.policy)
     senders = sim.run(policy, [draw(client, seed)], room, client.value, topics=client.topics)
@@ -184,7 +184,7 @@ def send(
     transmitted_us = np.asarray(senders.batch.log[0])[: sender["arrivals"]]["transmitted_us"]
     received_s = np.where(transmitted_us == sim.NEVER, np.nan, (transmitted_us + sender["propagation_us"]) / 1e6)
     if live:
-        from bufgym.reproduce import on_sockets  # not for those who only simulate
+        from bufgym.reproduce import on_sockets  # not needed to simulate
 
         received_s = on_sockets.received_s(policy, senders, client.value, live, watched_s)
     consumer, topic = np.divmod(arrivals["topic"], len(streams))
@@ -193,14 +193,14 @@ def send(
 
 @dataclass(frozen=True)
 class ClientFigure(Figure):
-    """A figure of programs that send the same topics over one link; the mean of ``runs`` runs."""
+    """A figure of programs that send the same topics over one link; values are means of ``runs`` runs."""
 
     round_trip_ms: float = ROUND_TRIP_MS
-    """Half of it to the server, the whole from the end of a message's transmission to its pong."""
+    """Time from the end of a message's transmission to its pong; half of it is the way to the server."""
     runs: int = 5
-    """Differ by arrival jitter."""
+    """Number of runs, which differ by arrival jitter."""
     live: float = 0.0
-    """How much faster than in truth messages go over real sockets; 0: they are simulated."""
+    """Speed-up of a run on real sockets; 0 simulates."""
 
     RULES = {
         "live": at_least_0,
@@ -215,18 +215,18 @@ class ClientFigure(Figure):
 
     @functools.cached_property
     def watchers(self) -> list[Callable[[float], None]]:
-        """Each is told after each run how long it took, s."""
+        """Functions called after each run with its duration in s."""
         return []
 
     @functools.cached_property
     def played(self) -> dict[Any, Any]:
-        """See ``played_once``."""
+        """Results of earlier runs; see ``played_once``."""
         return {}
 
     def send(
         self, name: str, streams: Sequence[Stream], link: Trace, duration_s: float, seed: int, **client: Any
     ) -> Sent:
-        """``send`` with the figure's own options."""
+        """Call ``send`` with the figure's own options."""
         if "queue_size" not in client:
             client["queue_size"] = getattr(self, "queue_size", QUEUE_SIZE)
         sent = send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, live=self.live, **client)
@@ -244,7 +244,7 @@ Result = TypeVar("Result")
 def played_once(
     run: Callable[Concatenate[Kind, Arguments], Result],
 ) -> Callable[Concatenate[Kind, Arguments], Result]:
-    """A run of a figure, which live takes its time: who asks for the same one again, such as a picture, is given it."""
+    """Keep the result of each run of a figure, because live runs are slow and the picture needs them again."""
 
     @functools.wraps(run)
     def once(figure: Kind, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
@@ -264,18 +264,18 @@ class CloudFigure(ClientFigure):
     """A figure of one PointCloud2 topic."""
 
     points: int = POINTS
-    """Of a cloud, 16 bytes each."""
+    """Points of a cloud, 16 bytes each."""
     queue_size: int = QUEUE_SIZE
-    """Of native ROS, messages."""
+    """Queue of native ROS, messages."""
 
 
 def p95(numbers: NDArray[np.float64]) -> float:
-    """95th percentile; NaN of nothing."""
+    """95th percentile, or NaN without numbers."""
     return float(np.percentile(numbers, 95)) if len(numbers) else np.nan
 
 
 def curves(axes: Any, rows: Rows, x: str, y: str, names: Sequence[str], **styles: Any) -> None:
-    """The mean of column ``y`` against column ``x``: one line a sender; ``styles`` change every line."""
+    """Draw the mean of column ``y`` against column ``x``, one line per sender; ``styles`` apply to every line."""
     for k, name in enumerate(names):
         means = {at: rows.mean(y, **{x: at}, sender=name) for at in rows.where(sender=name).distinct(x)}
         program = PROGRAMS[name]

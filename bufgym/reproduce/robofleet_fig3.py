@@ -1,8 +1,8 @@
-"""Fig. 3 of the Robofleet paper: latency and throughput against the publish rate of one PointCloud2 topic, 100 Mbit/s.
+"""Fig. 3 of the Robofleet paper: latency and throughput against the publish rate of a PointCloud2 at 100 Mbit/s.
 
-Robofleet with n_T = 1 (one message is being sent and one waits, the newest) and with every topic no_drop (all wait),
-as published and as released; beside it rosbridge, which sends JSON from an unbounded queue, and native ROS with a
-queue of its own. The size of a cloud, the round trip and how long it is published are not known to us.
+Robofleet runs with n_T = 1, where one message is being sent and only the newest waits. It also runs with every topic
+no_drop, where all messages wait, as published and as released. Beside it run rosbridge, which sends JSON from an
+unbounded queue, and native ROS with a queue of its own. The paper gives no cloud size, round trip or publishing time.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from bufgym.traces.generate import steady
 
 SENDERS = ("robofleet", "no-drop", "no-drop-released", "rosbridge", "ros-native")
 LOW = 2.0
-"""Latency up to so many times that of the lowest rate is called low."""
+"""Ratio to the latency at the lowest rate up to which a latency is called low."""
 EQUAL = 0.02
-"""Relative: latencies nearer than this count as alike."""
+"""Relative difference up to which latencies count as equal."""
 GROWN = 10.0
-"""Latency beyond so many times that of the lowest rate is called grown."""
+"""Ratio to the latency at the lowest rate beyond which a latency is called grown."""
 
 
 @dataclass(frozen=True)
@@ -32,16 +32,16 @@ class Reproduction(CloudFigure):
 
     rates_hz: Sequence[float] = (5, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100, 120)
     mbit_per_s: float = 100.0
-    """Of the link, which is steady."""
+    """Rate of the link, which is steady."""
     duration_s: float = 20.0
-    """How long is published; without drops the latency depends on it."""
+    """Publishing time; without drops the latency depends on it."""
 
     LIVE = {"rates_hz": (2, 8, 16, 24), "mbit_per_s": 20.0, "duration_s": 3.0, "runs": 1, "live": 1.0}
     SIZE_INCHES = (10.0, 4.4)
 
     @property
     def link_hz(self) -> float:
-        """Clouds a second that the link carries."""
+        """Clouds per second that the link carries."""
         return self.mbit_per_s * MBIT / cloud_bytes(self.points)[1]
 
     def simulate(self) -> Rows:
@@ -81,7 +81,7 @@ class Reproduction(CloudFigure):
         growth = {name: high_ms[name] / rows.mean("latency_ms", sender=name, publish_hz=low) for name in SENDERS}
         received_hz = at_high.mean("received_hz", sender="robofleet")
         tested = high > self.link_hz
-        # Rosbridge is behind at the lowest rate already, for its messages are longer.
+        # Rosbridge is behind already at the lowest rate, because its messages are longer.
         rates = sorted(self.rates_hz)
         ms = {name: [rows.mean("latency_ms", sender=name, publish_hz=rate) for rate in rates] for name in SENDERS}
         trio = list(zip(rates, ms["robofleet"], ms["rosbridge"], ms["ros-native"], strict=True))

@@ -1,12 +1,11 @@
-"""Fig. 4 of the Robofleet paper: how soon latency is back to nominal after a dropout.
+"""Fig. 4 of the Robofleet paper: time until latency is nominal again after a dropout.
 
-A sender's nominal latency is the median of what arrived before the dropout. Its recovery time runs from the link's
-return to the receipt of the first message from which on every message received has at most ``factor`` times that; a
-sender whose last message is still later never recovers.
+A sender's nominal latency is the median over messages received before the dropout. The sender has recovered once every
+further message received has at most ``factor`` times the nominal latency. Its recovery time runs from the link's return
+to the first of these messages, and is infinite if even the last message is later.
 
-The paper leaves open how long the dropout was, what was sent, how fast the link was, and whether native ROS was similar
-to Robofleet or to rosbridge. So the length and the link are swept, for one topic of each kind, at the rates that the
-paper's Fig. 6 and 7 have.
+The paper leaves open how long the dropout was, what was sent and how fast the link was. So we sweep the length and the
+link, for one topic of each kind, at the rates of the paper's Fig. 6 and 7.
 """
 
 from __future__ import annotations
@@ -35,10 +34,10 @@ KIND_COLOURS = {
 }
 PAPER_RATIO = 5.0
 ABOUT = (4.0, 6.0)
-"""What we let pass as "about 5 times"."""
+"""Range of ratios that we accept as "about 5 times"."""
 BEFORE_S = 10.0
 WATCHED = 12.0
-"""After the link's return we watch for so many dropouts, and for ``LEAST_WATCHED_S`` at least."""
+"""Time watched after the link's return, in dropout lengths; at least ``LEAST_WATCHED_S``."""
 LEAST_WATCHED_S = 30.0
 
 
@@ -49,13 +48,13 @@ class Reproduction(CloudFigure):
     dropouts_s: Sequence[float] = (1, 2, 5, 10, 20, 30)
     links_mbit_per_s: Sequence[float] = (12, 25, 50, 100)
     kinds: Sequence[str] = tuple(RATES_HZ)
-    """Of messages, one topic each time."""
+    """Kinds of messages, with one topic in each run."""
     factor: float = 2.0
-    """Latency within so many times nominal counts as nominal."""
+    """Ratio to the nominal latency up to which a latency counts as nominal."""
     silence_s: float = 0.0
-    """How long nothing is sent yet although the link is back, as TCP may be between two retransmissions."""
+    """Silence after the link's return, as TCP may wait for its next retransmission."""
     shown_s: float | None = None
-    """Which dropout the left panel shows; by default the one nearest to 10 s."""
+    """Dropout shown in the left panel; by default the one nearest to 10 s."""
 
     RULES = {
         "dropouts_s": several(above_0),
@@ -77,7 +76,7 @@ class Reproduction(CloudFigure):
 
     @played_once
     def run(self, kind: str, mbit: float, dropout_s: float, name: str, seed: int) -> tuple[float, Sent]:
-        """(when the link goes away, what became of the messages) for one dropout."""
+        """Play one dropout; return when the link goes away, and the messages' outcome."""
         away_s = BEFORE_S + float(np.random.default_rng(seed).random()) / RATES_HZ[kind]
         outage_s = dropout_s + self.silence_s
         watched_s = max(LEAST_WATCHED_S, WATCHED * outage_s)
@@ -174,9 +173,9 @@ class Reproduction(CloudFigure):
 
 
 def recovery_s(sent: Sent, away_s: float, back_s: float, factor: float) -> float:
-    """From the link's return at ``back_s`` until latency stays within ``factor`` times nominal; inf if it never does.
+    """Time from the link's return at ``back_s`` until latency stays within ``factor`` times nominal, or inf.
 
-    Nominal: the median of what was received before ``away_s``, when the link went away.
+    The nominal latency is the median over messages received before ``away_s``, when the link went away.
     """
     received = sent.received
     latency_s = received.latency_s
@@ -197,12 +196,12 @@ Cells = dict[tuple[str, float, float], tuple[float, ...]]
 
 
 def ratio(cell: Sequence[float]) -> float:
-    """Rosbridge's recovery to Robofleet's."""
+    """Divide rosbridge's recovery time by Robofleet's."""
     return cell[1] / cell[0] if cell[0] > 0 and math.isfinite(cell[0]) else math.nan
 
 
 def length_for(dropouts_s: Sequence[float], ratios: Sequence[float], target: float = PAPER_RATIO) -> str:
-    """The dropout for which the ratio is ``target``, by a line between the two lengths around it."""
+    """Interpolate linearly the dropout length at which the ratio is ``target``."""
     finite = sorted((d, r) for d, r in zip(dropouts_s, ratios, strict=True) if math.isfinite(r))
     for (d, r), (e, q) in pairwise(finite):
         if r <= target <= q:
@@ -213,7 +212,7 @@ def length_for(dropouts_s: Sequence[float], ratios: Sequence[float], target: flo
 
 
 def by_cell(rows: Rows) -> Cells:
-    """The mean recovery of each of ``SENDERS`` for each message, link and dropout."""
+    """Average the recovery of each of ``SENDERS`` for each message kind, link and dropout."""
     return {
         (kind, mbit, dropout): tuple(
             rows.mean("recovery_s", message=kind, link_mbit_per_s=mbit, dropout_s=dropout, sender=name)
@@ -224,5 +223,5 @@ def by_cell(rows: Rows) -> Cells:
 
 
 def groups(cells: Iterable[tuple[str, float, float]]) -> list[tuple[str, float]]:
-    """(kind, Mbit/s) of these cells, each once."""
+    """List the distinct (kind, Mbit/s) of these cells."""
     return list(dict.fromkeys((kind, mbit) for kind, mbit, _ in cells))

@@ -1,9 +1,9 @@
 """Fig. 5 of the Robofleet paper: latency and throughput while capacity falls evenly from 100 to 4 Mbit/s in 15 s.
 
-One PointCloud2 topic; its size and rate are not known to us: 10 Hz are what Robofleet's example client allows a cloud.
-A message's latency stands at the second in which it was received; the link stays at its last rate for a while, so that
-what is late comes in too. A program breaks in the first second in which the mean latency is beyond `BROKEN` times what
-one message needs by itself, at the capacity of that second.
+The paper gives neither size nor rate of its PointCloud2 topic; Robofleet's example client allows a cloud 10 Hz. A
+latency is plotted at the second in which its message was received. The link stays at its last rate for a while, so that
+late messages are received too. A program breaks in the first second whose mean latency exceeds `BROKEN` times the time
+that one message needs alone at the capacity of that second.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Reproduction(CloudFigure):
     from_mbit_per_s: float = 100.0
     to_mbit_per_s: float = 4.0
     fall_s: float = 15.0
-    """How long capacity falls."""
+    """Time over which capacity falls."""
     stay_s: float = 5.0
-    """How long it then stays, and messages still come."""
+    """Time at the last capacity, during which messages still arrive."""
     RULES = {"from_mbit_per_s": above_0, "to_mbit_per_s": above_0, "fall_s": above_0, "stay_s": at_least_0}
     LIVE = {
         "rate_hz": 5.0,
@@ -47,7 +47,7 @@ class Reproduction(CloudFigure):
         "runs": 1,
         "live": 1.0,
     }
-    """A quarter of the bytes a second, over a quarter of the link."""
+    """Options of a live run: a quarter of the bytes per second over a quarter of the link."""
     SIZE_INCHES = (7.5, 5.8)
 
     def __post_init__(self) -> None:
@@ -57,11 +57,11 @@ class Reproduction(CloudFigure):
 
     @property
     def until_s(self) -> float:
-        """When the last message comes."""
+        """Time of the last message's arrival."""
         return self.fall_s + self.stay_s
 
     def capacity(self, at_s: float) -> float:
-        """Of the link, Mbit/s."""
+        """Capacity of the link, Mbit/s."""
         return self.from_mbit_per_s + (self.to_mbit_per_s - self.from_mbit_per_s) * min(at_s / self.fall_s, 1)
 
     def simulate(self) -> Rows:
@@ -98,7 +98,7 @@ class Reproduction(CloudFigure):
         ]
 
     def broken(self, rows: Rows, name: str) -> int | None:
-        """The second in which this program breaks; None if it never does."""
+        """Find the second in which this program breaks; None if it never does."""
         size = dict(zip(("ros-native", "robofleet", "rosbridge"), cloud_bytes(self.points), strict=True))
         for second in rows.distinct("second"):
             alone_s = (
@@ -111,7 +111,7 @@ class Reproduction(CloudFigure):
     def claims(self, rows: Rows) -> dict[str, Any]:
         ros, size, _ = cloud_bytes(self.points)
         last_s = size / (self.to_mbit_per_s * MBIT)
-        # What is sent is never older than a period, jitter included: a newer one would have overwritten it.
+        # A message sent is at most one period old, plus jitter, because a newer one would have overwritten it.
         bound_s = last_s + (1 + JITTER) / self.rate_hz + self.round_trip_ms / 2e3
         published = self.runs * self.rate_hz * self.until_s
         share = {name: rows.column("received", sender=name).sum() / published for name in SENDERS}

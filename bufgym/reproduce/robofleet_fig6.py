@@ -1,9 +1,9 @@
-"""Fig. 6 of the Robofleet paper: latency against the number of consumers, 5 Hz point clouds over 12 Mbit/s.
+"""Fig. 6 of the Robofleet paper: latency against the number of consumers of 5 Hz point clouds over 12 Mbit/s.
 
-Native ROS sends one copy to each consumer over the uplink, Robofleet one in all to its server, which copies. Only the
-uplink is simulated: what the server's own links add is no part of this. Neither the size of a cloud nor the publisher's
-queue is in the paper: of both two are shown, of the sizes one that the link can carry eight times. Counted is what is
-received while clouds are published: what full queues hand over afterwards is no part of it.
+Native ROS sends one copy to each consumer over the uplink. Robofleet sends one copy to its server, which copies it.
+Only the uplink is simulated; the server's own links are left out. The paper gives neither the size of a cloud nor the
+publisher's queue, so we show several of each; the link can carry the smallest clouds eight times. Only messages
+received while clouds are published count, not those that full queues deliver afterwards.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from bufgym.reproduce.rows import Rows, average, listed
 from bufgym.traces.generate import steady
 
 CONSTANT = 1.05
-"""Robofleet's latency with the most consumers, to that with one: within this it is constant."""
+"""Largest ratio of Robofleet's latency with the most consumers to its latency with one that counts as constant."""
 STRAIGHT = 0.98
-"""Correlation of native ROS's mean latency with the number of consumers from which on it is linear."""
+"""Least correlation of native ROS's mean latency with the number of consumers that counts as linear."""
 
 
 @dataclass(frozen=True)
 class Reproduction(ClientFigure):
-    """Fig. 6 for clouds of so many points and 1 to ``max_consumers`` consumers."""
+    """Fig. 6 for clouds of ``points`` points and 1 to ``max_consumers`` consumers."""
 
     points: Sequence[int] = (1_500, 4_000, 10_000)
-    """Of a cloud, 16 bytes each; one panel each."""
+    """Numbers of points of a cloud, 16 bytes each; one panel per number."""
     max_consumers: int = 8
     rate_hz: float = 5.0
     mbit_per_s: float = 12.0
     queue_sizes: Sequence[int] = (1, 10)
-    """Of native ROS, messages to each consumer; one line each."""
+    """Queues of native ROS, in messages to each consumer; one line per size."""
     duration_s: float = 60.0
-    """How long is published."""
+    """Publishing time."""
 
     LIVE = {"points": (4_000,), "max_consumers": 4, "queue_sizes": (10,), "duration_s": 6.0, "runs": 1, "live": 1.0}
     RULES = {"points": several(whole(1, 10**7)), "max_consumers": whole(2, 100)}
@@ -70,7 +70,7 @@ class Reproduction(ClientFigure):
         return rows
 
     def fits(self, points: int) -> float:
-        """Copies of such a cloud that the link carries, as ROS binary."""
+        """Number of copies of such a cloud, as ROS binary, that the link carries."""
         return self.mbit_per_s * MBIT / (self.rate_hz * cloud_bytes(points)[0])
 
     def tables(self, rows: Rows) -> list[str]:
@@ -124,7 +124,7 @@ class Reproduction(ClientFigure):
         }
 
     def size_inches(self, rows: Rows) -> tuple[float, float]:
-        return max(5.6, 4.4 * len(self.points) + 0.4), 4.2  # the legend's width is the least
+        return max(5.6, 4.4 * len(self.points) + 0.4), 4.2  # at least the legend's width
 
     def draw(self, rows: Rows, figure: Any) -> None:
         panels = figure.subplots(1, len(self.points), squeeze=False)[0]
@@ -132,7 +132,7 @@ class Reproduction(ClientFigure):
         for axes, points in zip(panels, self.points, strict=True):
             for k, (name, label) in enumerate(rows.distinct("sender", "line")):
                 style = PROGRAMS[name].style | {"zorder": 3 - 0.1 * k}
-                if k > 2:  # further queues: open and larger, so that equal lines stay visible
+                if k > 2:  # markers of further queues are open and larger, so that equal lines stay visible
                     style |= {"linestyle": "--", "markersize": 5.5 + 2 * k, "markerfacecolor": "none"}
                 axes.plot(consumers, self.latencies_s(rows, points, label), label=label, **style)
             if (fits := self.fits(points)) < self.max_consumers:
@@ -147,5 +147,5 @@ class Reproduction(ClientFigure):
 
 
 def least_share(sent: Sent, received: NDArray[np.bool_]) -> float:
-    """Part of its messages that the consumer with the fewest got; ``received``, bool[messages]: which counted."""
+    """Smallest share of its messages that a consumer got; ``received``, bool[messages], marks those that count."""
     return float((np.bincount(sent.consumer, received) / np.bincount(sent.consumer)).min())

@@ -1,9 +1,9 @@
 """Fig. 7 of the Robofleet paper: latency of each topic as a robot drives into a bad zone.
 
-PoseStamped at 10 Hz, LaserScan at 10 Hz, CompressedImage at 2 Hz; the zone begins at about message 430, which we count
-on the topics of 10 Hz. How bad the zone was is not in the paper, nor which topic was no_drop, nor the priorities: here
-the link falls from one steady rate to another, poses are no_drop, and priorities are those of Robofleet's example
-client (localization 20, laser scans 2, images 1); lower ones of images are tried as well.
+The topics are PoseStamped at 10 Hz, LaserScan at 10 Hz and CompressedImage at 2 Hz. The zone begins at about message
+430, which we count on the topics of 10 Hz. The paper does not say how bad the zone was, which topic was no_drop, or
+what the priorities were. Here the link falls from one steady rate to another and poses are no_drop. Priorities follow
+Robofleet's example client: localization 20, laser scans 2, images 1. We also try lower priorities of images.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ TOPICS = {
     "LaserScan": (10.0, {"priority": 2.0}),
     "CompressedImage": (2.0, {"priority": 1.0}),
 }
-"""Kind -> publish rate, Hz, and what the operator asks of it."""
+"""Kind -> publish rate in Hz and the operator's settings of the topic."""
 LOOKS = {
     "PoseStamped": (COLOURS["afr"], "o", 2.5),
     "LaserScan": (COLOURS["drop-oldest"], "s", 2.5),
@@ -48,9 +48,9 @@ LOOKS = {
 """Kind -> colour, marker and its size."""
 COUNTED_HZ = 10.0
 SPIKE = 2.0
-"""A topic is affected by the zone until the last receipt with a latency beyond so many times its highest before it."""
+"""Ratio to a topic's highest latency before the zone; the topic is affected until its last latency beyond that."""
 KEPT = 2.0
-"""A latency is kept whose median in the zone is within so many times that before it, own bytes slower as they are."""
+"""Ratio up to which a median latency counts as kept in the zone, after allowing for slower transmission."""
 
 
 @dataclass(frozen=True)
@@ -59,19 +59,19 @@ class Reproduction(ClientFigure):
 
     bad_mbit_per_s: Sequence[float] = (4.0, 2.0, 1.0, 0.5)
     good_mbit_per_s: float = 10.0
-    """Of the link elsewhere; at 100 rosbridge's backlog is gone in a moment, and its long recovery cannot be seen."""
+    """Link rate outside the zone. At 100 rosbridge's backlog vanishes at once, which hides its long recovery."""
     image_priorities: Sequence[float] = (1.0, 0.1, 0.01)
-    """Of Robofleet's images; the first in every zone, all of them in the one that is shown."""
+    """Priorities of Robofleet's images: the first in every zone, all of them in the zone shown."""
     bad_from: int = 430
-    """The message, of a topic of 10 Hz, with which the zone begins."""
+    """Message of a 10 Hz topic at which the zone begins."""
     bad_s: float = 30.0
-    """How long it lasts."""
+    """Length of the zone."""
     after_s: float = 60.0
-    """How long the link is good again."""
+    """Time of good link after the zone."""
     queue_size: int = QUEUE_SIZE
-    """Of native ROS, messages a topic."""
+    """Queue of native ROS, messages per topic."""
     shown_mbit_per_s: float | None = None
-    """Which zone the picture shows; by default the third, or the last."""
+    """Zone shown in the picture; by default the third, or the last."""
 
     RULES = {
         "bad_mbit_per_s": several(above_0),
@@ -99,18 +99,18 @@ class Reproduction(ClientFigure):
 
     @property
     def shown(self) -> float:
-        """Mbit/s of the zone that the picture shows."""
+        """Link rate in the zone shown, Mbit/s."""
         return self.shown_mbit_per_s or self.bad_mbit_per_s[:3][-1]
 
     @property
     def zone_s(self) -> tuple[float, float]:
-        """When the bad zone begins and ends."""
+        """Begin and end of the bad zone."""
         from_s = self.bad_from / COUNTED_HZ
         return from_s, from_s + self.bad_s
 
     @played_once
     def run(self, bad: float, name: str, image_priority: float, seed: int) -> Sent:
-        """What became of the messages of one drive through the zone."""
+        """Send the messages of one drive through the zone."""
         rates = ((self.zone_s[0], self.good_mbit_per_s), (self.bad_s, bad), (self.after_s, self.good_mbit_per_s))
         link = Trace.steps([(length_s, mbit * MBIT) for length_s, mbit in rates], after="hold")
         changed: dict[str, dict[str, Any]] = {"CompressedImage": {"priority": image_priority}}
@@ -148,7 +148,7 @@ class Reproduction(ClientFigure):
         ]
 
     def _kept(self, rows: Rows) -> list[str]:
-        """Whether images are dropped and small messages keep their latency, with the numbers."""
+        """Tabulate whether images are dropped and small messages keep their latency."""
         small = ("PoseStamped", "LaserScan")
         lines = [["", "images dropped", *(head for kind in small for head in (f"{kind}, ms", "at most", "kept"))]]
         for bad, priority in rows.distinct("bad_mbit_per_s", "image_priority"):
@@ -164,7 +164,7 @@ class Reproduction(ClientFigure):
         return table(lines)
 
     def affected(self, rows: Rows, name: str) -> list[float]:
-        """For each zone, how long after its end the topic that recovers last is still affected, s; mean over runs."""
+        """List for each zone how long after it the last topic is still affected, s, mean over runs."""
         first = rows.where(sender=name, image_priority=self.image_priorities[0])
         return [
             max(first.mean("affected_after_s", bad_mbit_per_s=bad, topic=kind) for kind in TOPICS)
@@ -224,7 +224,7 @@ class Reproduction(ClientFigure):
                 style = {"color": colour, "markersize": size, "label": label}
                 axes.plot(COUNTED_HZ * received.arrival_s, received.latency_s, marker, **style)
                 dropped = COUNTED_HZ * topic.arrival_s[np.isnan(topic.received_s)]
-                # A tick along the bottom, a line a topic.
+                # Ticks along the bottom, one line per topic.
                 ticks = {"markersize": 5, "markeredgewidth": 0.6, "transform": axes.get_xaxis_transform()}
                 axes.plot(dropped, np.full(len(dropped), 0.03 + 0.045 * k), "|", color=colour, **ticks)
             axes.axvspan(*(COUNTED_HZ * s for s in self.zone_s), color=COLOURS["other"], alpha=0.2, linewidth=0)
@@ -240,7 +240,7 @@ class Reproduction(ClientFigure):
 
 
 def _entry(sent: Sent, zone_s: tuple[float, float]) -> Row:
-    """What became of one topic before the zone and in it."""
+    """Summarize one topic before the zone and in it."""
     zone = sent.between(*zone_s)
     latency_s, received = zone.received.latency_s, sent.received
     before_s = sent.between(0, zone_s[0]).received.latency_s

@@ -1,9 +1,8 @@
-"""Table I of the Robofleet paper: bytes of a message as ROS binary, as Robofleet's flatbuffer, as rosbridge's JSON.
+"""Table I of the Robofleet paper: bytes of a message as ROS binary, Robofleet flatbuffer and rosbridge JSON.
 
 The paper [sikand2021robofleet] names types and bytes, not contents. We build a message of each type that has the
-paper's bytes as ROS binary, then encode the same message in the other ways. What is ours alone to choose (beams,
-topics, content) is stated in the text; PointCloud2, PoseStamped and Odometry are in the paper's experiments but not in
-its table.
+paper's bytes as ROS binary, then encode the same message in the other ways. The text states our own choices of beams,
+topics and content. PointCloud2, PoseStamped and Odometry are in the paper's experiments but not in its table.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ PAPER = {
 }
 """Bytes as ROS binary, Robofleet flatbuffer and rosbridge JSON."""
 COLUMN = {"ros1": 0, "robofleet": 1, "robofleet-bare": 1, "json": 2, "json-numbers": 2}
-"""Encoding -> the column of ``PAPER`` that it stands beside."""
+"""Encoding -> the column of ``PAPER`` to compare it with."""
 SHOWN = {
     "cdr": ("ROS 2 CDR", COLOURS["other"]),
     "robofleet": ("Robofleet, type and topic inside", COLOURS["afr"]),
@@ -38,7 +37,7 @@ SHOWN = {
 }
 """Encoding -> label and colour of its bars."""
 MAX_FRAME_ID = 64
-"""Longest frame_id, in letters, that we take for likely."""
+"""Longest frame_id, in letters, that we consider likely."""
 
 
 @dataclass(frozen=True)
@@ -46,21 +45,21 @@ class Reproduction(Figure):
     """Table I for every kind of message in ``encodings``."""
 
     beams: int = 1800
-    """Of the LaserScan; its frame_id is made as long as the paper's size needs."""
+    """Beams of the LaserScan; its frame_id is made as long as the paper's size needs."""
     points: int = 10_000
-    """Of the PointCloud2, which the paper's table leaves out."""
+    """Points of the PointCloud2, which the paper's table leaves out."""
     point_step: int = 16
-    """Bytes of one of these points."""
+    """Bytes per point."""
     topic: str = "/robot/topic"
-    """Goes into the flatbuffer and the JSON."""
+    """Topic name written in the flatbuffer and the JSON."""
     seed: int = 0
-    """Of every message's content."""
+    """Seed of every message's content."""
 
     SIZE_INCHES = (9.0, 4.8)
 
     @cached_property
     def messages(self) -> dict[str, Content]:
-        """Kind -> the message that is encoded."""
+        """Map each kind to the message that is encoded."""
         messages = fitted(self.beams, self.seed)
         for kind in KINDS:
             parameters = {"points": self.points, "point_step": self.point_step} if kind == "PointCloud2" else {}
@@ -107,7 +106,7 @@ class Reproduction(Figure):
         return equal | listed | others | self._contents() | self._flatbuffers(sizes) | self._json(sizes)
 
     def _contents(self) -> dict[str, Any]:
-        """What was chosen so that the ROS binaries have the paper's bytes."""
+        """Give the choices with which the ROS binaries have the paper's bytes."""
         scan, fix, image = (self.messages[kind] for kind in PAPER)
         beams, letters = len(scan["ranges"]), len(scan["header"]["frame_id"])
         others = (f"{beams + (letters - n) // 4:,} and {n}" for n in range(letters % 4, 17, 4) if n != letters)
@@ -119,11 +118,11 @@ class Reproduction(Figure):
         }
 
     def _flatbuffers(self, sizes: dict[str, dict[str, int]]) -> dict[str, Any]:
-        """The flatbuffers beside the paper's, and by how much an image's can be longer than its ROS binary."""
+        """Compare flatbuffer sizes with the paper's, and find how much longer than ROS binary an image can be."""
         added = [sizes[kind]["robofleet"] - sizes[kind]["robofleet-bare"] for kind in PAPER]
         scan = self.messages["LaserScan"]
         zero = len(encode("LaserScan", {**scan, "header": {**scan["header"], "seq": 0}}, "robofleet-bare"))
-        # Nothing in this table is aligned to more than 4 bytes: these are all the lengths that can differ.
+        # Alignment in this table is at most 4 bytes, so these lengths cover all differences.
         longer = []
         for a, b, c, seq in itertools.product(*[range(4)] * 3, range(2)):
             image = content("CompressedImage", frame_id="c" * a, format="f" * b, data_bytes=100 + c)
@@ -144,7 +143,7 @@ class Reproduction(Figure):
         }
 
     def _json(self, sizes: dict[str, dict[str, int]]) -> dict[str, Any]:
-        """The JSON beside the paper's, and what of a message's content would make them equal."""
+        """Compare JSON sizes with the paper's, and find message content that would make them equal."""
 
         def bytes_(kind: str, **changed: Any) -> int:
             return len(encode(kind, self.messages[kind] | changed, "json-numbers", self.topic))
@@ -187,7 +186,7 @@ class Reproduction(Figure):
 
 
 def sizes_of(rows: Rows) -> dict[str, dict[str, int]]:
-    """Kind -> encoding -> bytes."""
+    """Map kind and encoding to bytes."""
     sizes: dict[str, dict[str, int]] = {}
     for row in rows:
         sizes.setdefault(row["message"], {})[row["encoding"]] = row["bytes"]
@@ -195,12 +194,12 @@ def sizes_of(rows: Rows) -> dict[str, dict[str, int]]:
 
 
 def of_paper(kind: str, encoding: str) -> int | None:
-    """The paper's bytes that this is to stand beside; None where it gives none."""
+    """Find the paper's bytes to compare with, or None where it gives none."""
     return PAPER[kind][COLUMN[encoding]] if kind in PAPER and encoding in COLUMN else None
 
 
 def fitted(beams: int, seed: int = 0) -> dict[str, Content]:
-    """A message of each of the paper's types whose ROS binary is as long as the paper's."""
+    """Build a message of each of the paper's types whose ROS binary is as long as the paper's."""
 
     def bytes_(kind: str, **parameters: Any) -> int:
         return len(encode(kind, content(kind, **parameters), "ros1"))

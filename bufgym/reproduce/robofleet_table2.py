@@ -1,9 +1,9 @@
-"""Table II of the Robofleet paper: what a client takes of the machine, with 1 to 5 topics.
+"""Table II of the Robofleet paper: CPU and memory of a client with 1 to 5 topics.
 
-The real programs: our client at our relay, and beside it a client in rosbridge's way, which makes JSON of each message
-and puts it on a WebSocket. Each is a process of its own; a third has the same messages and sends nothing, so that what
-Python takes can be told from what sending takes. The relay, and what reads the JSON, are in this process and not
-counted. The paper's programs, messages and rates are not these.
+We run real programs: our client at our relay, and a client that sends JSON over a WebSocket as rosbridge does. Each is
+a process of its own. A third process makes the same messages and sends nothing, so that the cost of Python can be told
+from the cost of sending. The relay and the reader of the JSON run in this process and are not counted. The paper uses
+other programs, messages and rates.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from bufgym.reproduce.figure import COLOURS, Figure, finish, legend_below, sever
 from bufgym.reproduce.rows import Rows, listed
 
 TOPICS: Final = ("LaserScan", "CompressedImage", "NavSatFix", "PoseStamped", "Odometry")
-"""What is published on the first topic, the second, ..."""
+"""Kind of message on each topic."""
 PROGRAMS: Final = {
     "bufgym": ("our client", COLOURS["afr"]),
     "json": ("JSON, rosbridge's way", COLOURS["random"]),
@@ -34,7 +34,7 @@ PROGRAMS: Final = {
 }
 """Program -> label and colour."""
 _SETTLE_S: Final = 2.0
-"""Before it counts: connections, and code that is compiled or read from a cache."""
+"""Time before counting begins, for connections and for code to be compiled or loaded from a cache."""
 _START_S: Final = 120.0
 _BYTES: Final = 2**20
 
@@ -45,9 +45,9 @@ class Reproduction(Figure):
 
     topics: Sequence[int] = (1, 2, 3, 4, 5)
     rate_hz: int = 10
-    """Of each topic."""
+    """Rate of each topic."""
     seconds: int = 8
-    """Of each run that are counted."""
+    """Seconds counted of each run."""
     runs: int = 1
 
     SIZE_INCHES = (9.0, 4.0)
@@ -61,7 +61,7 @@ class Reproduction(Figure):
         return rows
 
     async def _measured(self, program: str, count: int) -> dict[str, float]:
-        """What one process took, as it says itself."""
+        """Run one process; return the costs that it reports."""
         listening = {"bufgym": _relay, "json": _sink, "nothing": _nobody}[program]
         port, close = await listening()
         words = [program, str(port), str(count), str(self.rate_hz), str(self.seconds)]
@@ -131,7 +131,7 @@ async def _relay() -> tuple[int, Close]:
 
 
 async def _sink() -> tuple[int, Close]:
-    """Reads, and forgets."""
+    """Start a server that reads and discards."""
     try:
         from websockets.asyncio.server import serve
     except ModuleNotFoundError:
@@ -161,12 +161,12 @@ async def _nobody() -> tuple[int, Close]:
 
 
 def name_of(number: int) -> str:
-    """Of a topic."""
+    """Name a topic."""
     return f"/robots/robot/{number}"
 
 
 async def _client(program: str, port: int, count: int, rate_hz: float, seconds: float) -> dict[str, float]:
-    """Publish, and say what that took."""
+    """Publish, then report the cost."""
     messages = [content(kind) for kind in TOPICS[:count]]
     binary = [encode(kind, message, "ros1") for kind, message in zip(TOPICS, messages, strict=False)]
     if program == "bufgym":

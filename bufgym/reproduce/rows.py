@@ -1,4 +1,4 @@
-"""The numbers of a figure as rows, what they are asked for, and how tables of them are written."""
+"""Rows of a figure's numbers: queries, and tables of text."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Row = dict[str, Any]
 
 
 class Rows(list[Row]):
-    """Rows with the same columns; in each method ``where`` limits them to those whose columns have these values."""
+    """Rows with the same columns. In each method ``where`` selects rows whose columns have these values."""
 
     def where(self, **values: object) -> Rows:
         return Rows(row for row in self if all(row[name] == value for name, value in values.items()))
 
     def column(self, name: str, **where: object) -> NDArray[np.float64]:
-        """One column, float64[rows]."""
+        """Return one column, float64[rows]."""
         return np.array([row[name] for row in self.where(**where)], np.float64)
 
     def mean(self, name: str, **where: object) -> float:
@@ -32,16 +32,16 @@ class Rows(list[Row]):
         return average(self.column(name, **where))
 
     def distinct(self, *names: str) -> list[Any]:
-        """The values of one column (tuples, of several), each once, in the order of the rows."""
+        """List the distinct values of a column in row order; several columns give tuples."""
         values = (row[names[0]] if len(names) == 1 else tuple(row[name] for name in names) for row in self)
         return list(dict.fromkeys(values))
 
     def pivot(self, index: str, by: str, value: str, spec: str, labels: Mapping[Any, str] | None = None) -> list[str]:
-        """A table of means of the column ``value``: a line for each of ``index``, a column for each of ``by``.
+        """Tabulate means of the column ``value``, with a line per value of ``index`` and a column per value of ``by``.
 
         Args:
-            spec: how a mean is written, such as ".1f" or ".0%".
-            labels: what a line or column is called, where that is not its value.
+            spec: format of a mean, such as ".1f" or ".0%".
+            labels: names of lines and columns to show instead of their values.
         """
         known = labels or {}
 
@@ -66,12 +66,12 @@ class Rows(list[Row]):
 
 
 def average(numbers: NDArray[np.float64]) -> float:
-    """Mean; NaN of nothing."""
+    """Mean, or NaN without numbers."""
     return float(numbers.mean()) if len(numbers) else math.nan
 
 
 def table(lines: Sequence[Sequence[object]], left: int = 1) -> list[str]:
-    """Lines of a table with aligned columns: the first ``left`` flush left, the others flush right."""
+    """Align the columns of a table; the first ``left`` columns are flush left, the others flush right."""
     texts = [[str(cell) for cell in line] for line in lines]
     widths = [max(map(len, cells)) for cells in zip(*texts, strict=True)]
     return [
@@ -81,5 +81,5 @@ def table(lines: Sequence[Sequence[object]], left: int = 1) -> list[str]:
 
 
 def listed(numbers: Sequence[Any]) -> str:
-    """``1, 2, 3``; ``none`` for nothing."""
+    """Join as in ``1, 2, 3``; an empty sequence gives ``none``."""
     return ", ".join(map(str, numbers)) or "none"

@@ -1,7 +1,7 @@
-"""Every policy beside the exact optimum of those that don't know the future, over a link small enough to solve.
+"""Every policy beside the exact optimum without knowledge of the future, over a link small enough to solve.
 
-The link, the programme and what the optimum knows are those of ``bufgym.oracle.small_link``. All policies meet the same
-episodes, so regrets are compared without the chance of the draw.
+``bufgym.oracle.small_link`` defines the link, the programme and the optimum's knowledge. All policies meet the same
+episodes, so differences in regret do not come from the draw of episodes.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from bufgym.scenario import Episode, messages
 from bufgym.traces import Trace
 
 PERIOD_US = 100_000
-"""Between arrivals: so a rate lasts a second, as it does on links of robots."""
+"""Time between arrivals. A link rate then lasts about a second, as on robots' links."""
 SIZE_BYTES = 100_000
-"""Of a message: at one message a period the link carries a byte in a us."""
+"""Size of a message. At one message per period the link carries one byte per us."""
 OPTIMUM, FULL, IDLE = "optimum", "optimum, only when full", "optimum, always asked"
 IDLE_UP_TO = 3
-"""L up to which the programme is solved for ``IDLE`` too: it takes as long again."""
+"""Largest L for which ``IDLE`` is solved too, which doubles the time."""
 NAMES = ("afr", "drop-oldest", "random", "min-gap", "min-motion-gap", "paced-motion-gap")
-"""Played beside the optimum, AFR first."""
+"""Policies played beside the optimum, AFR first."""
 LEARNED = ("learned-motion", "learned-time")
-"""Agents, by name."""
+"""Learned policies played too."""
 STYLES = {OPTIMUM: ("oracle", "-"), FULL: ("oracle", ":"), "min-gap": ("random", "-")}
 STYLES |= {"learned-motion": ("sky", "--"), "paced-motion-gap": ("orange", "-")}
 
 
 def episode(states: NDArray[np.int64]) -> Episode:
-    """One message a period over a link in these states of the chain, and at its best once all have arrived."""
+    """Make one message per period over a link in these states; the link is at its best once all have arrived."""
     rates = [float(QUARTERS[state]) / MESSAGE * SIZE_BYTES / PERIOD_US * 1e6 for state in states]
     steps = Trace.steps(
         [*((PERIOD_US / 1e6, rate) for rate in rates), (1.0, SIZE_BYTES / PERIOD_US * 1e6)], name="small"
@@ -53,7 +53,7 @@ def episode(states: NDArray[np.int64]) -> Episode:
 
 @dataclass(frozen=True)
 class Reproduction(Figure):
-    """The optimum and every policy for each L, over the same episodes."""
+    """The optimum and every policy for each L over the same episodes."""
 
     capacities: Sequence[int] = (2, 3, 4)
     runs: int = 100
@@ -65,7 +65,8 @@ class Reproduction(Figure):
     RULES = {"capacities": several(whole(2, 6)), "arrivals": whole(2), "depth": whole(2, 16), "seed": whole(0)}
 
     def simulate(self) -> Rows:
-        """A row for each L and policy: E[H] of the programme, mean H and its error, the share of AFR's regret."""
+        """Return a row for each L and policy: the programme's E[H], mean H, its error, and the share of AFR's
+        regret."""
         chain, v = Chain(self.stays), cut_off(qoi.exponential(0.618), self.depth)
         rng = np.random.default_rng(self.seed)
         episodes = [episode(chain.draw(self.arrivals, rng)).with_uniforms(rng) for _ in range(self.runs)]

@@ -1,16 +1,16 @@
-"""ROS 1: the queue inside rospy under a policy, its interface unchanged.
+"""ROS 1: a policy rules the queue inside rospy, whose interface stays the same.
 
     import bufgym.ros1
 
     bufgym.ros1.install(policy="afr")  # before the first subscriber comes; the node stays as it is
     publisher = rospy.Publisher("/camera", Image, queue_size=15)
 
-or, for a node that is not touched at all,
+or, for an unmodified node,
 
     python -m bufgym.ros1 --policy learned-motion --odom /odom NODE.py ARGS
 
-``queue_size`` is L, and each subscriber has a queue of its own. Publishers without one (rospy then sends at once, in
-``publish``), with ``queue_size=0`` (no end) and the topics of ``UNTOUCHED`` stay rospy's.
+``queue_size`` is L, and each subscriber has a queue of its own. Publishers without ``queue_size`` send at once in
+``publish``, and ``queue_size=0`` is unbounded. Both, and the topics of ``UNTOUCHED``, stay rospy's.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from bufgym.ros1.connection import PolicyConnection
 from bufgym.traces import MotionSettings
 
 UNTOUCHED: Final = ("/rosout", "/tf", "/tf_static", "/clock")
-"""Small, and read by all; a policy that is named for one of them rules it all the same."""
+"""Small topics that every node reads. A policy named for one of them still rules it."""
 _ROOM: Final = 4096
-"""Of a queue's bookkeeping: half a MB for each subscriber."""
+"""Size of a queue's bookkeeping, half a MB for each subscriber."""
 
 
 @contextmanager
 def needs_rospy() -> Iterator[None]:
-    """An error that says how to get ROS 1 where the block cannot import it."""
+    """Raise an error that says how to get ROS 1 if the block can't import it."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -60,19 +60,19 @@ def install(
     value: Value | None = None,
     log: str | Path | None = None,
 ) -> None:
-    """From now on, queues of this process's publishers are ruled by ``policy``.
+    """Put the queues of this process's publishers under ``policy`` from now on.
 
     Args:
-        policy: a registered policy by name, or a ``Policy``; None: rospy's own queue.
-        topics: other policies for single topics, by their resolved names ("/camera/image").
-        odometry: a topic with poses (Odometry, PoseStamped and the like), which gives x: how far the scene has moved
-            on. None: x counts messages.
+        policy: name of a registered policy, or a ``Policy``; None keeps rospy's own queue.
+        topics: other policies for single topics by resolved name, such as "/camera/image".
+        odometry: a topic with poses, such as Odometry or PoseStamped, which gives x, the scene's motion. None: x counts
+            messages.
         motion: the camera's field of view and the scene's scale, for ``odometry``.
         value: V (default: 1 - 0.618^d over messages, 1 - e^-d over motion).
-        log: a folder that takes a log of each queue, ``TOPIC-K.mcap``.
+        log: folder for a log of each queue, ``TOPIC-K.mcap``.
 
     Raises:
-        BufgymError: rospy is not there, or no such policy, or one that no live queue can have.
+        BufgymError: rospy is not installed, or the policy is unknown or cannot rule a live queue.
     """
     with needs_rospy():
         from rospy import topics as rospy_topics
@@ -91,7 +91,7 @@ def install(
     numbers = itertools.count()
 
     def queued(connection: Any, queue_size: int) -> Any:
-        """What rospy wraps a new subscriber's connection in."""
+        """Wrap a new subscriber's connection; replaces rospy's own wrapper."""
         ruling = chosen.get(connection.name, policy)
         if ruling is None or queue_size < 1:
             return QueuedConnection(connection, queue_size)
@@ -106,7 +106,7 @@ def install(
 
 
 def _warm_up(policy: Any, value: Value) -> None:
-    """Errors and compiling come now, not with the first subscriber."""
+    """Check and compile now instead of at the first subscriber."""
     queue = PolicyQueue(policy, 1, value=value, room=_ROOM)
     for _ in range(3):
         queue.put(None, 1)
@@ -119,7 +119,7 @@ def _log_file(folder: Path, topic: str, number: int) -> LogFile:
 
 
 class _Subscribed:
-    """Odometry from a topic of any type that has a pose, subscribed once there is a queue that needs it."""
+    """Odometry from a topic of any type with a pose, subscribed once a queue needs it."""
 
     def __init__(self, topic: str, odometry: Odometry) -> None:
         self._topic, self._odometry = topic, odometry

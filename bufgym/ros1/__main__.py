@@ -1,4 +1,4 @@
-"""``python -m bufgym.ros1 --policy afr NODE.py ARGS``: a rospy node as it is, its queues under a policy."""
+"""``python -m bufgym.ros1 --policy afr NODE.py ARGS`` runs an unmodified rospy node with its queues under a policy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RULES = "also mine.safetensors or module:function, whose code is run; 'rospy': r
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node; the exit code."""
+    """Run the node; return the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m bufgym.ros1", description="Run a rospy node as it is, its queues under a policy."
     )
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _choice(text: str) -> tuple[str, str | None]:
-    """(the topic, "" for all; its policy, None for rospy's own queue)."""
+    """Parse a choice: the topic, "" for all, and its policy, None for rospy's own queue."""
     topic, _, name = text.partition("=") if text.startswith("/") else ("", "", text)
     if name == "rospy":
         return topic, None

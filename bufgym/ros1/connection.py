@@ -1,7 +1,7 @@
-"""One subscriber's connection, whose queue a policy rules: what stands where rospy has its ``QueuedConnection``.
+"""Connection of one subscriber with a queue ruled by a policy, in place of rospy's ``QueuedConnection``.
 
-rospy's own sender takes its whole queue at once and writes it into a socket whose buffers grow to megabytes: nothing
-of that can be dropped any more. This one takes a message at a time from a ``PolicyQueue``, and the next one when the
+rospy's own sender takes its whole queue at once and writes it into a socket whose buffers grow to megabytes, where
+nothing can be dropped any more. This one takes one message at a time from a ``PolicyQueue``, and the next when the
 subscriber's system has acked nearly all of it.
 """
 
@@ -22,7 +22,7 @@ _POLL_S: Final = 0.001
 
 
 class PolicyConnection:
-    """Behaves as rospy's connection does, and all that is not about the queue is its."""
+    """Behaves like rospy's connection, and delegates to it everything except the queue."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class PolicyConnection:
         x: Callable[[], float | None] = lambda: None,
         log: LogFile | None = None,
     ) -> None:
-        """``connection``: a ``TCPROSTransport``; ``x``: the coordinate now; ``log``: closed with the connection."""
+        """``connection`` is a ``TCPROSTransport``, ``x`` gives the coordinate now, and ``log`` is closed at the end."""
         self._connection = connection
         self.queue = queue
         self._x = x
@@ -52,10 +52,10 @@ class PolicyConnection:
         return getattr(self._connection, name)
 
     def write_data(self, data: bytes) -> bool:
-        """A serialized message arrives at the queue. Never blocks.
+        """Put a serialized message into the queue; never blocks.
 
         Raises:
-            Exception: that of the last message sent, as rospy's own connection does.
+            Exception: the error of the last message sent, as from rospy's own connection.
         """
         if self._error is not None:
             error, self._error = self._error, None
@@ -78,9 +78,10 @@ class PolicyConnection:
                 self._log.close()
 
     def _send(self, message: memoryview) -> None:
-        """Returns when a message has left: nearly all of it is acked.
+        """Send a message and wait until nearly all of it is acked.
 
-        Nearly, as the subscriber's system delays its last ack by up to 40 ms, which small messages can't wait for.
+        Its last ack is not awaited, because the subscriber's system delays it by up to 40 ms, too long for small
+        messages.
         """
         connection = self._connection
         messages = connection.stat_num_msg
@@ -89,7 +90,7 @@ class PolicyConnection:
             for start in range(0, len(message), PIECE_BYTES):
                 piece = message[start : start + PIECE_BYTES]
                 connection.write_data(piece)
-                connection.stat_num_msg = messages  # rospy counts a message for each writing
+                connection.stat_num_msg = messages  # rospy counts each write as a message
                 self._unwritten_bytes -= len(piece)
             connection.stat_num_msg = messages + 1
         finally:

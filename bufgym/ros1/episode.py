@@ -1,9 +1,9 @@
-"""An episode through ROS 1: a rospy node under ``install``, a shaped link, a rospy subscriber.
+"""Episode through ROS 1: a rospy node under ``install``, a shaped link, a rospy subscriber.
 
     node (camera, odometry) -> PolicyConnection ==shaped link==> subscriber
 
-Camera and odometry are an ordinary node's, which knows nothing of any policy. The policy has x from the odometry's
-topic. All goes as in real time.
+An ordinary node, unaware of any policy, publishes camera and odometry. The policy has x from the odometry's topic.
+Everything runs in real time.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def player() -> Play:
     """Plays episodes through ROS 1.
 
     Raises:
-        BufgymError: it is not here.
+        BufgymError: ROS 1 is not installed.
     """
     with ros1.needs_rospy():
         for module in ("rospy", "rosmaster.master"):
@@ -60,7 +60,7 @@ def player() -> Play:
 def play(
     policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
 ) -> list[Received]:
-    """What a rospy subscriber gets of the episode's messages. Randomised policies make draws of their own."""
+    """Play the episode; return the messages that a rospy subscriber got. Randomised policies use their own draws."""
     if speed != 1:
         raise BufgymError(f"speed = {speed:g}: must be 1 with ROS, whose nodes live in real time")
     warm(PolicyQueue(policy, capacity, value=value))
@@ -90,7 +90,7 @@ async def _play(begun: Sequence[Program], episode: Episode) -> list[Received]:
 
 
 def _in_ros(uri: str, logs: str, node: str) -> None:
-    """This process is a node of that name."""
+    """Make this process a node of that name."""
     os.environ.update(ROS_MASTER_URI=uri, ROS_IP="127.0.0.1", ROS_LOG_DIR=logs)
     import rospy
 
@@ -98,7 +98,7 @@ def _in_ros(uri: str, logs: str, node: str) -> None:
 
 
 def _view(logs: str, parent: Connection) -> None:
-    """The master, and a subscriber that connects through the link."""
+    """Run the master, and a subscriber that connects through the link."""
     from rosmaster.master import Master
 
     master = Master(0)
@@ -129,7 +129,7 @@ def _view(logs: str, parent: Connection) -> None:
 
 
 def _publish(logs: str, policy: Policy, episode: Episode, capacity: int, value: Value, parent: Connection) -> None:
-    """The node, and around it what tells the others how it goes."""
+    """Run the node, and report its progress to the other programs."""
     uri = parent.recv()
     ros1.install(policy, topics={ODOMETRY: None}, odometry=ODOMETRY, value=value)
 

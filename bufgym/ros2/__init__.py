@@ -1,8 +1,8 @@
-"""ROS 2: a relay whose uplink a policy rules, and a publisher of one's own node with a policy's queue.
+"""ROS 2: a relay with an uplink ruled by a policy, and a publisher with a policy's queue for your own node.
 
-The relay (``bufgym ros2 send`` on the robot, ``bufgym ros2 receive`` at the other end) leaves all nodes as they are: it
-subscribes on the robot, sends over one uplink of ``bufgym.live``, and republishes there. ``Publisher`` stands in for
-``node.create_publisher`` in one's own node, and sends to the same receiver.
+The relay needs no change of any node. ``bufgym ros2 send`` subscribes on the robot and sends over one uplink of
+``bufgym.live``. ``bufgym ros2 receive`` republishes at the other end. ``Publisher`` replaces ``node.create_publisher``
+in your own node, and sends to the same receiver.
 """
 
 from bufgym.ros2.publisher import Publisher

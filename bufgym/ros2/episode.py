@@ -1,9 +1,9 @@
-"""An episode through ROS 2: a rclpy node, the relay pair with a shaped link between, a rclpy viewer.
+"""Episode through ROS 2: a rclpy node, the relay pair with a shaped link between, a rclpy viewer.
 
     node (camera, odometry) -> relay ==shaped link==> relay -> viewer
 
-Node and viewer are ordinary ones in two domains of DDS. The relay has x from the odometry's topic. All goes as in real
-time.
+Node and viewer are ordinary nodes in two DDS domains. The relay has x from the odometry's topic. Everything runs in
+real time.
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ from bufgym.scenario import Client, Episode, Stream
 from bufgym.traces import Trace, load_motion
 
 _DOMAIN = 20 + os.getpid() % 40 * 2
-"""Of the robot, and the next one of the base: others for each run, as two may run at a time."""
+"""Domain of the robot; the base has the next. Each process has its own, because two may run at a time."""
 _WARM_UP = -1
-"""A frame before the first: DDS takes its time until a new publisher has found its subscribers."""
+"""Number of a frame before the first, because a new DDS publisher needs time to find its subscribers."""
 _DEPTH = 100
-"""Of each topic's history in DDS: on this machine nothing waits there for long."""
+"""History depth of each topic in DDS; on one machine nothing waits there for long."""
 _SETTLED_S = 1.0
-"""By then what was published is where it is heard."""
+"""Time after which published messages have arrived."""
 
 
 def player() -> Play:
     """Plays episodes through ROS 2.
 
     Raises:
-        BufgymError: it is not here.
+        BufgymError: ROS 2 is not installed.
     """
     with needs_rclpy():
         importlib.import_module("rclpy")
@@ -72,7 +72,7 @@ def player() -> Play:
 def play(
     policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
 ) -> list[Received]:
-    """What a viewer gets of the episode's messages. Randomised policies make draws of their own."""
+    """Play the episode; return the messages that a viewer got. Randomised policies use their own draws."""
     if speed != 1:
         raise BufgymError(f"speed = {speed:g}: must be 1 with ROS, whose nodes live in real time")
     warm(PolicyQueue(policy, capacity, value=value))
@@ -102,7 +102,7 @@ async def _play(begun: Sequence[Program], episode: Episode) -> list[Received]:
 
 
 def _on(domain: int) -> None:
-    """This process is in that domain, on this machine alone."""
+    """Put this process into a domain limited to this machine."""
     os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
 
 

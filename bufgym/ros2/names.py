@@ -1,6 +1,6 @@
-"""What a relay says of a topic with each of its messages: name, type and quality of service.
+"""Topic information that a relay sends with each message: name, type and quality of service.
 
-With each, so that either end may be restarted at any time. It is some 60 bytes.
+It takes some 60 bytes. Every message has it, so that either end may restart at any time.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bufgym.errors import BufgymError, install
 from bufgym.live.frames import FrameError
 
 DEPTH: Final = 10
-"""Of a history whose publisher does not tell its own: DDS announces none."""
+"""Default history depth, because DDS does not announce a publisher's own."""
 _MAX_NAME_BYTES: Final = 255
 _HEAD: Final = struct.Struct("!BBBH")
 """Bytes of name and type, flags, depth."""
@@ -28,7 +28,7 @@ _TYPE: Final = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)
 
 @contextmanager
 def needs_rclpy() -> Iterator[None]:
-    """An error that says how to get ROS 2 where the block cannot import it."""
+    """Raise an error that says how to get ROS 2 if the block can't import it."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -37,10 +37,10 @@ def needs_rclpy() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Published:
-    """A topic as its publishers on the robot have it."""
+    """A topic with its publishers' settings on the robot."""
 
     name: str
-    """With its namespace: "/camera/image"."""
+    """Name with its namespace, such as "/camera/image"."""
     type: str
     """ "sensor_msgs/msg/Image"."""
     reliable: bool = True
@@ -66,7 +66,7 @@ class Published:
 
     @property
     def message_class(self) -> Any:
-        """The class of its messages; an error where their package is not installed."""
+        """Class of its messages; raises an error if their package is not installed."""
         package, _, name = self.type.split("/")
         try:
             return getattr(importlib.import_module(f"{package}.msg"), name)
@@ -74,17 +74,17 @@ class Published:
             raise BufgymError(f"topic {self.name}: messages of {self.type}, which is not installed here") from None
 
     def head(self) -> bytes:
-        """What goes before each of its messages."""
+        """Header sent before each of its messages."""
         name, kind = self.name.encode(), self.type.encode()
         flags = _RELIABLE * self.reliable | _TRANSIENT_LOCAL * self.transient_local
         return _HEAD.pack(len(name), len(kind), flags, min(self.depth, 2**16 - 1)) + name + kind
 
 
 def parse(body: bytes | memoryview) -> tuple[Published, bytes]:
-    """(the topic, the serialized message) of what came.
+    """Parse received bytes; return the topic and the serialized message.
 
     Raises:
-        FrameError: it is nothing that a relay sends.
+        FrameError: no relay sends such bytes.
     """
     try:
         name_bytes, type_bytes, flags, depth = _HEAD.unpack_from(body)
@@ -97,9 +97,9 @@ def parse(body: bytes | memoryview) -> tuple[Published, bytes]:
 
 
 def published(node: Any, name: str, but_not: str) -> Published | None:
-    """The topic as the node sees it; None while nobody publishes it but nodes named ``but_not``.
+    """Find the topic as the node sees it; None while only nodes named ``but_not`` publish it.
 
-    Best effort or transient local is what all of its publishers offer: then a subscription with that gets them all.
+    It is best effort if any publisher is, and transient local if all are, so that one subscription gets them all.
     """
     found = [one for one in node.get_publishers_info_by_topic(name) if one.node_name != but_not]
     if not found:

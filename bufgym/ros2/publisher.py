@@ -1,10 +1,10 @@
-"""A publisher for one's own ROS 2 node, whose queue a policy rules, with an uplink of its own.
+"""Publisher for your own ROS 2 node, with a queue ruled by a policy and an uplink of its own.
 
     camera = bufgym.ros2.Publisher(node, Image, "/camera", policy="afr", queue_size=15, to=("base", 7410))
     camera.publish(image)  # never blocks
 
-``bufgym ros2 receive`` republishes at the other end. Why not DDS itself, one message at a time? Because a message of
-many packets is sent again and again by it where the link loses some: over a fade 38 of 600 frames came so.
+``bufgym ros2 receive`` republishes at the other end. Sending one message at a time by DDS would not do: it resends a
+message of many packets again and again on a lossy link. Over a fade 38 of 600 frames arrived that way.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from bufgym.ros2.names import DEPTH, Published, needs_rclpy
 
 
 class Publisher:
-    """See the module's text."""
+    """Publisher with a policy's queue. See the module's text."""
 
     def __init__(
         self,
@@ -41,16 +41,16 @@ class Publisher:
         transport: str = "tcp",
         log: LogFile | None = None,
     ) -> None:
-        """A publisher on ``topic``, a name in the node's namespace.
+        """Make a publisher on ``topic``, a name in the node's namespace.
 
         Args:
             to: host and port of the receiver.
-            policy: a registered policy by name, or a ``Policy``.
+            policy: name of a registered policy, or a ``Policy``.
             queue_size: L, messages.
             reliable, depth: quality of service at the other end.
-            value: V (default: 1 - 0.618^d).
-            x: how far the scene has moved on now; by default it counts messages. ``bufgym.live.odometry`` has one.
-            log: takes every decision.
+            value: V; 1 - 0.618^d by default.
+            x: returns the scene's motion now, such as ``bufgym.live.odometry``; by default it counts messages.
+            log: log of every decision.
         """
         package, name = msg_type.__module__.split(".")[0], msg_type.__name__
         self._head = Published(
@@ -65,10 +65,10 @@ class Publisher:
         self._thread.start()
 
     def publish(self, message: Any) -> None:
-        """A message (or a serialized one) arrives at the queue. Never blocks.
+        """Put a message, serialized or not, into the queue; never blocks.
 
         Raises:
-            BufgymError: one was larger than the receiver takes, which has ended the sending.
+            BufgymError: an earlier message was larger than the receiver takes, which ended the sending.
         """
         with needs_rclpy():
             from rclpy.serialization import serialize_message
@@ -78,7 +78,7 @@ class Publisher:
         self.queue.put(data, len(data), self._x())
 
     def destroy(self, drain_s: float = 0.0) -> None:
-        """End; ``drain_s``: for so long what is queued is still sent."""
+        """Stop the publisher; queued messages are still sent for up to ``drain_s``."""
         self.queue.close()
         self._thread.join(drain_s)
         self._loop.call_soon_threadsafe(self._sending.cancel)

@@ -1,9 +1,9 @@
-"""The relay: on the robot it subscribes and sends over one uplink, at the other end it receives and republishes.
+"""Relay that subscribes on the robot, sends over one uplink, and republishes at the other end.
 
     robot's nodes -> subscription (serialized) -> PolicyQueue -> Sender ==uplink==> Receiver -> publisher -> nodes
 
-Both ends are one asyncio program each; the robot's subscriptions run in a thread of rclpy's executor. Commands go the
-other way through a second pair, whose topics are ``no_drop``.
+Each end is one asyncio program; the robot's subscriptions run in a thread of rclpy's executor. Commands go the other
+way through a second pair with ``no_drop`` topics.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from bufgym.ros2.names import Published, needs_rclpy, parse, published
 from bufgym.scenario import Client
 
 SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
-"""Names of the nodes. What a receiver publishes is never sent on: a pair each way makes no circle."""
+"""Names of the nodes. A sender ignores topics of a receiver, so a pair each way makes no loop."""
 LOOK_S: Final = 0.2
-"""Between two looks at who publishes."""
+"""Time between two searches for publishers."""
 _MATCH_S: Final = 1.0
-"""A new publisher's first message waits so long for a subscriber at most."""
+"""Longest wait of a new publisher's first message for a subscriber."""
 
 
 def resolved(name: str) -> str:
@@ -54,7 +54,7 @@ def own_node(name: str) -> Iterator[Any]:
 
 
 class Robot:
-    """The sending end: the topics of ``client`` over one uplink to (``host``, ``port``)."""
+    """The sending end, which sends the topics of ``client`` over one uplink to ``host`` and ``port``."""
 
     def __init__(
         self,
@@ -71,11 +71,11 @@ class Robot:
     ) -> None:
         """
         Args:
-            client: its topics, with the rules for each, and n_T; ``bufgym.scenario.read_client`` reads one.
+            client: topics with their rules, and n_T; ``bufgym.scenario.read_client`` reads one.
             policy: a drop rule for one topic, a scheduler for several.
             capacity: L, messages of all topics together.
-            odometry: a topic with poses, which gives x to the topics that move; x of the others is time.
-            say: takes a line for each topic that is found.
+            odometry: a topic with poses, which gives x to topics that move; x of other topics is time.
+            say: called with a line for each topic found.
         """
         moving = [stream.topic.name for stream in client.streams if stream.moves]
         if moving and odometry is None:
@@ -118,7 +118,7 @@ class Robot:
                 await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _look(self, node: Any) -> None:
-        """Subscribe to each topic once somebody publishes it."""
+        """Subscribe to each topic once it has a publisher."""
         wanted = {resolved(stream.topic.name): number for number, stream in enumerate(self._streams)}
         if self._odometry_topic is not None:
             wanted[resolved(self._odometry_topic)] = wanted.get(resolved(self._odometry_topic), -1)
@@ -150,9 +150,9 @@ async def receive(
     transport: str = "tcp",
     say: Callable[[str], None] = lambda text: None,
 ) -> None:
-    """The other end: republish what comes, with its publishers' quality of service, until cancelled.
+    """Run the other end: republish messages with their publishers' quality of service, until cancelled.
 
-    Messages of a type that is not installed here are told of once, and dropped.
+    Messages of a type that is not installed here are reported once and dropped.
     """
     with own_node(RECEIVER) as node:
         publishers: dict[Published, Any] = {}
@@ -180,7 +180,7 @@ async def receive(
 
 
 async def matched(subscribers: Callable[[], int]) -> None:
-    """Subscribers that are there already find a new publisher within some 100 ms; until then they would miss it."""
+    """Wait for subscribers to find a new publisher, which takes some 100 ms; earlier messages would be missed."""
     deadline_s = time.monotonic() + _MATCH_S
     while subscribers() == 0 and time.monotonic() < deadline_s:
         await asyncio.sleep(0.01)

@@ -1,8 +1,8 @@
-"""What arrives of a rospy camera over a link that fades: with rospy's own queue, and under policies.
+"""Frames of a rospy camera that arrive over a fading link, with rospy's own queue and under policies.
 
-Link and stream are those of ``examples/fade.py``. The node is
-``camera.py``, as it is; the subscriber is rospy's, and connects through ``bufgym.live.shaped``. Beside it the same
-policies in the simulator. Run it with a Python that has rospy, rosmaster and bufgym:
+``examples/fade.py`` defines link and stream. The node is the unmodified ``camera.py``. The subscriber is rospy's and
+connects through ``bufgym.live.shaped``. The same policies also run in the simulator. Run it with a Python that has
+rospy, rosmaster and bufgym:
 
     python3 examples/ros1/fade.py --policies rospy,drop-oldest,afr
 """
@@ -41,7 +41,7 @@ from bufgym.live.shaped import ShapedLink
 from bufgym.model.link import Link
 
 PORT = 11399
-"""Of the master in a namespace of its own."""
+"""Port of the master in a namespace of its own."""
 CAMERA = Path(__file__).with_name("camera.py")
 
 

@@ -1,8 +1,8 @@
-"""What arrives of a ROS 2 camera over a link that fades: by DDS itself, and by the relay under policies.
+"""Frames of a ROS 2 camera that arrive over a fading link, by DDS itself and by the relay under policies.
 
-The link is that of ``examples/fade.py``. The relay's uplink goes through ``bufgym.live.shaped``; robot and viewer are
-in two domains of DDS. ``best-effort`` and ``reliable`` are DDS itself, between two network namespaces with `tc tbf`
-and 200 kB of queue, which takes root on Linux.
+``examples/fade.py`` defines the link. The relay's uplink goes through ``bufgym.live.shaped``; robot and viewer are in
+two DDS domains. ``best-effort`` and ``reliable`` are DDS itself, between two network namespaces with `tc tbf` and 200
+kB of queue, which takes root on Linux.
 
     python3 examples/ros2/fade.py --queues best-effort,reliable,drop-oldest,afr
 """
@@ -40,7 +40,7 @@ from bufgym.live.shaped import ShapedLink
 from bufgym.model.link import Link
 
 DOMAIN = 20 + os.getpid() % 40 * 2
-"""Of DDS, and the next one: others for each run, as two may run at a time."""
+"""DDS domain; the next one is used too. Each process has its own, because two may run at a time."""
 HERE = Path(__file__).resolve().parent
 CONFIG = f"""\
 [[topic]]

@@ -1,7 +1,6 @@
-"""The report of a suite's run: one HTML page that needs no network, and tables for a terminal or a README.
+"""Report of a suite's run: one HTML page that needs no network, and tables for a terminal or a README.
 
-It reads what ``bufgym bench --suite`` left in a folder. It simulates nothing and computes no statistic: the summary is
-the task's.
+It reads a folder of ``bufgym bench --suite``. It simulates nothing and takes all statistics from the task.
 """
 
 from __future__ import annotations

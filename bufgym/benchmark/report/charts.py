@@ -1,4 +1,4 @@
-"""The charts, each a ``Chart`` of plain dictionaries that plotly draws; every statistic in them is the summary's."""
+"""Charts as plain dictionaries for plotly; every statistic in them comes from the summary."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from bufgym.benchmark.table import REGRET_AT_MOST, percent
 
 @dataclass(frozen=True)
 class Chart:
-    """One place on the page."""
+    """A chart on the page."""
 
     id: str
-    """Of its section."""
+    """Id of its section."""
     alt: str
-    """What it shows, for those who can't see it."""
+    """Alternative text for readers who can't see it."""
     choices: list[tuple[str, list[str]]]
-    """What can be chosen: (label, options), the first option first."""
+    """Choices as (label, options), the default option first."""
     panels: Mapping[tuple[str, ...], list[Figure]]
-    """By one option of each choice: the figures that stand side by side."""
+    """One option of each choice -> figures shown side by side."""
 
 
 @dataclass(frozen=True)
 class Context:
-    """What every chart is made from."""
+    """Input of every chart."""
 
     run: Run
     """The run."""
     summary: Summary
-    """What its rows say."""
+    """Summary of its rows."""
     colours: dict[str, str]
-    """By policy, for those that stand out."""
+    """Colours of highlighted policies."""
 
     @classmethod
     def of(cls, run: Run, summary: Summary) -> Context:
@@ -50,19 +50,19 @@ class Context:
 
     @property
     def cells(self) -> list[CellScore]:
-        """Scores of every cell; none where there are no scores."""
+        """Scores of every cell; empty without scores."""
         return [] if self.summary.scores is None else self.summary.scores.cells
 
     def colour(self, policy: str) -> str:
         return self.colours.get(policy, style.MUTED)
 
     def order(self, policies: Sequence[str]) -> list[str]:
-        """Muted ones first, so that the others are drawn on top of them."""
+        """Put muted policies first, so that highlighted ones are drawn on top."""
         return sorted(policies, key=lambda name: name in self.colours)
 
 
 def with_interval(value: Interval, write: Callable[[float], str]) -> str:
-    """Both as text."""
+    """Format value and interval."""
     return " ".join(filter(None, written(value, write)))
 
 
@@ -70,7 +70,7 @@ def with_interval(value: Interval, write: Callable[[float], str]) -> str:
 
 
 def ranking(context: Context) -> Chart | None:
-    """A dot and an interval for each policy; None where no policy has a value of what ranks them."""
+    """Draw a dot and an interval for each policy; None if no policy has a value of the ranking quantity."""
     quantities = {quantity.key: quantity for quantity in context.summary.quantities}
     if not _known(context, quantities[context.summary.rank_by]):
         return None
@@ -84,7 +84,7 @@ def ranking(context: Context) -> Chart | None:
 
 
 def _known(context: Context, quantity: Quantity) -> dict[str, Interval]:
-    """The policies that have a value; where no interval is known it is that point."""
+    """Select policies with a value; an unknown interval becomes that point."""
     values = {standing.policy: standing[quantity.key] for standing in context.summary.overall}
     return {
         policy: Interval(value, *((value, value) if math.isnan(low) else (low, high)))
@@ -94,9 +94,9 @@ def _known(context: Context, quantity: Quantity) -> dict[str, Interval]:
 
 
 def _dots(context: Context, quantity: Quantity, second: Quantity | None) -> Figure:
-    """One lane for each policy, with a tick for a second quantity. A line marks the policy that is compared with.
+    """Draw one lane for each policy, with a tick for a second quantity. A line marks the baseline.
 
-    What lies more than two interquartile ranges beyond the quartiles is written at the edge.
+    Values more than two interquartile ranges beyond the quartiles are written at the edge.
     """
     known, standings = _known(context, quantity), context.summary.standings
     first, third = np.percentile([value for value, *_ in known.values()], [25, 75]).tolist()
@@ -138,7 +138,7 @@ def _dots(context: Context, quantity: Quantity, second: Quantity | None) -> Figu
 
 
 def capacities(context: Context) -> Chart | None:
-    """Regret against L, a scenario at a time; None where there is but one capacity."""
+    """Draw regret against L for one scenario at a time; None with a single capacity."""
     cells = context.cells
     if len({cell.capacity for cell in cells}) < 2:
         return None
@@ -155,7 +155,7 @@ def capacities(context: Context) -> Chart | None:
 
 
 def outages(context: Context) -> Chart | None:
-    """Regret against the length of the one outage, for each V and capacity; None with fewer than two lengths."""
+    """Draw regret against the outage's length for each V and capacity; None with fewer than two lengths."""
     scenarios = context.run.manifest["scenarios"]
     lengths = {name: float(s["outage_s"]) for name, s in scenarios.items() if s.get("outage_s") is not None}
     cells = [cell for cell in context.cells if cell.scenario in lengths]
@@ -179,7 +179,7 @@ Curve = list[tuple[float, CellScore]]
 
 
 def _curves(cells: Sequence[CellScore], at: Callable[[CellScore], float]) -> dict[str, Curve]:
-    """By policy; cells without a regret are left out."""
+    """Group the cells by policy; cells without a regret are left out."""
     curves: dict[str, Curve] = {}
     for cell in sorted(cells, key=at):
         if not math.isnan(cell.regret.value):
@@ -188,7 +188,7 @@ def _curves(cells: Sequence[CellScore], at: Callable[[CellScore], float]) -> dic
 
 
 def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]) -> Figure:
-    """Lines and bands; those that stand out are labelled at their right end."""
+    """Draw lines and bands; highlighted lines are labelled at their right end."""
     low, high = regret_range([cell.regret.value for curve in curves.values() for _, cell in curve])
     data: list[dict[str, Any]] = []
     for policy in context.order(list(curves)):
@@ -228,7 +228,7 @@ def _fine(number: float) -> str:
 
 
 def _end_labels(context: Context, curves: dict[str, Curve], span: tuple[float, float], pixels: int) -> list[Any]:
-    """Names at the right ends of the curves that stand out, moved apart where they would overlap."""
+    """Place names at the right ends of highlighted curves, moved apart where they would overlap."""
     low, high = (math.log10(end) for end in span)
     ends = {
         p: math.log10(max(curve[-1][1].regret.value, span[0])) for p, curve in curves.items() if p in context.colours
@@ -250,7 +250,7 @@ def regret_title(cells: Iterable[CellScore]) -> str:
 
 
 def regret_range(regrets: Sequence[float]) -> tuple[float, float]:
-    """Ends of a logarithmic axis: what is below one ten-thousandth (the clairvoyant's 0) is drawn on the lower edge."""
+    """Ends of a logarithmic axis; regrets below 1/10,000, such as the clairvoyant's 0, sit on the lower edge."""
     positive = [regret for regret in regrets if regret > 1e-4]
     if not positive:
         return 1e-4, 1.0
@@ -258,7 +258,7 @@ def regret_range(regrets: Sequence[float]) -> tuple[float, float]:
 
 
 def middle_first(sizes: set[int]) -> list[int]:
-    """Ascending but for the middle one, which comes first: the one to show at first."""
+    """Sort the sizes in ascending order, but put the middle one first, as the default to show."""
     ordered = sorted(sizes)
     middle = ordered[len(ordered) // 2 : len(ordered) // 2 + 1]
     return middle + [size for size in ordered if size not in middle]

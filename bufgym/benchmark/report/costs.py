@@ -1,4 +1,4 @@
-"""What a policy costs besides information: delay at the sender, age at the server, memory."""
+"""Costs of a policy besides information: delay at the sender, age at the server, memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bufgym.benchmark.report.style import Figure
 from bufgym.benchmark.score import CellScore
 
 LONG = 8.0
-"""Largest over smallest value from which on an axis is logarithmic."""
+"""Ratio of largest to smallest value from which an axis is logarithmic."""
 
 
 def delays(context: Context) -> Chart | None:

@@ -1,4 +1,4 @@
-"""One page from a run and its summary: the templates, the style sheet, the script, plotly and the charts' numbers."""
+"""Page of a run and its summary, made of templates, style sheet, script, plotly and the charts' numbers."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from bufgym.benchmark.summary import Summary, title
 from bufgym.errors import BufgymError, install
 
 CHARTS = (charts.ranking, charts.capacities, charts.outages, costs.delays, timeline, costs.memory)
-"""Each is None where the run has nothing to show in it."""
+"""Functions that make the charts; each returns None if the run has nothing to show."""
 
 
 def html(run: Run, summary: Summary) -> str:
-    """The whole page, in one file that asks for no other."""
+    """Render the whole page in one self-contained file."""
     context = Context.of(run, summary)
     cells = list(dict.fromkeys((row["scenario"], row["capacity"]) for row in run.rows))
     return rendered(
@@ -52,7 +52,7 @@ def html(run: Run, summary: Summary) -> str:
 
 
 def rendered(template: str, drawn: Sequence[Chart], **words: Any) -> str:
-    """A page with charts, from one of the templates here and what it asks for."""
+    """Render a page with charts from a template and its variables ``words``."""
     jinja2, graphs, plotly_js = _libraries()
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(_asset),
@@ -92,7 +92,7 @@ def _asset(name: str) -> str:
 
 
 def _figures(drawn: dict[str, Chart], graphs: Any) -> str:
-    """All charts as JSON that may stand in a script element; plotly checks every name and value on the way."""
+    """Encode all charts as JSON for a script element; plotly checks every name and value."""
     figures = {
         id: {
             "\n".join(options): [graphs.Figure(figure).to_plotly_json() for figure in panel]
@@ -104,7 +104,7 @@ def _figures(drawn: dict[str, Chart], graphs: Any) -> str:
 
 
 def _shade(cell: CellScore) -> str:
-    """How strongly a cell of the heat map is coloured, and with what: one CSS declaration."""
+    """CSS declaration of a heat map cell's colour and strength."""
     value = cell.score.value
     if math.isnan(value) or not cell.discriminative:
         return ""

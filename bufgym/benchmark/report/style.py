@@ -1,7 +1,7 @@
-"""How things look in every chart: one colour for each policy, one layout.
+"""Style of every chart: one colour for each policy, one layout.
 
-Colours are names of CSS variables (``var(--ink)``); the page's script replaces them by those of the style sheet, light
-or dark. Chart text may hold HTML, so names are escaped.
+Colours are names of CSS variables such as ``var(--ink)``. The page's script replaces them by the light or dark colours
+of the style sheet. Chart text may hold HTML, so names are escaped.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ FIXED = {"afr": "var(--blue)", "drop-oldest": "var(--vermillion)", "clairvoyant"
 """Policies that look the same in every report."""
 
 SPARE = ("var(--green)", "var(--orange)", "var(--purple)", "var(--sky)")
-"""For the best of the others, in their order."""
+"""Colours of the best other policies, in order."""
 
 MUTED = "var(--muted)"
 
 
 def colours(ranked: Sequence[str], baseline: str) -> dict[str, str]:
-    """A colour for each policy that stands out: fixed ones, the baseline, the best of ``ranked`` (best first)."""
+    """Choose a colour for each highlighted policy: the fixed ones, the baseline and the first of ``ranked``."""
     fixed = dict(FIXED)
     if baseline not in fixed:
         fixed[baseline] = fixed.pop("drop-oldest")
@@ -33,12 +33,12 @@ def colours(ranked: Sequence[str], baseline: str) -> dict[str, str]:
 
 
 def text(name: str) -> str:
-    """A name as chart text that shows as it is written."""
+    """Escape a name so that a chart shows it as written."""
     return html.escape(name, quote=False)
 
 
 def rounded(entries: Sequence[Any]) -> list[Any]:
-    """Numbers in six digits, enough for a screen, None where there is no number; text as it is."""
+    """Round numbers to six digits, enough for a screen; NaN becomes None, and text stays."""
     return [
         e if isinstance(e, str) else None if e is None or not math.isfinite(e) else float(f"{e:.6g}") for e in entries
     ]
@@ -78,7 +78,7 @@ def short_percent(share: float) -> str:
 
 
 def layout(height: int, **changes: Any) -> dict[str, Any]:
-    """What all charts share; ``height`` in pixels."""
+    """Layout shared by all charts; ``height`` in pixels."""
     hover = {"bgcolor": "var(--panel)", "bordercolor": "var(--axis)", "font": {"color": "var(--ink)", "size": 13}}
     return {
         "template": {},
@@ -104,7 +104,7 @@ def scatter(
 
 
 def lanes(names: Sequence[str], grid: bool = False, **changes: Any) -> dict[str, Any]:
-    """A layout with one lane for each policy, the last on top; ``grid``: with a line through each."""
+    """Layout with one lane for each policy, the last on top; ``grid`` draws a line through each."""
     labels = [text(name) for name in names]
     y = axis(categoryorder="array", categoryarray=labels, tickvals=labels, ticks="", showline=False, showgrid=grid)
     y["range"] = [-0.7, len(names) - 0.3]

@@ -1,4 +1,4 @@
-"""The tables of the report: the ranking, and every policy in every cell."""
+"""Tables of the report: the ranking, and every policy in every cell."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Place:
     values: list[tuple[str, str]]
     """(value, interval) as text, a pair for each quantity of the summary."""
     reason: str
-    """Why it is not ranked; empty where it is."""
+    """Reason why it is not ranked; empty if it is."""
 
 
 def ranking(run: Run, summary: Summary, standings: Sequence[Standing] | None = None) -> list[Place]:
@@ -75,7 +75,7 @@ def heat_map(scores: Scores) -> HeatMap:
 
 
 def plain(run: Run, summary: Summary) -> str:
-    """Aligned text: the ranking where there are scores, else a block for each cell; then the notes."""
+    """Write aligned text: the ranking, or a block for each cell if there are no scores, then the notes."""
     unranked = run.manifest["unranked"]
     notes = [f"{s.policy} has no rank: {unranked[s.policy]}." for s in summary.overall if not s.ranked]
     notes += [*table.invalid(run.task.senders(run.rows)), *summary.notes]
@@ -91,7 +91,7 @@ def plain(run: Run, summary: Summary) -> str:
 
 
 def intro(run: Run) -> list[str]:
-    """What was run, a line each."""
+    """Describe the run in a few lines."""
     manifest = run.manifest
     lines = [f"Suite {manifest['suite']}, {manifest['split']}: {manifest['about']}.", manifest["episodes"]]
     if manifest["changes"]:
@@ -151,5 +151,5 @@ def _marks(heat: HeatMap, scenario: str, capacity: int) -> str:
 
 
 def _plain(name: str) -> str:
-    """A name that Markdown shows as it is written."""
+    """Escape a name so that Markdown shows it as written."""
     return style.text(name).replace("|", "\\|").replace("*", "\\*")

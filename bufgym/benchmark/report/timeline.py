@@ -1,4 +1,4 @@
-"""One episode, message by message: the link's capacity above, and under it one lane a policy."""
+"""Chart of one episode, message by message: the link's capacity above one lane per policy."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from bufgym.benchmark.report.charts import Chart, Context
 from bufgym.benchmark.report.style import Figure
 
 DROPPED, IN_GAP, KEPT, LEFT = 0, 1, 2, 3
-"""What became of a message: dropped; dropped within the longest gap; delivered; still queued at the end."""
+"""Outcomes of a message: dropped, dropped within the longest gap, delivered, still queued at the end."""
 
 COLOURS = ("var(--lane)", "var(--gap)", "var(--kept)", "var(--axis)")
 
 
 def timeline(context: Context) -> Chart | None:
-    """The chart; None where the run left no timeline."""
+    """Draw the chart; None if the run left no timeline."""
     episode = context.run.timeline
     if episode is None:
         return None
@@ -28,16 +28,16 @@ def timeline(context: Context) -> Chart | None:
 
 
 def longest_gap(x: Sequence[float], received: Sequence[int]) -> tuple[int, int] | None:
-    """(from, to): the two messages received one after the other that are furthest apart in x; None with fewer than two.
+    """Find the consecutive messages received that are furthest apart in x, the first pair on ties.
 
-    The first such pair where several are.
+    Returns (from, to), or None with fewer than two messages.
     """
     pairs = list(pairwise(received))
     return max(pairs, key=lambda pair: x[pair[1]] - x[pair[0]]) if pairs else None
 
 
 def log(messages: int, lane: Mapping[str, Any], gap: tuple[int, int] | None) -> list[int]:
-    """What became of each message, in the order of their arrival."""
+    """List each message's outcome in order of arrival."""
     outcomes = np.full(messages, LEFT)
     dropped = [entry[0] for entry in lane["dropped"]]
     outcomes[dropped] = DROPPED
@@ -116,7 +116,7 @@ def _link(episode: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _lanes(at: Sequence[float], names: list[str], rows: list[list[int]], hover: list[list[str]]) -> dict[str, Any]:
-    """One image for all lanes: thousands of messages stay light."""
+    """Draw all lanes as one image, which stays small for thousands of messages."""
     shades = [[edge, colour] for k, colour in enumerate(COLOURS) for edge in (k / 4, (k + 1) / 4)]
     return {
         "type": "heatmap",

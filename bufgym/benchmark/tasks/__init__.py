@@ -1,6 +1,6 @@
-"""The kinds of experiment, each behind the protocol ``Task``: one queue, the same under stress, topics, fleets.
+"""Kinds of experiment behind the protocol ``Task``: one queue, one queue under stress, topics, fleets.
 
-A new kind of task is one more file here and one more entry of ``TASKS``.
+A new kind of task adds a file here and an entry of ``TASKS``.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from bufgym.benchmark.tasks.topics import TopicsTask
 __all__ = ["TASKS", "FleetTask", "QueueTask", "StressTask", "Task", "TopicsTask", "of"]
 
 TASKS: dict[str, Task] = {task.kind: task for task in (QueueTask(), StressTask(), TopicsTask(), FleetTask())}
-"""By ``Suite.kind``."""
+"""``Suite.kind`` -> task."""
 
 
 def of(scenario: Any, **settings: Any) -> Task:
-    """The task that a scenario is for; a scenario of no known kind is for one queue.
+    """Find the task for a scenario; a scenario of unknown kind is for one queue.
 
     ``settings`` are the task's own, such as max_bytes, decide_at and bound of ``QueueTask``.
     """

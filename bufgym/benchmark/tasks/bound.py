@@ -17,7 +17,7 @@ from bufgym.sim import Senders, padded, run
 def best(
     episode: Episode, capacity: int, scenario: Scenario, max_bytes: int | None = None, decide_at: str = "arrival"
 ) -> Plan:
-    """The clairvoyant's plan; where only a full buffer asks, no more than an upper bound."""
+    """Compute the clairvoyant's plan, which is only an upper bound if decisions wait for a full buffer."""
     plan = clairvoyant(episode, capacity, scenario.value, max_bytes=max_bytes)
     return plan if decide_at == "arrival" or plan.kept.all() else replace(plan, certified=False)
 
@@ -31,7 +31,7 @@ def meet(
     max_bytes: int | None = None,
     decide_at: str = "arrival",
 ) -> Senders:
-    """The senders after ``policy`` met the episodes; the clairvoyant reads the plans that are known already."""
+    """Run ``policy`` on the episodes and return the senders; the clairvoyant reuses known plans."""
     memory = None
     if policy.privileged is privileged and all(plan is not None for plan in plans):
         memory = padded([plan.kept for plan in plans if plan is not None])
@@ -39,7 +39,7 @@ def meet(
 
 
 def columns(policy: Policy, h: float, plan: Plan | None) -> Row:
-    """What a row has besides the policy's ``Outcome``: clairvoyant, certified, regret (see ``rows.COLUMNS``)."""
+    """Columns of a row besides the policy's ``Outcome``: clairvoyant, certified and regret, see ``rows.RUNS``."""
     if plan is None:
         return {"clairvoyant": None, "certified": None, "regret": None}
     lost = None if policy.unbounded else regret(h, plan.qoi)

@@ -1,4 +1,4 @@
-"""Robots that share a cell: each policy on all of them, beside AFR on all of them, robot by robot."""
+"""Robots that share a cell: each policy runs on all robots and is compared with AFR robot by robot."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ ROWS: Layout = {
     **{"scenario": str, "trace": str, "seed": int, "robots": int, "policy": str, "capacity": int, "robot": int},
     **columns_of(Outcome),
 }
-"""One row for each robot and episode: which robot, of how many, and its ``Outcome``."""
+"""One row for each robot and episode: the robot's number, the fleet's size and the robot's ``Outcome``."""
 
 
 @dataclass(frozen=True)
 class FleetTask(Task):
     """Robots that share one uplink, the same policy on each.
 
-    They are no independent sample: intervals resample episodes, never robots.
+    Robots are not independent, so intervals resample episodes, never robots.
     """
 
     kind = "fleet"
@@ -124,7 +124,7 @@ def _statistics(ours: Numbers, base: Numbers, weights: Numbers) -> dict[str, Num
         "above": (ours - base > TIE * base).mean(1),
         "below": (base - ours > TIE * base).mean(1),
         "worst": ours.min(1),
-        # Where nobody got anything all are equal.
+        # If no robot got anything, all are equal.
         "fairness": np.where(square > 0, ratio(np.square(ours.sum(1)), square, square > 0), 1.0),
     }
     return {name: weights @ numbers / len(ours) for name, numbers in by_episode.items()}

@@ -1,4 +1,4 @@
-"""One queue: every policy beside the clairvoyant, scored between Drop Oldest (0) and the clairvoyant (1)."""
+"""One queue: every policy is scored between Drop Oldest at 0 and the clairvoyant at 1."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class QueueTask(Task):
     listed = ("score", "regret", "improvement")
 
     def default_policies(self, suite: str) -> list[str]:
-        """All that are not made for topics, as their sources have them, and the variants tuned on the suite."""
+        """List all policies for one queue with their sources' parameters, and the variants tuned on the suite."""
         return [*names(for_topics=False), *tuned(suite)]
 
     def check(self, policy: Policy) -> None:

@@ -1,4 +1,4 @@
-"""One queue under stress: as one queue, but policies are ordered by their worst cell."""
+"""One queue under stress, where policies are ranked by their worst cell."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from bufgym.policies import Policy
 from bufgym.scenario.suites import Setting
 
 LEAST_REGRET = 0.001
-"""Where the better of the two yardsticks loses less, a ratio says nothing, and the cell is not counted."""
+"""Least regret of the better yardstick for a cell to count; below it a ratio means nothing."""
 
 
 class Ratios(NamedTuple):
-    """A policy's regret over that of the better of the baseline (Drop Oldest) and the reference (AFR), cell by cell."""
+    """Ratios, cell by cell, of a policy's regret to the lower regret of Drop Oldest and AFR."""
 
     worst: float
-    """The largest; NaN where no cell counts."""
+    """Largest ratio; NaN if no cell counts."""
     cell: Cell | None
-    """Where that is."""
+    """Cell of the largest ratio."""
     mean: float
-    """Mean of all."""
+    """Mean ratio."""
     cells: int
-    """How many cells count."""
+    """Number of cells that count."""
 
 
 def ratios(scored: Scores) -> dict[str, Ratios]:
-    """By policy. Where the reference did not run, there are none."""
+    """Compute the ratios of each policy; empty if the reference did not run."""
     regrets = {(c.policy, (c.scenario, c.capacity)): c.regret.value for c in scored.cells}
     cells = dict.fromkeys(cell for _, cell in regrets)
     yardsticks = {
@@ -62,7 +62,7 @@ class StressTask(QueueTask):
         return (*_ratios(reference), *super().quantities(reference))
 
     def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
-        """Ranked by the worst cell, the smallest first; the notes say where it is."""
+        """Rank by the worst cell, smallest ratio first; the notes name that cell."""
         summary = QueueTask().summary(rows, unranked, **options)
         assert summary.scores is not None
         found = ratios(summary.scores)
@@ -92,7 +92,7 @@ class StressTask(QueueTask):
     def example(
         self, policies: Sequence[Policy], rows: Sequence[Row], setting_of: Callable[[Row], Setting]
     ) -> dict[str, Any] | None:
-        """As of one queue; an episode under a byte limit is not shown."""
+        """Choose an example as for one queue, without a byte limit."""
         firsts = {row["scenario"]: row for row in reversed(rows)}
         free = {label for label, row in firsts.items() if setting_of(row).max_bytes is None}
         return super().example(policies, [row for row in rows if row["scenario"] in free], setting_of)
@@ -109,5 +109,5 @@ def _ratios(reference: str) -> tuple[Quantity, ...]:
 
 
 def _alone(value: float) -> Interval:
-    """A number without an interval: the largest of many has none that a bootstrap of few episodes could give."""
+    """Make a number without an interval, because a bootstrap of few episodes gives none for a maximum."""
     return UNKNOWN if math.isnan(value) else Interval(value, math.nan, math.nan)

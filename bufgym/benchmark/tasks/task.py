@@ -1,4 +1,4 @@
-"""The protocol of a task, and how an episode is drawn for any of them."""
+"""Protocol of a task, and the drawing of its episodes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from bufgym.policies import Policy
 from bufgym.scenario.suites import Setting
 
 Result = list[Row]
-"""The rows of one run, without what ``run`` adds: scenario, trace, seed, policy and capacity."""
+"""Rows of one run without scenario, trace, seed, policy and capacity, which ``run`` adds."""
 
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """One kind of experiment: every policy on the same episodes, and what is said of the rows."""
+    """One kind of experiment: it plays every policy on the same episodes and summarizes the rows."""
 
     kind: ClassVar[str]
     """Its name: ``Suite.kind``."""
@@ -28,15 +28,15 @@ class Task(ABC):
     layout: ClassVar[Layout]
     """The columns of its rows."""
     needed: ClassVar[tuple[str, ...]]
-    """The columns that a report cannot do without."""
+    """Columns that a report needs."""
     baseline: ClassVar[str]
     """The policy that the others are measured against; it always runs."""
     reference: ClassVar[str]
-    """The policy that a row of the leaderboard is compared with besides."""
+    """Second policy that a row of the leaderboard is compared with."""
     listed: ClassVar[tuple[str, ...]]
     """Quantities that the leaderboard lists, by key."""
     no_plan: ClassVar[str] = ""
-    """Why a privileged policy can't take part: what it plans with; empty if it can."""
+    """Reason why a privileged policy can't take part; empty if it can."""
     legend: ClassVar[tuple[str, ...]] = ()
     """Lines under a printed summary."""
 
@@ -45,48 +45,48 @@ class Task(ABC):
         """The policies that run on a suite unless the caller says otherwise."""
 
     def check(self, policy: Policy) -> None:
-        """An error for a policy that can't take part."""
+        """Raise an error for a policy that can't take part."""
         if policy.privileged is not None and self.no_plan:
             raise BufgymError(f"policy {policy.name}: it plans with {self.no_plan}")
 
     def verify(self, policy: Policy, row: Row) -> None:
-        """An error for a row that cannot be true."""
+        """Raise an error for a row that cannot be true."""
         return None
 
     def messages(self, scenario: Any) -> int:
-        """How many messages the senders of one episode hold at most."""
+        """Most messages that the senders of one episode hold."""
         return int(scenario.max_messages)
 
     def rows_per_run(self, scenario: Any) -> int:
-        """How many rows one run makes."""
+        """Number of rows that one run makes."""
         return 1
 
     @abstractmethod
     def play(
         self, policies: Sequence[Policy], scenario: Any, episodes: Sequence[Any], capacity: int
     ) -> Iterator[list[Result]]:
-        """For each policy in turn, the result of each episode."""
+        """Yield for each policy in turn the results of all episodes."""
 
     @abstractmethod
     def quantities(self) -> tuple[Quantity, ...]:
-        """What its summary shows of each policy."""
+        """Quantities that its summary shows."""
 
     @abstractmethod
     def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
-        """Every policy beside the baseline.
+        """Compare every policy with the baseline.
 
         Args:
-            rows: of ``run``.
+            rows: rows of ``run``.
             unranked: policies that are shown but not ranked.
             options: ``resamples``, ``confidence`` and ``seed``, as in ``summarise``.
         """
 
     def senders(self, rows: Sequence[Row]) -> Sequence[Row]:
-        """One row for each sender: for what all rows of a sender repeat."""
+        """Select one row for each sender, for columns that all rows of a sender repeat."""
         return rows
 
     def describe(self, scenarios: Sequence[Any], episodes: int) -> str:
-        """What the policies meet, in one sentence; empty where the scenarios' own descriptions say it."""
+        """Describe the scenarios in one sentence; empty if their own descriptions do."""
         return ""
 
     def example(

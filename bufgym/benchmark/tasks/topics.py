@@ -63,7 +63,7 @@ class TopicsTask(Task):
     )
 
     def default_policies(self, suite: str) -> list[str]:
-        """All that are made for topics, and what is in use without them."""
+        """List all policies for topics, and the common policies that ignore topics."""
         return [*_RIVALS, *names(for_topics=True)]
 
     def messages(self, scenario: Client) -> int:
@@ -80,7 +80,7 @@ class TopicsTask(Task):
             yield [_rows(scenario, senders, i) for i in range(len(episodes))]
 
     def quantities(self, first: str = "first") -> tuple[Quantity, ...]:
-        """``first``: what the topics of the highest priority are called."""
+        """List the quantities; ``first`` names the topics of the highest priority."""
 
         paired = "Both are sums over the episodes that both met"
         first_age = "mean age of information at the server of the topics with the highest priority, s"
@@ -123,7 +123,7 @@ class TopicsTask(Task):
 
 
 def _rows(client: Client, senders: Senders, i: int) -> Result:
-    """What became of each topic at sender ``i``."""
+    """Make the rows of each topic at sender ``i``."""
     sender, messages = np.asarray(senders.batch.senders)[i], received(senders, i)
     log = np.asarray(senders.batch.log[i])
     last_us = int(np.asarray(senders.batch.arrivals[i])["arrival_us"][sender["arrivals"] - 1])
@@ -153,7 +153,7 @@ def _rows(client: Client, senders: Senders, i: int) -> Result:
 
 
 def _folded(copies: Sequence[TopicOutcome]) -> Row:
-    """The means of a topic's copies, one for each consumer."""
+    """Average a topic's copies over the consumers."""
     outcomes = [asdict(copy) for copy in copies]
     means: Row = {name: mean([outcome[name] for outcome in outcomes]) for name in _OUTCOME}
     return {**means, "arrived": int(means["arrived"])}
@@ -175,7 +175,7 @@ def _messages(number: float) -> str:
 
 
 def _numbers(topics: Rows) -> list[float]:
-    """What ``_statistics`` takes of one run: QoI, no_drop messages lost, age of the first topics and of the others,
+    """Numbers of one run for ``_statistics``: QoI, no_drop messages lost, age of the first topics and of the others,
     messages late, delivered with a deadline and delivered in all, seconds."""
     highest = max(row["priority"] for row in topics)
     with_deadline = [row for row in topics if row["deadline_s"] is not None]
@@ -230,7 +230,7 @@ TOPIC_COLUMNS = (
 
 
 def by_topic(rows: Rows, policy: str) -> str:
-    """The means over episodes of each topic's outcome under one policy, as aligned text, a block for each cell."""
+    """Write each topic's mean outcome over episodes under one policy as aligned text, a block for each cell."""
     cells: dict[tuple[str, int], dict[str, list[Mapping[str, Any]]]] = {}
     for row in rows:
         if row["policy"] == policy:
