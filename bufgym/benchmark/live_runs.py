@@ -7,15 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bufgym.benchmark.bootstrap import (
-    Interval,
-    check_resampling,
-    percentile_interval,
-    ratio,
-    stream,
-    times_drawn,
-    written,
-)
+from bufgym.benchmark.bootstrap import Interval, percentile_interval, ratio, stream, times_drawn, written
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.table import percent
 from bufgym.live.runs import Run, by_policy
@@ -44,15 +36,12 @@ def _percent(interval: Interval) -> str:
     return " ".join(written(interval, percent)).strip()
 
 
-def margins(
-    runs: Sequence[Run], reference: str = "afr", *, resamples: int = 2000, confidence: float = 0.95, seed: int = 0
-) -> list[Margin]:
+def margins(runs: Sequence[Run], reference: str = "afr") -> list[Margin]:
     """Of each other policy, the best in the simulator first; none without the reference or with a single episode.
 
     Regret is on sums over the episodes. Intervals are paired percentile bootstraps over them (see ``score``): live and
     simulated runs of an episode, and those over several transports, are drawn together.
     """
-    check_resampling(resamples, confidence)
     policies = by_policy(runs)
     if reference not in policies:
         return []
@@ -61,11 +50,11 @@ def margins(
         sums = _sums([one for one in runs if one.policy == policy], policies[reference])
         if policy == reference or len(sums) < 2:
             continue
-        weights = times_drawn(len(sums), resamples, stream(seed, policy))
+        weights = times_drawn(len(sums), 2000, stream(0, policy))
         live, simulated, best = (weights @ sums).T
         known = best > 0
         numbers = ratio(live, best, known), ratio(simulated, best, known), ratio(live, simulated, simulated > 0)
-        found.append(Margin(policy, reference, len(sums), *(percentile_interval(n, confidence) for n in numbers)))
+        found.append(Margin(policy, reference, len(sums), *(percentile_interval(n, 0.95) for n in numbers)))
     return found
 
 

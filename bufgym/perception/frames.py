@@ -31,8 +31,6 @@ SENT_WIDTH: Final = 640
 """Frames are sent at the size at which a Kinect takes them, 640x480."""
 JPEG_QUALITY: Final = 50
 """The paper sends "a low-quality JPEG" beside the depth."""
-MAX_DEPTH_M: Final = 65.0
-"""What fits into 16 bits of millimetres."""
 
 
 @dataclass(frozen=True)

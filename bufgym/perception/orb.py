@@ -30,11 +30,11 @@ NEAR_BITS: Final = 64
 class OrbSimilarity:
     """Similarity of the images of two frames; features are computed once a frame and pairs compared once."""
 
-    def __init__(self, image: Callable[[int], Image], features: int = FEATURES) -> None:
+    def __init__(self, image: Callable[[int], Image]) -> None:
         """``image(k)`` is the picture of frame k, uint8[height, width]."""
         cv2 = library("cv2")
         self._image = image
-        self._detector = cv2.ORB_create(features)
+        self._detector = cv2.ORB_create(FEATURES)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         self._descriptors: dict[int, NDArray[np.uint8]] = {}
         self._known: dict[tuple[int, int], float] = {}
@@ -56,7 +56,7 @@ class OrbSimilarity:
         return self._descriptors[k]
 
 
-def orbbuf_by(similar: Callable[[int, int], float], episode: Episode, name: str = "orbbuf-images") -> Policy:
+def orbbuf_by(similar: Callable[[int, int], float], episode: Episode) -> Policy:
     """`orbbuf` for one episode, by a similarity of two frames that are given by their places in it."""
     frames = {int(time_us): k for k, time_us in enumerate(episode.arrivals["arrival_us"].tolist())}
 
@@ -73,7 +73,7 @@ def orbbuf_by(similar: Callable[[int, int], float], episode: Episode, name: str 
         return victim
 
     about = "ORBBuf by what two images have in common; it sees the images, as no other policy does."
-    return Policy(name, on_arrival, about=about, source="ORBBuf [wang2021orbbuf], ORB features by OpenCV")
+    return Policy("orbbuf-images", on_arrival, about=about, source="ORBBuf [wang2021orbbuf], ORB features by OpenCV")
 
 
 def orbbuf_with_images(sequence: Sequence, episode: Episode) -> Policy:
@@ -85,14 +85,14 @@ COMPARED: Final = 3
 """Further images that the last of so many decisions compares."""
 
 
-def decision_ms(sequence: Sequence, decisions: int = 50, features: int = FEATURES) -> NDArray[np.float64]:
+def decision_ms(sequence: Sequence, decisions: int = 50) -> NDArray[np.float64]:
     """float64[decisions]: times of one decision as the paper has it, ms.
 
     A message went and one came: the features of the new image are computed, and the similarity of each neighbour of
     the gap to the one now beside it. Reading the images takes no part.
     """
     images = [sequence.grey(k) for k in range(decisions + COMPARED)]
-    similar = OrbSimilarity(images.__getitem__, features)
+    similar = OrbSimilarity(images.__getitem__)
     for k in range(COMPARED - 1):
         similar(k, k + 1)
     times = np.zeros(decisions)

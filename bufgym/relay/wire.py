@@ -227,8 +227,8 @@ def no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no JSON")
 
 
-def to_json(message: Message, op: str = "message") -> str:
-    """The message as a text frame: ``message`` from the relay, ``publish`` to it."""
+def to_json(message: Message) -> str:
+    """The message as a text frame from the relay."""
     data: Any
     if message.encoding == "json":
         try:
@@ -239,7 +239,7 @@ def to_json(message: Message, op: str = "message") -> str:
         data = base64.b64encode(message.payload).decode()
     fields = message._asdict()
     del fields["payload"]
-    return say(op, **fields, data=data)
+    return say("message", **fields, data=data)
 
 
 def from_json(said: Mapping[str, Any]) -> Message:
