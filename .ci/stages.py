@@ -84,12 +84,14 @@ def files_that_run_uncompiled() -> list[str]:
 
 
 def check() -> list[Stage]:
-    """Format, lint, types, workflows."""
+    """Format, lint, types, layers, weight, workflows."""
     actionlint = BIN / "actionlint"
     return [
         Stage("format", [str(BIN / "ruff"), "format", "--check", "."]),
         Stage("lint", [str(BIN / "ruff"), "check", "."]),
         Stage("types", [str(BIN / "mypy")]),
+        Stage("imports", [str(BIN / "lint-imports")]),
+        Stage("weight", [PYTHON, ".ci/weight.py"]),
         Stage("workflows", [str(actionlint)], unless="" if actionlint.exists() else "actionlint is not here"),
     ]
 

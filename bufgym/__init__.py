@@ -5,10 +5,17 @@ import bufgym
 
 env = gym.make("bufgym/Uplink-v0", capacity=8)
 envs = gym.make_vec("bufgym/Uplink-v0", num_envs=1024, capacity=8)
+print(bufgym.compare(["afr", "drop-oldest"], "lte", capacity=8))
 """
+
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as _gym
 
+if TYPE_CHECKING:
+    from bufgym.benchmark.compare import Comparison, compare, make_policy
+
+__all__ = ["ENVIRONMENTS", "ON_TASKS", "Comparison", "compare", "make_policy"]
 __version__ = "0.2.0"
 
 ENVIRONMENTS = {
@@ -44,3 +51,12 @@ for _id, (_scenario, _) in ON_TASKS.items():
             vector_entry_point="bufgym.envs:SenderVectorEnv",
             kwargs={"scenario": _scenario, "reward": "covered"},
         )
+
+
+def __getattr__(name: str) -> Any:
+    """The benchmark's verbs, imported when they are first asked for: ``import bufgym`` is light."""
+    if name in ("Comparison", "compare", "make_policy"):
+        from bufgym.benchmark import compare as module
+
+        return getattr(module, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

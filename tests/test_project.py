@@ -1,12 +1,10 @@
-"""The house rules: rooms import only from rooms above, paths are relative, importing stays cheap, hints name extras."""
+"""The house rules: paths are relative, importing stays cheap, hints name extras. `lint-imports` knows the layers."""
 
-import ast
 import importlib.metadata
 import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,78 +12,6 @@ import pytest
 from bufgym import errors
 
 REPO = Path(__file__).resolve().parent.parent
-
-_ROOMS = """
-    errors files modules kernel traces model observe policies scenario sim oracle live perception c envs expert sb3
-    benchmark ros1 ros2 relay reproduce gallery cli __main__
-"""
-ROOMS = _ROOMS.split()
-"""The rooms of the house, top to bottom. Each imports only from itself and from rooms above it."""
-
-_TRAINING = """
-    agents.settings agents.runs agents.mixed_env agents.evaluation agents.held_out agents.figure
-    agents.objectives.objective agents.objectives.queue agents.objectives.topics agents.objectives.fleet
-    agents.objectives agents.cma_es agents.callbacks agents.dqn agents.training agents.page agents.report agents.goals
-    agents.scheduling agents.on_task agents.ablation agents.small_queue train
-"""
-TRAINING = _TRAINING.split()
-"""The modules that drive training, top to bottom. Each imports only bufgym and modules above it."""
-
-OUTSIDE = {"agents", "train", "tests", "website"}
-"""What imports bufgym, and is never imported by it."""
-
-
-def imported_names(path: Path, module: str) -> Iterator[tuple[str, str]]:
-    """Each (file and line, full dotted name) that a module imports: at the top, in a function, or for types only."""
-    package = module.split(".")[: None if path.name == "__init__.py" else -1]
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            yield from ((f"{module}:{node.lineno}", alias.name) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else []
-            prefix = ".".join([*base, *([node.module] if node.module else [])])
-            yield from ((f"{module}:{node.lineno}", f"{prefix}.{alias.name}") for alias in node.names)
-
-
-def modules(*folders: str) -> dict[str, Path]:
-    """Dotted name -> file of every module under the folders, but for their own ``__init__.py``."""
-    paths = [path for folder in folders for path in sorted(REPO.glob(folder))]
-    names = [".".join(path.relative_to(REPO).with_suffix("").parts).removesuffix(".__init__") for path in paths]
-    return {name: path for name, path in zip(names, paths, strict=True) if name not in ("bufgym", "agents")}
-
-
-def test_each_room_imports_only_from_rooms_above() -> None:
-    found = modules("bufgym/**/*.py")
-    assert {name.split(".")[1] for name in found} == set(ROOMS)
-    faults = []
-    for module, path in found.items():
-        room = module.split(".")[1]
-        for where, name in imported_names(path, module):
-            top, *rest = name.split(".")
-            if top in OUTSIDE:
-                faults.append(f"{where}: bufgym never imports {top}")
-            elif top == "bufgym" and rest != ["__version__"]:
-                if not rest or rest[0] not in ROOMS:
-                    faults.append(f"{where}: imports {name}: name a room, not the whole package")
-                elif ROOMS.index(rest[0]) > ROOMS.index(room):
-                    faults.append(f"{where}: imports {rest[0]}, which is below {room}")
-    assert not faults, "\n".join(faults)
-
-
-def test_each_module_of_training_imports_only_what_is_above_it() -> None:
-    found = modules("agents/**/*.py", "train.py")
-    assert set(found) == set(TRAINING)
-    faults = []
-    for module, path in found.items():
-        for where, name in imported_names(path, module):
-            # The longest module that the name begins with: "agents.objectives.queue.start" is of that module.
-            owner = max((other for other in TRAINING if f"{name}.".startswith(f"{other}.")), key=len, default=None)
-            if name.split(".")[0] in OUTSIDE and (owner is None or TRAINING.index(owner) >= TRAINING.index(module)):
-                faults.append(f"{where}: imports {name}, which is not above {module}")
-            elif name.startswith("importlib.import_module"):
-                faults.append(f"{where}: import_module hides what is imported")
-    assert not faults, "\n".join(faults)
-
 
 HOMES = ["home", "root", "Users", "work", "workspace", "workspaces", "builds"]
 """Top folders where people and build machines keep checkouts: a path into one holds on one machine only."""

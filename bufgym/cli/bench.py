@@ -53,8 +53,7 @@ def _scenario(options: argparse.Namespace) -> None:
     from bufgym import policies
     from bufgym.benchmark import rows as files
     from bufgym.benchmark import table
-    from bufgym.benchmark.run import run
-    from bufgym.oracle.measure import BASELINE
+    from bufgym.benchmark.compare import compare
 
     if target(options) is not None:
         raise BufgymError(f"--out {options.out}: without --suite it must be a folder")
@@ -79,12 +78,10 @@ def _scenario(options: argparse.Namespace) -> None:
                 f"{out}: holds the run of a suite; choose another --out (its rows are never written over)"
             )
     settings = {"max_bytes": options.max_bytes, "decide_at": options.decide_at}
-    rows = run(chosen, stream, options.capacity, options.seeds, progress=True, **settings)
-    floor = []  # of the scores
-    if all(policy.name != BASELINE for policy in chosen):
-        floor = run([policies.get(BASELINE)], stream, options.capacity, options.seeds, bound=False, **settings)
+    done = compare(chosen, stream, capacity=options.capacity, seeds=options.seeds, about=about, **settings)
+    rows = done.rows
     bounds = _bound_notes(rows, stream, options.decide_at) if options.workload is not None else []
-    print("\n".join([f"{about}\n\n{table.plain(rows, floor)}", *bounds]))
+    print("\n".join([str(done), *bounds]))
     if options.workload is not None:
         order = dict.fromkeys(entry["policy"] for entry in table.means(rows))
         _dropped(options, chosen, stream, list(order))
@@ -92,7 +89,7 @@ def _scenario(options: argparse.Namespace) -> None:
         written = files.write_rows(rows, Path(options.out) / f"rows.{form}")
         page = Path(options.out) / "table.md"
         with replaced(page) as temporary:
-            text = "\n".join([f"{about}\n\n{table.markdown(rows, floor)}", *([""] if bounds else []), *bounds])
+            text = "\n".join([f"{about}\n\n{done.markdown}", *([""] if bounds else []), *bounds])
             temporary.write_text(text + "\n", encoding="utf-8")
         print(f"\n{len(rows)} rows in {written}, this table in {page}")
 

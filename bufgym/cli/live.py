@@ -129,7 +129,7 @@ def _link(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from bufgym import policies, traces
-    from bufgym.benchmark.live_runs import margins
+    from bufgym.live.margins import margins
     from bufgym.live.runs import save, table
     from bufgym.live.validate import validate
     from bufgym.scenario import Uplink
@@ -160,9 +160,9 @@ def _validate(options: argparse.Namespace) -> None:
     )
     print("\n".join([table(runs), "", *map(str, margins(runs))]))
     if options.out is not None:
-        from bufgym.benchmark.report import live
+        from bufgym.live import report as page
 
-        print(f"\nwrote {live.write(save(runs, about, _command(options), Path(options.out)))}")
+        print(f"\nwrote {page.write(save(runs, about, _command(options), Path(options.out)))}")
 
 
 def _play_over(transport: str) -> Play:

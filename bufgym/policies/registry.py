@@ -253,16 +253,15 @@ def _registration(
         Keywords are the fields of ``Policy``: ``parameters``, ``memory``, ``on_departure``, ``compile`` and so on.
 
         Raises:
-            BufgymError: the name is empty, holds one of ``:,=`` or a blank, or is a built-in policy's.
+            BufgymError: the name is empty, holds one of ``:,=`` or a blank, or another policy has it.
         """
-        entry = _REGISTRY.get(name)
-        if entry and (isinstance(entry, Later) or entry.on_arrival.__module__.startswith("bufgym.")):
-            raise BufgymError(f"policy {name!r}: a built-in policy has this name")
         check_name("policy", name)
 
         def add(on_arrival: OnArrival) -> OnArrival:
             if not callable(on_arrival):
                 raise BufgymError(f"policy {name!r}: {on_arrival!r} is not a function")
+            if owner := _owner(name, on_arrival):
+                raise BufgymError(f"policy {name!r}: {owner} has this name")
             policy = make(name, on_arrival, *args, **kwargs)
             for what, entries in (("parameters", policy.parameters), ("memory", policy.memory)):
                 if not isinstance(entries, Mapping):
@@ -273,6 +272,17 @@ def _registration(
         return add
 
     return register
+
+
+def _owner(name: str, on_arrival: OnArrival) -> str:
+    """The other policy of this name, in words, or nothing. A function may replace itself, as a notebook runs again."""
+    entry = _REGISTRY.get(name)
+    if entry is None:
+        return ""
+    if isinstance(entry, Later) or entry.on_arrival.__module__.startswith("bufgym."):
+        return "a built-in policy"
+    places = [(function.__module__, function.__qualname__) for function in (entry.on_arrival, on_arrival)]
+    return "" if places[0] == places[1] else f"the function {'.'.join(places[0])}"
 
 
 register = _registration(Policy)

@@ -15,7 +15,6 @@ from bufgym import policies
 from bufgym.benchmark import leaderboard, report
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.leaderboard import Entry, entries
-from bufgym.benchmark.live_runs import margins
 from bufgym.benchmark.score import scores
 from bufgym.benchmark.summary import Quantity, Run, Summary, plain, summarise
 from bufgym.benchmark.sweep import Sweep, run_sweep
@@ -23,6 +22,7 @@ from bufgym.benchmark.table import score
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.stress import ratios
 from bufgym.errors import BufgymError
+from bufgym.live.margins import margins
 from bufgym.live.runs import Run as LiveRun
 from bufgym.scenario import Uplink, suites
 from bufgym.traces import Trace

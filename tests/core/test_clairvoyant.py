@@ -149,6 +149,21 @@ def test_where_nothing_need_be_dropped_all_is_sent_at_once():
 
 
 @kernels
+@given(st.lists(st.tuples(st.integers(0, 8), st.integers(0, 8)), max_size=20))
+def test_labels_are_those_that_no_other_beats(offered):
+    """A label is beaten by one that ends no later with as much gain; of two alike the newer stays."""
+    held = labels.no_labels(1)
+    stop, front = 0, {}
+    for number, (end, gain) in enumerate(offered):
+        stop = labels.insert(held, 0, stop, end, float(gain), number)
+        if not any(e <= end and g >= gain and (e, g) != (end, gain) for e, g in front):
+            front = {(e, g): k for (e, g), k in front.items() if not (e >= end and g <= gain)} | {(end, gain): number}
+        assert list(zip(held.end[:stop], held.gain[:stop], held.parent[:stop], strict=True)) == [
+            (e, g, k) for (e, g), k in sorted(front.items())
+        ]
+
+
+@kernels
 def test_unequal_sizes_by_hand():
     """L = 1, messages of 10, 30 and 10 us at 0, 5 and 6: of the two that wait only one has room, and the small one
     lets the fourth, at 25, find an idle link."""
@@ -156,6 +171,17 @@ def test_unequal_sizes_by_hand():
     plan = clairvoyant(episode, 1, V)
     assert plan.kept.tolist() == [True, False, True, True] and plan.certified
     assert plan.qoi == pytest.approx(V.information(np.array([0.0, 2.0, 3.0])), abs=EXACT)
+
+
+@kernels
+@pytest.mark.parametrize(("L", "limits", "reached"), [(3, {}, 0.999), (9, {"max_bytes": 40}, 0.98)])
+def test_the_plan_for_sixteen_unequal_messages_comes_close_to_the_bound(L, limits, reached):
+    sizes = np.maximum(1, 12 * np.random.default_rng(2).lognormal(0, 0.9, 16)).astype(int)
+    episode = line(np.arange(16) * 5, sizes=sizes)
+    plan = clairvoyant(episode, L, V, **limits)
+    result = outcome(run(policies.get("clairvoyant"), [episode], L, V, **limits), 0)
+    assert not plan.certified and result.invalid == 0
+    assert result.qoi == V.information(np.flatnonzero(plan.kept).astype(float)) >= reached * plan.qoi
 
 
 @pytest.mark.nightly

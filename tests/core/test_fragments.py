@@ -148,6 +148,9 @@ def test_webrtc_leaks_and_follows():
     memory[webrtc.LEVEL] = 0.0
     webrtc.fill(memory, 9e6, 40_000.0)
     assert memory[webrtc.LEVEL] == 4_500_000
+    memory[webrtc.LEVEL] = 499_999.0  # a bucket that fits its new size, 0.5 MB, stays as it is
+    webrtc.retarget(memory, 1.0)
+    assert memory[webrtc.LEVEL] == 499_999
 
 
 @kernels

@@ -41,6 +41,7 @@ from bufgym.policies.target_gap import REMEMBERED
 from bufgym.scenario import Interruption
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
+from tests.conftest import COMPILED
 
 kernels = pytest.mark.kernels
 V = qoi.exponential(0.618)
@@ -155,6 +156,25 @@ def test_the_twin_counts_as_one_does_by_hand():
     # A second layer: relu(5 * 1 + 0 * 9 + 2) = 7; score = -3 * 7 + 7 * 3 + 0.5
     second = (np.float32([[1], [9]]), np.float32([2]))
     assert score(replace(net, layers=(*net.layers, second), out=np.float32([-3])), [3.0]) == 0.5
+
+
+@kernels
+@pytest.mark.skipif(COMPILED, reason="compiling for a queue by hand takes 10 s, and others compare both")
+@pytest.mark.parametrize("hidden", [0, 1, 2])
+def test_what_a_hidden_layer_lets_through_decides(hidden):
+    """relu(relu(rank)) is largest for the newcomer, relu(relu(1 - rank)) for the oldest; relu(-rank) is 0 for all,
+    and of equals the oldest goes."""
+    one = np.float32([[1]]), np.float32([0])
+
+    def choice(weight, bias):
+        first = np.float32([[weight]]), np.float32([bias])
+        net = Network(np.float32([0]), np.float32([0]), (first, one)[:hidden], np.float32([1] if hidden else []))
+        made = Weights(("rank",), net if hidden else replace(net, skip=np.float32([weight])), net)
+        policy = learned.policy("by-hand", made)
+        return policy.on_arrival(queue_of(2, 2, policy.parameter_array), newcomer(), policy.new_memory(1, 2)[0])
+
+    assert [choice(1, 0), choice(-1, 1)] == [REJECT, 0]
+    assert choice(-1, 0) == 0
 
 
 def start(fields, seen):

@@ -24,6 +24,7 @@ from bufgym.policies.small_queue import BASES, CAPACITIES, LONGEST, NONE
 from bufgym.reproduce.small_link import episode
 from bufgym.scenario import Interruption, Streams, registry
 from bufgym.sim import run
+from bufgym.sim.metrics import outcome
 
 # The number of examples is set where one of them is hundreds of runs.
 
@@ -41,6 +42,20 @@ def test_by_hand():
     # With room for all, nothing is lost: T + 1 gaps of 1.
     assert integer(5, 3, v) == ideal(5, 3, v) == 4 * 0.5
     assert integer(1, 0, v) == 0.5
+
+
+@kernels
+@pytest.mark.parametrize(("L", "T"), [(1, 1), (2, 7), (3, 9)])
+def test_the_policy_of_this_name_keeps_these_gaps(L, T):
+    v = qoi.exponential(0.5)
+    (row,) = [outcome(run(policies.get("oracle"), [Interruption(t_max=T).episode(T)], L, v), 0)]
+    assert row.qoi == pytest.approx(1 + integer(L, T, v), abs=1e-12) and row.invalid == 0
+
+
+@kernels
+def test_the_law_of_t_by_hand():
+    assert law(Interruption(law="uniform", t_min=1, t_max=4)).tolist() == [0, 0.25, 0.25, 0.25, 0.25]
+    assert law(Interruption(law="uniform", t_min=1, t_max=4, lengths=(1, 2))).tolist() == [0, 0.5, 0.5, 0, 0]
 
 
 @kernels

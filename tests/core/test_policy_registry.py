@@ -12,7 +12,7 @@ from policy_cases import interruption, kept
 from bufgym import policies
 from bufgym.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.policies import ACCEPT, register, registry
+from bufgym.policies import ACCEPT, REJECT, register, registry
 from bufgym.sim.metrics import outcome
 
 ALL = tuple(name for name in policies.names() if policies.get(name).privileged is None)
@@ -153,6 +153,11 @@ def test_bad_registrations():
     for name in policies.names():
         with pytest.raises(BufgymError, match=f"policy '{name}': a built-in policy has this name"):
             register(name)(keep_even)
+    register("test-mine")(keep_even)
+    register("test-mine")(keep_even)  # a notebook's cell runs again
+    with pytest.raises(BufgymError, match=r"policy 'test-mine': the function .*\.keep_even has this name"):
+        register("test-mine")(lambda buffer, arrival, memory: REJECT)
+    registry._REGISTRY.pop("test-mine")
     for name in ("", "a b", "a:b", "a,b", "a=b"):
         with pytest.raises(BufgymError, match="a name must be non-empty"):
             register(name)(keep_even)

@@ -158,7 +158,7 @@ def test_orders_by_hand() -> None:
 def report() -> Any:
     pytest.importorskip("jinja2", reason="the page needs Jinja")
     pytest.importorskip("plotly", reason="the page needs plotly")
-    from bufgym.benchmark.report import live
+    from bufgym.live import report as live
 
     return live
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bufgym import __version__
-from bufgym.benchmark.live_runs import margins
+from bufgym.live.margins import margins
 from bufgym.benchmark.report import style
 from bufgym.benchmark.report.charts import Chart
 from bufgym.benchmark.report.page import rendered

@@ -1,0 +1,159 @@
+"""``bufgym.compare`` and ``bufgym.make_policy``: policies side by side on the same episodes."""
+
+from __future__ import annotations
+
+import difflib
+import html
+import math
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bufgym import policies, scenario
+from bufgym.benchmark import report, sources, table
+from bufgym.benchmark.rows import Row
+from bufgym.benchmark.run import run
+from bufgym.benchmark.sweep import Sweep, run_sweep
+from bufgym.errors import BufgymError, install
+from bufgym.oracle.measure import BASELINE
+from bufgym.policies import Policy
+from bufgym.policies.registry import OnArrival
+from bufgym.scenario import suites
+
+PolicyLike = Policy | str | Path | OnArrival
+
+
+def make_policy(spec: PolicyLike) -> Policy:
+    """A policy from its name, a function, or a file.
+
+    Args:
+        spec: a registered name (``"afr"``, ``"decimate:every=2"``), a function (buffer, arrival, memory),
+            ``"module:function"``, a model of stable-baselines3 (``.zip``, which can run any code), or a learned policy
+            (``.safetensors``, which runs none). A ``Policy`` comes back as it is.
+
+    Raises:
+        BufgymError: there is no such policy, or the file holds none.
+    """
+    if isinstance(spec, Path) or (isinstance(spec, str) and sources.is_source(spec)):
+        spec = sources.load(os.fspath(spec))
+    return policies.get(spec)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Policies side by side on the same episodes. It prints as its table, in a notebook too."""
+
+    rows: list[Row]
+    """One row for each policy, capacity and episode."""
+    about: str
+    """The scenario or suite."""
+    plain: str
+    """The table as aligned text."""
+    markdown: str
+    """The table as Markdown."""
+
+    def table(self, form: str = "plain") -> str:
+        """Means by policy: ``"plain"`` text or ``"markdown"``."""
+        if form not in ("plain", "markdown"):
+            raise BufgymError(f"form = {form!r}: must be 'plain' or 'markdown'")
+        return self.plain if form == "plain" else self.markdown
+
+    def to_pandas(self) -> Any:
+        """``rows`` as a pandas DataFrame."""
+        try:
+            import pandas  # type: ignore[import-untyped,unused-ignore]
+        except ImportError:
+            raise BufgymError("to_pandas needs pandas: pip install pandas") from None
+        return pandas.DataFrame(self.rows)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw each policy's regret as a bar, a colour for each L; Matplotlib's axes. QoI where no regret is known."""
+        try:
+            from matplotlib import pyplot
+        except ImportError:
+            raise BufgymError(f"plot needs matplotlib: {install('plot')}") from None
+        axes = pyplot.subplots(layout="constrained")[1] if axes is None else axes
+        entries = table.means(self.rows)
+        capacities = list(dict.fromkeys(entry["capacity"] for entry in entries))
+        names = list(dict.fromkeys(entry["policy"] for entry in reversed(entries)))
+        height = 0.8 / len(capacities)
+        key, scale, label = "regret", 100, "regret: part of the best QoI that is lost, % (shorter is better)"
+        if any(math.isnan(entry["regret"]) for entry in entries):
+            key, scale, label = "qoi", 1, "QoI, mean over the episodes (longer is better)"
+        for k, capacity in enumerate(capacities):
+            chosen = [entry for entry in entries if entry["capacity"] == capacity]
+            places = [names.index(entry["policy"]) + (k - (len(capacities) - 1) / 2) * height for entry in chosen]
+            axes.barh(places, [scale * entry[key] for entry in chosen], height, label=f"L = {capacity}")
+        axes.set_yticks(range(len(names)), names)
+        axes.set_xlabel(label)
+        axes.set_title(self.about.partition("\n")[0], fontsize="medium", loc="left")
+        if len(capacities) > 1:
+            axes.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
+        return axes
+
+    def __str__(self) -> str:
+        return f"{self.about}\n\n{self.plain}"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(str(self))}</pre>"
+
+
+def compare(
+    policies: Sequence[PolicyLike],
+    on: Any = "lte",
+    *,
+    capacity: int | Sequence[int] | None = None,
+    seeds: int | Sequence[int] | None = None,
+    progress: bool = True,
+    about: str = "",
+    **settings: Any,
+) -> Comparison:
+    """Run each policy on the same episodes of a scenario or a suite.
+
+    Args:
+        policies: as ``make_policy`` takes them.
+        on: a scenario, its name (see ``bufgym list``), or a suite's name such as ``"outage-v1"``.
+        capacity: L, messages, or several; by default 8, or the suite's.
+        seeds: so many episodes on each trace, or these; by default 10, or the suite's.
+        progress: show a bar on stderr, where that is a terminal.
+        about: a line that stands above the table; by default what ``on`` is.
+        settings: of a queue, ``max_bytes`` and ``decide_at``; the others are parameters of a scenario that is named.
+
+    Raises:
+        BufgymError: an argument is out of its range, or there is no such policy, scenario or suite.
+    """
+    chosen = [make_policy(policy) for policy in policies]
+    capacities = [capacity] if isinstance(capacity, int) else list(capacity or ())
+    if isinstance(on, str) and on in suites.SUITES:
+        if settings:
+            raise BufgymError(f"{', '.join(settings)}: a suite's episodes are frozen")
+        return _on_suite(chosen, on, capacities, seeds, progress)
+    if isinstance(on, str) and on.isidentifier() and on not in scenario.SCENARIOS:
+        close = difflib.get_close_matches(on, [*scenario.SCENARIOS, *suites.SUITES], 1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join([*scenario.SCENARIOS, *suites.SUITES])}"
+        raise BufgymError(f"{on!r}: no scenario and no suite; {hint}")
+    queue = {name: settings.pop(name) for name in ("max_bytes", "decide_at") if name in settings}
+    stream = scenario.get(on, **settings) if isinstance(on, str) else on
+    seeds, capacities = 10 if seeds is None else seeds, capacities or [8]
+    rows = run(chosen, stream, capacities, seeds, progress=progress, **queue)
+    floor: list[Row] = []  # of the scores
+    if all(policy.name != BASELINE for policy in chosen):
+        floor = run([BASELINE], stream, capacities, seeds, bound=False, **queue)
+    text, page = table.plain(rows, floor), table.markdown(rows, floor)
+    return Comparison(rows, about or (on if isinstance(on, str) else repr(stream)), text, page)
+
+
+def _on_suite(chosen: Sequence[Policy], name: str, capacities: Sequence[int], seeds: Any, progress: bool) -> Comparison:
+    """``compare`` on the test split of a suite. Its processes know policies by name, so they must be registered."""
+    if unknown := [policy.name for policy in chosen if policy.name not in policies.names() and ":" not in policy.name]:
+        raise BufgymError(f"policy {unknown[0]}: register it to run it on a suite, whose processes know it by name")
+    if seeds is not None and not isinstance(seeds, int):
+        raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
+    sweep = Sweep(suites.get(name).name, tuple(policy.name for policy in chosen), "test", tuple(capacities), seeds)
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        rows = run_sweep(sweep, out, form="csv", progress=progress)
+        return Comparison(rows, f"suite {name}", report.plain(out), report.markdown(out))

@@ -1,0 +1,79 @@
+"""``bufgym.compare``: the same rows as the benchmark's, as text, Markdown, a data frame and a picture."""
+
+from pathlib import Path
+
+import pytest
+
+import bufgym
+from bufgym import policies, scenario
+from bufgym.benchmark.run import run
+from bufgym.errors import BufgymError
+from bufgym.policies import REJECT
+
+
+def stubborn(buffer, arrival, memory):
+    """Rejects all, room or not."""
+    return REJECT
+
+
+def test_a_scenario_by_name_or_made_and_policies_of_each_kind() -> None:
+    done = bufgym.compare(["afr", stubborn], "interruption", capacity=[2, 4], seeds=3, t_max=20, progress=False)
+    made = scenario.get("interruption", t_max=20)
+    rows = run([policies.get("afr"), policies.get(stubborn)], made, [2, 4], 3)
+    assert done.rows == rows and bufgym.compare(["afr", stubborn], made, capacity=[2, 4], seeds=3).rows == rows
+    # The score needs Drop Oldest on the same episodes, though it is no row.
+    head, *lines = done.table().splitlines()
+    assert head.split()[:5] == ["policy", "L", "score", "QoI", "regret"] and "drop-oldest" not in done.table()
+    assert [line.split()[0] for line in lines if line] == ["afr", "stubborn", "afr", "stubborn"]
+    assert done.table("markdown").startswith("| policy | L |") and str(done).startswith("interruption\n\n")
+    assert "stubborn" in done._repr_html_()
+
+
+def test_a_suite_by_name() -> None:
+    done = bufgym.compare(["afr"], "interruption-v1", capacity=2, seeds=1, progress=False)
+    assert {row["policy"] for row in done.rows} == {"afr", "drop-oldest"} and "afr" in done.table()
+
+
+def test_a_picture() -> None:
+    pytest.importorskip("matplotlib", reason="a picture needs the extra [plot]")
+    done = bufgym.compare(["afr", "min-gap"], "interruption", capacity=[2, 4], seeds=2, progress=False)
+    axes = done.plot()
+    assert {label.get_text() for label in axes.get_yticklabels()} == {"min-gap", "afr"}
+    assert len(axes.patches) == 4 and axes.get_xlabel().startswith("regret")
+
+
+def test_a_frame() -> None:
+    frame = pytest.importorskip("pandas", reason="a frame needs pandas")
+    done = bufgym.compare(["afr"], "interruption", seeds=2, progress=False)
+    assert isinstance(done.to_pandas(), frame.DataFrame) and done.to_pandas()["policy"].tolist() == ["afr", "afr"]
+
+
+def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text("def every_other(buffer, arrival, memory):\n    return -1 if arrival.seq % 2 else -2\n")
+    assert bufgym.make_policy("decimate:every=3").parameters["every"] == 3
+    assert bufgym.make_policy(stubborn).name == "stubborn"
+    assert bufgym.make_policy("mine:every_other").name == "every_other"
+    assert bufgym.make_policy(policies.get("afr")).name == "afr"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ((["afrr"],), "unknown policy 'afrr'"),
+        ((["afr"], "ltee"), "'ltee': no scenario and no suite; did you mean 'lte'?"),
+        ((["afr"], "outage"), "'outage': no scenario and no suite; did you mean 'outage-v1'?"),
+        (([stubborn], "outage-v1"), "policy stubborn: register it to run it on a suite"),
+        (([],), "policies = .*: need at least one"),
+    ],
+)
+def test_what_is_wrong_is_named(arguments, says) -> None:
+    with pytest.raises(BufgymError, match=says.replace("?", r"\?")):
+        bufgym.compare(*arguments)
+
+
+def test_a_suite_is_frozen_and_forms_are_two() -> None:
+    with pytest.raises(BufgymError, match="duration_s: a suite's episodes are frozen"):
+        bufgym.compare(["afr"], "outage-v1", duration_s=3.0)
+    with pytest.raises(BufgymError, match="form = 'html': must be 'plain' or 'markdown'"):
+        bufgym.compare(["afr"], "interruption", seeds=1).table("html")
