@@ -62,7 +62,7 @@ docs: $(READY)
 	@echo "build/site/index.html"
 
 gallery: $(READY)
-	$(BIN)/bufgym gallery all --out docs/gallery --interactive docs/interactive.html
+	$(BIN)/python -m website.films all --interactive docs/interactive.html
 
 # Each draws its picture beside itself.
 tutorials: $(READY)

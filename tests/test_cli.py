@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 from cli_cases import Capsys, Patch, fails, shown
+from PIL import Image
 
 from bufgym import __version__, cli, policies, scenario, traces
 from bufgym.benchmark.rows import read_rows
@@ -53,6 +54,7 @@ def test_the_module_runs_as_a_command_and_opens_no_heavy_module() -> None:
         ("trace info missing.csv", "missing.csv"),
         ("trace plot lte-synthetic-0 --out x.doc", "x.doc"),
         ("play --env Moon-v0", "'Moon-v0'"),
+        ("play --out film.mp4", "film.mp4: must end in .gif"),
         ("reproduce fig99", "'fig99'"),
     ],
 )
@@ -76,6 +78,14 @@ def test_ctrl_c_and_a_reader_that_left(monkeypatch: Patch, capsys: Capsys, tmp_p
         process.stdout.close()
         assert process.stderr.read() == ""
     assert process.returncode == 141
+
+
+def test_play_writes_a_film(tmp_path: Path) -> None:
+    """A picture for each decision, and one of the end; 5 a second."""
+    film = tmp_path / "film.gif"
+    assert main(["play", "--env", "Interruption-v0", "--steps", "3", "--out", str(film)]) == 0
+    with Image.open(film) as picture:
+        assert (picture.n_frames, picture.size, picture.info["duration"]) == (3, (800, 400), 200)
 
 
 def test_play_ends_where_bench_does(capsys: Capsys) -> None:

@@ -5,12 +5,11 @@ from pathlib import Path
 import pytest
 from browser_cases import embedded, opened
 
-from bufgym import gallery
-from bufgym.cli import main
+from bufgym.benchmark import picture
 from bufgym.envs.render.scene import DELIVERED, DROPPED, QUEUED, SENDING
-from bufgym.gallery import comparison
 from bufgym.scenario import Interruption
 from bufgym.scenario.numbered import draw
+from website import films
 
 REPO = Path(__file__).resolve().parent.parent
 FILMS = REPO / "docs" / "gallery"
@@ -20,12 +19,12 @@ MAX_ALL_BYTES = 2_000_000
 def test_an_interruption_second_by_second() -> None:
     """T = 4, L = 2 under Drop Oldest: 3 evicts 1, 4 evicts 2; the link returns half a period after 4."""
     scenario = Interruption(law="fixed", t_max=4, rate_hz=10)
-    (run,) = gallery.play(["drop-oldest"], draw(scenario, 0), 2, scenario)
+    (run,) = picture.play(["drop-oldest"], draw(scenario, 0), 2, scenario)
     assert run.received.tolist() == [0, 3, 4, 5]
-    assert comparison.states_at(run, 250_000).tolist() == [SENDING, QUEUED, QUEUED, -1, -1, -1]
-    assert comparison.states_at(run, 300_000).tolist() == [SENDING, DROPPED, QUEUED, QUEUED, -1, -1]
+    assert picture.states_at(run, 250_000).tolist() == [SENDING, QUEUED, QUEUED, -1, -1, -1]
+    assert picture.states_at(run, 300_000).tolist() == [SENDING, DROPPED, QUEUED, QUEUED, -1, -1]
     after = [DELIVERED, DROPPED, DROPPED, DELIVERED, DELIVERED, DELIVERED]
-    assert comparison.states_at(run, 900_000).tolist() == after
+    assert picture.states_at(run, 900_000).tolist() == after
     assert run.longest_gap_s == pytest.approx(0.3)
     # Gaps of 3, 1 and 1 with V = 1 - 0.618^d.
     assert run.h == pytest.approx(1 + (1 - 0.618**3) + 2 * (1 - 0.618))
@@ -33,14 +32,14 @@ def test_an_interruption_second_by_second() -> None:
 
 def test_the_films_in_docs_are_small_and_all_there() -> None:
     sizes = {path.stem: path.stat().st_size for path in FILMS.glob("*.webp")}
-    assert set(sizes) == set(gallery.FILMS)
-    assert max(sizes.values()) < gallery.films.MAX_BYTES
+    assert set(sizes) == set(films.FILMS)
+    assert max(sizes.values()) < films.MAX_BYTES
     assert sum(sizes.values()) < MAX_ALL_BYTES
 
 
 @pytest.mark.nightly
 def test_the_page_is_what_the_command_writes(tmp_path: Path) -> None:
-    assert main(["gallery", "--interactive", str(tmp_path / "page.html")]) == 0
+    films.main(["--interactive", str(tmp_path / "page.html")])
     assert (tmp_path / "page.html").read_text() == (REPO / "docs" / "interactive.html").read_text()
 
 

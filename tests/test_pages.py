@@ -157,7 +157,7 @@ RUN = {
     r"bufgym dataset make --kind mixed .*": "--episodes 3 --option duration_s=2.0",
     r"bufgym dataset make --suite lte-v1 .*": "--episodes 2 --out data",
     r"bufgym topics --config \S+": "--seeds 1 --policies robofleet",
-    r"bufgym (--help|list \w+|gallery|trace fetch --list)": "",
+    r"bufgym (--help|list \w+|trace fetch --list)": "",
     r"bufgym trace generate .*": "-o made.csv",
     r"bufgym play --policies .*": "--speed 0 --steps 20",
 }

@@ -9,9 +9,9 @@ from typing import Any
 
 import bufgym
 from bufgym import scenario
-from bufgym.gallery import FILMS
 from bufgym.observe import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS
 from bufgym.scenario import FleetScenario
+from website.films import FILMS
 from website.markdown import code, parameters, table
 
 FLEET = "bufgym_fleet_v0"
@@ -143,7 +143,7 @@ def _make(id: str) -> str:
 
 
 def _made_by(film: str) -> str:
-    return f"Made by `bufgym gallery {film} --out docs/gallery`"
+    return f"Made by `python -m website.films {film}`"
 
 
 def _films(id: str) -> list[str]:

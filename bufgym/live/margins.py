@@ -1,4 +1,4 @@
-"""Margins between policies on real sockets and in the simulator, over the same episodes."""
+"""By how much a policy beats another on real sockets, and by how much in the simulator, over the same episodes."""
 
 from __future__ import annotations
 
@@ -7,15 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bufgym.benchmark.bootstrap import (
-    Interval,
-    check_resampling,
-    percentile_interval,
-    ratio,
-    stream,
-    times_drawn,
-    written,
-)
+from bufgym.benchmark.bootstrap import Interval, percentile_interval, ratio, stream, times_drawn, written
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.table import percent
 from bufgym.live.runs import Run, by_policy
@@ -23,7 +15,7 @@ from bufgym.live.runs import Run, by_policy
 
 @dataclass(frozen=True)
 class Margin:
-    """Reduction of a policy's regret relative to the reference, with intervals over the episodes that both met."""
+    """How much lower a policy's regret is than the reference's, with intervals over the episodes that both met."""
 
     policy: str
     reference: str
@@ -31,7 +23,7 @@ class Margin:
     live: Interval
     simulated: Interval
     share: Interval
-    """Live margin over simulated margin."""
+    """Live over simulated."""
 
     def __str__(self) -> str:
         live, simulated, share = map(_percent, (self.live, self.simulated, self.share))
@@ -44,16 +36,12 @@ def _percent(interval: Interval) -> str:
     return " ".join(written(interval, percent)).strip()
 
 
-def margins(
-    runs: Sequence[Run], reference: str = "afr", *, resamples: int = 2000, confidence: float = 0.95, seed: int = 0
-) -> list[Margin]:
-    """Compute each policy's margin over ``reference``, the best in the simulator first; [] without data.
+def margins(runs: Sequence[Run], reference: str = "afr") -> list[Margin]:
+    """Of each other policy, the best in the simulator first; none without the reference or with a single episode.
 
-    The list is empty without the reference or with a single episode. Regret is computed on sums over the episodes.
-    Intervals are paired percentile bootstraps over episodes, as in ``score``. All runs of an episode, live and
-    simulated and over any transport, are drawn together.
+    Regret is on sums over the episodes. Intervals are paired percentile bootstraps over them (see ``score``): live and
+    simulated runs of an episode, and those over several transports, are drawn together.
     """
-    check_resampling(resamples, confidence)
     policies = by_policy(runs)
     if reference not in policies:
         return []
@@ -62,16 +50,16 @@ def margins(
         sums = _sums([one for one in runs if one.policy == policy], policies[reference])
         if policy == reference or len(sums) < 2:
             continue
-        weights = times_drawn(len(sums), resamples, stream(seed, policy))
+        weights = times_drawn(len(sums), 2000, stream(0, policy))
         live, simulated, best = (weights @ sums).T
         known = best > 0
         numbers = ratio(live, best, known), ratio(simulated, best, known), ratio(live, simulated, simulated > 0)
-        found.append(Margin(policy, reference, len(sums), *(percentile_interval(n, confidence) for n in numbers)))
+        found.append(Margin(policy, reference, len(sums), *(percentile_interval(n, 0.95) for n in numbers)))
     return found
 
 
 def _sums(ours: Sequence[Run], theirs: Sequence[Run]) -> Numbers:
-    """Sum over transports: H less the other's H, live and simulated, and the clairvoyant's H; [episodes, 3]."""
+    """[episodes, 3] over the transports of each: H less the other's H, live and simulated, and the clairvoyant's."""
     episodes: dict[tuple[str, int], list[float]] = {}
     others = {(one.transport, one.link, one.seed): one for one in theirs}
     for one in ours:

@@ -1,7 +1,7 @@
-"""Frames of a depth camera with their true poses, as a robot records and sends them.
+"""Frames of a depth camera, with the true pose of each: what a robot records and sends.
 
-Cameras look along z, x is right and y down, as in OpenCV. A pixel (u, v) with depth z is the point ((u - cx) z / fx, (v
-- cy) z / fy, z) in metres. A pose takes it to the world. Depth 0 means no measurement.
+Cameras look along z, x is right and y down, as in OpenCV. A pixel (u, v) with depth z is the point
+((u - cx) z / fx, (v - cy) z / fy, z), in metres; a pose takes it to the world. Depth 0 is no measurement.
 """
 
 from __future__ import annotations
@@ -31,8 +31,6 @@ SENT_WIDTH: Final = 640
 """Frames are sent at the size at which a Kinect takes them, 640x480."""
 JPEG_QUALITY: Final = 50
 """The paper sends "a low-quality JPEG" beside the depth."""
-MAX_DEPTH_M: Final = 65.0
-"""Largest depth; it fits into 16 bits of millimetres."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +74,9 @@ class Sequence(ABC):
     """A recording: frames in the order of time, each with its true pose."""
 
     name: str
-    """Name in tables."""
+    """What to call it in tables."""
     camera: Camera
-    """Camera of both depth and image."""
+    """Of depth and image alike."""
     time_us: Int64Array
     """int64[n], microseconds, increasing from 0."""
     poses: Float64Array
@@ -89,7 +87,7 @@ class Sequence(ABC):
 
     @abstractmethod
     def depth(self, k: int) -> Depth:
-        """Read the depth of frame k.
+        """Of frame k.
 
         Raises:
             BufgymError: the frame is missing, truncated or of another size; the message names the file.
@@ -97,7 +95,7 @@ class Sequence(ABC):
 
     @abstractmethod
     def image(self, k: int) -> Image:
-        """Read the picture of frame k, grey or in colours; raises as `depth`."""
+        """The picture of frame k, grey or in colours. Raises as `depth`."""
 
     def grey(self, k: int) -> Image:
         """The picture of frame k, uint8[height, width]."""
@@ -105,14 +103,15 @@ class Sequence(ABC):
         return image if image.ndim == 2 else np.asarray(library("cv2").cvtColor(image, 6), np.uint8)  # BGR to grey
 
     def size_bytes(self, k: int) -> int:
-        """Encode frame k, its depth by RVL and its picture by JPEG, and return the bytes.
+        """How long frame k is when it is sent: its depth by RVL and its picture by JPEG, both encoded to find out.
 
-        Smaller frames are first brought to 640x480: depth pixels are repeated, and the picture is scaled.
+        Frames that are smaller than 640x480 are brought to that size first: pixels of the depth are repeated, the
+        picture is scaled.
         """
         return encoded_bytes(self.depth(k), self.image(k))
 
     def motion(self, settings: MotionSettings | None = None) -> Motion:
-        """Motion of the scene by the true poses, by default with this camera's field of view."""
+        """How far the scene has moved on, by the true poses; by default with this camera's field of view."""
         settings = settings or MotionSettings(fov_deg=self.camera.fov_deg)
         poses = Poses(self.time_us, self.poses[:, :3, 3], quaternions(self.poses[:, :3, :3]))
         return motion_from_poses(poses, settings, name=self.name)
@@ -122,7 +121,7 @@ class Sequence(ABC):
         return self if stride == 1 else _Reduced(self, stride)
 
     def loaded(self, frames: Iterable[int] | None = None) -> Sequence:
-        """Load the depths into memory for repeated use; pictures stay on disk."""
+        """The same with its depths in memory, for those who use them again and again; pictures stay where they are."""
         return _Loaded(self, range(len(self)) if frames is None else frames)
 
 
@@ -139,7 +138,7 @@ class _Reduced(Sequence):
         return np.ascontiguousarray(self._whole.image(k)[:: self._stride, :: self._stride])
 
     def size_bytes(self, k: int) -> int:
-        return self._whole.size_bytes(k)  # the whole frame is sent
+        return self._whole.size_bytes(k)  # it is still the whole frame that is sent
 
 
 class _Loaded(Sequence):
@@ -161,8 +160,7 @@ class _Loaded(Sequence):
 def encoded_bytes(depth: Depth, image: Image) -> int:
     """Bytes of the depth by RVL (Wilson, "Fast Lossless Depth Image Compression", ISS 2017) and of the picture by JPEG.
 
-    RVL stores each run of unmeasured pixels by its length, and each other pixel by its difference to the previous, in
-    mm.
+    RVL stores each run of unmeasured pixels by its length, and of the others the difference to the one before, in mm.
     """
     cv2, rvl = library("cv2"), library("rvl")
     repeat = max(1, SENT_WIDTH // depth.shape[1])
@@ -174,7 +172,7 @@ def encoded_bytes(depth: Depth, image: Image) -> int:
 
 
 def open_sequence(path: str | PathLike[str]) -> Sequence:
-    """Open a recording in a folder; `recordings` lists the layouts.
+    """The recording in a folder: TUM RGB-D, 7-Scenes, or 7-Scenes in zip archives (see `recordings`).
 
     Raises:
         BufgymError: no such folder, none of these layouts, a missing list or pose file; the message names the file.

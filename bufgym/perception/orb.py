@@ -1,9 +1,9 @@
-"""ORBBuf as its paper describes it [wang2021orbbuf]: the similarity of images decides which message to drop.
+"""ORBBuf as its paper describes it [wang2021orbbuf]: which message goes is decided by what their images have in common.
 
-Similarity is the share of an image's ORB features that match a feature of the other image, each being the other's
-nearest (Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011). The formula is ours, because the
-released code has a random number in its place and the paper's wording was not at hand. The rest of the rule is the
-policy `orbbuf`, which compares recorded motion.
+Similarity is that of ORB features (Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011): the
+share of one image's features that match one of the other's, each being the other's nearest. The released code has a
+random number in this place, and the wording of the paper's formula was not at hand: the formula is ours. The rule
+around it is that of the policy `orbbuf`, which compares recorded motion.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.scenario import Episode
 
 FEATURES: Final = 500
-"""Most features of an image, OpenCV's default."""
+"""Features of an image at most, as OpenCV has it by default."""
 NEAR_BITS: Final = 64
-"""Most differing bits of matching 256-bit descriptors; ORB-SLAM2's TH_LOW is 50 and its TH_HIGH 100."""
+"""Descriptors of 256 bits match where at most so many differ (ORB-SLAM2's TH_LOW is 50, its TH_HIGH 100)."""
 
 
 class OrbSimilarity:
     """Similarity of the images of two frames; features are computed once a frame and pairs compared once."""
 
-    def __init__(self, image: Callable[[int], Image], features: int = FEATURES) -> None:
+    def __init__(self, image: Callable[[int], Image]) -> None:
         """``image(k)`` is the picture of frame k, uint8[height, width]."""
         cv2 = library("cv2")
         self._image = image
-        self._detector = cv2.ORB_create(features)
+        self._detector = cv2.ORB_create(FEATURES)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         self._descriptors: dict[int, NDArray[np.uint8]] = {}
         self._known: dict[tuple[int, int], float] = {}
 
     def __call__(self, i: int, j: int) -> float:
-        """Compare two frames, in either order, in [0, 1]; an image without features is like no other."""
+        """In [0, 1]; the same whichever comes first. An image without features is like no other."""
         pair = (i, j) if i < j else (j, i)
         if pair not in self._known:
             first, second = self._of(pair[0]), self._of(pair[1])
@@ -56,15 +56,15 @@ class OrbSimilarity:
         return self._descriptors[k]
 
 
-def orbbuf_by(similar: Callable[[int, int], float], episode: Episode, name: str = "orbbuf-images") -> Policy:
-    """Make `orbbuf` for one episode from a similarity of two frames, given by their indices in the episode."""
+def orbbuf_by(similar: Callable[[int, int], float], episode: Episode) -> Policy:
+    """`orbbuf` for one episode, by a similarity of two frames that are given by their places in it."""
     frames = {int(time_us): k for k, time_us in enumerate(episode.arrivals["arrival_us"].tolist())}
 
     def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         L = len(buffer.slots)
         if has_space(buffer, arrival):
             return ACCEPT
-        # The head's older neighbour is the last departed message; before any departure the head stays.
+        # The head's older neighbour is the message that left last; while none has left, the head stays.
         queue = [frames[int(buffer.dequeued_arrival_us)], *(int(seq) for seq in buffer.slots["seq"])]
         victim, most_similar = L - 1, -np.inf
         for k in range(0 if buffer.dequeued > 0 and L > 2 else 1, L - 1):
@@ -73,26 +73,26 @@ def orbbuf_by(similar: Callable[[int, int], float], episode: Episode, name: str 
         return victim
 
     about = "ORBBuf by what two images have in common; it sees the images, as no other policy does."
-    return Policy(name, on_arrival, about=about, source="ORBBuf [wang2021orbbuf], ORB features by OpenCV")
+    return Policy("orbbuf-images", on_arrival, about=about, source="ORBBuf [wang2021orbbuf], ORB features by OpenCV")
 
 
 def orbbuf_with_images(sequence: Sequence, episode: Episode) -> Policy:
-    """Make `orbbuf` by the ORB features of the frames, which must be the episode's messages in order."""
+    """`orbbuf` by the ORB features of the frames, which must be the episode's messages in their order."""
     return orbbuf_by(OrbSimilarity(sequence.grey), episode)
 
 
 COMPARED: Final = 3
-"""Number of further images that the last decision compares."""
+"""Further images that the last of so many decisions compares."""
 
 
-def decision_ms(sequence: Sequence, decisions: int = 50, features: int = FEATURES) -> NDArray[np.float64]:
-    """Time single decisions as the paper describes them, float64[decisions], ms.
+def decision_ms(sequence: Sequence, decisions: int = 50) -> NDArray[np.float64]:
+    """float64[decisions]: times of one decision as the paper has it, ms.
 
-    After an eviction and an arrival, a decision computes the new image's features and the similarities of the gap's
-    neighbours to their new neighbours. Reading the images is not timed.
+    A message went and one came: the features of the new image are computed, and the similarity of each neighbour of
+    the gap to the one now beside it. Reading the images takes no part.
     """
     images = [sequence.grey(k) for k in range(decisions + COMPARED)]
-    similar = OrbSimilarity(images.__getitem__, features)
+    similar = OrbSimilarity(images.__getitem__)
     for k in range(COMPARED - 1):
         similar(k, k + 1)
     times = np.zeros(decisions)

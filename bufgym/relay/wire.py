@@ -1,8 +1,8 @@
-"""Protocol on a relay's WebSockets: a binary frame is one message, a text frame is a JSON object with an ``op``.
+"""What goes over a relay's WebSockets: binary frames are a message each, text frames are JSON objects with an ``op``.
 
-A binary message is big endian and has a header of 32 bytes, then topic, type, encoding and sender in UTF-8, then the
-payload. ``docs/guide/relay.md`` has the table. In JSON the same message is an object whose ``data`` is the value itself
-for the encoding ``json``, and otherwise the payload in base64.
+A binary message, big endian (``docs/guide/relay.md`` has the table): a header of 32 bytes, then topic, type, encoding
+and sender in UTF-8, then the payload. In JSON the same message is an object whose ``data`` is the value itself
+where the encoding is ``json``, and base64 of the payload where it is not.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ VERSION: Final = 1
 MESSAGE: Final = 1
 """The one kind of binary frame."""
 NO_DROP: Final = 1
-"""Flag of a no_drop message."""
+"""A flag."""
 MAX_NAME_BYTES: Final = 255
-"""Length limit of a topic, type, encoding or sender."""
+"""Of a topic, a type, an encoding, a sender."""
 MAX_SEQ: Final = 2**53
-"""Largest number; JavaScript's numbers are exact up to this."""
+"""Numbers are exact in JavaScript up to this."""
 MAX_STAMP_US: Final = 2**53
 
 _HEADER: Final = struct.Struct("!2s7B3sIQq")
@@ -36,7 +36,7 @@ _MAGIC: Final = b"bR"
 
 
 class WireError(BufgymError):
-    """Data that is not a frame of this protocol."""
+    """What came is no frame of this protocol."""
 
 
 class Message(NamedTuple):
@@ -47,18 +47,18 @@ class Message(NamedTuple):
     encoding: str = "json"
     """How to read the payload: json, cdr, ros1, jpeg, png, or a name that sender and receivers know."""
     type: str = ""
-    """Type as in ROS, such as ``sensor_msgs/msg/LaserScan``; empty if unknown."""
+    """As in ROS, ``sensor_msgs/msg/LaserScan``; empty if unknown."""
     sender: str = ""
-    """Sender's name, filled in by the relay."""
+    """The relay fills it in."""
     seq: int = 0
-    """Number of a no_drop message; free for the sender's use in any other message."""
+    """A no_drop message's number on its way; any other's is its sender's own business."""
     stamp_us: int = 0
-    """Time of the put by its sender's clock, us since 1970."""
+    """When it was put, us since 1970, by its sender's clock."""
     no_drop: bool = False
 
 
 def encode(message: Message) -> bytes:
-    """Make the binary frame; names are checked as in ``decode``."""
+    """The binary frame; the names are checked, as those of ``decode`` are."""
     _check(message)
     names = [name.encode() for name in (message.topic, message.type, message.encoding, message.sender)]
     return b"".join(
@@ -81,9 +81,9 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes, max_bytes: int = 2**26) -> Message:
-    """Read the message of a binary frame of at most ``max_bytes``.
+    """The message of a binary frame of at most ``max_bytes``.
 
-    Raises WireError: it is not such a frame.
+    Raises WireError: it is none.
     """
     if not HEADER_BYTES <= len(data) <= max_bytes:
         raise WireError(f"frame of {len(data)} bytes: must be from {HEADER_BYTES} to {max_bytes}")
@@ -120,14 +120,14 @@ def _check(message: Message) -> None:
 
 
 def check_topic(topic: str) -> None:
-    """Check that a topic's name is valid and begins with ``/``."""
+    """A topic's name begins with ``/``."""
     check_name("topic", topic)
     if not topic.startswith("/"):
         raise WireError(f"topic {topic!r}: must begin with '/'")
 
 
 def check_name(what: str, name: str) -> None:
-    """Check that a name is short and printable."""
+    """A name is short, and prints as it stands."""
     if not name.isprintable() or (not name.isascii() and _utf8_bytes(what, name) > MAX_NAME_BYTES):
         raise WireError(f"{what} {name!r}: must be printable, at most {MAX_NAME_BYTES} bytes")
     if len(name) > MAX_NAME_BYTES:
@@ -183,19 +183,19 @@ FIELDS: Final[Mapping[str, Mapping[str, tuple[Any, bool]]]] = {
     "delivered": {"seq": (int, True), "receivers": (int, True), "lost": (int, True)},
     "refused": {"what": (str, True), "code": (str, True), "why": (str, True)},
 }
-"""op -> field -> (its kind, whether it is required). Other fields are allowed, as a later version may have more."""
+"""op -> field -> (its kind, whether it must be there). Other fields are let pass: a later version may have more."""
 FORMS: Final = ("binary", "json")
 
 
 def say(op: str, **fields: Any) -> str:
-    """Make the text frame of an ``op``."""
+    """The text frame of an ``op``."""
     return json.dumps({"op": op, **fields}, separators=(",", ":"), allow_nan=False)
 
 
 def heard(text: str) -> dict[str, Any]:
-    """Read a text frame and check its ``op`` and the kinds of its fields.
+    """The object of a text frame: its ``op`` is known, its fields are of their kinds.
 
-    Raises WireError: it is not a frame of this protocol.
+    Raises WireError: it is none of this protocol.
     """
     try:
         said = json.loads(text, parse_constant=no_constant)
@@ -227,8 +227,8 @@ def no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no JSON")
 
 
-def to_json(message: Message, op: str = "message") -> str:
-    """Make a message's text frame: ``message`` from the relay, ``publish`` to it."""
+def to_json(message: Message) -> str:
+    """The message as a text frame from the relay."""
     data: Any
     if message.encoding == "json":
         try:
@@ -239,11 +239,11 @@ def to_json(message: Message, op: str = "message") -> str:
         data = base64.b64encode(message.payload).decode()
     fields = message._asdict()
     del fields["payload"]
-    return say(op, **fields, data=data)
+    return say("message", **fields, data=data)
 
 
 def from_json(said: Mapping[str, Any]) -> Message:
-    """Read the message of a received ``publish`` or ``message``."""
+    """The message of a ``publish`` or ``message`` that was heard."""
     encoding = said.get("encoding", "json")
     if encoding == "json":
         payload = json.dumps(said["data"], separators=(",", ":")).encode()

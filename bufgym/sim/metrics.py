@@ -6,7 +6,7 @@ propagation delay later.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -52,9 +52,6 @@ class Outcome:
     """Largest number of bytes queued; a message that goes straight to an idle socket counts as queued too."""
     invalid: int
     """Decisions that could not be carried out as given."""
-
-
-METRICS = tuple(f.name for f in fields(Outcome))
 
 
 def received(senders: Senders, i: int) -> NDArray[Any]:

@@ -63,13 +63,13 @@ print(table.plain(rows))
 # ## What did the server see?
 
 # %%
-from bufgym import gallery
+from bufgym.benchmark import picture
 from bufgym.scenario.numbered import draw
 
 one = Interruption(law="fixed", t_max=60)
 episode = draw(one, seed=0)
-gallery.save(
-    gallery.play([mine, "afr", "drop-oldest"], episode, 8, one), episode, "first-agent.png", "60 messages, L = 8"
+picture.save(
+    picture.play([mine, "afr", "drop-oldest"], episode, 8, one), episode, "first-agent.png", "60 messages, L = 8"
 )
 
 # %% [markdown]

@@ -98,12 +98,12 @@ print(table.plain(run.run(chosen, held_out, capacities=[8], seeds=10)))
 # ## The picture
 
 # %%
-from bufgym import gallery
+from bufgym.benchmark import picture
 from bufgym.scenario.numbered import draw
 
 episode = draw(held_out, seed=0)
-gallery.save(
-    gallery.play([mine, "clairvoyant", "afr", "drop-oldest"], episode, 8, held_out), episode, "imitation.png", "L = 8"
+picture.save(
+    picture.play([mine, "clairvoyant", "afr", "drop-oldest"], episode, 8, held_out), episode, "imitation.png", "L = 8"
 )
 
 # %% [markdown]

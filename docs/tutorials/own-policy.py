@@ -45,12 +45,12 @@ print(table.plain(rows))
 # ## The picture
 
 # %%
-from bufgym import gallery
+from bufgym.benchmark import picture
 from bufgym.scenario.numbered import draw
 
-fading = gallery.fading()
+fading = picture.fading()
 episode = draw(fading, seed=0)
-gallery.save(gallery.play(names, episode, 8, fading), episode, "own-policy.png", "A fading link, L = 8")
+picture.save(picture.play(names, episode, 8, fading), episode, "own-policy.png", "A fading link, L = 8")
 
 # %% [markdown]
 # The policy thins one interruption evenly, but here it is hardly better than `drop-oldest`: while the link is slow,

@@ -56,11 +56,11 @@ print(Path("dropped.csv").read_text().splitlines()[:3])
 # ## The picture
 
 # %%
-from bufgym import gallery
+from bufgym.benchmark import picture
 from bufgym.scenario.numbered import draw
 
 episode = draw(scenario, seed=0)
-gallery.save(gallery.play(names, episode, 8, scenario), episode, "own-recording.png", "My drive over my link, L = 8")
+picture.save(picture.play(names, episode, 8, scenario), episode, "own-recording.png", "My drive over my link, L = 8")
 
 # %% [markdown]
 # ![What the server saw of the recording](own-recording.png)

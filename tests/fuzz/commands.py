@@ -22,7 +22,7 @@ VALUES = [*WORDS.split(), "", "9" * 30, "1" * 5000, "\x1b[31m", "\n", "\u2013", 
 
 WORK = """benchmark.run.run benchmark.sweep.run_sweep benchmark.tune.tune benchmark.leaderboard.make
 benchmark.leaderboard.validate benchmark.perf.measure live.cost.measure traces.datasets.fetch.fetch_dataset
-cli.figures._text gallery.page gallery.write_film cli.play._play cli.live.run_async cli.ros2.run_async
+cli.figures._text cli.play._play cli.live.run_async cli.ros2.run_async
 cli.relay.run_async cli.relay_robots.run_async live.validate.validate expert.dataset.make"""
 """What takes long, downloads, or needs a terminal."""
 

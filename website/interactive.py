@@ -6,14 +6,14 @@ Everything that the page shows is computed here and written into it as JSON; the
 from __future__ import annotations
 
 import json
-from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bufgym import policies, sim
+from bufgym.benchmark.picture import fading, play
 from bufgym.benchmark.run import by_trace, draw
-from bufgym.gallery.played import fading, play
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Scenario, get
 from bufgym.sim import metrics
@@ -33,7 +33,7 @@ _MARK = "/*DATA*/null"
 
 def page() -> str:
     """The whole page: one HTML file that asks for no other."""
-    template = files("bufgym.gallery").joinpath("interactive.html").read_text(encoding="utf-8")
+    template = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
     data = json.dumps(page_data(), separators=(",", ":"))
     return template.replace(_MARK, data)
 

@@ -1,24 +1,31 @@
-"""The films of the gallery, by name, and how they are written: animated WebP of at most 300 kB each."""
+"""The site's films, by name, and how they are written: animated WebP of at most 300 kB each.
+
+``python -m website.films NAME... --out DIR`` writes films, ``--interactive FILE`` the interactive page. Every film
+shows a fixed episode, so the command draws the same film again.
+"""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from bufgym import policies
+from bufgym.benchmark import picture
+from bufgym.benchmark.picture import fading, play
 from bufgym.benchmark.run import draw
 from bufgym.envs import SenderEnv
 from bufgym.envs.render.image import COLOURS, canvas_of, pixels
-from bufgym.errors import BufgymError, install
+from bufgym.errors import BufgymError
 from bufgym.expert import Player
-from bufgym.gallery import comparison
-from bufgym.gallery.played import fading, play
 from bufgym.scenario import Episode, Interruption, Scenario, get, suites
 from bufgym.scenario.numbered import numbered
+from website import interactive
 
 Frames = Iterator[NDArray[np.uint8]]
 
@@ -49,10 +56,6 @@ def write_film(name: str, folder: Path) -> Path:
     """Write the film to ``folder/name.webp`` and return that path; BufgymError for an unknown name."""
     if name not in FILMS:
         raise BufgymError(f"unknown film {name!r}; known: {', '.join(FILMS)}")
-    try:
-        from PIL import Image
-    except ImportError:
-        raise BufgymError(f"the gallery needs Pillow, which comes with matplotlib: {install('plot')}") from None
     pictures = [Image.fromarray(frame) for frame in FILMS[name].frames()]
     palette = _palette(pictures)
     pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE).convert("RGB") for picture in pictures]
@@ -65,10 +68,8 @@ def write_film(name: str, folder: Path) -> Path:
     return path
 
 
-def _palette(pictures: Sequence[Any]) -> Any:
+def _palette(pictures: Sequence[Image.Image]) -> Image.Image:
     """One palette for all images, so that nothing flickers: of the middle and the last one, and of each state."""
-    from PIL import Image
-
     width, height = pictures[-1].size
     sample = Image.new("RGB", (width, 2 * height + 40 * len(COLOURS)), "white")
     sample.paste(pictures[len(pictures) // 2], (0, 0))
@@ -79,7 +80,7 @@ def _palette(pictures: Sequence[Any]) -> Any:
 
 
 def _compared(names: Sequence[str], episode: Episode, scenario: Scenario, title: str) -> Frames:
-    return comparison.frames(play(names, episode, 8, scenario), episode, title)
+    return picture.frames(play(names, episode, 8, scenario), episode, title)
 
 
 def _readme() -> Frames:
@@ -177,3 +178,22 @@ FILMS: dict[str, Film] = {
     "fleet": Film("bufgym_fleet_v0", "eight robots share one cell: Drop Oldest beside the learned agent", _fleet),
     "mapping": Film("bufgym/Mapping-v0", "a made-up room is filmed: four policies, one link", _mapping),
 }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the films and the page that the command line names."""
+    parser = argparse.ArgumentParser(prog="python -m website.films", description="Draw the site's pictures.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"films: all, {', '.join(FILMS)}")
+    parser.add_argument("--out", type=Path, default=Path("docs/gallery"), metavar="DIR", help="(%(default)s)")
+    parser.add_argument("--interactive", type=Path, metavar="FILE", help="write the interactive page (HTML)")
+    options = parser.parse_args(arguments)
+    if options.interactive is not None:
+        options.interactive.write_text(interactive.page(), encoding="utf-8")
+        print(f"wrote {options.interactive}")
+    for name in FILMS if "all" in options.names else options.names:
+        path = write_film(name, options.out)
+        print(f"wrote {path} ({path.stat().st_size / 1000:.0f} kB)", flush=True)
+
+
+if __name__ == "__main__":
+    main()
