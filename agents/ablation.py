@@ -1,9 +1,9 @@
-"""What each part of an evolved agent is worth: the same training without it, as a page.
+"""The worth of each part of an evolved agent, as a page: the same training without that part.
 
-``python -m agents.ablation --steps 40000000 --seeds 2 --out docs/ablation.md`` trains every variant, a process a core
-(a finished one is not trained again), and measures the kept agents on the test splits: regret over that of AFR or Drop
-Oldest, whichever is better (``objectives.queue.SuiteObjective``). ``--runs runs/a,runs/b`` adds how those runs of
-``train.py`` learned, by whatever algorithm, and what more seeds are worth to the evolved ones.
+``python -m agents.ablation --steps 40000000 --seeds 2 --out docs/ablation.md`` trains every unfinished variant, one
+process per core. It measures the kept agents on the test splits, by regret over that of AFR or Drop Oldest, whichever
+is better (``objectives.queue.SuiteObjective``). ``--runs runs/a,runs/b`` adds the learning curves of those ``train.py``
+runs, by any algorithm, and the gain of more seeds for evolved agents.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ WITHOUT = {
 }
 """Fields left out of ``settings.MOTION``."""
 HIDDEN = ((4, 0), (4, 3), (4, 12))
-"""Hidden units beside the mixing: those of the scorer of links that move, and of links that stand still."""
+"""Hidden units beside the mixing: in the scorer of moving links, and in the scorer of links that stand still."""
 
 
 def variants(base: Settings) -> dict[str, Settings]:
-    """Name -> how to train it."""
+    """Name -> settings of its training."""
     by_name = {}
     for name, left_out in WITHOUT.items():
         by_name[name] = replace(base, fields=",".join(field for field in MOTION if field not in left_out))
@@ -66,7 +66,7 @@ def tested(settings: Settings, model: Path) -> list[float]:
 
 
 def trained(settings: Settings, seed: int) -> list[float]:
-    """Train one variant with one seed and test it, or read what an earlier call measured."""
+    """Train one variant with one seed and test it, or read the result of an earlier call."""
     folder = RUNS / settings.name
     file = folder / f"seed-{seed}" / "test.json"
     if not file.exists():
@@ -79,7 +79,7 @@ def trained(settings: Settings, seed: int) -> list[float]:
 def variants_table(
     measured: Mapping[str, Sequence[Sequence[float]]], sizes: Mapping[str, int], suites: Sequence[str]
 ) -> list[str]:
-    """Markdown: a row a variant, mean over its seeds, and the range of the mean over the suites."""
+    """Markdown: a row per variant, with the mean over its seeds and the range of the mean over the suites."""
     rows = []
     for name, seeds in measured.items():
         means = np.mean(seeds, axis=1)
@@ -92,7 +92,7 @@ MOMENTS_S = (0, 15, 30, 60, 120, 180)
 
 
 def learning(runs: Sequence[Path]) -> list[str]:
-    """Markdown: the best regret over AFR's on validation after so many seconds, for every seed of these runs."""
+    """Markdown: the best regret over AFR's on validation after some training times, for every seed of these runs."""
     rows = []
     for run in runs:
         for path in sorted(run.glob("seed-*/validation.csv")):
@@ -110,9 +110,9 @@ def learning(runs: Sequence[Path]) -> list[str]:
 
 
 def more_seeds(run: Path) -> list[str]:
-    """Markdown: what the best of n seeds by validation is on the test splits, on average over all choices of n.
+    """Markdown: test results of the best of n seeds by validation, on average over all choices of n.
 
-    Both as the regret over that of AFR or Drop Oldest, whichever is better, mean over the run's suites.
+    The measure is the regret over that of AFR or Drop Oldest, whichever is better, mean over the run's suites.
     """
     values = read_settings(run)
     settings = Settings(**{field.name: values[field.name] for field in fields(Settings)})
@@ -128,12 +128,12 @@ def more_seeds(run: Path) -> list[str]:
 
 
 def train_variants(by_name: Mapping[str, Settings], seeds: int) -> dict[str, list[list[float]]]:
-    """What every variant's seeds measure on the test splits."""
+    """Results of every variant's seeds on the test splits."""
     first, *others = by_name.values()
     validation = RUNS / first.name / "validation"
     if not validation.exists():
         ValidationSets(first, prepare(first))
-    for variant in others:  # all meet the same validation episodes, whose bounds are found once
+    for variant in others:  # all share the validation episodes, whose bounds are computed once
         if not (RUNS / variant.name).exists():
             shutil.copytree(validation, prepare(variant) / "validation")
     with pool_of(os.cpu_count() or 1) as pool:
@@ -151,18 +151,18 @@ def main(
     runs: str = "",
     out: Path | None = None,
 ) -> None:
-    """What each part of an evolved agent is worth: train what is missing, and make the page.
+    """The worth of each part of an evolved agent: train what is missing, and make the page.
 
     Args:
         name: folder under runs/.
         steps: decisions a seed.
         seeds: seeds a variant.
-        suites: what they are trained and tested on.
-        runs: folders of runs whose learning is shown beside.
+        suites: suites to train and test on.
+        runs: folders of runs whose learning curves are added.
         out: Markdown file to write; the page is printed in any case.
     """
     base = Settings(suite=suites, algo="evolution", name=name, steps=steps, hidden=4)
-    # Where there is nothing but interruptions, the link never moves.
+    # With nothing but interruptions, the link never moves.
     share = 1 if suites == "interruption-v1" else 2
     base = replace(base, validate_every=steps // 5, warm_up=steps // share)
     by_name = variants(base)

@@ -1,4 +1,4 @@
-"""What happens between a learner's updates: checkpoints, the learning curve, validation, a progress bar."""
+"""Work between a learner's updates: checkpoints, the learning curve, validation, a progress bar."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def checkpoints(home: Path) -> list[Path]:
 
 
 def checkpoint(home: Path, steps: int) -> Path:
-    """Where the learner is saved after so many steps."""
+    """Path of the learner's file after so many steps."""
     return home / "checkpoints" / f"{steps:012d}.zip"
 
 
 def save(model: BaseAlgorithm, home: Path) -> None:
-    """The whole learner (weights, optimizer, counters), whole or not at all: a kill leaves no broken file."""
+    """Save the whole learner (weights, optimizer, counters), whole or not at all: a kill leaves no broken file."""
     path = checkpoint(home, model.num_timesteps)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replaced(path) as unfinished:
@@ -35,7 +35,7 @@ def save(model: BaseAlgorithm, home: Path) -> None:
 
 
 class BetweenUpdates(BaseCallback):
-    """A callback that needs no call at single steps."""
+    """A callback that does nothing at single steps."""
 
     def _on_step(self) -> bool:
         return True
@@ -59,7 +59,7 @@ class Checkpoints(BetweenUpdates):
 
 
 class Curve(BetweenUpdates):
-    """Mean QoI of the latest training episodes, a row an update."""
+    """Mean QoI of the latest training episodes, a row per update."""
 
     def __init__(self, path: Path, steps: int) -> None:
         super().__init__()
@@ -82,14 +82,14 @@ class Curve(BetweenUpdates):
 
 
 class Validation(BetweenUpdates):
-    """Validates when it is due and saves what was validated: a row of validation.csv always has its checkpoint.
+    """Validates when it is due and saves the validated learner: every row of validation.csv has its checkpoint.
 
     Args:
         home: the seed's folder.
         validations: the seed's validations so far.
         measure: model -> the measures in ``validations``' columns.
-        describe: the measures, for people.
-        curve: tells the seconds of training.
+        describe: the measures in words.
+        curve: has the seconds of training.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Validation(BetweenUpdates):
         )
 
     def latest(self) -> str:
-        """The latest validation, for people."""
+        """The latest validation in words."""
         rows = self.validations.rows
         return self.describe(rows[-1][2:]) if rows else ""
 
@@ -118,7 +118,7 @@ class Validation(BetweenUpdates):
         self.validate(self.model)
 
     def validate(self, model: Any) -> None:
-        """Where it is due."""
+        """Validate if it is due."""
         if not self.validations.due(model.num_timesteps):
             return
         save(model, self.home)
@@ -129,7 +129,7 @@ class Validation(BetweenUpdates):
 
 
 class Progress(BetweenUpdates):
-    """A bar with the time left on a terminal, a plain line every tenth of the way elsewhere."""
+    """A bar with the time left on a terminal; elsewhere a plain line every tenth of the way."""
 
     def __init__(self, source: Validation, settings: Settings, seed: int, line: int) -> None:
         super().__init__()

@@ -1,13 +1,14 @@
 """Evolution: a scorer's weights by CMA-ES over whole episodes, rolled out in compiled code.
 
-PPO learns from single decisions by costly updates; here a candidate is a vector of weights, and its fitness
-that of whole episodes (``objectives``). A rollout decides two million times a second, so a few minutes suffice. All
-candidates of a generation meet the same episodes, so that only what they decide tells them apart (common random
-numbers); the next generation meets others, and validation episodes say which mean to keep. The optimiser is pycma
-(Hansen, The CMA Evolution Strategy: A Tutorial, arXiv 1604.00772).
+PPO learns from single decisions by costly updates. Here a candidate is a vector of weights, and its fitness comes from
+whole episodes (``objectives``). A rollout decides two million times a second, so a few minutes suffice. All candidates
+of a generation meet the same episodes (common random numbers), so only their decisions tell them apart. The next
+generation meets others, and validation episodes say which mean to keep. The optimiser is pycma (Hansen, The CMA
+Evolution Strategy: A Tutorial, arXiv 1604.00772).
 
-With a warm-up, two scorers are learned one after the other: first that for a link that stands still, from interruptions
-alone (their mean over T is exact and cheap), then that for all other links, from the other suites.
+With a warm-up, two scorers are learned one after the other. The first is for a link that stands still and learns from
+interruptions alone, whose mean over T is exact and cheap. The second is for all other links and learns from the other
+suites.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from bufgym.policies.learned import Weights
 from bufgym.policies.learned_topics import TopicWeights
 
 POPULATION = 16
-"""Candidates a generation."""
+"""Candidates per generation."""
 MEMORY = 10
 """Generations over which the strategy's mean is averaged, exponentially."""
 DIAGONAL = 100
-"""From so many weights on, a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
+"""Number of weights from which a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
 
 
 # --- how candidates are evaluated ------------------------------------------------------------------------------------
@@ -51,7 +52,7 @@ Evaluate = Callable[[Sequence[Weights | TopicWeights], int, bool], list[tuple[fl
 
 
 def evaluation_here(objective: Objective) -> Evaluate:
-    """In this process, one after the other."""
+    """Evaluate candidates in this process, one after the other."""
 
     def evaluate(candidates: Sequence[Weights | TopicWeights], part: int, still: bool) -> list[tuple[float, int]]:
         return [_evaluated(objective, candidate, part, still) for candidate in candidates]
@@ -61,7 +62,7 @@ def evaluation_here(objective: Objective) -> Evaluate:
 
 @contextmanager
 def evaluation(settings: Settings, folder: Path, seed: int, objective: Objective) -> Iterator[Evaluate]:
-    """Where the settings say: here, or on the cluster at ``settings.address``. ``objective``: of that seed."""
+    """Evaluate as the settings say: here, or on the cluster at ``settings.address``, with that seed's ``objective``."""
     if settings.backend == "local":
         yield evaluation_here(objective)
         return
@@ -81,7 +82,7 @@ _ONE_AT_A_TIME = threading.Lock()
 def evaluated_on_a_worker(
     settings: Settings, folder: Path, seed: int, candidate: Weights | TopicWeights, part: int, still: bool
 ) -> tuple[float, int]:
-    """The fitness and the decisions of one candidate. The episodes are drawn and bounded once a process."""
+    """The fitness and the decisions of one candidate. Each process draws and bounds the episodes once."""
     with _ONE_AT_A_TIME:
         return _evaluated(_objective(settings, folder, seed), candidate, part, still)
 
@@ -101,16 +102,16 @@ def _evaluated(objective: Objective, candidate: Weights | TopicWeights, part: in
 
 @dataclass
 class Evolution:
-    """The state of one seed's evolution: what a checkpoint holds."""
+    """The state of one seed's evolution, as in a checkpoint."""
 
     like: Weights | TopicWeights
-    """What is not searched has these numbers."""
+    """Weights with the numbers that are not searched."""
     still: bool
-    """Whether the scorer for links that stand still is searched, or the one for all others (or for all)."""
+    """Whether the search is for the scorer of links that stand still; otherwise for that of all others, or of all."""
     strategy: Any
     """pycma's strategy."""
     average: Vector
-    """Of the strategy's latest means (``MEMORY``), which the noise of single parts moves about: this is the agent."""
+    """The agent: an average of the strategy's latest means (``MEMORY``), in which the noise of single parts cancels."""
     steps: int = 0
     """Decisions rolled out so far."""
     generations: int = 0
@@ -122,13 +123,13 @@ class Evolution:
     def around(
         like: Weights | TopicWeights, sigma: float, seed: int, *, still: bool = False, steps: int = 0
     ) -> Evolution:
-        """A new search around these weights; ``still`` searches those of their second scorer."""
+        """A new search around these weights; ``still`` searches their second scorer."""
         begin = to_vector(like.still if still and isinstance(like, Weights) and like.still else like)
         options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
         return Evolution(like, still, cma.CMAEvolutionStrategy(begin, sigma, options), begin, steps)
 
     def weights(self, vector: Vector) -> Weights | TopicWeights:
-        """The agent that these numbers make."""
+        """The agent with these numbers."""
         if self.still and isinstance(self.like, Weights) and self.like.still:
             return replace(self.like, still=with_vector(self.like.still, vector))
         weights: Weights | TopicWeights = with_vector(self.like, vector)
@@ -140,7 +141,7 @@ class Evolution:
         return self.weights(self.average)
 
     def generation(self, evaluate: Evaluate) -> float:
-        """Ask for candidates, try them and tell their fitness, once; the best fitness."""
+        """Ask for candidates, evaluate them and report their fitness, once; return the best fitness."""
         vectors = self.strategy.ask()
         results = evaluate([self.weights(vector) for vector in vectors], self.generations, self.still)
         fitness = [each for each, _ in results]
@@ -154,12 +155,12 @@ class Evolution:
 def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
     """Evolve one seed until ``settings.steps`` decisions were rolled out, from its last checkpoint if there is one.
 
-    What did best on validation, by the same measure on other episodes, is kept as ``model.safetensors``.
+    The agent with the best validation, the same measure on other episodes, is kept as ``model.safetensors``.
     """
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
     objective = OBJECTIVES[settings.kind](settings, folder, seed)
-    checkpoint = home / "evolution.pkl"  # one's own run alone: pickles run code when they are read
+    checkpoint = home / "evolution.pkl"  # only from your own run: pickles run code when they are read
     if checkpoint.exists():
         state: Evolution = pickle.loads(checkpoint.read_bytes())
     else:
@@ -183,7 +184,7 @@ def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
             if state.steps >= settings.steps:
                 break
             if state.still and state.steps >= settings.warm_up:
-                # From what did best on validation, as a scorer of interruptions alone may come to fail elsewhere.
+                # Start from the best on validation, as a scorer of interruptions alone may come to fail elsewhere.
                 state = Evolution.around(weights.read(home / MODEL)[0], objective.sigma[False], seed, steps=state.steps)
             fitness = state.generation(evaluate)
             state.seconds = round(time.perf_counter() - began, 3)

@@ -1,11 +1,11 @@
 """Double DQN with action masks: stable-baselines3's DQN with another Q network, exploration and targets.
 
-Which actions are valid follows from the observation (a slot holds a message; there is room), so no masks are stored:
-the Q network itself gives invalid actions a value that no maximum picks, neither when it acts nor in a target.
+The observation shows which actions are valid (a slot holds a message; there is room), so no masks are stored. The Q
+network itself gives invalid actions a value that no maximum picks, neither when it acts nor in a target.
 
-Targets are those of van Hasselt, Guez and Silver (2016): the online network chooses the next action, the target network
+Targets follow van Hasselt, Guez and Silver (2016): the online network chooses the next action, the target network
 values it. Q is the sum of a state value and a score for each slot (after Wang et al., 2016), because one message makes
-little difference beside all the reward that is still to come.
+little difference beside all the reward still to come.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ INVALID = -1e9
 
 
 def valid_actions(observation: Any) -> Tensor:
-    """bool[n, L + 2]: evict where a slot holds a message, reject always, accept where there is room for one more."""
+    """bool[n, L + 2]: evict a slot that holds a message, reject always, accept if there is room for one more."""
     held, room = (torch.as_tensor(observation[name]) for name in ("occupied", "occupancy"))
     return torch.cat([held > 0, room < 1], dim=1)
 
@@ -57,7 +57,7 @@ class MaskedQNetwork(QNetwork):
 
 
 class MaskedDQNPolicy(DQNPolicy):
-    """Two ``MaskedQNetwork``: slot by slot with a ``width``, plain layers (``net_arch``) with width 0."""
+    """Two ``MaskedQNetwork``: slot by slot with a ``width``; plain layers (``net_arch``) with width 0."""
 
     def __init__(self, *args: Any, width: int = 32, **kwargs: Any) -> None:
         self.width = width
@@ -88,7 +88,7 @@ class MaskedDQN(DQN):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Each environment explores on its own: a valid action at random, all equally likely."""
+        """Explore in each environment separately: a valid action at random, all equally likely."""
         assert self._last_obs is not None
         actions, _ = self.policy.predict(self._last_obs, deterministic=True)
         valid = valid_actions(self._last_obs).numpy()

@@ -1,6 +1,6 @@
-"""A suite's episodes to validate and test agents on, beside what the fixed policies and the clairvoyant reach there.
+"""A suite's episodes to validate and test agents on, with the results of the fixed policies and the clairvoyant.
 
-The episodes, and the rows of the fixed policies, are those of ``bufgym bench`` on the same split.
+Episodes and rows of fixed policies equal ``bufgym bench`` on the same split.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Numbers = NDArray[np.float64]
 def play(agent: Any, env: MixedEnv, episodes: Sequence[Episode]) -> list[Outcome]:
     """The outcome of each episode (one a row) under a learner's most likely action at every decision.
 
-    ``agent``: a model of stable-baselines3, or what has its ``predict``.
+    ``agent`` is a model of stable-baselines3, or has its ``predict``.
     """
     masked = takes_masks(agent)
     env.load(episodes)
@@ -54,7 +54,7 @@ def play(agent: Any, env: MixedEnv, episodes: Sequence[Episode]) -> list[Outcome
 class Verdict(NamedTuple):
     """An agent's validation: means over the discriminative cells (see ``benchmark.score``).
 
-    Fields: ``score``, 0 is Drop Oldest and 1 the clairvoyant; ``regret``, 1 - H / the clairvoyant's; ``over_afr``,
+    ``score`` is 0 for Drop Oldest and 1 for the clairvoyant. ``regret`` is 1 - H / the clairvoyant's. ``over_afr`` is
     regret over AFR's regret.
     """
 
@@ -87,11 +87,11 @@ class EvaluationSet:
         return np.array([self._fixed[*_name(key), policy][column] for key in self._keys], np.float64)
 
     def play(self, agent: Any, padded_slots: int) -> list[Outcome]:
-        """What an agent that observes so many slots reaches in every row."""
+        """Outcomes of an agent that observes so many slots, in every row."""
         return play(agent, MixedEnv(self.cells, self._sizes, padded_slots), self._episodes)
 
     def run(self, policy: Policy) -> list[Outcome]:
-        """What a policy reaches in every row."""
+        """Outcomes of a policy in every row."""
         ends = np.cumsum(self._sizes).tolist()
         outcomes = []
         for c, size, end in zip(self.cells, self._sizes, ends, strict=True):
@@ -150,7 +150,7 @@ def sweep_for(
 
 
 class ValidationSets:
-    """The fixed validation episodes of all suites; made once, read from the run's folder afterwards."""
+    """The fixed validation episodes of all suites, made once and afterwards read from the run's folder."""
 
     def __init__(self, settings: Settings, folder: Path, progress: bool = False) -> None:
         home = folder / "validation"
@@ -175,7 +175,7 @@ def _mean(verdicts: Sequence[Verdict]) -> Verdict:
 
 
 def test_rows(settings: Settings, policies: Sequence[Policy]) -> list[Row]:
-    """The rows of these policies on the test split of the run's one suite, of whatever kind."""
+    """The rows of these policies on the test split of the run's one suite, of any kind."""
     sweep = Sweep(settings.suite, (), "test", settings.capacities_of(settings.suite), settings.test_seeds or None)
     rows = []
     for shard in sweep.checked().shards():

@@ -34,10 +34,10 @@ def draw(
         path: the picture.
         runs: one a curve.
         curves: (steps, measure) of each run, float[rows, 2].
-        measure: what the curves show.
+        measure: the curves' measure.
         bars: policy -> score, best first.
-        title: where the scores were reached.
-        lines: what fixed policies reach of the curves' measure.
+        title: the episodes of the scores.
+        lines: values of fixed policies in the curves' measure.
         notes: lines below the bars.
     """
     if importlib.util.find_spec("matplotlib") is None:

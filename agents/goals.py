@@ -1,9 +1,9 @@
-"""How far trained agents are above AFR: all training seeds of a run on the test splits of suites, as a page.
+"""The gain of trained agents over AFR: all training seeds of a run on the test splits of suites, as a page.
 
 ``python -m agents.goals runs/NAME --suites lte-v1,outage-v1 --out docs/agents.md`` (``--data DIR`` for recordings).
 
 The figure is the regret over AFR's: the sum of an agent's regrets over the cells (scenario, L) of one L, or over all,
-divided by that of AFR's. Intervals are percentile bootstraps: training seeds are drawn, then the episodes of each cell,
+divided by AFR's. Intervals are percentile bootstraps: first training seeds are drawn, then the episodes of each cell,
 the same ones for the agent and for AFR.
 """
 
@@ -34,12 +34,12 @@ from bufgym.scenario.suites import get as suite_of
 
 RESAMPLES = 500
 RESAMPLES_OF_MANY = 200
-"""With more than ``MANY`` cells, whose mean varies less."""
+"""Resamples with more than ``MANY`` cells, whose mean varies less."""
 MANY = 30
 AFR = "afr"
 AGENTS = "agents"
 NEGLIGIBLE = 1e-9
-"""Where AFR's regrets add up to less, a ratio says nothing."""
+"""Sum of AFR's regrets below which a ratio says nothing."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,14 @@ class SuiteResults:
     best: list[Numbers]
     """The clairvoyant's H, float64[episodes] of each cell."""
     fixed: dict[str, list[Numbers]]
-    """The same by fixed policy."""
+    """H of each fixed policy, likewise."""
     agents: list[list[Numbers]]
-    """The same by training seed."""
+    """H of each training seed, likewise."""
     scores: dict[str, Interval]
-    """Of the agents together (AGENTS) and of every fixed policy: 0 is Drop Oldest, 1 the clairvoyant."""
+    """Scores of the agents together (AGENTS) and of every fixed policy: 0 is Drop Oldest, 1 the clairvoyant."""
 
     def ratio(self, seeds_qoi: Sequence[list[Numbers]], cells: Sequence[int], rng: np.random.Generator) -> Interval:
-        """Regret over AFR's in these cells; ``seeds_qoi``: H by training seed, as ``agents``."""
+        """Regret over AFR's in these cells; ``seeds_qoi`` has H by training seed, as ``agents``."""
 
         def resampled(seeds: Sequence[int], picks: Sequence[NDArray[np.int64] | slice]) -> float:
             agents = afr = 0.0
@@ -208,11 +208,11 @@ def main(
     seeds: int | None = None,
     out: Path | None = None,
 ) -> None:
-    """How far the agents of a run are above AFR, as a page.
+    """The gain of a run's agents over AFR, as a page.
 
     Args:
         run: folder of a run of train.py --algo evolution.
-        suites: where they are tested.
+        suites: suites to test on.
         data: folder of recordings.
         seeds: episodes a trace, if not the suite's own.
         out: Markdown file to write; the page is printed in any case.

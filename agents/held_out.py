@@ -26,11 +26,11 @@ from bufgym.sim.metrics import Outcome, outcome
 
 HELD_OUT_TRACES = 2
 FIRST_SEED = {"validation": 2_000_000_000, "test": 1_000_000_000}
-"""Episodes of a split are drawn from this seed on."""
+"""First seed of a split's episodes."""
 
 
 def split_scenario(settings: Settings) -> tuple[Scenario, Scenario]:
-    """(training scenario, held-out scenario): the same but for the traces, the last two of which are held out."""
+    """Training and held-out scenario, the same but for the traces; the last two traces are held out."""
     base = scenarios.get(gym.spec(settings.env).kwargs["scenario"])
     if not isinstance(base, Uplink):
         return base, base
@@ -40,9 +40,9 @@ def split_scenario(settings: Settings) -> tuple[Scenario, Scenario]:
 
 
 class FixedEpisodes:
-    """Episodes that no training run sees, beside what the clairvoyant and Drop Oldest reach on them.
+    """Episodes that no training run sees, with the results of the clairvoyant and Drop Oldest.
 
-    ``validation``: new episodes on the traces that are trained on; ``test``: episodes on the held-out traces.
+    ``validation`` has new episodes on the training traces, ``test`` has episodes on the held-out traces.
     """
 
     def __init__(self, settings: Settings, split: str) -> None:
@@ -56,16 +56,16 @@ class FixedEpisodes:
         self._best = math.fsum(plan.qoi for plan in self._plans)
 
     def run(self, policy: str) -> list[Outcome]:
-        """What a registered policy reaches."""
+        """Outcomes of a registered policy."""
         senders = run(registry.get(policy), self.episodes, self.capacity, self.scenario.value)
         return [outcome(senders, i) for i in range(len(self.episodes))]
 
     def run_fixed(self) -> dict[str, list[Outcome]]:
-        """What every registered policy of one queue reaches, by name."""
+        """Outcomes of every registered policy of one queue, by name."""
         return {name: self.run(name) for name in registry.names(for_topics=False)}
 
     def play(self, agent: Any) -> list[Outcome]:
-        """What a learner reaches."""
+        """Outcomes of a learner."""
         cell = Cell("", self.scenario, self.capacity)
         return play(agent, MixedEnv([cell], [len(self.episodes)], decide_at=self.decide_at), self.episodes)
 
@@ -87,7 +87,7 @@ class FixedEpisodes:
 
 
 def known_mean(numbers: Sequence[float]) -> float:
-    """The mean of those that are known; NaN where none is: a policy that delivered nothing has no delay."""
+    """The mean of the known numbers, NaN if none is: a policy that delivered nothing has no delay."""
     known = [number for number in numbers if not math.isnan(number)]
     return float(np.mean(known)) if known else math.nan
 
@@ -95,9 +95,9 @@ def known_mean(numbers: Sequence[float]) -> float:
 def summarise(
     outcomes: Mapping[str, Sequence[Outcome]], rows: Sequence[Row], agent: str, resamples: int = 2000
 ) -> list[dict[str, Any]]:
-    """One entry a policy, best QoI first: its score and regret, means over the episodes, QoI minus the agent's.
+    """One entry per policy, best QoI first: its score and regret, means over the episodes, QoI minus the agent's.
 
-    ``rows``: those of the outcomes. ``score_95`` and ``minus_agent_95`` are 95 % intervals, paired as in ``score``:
+    ``rows`` belong to the outcomes. ``score_95`` and ``minus_agent_95`` are 95 % intervals, paired as in ``score``:
     policies meet the same episodes, so an episode's own QoI cancels.
     """
     measured = {cell.policy: cell for cell in scores(rows, resamples=resamples).cells}

@@ -1,11 +1,11 @@
 """Training on whole suites: rows of many scenarios (links, motions, V) and capacities side by side.
 
 A learner needs one observation space, but L differs from row to row. So every row is *padded* to as many slots as the
-largest L: the slots beyond its own L are always empty, and their eviction is always masked. The newcomer, and the
-actions to reject and to accept, stay last. Thus every batch of experience mixes all cells under one optimizer and one
-replay, and padding costs next to nothing, as the slot network does not score empty slots (``bufgym.sb3.SlotScorer``).
+largest L. Slots beyond its own L are always empty, and their eviction is always masked. The newcomer, and the actions
+to reject and to accept, stay last. So every batch of experience mixes all cells under one optimizer and one replay.
+Padding costs next to nothing, as the slot network does not score empty slots (``bufgym.sb3.SlotScorer``).
 
-Without masks, evicting a padded slot does what any invalid action does: accept where there is room, else reject.
+Without masks, evicting a padded slot does the same as any invalid action: accept if there is room, else reject.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Observation = dict[str, NDArray[np.float32]]
 class Cell(NamedTuple):
     """One scenario at one capacity.
 
-    Fields: ``label``, the scenario's name in its suite; ``scenario``; ``capacity``, L in messages.
+    ``label`` is the scenario's name in its suite; ``capacity`` is L in messages.
     """
 
     label: str
@@ -89,7 +89,7 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """New episodes in all rows, each entered at a random step; ``seed``: one a row, or row i's is seed + i."""
+        """Begin new episodes in all rows, each at a random step; ``seed`` has one per row, or row i's is seed + i."""
         if seed is not None:
             seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
             for rows, span in zip(self.groups, self.spans, strict=True):
@@ -115,7 +115,7 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """One decision in every row: (observation, rewards, terminated, truncated, info), each with a row an env."""
+        """Take one decision in every row: observation, rewards, terminated, truncated, info, each with a row an env."""
         self.act(actions)
         rewards = np.concatenate([rows.output.reward_terms @ rows.weights for rows in self.groups])
         ended, info = self.ended(), {}
@@ -131,7 +131,7 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return observation, rewards, ended, np.zeros(self.num_envs, np.bool_), info
 
     def act(self, actions: NDArray[np.int64]) -> None:
-        """One decision in every row; rows that have ended stay as they are."""
+        """Take one decision in every row; rows that have ended stay as they are."""
         for rows, span in zip(self.groups, self.spans, strict=True):
             action, L = np.asarray(actions[span], np.int64), rows.capacity
             # Beyond L there is nothing to evict; accepting does what a queue does, whether there is room or not.
@@ -139,11 +139,11 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             rows.step(np.where(action >= self.padded_slots, action - self.padded_slots + L, unpadded))
 
     def ended(self) -> NDArray[np.bool_]:
-        """bool[n]: the row's episode is over."""
+        """bool[n]: whether the row's episode is over."""
         return np.concatenate([rows.output.terminated for rows in self.groups])
 
     def observation(self) -> Observation:
-        """Every row's, padded; fresh arrays."""
+        """Padded observations of all rows, in fresh arrays."""
         form = self._widest.form
         padded = np.zeros((self.num_envs, form.numbers), np.float32)
         slots, context = form.split(padded)

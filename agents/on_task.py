@@ -1,11 +1,11 @@
-"""Does an agent that is rewarded by the robot's own task do it better? Evolution asks, on `bufgym/Mapping-v0`.
+"""Does an agent do a robot's own task better if that task is its reward? An experiment on `bufgym/Mapping-v0`.
 
     python -m agents.on_task
 
-A small slot scorer is evolved under each of three rewards: the information that arrives, by the motion of the camera
-(what every environment pays by default), `covered`, and `followed`, which stands in for `tracked` as that takes seconds
-an episode. All begin as the rule `min-motion-gap`, and are tested on links that none has seen, by what tracking and
-coverage really are.
+Evolution makes a small slot scorer under each of three rewards. The first is the information that arrives, by the
+motion of the camera, which is every environment's default. The others are `covered` and `followed`, which stands in for
+`tracked` as that takes seconds an episode. All begin as the rule `min-motion-gap`. Tests use links that none has seen,
+and measure real tracking and coverage.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from bufgym.policies.learned import Weights
 from bufgym.sim import Senders
 
 TEST_LINKS = 2
-"""Of the shipped links the last so many are for tests alone."""
+"""Number of shipped links for tests alone, the last ones."""
 PARTS, PART_EPISODES = 8, 24
-"""Training episodes come in so many parts of so many, one a generation in turn."""
+"""Parts of the training episodes, one a generation in turn, and episodes in each."""
 HIDDEN, SIGMA = 4, 0.3
 """Hidden units of the scorer, and the search's first step size."""
 RIVALS = ("afr", "drop-oldest", "min-motion-gap", "learned-motion")
@@ -56,16 +56,16 @@ REWARDS: Mapping[str, Callable[[Frames], float]] = {
     "covered": worth.coverage_of,
     "followed": worth.least_followed,
 }
-"""What agents are evolved by."""
+"""Rewards for evolution."""
 TESTED: Mapping[str, Callable[[Frames], float]] = {**REWARDS, "tracked": worth.tracked_part}
-"""What they are tested by."""
+"""Measures for tests."""
 
 
 class Episodes:
     """Episodes of `bufgym/Mapping-v0` side by side, with a queue of L messages."""
 
     def __init__(self, pairs: Sequence[tuple[int, int]], L: int) -> None:
-        """``pairs``: (link, seed) of each."""
+        """``pairs`` has the (link, seed) of each episode."""
         scenario = worth.mapping()
         links = by_trace(scenario)
         self.episodes = [draw(links[link][1], seed) for link, seed in pairs]
@@ -82,7 +82,7 @@ class Episodes:
 
 
 class Task(Objective):
-    """The mean of a reward over episodes of the links that are for training."""
+    """The mean of a reward over episodes of the training links."""
 
     name = "on-task"
     best = max
@@ -95,7 +95,7 @@ class Task(Objective):
         ]
 
     def start(self) -> Weights:
-        """The smallest merged gap of motion goes."""
+        """The rule "smallest merged motion gap"."""
         return start(MOTION, HIDDEN, np.random.default_rng(0))
 
     def measure(self, policy: Policy, episodes: Any, part: int | None = None) -> float:
@@ -112,7 +112,7 @@ def evolved(reward: str, L: int, seed: int, generations: int) -> Policy:
 
 
 def tested(policy: Policy, episodes: Episodes) -> dict[str, NDArray[np.float64]]:
-    """Measure -> of each episode."""
+    """Measure -> its value in each episode."""
     arrived = episodes.arrived(policy)
     return {name: np.array([measure(frames) for frames in arrived]) for name, measure in TESTED.items()}
 
@@ -120,13 +120,13 @@ def tested(policy: Policy, episodes: Episodes) -> dict[str, NDArray[np.float64]]
 def main(
     generations: int = 120, seeds: int = 2, capacity: int = 8, episodes: int = 40, out: Path | None = None
 ) -> None:
-    """The table of what agents reach that were evolved by each reward, beside fixed policies.
+    """A table of agents evolved by each reward, beside fixed policies.
 
     Args:
         generations: of 16 candidates each.
         seeds: training seeds of each reward.
         capacity: L, messages.
-        episodes: for the test, on the links that are for it.
+        episodes: number of test episodes, on the test links.
         out: the Markdown file; printed in any case.
     """
     links = len(worth.mapping().traces)
@@ -141,7 +141,7 @@ def main(
     weights = times_drawn(episodes, RESAMPLES, stream(0, "on task")) / episodes
 
     def ahead(name: str, base: str) -> str:
-        """How much further tracking gets than with the other; paired, over episodes."""
+        """Gain in tracking over the other policy, paired over episodes."""
         if name == base:
             return ""
         more = percentile_interval(weights @ (tracked[name] - tracked[base]), CONFIDENCE)

@@ -1,4 +1,4 @@
-"""What the pages about trained agents share: their commands, tables, and how numbers are written."""
+"""Shared parts of the pages about trained agents: commands, tables, and the form of numbers."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def _line(cells: Sequence[object]) -> str:
 
 
 def written(interval: Interval, form: str) -> str:
-    """Such as 1.03 [1.01, 1.05], each number in this format."""
+    """An interval as text such as 1.03 [1.01, 1.05], with this format for each number."""
     return " ".join(filter(None, bootstrap.written(interval, lambda number: format(number, form))))
 
 
 def columns_of(file: Path, *names: str) -> list[tuple[float, ...]]:
-    """These columns of a curve that a run left, a tuple a row."""
+    """These columns of a curve from a run's folder, a tuple per row."""
     with file.open(newline="", encoding="utf-8") as lines:
         return [tuple(float(row[name]) for name in names) for row in csv.DictReader(lines)]
 
 
 def publish(text: str, out: Path | None) -> None:
-    """Write the page where that is asked for, and print it."""
+    """Write the page to ``out`` if given, and print it."""
     if out:
         out.write_text(text, encoding="utf-8")
     print(text)

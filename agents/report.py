@@ -1,4 +1,4 @@
-"""What comes out of a training run: a table, a figure, JSON or rows, and the best agent, all in the run's folder."""
+"""The report of a training run: a table, a figure, JSON or rows, and the best agent, all in the run's folder."""
 
 from __future__ import annotations
 
@@ -71,12 +71,12 @@ def report(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
 
 
 def agent_name(run: Run) -> str:
-    """What one seed's agent is called in tables."""
+    """Name of one seed's agent in tables."""
     return f"agent (seed {run.seed})"
 
 
 def _save(home: Path, settings: Settings, runs: Sequence[Run], best: Run, **results: Any) -> dict[str, Any]:
-    """Write results.json; the best agent's QoI, for its notes."""
+    """Write results.json; return the best agent's QoI, for its notes."""
     content = {
         "settings": dataclasses.asdict(settings),
         "seeds": [run.seed for run in runs],
@@ -93,11 +93,11 @@ def _save(home: Path, settings: Settings, runs: Sequence[Run], best: Run, **resu
 
 
 RIVALS: dict[str, Callable[[], list[Policy]]] = {"topics": topics.rivals, "fleet": fleet.rivals}
-"""Kind -> the fixed policies that its agents are measured against."""
+"""Kind -> the fixed policies for comparison."""
 
 
 def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
-    """Every seed's agent beside the fixed policies on the test split: rows.csv, and the table in results.txt."""
+    """Write every seed's agent beside the fixed policies on the test split: rows.csv, and the table in results.txt."""
     agents = [dataclasses.replace(weights.load(run.model), name=agent_name(run)) for run in runs]
     rows = test_rows(settings, [*agents, *RIVALS[settings.kind]()])
     task = TASKS[settings.kind]
@@ -111,7 +111,7 @@ def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
 
 
 def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], best: Run) -> dict[str, Any]:
-    """All agents and fixed policies on the held-out episodes; the best agent's notes."""
+    """Evaluate all agents and fixed policies on the held-out episodes; return the best agent's notes."""
     test, validation = FixedEpisodes(settings, "test"), FixedEpisodes(settings, "validation")
     outcomes = test.run_fixed()
     for run in runs:
@@ -149,9 +149,9 @@ def rules(episodes: FixedEpisodes) -> dict[str, float]:
 
 
 def _drawn(bars: Mapping[str, Interval], alike: Mapping[str, Sequence[str]]) -> tuple[dict[str, Interval], list[str]]:
-    """(The bars that are drawn, notes on those that stand for several policies).
+    """The bars to draw, and notes on bars that stand for several policies.
 
-    Policies below Drop Oldest are in the table alone, as they would squeeze the rest of the figure; agents are not.
+    Policies below Drop Oldest are only in the table, as they would squeeze the rest of the figure; agents are drawn.
     """
     others = {name for names in alike.values() for name in names}
     drawn = {name: bar for name, bar in bars.items() if name not in others}
@@ -160,7 +160,7 @@ def _drawn(bars: Mapping[str, Interval], alike: Mapping[str, Sequence[str]]) -> 
 
 
 def table(entries: Sequence[dict[str, Any]], agent: str, alike: Mapping[str, Sequence[str]]) -> str:
-    """Best first, with the difference to the agent and its 95 % interval; ``alike``: policies that are one line."""
+    """A table, best first, with the difference to the agent and its 95 % interval; ``alike`` policies share a line."""
     lines = [["policy", "score [95 %]", *(heading for heading, *_ in COLUMNS), "QoI - agent's [95 %]"]]
     others = {name for names in alike.values() for name in names}
     for entry in entries:
@@ -180,10 +180,10 @@ def table(entries: Sequence[dict[str, Any]], agent: str, alike: Mapping[str, Seq
 def report_suite(
     settings: Settings, suite: str, folder: Path, home: Path, runs: Sequence[Run], best: Run
 ) -> tuple[dict[str, Any], Interval]:
-    """All agents and fixed policies on the suite's test split, scored as ``bufgym bench`` does.
+    """Score all agents and fixed policies on the suite's test split, as ``bufgym bench`` does.
 
-    The training seeds together are one entry, with intervals over them and over episodes. Nothing is chosen here: each
-    seed's agent, and the one in the run's folder, are those that did best on validation.
+    The training seeds together are one entry, with intervals over seeds and over episodes. No choice is made here: each
+    seed's agent, and the one in the run's folder, did best on validation.
 
     Returns:
         (the best agent's notes, the score of the agents together).
@@ -214,7 +214,7 @@ def report_suite(
         standings=[dataclasses.asdict(standing) for standing in result.standings],
         cells=[dataclasses.asdict(cell) for cell in result.cells],
     )
-    # Where no cell is discriminative, there are no scores to draw.
+    # Without a discriminative cell, there are no scores to draw.
     ranked = {s.policy: s.score for s in result.standings if s.ranked and math.isfinite(s.score.value)}
     bars, twins = _drawn(ranked, same(rows))
     rival = "that of AFR or Drop Oldest" if settings.algo == "evolution" else "AFR's"

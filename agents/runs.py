@@ -1,4 +1,4 @@
-"""A run's folder: its settings, one folder a seed with the seed's curves, and what each finished seed leaves."""
+"""A run's folder: its settings, one folder a seed with the seed's curves, and the results of each finished seed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bufgym.files import locked, replaced
 
 RUNS = Path("runs")
 MODEL = "model.safetensors"
-"""The file that holds an agent as weights which bufgym runs without torch."""
+"""The file of an agent whose weights bufgym runs without torch."""
 FREE = {"name", "resume", "steps", "checkpoint_every", "validate_every", "episodes", "seeds", "backend", "address"}
 """Settings that may differ between a run and its resumption."""
 
@@ -38,17 +38,17 @@ class Run:
     seed: int
     """The training seed."""
     folder: Path
-    """Where its files are: runs/NAME/seed-SEED."""
+    """Its folder, runs/NAME/seed-SEED."""
     seconds: float
     """Time spent training, over all its sessions, s."""
     curve: list[Numbers]
-    """(steps, seconds, mean QoI of the latest training episodes, or an evolved agent's fitness), a row an update."""
+    """(steps, seconds, mean QoI of the latest training episodes, or an evolved agent's fitness), a row per update."""
     validation: list[Numbers]
-    """(steps, seconds, measures; the last one is what the agent to keep is chosen by), a row a validation."""
+    """(steps, seconds, measures), a row per validation; the last measure chooses the agent to keep."""
     file: str = "model.zip"
     """The kept agent's file in ``folder``."""
     best: Callable[..., Any] = min
-    """``min`` or ``max``: which of the validations' last measures is the best."""
+    """``min`` or ``max``, the better direction of the last measure."""
 
     @property
     def model(self) -> Path:
@@ -70,7 +70,7 @@ class Run:
 
 
 def prepare(settings: Settings) -> Path:
-    """The run's folder: made for a new run, checked against these settings for one that goes on."""
+    """The run's folder: made for a new run, checked against these settings for a resumed one."""
     settings.checked()
     folder = RUNS / (settings.name or _default_name(settings.resume))
     if settings.resume:
@@ -95,7 +95,7 @@ def prepare(settings: Settings) -> Path:
 def write_notes(
     folder: Path, settings: Settings, seeds: Sequence[int], scores: Mapping[str, Any] | None = None
 ) -> None:
-    """Write what ``bufgym export`` says of the model in this folder: notes.json."""
+    """Write notes.json, from which ``bufgym export`` describes the model in this folder."""
     notes: dict[str, Any] = {"training": settings.command, "seeds": list(seeds)}
     if scores:
         notes["scores"] = scores
@@ -119,13 +119,13 @@ def _default_name(resume: bool) -> str:
 
 
 def pool_of(workers: int) -> concurrent.futures.ProcessPoolExecutor:
-    """So many processes, which end when this one does. Fresh interpreters: torch's threads do not survive a fork."""
+    """A pool of so many processes, which end with this one. They are fresh: torch's threads do not survive a fork."""
     context = multiprocessing.get_context("spawn")
     return concurrent.futures.ProcessPoolExecutor(workers, context, end_with, (os.getpid(),))
 
 
 def each_seed(train: Callable[[Settings, Path, int, int], Run], settings: Settings, folder: Path) -> list[Run]:
-    """``train`` (settings, the run's folder, seed, line of its progress bar) for every seed, a process each."""
+    """Call ``train`` (settings, the run's folder, seed, line of its progress bar) for every seed, a process each."""
     seeds = range(settings.seed, settings.seed + settings.seeds)
     for seed in seeds:
         (folder / f"seed-{seed}").mkdir(exist_ok=True)
@@ -155,7 +155,7 @@ def each_seed(train: Callable[[Settings, Path, int, int], Run], settings: Settin
 
 
 class Record:
-    """Rows (steps, seconds, ...) in a CSV file that grows; a resumed run keeps those up to its checkpoint."""
+    """Rows (steps, seconds, ...) in a CSV file that grows; a resumed run keeps the rows up to its checkpoint."""
 
     def __init__(self, path: Path, columns: tuple[str, ...], steps: int) -> None:
         self.path = path
@@ -175,12 +175,12 @@ class Record:
 
 
 class Validations:
-    """A seed's validations, ``validate_every`` steps apart, in validation.csv; which was the best of them.
+    """A seed's validations, ``validate_every`` steps apart, in validation.csv, and the best of them.
 
     Args:
         home: the seed's folder.
-        columns: names of the measures; the last one is what the agent to keep is chosen by.
-        best: ``min`` or ``max``: which of its values is the best.
+        columns: names of the measures; the last one chooses the agent to keep.
+        best: ``min`` or ``max``, its better direction.
         steps: where training goes on from; later rows are left out.
     """
 
@@ -192,7 +192,7 @@ class Validations:
 
     @property
     def rows(self) -> list[Numbers]:
-        """(steps, seconds, *measures), a row a validation."""
+        """(steps, seconds, *measures), a row per validation."""
         return self.record.rows
 
     @property
@@ -202,20 +202,20 @@ class Validations:
         return row
 
     def due(self, steps: int) -> bool:
-        """Whether it is time again; at the beginning and at the end it always is."""
+        """Whether a validation is due; at the beginning and at the end it always is."""
         if not self.rows:
             return True
         since = steps - self.rows[-1][0]
         return since >= self.settings.validate_every or (steps >= self.settings.steps and since > 0)
 
     def add(self, steps: int, seconds: float, measures: Numbers) -> bool:
-        """Note a validation; whether it is the best so far."""
+        """Add a validation; return whether it is the best so far."""
         self.record.append(steps, round(seconds, 3), *measures)
         return self.best is self.rows[-1]
 
 
 def seed_bar(steps: int, done: int, seed: int, line: int) -> Any:
-    """A seed's progress bar, on a terminal alone; ``line``: where it goes."""
+    """A seed's progress bar on line ``line``, on a terminal only."""
     return tqdm(
         total=steps,
         initial=done,

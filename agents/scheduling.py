@@ -48,10 +48,10 @@ rest.
 
 
 def main(run: Positional[Path], out: Path | None = None) -> None:
-    """What a finished run's schedulers reached, as a page.
+    """The results of a finished run's schedulers, as a page.
 
     Args:
-        run: its folder, runs/NAME.
+        run: the run's folder, runs/NAME.
         out: Markdown file to write; the page is printed in any case.
     """
     if not (run / "rows.csv").is_file():

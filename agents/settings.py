@@ -15,7 +15,7 @@ from bufgym.scenario import Interruption, Uplink, suites
 from bufgym.scenario.uplink import RGBD_BYTES
 
 TIME = ("rank", "index_before", "index_merged", "occupancy", "stalled", "service_ratio")
-"""Fields that a queue and a clock can tell, as AFR's."""
+"""Fields from a queue and a clock, as AFR's."""
 
 MOTION = (
     *("rank", "motion_before", "motion_merged", "loss", "relative_loss"),
@@ -24,19 +24,19 @@ MOTION = (
 """Fields with odometry and V."""
 
 LINK = (*MOTION, "rate_short", "rate_medium", "rate_long", "rate_trend", "time_to_free")
-"""These, and the link's rate as the socket shows it."""
+"""Fields of ``MOTION``, and the link's rate as the socket shows it."""
 
 SEES = {"time": TIME, "motion": MOTION, "link": LINK}
 
 Kind = Literal["environment", "queue", "topics", "fleet"]
-"""What a run trains on: one environment, suites of one queue, a suite of many topics, or one of many robots."""
+"""The task of a run: one environment, suites of one queue, a suite of many topics, or one of many robots."""
 
 _ALONE = {"topics": ("a scheduler", ("evolution",)), "fleet": ("a fleet's agent", ("evolution", "maskable-ppo"))}
-"""Kinds that are trained on one suite alone: what is trained, and by which algorithms."""
+"""Kinds for one suite alone, with the trained agent and its algorithms."""
 
 
 class Range(NamedTuple):
-    """The numbers that a setting may be: from ``low`` to ``high``, and above 0 where ``positive``."""
+    """Limits of a setting's numbers: from ``low`` to ``high``, and above 0 if ``positive``."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -145,19 +145,19 @@ class Settings:
 
     @property
     def suites(self) -> tuple[str, ...]:
-        """Those that ``suite`` names."""
+        """Names in ``suite``."""
         return tuple(filter(None, self.suite.split(",")))
 
     @property
     def kind(self) -> Kind:
-        """What the run trains on."""
+        """The task of the run."""
         kinds = {suites.get(suite).kind for suite in self.suites}
         if not kinds:
             return "environment"
         return "topics" if "topics" in kinds else "fleet" if "fleet" in kinds else "queue"
 
     def capacities_of(self, suite: str) -> tuple[int, ...]:
-        """L to train for and to test at: those given, or the suite's."""
+        """L to train for and to test at: the given ones, or the suite's."""
         if not self.capacities:
             return suites.get(suite).capacities
         try:
@@ -175,7 +175,7 @@ class Settings:
 
     @property
     def command(self) -> str:
-        """The command that trains it again: the settings that differ from the defaults."""
+        """The command that trains it again, with all settings that differ from the defaults."""
         defaults = asdict(Settings())
         words = [
             f"--{name.replace('_', '-')} {shlex.quote(str(value))}"
@@ -185,7 +185,7 @@ class Settings:
         return " ".join(["python train.py", *words])
 
     def checked(self) -> Settings:
-        """These settings, or a BufgymError that names the first one that breaks a rule, and the rule."""
+        """Check these settings and return them; a BufgymError names the first that breaks a rule, and the rule."""
         for name, hint in get_type_hints(Settings, include_extras=True).items():
             value = getattr(self, name)
             for part in getattr(hint, "__metadata__", ()):
@@ -224,7 +224,7 @@ class Settings:
         return self
 
     def _check_fields(self) -> None:
-        """The rule of what an evolved agent reads."""
+        """Check the fields that an evolved agent reads."""
         known = [name for name in self.observed if name in NAMES]
         merged = {"motion_merged", "time_merged", "index_merged"} & set(known)
         if len(set(known)) < len(self.observed) or not merged or "rank" not in known:
@@ -234,11 +234,11 @@ class Settings:
             self._refuse("fields", f"{rule} (bufgym list observations)")
 
     def _check_suites(self) -> None:
-        """The rules of suites of one queue."""
+        """Check the rules of suites of one queue."""
         interruptions = False
         for name in self.suites:
             suite = suites.get(name)
-            suite.settings("validation", self.data or None)  # an error here where recordings are missing
+            suite.settings("validation", self.data or None)  # raises here if recordings are missing
             settings = suite.settings("train", self.data or None).values()
             interruptions |= any(isinstance(setting.scenario, Interruption) for setting in settings)
         if self.warm_up and not interruptions:

@@ -19,15 +19,14 @@ from bufgym.scenario import Interruption
 SOLVED = {1: 400, 2: 300, 3: 120, 4: 70}
 """L, and the longest T for which the online optimum's table fits into memory."""
 BEAM = 1000
-"""Queues that are followed at a time beyond that."""
+"""Queues that the beam follows at a time beyond that."""
 
 
 def plan(base: float, L: int) -> list[int]:
-    """What an interruption's arrivals L + 1, L + 2, ... evict from a full queue (L: themselves).
+    """Evictions from a full queue at an interruption's arrivals L + 1, L + 2, ...; L stands for the newcomer.
 
-    T is log-uniform on 1..SOLVED[L], for which the plan is the online optimum; one that lasts longer is taken as one
-    log-uniform on 1..LONGEST, for which a beam search goes on from there. Nothing is learned meanwhile, so it is one
-    list for all T.
+    T is log-uniform on 1..SOLVED[L], for which the plan is the online optimum. A longer one is taken as log-uniform on
+    1..LONGEST, for which a beam search continues the plan. Nothing is learned meanwhile, so one list serves all T.
     """
     scenario = Interruption(value=qoi.exponential(base), t_max=SOLVED[L])
     optimum = online_optimum(L, law(scenario), scenario.value, objective="qoi")
@@ -41,9 +40,9 @@ def plan(base: float, L: int) -> list[int]:
 
 
 def continued(base: float, kept: NDArray[np.int64], begin: int) -> list[int]:
-    """The plan for arrivals ``begin`` + 1 to LONGEST of a queue that holds ``kept`` then, as a beam search finds it.
+    """The plan for arrivals ``begin`` + 1 to LONGEST of a queue that then holds ``kept``, by beam search.
 
-    Queues are compared by what they have given until then, and would give if nothing came after.
+    Queues are compared by their gain so far plus the gain if nothing came after.
     """
     p = law(Interruption(value=qoi.exponential(base), t_max=LONGEST))
     beyond = np.append(p[::-1].cumsum()[::-1], 0.0)  # P(T >= t)

@@ -1,7 +1,8 @@
 """Training agents by PPO, DQN or evolution: checkpoints, resuming, one process a seed.
 
-PPO is bound here by its updates, not by the environment (a compiled step of 256 environments costs as much as one
-gradient step on a few hundred decisions). So: large batches, few epochs, a small network, one torch thread a process.
+PPO is bound here by its updates, not by the environment. A compiled step of 256 environments costs as much as one
+gradient step on a few hundred decisions. So batches are large, epochs few, the network small, and a process has one
+torch thread.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from bufgym.sb3.networks import policy_of
 def train_all(settings: Settings, folder: Path) -> list[Run]:
     """Train every seed, in processes of their own if there are several; with a cluster they share it."""
     if settings.kind == "queue":
-        ValidationSets(settings, folder, progress=True)  # the clairvoyant's bounds are found once for all seeds
+        ValidationSets(settings, folder, progress=True)  # compute the clairvoyant's bounds once for all seeds
     if settings.backend == "local":
         return each_seed(cma_es.train if settings.algo == "evolution" else train_seed, settings, folder)
     with begun(settings.backend, settings.address or None) as address:
@@ -52,16 +53,16 @@ def train_all(settings: Settings, folder: Path) -> list[Run]:
 
 
 def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
-    """Train one seed to the end, from its latest checkpoint if there is one. ``line``: where its bar goes."""
+    """Train one seed to the end, from its latest checkpoint if any; ``line`` is the line of its progress bar."""
     torch.set_num_threads(1)
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
     env = training_env(settings)
     algorithm, new = LEARNERS[settings.algo]
     saved = checkpoints(home)
-    torch.manual_seed(seed)  # of the first weights
+    torch.manual_seed(seed)  # for the first weights
     model = algorithm.load(saved[-1], env=env, device="cpu") if saved else new(settings, env)
-    # Every session has a seed of its own, from where it begins: the episodes before a kill do not come again.
+    # Every session has a seed of its own, by its first step: the episodes before a kill do not come again.
     model.set_random_seed(int(np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1)[0]))
     model.set_logger(configure(str(home / "tensorboard"), ["tensorboard"]))
     curve = Curve(home / "curve.csv", model.num_timesteps)
@@ -89,7 +90,7 @@ def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0) -> Ru
 
 
 def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, steps: int) -> Validation:
-    """What validates a learner of this kind of task."""
+    """The validation of a learner on this kind of task."""
     if settings.kind == "environment":
         episodes = FixedEpisodes(settings, "validation")
 
@@ -97,7 +98,7 @@ def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, st
             outcomes = episodes.play(model)
             return episodes.score(outcomes), float(np.mean([result.qoi for result in outcomes]))
 
-        # By QoI: it orders agents as the score does, and is known where nothing can be gained too.
+        # By QoI, which orders agents like the score, and is known even if nothing can be gained.
         validations = Validations(home, ("score", "qoi"), max, settings, steps)
         return Validation(home, validations, score, lambda measures: f"validation score {measures[0]:.3f}", curve)
     if settings.kind == "fleet":
@@ -180,7 +181,7 @@ def new_ppo(settings: Settings, env: VecEnv) -> MaskablePPO | PPO:
 
 
 def even_batch(decisions: int, most: int) -> int:
-    """The largest batch size up to ``most`` that divides the decisions: no update ends with a noisy rest of a batch."""
+    """The largest batch size up to ``most`` that divides the decisions, so that no noisy rest is left."""
     batches = -(-decisions // most)
     while decisions % batches:
         batches += 1
@@ -195,9 +196,9 @@ REPLAY = 100_000
 
 
 def new_dqn(settings: Settings, env: VecEnv) -> MaskedDQN:
-    """An untrained Q network. It sees each decision as often as PPO (``epochs`` times), in smaller batches and steps.
+    """Make an untrained Q network. It sees each decision as often as PPO (``epochs`` times), in smaller batches.
 
-    Little is explored: a message dropped at random is missing for the rest of the episode.
+    It explores little: a message dropped at random is missing for the rest of the episode.
     """
     batch = max(1, settings.batch_size // 4)
     steps = max(1, settings.n_steps // 16)
@@ -226,15 +227,15 @@ LEARNERS: dict[str, tuple[Any, Callable[[Settings, VecEnv], Any]]] = {
     "ppo": (PPO, new_ppo),
     "dqn": (MaskedDQN, new_dqn),
 }
-"""Algorithm -> (its class, what makes an untrained one)."""
+"""Algorithm -> (its class, function that makes an untrained one)."""
 
 ALGORITHMS = (*LEARNERS, "evolution")
-"""What ``--algo`` can name."""
+"""Values of ``--algo``."""
 
 
 def load(settings: Settings, run: Run) -> Any:
     """The learner that the run kept."""
-    torch.set_num_threads(1)  # on batches this small, more only wait for one another
+    torch.set_num_threads(1)  # on batches this small, more threads only wait for one another
     return LEARNERS[settings.algo][0].load(run.model, device="cpu")
 
 

@@ -24,7 +24,7 @@ ENVIRONMENTS = {
     "bufgym/Suite-v0": ("suite", "the episodes of a benchmark suite, split by split"),
     "bufgym/Topics-v0": ("topics", "many topics over one uplink: what to drop, and what to send next (Robofleet)"),
 }
-"""Id -> (name of the scenario, what it is)."""
+"""Id -> (name of the scenario, its description)."""
 
 ON_TASKS = {
     "bufgym/Mapping-v0": (
@@ -32,7 +32,7 @@ ON_TASKS = {
         "a made-up room is filmed: what are the frames worth?",
     ),
 }
-"""The same for environments whose reward is a robot's own task; they need the extra ``perception``."""
+"""Id -> task, for environments whose reward is a robot's own task; they need the extra ``perception``."""
 
 for _id, (_scenario, _) in ENVIRONMENTS.items():
     if _id not in _gym.registry:

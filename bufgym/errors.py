@@ -1,7 +1,7 @@
-"""The errors that bufgym raises on purpose.
+"""Errors that bufgym raises on purpose.
 
-One family: `except BufgymError` catches whatever the caller can put right (a bad parameter, a broken file).
-Anything else that escapes is a bug of bufgym.
+``except BufgymError`` catches every error that the caller can put right, such as a bad parameter or a broken file. Any
+other exception that escapes is a bug in bufgym.
 """
 
 from __future__ import annotations
@@ -13,30 +13,30 @@ import traceback
 from os import PathLike
 
 _MOST_CHARACTERS = 60
-"""Longer values are cut in messages: a broken file can hold a line of any length."""
+"""Longest value shown in a message, characters: a broken file can hold a line of any length."""
 _MOST_MESSAGE = 2000
-"""Characters."""
+"""Longest message, characters."""
 
 
 def printable(text: object) -> str:
-    """The text on one line, without a character that a terminal obeys: each is written as in Python (``\\x1b``).
+    """Return the text on one line, with every character that a terminal obeys written as in Python (``\\x1b``).
 
-    Names come from files of strangers: a newline in one could forge a line of output, an escape code hide another.
+    Names come from strangers' files. A newline could forge a line of output, and an escape code could hide another.
     """
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 
 
 class BufgymError(ValueError):
-    """A value that bufgym cannot work with; the message names the value and the rule that it breaks, on one line."""
+    """A value that bufgym cannot work with; the message names the value and the broken rule, on one line."""
 
     def __init__(self, message: object = "") -> None:
         text = printable(message)
-        # The place stands at the beginning and the rule at the end; what is between may be as long as a file.
+        # The message begins with the place and ends with the rule; the value between may be as long as a file.
         super().__init__(text if len(text) <= _MOST_MESSAGE else f"{text[:1000]}...{text[-500:]}")
 
 
 class TraceError(BufgymError):
-    """A trace or motion file that cannot be read or written; the message names the file and the line."""
+    """A trace or motion file that cannot be read or written; the message names file and line."""
 
 
 def where(
@@ -47,14 +47,14 @@ def where(
     *,
     field: str | None = None,
 ) -> str:
-    """Say where something is wrong, what it is, and which rule it breaks.
+    """Say where an error is, which value is wrong, and which rule it breaks.
 
     Args:
         path: the file, as the caller wrote it.
-        line: line number, counted from 1; None when the file as a whole is meant.
-        value: the offending value as it stands in the file; None when there is none to show.
-        rule: what would have been right, to be read after the value ("must be a whole number >= 0").
-        field: what the value is, such as a column's name.
+        line: line number, counted from 1; None for the file as a whole.
+        value: the offending value as it stands in the file; None if there is none to show.
+        rule: the requirement, to be read after the value ("must be a whole number >= 0").
+        field: name of the value, such as a column's.
 
     Returns:
         For example "lte.csv, line 12: bytes = -3: must be a whole number >= 0".
@@ -67,7 +67,7 @@ def where(
 
 
 def _quoted(value: object) -> str:
-    """Plain words and numbers as they stand; blanks, spaces and control characters quoted; long text cut."""
+    """Quote blanks, spaces and control characters; leave plain words and numbers as they are; cut long text."""
     text = str(value)
     cut = text if len(text) <= _MOST_CHARACTERS else text[: _MOST_CHARACTERS - 3] + "..."
     plain = cut.isprintable() and cut.isascii() and cut != "" and " " not in cut
@@ -75,7 +75,7 @@ def _quoted(value: object) -> str:
 
 
 def line_in(error: Exception, file: str) -> str | None:
-    """Where in that file the error came from ("mine.py, line 3", the innermost line), or None."""
+    """The innermost line of ``file`` that raised the error ("mine.py, line 3"), or None."""
     lines = [
         line
         for frame, line in traceback.walk_tb(error.__traceback__)
@@ -85,10 +85,10 @@ def line_in(error: Exception, file: str) -> str | None:
 
 
 def install(extra: str) -> str:
-    """The command that installs what an optional part needs.
+    """The command that installs an optional part.
 
-    It names the packages of the extra, and so works from a checkout and beside an installed bufgym alike: both carry
-    the list, and no package index need know bufgym.
+    It lists the extra's packages, so it works both in a checkout and beside an installed bufgym, and no package index
+    needs to know bufgym.
     """
     try:
         packages = _packages(importlib.metadata.requires("bufgym") or [], extra)
@@ -99,7 +99,7 @@ def install(extra: str) -> str:
 
 
 def _packages(requirements: list[str], extra: str) -> list[str]:
-    """What the extra asks for, with what the extras of bufgym's own that it names ask for."""
+    """Packages that an extra requires, directly or through another extra of bufgym."""
     found: list[str] = []
     for requirement in requirements:
         package, _, condition = requirement.partition(";")

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, read with bounds, and the folders of those that come with bufgym."""
+"""Files: written whole or not at all, read with size limits, and found where bufgym ships them."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ PACKAGE = Path(__file__).resolve().parent
 
 FREELY_UNPACKED_BYTES = 64 * 2**20
 MOST_UNPACKED = 100
-"""No recording or data set of text is packed so well; a bomb is packed a thousand times smaller or more."""
+"""Largest ratio of unpacked to packed bytes. No recording or text data set packs so well; a bomb packs 1,000:1."""
 
 MAX_TOML_BYTES = 2**18
-"""A client of a thousand topics has less."""
+"""Limit for a TOML file: a client of a thousand topics needs less."""
 MAX_DOTS = 100
-"""In a line."""
+"""Most dots in one line of a TOML file."""
 
 
 def read_whole(path: str | os.PathLike[str], most_bytes: int) -> bytes:
-    """All bytes of a regular file of at most so many.
+    """Read all bytes of a regular file that has at most ``most_bytes``.
 
     Raises BufgymError: missing, a folder, a device, a FIFO, larger.
     """
@@ -46,7 +46,7 @@ def read_whole(path: str | os.PathLike[str], most_bytes: int) -> bytes:
 
 
 def read_utf8(path: str | os.PathLike[str], most_bytes: int) -> str:
-    """The text of such a file; an error for one that is not UTF-8."""
+    """Read the UTF-8 text of such a file; raise a BufgymError for other encodings."""
     try:
         return read_whole(path, most_bytes).decode("utf-8")
     except UnicodeDecodeError:
@@ -54,7 +54,7 @@ def read_utf8(path: str | os.PathLike[str], most_bytes: int) -> str:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """What the TOML file holds."""
+    """Read a TOML file."""
     text = read_utf8(path, MAX_TOML_BYTES)
     for number, line in enumerate(text.split("\n"), 1):
         # The parser's memory grows with the square of a dotted key's parts.
@@ -64,19 +64,19 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         return tomllib.loads(text)
     except RecursionError:
         raise BufgymError(f"{path}: nested too deep") from None
-    except ValueError as error:  # tomllib's own, and int()'s for thousands of digits
+    except ValueError as error:  # from tomllib, or from int() for thousands of digits
         raise BufgymError(f"{path}: {str(error).partition(';')[0]}") from None
 
 
 def check_keys(table: Mapping[str, Any], known: set[str], first: str = "") -> None:
-    """Every key of the table is known; ``first``: what the message names before the known keys."""
+    """Check that every key of the table is known; the message names ``first`` before the known keys."""
     unknown = sorted(set(table) - known)
     if unknown:
         raise BufgymError(f"unknown key {unknown[0]!r}; known: {first}{', '.join(sorted(known))}")
 
 
 def unpacked_limit(packed_bytes: int) -> int:
-    """How many bytes may come out of so many packed ones."""
+    """Most bytes that so many packed bytes may unpack to."""
     return FREELY_UNPACKED_BYTES + MOST_UNPACKED * packed_bytes
 
 
@@ -86,7 +86,7 @@ def _why(error: Exception) -> str:
 
 @contextmanager
 def replaced(target: Path) -> Iterator[Path]:
-    """A temporary file beside ``target`` to write to; it replaces the target if the block ends without an error."""
+    """Yield a temporary file beside ``target``, which replaces the target if the block ends without an error."""
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
     os.close(handle)
     temporary = Path(name)
@@ -103,7 +103,7 @@ def replaced(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """``folder`` is this process's alone while the block runs; a kill releases it.
+    """Lock ``folder`` for this process while the block runs; the lock ends with the process.
 
     Raises BufgymError: another process holds it.
     """
@@ -116,7 +116,7 @@ def locked(folder: Path) -> Iterator[None]:
     except Timeout:
         rule = "wait until it has ended, or choose another folder"
         raise BufgymError(f"{folder}: another process is writing there; {rule}") from None
-    except PermissionError:  # nor can anybody write there
+    except PermissionError:  # nobody else can write there either
         yield
         return
     try:
@@ -127,9 +127,9 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def shipped(inside: str, checkout: str, pattern: str) -> dict[str, Path]:
-    """Stem -> path of the files that come with bufgym; empty where there are none.
+    """Stem -> path of the files that come with bufgym; empty if there are none.
 
-    A wheel carries them inside the package, in ``bufgym/data/<inside>``; a checkout has them in its ``<checkout>``.
+    A wheel carries them inside the package, in ``bufgym/data/<inside>``; a checkout has them in ``<checkout>``.
     """
     for folder in (PACKAGE / "data" / inside, PACKAGE.parent / checkout):
         # A folder with an __init__.py is another package of that name, next to an installed bufgym.

@@ -1,7 +1,7 @@
-"""What is named as text by ``module:function``: a policy, a V, a link generator, a scenario of one's own.
+"""Your own policy, V, link generator or scenario, named in text as ``module:function``.
 
-The module is imported, from the current folder too, and importing runs its code: names that come from files of
-strangers (leaderboards, results, configurations of clients) never get here.
+Importing the module runs its code, and modules in the current folder count too. Names from strangers' files, such as
+leaderboards, results and configurations of clients, therefore never get here.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from typing import Any
 from bufgym.errors import BufgymError, line_in
 
 _NAMED = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-"""A setting, as in ``decimate:every=2``, has a "=" behind the colon."""
+"""A setting such as ``decimate:every=2`` does not match, as it has "=" after the colon."""
 
 FILES: list[str] = []
-"""Those of the modules imported here: an error that comes from one of them is the caller's own."""
+"""Files of the modules imported here. An error that comes from one of them is the caller's own."""
 
 
 def is_named(text: str) -> bool:
-    """Whether the text reads ``module:function``."""
+    """Whether the text has the form ``module:function``."""
     return _NAMED.fullmatch(text) is not None
 
 
 def find(text: str, folder: str | None = None) -> Any:
-    """What ``module:function`` names; the module is looked for in ``folder`` (None: the current one) too.
+    """The object named by ``module:function``; ``folder`` (by default the current one) is searched for the module too.
 
     Raises:
-        BufgymError: there is none.
+        BufgymError: no such module or function.
     """
     module, _, name = text.partition(":")
     found = getattr(imported(text, folder or os.getcwd()), name, None)
@@ -42,7 +42,7 @@ def find(text: str, folder: str | None = None) -> Any:
 
 
 def imported(text: str, folder: str, also: str = "") -> Any:
-    """The module of ``module:function``; ``also``: what else the text could have been, for the message."""
+    """Import the module of ``module:function``; the error message mentions ``also``, another reading of the text."""
     place = text.partition(":")[0]
     # The installed command, unlike python -m bufgym, does not look for modules in the current folder.
     if folder not in map(os.path.abspath, sys.path):
@@ -55,7 +55,7 @@ def imported(text: str, folder: str, also: str = "") -> Any:
         here = f"in {folder} or among those installed"
         what = f"neither {also} {place!r} nor a module of that name" if also else f"no module {place!r}"
         raise BufgymError(f"{text}: {what} {here}") from None
-    except Exception as error:  # whatever the module does when it is run
+    except Exception as error:  # any error that the module's own code raises
         raise BufgymError(f"{text}: cannot be imported: {type(error).__name__}: {error}") from None
     if module.__file__ is not None and module.__file__ not in FILES:
         FILES.append(module.__file__)
@@ -63,7 +63,7 @@ def imported(text: str, folder: str, also: str = "") -> Any:
 
 
 def run_file(path: str, option: str) -> None:
-    """Run the caller's Python file, which registers what is his own; ``option``: where it was named."""
+    """Run the caller's Python file, which registers their own objects; ``option`` is the option that named the file."""
     if not Path(path).is_file():
         raise BufgymError(f"{path}: no such file ({option})")
     spec = importlib.util.spec_from_file_location(
@@ -81,18 +81,18 @@ def run_file(path: str, option: str) -> None:
 
 
 def line_of(error: Exception, *files: str | None) -> str | None:
-    """Where in the caller's code the error came from, these files or a module imported here; None for nowhere there."""
+    """The line of the caller's code that raised the error, in ``files`` or an imported module; None if elsewhere."""
     places = (line_in(error, file) for file in [*filter(None, files), *FILES])
     return next(filter(None, places), None)
 
 
 def first_line(documented: Any) -> str:
-    """The first line of its docstring; empty if there is none."""
+    """The first line of an object's docstring, or empty text."""
     return (inspect.getdoc(documented) or "").split("\n")[0]
 
 
 def needs(function: Any) -> int:
-    """Arguments without a default; -1 where they cannot be told."""
+    """Number of arguments without a default; -1 if unknown."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""What evolution searches for, one module a kind of task: one queue, many topics, a fleet."""
+"""Objectives of evolution, one module per kind of task: one queue, many topics, a fleet."""
 
 from __future__ import annotations
 

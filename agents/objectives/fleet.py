@@ -1,8 +1,8 @@
-"""A fleet: one agent decides on every robot's buffer; its team QoI (the mean over robots of H) minus that of AFR.
+"""A fleet: one agent decides on every robot's buffer. Its objective is team QoI (mean H over robots) minus AFR's.
 
-The robots of a cell share its capacity, so what one sends another cannot; each still sees its own buffer alone. The
-search begins with the agent that ships with bufgym, which learned on a link of its own; it may read more of the link
-(``MORE``) and learn to spare it (``THRIFT``).
+The robots of a cell share its capacity, so bytes that one sends another cannot; each still sees its own buffer alone.
+The search begins with the agent that ships with bufgym, which learned on a link of its own. The new agent may read more
+of the link (``MORE``) and learn to spare it (``THRIFT``).
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
 
 PARTS, EPISODES, EPISODE_S = 12, 2, 30.0
-"""Training episodes come in so many parts, one a generation in turn: so many links, each at every capacity, so long.
-Of fleet-v1's training links each comes once."""
+"""Parts of the training episodes, one a generation in turn; episodes of each link and capacity in a part; their length,
+s. Each of fleet-v1's training links comes once."""
 VALIDATION_EPISODES = 4
-"""Validation episodes a link, of the suite's own length."""
+"""Validation episodes per link, of the suite's own length."""
 LINK = ("busy", "left", "departures")
 MORE = {"motion": ("time_before", "time_merged", *LINK, "arrival_motion_gap"), "time": LINK}
-"""What evolution reads besides what the shipped agents do: how the shared link goes on from one message to the next."""
+"""Fields that evolution reads besides those of the shipped agents: how the shared link changes between messages."""
 THRIFT = 7.0
-"""What evolution takes off the shipped agents' score of accepting where there is room. They accept by a margin so wide
-that changing it a little changes nothing, and a search from there stays where it is; with this off, the one with
-odometry drops while there is still room and its gain on training episodes is near its largest (docs/fleet.md)."""
+"""Amount that evolution takes off the shipped agents' score of accepting while there is room. Their margin is so wide
+that small changes have no effect, and a search from there stays in place. With this off, the agent with odometry
+drops while there is still room, and its gain on training episodes is near its largest (docs/fleet.md)."""
 
 
 def fleet_of(suite: str, split: str) -> FleetScenario:
@@ -48,7 +48,7 @@ def fleet_of(suite: str, split: str) -> FleetScenario:
 
 
 def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
-    """Its scorers, which read these fields as well but make nothing of them yet, and may mix all; it thins nothing."""
+    """The agent with scorers that also read these fields, at weight 0, and may mix all; it thins nothing."""
     still = agent.still and widened(agent.still, more)
     mix = np.zeros((len(agent.context), len(agent.slot)), np.float32) if agent.mix is None else agent.mix
     return replace(agent, mix=mix, still=still, thins=False).reading(more)
@@ -58,12 +58,12 @@ def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
 
 
 class FleetEpisodes:
-    """Cells full of robots with one L, and what AFR on every robot reaches there."""
+    """Cells full of robots with one L, with AFR's result on every robot."""
 
     def __init__(self, fleet: FleetScenario, episodes: Sequence[FleetEpisode], capacity: int) -> None:
         self.episodes = episodes
         self.decisions = sum(len(arrivals) for episode in episodes for arrivals in episode.arrivals)
-        """How many a candidate takes: one an arrival."""
+        """Decisions of a candidate, one per arrival."""
         rows, messages = fleet.robots * len(episodes), fleet.max_messages
         self.fleet = Fleet(Senders(rows, capacity, fleet.value, max_messages=messages), fleet.robots)
         self.rival = self.team_qoi(policies.get(tasks.TASKS["fleet"].baseline))
@@ -124,16 +124,16 @@ class FleetObjective(Objective):
 
     @functools.cached_property
     def training(self) -> list[list[FleetEpisodes]]:
-        """See ``training_parts``."""
+        """Episodes of ``training_parts``."""
         return training_parts(self.settings.suite, self._capacities, self.seed)
 
     @functools.cached_property
     def judges(self) -> list[FleetEpisodes]:
-        """See ``validation_episodes``."""
+        """Episodes of ``validation_episodes``."""
         return validation_episodes(self.settings.suite, self._capacities)
 
     def start(self) -> Weights:
-        """The shipped agent, less ready to accept; where fields or hidden units are asked for, greed."""
+        """The shipped agent, less ready to accept; or greed, if fields or hidden units are asked for."""
         settings = self.settings
         if settings.fields or settings.hidden:
             return queue.start(settings.observed, settings.hidden, np.random.default_rng(self.seed))
@@ -143,7 +143,7 @@ class FleetObjective(Objective):
         return agent
 
     def measure(self, policy: Policy, episodes: Sequence[FleetEpisodes]) -> float:
-        """See ``mean_gain``."""
+        """Compute ``mean_gain``."""
         return mean_gain(policy, episodes)
 
 

@@ -1,4 +1,4 @@
-"""What an objective is to the evolution loop, and weights as the vector that is searched."""
+"""The objective of the evolution loop, and weights as the vector that is searched."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ Vector = NDArray[np.float64]
 
 
 class Objective(ABC):
-    """One kind of task: where a search begins, how candidates are compared, how the agent to keep is chosen.
+    """One kind of task: the start of a search, the comparison of candidates, the choice of the agent to keep.
 
     Training episodes come in parts, one a generation in turn, so that many episodes cost no more than a few.
 
     Args:
-        settings: those of the run.
+        settings: the run's settings.
         folder: the run's folder.
         seed: the training seed, which training episodes are drawn from.
     """
 
     name: str
-    """What its policies are called."""
+    """Name of its policies."""
     columns: tuple[str, ...]
-    """Names of what ``validate`` measures; the last one is what the agent to keep is chosen by."""
+    """Names of the measures of ``validate``; the last one chooses the agent to keep."""
     best: Callable[..., Any]
-    """``min`` or ``max``: which value of that last measure is the best."""
+    """``min`` or ``max``, the better direction of that last measure."""
     message: str
-    """That measure in words, as a format."""
+    """Format of that measure in words."""
     sigma: Mapping[bool, float]
-    """First step size; True: for the scorer of links that stand still."""
+    """First step size; True is the scorer of links that stand still."""
     training: Any
-    """The training episodes, part by part; each set of episodes has ``decisions``, about how many a candidate takes."""
+    """Training episodes by part; each set has ``decisions``, the approximate number per candidate."""
     judges: Any
     """The validation episodes."""
     warm_up = False
@@ -52,19 +52,19 @@ class Objective(ABC):
 
     @abstractmethod
     def start(self) -> Weights | TopicWeights:
-        """Where the search begins."""
+        """The weights at which the search begins."""
 
     @abstractmethod
     def measure(self, policy: Policy, episodes: Any) -> float:
-        """The measure that candidates are compared by, on these episodes."""
+        """The measure that compares candidates, on these episodes."""
 
     def fitness(self, policy: Policy, part: int, still: bool) -> float:
-        """How a candidate does on a part of the training episodes: the less the better."""
+        """The fitness of a candidate on a part of the training episodes: the less the better."""
         measure = self.measure(policy, self.training[part % len(self.training)])
         return -measure if self.best is max else measure
 
     def decisions(self, part: int, still: bool) -> int:
-        """How many decisions one candidate takes there."""
+        """Decisions of one candidate on a part."""
         return sum(episodes.decisions for episodes in self.training[part % len(self.training)])
 
     def validate(self, policy: Policy) -> tuple[float, ...]:
@@ -73,7 +73,7 @@ class Objective(ABC):
 
 
 def policy_of(name: str, weights: Weights | TopicWeights) -> Policy:
-    """The policy of these weights."""
+    """Make the policy of these weights."""
     if isinstance(weights, TopicWeights):
         return learned_topics.policy(name, weights)
     return learned.policy(name, weights)
@@ -83,10 +83,9 @@ def policy_of(name: str, weights: Weights | TopicWeights) -> Policy:
 
 
 def to_vector(weights: Weights | TopicWeights) -> Vector:
-    """The numbers that are searched, float64[n]: networks one after the other, then the mixing.
+    """The searched numbers, float64[n]: networks one after the other, then the mixing.
 
-    What the context and the bias add to the score of every candidate alike decides in ``accept`` alone, which stays
-    linear.
+    Context and bias add the same to every candidate's score, so they matter in ``accept`` alone, which stays linear.
     """
     numbers, searched = _numbers(weights)
     return np.concatenate(numbers)[np.concatenate(searched)]

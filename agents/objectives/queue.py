@@ -1,6 +1,6 @@
 """One queue: the regret over that of AFR or Drop Oldest, whichever is better, averaged over suites.
 
-On interruptions the regret is *exact* over every length T (``oracle.EveryLength``); on other links it is that of
+On interruptions the regret is *exact* over every length T (``oracle.EveryLength``). On other links it comes from
 *sampled* episodes, the same for all candidates (common random numbers).
 """
 
@@ -31,22 +31,22 @@ from bufgym.sim import Senders
 SIGMA = {True: 2.0, False: 0.3}
 """First step size, for the scorer of a still link or of a moving one; the start's weights are of the order of 10."""
 SMALL = (1, 2, 3)
-"""L to learn from besides the suite's own, where the regret is exact and so costs next to nothing."""
+"""Further L to learn from, where the regret is exact and so costs next to nothing."""
 
 PARTS, PART_EPISODES = 8, 12
-"""A suite's training episodes come in so many parts of so many; interruptions, being exact, in one."""
+"""Parts of a suite's training episodes, and episodes in each; interruptions are exact and have one part."""
 EPISODES = 40
-"""Sampled episodes a suite by default, spread evenly over its cells; at least one a cell."""
+"""Sampled episodes of a suite by default, spread evenly over its cells; at least one per cell."""
 VALIDATION_EPISODES, VALIDATION_SEED = 3 * EPISODES, 1
 
 AT_LEAST = 0.003
-"""A cell where AFR's regret is smaller counts as if it were this: there is next to nothing to be gained."""
+"""Least regret of AFR that counts in a cell: below it there is next to nothing to gain."""
 WORST = 3.0
-"""No ratio counts for more."""
+"""Largest ratio that counts."""
 
 
 def start(fields: tuple[str, ...], width: int, rng: np.random.Generator) -> Weights:
-    """Drop what leaves the smallest merged gap (of motion, where it is seen), rather old than new; accept with room."""
+    """Drop by the smallest merged gap (of motion, if seen), older messages rather; accept with room."""
     weights = learned.random_weights(fields, (width,) if width else (), rng)
     merged = next(name for name in ("motion_merged", "index_merged", "time_merged") if name in fields)
     weights.drop.skip[fields.index(merged)] = -10.0
@@ -73,7 +73,7 @@ class ExactRegrets:
         self.decisions = sum(lengths.decisions for _, lengths in self._lengths)
 
     def regrets(self, policy: Policy) -> NDArray[np.float64]:
-        """By cell."""
+        """Regret of each cell."""
         by_cell = np.empty(len(self.cells))
         for indices, lengths in self._lengths:
             by_cell[indices] = lengths.regrets(policy)
@@ -81,7 +81,7 @@ class ExactRegrets:
 
 
 class SampledRegrets:
-    """Episodes of cells with links; ``drawn``: the (trace, seed) of each cell's episodes."""
+    """Episodes of cells with links; ``drawn`` has the (trace, seed) of each cell's episodes."""
 
     def __init__(self, cells: Sequence[Cell], drawn: Sequence[Sequence[tuple[int, int]]]) -> None:
         self.cells = list(cells)
@@ -94,7 +94,7 @@ class SampledRegrets:
         self.decisions = sum(len(episode.arrivals) for episodes in self.episodes for episode in episodes)
 
     def regrets(self, policy: Policy) -> NDArray[np.float64]:
-        """By cell."""
+        """Regret of each cell."""
         by_cell = []
         for episodes, senders, most in zip(self.episodes, self._senders, self._best, strict=True):
             for i, episode in enumerate(episodes):
@@ -106,7 +106,7 @@ class SampledRegrets:
 
 
 def sampled_regrets(cells: Sequence[Cell], seed: int, episodes: int = EPISODES) -> SampledRegrets:
-    """So many episodes in all, traces in turn from cell to cell; if they are fewer than cells, on that many cells."""
+    """Sample ``episodes`` episodes, traces in turn from cell to cell; fewer than cells cover only that many cells."""
     rng = np.random.default_rng(seed)
     chosen = list(cells)
     if episodes < len(chosen):
@@ -127,7 +127,7 @@ CellRegrets = ExactRegrets | SampledRegrets
 
 
 class SuiteObjective:
-    """One suite: a policy's regrets over those of the rival, which in each cell is the better of AFR and Drop Oldest.
+    """One suite: a policy's regrets over the rival's, the better of AFR and Drop Oldest in each cell.
 
     Args:
         parts: samples of the suite's cells, one a generation in turn.
@@ -140,7 +140,7 @@ class SuiteObjective:
         rivals = [policies.get(name) for name in ("afr", BASELINE)]
         regrets = [np.concatenate([part.regrets(rival) for part in parts]) for rival in rivals]
         self.rivals = np.maximum(AT_LEAST, np.minimum(*regrets))
-        # Ratios of single sampled cells would be noise: those of one L and V are pooled. Exact ones each count.
+        # Ratios of single sampled cells would be noise, so cells of one L and V are pooled. Exact ones each count.
         keys = [(cell.capacity, cell.scenario.value.name) for part in parts for cell in part.cells]
         kinds = list(dict.fromkeys(keys))
         pool = np.array([kinds.index(key) for key in keys])
@@ -148,13 +148,13 @@ class SuiteObjective:
         self._pooled_rivals = np.array([self.rivals[pool == k].mean() for k in range(len(kinds))])
 
     def decisions_of(self, part: int | None = None) -> int:
-        """Arrivals that one policy decides about; ``part``: on this one alone."""
+        """Arrivals that one policy decides about, on all parts or on one."""
         return sum(self.parts[k].decisions for k in self._chosen(part))
 
     def over_rivals(self, policy: Policy, part: int | None = None) -> float:
         """Regret over the rival's: root mean square over the cells, so that the worst ones count most.
 
-        ``part``: on this one alone (they are taken in turn), but over the rival's regret on all of them.
+        ``part`` takes the policy's regret on that part alone, but over the rival's on all of them.
         """
         chosen = self._chosen(part)
         regrets = np.concatenate([self.parts[k].regrets(policy) for k in chosen])
@@ -169,7 +169,7 @@ class SuiteObjective:
 def suite_objectives(
     settings: Settings, split: str, seed: int, episodes: int = EPISODES, parts: int = 1
 ) -> list[SuiteObjective]:
-    """Those of every suite, drawn from ``seed``: ``parts`` times so many episodes, or the exact cells."""
+    """Objectives of every suite, drawn from ``seed``: ``parts`` times so many episodes, or the exact cells."""
     small = () if settings.capacities else SMALL
     rest = small, settings.data or None, split, seed, episodes, parts
     return [_suite_objective(suite, settings.capacities_of(suite), *rest) for suite in settings.suites]
@@ -196,7 +196,7 @@ def _suite_objective(
 
 
 class QueueObjective(Objective):
-    """All suites of a run; with a warm-up first those of interruptions, then the others."""
+    """All suites of a run; with a warm-up first the interruptions, then the others."""
 
     name = "evolved"
     columns = (*Verdict._fields, "over_rivals")
@@ -210,12 +210,14 @@ class QueueObjective(Objective):
 
     @functools.cached_property
     def _validation(self) -> ValidationSets:
-        """Made when asked for: what evaluates candidates elsewhere needs neither it nor the run's folder."""
+        """Validation sets, made at first use: a worker that evaluates candidates needs neither them nor the run's
+        folder.
+        """
         return ValidationSets(self.settings, self.folder)
 
     @functools.cached_property
     def training(self) -> list[list[SuiteObjective]]:
-        """All suites; their parts are their own."""
+        """All suites, which have parts of their own."""
         return [suite_objectives(self.settings, "train", self.seed, PART_EPISODES, PARTS)]
 
     @functools.cached_property
@@ -224,9 +226,9 @@ class QueueObjective(Objective):
         return suite_objectives(self.settings, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
 
     def start(self) -> Weights:
-        """The smallest merged gap goes, with a warm-up in both scorers; or what an earlier agent does, thinning apart.
+        """The rule "smallest merged gap", with a warm-up in both scorers; or an earlier agent without thinning.
 
-        Where that thins to the link its scorers would not be asked.
+        Thinning to the link would keep the scorers from being asked.
         """
         settings, fields = self.settings, self.settings.observed
         if settings.start:
@@ -245,7 +247,7 @@ class QueueObjective(Objective):
         return self.measure(policy, self._searched(still), part)
 
     def decisions(self, part: int, still: bool) -> int:
-        """Over these suites."""
+        """Decisions over these suites."""
         return sum(objective.decisions_of(part) for objective in self._searched(still))
 
     def validate(self, policy: Policy) -> tuple[float, ...]:

@@ -1,9 +1,9 @@
-"""Many topics: what is dropped and what is sent, compared with Robofleet's published client on the same episodes.
+"""Many topics: which messages to drop and to send, compared with Robofleet's published client on the same episodes.
 
-The weighted QoI is to be large, the age of information of the topics with the highest priority no larger
-(``AGE_SHARE``), that of the others not much larger (``OTHERS_SHARE``), and no ``no_drop`` message may be lost. Training
+The weighted QoI should be large. The age of information of the topics with the highest priority should be no larger
+(``AGE_SHARE``), and the others' not much larger (``OTHERS_SHARE``). No ``no_drop`` message may be lost. Training
 episodes have other topics and faster or slower links (``varied``). The search begins with the greedy scheduler: drop
-what loses the least QoI now, send what gains the most a byte.
+the message that loses the least QoI now, send the one that gains the most a byte.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ SLOT = (
     *("own", "waited", "silence", "lateness", "queued", "gain", "gain_per_byte"),
 )
 FIELDS = CONTEXT + SLOT
-"""What the agent reads."""
+"""Fields that the agent reads."""
 
 PARTS, EPISODES, EPISODE_S = 24, 1, 30.0
-"""Training episodes come in so many parts, one a generation in turn: so many a setting of the suite, so long."""
+"""Parts of the training episodes, one a generation in turn; episodes per setting of the suite; their length, s."""
 SIGMA = {False: 1.0}
 """First step size."""
 AGE_SHARE, AGE_PENALTY = 0.9, 3.0
-"""The age of the first topics is to be this part of the rival's; what is more costs so much."""
+"""Target for the age of the first topics, as a share of the rival's, and the price of an excess."""
 OTHERS_SHARE, OTHERS_PENALTY = 1.5, 0.25
-"""The same of all other topics: without it, what weighs little is never sent."""
+"""The same for all other topics. Without it, topics of little weight would never be sent."""
 BELOW_PENALTY = 3.0
-"""What a QoI below the rival's costs, for each part of it that is missing."""
+"""Price of QoI below the rival's, by the missing share."""
 VALIDATION_EPISODES, VALIDATION_SEED = 6, 1
 SCALES, KEPT = (0.7, 10.0), 0.75
-"""In training links are so many times as fast, and a topic is there with this probability: an agent that knows one
-client on scarce links alone falls behind its rival on others."""
+"""Range of link speeds in training, and the probability that a topic is there. An agent that knows one client on scarce
+links alone falls behind its rival on others."""
 AMPLE = 6.0
-"""Validation episodes come once as they are, and once on links so many times as fast."""
+"""Speed of the second set of validation links; the first set is unchanged."""
 TINY = 1e-9
-"""So that an age of 0 can be compared with."""
+"""Least age, to divide by."""
 
 
 def start() -> TopicWeights:
-    """Greedy: drop what loses least, rather old than new; accept with room; send what gains most a byte."""
+    """Greedy: drop the message that loses least, rather old; accept with room; send the one that gains most a byte."""
 
     def network(**skip: float) -> Network:
         weights = np.array([skip.get(field, 0.0) for field in FIELDS], np.float32)
@@ -73,11 +73,11 @@ def start() -> TopicWeights:
 
 
 class Reached(NamedTuple):
-    """What a policy reaches, summed over episodes.
+    """Results of a policy, summed over episodes.
 
-    Fields: ``qoi``, the weighted sum of the topics' H; ``first_age`` and ``others_age``, age of information at the
-    server of the topics with the highest priority and of the others, integrated over time, s^2; ``lost``, ``no_drop``
-    messages.
+    ``qoi`` is the weighted sum of the topics' H. ``first_age`` and ``others_age`` are the ages of information at the
+    server, of the topics with the highest priority and of the others, integrated over time, s^2. ``lost`` counts
+    ``no_drop`` messages.
     """
 
     qoi: float
@@ -87,7 +87,7 @@ class Reached(NamedTuple):
 
 
 class ClientEpisodes:
-    """Episodes of one client over its traces, and what the rival reaches there."""
+    """Episodes of one client over its traces, with the rival's results."""
 
     def __init__(self, client: Client, capacity: int, count: int, rng: np.random.Generator) -> None:
         traces = [client.traces[int(k)] for k in rng.permutation(len(client.traces))]
@@ -98,12 +98,12 @@ class ClientEpisodes:
         self._no_drop = np.array([topic.no_drop for topic in client.topics])
         self.episodes = [draw(replace(client, traces=(trace,)), int(rng.integers(10**6))) for trace in chosen]
         self.decisions = sum(len(episode.arrivals) for episode in self.episodes)
-        """About how many a candidate takes: one an arrival."""
+        """Decisions of a candidate, about one per arrival."""
         self._senders = Senders(count, capacity, client.value, max_messages=client.max_messages, topics=client.topics)
         self.rival = self.reached(policies.get(RIVAL))
 
     def reached(self, policy: Policy) -> Reached:
-        """What the policy reaches."""
+        """Results of a policy."""
         for i, episode in enumerate(self.episodes):
             self._senders.load(i, episode)
         self._senders.run(policy)
@@ -123,7 +123,7 @@ class ClientEpisodes:
 
 
 def mean_fitness(policy: Policy, parts: Sequence[ClientEpisodes]) -> float:
-    """The less the better: minus the mean of QoI over the rival's, plus what the age is too large, plus losses."""
+    """Fitness, the less the better: minus the mean of QoI over the rival's, plus excess age, plus losses."""
     total = 0.0
     for part in parts:
         agent, rival = part.reached(policy), part.rival
@@ -138,7 +138,7 @@ def mean_fitness(policy: Policy, parts: Sequence[ClientEpisodes]) -> float:
 def client_episodes(
     suite: str, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
 ) -> list[ClientEpisodes]:
-    """Episodes of each setting of a suite, its links ``scale`` times as fast; 0: each client varied by chance."""
+    """Episodes of each setting of a suite, its links ``scale`` times as fast; scale 0 varies each client by chance."""
     rng, capacities = np.random.default_rng(seed), suites.get(suite).capacities
     drawn = []
     for setting in suites.get(suite).settings(split).values():
@@ -152,7 +152,7 @@ def client_episodes(
 
 
 def varied(client: Client, rng: np.random.Generator) -> Client:
-    """The same client with some of its topics, three at least, on links of another speed."""
+    """The same client with at least three of its topics, on links of another speed."""
     kept = rng.random(len(client.streams)) < KEPT
     kept[rng.permutation(len(kept))[:3]] = True
     streams = tuple(stream for stream, is_kept in zip(client.streams, kept, strict=True) if is_kept)
@@ -173,7 +173,7 @@ class TopicsObjective(Objective):
 
     @functools.cached_property
     def training(self) -> list[list[ClientEpisodes]]:
-        """``PARTS`` of them, each of varied clients."""
+        """``PARTS`` sets of episodes of varied clients."""
         suite, seeds = self.settings.suite, [1000 * self.seed + part for part in range(PARTS)]
         return [client_episodes(suite, "train", seed, EPISODES, EPISODE_S, scale=0) for seed in seeds]
 
@@ -188,7 +188,7 @@ class TopicsObjective(Objective):
         return start()
 
     def measure(self, policy: Policy, episodes: Sequence[ClientEpisodes]) -> float:
-        """See ``mean_fitness``."""
+        """Compute ``mean_fitness``."""
         return mean_fitness(policy, episodes)
 
 

@@ -42,7 +42,7 @@ def make_policy(spec: PolicyLike) -> Policy:
     return policies.get(spec)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """Policies side by side on the same episodes. It prints as its table, in a notebook too."""
 
@@ -97,12 +97,14 @@ class Comparison:
     def __str__(self) -> str:
         return f"{self.about}\n\n{self.plain}"
 
+    __repr__ = __str__
+
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(str(self))}</pre>"
 
 
 def compare(
-    policies: Sequence[PolicyLike],
+    policies: PolicyLike | Sequence[PolicyLike],
     on: Any = "lte",
     *,
     capacity: int | Sequence[int] | None = None,
@@ -125,7 +127,8 @@ def compare(
     Raises:
         BufgymError: an argument is out of its range, or there is no such policy, scenario or suite.
     """
-    chosen = [make_policy(policy) for policy in policies]
+    several = [policies] if isinstance(policies, str | Path | Policy) or callable(policies) else policies
+    chosen = [make_policy(policy) for policy in several]
     capacities = [capacity] if isinstance(capacity, int) else list(capacity or ())
     if isinstance(on, str) and on in suites.SUITES:
         if settings:

@@ -1,13 +1,13 @@
 """Environments: a single sender, n of them as one native batch, and robots that share a cell.
 
-``FleetEnv`` and ``parallel_env`` are PettingZoo's and need the extra ``fleet``; all the rest does without it.
+``FleetEnv`` and ``parallel_env`` are PettingZoo's and need the extra ``fleet``; the others work without it.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from bufgym import oracle  # noqa: F401  (registers the clairvoyant, so that it can play here)
+from bufgym import oracle  # noqa: F401  (registers the clairvoyant as a policy that can play here)
 from bufgym.envs.fleet_vec import FleetVecEnv
 from bufgym.envs.single import SenderEnv
 from bufgym.envs.vector import SenderVectorEnv

@@ -1,4 +1,4 @@
-"""How good a finished episode was, between what Drop Oldest reaches on it and the clairvoyant's bound."""
+"""The quality of a finished episode, between Drop Oldest's H and the clairvoyant's bound."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ BOUND = ("clairvoyant", "regret", "score")
 
 
 def check_one_queue(senders: Senders) -> None:
-    """An error where no clairvoyant is known."""
+    """Raise a BufgymError unless the episode is one queue with a known clairvoyant."""
     if senders.topics:
         raise BufgymError("bound = True: the clairvoyant is known for one queue, not for several topics")
 
 
 def measured(senders: Senders, i: int, h: float) -> dict[str, float]:
-    """What ``h`` was worth on the episode of sender ``i``, found now: it takes a tenth of a second on long episodes.
+    """Rate ``h`` on the episode of sender ``i``; this takes a tenth of a second on long episodes.
 
-    ``clairvoyant``: the best H, or an upper bound of it (see ``oracle.Plan``); ``regret``: the share of it that was
-    lost; ``score``: 0 for Drop Oldest, 1 for the clairvoyant, NaN where the two are equal.
+    ``clairvoyant`` is the best H or an upper bound of it (see ``oracle.Plan``). ``regret`` is the share of it that was
+    lost. ``score`` is 0 for Drop Oldest and 1 for the clairvoyant, or NaN where the two are equal.
     """
     episode, v, capacity = senders.episodes[i], senders.value_of(i), senders.capacity
     assert episode is not None

@@ -24,37 +24,39 @@ Spaces = dict[str, spaces.Space[Any]]
 
 
 class FleetEnv(ParallelEnv[str, Observation, int]):
-    """N robots send camera frames through one cell that divides its capacity among those that are sending.
+    """N robots send camera frames through one cell that divides its capacity among the robots now sending.
 
-    **A step is one frame tick**: all cameras tick together, so at every step each robot decides about its newcomer at
-    the same moment, knowing nothing of the others' decisions; then the cell carries what it can until the next tick.
-    Under a byte limit a robot may be asked again about the same newcomer (see ``SenderEnv``): that is one more step of
-    the same tick, in which robots without a decision due observe zeros and have one valid action, L, without effect.
+    **A step is one frame tick**: all cameras tick together, so every robot decides about its newcomer at the same
+    moment and without knowing the others' decisions. Then the cell carries as much as it can until the next tick.
+    Under a byte limit a robot may be asked again about the same newcomer (see ``SenderEnv``), in one more step of the
+    same tick. In that step, robots without a decision due observe zeros and have one valid action, L, without effect.
 
     **Agents** ``robot_0`` .. ``robot_{N-1}``, N up to 256.
 
-    **Action, observation** of each are those of ``SenderEnv``: ``Discrete(L + 2)``; a Dict with one key for each field
-    of ``bufgym.observe``, of what that robot has on board. ``infos[agent]["action_mask"]``, int8[L + 2], says which
-    actions are valid; with ``mask_in_observation`` so does ``observation["action_mask"]``. ``state()`` is every field
-    of every robot, for critics that may see them all.
+    **Action, observation** of each robot are as in ``SenderEnv``: actions are ``Discrete(L + 2)``. The observation is
+    a Dict with one key for each field of ``bufgym.observe`` and holds what that robot has on board.
+    ``infos[agent]["action_mask"]``, int8[L + 2], marks the valid actions; with ``mask_in_observation`` so does
+    ``observation["action_mask"]``. ``state()`` has every field of every robot, for critics that may see them all.
 
-    **Reward** "team": each robot gets the mean over all robots of the ``term`` (or weighted terms) that ``SenderEnv``
-    calls reward; "own": its own. ``infos[agent]["reward_terms"]`` has each robot's own terms in any case.
+    **Reward** "team" gives each robot the mean over all robots of ``term``, which is the reward of ``SenderEnv``.
+    "own" gives each robot its own. ``infos[agent]["reward_terms"]`` has each robot's own terms in any case.
 
     **Episode end** all agents are ``terminated`` together, when the last message of the episode has left; none is ever
-    ``truncated``. The last infos have what those of ``SenderEnv`` have.
+    ``truncated``. The last infos have the same entries as in ``SenderEnv``.
 
     **Arguments**
 
     - ``robots``: N.
-    - ``scenario``: the name of an uplink, an ``Uplink`` (what each robot would have if it were alone) or a
-      ``FleetScenario``.
-    - ``capacity``: L of every robot, messages; ``max_bytes``: B, bytes.
-    - ``reward`` and ``term``: see above; ``fields``, ``observation`` and ``info``: as of ``SenderEnv``.
-    - ``mask_in_observation``: see above; ``render_mode``: "ansi" or "rgb_array".
+    - ``scenario``: the name of an uplink, an ``Uplink`` (as each robot would have it alone) or a ``FleetScenario``.
+    - ``capacity``: L of every robot, messages.
+    - ``max_bytes``: B, bytes.
+    - ``reward``: "team" or "own".
+    - ``term``, ``fields``, ``observation``, ``info``: as ``reward`` and the others in ``SenderEnv``.
+    - ``mask_in_observation``: whether observations have ``action_mask`` too.
+    - ``render_mode``: "ansi" or "rgb_array".
     - any further argument replaces a parameter of the uplink.
 
-    ``reset(options={"episode": e})`` plays the ``FleetEpisode`` e; other options are ignored, as PettingZoo has it.
+    ``reset(options={"episode": e})`` plays the ``FleetEpisode`` e; other options are ignored, as in PettingZoo.
     """
 
     metadata = {
@@ -98,7 +100,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         self.mask_in_observation = mask_in_observation
         self.possible_agents = [f"robot_{i}" for i in range(len(self.rows))]
         self.agents: list[str] = []
-        # PettingZoo's way to seed an agent is to seed its spaces: each has its own.
+        # PettingZoo seeds an agent by seeding its spaces, so each agent has its own.
         self.observation_spaces: Spaces = {agent: self._space() for agent in self.possible_agents}
         actions = self.rows.capacity + 2
         self.action_spaces: Spaces = {agent: spaces.Discrete(actions) for agent in self.possible_agents}
@@ -145,23 +147,23 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         )
 
     def state(self) -> NDArray[np.float32]:
-        """float32[N x fields]: robot by robot, slot fields of the tables, then context fields; chosen or not."""
+        """float32[N x fields]: robot by robot, all slot fields of the tables, then all context fields."""
         return self.rows.output.flat[:, : self.rows.form.table_numbers].flatten()
 
     def render(self) -> Any:
-        """One line a robot: its buffer, and what has become of its messages; as text, or as uint8[400, 800, 3]."""
+        """A line for each robot with its buffer and the fate of its messages, as text or as uint8[400, 800, 3]."""
         if self.render_mode is None:
             gym.logger.warn("render() needs a render_mode: parallel_env(..., render_mode='ansi' or 'rgb_array')")
             return None
         if self.rows.senders.episodes[0] is None:
             raise gym.error.ResetNeeded("call reset() before render()")
-        from bufgym.envs.render import cell  # loaded by those who draw only
+        from bufgym.envs.render import cell  # loaded only to draw
 
         draw = cell.cell_ansi if self.render_mode == "ansi" else cell.cell_rgb_array
         return draw(self.rows, self.possible_agents)
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing: no resource is open."""
 
     def _space(self) -> spaces.Space[Any]:
         space: Any = copy.deepcopy(self.rows.observation_space)
@@ -183,5 +185,5 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
 
 
 def parallel_env(**arguments: Any) -> FleetEnv:
-    """``FleetEnv`` under the name that PettingZoo's tools look for."""
+    """``FleetEnv`` under the name that PettingZoo's tools expect."""
     return FleetEnv(**arguments)

@@ -1,4 +1,4 @@
-"""Rows whose senders are the robots of cells, each of which shares one link."""
+"""Rows whose senders are the robots of cells; the robots of a cell share one link."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bufgym.sim.cell import Fleet
 
 
 class FleetRows(Rows):
-    """``cells`` cells with N = ``scenario.robots`` robots each: robot r of cell c is row c N + r.
+    """``cells`` cells with N = ``scenario.robots`` robots each. Robot r of cell c is row c N + r.
 
     The robots of a cell begin an episode together; it is drawn from the streams of the cell's first row.
     """
@@ -32,7 +32,7 @@ class FleetRows(Rows):
         term: str | Mapping[str, float] = "retained",
         **options: Any,
     ) -> None:
-        """``reward``: "team" or "own"; ``term``: what ``Rows`` calls reward; the rest as of ``Rows``."""
+        """``reward`` is "team" or "own", ``term`` is the reward of ``Rows``, and the rest is as in ``Rows``."""
         if reward not in ("team", "own"):
             raise BufgymError(
                 f"reward = {reward!r}: must be 'team' (the mean over the robots) or 'own'; its term is `term`"
@@ -46,12 +46,12 @@ class FleetRows(Rows):
         self._threads = Threads(np.arange(cells), options.get("num_threads", 1))
 
     def seed(self, i: int, rng: np.random.Generator) -> None:
-        """Give row ``i`` streams of its own if it is the first of its cell; the others need none."""
+        """Give row ``i`` streams of its own if it is the first of its cell; other rows need none."""
         if i % self.robots == 0:
             super().seed(i, rng)
 
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
-        """Begin a new episode in each cell of ``rows``: ``episodes[c]``, or where that is None the next one drawn."""
+        """Begin a new episode in each cell of ``rows``: ``episodes[c]``, or the next one drawn where that is None."""
         cells = np.unique(rows // self.robots)
         if len(cells) * self.robots != len(rows):
             raise BufgymError("reset_mask: the robots of one cell begin together; give all of them or none")
@@ -70,14 +70,14 @@ class FleetRows(Rows):
             self._begin_own(rows)
 
     def step(self, actions: NDArray[np.int64]) -> None:
-        """One decision of every robot; the result is in ``self.output``."""
+        """Apply one decision of every robot; the result is in ``self.output``."""
         batch, shares, rewarded, output = self.senders.batch, self.fleet.shares, self.rewarded, self.output
         self._threads.each(lambda cells: step_cells(batch, shares, cells, actions, rewarded, output))
         if self._has_own:
             self._step_own()
 
     def rewards(self) -> NDArray[np.float64]:
-        """float64[rows]: each robot's own weighted sum, or for a "team" the mean of those in its cell."""
+        """float64[rows]: each robot's own weighted sum, or for a "team" the mean within its cell."""
         own = super().rewards()
         if self.reward == "own":
             return own

@@ -1,4 +1,4 @@
-"""``gymnasium.vector.VectorEnv`` whose rows are robots: one policy, shared by all of them, learns from every row."""
+"""``gymnasium.vector.VectorEnv`` whose rows are robots: one shared policy learns from every row."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from bufgym.scenario import FleetScenario, Uplink
 
 
 class FleetVecEnv(SenderVectorEnv):
-    """``cells`` cells with N ``robots`` each as a batch of cells x N environments: robot r of cell c is row c N + r.
+    """``cells`` cells with N ``robots`` each, as a batch of cells x N environments. Robot r of cell c is row c N + r.
 
-    So any learner for one robot trains weights that all robots of a fleet share, each deciding from its own
+    Any learner for one robot thus trains weights that all robots of a fleet share, each deciding from its own
     observation:
 
         from sb3_contrib import MaskablePPO
@@ -24,12 +24,12 @@ class FleetVecEnv(SenderVectorEnv):
         envs = GymVecEnv(FleetVecEnv(cells=16, robots=4, autoreset_mode="SameStep"))
         MaskablePPO("MultiInputPolicy", envs).learn(1_000_000)
 
-    **Action, observation, episode end** of each row are those of ``SenderVectorEnv``, and so are the other arguments,
-    but: the robots of a cell begin and end together; ``reset(seed=s)`` seeds cell c with s + c N;
-    ``options["episodes"]`` holds a ``FleetEpisode`` for each cell; ``parameters`` replace those of the uplink.
+    **Action, observation, episode end** of each row and the other arguments are as in ``SenderVectorEnv``, with these
+    differences. The robots of a cell begin and end together. ``reset(seed=s)`` seeds cell c with s + c N.
+    ``options["episodes"]`` holds a ``FleetEpisode`` for each cell. ``parameters`` replace those of the uplink.
 
-    **Reward** "team": each robot gets the mean over its cell of the ``term`` (or weighted terms) that the other
-    environments call reward; "own": its own. ``info["reward_terms"]`` has each robot's own in any case.
+    **Reward** "team" gives each robot the mean over its cell of ``term``, the reward of the other environments; "own"
+    gives each robot its own. ``info["reward_terms"]`` has each robot's own terms in any case.
     """
 
     def __init__(

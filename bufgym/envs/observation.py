@@ -1,4 +1,4 @@
-"""The forms in which an observation is handed out, all of them views of the flat row of numbers that kernels write."""
+"""Forms of an observation; each is a view of the flat row of numbers that kernels write."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from bufgym.errors import BufgymError
 from bufgym.observe import OWN_FIELDS, Field, own_field
 
 Observation = Any
-"""A dict of arrays, or for "flat" one array."""
+"""A dict of arrays; for "flat", one array."""
 
 FORMS = ("dict", "flat", "slots")
-"""Names of the forms; ``ObservationForm`` says what each is."""
+"""Names of the forms, which ``ObservationForm`` explains."""
 
 
 class Place(NamedTuple):
-    """Where a field stands in a row of numbers.
+    """Place of a field in a row of numbers.
 
     Fields:
-        field: which.
-        first: its first number.
-        entries: how many it has.
+        field: the field.
+        first: index of its first number.
+        entries: count of its numbers.
     """
 
     field: Field
@@ -36,18 +36,17 @@ class Place(NamedTuple):
 
 
 class ObservationForm:
-    """What is observed of a queue of L = ``capacity`` messages, and how it is handed out.
+    """The observed fields of a queue of L = ``capacity`` messages, and the form of the observation.
 
-    A row of numbers holds the slot fields, each with L + 1 entries and the newcomer's last, then the context fields; so
-    much is ``table_numbers``. Fields of one's own that are chosen follow (``places`` says where).
-    ``form`` is one of
+    A row of numbers first holds the fields of the tables (``table_numbers``): slot fields with L + 1 entries each, the
+    newcomer's last, then context fields. Chosen fields of your own follow at ``places``. ``form`` is one of
 
-    - "dict": an array for each field, [L + 1] or [1];
-    - "flat": the row itself, as ``gymnasium.wrappers.FlattenObservation`` makes it of the dict;
-    - "slots": ``slots`` [L + 1, slot fields] and ``context`` [context fields], as attention networks take them.
+    - "dict", an array for each field, [L + 1] or [1],
+    - "flat", the row itself, equal to the dict under ``gymnasium.wrappers.FlattenObservation``,
+    - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks.
 
-    Only the fields that are ``chosen`` by name are observed (None: all of the tables), in the tables' order, one's own
-    behind them. With all of the tables nothing is copied. ``space`` is the Gymnasium space of one observation,
+    Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, and
+    your own come last. With all of the tables nothing is copied. ``space`` is the Gymnasium space of one observation,
     ``numbers`` the length of a row.
     """
 
@@ -98,12 +97,12 @@ class ObservationForm:
         self.space = self._space([place.field for place in self.places])
 
     def _numbers_of(self, *kinds: str) -> NDArray[np.int64]:
-        """Where in a row the numbers of the chosen fields stand."""
+        """Indices, in a row, of the numbers of the chosen fields."""
         ranges = [range(place.first, place.first + place.entries) for place in self.places if place.field.per in kinds]
         return np.array([number for numbers in ranges for number in numbers], np.int64)
 
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Views of ``rows``, one row of numbers or n: slots [(n,) fields, L + 1] and context [(n,) fields]."""
+        """Split ``rows`` (one row or n) into views: slots [(n,) fields, L + 1] and context [(n,) fields]."""
         first, end, fields, width = self._first_context, self.table_numbers, self._slot_fields, self._width
         if rows.ndim == 1:
             return rows[:first].reshape(fields, width), rows[first:end]
@@ -124,7 +123,7 @@ class ObservationForm:
         if not self._tables_only:
             return {place.field.name: rows[..., place.first : place.first + place.entries] for place in self.places}
         slots, context = self.split(rows)
-        # Walked over with the fields' axis first, a view costs half of what an index costs.
+        # With the fields' axis first, iterating over a view costs half as much as indexing.
         if rows.ndim > 1:
             slots, context = slots.swapaxes(0, 1), context.T
         arrays = [*slots, *context[..., np.newaxis]]
@@ -133,7 +132,7 @@ class ObservationForm:
     def _space(self, fields: Sequence[Field]) -> Any:
         boxes = [_box([field], self._width if field.per == "slot" else 1) for field in fields]
         if self.form == "dict":
-            # An OrderedDict keeps its order, of any other mapping Gymnasium sorts the keys: so to flatten it is "flat".
+            # Gymnasium sorts the keys of any mapping but an OrderedDict, and so would flatten in another order.
             return spaces.Dict(OrderedDict((field.name, box) for field, box in zip(fields, boxes, strict=True)))
         if self.form == "flat":
             return spaces.Box(np.concatenate([box.low for box in boxes]), np.concatenate([box.high for box in boxes]))
@@ -148,7 +147,7 @@ class ObservationForm:
 
 
 class _Made:
-    """An observation of one row, and what holds it apart from who it was handed to."""
+    """An observation of one row, with the arrays behind it."""
 
     def __init__(self, form: ObservationForm, row: NDArray[np.float32]) -> None:
         self.numbers = row.copy()
@@ -156,14 +155,14 @@ class _Made:
         self.views = list(self.observation.values())
 
     def references(self) -> tuple[int, int]:
-        """To the numbers, views of them included, and most to one of its views."""
+        """Count references to the numbers, including views, and the most to one of the views."""
         return sys.getrefcount(self.numbers), max(map(sys.getrefcount, self.views))
 
 
 class Handed:
-    """Observations of one row as they are handed out: never written again while anyone holds them.
+    """Hands out observations of one row; an observation that anyone still holds is never written again.
 
-    A dict of twenty views costs more than a step to make. So one that nobody holds any more is filled again.
+    Making a dict of twenty views costs more than a step, so observations that nobody holds are filled again.
     """
 
     def __init__(self, form: ObservationForm) -> None:
@@ -172,7 +171,7 @@ class Handed:
         self._free = (0, 0)
 
     def of(self, row: NDArray[np.float32]) -> Observation:
-        """The observation of this row of numbers, which it copies."""
+        """The observation of this row of numbers, which is copied."""
         if self._form.form != "dict":
             return self._form.of(row.copy())
         for made in self._made:
@@ -187,10 +186,10 @@ class Handed:
 
 
 _MADE = 4
-"""So many are kept at most: who collects observations holds them all."""
+"""Most observations to keep: a caller that collects them holds them all."""
 
 
 def _box(fields: Sequence[Field], entries: int) -> spaces.Box:
-    """The bounds of so many entries of each of ``fields``, in one row."""
+    """The bounds of ``entries`` entries of each of ``fields``, in one row."""
     low, high = (np.array([getattr(field, end) for field in fields], np.float32) for end in ("low", "high"))
     return spaces.Box(np.repeat(low, entries), np.repeat(high, entries))

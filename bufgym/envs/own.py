@@ -1,7 +1,7 @@
-"""Observation fields and reward terms of one's own, computed beside the built-in ones where an environment names them.
+"""Your own observation fields and reward terms, computed beside the built-in ones where an environment names them.
 
-Compiled functions are values of one function type, as policies are: the kernels here are compiled once for all of them.
-Others run in ordinary Python. Either way row i of a batch and the single environment call the same function.
+Compiled functions are values of one function type, as policies are, so these kernels are compiled once for all of them.
+Other functions run in ordinary Python. Row i of a batch and the single environment call the same function.
 """
 
 from __future__ import annotations
@@ -25,41 +25,41 @@ from bufgym.policies.registry import view_type
 from bufgym.sim import ARRIVAL_WAITS, NOTHING_WAITS, Batch, python_arrival, python_view, view
 from bufgym.sim.state import LOG_ENTRY, batch_type
 
-# Columns of ``marks``: counts of a sender at the step before, and until when that went.
+# Columns of ``marks``: counts of a sender at the step before, and that step's end.
 TRANSMITTED, CREDITED, DROPS, UNTIL = range(4)
 
 
 @documented
 class Step(NamedTuple):
-    """What happened in a step, for reward terms: the truth, of which the robot itself knows a part. Do not write to it.
+    """The events of one step, for reward terms. They are the truth; the robot knows only a part. Do not write to it.
 
-    A reset is no step: the first one begins with the episode.
+    A reset is no step: the first step begins with the episode.
     """
 
     messages: NDArray[Any]
     """MESSAGE[arrived]: every message that has arrived so far, in order."""
     log: NDArray[Any]
-    """LOG_ENTRY[arrived]: what became of each: ``transmitted_us``, ``dropped_us`` (-1: not so far) and the like."""
+    """LOG_ENTRY[arrived]: the fate of each message: ``transmitted_us``, ``dropped_us`` (-1 if not yet) and others."""
     transmitted: NDArray[np.int64]
-    """int64[messages]: places in ``messages`` of those whose last byte crossed the link in this step, in order."""
+    """int64[messages]: indices in ``messages`` whose last byte crossed the link in this step, in order."""
     delivered: NDArray[np.int64]
-    """int64[messages]: the same for those that reached the server, ``propagation_us`` later."""
+    """int64[messages]: indices that reached the server in this step, ``propagation_us`` later."""
     drops: int
     """Messages dropped in this step."""
     from_us: int
-    """When the step begins, us."""
+    """Begin of the step, us."""
     until_us: int
-    """When it ends: at the next decision, or with the episode's last delivery."""
+    """End of the step, us: the next decision, or the episode's last delivery."""
     propagation_us: int
-    """From a message's last byte on the link to the server, us."""
+    """Time from a message's last byte on the link to the server, us."""
     queued: int
-    """Messages in the buffer at its end."""
+    """Messages in the buffer at the step's end."""
     backlog_bytes: int
-    """Their bytes."""
+    """Bytes of these messages."""
     capacity: int
     """L, messages."""
     ended: bool
-    """Whether the episode ends with it."""
+    """Whether the episode ends with this step."""
     topics: NDArray[Any]
     """TOPIC[topics]: settings and past of each topic."""
     parameters: NDArray[np.float64]
@@ -71,13 +71,13 @@ class Step(NamedTuple):
 
 @kernel
 def last_arrival(batch: Batch, i: int) -> Any:
-    """The arrival that waits for a decision; where the socket asks, the one that came last."""
+    """The arrival that waits for a decision; where the socket asks, the latest arrival."""
     sender = batch.senders[i]
     return at(batch.arrivals, i, sender.next if sender.waiting == ARRIVAL_WAITS else sender.next - 1)
 
 
 def write_slots(batch: Batch, function: Any, first: int, flat: NDArray[np.float32]) -> None:
-    """Write the field for every slot of each row that waits for a decision, in column ``first`` and those after it."""
+    """Write a slot field into the columns from ``first`` on, for each row that waits for a decision."""
     for i in range(len(batch.senders)):
         sender = batch.senders[i]
         if sender.waiting != NOTHING_WAITS:
@@ -90,7 +90,7 @@ def write_slots(batch: Batch, function: Any, first: int, flat: NDArray[np.float3
 
 
 def write_context(batch: Batch, function: Any, first: int, flat: NDArray[np.float32]) -> None:
-    """The same for a field of the context."""
+    """Write a context field likewise."""
     for i in range(len(batch.senders)):
         if batch.senders[i].waiting != NOTHING_WAITS:
             flat[i, first] = function(local(view(batch, i)), last_arrival(batch, i))
@@ -111,15 +111,15 @@ def write_in_python(place: Place, buffer: Buffer, arrival: Any, arriving: bool, 
 
 
 def check_bounds(field: OwnField, numbers: NDArray[np.float32]) -> None:
-    """An error if the field is out of the bounds that it was registered with."""
-    inside = (numbers >= np.float32(field.low)) & (numbers <= np.float32(field.high))  # NaN is not
+    """Raise a BufgymError if the field is outside its registered bounds."""
+    inside = (numbers >= np.float32(field.low)) & (numbers <= np.float32(field.high))  # False for NaN
     if not inside.all():
         wrong = float(numbers[~inside].flat[0])
         raise BufgymError(f"field {field.name!r}: is {wrong:g}: must lie in its bounds, {field.low:g}..{field.high:g}")
 
 
 class OwnFields:
-    """The fields of one's own that a form observes, filled after each step."""
+    """Your own fields that a form observes, filled after each step."""
 
     def __init__(self, form: ObservationForm) -> None:
         self._places = [(place, place.field) for place in form.places if isinstance(place.field, OwnField)]
@@ -129,7 +129,7 @@ class OwnFields:
         return bool(self._places)
 
     def write(self, batch: Batch, output: StepOutput) -> None:
-        """Write each field of every row that waits for a decision; the others' are 0 already."""
+        """Write each field of every row that waits for a decision; other rows are 0 already."""
         records = named(batch)
         for (place, field), compiled in zip(self._places, self._compiled, strict=True):
             if compiled is not None:
@@ -170,7 +170,7 @@ def step_of(batch: Batch, i: int, marks: NDArray[np.int64], ended: bool, paramet
 
 @kernel
 def end_of_step(batch: Batch, i: int, ended: bool) -> int:
-    """Now; at the end of an episode when the last message reached the server, if that is later."""
+    """The present time; at an episode's end the time of the last delivery, if that is later."""
     sender = batch.senders[i]
     if not ended or sender.credited == 0:
         return int(sender.now_us)
@@ -188,13 +188,13 @@ def write_term(
     column: int,
     reward_terms: NDArray[np.float64],
 ) -> None:
-    """Write what the term is for the step of every row; ``memory`` is float64[n, entries]."""
+    """Write the term's value for the step of every row; ``memory`` is float64[n, entries]."""
     for i in range(len(batch.senders)):
         reward_terms[i, column] = function(step_of(batch, i, marks, ended[i], parameters), memory[i])
 
 
 class OwnTerms:
-    """The reward terms of one's own that an environment names, from column ``first`` of its terms on."""
+    """Your own reward terms that an environment names, in the columns from ``first`` on."""
 
     def __init__(self, terms: Sequence[OwnTerm], first: int, n: int) -> None:
         self._terms, self._first = terms, first
@@ -207,7 +207,7 @@ class OwnTerms:
         return bool(self._terms)
 
     def begin(self, batch: Batch, rows: NDArray[np.int64]) -> None:
-        """These rows begin an episode."""
+        """Begin an episode in these rows."""
         self._marks[rows] = 0
         self._marks[rows, UNTIL] = batch.arrivals["arrival_us"][rows, 0]
         for term, memory in zip(self._terms, self._memory, strict=True):
@@ -250,7 +250,7 @@ def _read_only_step(step: Step) -> Step:
 
 @functools.cache
 def _types() -> dict[str, Any]:
-    """Numba types that the signatures here are made of."""
+    """Numba types used in the signatures here."""
     types, message, log = cast(Any, numba.types), numba.from_dtype(MESSAGE), numba.from_dtype(LOG_ENTRY)
     whole, constants = types.int64, types.Array(types.float64, 1, "C", readonly=True)
     kinds = {

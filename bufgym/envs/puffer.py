@@ -26,17 +26,17 @@ except ModuleNotFoundError as error:
 class PufferSenders(pufferlib.PufferEnv):  # type: ignore[misc]
     """A batch of ``SenderEnv`` with flat observations, for ``pufferlib.vector`` and its trainer.
 
-    With all fields of the tables the kernels write observations straight into PufferLib's array. Rows that end begin
-    anew at once. PufferLib knows no action masks: an invalid action does what a plain queue does, and
-    ``action_masks()`` has them. The infos of a step have a dict for each episode that ended in it: its ``qoi``,
-    ``arrived``, ``delivered``, ``dropped`` and ``invalid``.
+    With all fields of the tables, kernels write observations straight into PufferLib's array. Rows that end begin anew
+    at once. PufferLib knows no action masks: an invalid action does what a plain queue does. ``action_masks()`` returns
+    the masks. The infos of a step have a dict for each episode that ended in it, with ``qoi``, ``arrived``,
+    ``delivered``, ``dropped`` and ``invalid``.
 
         import pufferlib.vector
         from bufgym.envs.puffer import PufferSenders
 
         envs = pufferlib.vector.make(PufferSenders, env_kwargs={"num_envs": 1024, "capacity": 16})
 
-    For several processes: ``num_envs=2, backend=pufferlib.vector.Multiprocessing`` in addition.
+    For several processes add ``num_envs=2, backend=pufferlib.vector.Multiprocessing``.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class PufferSenders(pufferlib.PufferEnv):  # type: ignore[misc]
         seed: int | None = None,
         **options: Any,
     ) -> None:
-        """``buf``: PufferLib's arrays; ``seed``: as of ``reset``; ``options``: arguments of ``SenderEnv``."""
+        """``buf``: PufferLib's arrays. ``seed``: as in ``reset``. ``options``: arguments of ``SenderEnv``."""
         for name, value in (("observation", "flat"), ("info", "none")):
             if options.setdefault(name, value) != value:
                 raise BufgymError(f"{name} = {options[name]!r}: must be {value!r} for PufferLib")
@@ -79,7 +79,7 @@ class PufferSenders(pufferlib.PufferEnv):  # type: ignore[misc]
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], list[dict[str, float]]]:
-        """One decision in every row."""
+        """Take one decision in every row."""
         rows = self.rows
         if rows.senders.episodes[0] is None:
             raise gym.error.ResetNeeded("call reset() before step()")
@@ -95,13 +95,13 @@ class PufferSenders(pufferlib.PufferEnv):  # type: ignore[misc]
         return self.observations, self.rewards, self.terminals, self.truncations, infos
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """bool[n, L + 2]: the actions that are valid now in each row."""
+        """bool[n, L + 2]: the actions valid now in each row."""
         return self.rows.action_masks()
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: no resource is open."""
 
     def _show(self) -> None:
-        """What the rows observe now, where the kernels did not write it into PufferLib's array themselves."""
+        """Copy observations into PufferLib's array if the kernels did not write them there."""
         if self.rows.output.flat is not self.observations:
             self.observations[:] = self.rows.observation()

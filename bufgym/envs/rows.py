@@ -1,4 +1,4 @@
-"""The rows that every environment is made of: n senders, what they hand out, and one compiled step over all of them.
+"""Rows, the base of every environment: n senders, the arrays they hand out, and one compiled step over all of them.
 
 ``Rows`` has a link for each sender; in ``fleet_rows`` the robots of a cell share one.
 """
@@ -40,14 +40,14 @@ from bufgym.sim import Senders
 from bufgym.sim.senders import Begun
 
 INFOS = ("full", "steady", "mask", "none")
-"""How much ``info`` has: all of it; all of it and the summary so far, so that every step has the same entries; the
-action mask alone; nothing but the summary of an episode at its end."""
+"""How much ``info`` has: all of it, all plus the summary so far (so every step has the same entries), the action mask
+alone, or nothing. At an episode's end the summary is always there."""
 
 
 def reward_weights(
     reward: str | Mapping[str, float], several_topics: bool = False
 ) -> tuple[NDArray[np.float64], tuple[OwnTerm, ...]]:
-    """(float64[reward terms], the terms named that are in no table) from one term's name or from weights by name."""
+    """float64[reward terms] from one term's name or from weights by name, and the named terms that are in no table."""
     tables = [term.name for term in terms_for(several_topics)]
     known = ", ".join([*tables, *(name for name in OWN_TERMS if name not in tables)])
     if not isinstance(reward, str | Mapping):
@@ -72,17 +72,17 @@ def reward_weights(
 
 
 def check_render_mode(render_mode: str | None, known: Sequence[str]) -> str | None:
-    """``render_mode``, or an error if it is not one of ``known``."""
+    """Check that ``render_mode`` is one of ``known``, and return it."""
     if render_mode is not None and render_mode not in known:
         raise BufgymError(f"render_mode = {render_mode!r}: must be one of {known}")
     return render_mode
 
 
 NO_ACTIONS: NDArray[np.int64] = np.zeros(0, np.int64)
-"""For ``step_rows`` and ``step_cells``: episodes begin."""
+"""Argument of ``step_rows`` and ``step_cells`` where episodes begin."""
 
 NUMBERED = ("scenario", "trace", "seed")
-"""What names an episode of a benchmark: see ``bufgym.scenario.numbered``."""
+"""Options that name an episode of a benchmark; see ``bufgym.scenario.numbered``."""
 
 
 def _checked(names: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -95,8 +95,8 @@ def _checked(names: Mapping[str, Any]) -> Mapping[str, Any]:
 class Rows:
     """n senders, each with its own random streams, stepped together.
 
-    ``output`` (a ``StepOutput``) holds what the last step handed out; ``rewarded``, float64[n, reward terms], the sum
-    of each reward term over the episode so far; ``weights``, float64[reward terms], what each counts in the reward.
+    ``output``, a ``StepOutput``, has the results of the last step. ``rewarded``, float64[n, reward terms], sums each
+    reward term over the episode so far. ``weights``, float64[reward terms], are the terms' factors in the reward.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class Rows:
         return len(self.senders)
 
     def new_output(self) -> StepOutput:
-        """Zeroed arrays for what a step hands out."""
+        """Make zeroed arrays for the results of a step."""
         n, L = len(self), self.capacity
         return StepOutput(
             np.zeros((n, self.form.numbers), np.float32),
@@ -171,7 +171,7 @@ class Rows:
         )
 
     def from_pool(self, draw: Callable[[Streams], Any]) -> Callable[[Streams], Any]:
-        """``draw``, or where a pool was asked for what takes its episodes from there."""
+        """Return ``draw``, or with a pool a function that takes episodes from it."""
         return draw if self._pool_size is None else Pool(draw, self._pool_size)
 
     def seed(self, i: int, rng: np.random.Generator) -> None:
@@ -179,9 +179,9 @@ class Rows:
         self.streams[i] = Streams.seeded(int(rng.integers(2**63)))
 
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
-        """Begin a new episode in each of ``rows``: ``episodes[i]``, or where that is None the next of its streams.
+        """Begin a new episode in each of ``rows``: ``episodes[i]``, or the next of its streams where that is None.
 
-        An episode may be a dict: the arguments of ``numbered``.
+        An episode may be a dict of arguments for ``numbered``.
         """
         if episodes is not None and (not isinstance(episodes, Sequence) or len(episodes) != len(self)):
             raise BufgymError(
@@ -203,7 +203,7 @@ class Rows:
             self._begin_own(rows)
 
     def step(self, actions: NDArray[np.int64]) -> None:
-        """One decision in every row; the result is in ``self.output``."""
+        """Take one decision in every row; the result is in ``self.output``."""
         batch, rewarded, output = self.senders.batch, self.rewarded, self.output
         self._threads.each(lambda rows: step_rows(batch, rows, actions, rewarded, output))
         if self._has_own:
@@ -212,15 +212,15 @@ class Rows:
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step."""
         total = np.zeros(len(self))
-        # Term by term, as the single environment adds them: a matrix product may round differently.
+        # Added term by term, as in the single environment: a matrix product may round differently.
         for k, weight in enumerate(self.weights.tolist()):
             if weight:
                 total += weight * self.output.reward_terms[:, k]
         return total
 
     def summary(self, i: Any) -> dict[str, Any]:
-        """QoI and message counts so far of the episode(s) of row(s) ``i`` (an index, or several)."""
-        senders = self.senders.batch.senders  # a whole record of each row would be copied
+        """QoI and message counts so far in row(s) ``i``, an index or several."""
+        senders = self.senders.batch.senders  # indexing it first would copy each row's whole record
         return {
             "qoi": self.output.qoi[i],
             "arrived": senders["next"][i],
@@ -230,9 +230,10 @@ class Rows:
         }
 
     def info(self, i: int, terms: Sequence[float], ended: bool) -> dict[str, Any]:
-        """Gymnasium's info of row ``i`` after a reset or a step that gave the reward ``terms``; at the end its summary.
+        """Gymnasium's info of row ``i`` after a reset or a step with the reward ``terms``, with the entries of
+        ``INFOS``.
 
-        As much of it as was asked for: see ``INFOS``.
+        At an episode's end it has the summary.
         """
         info: dict[str, Any] = {}
         if self.shows_mask:
@@ -250,11 +251,11 @@ class Rows:
         return info
 
     def observation(self, i: int | None = None) -> Observation:
-        """What the rows observe now, as views of ``output``; of row ``i`` alone, a copy."""
+        """The present observation of all rows, as views of ``output``; of row ``i`` alone, as a copy."""
         return self.form.of(self.output.flat) if i is None else self._handed.of(self.output.flat[i])
 
     def action(self, name: str, action: Any) -> int:
-        """``action`` as an int, or an error that calls it ``name``."""
+        """``action`` as an int; the error for a bad action calls it ``name``."""
         try:
             number = operator.index(action)
         except TypeError:
@@ -266,7 +267,7 @@ class Rows:
         return number
 
     def actions(self, actions: Any) -> NDArray[np.int64]:
-        """One action for each row as the kernels read them, or an error that says which does not fit."""
+        """Convert one action for each row to the kernels' form; the error names the first row that is wrong."""
         numbers = np.asarray(actions)
         if numbers.dtype.kind not in "iu":
             raise BufgymError(f"actions are {numbers.dtype}: must be whole numbers (int64)")
@@ -279,11 +280,11 @@ class Rows:
         return numbers
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """bool[n, L + 2]: the actions that are valid now in each row."""
+        """bool[n, L + 2]: the actions valid now in each row."""
         return self.output.action_mask.astype(np.bool_)
 
     def bounds(self, ended: NDArray[np.bool_], qoi: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """By name float64[n]: what ``measured`` finds of the rows that have ``ended`` with this H; 0 elsewhere."""
+        """Name -> float64[n]: ``measured`` for the rows that have ``ended`` with this H; 0 elsewhere."""
         columns = {name: np.zeros(len(self)) for name in BOUND}
         for i in np.flatnonzero(ended).tolist():
             for name, number in measured(self.senders, i, float(qoi[i])).items():
@@ -291,24 +292,24 @@ class Rows:
         return columns
 
     def bad_action(self, name: str, action: Any) -> BufgymError:
-        """The error for an action outside of 0..L+1."""
+        """Make the error for an action outside 0..L+1."""
         return BufgymError(f"{name} = {action}: must lie in 0..{self.capacity + 1} (L = {self.capacity})")
 
     def _begin_own(self, rows: NDArray[np.int64]) -> None:
-        """Fields and terms of one's own, for rows that begin an episode."""
+        """Compute your own fields and terms for rows that begin an episode."""
         self._own_terms.begin(self.senders.batch, rows)
         if self._own_fields:
             self._own_fields.write(self.senders.batch, self.output)
 
     def _step_own(self) -> None:
-        """The same after a step of all rows."""
+        """Compute your own fields and terms after a step of all rows."""
         if self._own_terms:
             self._own_terms.write(self.senders.batch, self.output)
         if self._own_fields:
             self._own_fields.write(self.senders.batch, self.output)
 
     def _next_episode(self, i: int) -> tuple[Any, np.random.Generator]:
-        """The next episode of row ``i``'s streams, and what its uniform draws come from."""
+        """The next episode of row ``i``'s streams, and the generator of its uniform draws."""
         if self.streams[i] is None:
             self.seed(i, seeding.np_random()[0])
         streams = cast(Streams, self.streams[i])

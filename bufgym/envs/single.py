@@ -20,62 +20,63 @@ _ROW = np.zeros(1, np.int64)
 class SenderEnv(gym.Env[Observation, np.int64]):
     """A robot's send buffer holds L messages, and a fading link empties it: decide at every arrival what to drop.
 
-    **Action** ``Discrete(L + 2)``: 0..L-1 evict that slot (0 = oldest) and enqueue the newcomer; L rejects the
-    newcomer; L + 1 accepts it. ``info["action_mask"]``, int8[L + 2], says which are valid, as
-    ``action_space.sample(mask)`` takes it; ``action_masks()``, bool[L + 2], as sb3-contrib does. An invalid action does
-    what a plain queue does: it accepts where there is room, else it rejects; ``info["invalid"]`` counts these actions.
-    Where B has no room for the newcomer even after an eviction, the next step is about the same arrival again; an
-    arrival larger than B is dropped without a step.
+    **Action** ``Discrete(L + 2)``: 0..L-1 evict that slot, 0 being the oldest, and enqueue the newcomer. L rejects the
+    newcomer, and L + 1 accepts it. ``info["action_mask"]``, int8[L + 2], marks the valid actions for
+    ``action_space.sample(mask)``; ``action_masks()``, bool[L + 2], does so for sb3-contrib. An invalid action does what
+    a plain queue does: it accepts if there is room and otherwise rejects. ``info["invalid"]`` counts invalid actions.
+    If B has no room for the newcomer even after an eviction, the next step is about the same arrival again. An arrival
+    larger than B is dropped without a step.
 
-    **Observation** a Dict with one float32 array for each field of ``bufgym.observe.FIELDS``: slot fields of shape
-    (L + 1,) with the newcomer last, context fields of shape (1,), all in [0, 1]. With ``observation="flat"`` it is one
-    array of the same numbers, slot fields first; with "slots" a Dict of ``slots`` (L + 1, slot fields) and ``context``.
+    **Observation** a Dict with one float32 array for each field of ``bufgym.observe.FIELDS``, all in [0, 1]. Slot
+    fields have shape (L + 1,), with the newcomer last; context fields have shape (1,). With ``observation="flat"`` the
+    same numbers are one array, slot fields first. With "slots" they are a Dict of ``slots`` [L + 1, slot fields] and
+    ``context``.
 
-    **Reward** one of the terms of ``bufgym.observe.REWARD_TERMS`` or a weighted sum of them: ``delivered`` and
-    ``retained`` both add up to H - 1 over an episode (to H where nothing was delivered, H = 0).
-    ``info["reward_terms"]`` has each term.
+    **Reward** one of the terms of ``bufgym.observe.REWARD_TERMS`` or a weighted sum of them. Over an episode both
+    ``delivered`` and ``retained`` add up to H - 1, or to 0 if nothing was delivered. ``info["reward_terms"]`` has each
+    term.
 
     **Several topics** (a scenario with ``topics``, as of ``bufgym/Topics-v0``): the environment asks at a free socket
-    too. Where the field ``socket_asks`` is 1 there is no newcomer: an action 0..L-1 *sends* that slot, which must be
-    the oldest of its topic; L *holds* the socket until the next arrival or ack, as long as one is to come; L + 1 is
-    invalid. An invalid choice sends the oldest message. At an arrival all is as above, but a ``no_drop`` message can
-    be neither evicted nor rejected while something else can make room; if that was tried and the queue is full, the
-    oldest message of the lowest priority goes. The fields of ``bufgym.observe.TOPIC_FIELDS`` and the terms ``age`` and
-    ``late`` of ``TOPIC_REWARD_TERMS`` come in addition. H is the weighted sum over the topics, so ``delivered`` and
-    ``retained`` add up to H minus the weights of the topics of which anything was received.
+    too. Where the field ``socket_asks`` is 1 there is no newcomer. Then an action 0..L-1 *sends* that slot, which must
+    be the oldest of its topic, and L + 1 is invalid. L *holds* the socket until the next arrival or ack, as long as one
+    is to come. An invalid choice sends the oldest message. At an arrival all is as above, but a ``no_drop`` message can
+    be neither evicted nor rejected while another message can make room. If an action tries this and the queue is full,
+    the oldest message of the lowest priority goes. The fields of ``bufgym.observe.TOPIC_FIELDS`` and the terms ``age``
+    and ``late`` of ``TOPIC_REWARD_TERMS`` are added. H is the weighted sum over the topics, so ``delivered`` and
+    ``retained`` add up to H minus the weights of all topics with a delivery.
 
-    **Episode end** ``terminated`` when the episode's last message has left; never ``truncated``. In the step that
-    ends it, ``info`` also has ``arrived``, ``delivered`` and ``dropped`` (messages). ``qoi``, H of what was delivered
-    so far, is there in every step: so episodes that a ``TimeLimit`` truncates have it too. An episode that asks for no
+    **Episode end** ``terminated`` when the episode's last message has left; never ``truncated``. In the step that ends
+    it, ``info`` also counts messages as ``arrived``, ``delivered`` and ``dropped``. Every step has ``qoi``, H of the
+    messages delivered so far, so episodes that a ``TimeLimit`` truncates have it too. An episode that asks for no
     decision (``decide_at="overflow"`` and never full) ends with the first step, whose action has no effect.
 
     **Arguments**
 
     - ``scenario``: a name in ``bufgym.scenario.SCENARIOS``, ``module:function`` that makes one, or a scenario.
     - ``capacity``: L, messages.
-    - ``max_bytes``: B, bytes; None for no limit.
+    - ``max_bytes``: B, bytes, by default without limit.
     - ``decide_at``: "arrival", or "overflow" to ask only when the buffer is full.
-    - ``reward``: a term's name, or weights by name; those of ``bufgym.observe.OWN_TERMS`` count and show where named.
-    - ``fields``: names of the fields to observe, one's own among them; by default those of the tables.
+    - ``reward``: a term's name, or weights by name; terms of ``bufgym.observe.OWN_TERMS`` take part only if named.
+    - ``fields``: names of the fields to observe, your own included; by default all fields of the tables.
     - ``observation``: "dict", "flat" or "slots".
-    - ``info``: "full"; "steady" for the summary so far in every step, as recorders want it; "mask" for the action mask
-      alone, and at an episode's end its summary; "none" for the summary.
+    - ``info``: "full"; "steady" adds the summary so far in every step, for recorders; "mask" has the action mask alone,
+      and at an episode's end its summary; "none" has only this summary.
     - ``render_mode``: "ansi" or "rgb_array".
-    - ``bound``: whether the last ``info`` also has ``clairvoyant`` (the best H, or an upper bound of it), ``regret``
-      and ``score`` (0 for Drop Oldest, 1 for the clairvoyant, NaN where they are equal). One queue only; found when an
-      episode ends, in a tenth of a second where it is long.
-    - ``pool``: take every episode from a fixed set of so many (``bufgym.scenario.pool.Pool``, the same for every seed),
-      each drawn once, in place of a new one at each reset; None for no pool.
-    - any further argument replaces a parameter of the scenario (``t_max=100``), as an object or as
-      the text that the command line takes (``value="saturating:0.5"``, ``traces="lte-synthetic-0"``).
+    - ``bound``: whether the last ``info`` also has ``clairvoyant``, ``regret`` and ``score``, for one queue only. The
+      clairvoyant is the best H or an upper bound of it. The score is 0 for Drop Oldest and 1 for the clairvoyant, NaN
+      where they are equal. Computing them takes a tenth of a second after a long episode.
+    - ``pool``: take every episode from a fixed set of so many, each drawn once, instead of drawing a new one at each
+      reset. The set, a ``bufgym.scenario.pool.Pool``, is the same for every seed. None for no pool.
+    - any further argument replaces a parameter of the scenario (``t_max=100``). It is an object or the text that the
+      command line takes (``value="saturating:0.5"``, ``traces="lte-synthetic-0"``).
 
     ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e, and
-    ``reset(options={"trace": t, "seed": s})`` the one behind that row of ``bufgym bench`` (``trace``: its label or
-    number). On ``bufgym/Suite-v0`` the row's ``scenario`` comes in addition, and ``trace`` may be left out, as the seed
-    tells it. What ``reset(seed=s)`` begins is a sequence of others.
+    ``reset(options={"trace": t, "seed": s})`` the episode behind that row of ``bufgym bench``, where ``trace`` is the
+    row's label or number. On ``bufgym/Suite-v0`` add the row's ``scenario``; ``trace`` may be left out, as the seed
+    tells it. ``reset(seed=s)`` begins a different sequence of episodes.
 
-    Raises ``BufgymError`` for an argument, an option or an action that does not fit, ``ResetNeeded`` for a step before
-    a reset or after the end of the episode.
+    Raises ``BufgymError`` for an unfit argument, option or action, and ``ResetNeeded`` for a step before a reset or
+    after the end of the episode.
     """
 
     metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 10}
@@ -116,7 +117,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self._action = np.zeros(1, np.int64)
         self._weights = self.rows.weights.tolist()
         self._no_terms = [0.0] * len(self._weights)
-        self.rows.output.terminated[0] = True  # kept with the other arrays, so that a snapshot of them has it
+        self.rows.output.terminated[0] = True  # kept with the other arrays, so a snapshot of them has it
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -131,7 +132,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         if "episode" in options and len(options) > 1:
             raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")
         self.rows.reset(_ROW, [options.get("episode", options or None)])
-        self.rows.output.terminated[0] = False  # even where no arrival asks: the first step tells
+        self.rows.output.terminated[0] = False  # also if no arrival asks: the first step then ends the episode
         return self.rows.observation(0), self.rows.info(0, self._no_terms, False)
 
     def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -149,7 +150,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         return rows.observation(0), reward, terminated, False, rows.info(0, terms, terminated)
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """bool[L + 2]: the actions that are valid now (the name that sb3-contrib looks for)."""
+        """bool[L + 2]: the actions valid now, under the name that sb3-contrib looks for."""
         mask: NDArray[np.bool_] = self.rows.output.action_mask[0].astype(np.bool_)
         return mask
 
@@ -158,6 +159,6 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         if self.render_mode is None:
             gym.logger.warn("render() needs a render_mode: gym.make(..., render_mode='ansi' or 'rgb_array')")
             return None
-        from bufgym.envs import render  # loaded by those who draw only
+        from bufgym.envs import render  # loaded only to draw
 
         return render.draw(self.rows.senders, 0, self.render_mode)

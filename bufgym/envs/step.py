@@ -1,9 +1,9 @@
-"""What a step of any environment does to its senders and what it hands out, as compiled code over arrays.
+"""The step of every environment: its effect on senders and the arrays it hands out, as compiled code.
 
 An environment is n *rows*, each with a sender of its own. ``step_rows`` steps senders that have a link each,
-``step_cells`` the robots of cells that share one; what a row observes and is rewarded with is written by the same
-kernels for both. The single environment is a batch of one row: row i of a batch and the single environment with row
-i's seed run the same code and are equal bit for bit.
+``step_cells`` steps the robots of cells that share one. The same kernels write observations and rewards for both. The
+single environment is a batch of one row. Row i of a batch equals the single environment with row i's seed bit for bit,
+as both run the same code.
 """
 
 from __future__ import annotations
@@ -68,15 +68,15 @@ _AHEAD = 8
 
 @bundle
 class StepOutput(NamedTuple):
-    """What a step hands out of n rows; the kernels write these arrays in place.
+    """Results of a step of n rows; the kernels write these arrays in place.
 
     Fields:
-        flat: float32[n, numbers]: field by field, each of ``SLOT_FIELDS`` (L + 1 numbers), with several topics each of
-            ``TOPIC_SLOT_FIELDS`` too; then ``CONTEXT_FIELDS`` and ``TOPIC_CONTEXT_FIELDS`` likewise (a number each).
-        action_mask: int8[n, L + 2]: 1 where an action is valid.
-        reward_terms: float64[n, reward terms]: what each term adds in this step.
-        qoi: float64[n]: H of what has reached the server so far.
-        terminated: bool[n]: the episode is over.
+        flat: float32[n, numbers], field by field: first ``SLOT_FIELDS`` (L + 1 numbers each), with several topics also
+            ``TOPIC_SLOT_FIELDS``; then ``CONTEXT_FIELDS`` (one number each), likewise with ``TOPIC_CONTEXT_FIELDS``.
+        action_mask: int8[n, L + 2], 1 for a valid action.
+        reward_terms: float64[n, reward terms], gain of each term in this step.
+        qoi: float64[n], H of the messages at the server so far.
+        terminated: bool[n], whether the episode is over.
     """
 
     flat: NDArray[np.float32]
@@ -88,7 +88,7 @@ class StepOutput(NamedTuple):
 
 @kernel
 def decision_of(action: int, capacity: int) -> int:
-    """The decision that an action stands for: 0..L-1 evict that slot, L reject, L + 1 accept."""
+    """The decision for an action: 0..L-1 evict that slot, L reject, L + 1 accept."""
     if action < capacity:
         return action
     return REJECT if action == capacity else ACCEPT
@@ -108,7 +108,7 @@ def action_of(decision: int, capacity: int) -> int:
 
 @kernel
 def settle_gains(batch: Batch, i: int, ended: bool) -> None:
-    """Bring row ``i``'s delivered QoI and ages up to now; at the end of an episode, up to the last delivery."""
+    """Bring row ``i``'s delivered QoI and ages up to now, or at an episode's end up to the last delivery."""
     sender = batch.senders[i]
     until_us = FOREVER if ended else sender.now_us
     credit(batch, i, until_us)
@@ -122,7 +122,7 @@ def settle_gains(batch: Batch, i: int, ended: bool) -> None:
 
 @kernel
 def write_rewards(batch: Batch, i: int, rewarded: NDArray[np.float64], output: StepOutput) -> None:
-    """Write what each reward term of row ``i`` has gained since the step before; ``rewarded`` keeps the totals."""
+    """Write the gain of each reward term of row ``i`` since the step before; ``rewarded`` keeps the totals."""
     sender, terms = batch.senders[i], output.reward_terms
     terms[i, DELIVERED] = sender.delivered_gain - rewarded[i, DELIVERED]
     terms[i, RETAINED] = sender.retained_gain - rewarded[i, RETAINED]
@@ -132,7 +132,7 @@ def write_rewards(batch: Batch, i: int, rewarded: NDArray[np.float64], output: S
         weight = 0.0
         for topic in range(sender.topics):
             weight += batch.topics[i, topic].weight
-        # Where all topics have weight 0, nothing is rewarded, and any divisor will do.
+        # If all topics have weight 0, nothing is rewarded, and any divisor will do.
         weight = weight if weight > 0 else 1.0
         terms[i, AGE] = (rewarded[i, AGE] - sender.aged) / weight
         terms[i, LATE] = (rewarded[i, LATE] - sender.late) / weight
@@ -141,9 +141,9 @@ def write_rewards(batch: Batch, i: int, rewarded: NDArray[np.float64], output: S
 
 @kernel
 def delivered_qoi(batch: Batch, i: int) -> float:
-    """H of what has reached row ``i``'s server so far."""
+    """H of the messages that have reached row ``i``'s server so far."""
     sender = batch.senders[i]
-    # The 1 in H = 1 + sum of V, of each topic of which anything was received.
+    # The 1 in H = 1 + sum of V, for each topic with a delivery.
     ones = 1.0 if sender.credited > 0 else 0.0
     if batch.several is not None:
         ones = 0.0
@@ -181,7 +181,7 @@ def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> 
 
 @kernel
 def write_mask(batch: Batch, i: int, action_mask: NDArray[np.int8]) -> None:
-    """Write which actions are valid for row ``i``, which waits for a decision."""
+    """Write the valid actions of row ``i``, which waits for a decision."""
     sender = batch.senders[i]
     capacity = sender.capacity
     if batch.several is None:
@@ -223,14 +223,14 @@ def step_rows(
     rewarded: NDArray[np.float64],
     output: StepOutput,
 ) -> None:
-    """One decision in each of ``rows``; where ``actions`` is empty, bring freshly loaded rows to their first one.
+    """Take one decision in each of ``rows``; without ``actions``, bring freshly loaded rows to their first decision.
 
-    ``actions``: int64[n], by row; ``rewarded``: float64[n, reward terms], the rewards of the episode so far: at its
-    beginning nothing. A row without a decision due (its episode has ended, or asked for none) reports its end.
+    ``actions`` is int64[n], by row. ``rewarded``, float64[n, reward terms], sums the rewards of the episode so far and
+    begins with zeros. A row without a decision due has ended, or asked for none; it reports its end.
     """
     begins, last = len(actions) == 0, len(rows) - 1
     for r in range(len(rows)):
-        # Every row's messages lie in memory of their own: fetch a later row's next one while this row is worked on.
+        # Each row's messages lie in memory of their own: fetch a later row's next one while working on this row.
         later = rows[min(r + _AHEAD, last)]
         soon = min(batch.senders[later].next + 1, batch.arrivals.shape[1] - 1)
         prefetch(batch.arrivals, later, soon)
@@ -259,7 +259,7 @@ def step_rows(
 def advance_cell(batch: Batch, shares: Shares, c: int) -> None:
     """Run cell ``c`` to its next tick with a decision due, or to the end of its episode.
 
-    At a tick every robot has a decision due, but for those whose message is larger than B.
+    At a tick every robot has a decision due, except robots whose message is larger than B.
     """
     robots = shares.cells[c].robots
     event = DEPARTURE
@@ -273,7 +273,7 @@ def advance_cell(batch: Batch, shares: Shares, c: int) -> None:
 
 @kernel
 def decisions_due(batch: Batch, shares: Shares, c: int) -> bool:
-    """Whether any robot of cell ``c`` has a decision due: until its episode ends, always between two steps."""
+    """Whether any robot of cell ``c`` has a decision due. Between two steps of an episode this is always so."""
     robots = shares.cells[c].robots
     due = False
     for i in range(c * robots, (c + 1) * robots):
@@ -291,10 +291,10 @@ def step_cells(
     rewarded: NDArray[np.float64],
     output: StepOutput,
 ) -> None:
-    """One decision of every robot of ``cells`` that has one due, or the first tick of cells, as ``step_rows``.
+    """Take every decision that is due in ``cells``, or bring cells to their first tick, as ``step_rows`` does.
 
-    Cells that have ended stay as they are. A cell moves on once no decision is due: robots that are asked again about
-    the same arrival hold the others up.
+    Cells that have ended stay as they are. A cell moves on once no decision is due: robots asked again about the same
+    arrival hold up the others.
     """
     begins = len(actions) == 0
     for c in cells:

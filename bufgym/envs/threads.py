@@ -1,4 +1,4 @@
-"""Several threads on one step: kernels hold no lock of Python's, and rows share nothing that a step writes."""
+"""Several threads on one step: kernels hold no lock of Python's, and rows share no memory that a step writes."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from bufgym.model.checks import whole
 
 
 class Threads:
-    """Does the same work on each part of a batch at once: the first part here, each other one in a thread."""
+    """Does the same work on each part of a batch at once, the first part here and the others in threads."""
 
     def __init__(self, numbers: NDArray[np.int64], num_threads: int) -> None:
-        """``numbers``: int64[n], rows or cells; ``num_threads``: at most that many parts of them."""
+        """``numbers``, int64[n], are rows or cells. They are split into at most ``num_threads`` parts."""
         parts = np.array_split(numbers, min(whole("num_threads", num_threads, 1), len(numbers)))
         self.parts = [np.ascontiguousarray(part) for part in parts]
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
 
     def each(self, work: Callable[[NDArray[np.int64]], None]) -> None:
-        """``work`` on every part; returns when all is done."""
+        """Call ``work`` on every part; return when all are done."""
         if len(self.parts) == 1:
             work(self.parts[0])
             return

@@ -24,21 +24,21 @@ from bufgym.scenario import Scenario
 class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     """A batch of ``SenderEnv``: the same actions, observations, rewards, episode ends and arguments, row by row.
 
-    With several topics some rows may ask what to drop and others what to send: the field ``socket_asks`` says which.
+    With several topics some rows may ask what to drop and others what to send: the field ``socket_asks`` tells them
+    apart.
 
     ``num_envs``: n, rows. ``max_episode_steps`` truncates episodes, as Gymnasium's ``TimeLimit`` does.
-    ``autoreset_mode``: one of Gymnasium's. ``num_threads``: threads that share the rows of a step (default 1); what
-    comes out is the same. ``options``: the other arguments of ``SenderEnv``.
+    ``autoreset_mode``: one of Gymnasium's. ``num_threads``: threads that share the rows of a step, by default 1; they
+    do not change results. ``options``: the other arguments of ``SenderEnv``.
 
-    ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do; a sequence seeds row by row.
-    Options of ``reset``: ``reset_mask`` (bool[n], rows to reset) and ``episodes`` (one a row: an ``Episode``, a dict of
-    the options that name one in ``SenderEnv``, or None where the next is drawn).
+    ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do. A sequence seeds row by row.
+    ``reset`` takes two options. ``reset_mask``, bool[n], selects rows. ``episodes`` has an entry for each row: an
+    ``Episode``, a dict of the options that name one in ``SenderEnv``, or None to draw the next.
 
-    ``info`` has Gymnasium's form: ``info["action_mask"]`` int8[n, L + 2], ``info["qoi"]`` float64[n],
-    ``info["invalid"]`` int64[n], ``info["reward_terms"]`` float64[n] by name; with SAME_STEP autoreset
-    ``info["final_obs"]`` and ``info["final_info"]`` for rows that ended (``info["_final_obs"]`` says which). Rows that
-    end, truncated ones too, have their summary. Arrays that a step hands out are never written again while anyone
-    holds them.
+    ``info`` has Gymnasium's form, with ``action_mask`` int8[n, L + 2], ``qoi`` float64[n], ``invalid`` int64[n], and
+    ``reward_terms`` by name, float64[n] each. With SAME_STEP autoreset it also has ``final_obs`` and ``final_info`` for
+    the rows that ended, marked in ``info["_final_obs"]``. Rows that end, truncated ones too, have their summary. Arrays
+    from a step are never written again while anyone holds them.
     """
 
     metadata = {
@@ -124,7 +124,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._seed_the_rest()
         self.rows.reset(chosen, options.get("episodes"))
         self._steps[mask] = 0
-        self._done = self._done & ~mask  # a new array: the last step may have handed out this one
+        self._done = self._done & ~mask  # a new array: the last step may have handed out the old one
         return self.rows.observation(), self._info()
 
     def step(
@@ -147,14 +147,14 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         terminated = rows.output.terminated & ~self._done if restart else rows.output.terminated.copy()
         truncated = np.zeros(self.num_envs, np.bool_)
         if self.max_episode_steps is not None:
-            truncated = self._steps >= self.max_episode_steps  # as Gymnasium's TimeLimit: also where it ends anyway
+            truncated = self._steps >= self.max_episode_steps  # like Gymnasium's TimeLimit, even if the episode ends
         self._done = terminated | truncated
         info = self._end(self._done) if self._done.any() else {}
         info |= self._info()
         return rows.observation(), rewards, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """bool[n, L + 2]: the actions that are valid now in each row."""
+        """bool[n, L + 2]: the actions valid now in each row."""
         return self.rows.action_masks()
 
     def render(self) -> Any:
@@ -162,7 +162,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if self.render_mode is None:
             gym.logger.warn("render() needs a render_mode: gym.make_vec(..., render_mode='ansi' or 'rgb_array')")
             return None
-        from bufgym.envs import render  # loaded by those who draw only
+        from bufgym.envs import render  # loaded only to draw
 
         return tuple(render.draw(self.rows.senders, i, self.render_mode) for i in range(self.num_envs))
 
@@ -181,7 +181,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
                 last |= {name: column, f"_{name}": ended}
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
             return last
-        # One observation for each row that ended, None for the others, as in Gymnasium's SyncVectorEnv.
+        # As in Gymnasium's SyncVectorEnv: one observation for each row that ended, None for the others.
         observations: NDArray[Any] = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(done).tolist():
             observations[i] = rows.observation(i)
@@ -191,7 +191,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return {"final_obs": observations, "_final_obs": done, "final_info": last, "_final_info": done}
 
     def _info(self) -> dict[str, Any]:
-        """What the info of every step has, as far as it was asked for."""
+        """Entries of the info of every step, as far as they were asked for."""
         rows, every_row = self.rows, self._every_row
         info: dict[str, Any] = {}
         if rows.shows_mask:
@@ -211,7 +211,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return info
 
     def _seed(self, i: int, seed: int | None) -> None:
-        """Give row ``i`` streams of its own, from ``seed`` or where that is None from chance."""
+        """Give row ``i`` streams of its own, from ``seed``, or from chance if that is None."""
         generator, self._seeds[i] = seeding.np_random(seed)
         self._generators[i] = generator
         self.rows.seed(i, generator)
@@ -222,25 +222,25 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
                 self._seed(i, None)
 
     def _renew_output(self, keep: bool = False) -> None:
-        """Let the next step write into arrays that nobody holds outside; ``keep``: with what the last step wrote."""
+        """Let the next step write into arrays that nobody outside holds; ``keep`` copies the last step's results."""
         rows, before = self.rows, self.rows.output
         if not any(before is output for output in self._pool):
             self._pool.append(before)
         for output in self._pool:
-            # Held by its own tuple and by this loop's call only: no view of it is left outside.
+            # Only its own tuple and this loop's call hold it: no view is left outside.
             if all(sys.getrefcount(array) <= _OWN_REFERENCES for array in output):
                 rows.output = output
                 break
         else:
             rows.output = rows.new_output()
-            self._pool = [*self._pool[1 - _POOLED :], rows.output]  # who collects outputs holds them all
+            self._pool = [*self._pool[1 - _POOLED :], rows.output]  # a caller that collects outputs holds them all
         if keep and rows.output is not before:
             for new, old in zip(cast(Any, rows.output), before, strict=True):
                 new[...] = old
 
 
 def _only(rows: NDArray[np.bool_], info: dict[str, Any]) -> dict[str, Any]:
-    """``info`` of ``rows`` alone, zeros for the others; copies."""
+    """Copy ``info`` for ``rows`` alone, with zeros for the others."""
     own: dict[str, Any] = {}
     for name, column in info.items():
         if name.startswith("_"):
@@ -260,4 +260,4 @@ def _count_own() -> int:
 
 _OWN_REFERENCES = _count_own()
 _POOLED = 4
-"""As many outputs are kept at most, to be written again."""
+"""Most outputs to keep for reuse."""

@@ -1,10 +1,10 @@
-"""What an expert would do now, in any environment: for imitation, for DAgger, for the regret of a single decision.
+"""Experts, which say what to do now in any environment: for imitation, DAgger, and the regret of single decisions.
 
     expert = bufgym.expert.clairvoyant(env)
     expert.actions()  # int64[n]
-    expert.values()   # float64[n, L + 2]: the best H that each action still leaves attainable
+    expert.values()   # float64[n, L + 2], the best H still attainable after each action
 
-``env`` is an environment of bufgym, single (n = 1) or a native batch, wrapped or not; an expert reads the state that
+``env`` is an environment of bufgym, single (n = 1) or a native batch, wrapped or not. An expert reads the state that
 the environment is in when it is asked.
 """
 

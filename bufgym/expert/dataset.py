@@ -17,7 +17,7 @@ from bufgym.errors import BufgymError, install
 from bufgym.expert.record import KINDS, ROWS, record
 
 VARIABLE = "MINARI_DATASETS_PATH"
-"""Where Minari keeps its data sets; unset, in ``~/.minari/datasets``."""
+"""Environment variable for the folder of Minari's data sets; unset, ``~/.minari/datasets``."""
 
 
 def make(
@@ -32,24 +32,24 @@ def make(
     regret: bool = True,
     **options: Any,
 ) -> str:
-    """Record ``episodes`` and write them as one Minari data set; returns its id, for ``minari.load_dataset``.
+    """Record ``episodes`` and write them as one Minari data set; return its id, for ``minari.load_dataset``.
 
     The data set appears whole or not at all. Infos hold ``action_mask``, ``qoi`` and ``regret``; entry t of ``regret``
-    is about action t. ``options`` are the environment's, as text where they are kept with it.
+    is about action t. ``options`` are the environment's, as text or numbers, since the data set stores them.
 
     Args:
         env: the environment's id.
         kind: who plays, one of ``KINDS``.
-        episodes: how many.
+        episodes: number of episodes.
         name: the id; None for ``bufgym/<environment>/<kind>-v0``.
         out: folder of data sets; None for Minari's own (``VARIABLE``).
         medium: the policy of "medium", and of a third of the episodes of "mixed".
-        seed: as of ``reset`` of the batch.
-        regret: whether to find each decision's regret, which takes most of the time; equal sizes only.
+        seed: seed of the batch, as in ``reset``.
+        regret: whether to compute each decision's regret, which takes most of the time; equal sizes only.
     """
     try:
         import minari
-        import pyarrow  # noqa: F401  (the format that it writes here)
+        import pyarrow  # noqa: F401  (Minari's storage format here)
         from minari import namespace as namespaces
         from minari.data_collector import EpisodeBuffer
     except ImportError as error:
@@ -86,7 +86,7 @@ def make(
                 infos=infos,
             )
 
-    # Minari writes Arrow files beside its own folder where that is relative.
+    # For a relative folder Minari writes Arrow files beside it.
     root = Path(out or os.environ.get(VARIABLE) or Path.home() / ".minari" / "datasets").absolute()
     if (root / name).exists():
         raise BufgymError(f"{root / name}: exists already; remove it or give another --name")
@@ -119,7 +119,7 @@ def make(
 
 @contextlib.contextmanager
 def _datasets_in(folder: str | Path) -> Iterator[None]:
-    """Minari reads and writes there while the block runs."""
+    """Make Minari read and write in ``folder`` while the block runs."""
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = str(folder)
     try:

@@ -1,4 +1,4 @@
-"""Policies as experts: what one of them would do in the state that an environment is in."""
+"""Policies as experts: the action that a policy would choose in an environment's state."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STATE = ("next", "evictions", "now_us", "dequeued", "waiting")
 
 
 def rows_of(env: Any) -> Rows:
-    """The rows of an environment of bufgym, below its wrappers and stable-baselines3's adapter."""
+    """The rows of a bufgym environment, below its wrappers and the adapter of stable-baselines3."""
     env = getattr(env, "envs", env)
     rows = getattr(getattr(env, "unwrapped", env), "rows", None)
     if not isinstance(rows, Rows):
@@ -32,7 +32,7 @@ def rows_of(env: Any) -> Rows:
 class PolicyExpert:
     """One policy, asked about the decisions of an environment that anybody may play.
 
-    It should be asked at every decision, as its memory holds what it has seen; asked twice about one, it says the same.
+    Ask at every decision, so that the policy's memory misses nothing. Asked twice, it gives the same answer.
     """
 
     def __init__(self, env: Any, policy: Policy) -> None:
@@ -46,11 +46,11 @@ class PolicyExpert:
 
     @property
     def policy(self) -> Policy:
-        """Whose actions these are."""
+        """The policy that chooses the actions."""
         return self._player.policy
 
     def actions(self) -> NDArray[np.int64]:
-        """int64[n]: what the policy does now; L, which has no effect, where no decision is due."""
+        """int64[n]: the policy's actions now; L, which has no effect, where no decision is due."""
         senders = self.rows.senders
         state = np.column_stack([senders.begun, *(senders.batch.senders[name] for name in _STATE)])
         new = np.flatnonzero((state != self._asked).any(axis=1))
@@ -61,14 +61,14 @@ class PolicyExpert:
 
 
 def policy(env: Any, name: str | Policy) -> PolicyExpert:
-    """Any policy as an expert: a registered name, with settings as in ``"decimate:every=2"``, or a ``Policy``."""
+    """Make any policy an expert: a ``Policy``, or a registered name with settings such as ``"decimate:every=2"``."""
     return PolicyExpert(env, policies.get(name))
 
 
 def online(env: Any, *, objective: str = "ratio", max_states: int = 50_000_000) -> PolicyExpert:
-    """The best that does not know T, where that can be computed: ``bufgym/Interruption-v0``, few slots or short T.
+    """Make an expert of the best policy that does not know T, for ``bufgym/Interruption-v0`` with few slots or short T.
 
-    The arguments are those of ``oracle.online_optimum``.
+    The arguments are those for ``oracle.online_optimum``.
     """
     rows = rows_of(env)
     if not isinstance(rows.scenario, Interruption):

@@ -16,17 +16,17 @@ from bufgym.oracle.programme import find_idle
 from bufgym.sim import ARRIVAL_WAITS
 
 _TIE = 1e-9
-"""Values that differ by less are equal: sums of the same gaps in another order."""
+"""Values closer than this are equal: they sum the same gaps in another order."""
 
 _ROOM = 1 << 16
-"""Room for so many steps at first (20 bytes each); it grows as needed."""
+"""Initial room, in steps of 20 bytes each; it grows as needed."""
 
 
 class Clairvoyant:
-    """Knows the whole link and workload of every episode; the environment is one queue, decided at every arrival.
+    """Knows the whole link and workload of every episode of one queue that decides at every arrival.
 
-    Exact for equal sizes; other sizes are a BufgymError. An arrival that asks for no decision counts as one that could
-    be rejected: where that matters, values are upper bounds. (In an interruption it does not.)
+    Values are exact for equal sizes; other sizes raise a BufgymError. An arrival that asks for no decision counts as
+    one that could be rejected. Values are upper bounds where that matters, which is never the case in an interruption.
     """
 
     def __init__(self, env: Any) -> None:
@@ -49,7 +49,7 @@ class Clairvoyant:
         self._work = new_work(self.rows.capacity, messages)
 
     def values(self) -> NDArray[np.float64]:
-        """float64[n, L + 2]: the best H that is still attainable after each action, in hindsight.
+        """float64[n, L + 2]: the best H still attainable after each action, in hindsight.
 
         NaN for invalid actions, and where no decision is due.
         """
@@ -62,15 +62,15 @@ class Clairvoyant:
         return values
 
     def regrets(self) -> NDArray[np.float64]:
-        """float64[n, L + 2]: how much of H each action gives away for good; 0 for the best, NaN as in ``values``."""
+        """float64[n, L + 2]: the part of H that each action gives up for good, 0 for the best; NaN as in ``values``."""
         return regrets(self.values())
 
     def actions(self) -> NDArray[np.int64]:
-        """int64[n]: a best action; of equals accept, then reject, then the oldest slot. L where no decision is due."""
+        """int64[n]: a best action (ties: accept, then reject, then the oldest slot), L where no decision is due."""
         return best(self.values())
 
     def _load(self, i: int) -> None:
-        """Find the steps of row ``i``'s episode."""
+        """Compute the steps of row ``i``'s episode."""
         senders = self.rows.senders
         episode = senders.episodes[i]
         assert episode is not None
@@ -99,7 +99,7 @@ class Clairvoyant:
         self._begun[i] = senders.begun[i]
 
     def _make_room(self) -> None:
-        """Close the gaps that past episodes have left; where they were less than half, twice the room."""
+        """Close the gaps left by past episodes; double the room if they were less than half of it."""
         old, kept = self._ahead, int(np.diff(self._span).sum())
         room = len(old.latest) * (1 if 2 * (self._end - kept) > len(old.latest) else 2)
         pool: list[NDArray[Any]] = [np.zeros(room, array.dtype) for array in (old.latest, old.gain, old.follow)]

@@ -33,10 +33,10 @@ from bufgym.sim.state import batch_type
 class Player:
     """Owns a policy's memory for each of ``n`` senders and turns its decisions into an environment's actions.
 
-    Just before a decision the policy is called once for every departure since the one before, with the buffer as it is
-    now. Its uniform draws are the episode's; where an environment drew the episode, they come from its seed. It is
-    asked at arrivals, and with several topics for what to send next, once at each decision; with a new episode it
-    forgets the one before. A policy that drops at dequeue, or has an unbounded queue, can't play: a BufgymError.
+    Just before a decision the policy is called once for every departure since the last one, with the buffer as it is
+    now. Uniform draws belong to the episode; if an environment drew the episode, they come from its seed. The policy is
+    asked once per decision: at arrivals and, with several topics, for the message to send next. It forgets everything
+    at a new episode. A policy that drops at dequeue or has an unbounded queue raises a BufgymError.
     """
 
     def __init__(self, policy: Policy, n: int = 1) -> None:
@@ -53,7 +53,8 @@ class Player:
     def action(self, senders: Senders, i: int = 0) -> int:
         """The action for sender ``i``, whose decision is due: 0..L-1 evict, L reject, L + 1 accept.
 
-        Where the socket asks: 0..L-1 send, L hold. BufgymError where no decision is due, or the policy gave none.
+        Where the socket asks, 0..L-1 send and L holds. BufgymError if no decision is due or the policy gave no valid
+        one.
         """
         if senders.batch.senders["waiting"][i] not in (ARRIVAL_WAITS, SOCKET_WAITS):
             raise BufgymError(f"sender {i}: no decision is due")
@@ -70,12 +71,12 @@ class Player:
         return self._drops(answer_of(self.policy, "on_arrival", answer), senders.capacity)
 
     def actions(self, senders: Senders, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-        """int64[n]: ``action`` of every sender in ``rows`` (None: all) whose decision is due, L elsewhere.
+        """int64[n]: ``action`` of every sender in ``rows`` (by default all) whose decision is due, L elsewhere.
 
-        One compiled call where the policy is compiled.
+        A compiled policy takes one compiled call.
         """
         waiting = senders.batch.senders["waiting"]
-        # Whole numbers of another size would be read as these.
+        # Whole numbers of another size would be misread.
         rows = np.arange(len(senders)) if rows is None else np.ascontiguousarray(rows, np.int64)
         rows = rows[waiting[rows] != NOTHING_WAITS]
         actions = np.full(len(senders), senders.capacity)
@@ -96,7 +97,7 @@ class Player:
         return actions
 
     def _begin(self, senders: Senders, rows: NDArray[np.int64]) -> None:
-        """Fresh memory for those of ``rows`` that have begun another episode."""
+        """Give fresh memory to the ``rows`` that have begun another episode."""
         for i in rows[self._begun[rows] != senders.begun[rows]].tolist():
             senders.draw_uniforms(i)
             memory = senders.new_memory(self.policy, i)
@@ -138,7 +139,7 @@ def ask(
     hears_departures: bool,
     answers: NDArray[np.int64],
 ) -> None:
-    """Put a policy's answer for each of ``rows`` into ``answers``. ``heard``: int64[n], departures it was told of."""
+    """Write the policy's answer for each of ``rows`` into ``answers``; ``heard``, int64[n], counts departures."""
     for i in rows:
         sender = batch.senders[i]
         buffer = local(view(batch, i))
@@ -154,7 +155,7 @@ def ask(
 
 @functools.cache
 def compiled_ask(several: bool) -> Any:
-    """``ask`` compiled once for every policy, as the rollout is: its code."""
+    """``ask`` compiled once for every policy, like the rollout."""
     on_arrival, on_departure, _, on_send = map(numba.types.FunctionType, signatures())
     types = numba.types
     numbers, memory = types.Array(types.int64, 1, "C"), types.Array(types.float64, 2, "C")

@@ -1,4 +1,4 @@
-"""Episodes of a policy, recorded from the native batch: what data sets are made of."""
+"""Episodes of a policy, recorded from the native batch for data sets."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from bufgym.expert.hindsight import Clairvoyant, regrets
 from bufgym.expert.player import Player
 
 KINDS = ("expert", "medium", "mixed", "random")
-"""Who plays: the clairvoyant; a fixed policy; these two and ``random``, an episode each in turn; valid actions drawn
-uniformly."""
+"""Who plays: the clairvoyant, a fixed policy, a mixture of all (an episode each in turn), or random valid actions."""
 
 ROWS = 256
-"""Episodes that are played side by side, at most."""
+"""Most episodes played side by side."""
 
 
 class Recorded(NamedTuple):
@@ -27,12 +26,12 @@ class Recorded(NamedTuple):
 
     Fields:
         player: "expert", "medium" or "random".
-        observations: in the environment's form, T + 1 along the first axis: the last is that of the end.
+        observations: in the environment's form, T + 1 along the first axis; the last is taken at the end.
         actions: int64[T].
         rewards: float64[T].
         action_mask: int8[T + 1, L + 2], which actions were valid.
-        qoi: float64[T + 1], H of what had reached the server.
-        regret: float64[T + 1], what each action gave away of the best H still attainable, the last 0; None unasked.
+        qoi: float64[T + 1], H of the messages at the server.
+        regret: float64[T + 1], the best H still attainable that each action gave up, the last 0; None if not asked for.
     """
 
     player: str
@@ -47,9 +46,9 @@ class Recorded(NamedTuple):
 def record(
     envs: SenderVectorEnv, kind: str, episodes: int, *, medium: str = "afr", seed: int = 0, regret: bool = True
 ) -> Iterator[Recorded]:
-    """So many episodes that ``kind`` plays in the batch, as they end; ``seed`` as of ``envs.reset``.
+    """Yield the ``episodes`` that ``kind`` plays in the batch, as they end; ``seed`` seeds ``envs.reset``.
 
-    Row by row: the k-th that a row plays is always the same, and in "mixed" its player too; shorter ones come earlier.
+    The k-th episode of a row, and its player in "mixed", is always the same. Shorter episodes come earlier.
     """
     if kind not in KINDS:
         raise BufgymError(f"kind = {kind!r}: must be one of {', '.join(KINDS)}")
@@ -62,7 +61,7 @@ def record(
     judge = Clairvoyant(envs) if regret else None
     envs.reset(seed=seed)
     rng = np.random.default_rng([seed, 1])
-    # With a limit B an arrival may be asked about again, after an eviction: at most one more for each message.
+    # With a limit B an arrival may ask again after an eviction, at most once more for each message.
     steps = 2 * rows.scenario.max_messages + 1
     seen = np.zeros((n, steps, rows.form.numbers), np.float32)
     masks = np.zeros((n, steps, rows.capacity + 2), np.int8)

@@ -1,4 +1,4 @@
-"""A word on stderr while compiling takes long."""
+"""A notice on stderr when compiling takes long."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any, cast
 from numba.core import event
 
 PATIENCE_S = 1.0
-"""Compiling that takes longer is announced."""
+"""Compiling time after which the notice appears, s."""
 NOTICE = "bufgym: compiling, once (about 10 s; bufgym warmup does it beforehand)"
 
 
 class _Announcer(event.Listener):
-    """Writes ``NOTICE`` to stderr, once, when compiling has taken a process ``PATIENCE_S`` in all.
+    """Writes ``NOTICE`` to stderr once a process has spent ``PATIENCE_S`` compiling.
 
-    Numba tells of a kernel that it compiles, and of those that are compiled on the way; of one from the cache it
-    tells nothing.
+    Numba reports each kernel that it compiles, with those compiled on the way; it does not report kernels from the
+    cache.
     """
 
     def __init__(self) -> None:
@@ -65,5 +65,5 @@ def say() -> None:
 
 
 def compile_silently() -> None:
-    """This process says nothing of compiling from now on."""
+    """Make this process write no notice from now on."""
     _announcer.done = True

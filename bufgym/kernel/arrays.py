@@ -1,6 +1,6 @@
 """Elements and stretches of arrays in kernels, without the checks that Numba adds to every index.
 
-What is asked for exists: indices are >= 0 and slices lie inside the array. Numba's own indexing checks the sign of
+The caller guarantees that indices are >= 0 and slices lie inside the array. Numba's own indexing checks the sign of
 every index and the ends of every slice, which is a fifth of a rollout's instructions.
 """
 
@@ -104,7 +104,7 @@ def _hint(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 
 def _compile_as(function: Callable[..., Any], typer: Callable[..., Any], code: Callable[..., Any]) -> None:
-    """Numba compiles calls of ``function`` to ``code``; ``typer`` gives the type of the result."""
+    """Make Numba compile calls of ``function`` to ``code``; ``typer`` gives the type of the result."""
     numba_ = cast(Any, numba)
     numba_.extending.type_callable(function)(lambda context: typer)
     numba_.extending.lower_builtin(function, numba_.types.Array, numba_.types.VarArg(numba_.types.Any))(code)

@@ -1,8 +1,8 @@
-"""Bundles: named tuples of arrays that one kernel hands to the next by address.
+"""Bundles: named tuples of arrays that one kernel passes to the next by address.
 
-Numba hands a tuple of ten arrays on as seventy numbers, at each call, which takes half of all compiling. A bundle is
-handed on as one address. A field that is None is known to be None while a kernel is compiled, so that Numba leaves out
-every branch that needs it:
+Numba passes a tuple of ten arrays as seventy numbers at each call, which takes half of all compiling. A bundle is
+passed as one address. A field that is None is known to be None at compile time, so Numba leaves out every branch that
+needs it:
 
     if batch.several is not None:
         ...  # not compiled for batches of one queue each
@@ -92,9 +92,9 @@ def _from_python(kind: BundleType, value: Any, c: Any) -> Any:
 
 
 def local(given: Bundle) -> Bundle:
-    """``given`` itself; in a compiled kernel, a bundle whose fields are among the kernel's own variables.
+    """Return ``given``; in a compiled kernel, make its fields the kernel's own variables.
 
-    A kernel that makes a bundle hands on ``local(Bundle(...))``.
+    A kernel that makes a bundle passes on ``local(Bundle(...))``.
     """
     return given
 

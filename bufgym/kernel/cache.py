@@ -1,4 +1,4 @@
-"""Where machine code is kept: a file for each kernel, set of argument types, and state of all that it calls."""
+"""Storage of machine code: a file for each kernel, set of argument types, and state of all that it calls."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def _writable(folder: Path) -> bool:
-    """Whether files can be written there, or the folder be made."""
+    """Whether files can be written in ``folder``, which is made if missing."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     return folder.is_dir() and os.access(folder, os.W_OK)
 
 
 def _temporary_folder() -> Path:
-    """A folder for this process and those that it starts. Its name cannot be foreseen: what lies there is run."""
+    """Make a folder for this process and its children. Its name cannot be foreseen, as its content is executed."""
     folder = tempfile.mkdtemp(prefix="bufgym-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     os.environ["NUMBA_CACHE_DIR"] = folder
@@ -46,7 +46,7 @@ def _temporary_folder() -> Path:
 
 
 def _cache_folder() -> str:
-    """Folder for machine code: in ``NUMBA_CACHE_DIR``, beside the package, or in the user's cache."""
+    """Choose the folder for machine code: ``NUMBA_CACHE_DIR``, beside the package, or in the user's cache."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     if os.environ.get("NUMBA_CACHE_DIR"):
         parent = Path(os.environ["NUMBA_CACHE_DIR"])
@@ -57,18 +57,18 @@ def _cache_folder() -> str:
 
 
 FOLDER = _cache_folder() if JIT else ""
-"""Where machine code is kept; empty where nothing is compiled."""
+"""Folder for machine code; empty if nothing is compiled."""
 
 _KEPT_VERSIONS = 16
-"""Files kept of one kernel: one for each set of argument types and each state of its sources."""
+"""Most files of one kernel: one for each set of argument types and each state of its sources."""
 
 
 class Code:
     """Machine code of one kernel on disk, a file for each set of argument types.
 
-    A file is named by everything that its code depends on (see ``closure``). Processes that compile side by side
-    therefore never write different code into one file, and code of an earlier source is never found. A damaged file
-    is compiled anew. Where no file can be written, nothing is kept.
+    A file is named by everything that its code depends on (see ``closure``). So processes that compile side by side
+    never write different code into one file, and code of an earlier source is never found. A damaged file is compiled
+    anew. If no file can be written, nothing is stored.
     """
 
     def __init__(self, function: Any, role: str) -> None:
@@ -94,7 +94,7 @@ class Code:
             return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Keep the code that was compiled for the types of ``signature``."""
+        """Store the code that was compiled for the types of ``signature``."""
         if not isinstance(result.library, PartLibrary):
             set_environments(result)
         if result.lifted or result.library.has_dynamic_globals:  # it holds addresses of this process
@@ -127,7 +127,7 @@ def _rebuilt(
     reload: Any,
     environments: Any,
 ) -> Any:
-    """Compile result from what ``CompileResult._reduce`` gave."""
+    """Rebuild a compile result from the output of ``CompileResult._reduce``."""
     for function in reload:
         function()
     code = PartLibrary.read(target, library) if library[1] == PART else target.codegen().unserialize_library(library)
@@ -151,7 +151,7 @@ def _rebuilt(
 
 
 class NotKeptError(Exception):
-    """What was asked for must be compiled first."""
+    """The requested code must be compiled first."""
 
 
 _ONLY_KEPT: ContextVar[bool] = ContextVar("only_kept", default=False)
@@ -159,7 +159,7 @@ _ONLY_KEPT: ContextVar[bool] = ContextVar("only_kept", default=False)
 
 @contextlib.contextmanager
 def only_kept() -> Iterator[None]:
-    """In this block nothing is compiled: what is not on disk raises a ``NotKeptError``."""
+    """Compile nothing in this block: code that is not on disk raises a ``NotKeptError``."""
     token = _ONLY_KEPT.set(True)
     try:
         yield

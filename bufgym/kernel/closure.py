@@ -6,6 +6,7 @@ Comments, docstrings and line numbers are not part of it, nor is anything that n
 
 from __future__ import annotations
 
+import enum
 import functools
 import hashlib
 import sys
@@ -29,6 +30,9 @@ TOOLS = (
     ).hexdigest(),
 )
 """Versions of all that translates kernels, with the sources of this package that take part."""
+_VERSIONED = ("numba", "numpy", "llvmlite")
+_HAS_DOCSTRING = 0x4000000
+"""A flag of code from Python 3.13 on."""
 
 
 def closure(function: Any) -> str:
@@ -69,13 +73,22 @@ def told_types(types: Any) -> str:
 def _code(code: CodeType) -> Iterator[str]:
     """Instructions, names and constants of ``code``, without its docstring and line numbers."""
     yield code.co_code.hex()
-    yield repr((code.co_argcount, code.co_kwonlyargcount, code.co_flags, code.co_names, code.co_varnames))
+    flags = code.co_flags & ~_HAS_DOCSTRING
+    yield repr((code.co_argcount, code.co_kwonlyargcount, flags, code.co_names, code.co_varnames))
     yield code.co_exceptiontable.hex()
-    for constant in code.co_consts:
+    for constant in code.co_consts[1 if _has_docstring(code) else 0 :]:
         if isinstance(constant, CodeType):
             yield from _code(constant)
-        elif not isinstance(constant, str):  # no kernel computes with text: it is the docstring, or an error's message
+        else:
             yield _told(constant, [])
+
+
+def _has_docstring(code: CodeType) -> bool:
+    """Whether the first constant is a docstring."""
+    if sys.version_info >= (3, 13):
+        return bool(code.co_flags & _HAS_DOCSTRING)
+    # Before, a function without a docstring begins with None; other code, such as a lambda's, has none.
+    return not code.co_name.startswith("<") and isinstance((*code.co_consts, None)[0], str)
 
 
 def _names(code: CodeType) -> Iterator[str]:
@@ -94,17 +107,27 @@ def _read(function: FunctionType) -> Iterator[tuple[str, Any]]:
             value = function.__globals__[name]
             yield name, value
             if isinstance(value, ModuleType):
-                yield from ((f"{name}.{part}", getattr(value, part)) for part in names if hasattr(value, part))
+                yield from _attributes(name, value, names)
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         yield name, cell.cell_contents
     yield "defaults", (function.__defaults__, tuple(sorted((function.__kwdefaults__ or {}).items())))
+
+
+def _attributes(name: str, module: ModuleType, names: list[str], depth: int = 3) -> Iterator[tuple[str, Any]]:
+    """(dotted name, value) of all attributes with one of ``names``, in modules inside the module too."""
+    for part in names:
+        if hasattr(module, part):
+            value = getattr(module, part)
+            yield f"{name}.{part}", value
+            if isinstance(value, ModuleType) and depth > 0:
+                yield from _attributes(f"{name}.{part}", value, names, depth - 1)
 
 
 def _told(value: Any, waiting: list[Any]) -> str:
     """``value`` in words that are equal for equal values in every process; functions go to ``waiting`` as well."""
     function = getattr(value, "py_func", value)
     if isinstance(function, FunctionType):
-        if hasattr(value, "py_func"):
+        if function.__module__.partition(".")[0] not in _VERSIONED:  # the body counts, of numba.extending's helpers too
             waiting.append(function)
         return f"{function.__module__}.{function.__qualname__}"
     if isinstance(value, np.ndarray):
@@ -113,6 +136,8 @@ def _told(value: Any, waiting: list[Any]) -> str:
         return f"{type(value).__qualname__}({', '.join(_told(entry, waiting) for entry in value)})"
     if isinstance(value, frozenset | set):
         return f"set({sorted(_told(entry, waiting) for entry in value)})"
+    if isinstance(value, type) and issubclass(value, enum.Enum):
+        return f"{value.__module__}.{value.__qualname__} {[(one.name, one.value) for one in value]}"
     if isinstance(value, type):
         fields = getattr(value, "_fields", ()), tuple(getattr(value, "_field_defaults", {}).items())
         return f"{value.__module__}.{value.__qualname__} {_told(fields, waiting)}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, wait
@@ -15,7 +14,7 @@ from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
 from bufgym.kernel.cache import Code, NotKeptError, only_kept
-from bufgym.kernel.meanwhile import FEW, Meanwhile
+from bufgym.kernel.meanwhile import FEW, Meanwhile, is_possible
 from bufgym.kernel.pipeline import PartCompiler, WholeCompiler
 from bufgym.kernel.switch import JIT
 
@@ -33,33 +32,33 @@ _compiles_here = threading.Event()
 
 
 class _Kernel(CPUDispatcher):
-    """What Python calls. Other kernels call ``inlined``: the same function without a way in from Python.
+    """A kernel as Python calls it. Other kernels call ``inlined``, the same function without an entry from Python.
 
-    Such a way in holds the whole code once more, and few kernels need one.
+    An entry from Python repeats the whole code, and few kernels need one.
     """
 
     @functools.cached_property
     def inlined(self) -> Any:
-        """What goes into other kernels."""
+        """The form that goes into other kernels."""
         return _dispatcher(CPUDispatcher, cast(Any, self).py_func, "inlined", PartCompiler, **_INLINED)
 
     @property
     def _numba_type_(self) -> Any:
-        """What stands for it where a kernel calls it."""
+        """Numba's type of it in a kernel that calls it."""
         return cast(Any, numba).types.Dispatcher(self.inlined)
 
 
 def _dispatcher(
     kind: Any, function: Callable[..., Any], role: str, compiler: Any = WholeCompiler, **options: bool
 ) -> Any:
-    """Numba's compiler of ``function``, which keeps its code on disk by ``role``."""
+    """Numba's compiler of ``function``, which stores its code on disk by ``role``."""
     dispatcher = kind(function, targetoptions={**_OPTIONS, **options}, pipeline_class=compiler)
     dispatcher._cache = Code(function, role)
     return dispatcher
 
 
 def kernel(function: Function) -> Function:
-    """Compile ``function`` on its first call, for the types that it is called with."""
+    """Compile ``function`` on its first call, for the types of its arguments."""
     if not JIT:
         return function
     return cast(Function, _dispatcher(_Kernel, function, "called", no_cfunc_wrapper=True))
@@ -79,10 +78,10 @@ def compile_for(signature: Any, function: Function) -> Function:
 
 
 def entry(compiled: Any) -> Any:
-    """The code itself of what ``compile_for`` returned, for callers in Python that hand it the types of its signature.
+    """The plain code of a ``compile_for`` result, for callers in Python that pass exactly the types of its signature.
 
-    To find the code for their types Numba looks at every array of every tuple, at each call: 3 us, and ten times that
-    where there are functions among them. Here nobody looks: other types go unnoticed.
+    To find the code for its arguments, Numba looks at every array of every tuple at each call: 3 us, and ten times that
+    with functions among them. Here nobody looks, so wrong types go unnoticed.
     """
     if not JIT:
         return compiled
@@ -116,7 +115,7 @@ class _Direct:
         if meanwhile is not None and is_small and not meanwhile.is_over:
             return meanwhile
         kinds = tuple(cast(Any, numba).typeof(argument) for argument in (batch, *arguments))
-        if meanwhile is None and is_small and sys.executable:
+        if meanwhile is None and is_small and is_possible():
             try:
                 with only_kept():
                     self._entries[batch.several] = self.compile(kinds)
@@ -130,7 +129,7 @@ class _Direct:
 
 
 def compile_here() -> None:
-    """From now on this process compiles what it calls before it goes on: for measurements, and to fill the cache."""
+    """Make this process finish compiling before a call goes on: for measurements, and to fill the cache."""
     _compiles_here.set()
 
 
@@ -140,7 +139,7 @@ def direct(compiled: Function) -> Function:
 
 
 class _Located(types.WrapperAddressProtocol):
-    """A compiled function together with where its machine code lies."""
+    """A compiled function together with the address of its machine code."""
 
     def __init__(self, function: Any, signature: Any) -> None:
         self._numba_type_ = types.FunctionType(signature)
@@ -156,18 +155,18 @@ class _Located(types.WrapperAddressProtocol):
 
 
 def located(signature: Any, compiled: Any) -> Any:
-    """What ``compile_for`` returned, for calls that are short: Numba looks up where it lies here, not at each call.
+    """A ``compile_for`` result for short calls: Numba looks up its address here, not at each call.
 
-    That takes 0.1 ms a function; in return the kernel's calls of it are slower, by a few ns.
+    That saves 0.1 ms a function; in return the kernel's calls of it are slower, by a few ns.
     """
     return _Located(compiled, signature) if JIT else compiled
 
 
 def interruptible(work: Callable[[], Result]) -> Result:
-    """``work()``, which may spend minutes in kernels, while Ctrl-C is answered at once.
+    """Run ``work()``, which may spend minutes in kernels, and still answer Ctrl-C at once.
 
-    Python heeds a signal only in its main thread, and there only between two of its own instructions: so that thread
-    waits while another works (60 us). After a KeyboardInterrupt that one goes on until its kernel ends or the process.
+    Python handles a signal only in its main thread, between two of its own instructions. So the main thread waits (60
+    us) while another works. After a KeyboardInterrupt the other goes on until its kernel or the process ends.
     """
     if threading.current_thread() is not threading.main_thread():
         return work()
@@ -176,10 +175,10 @@ def interruptible(work: Callable[[], Result]) -> Result:
     def carry_out() -> None:
         try:
             future.set_result(work())
-        except BaseException as error:  # it belongs to the thread that waits
+        except BaseException as error:  # to be raised in the waiting thread
             future.set_exception(error)
 
     threading.Thread(target=carry_out, daemon=True).start()
     while not future.done():
-        wait([future], 0.5)  # where a signal does not end a wait (Windows), half a second does
+        wait([future], 0.5)  # on Windows a signal does not end a wait; half a second does
     return future.result()

@@ -8,22 +8,28 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import os
 import pickle
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from types import FunctionType
 from typing import Any, NamedTuple, TypeVar, cast
 
+import filelock
 import numpy as np
 from numba.core import serialize
 from numba.core.registry import CPUDispatcher
 
 from bufgym.kernel.announce import say
+from bufgym.kernel.cache import FOLDER
 
 FEW = 8
 """Rows of a batch that plain Python is fast enough for."""
+_MARK = "BUFGYM_COMPILES"
+"""Environment variable of the process that compiles: it starts no other, whatever program it turns out to be."""
 _CHILD = "import sys; sys.path[:] = {path!r}; from bufgym.kernel.meanwhile import fill_cache; fill_cache()"
 
 Bundle = TypeVar("Bundle", bound=NamedTuple)
@@ -63,26 +69,37 @@ class Meanwhile:
             return self._python(*(named(entry) if hasattr(entry, "_fields") else entry for entry in arguments))
 
     def _compile(self) -> None:
-        command = [sys.executable, "-c", _CHILD.format(path=sys.path)]
+        path = [place for place in sys.path if isinstance(place, str)]
+        command = [sys.executable, "-c", _CHILD.format(path=path)]
         quiet = subprocess.DEVNULL
         with contextlib.suppress(OSError):  # where no process can be started, is_over says so
-            subprocess.run(command, input=self._asked, stdout=quiet, stderr=quiet, check=False)
+            marked = {**os.environ, _MARK: "1"}
+            subprocess.run(command, input=self._asked, stdout=quiet, stderr=quiet, env=marked, check=False)
+
+
+def is_possible() -> bool:
+    """Whether another process can compile: not in a program that is one file with its Python, such as PyInstaller's."""
+    return bool(sys.executable) and not getattr(sys, "frozen", False) and _MARK not in os.environ
 
 
 def fill_cache() -> None:
     """Compile the kernel that standard input names, and leave it on disk."""
     module, name, kinds = pickle.load(sys.stdin.buffer)
-    getattr(importlib.import_module(module), name).compile(kinds)
+    # One process compiles at a time; those that wait find its code.
+    Path(FOLDER).mkdir(parents=True, exist_ok=True)
+    with filelock.FileLock(Path(FOLDER, f"{module}.{name}.lock")):
+        getattr(importlib.import_module(module), name).compile(kinds)
 
 
 _GLOBALS: dict[str, dict[str, Any]] = {}
+_LOCK = threading.RLock()
 
 
 def plain(function: Any) -> Callable[..., Any]:
     """A kernel's ``function`` as plain Python, which calls other kernels as plain Python too."""
-    return FunctionType(
-        function.__code__, _plain_globals(function.__module__), function.__name__, function.__defaults__
-    )
+    with _LOCK:
+        seen = _plain_globals(function.__module__)
+    return FunctionType(function.__code__, seen, function.__name__, function.__defaults__, function.__closure__)
 
 
 def _plain_globals(module: str) -> dict[str, Any]:

@@ -1,9 +1,8 @@
 """How Numba compiles kernels here: each is typed and translated once, and optimised only where Python calls it.
 
-Numba by default optimises every kernel together with all that it calls, and makes machine code of it: of a hundred
-kernels that call one another the innermost is optimised a hundred times. The code of a *part*, a kernel inside another,
-is kept as it comes out of the translation. The kernel that Python calls links its parts, inlines them and optimises the
-*whole*, once.
+By default Numba optimises every kernel together with all that it calls, and makes machine code of it. The innermost of
+a hundred nested kernels is then optimised a hundred times. Here the code of a *part*, a kernel inside another, stays as
+the translation made it. The kernel that Python calls links its parts, inlines them and optimises the *whole*, once.
 """
 
 from __future__ import annotations
@@ -53,13 +52,13 @@ class PartLibrary(_Library):  # type: ignore[misc]
         return 0
 
     def serialize_using_object_code(self) -> tuple[str, str, bytes]:
-        """(name, ``PART``, bitcode): the form in which it is kept on disk."""
+        """(name, ``PART``, bitcode), the form stored on disk."""
         self._ensure_finalized()
         return self.name, PART, self._final_module.as_bitcode()
 
     @classmethod
     def read(cls, target: Any, kept: tuple[str, str, bytes]) -> Any:
-        """The part that ``serialize_using_object_code`` gave as ``kept``."""
+        """Restore the part from ``kept``, the output of ``serialize_using_object_code``."""
         name, _, bitcode = kept
         library = cls(target.codegen(), name)
         library._final_module = binding.parse_bitcode(bitcode)
@@ -92,7 +91,7 @@ class _NoneFields(_Pass):  # type: ignore[misc]
         super().__init__()
 
     def run_pass(self, state: Any) -> bool:
-        """Change the code of one kernel in place; whether anything was changed."""
+        """Change the code of one kernel in place; return whether it changed."""
         changed = False
         for block in state.func_ir.blocks.values():
             for statement in block.find_insts(ir.Assign):
@@ -112,7 +111,7 @@ class _NoneFields(_Pass):  # type: ignore[misc]
 class _LocalBundles(_Pass):  # type: ignore[misc]
     """Puts the fields of bundles that come from Python among the kernel's own variables.
 
-    Left where they are, they would have to be read again after every store, which might have changed them.
+    Otherwise they would be read again after every store, which might have changed them.
     """
 
     _name = "bufgym_local_bundles"
@@ -121,7 +120,7 @@ class _LocalBundles(_Pass):  # type: ignore[misc]
         super().__init__()
 
     def run_pass(self, state: Any) -> bool:
-        """Change the code of one kernel in place; whether anything was changed."""
+        """Change the code of one kernel in place; return whether it changed."""
         changed = False
         block = state.func_ir.blocks[min(state.func_ir.blocks)]
         for place in reversed(range(len(block.body))):

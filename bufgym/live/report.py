@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from bufgym import __version__
-from bufgym.live.margins import margins
 from bufgym.benchmark.report import style
 from bufgym.benchmark.report.charts import Chart
 from bufgym.benchmark.report.page import rendered
 from bufgym.benchmark.report.style import Figure
 from bufgym.errors import BufgymError
 from bufgym.files import read_utf8, replaced
+from bufgym.live.margins import margins
 from bufgym.live.runs import COLUMNS, Run, agreement, by_policy, cells
 
 MAX_BYTES = 2**28

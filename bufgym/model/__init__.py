@@ -1,1 +1,1 @@
-"""The model's terms: Quantity of Information (``qoi``), messages and their queue (``buffer``), the link, topics."""
+"""Terms of the model: Quantity of Information, messages and their buffer, the link, topics."""

@@ -1,8 +1,8 @@
 """The bounded buffer of one sender, as a row of an array: push, pop the head, evict a slot.
 
-A row of ``slots`` holds, in order, the message dequeued last (in transmission or already delivered) and then the queued
-ones. The head is at column ``first``; so ``slots[first - 1]`` is what the head's information is measured against, and
-popping the head moves nothing. Slot 0 is the oldest queued message.
+A row of ``slots`` holds the message dequeued last (delivered or still in transmission), then the queued messages in
+order. Slot 0, the head, is the oldest queued message; it is at column ``first``. Its information is measured against
+``slots[first - 1]``, and popping it moves nothing in memory.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ TOPIC = np.dtype(
     [
         # settings (see ``bufgym.model.topics.Topic``)
         ("priority", np.float64),
-        ("weight", np.float64),  # of its H in the weighted sum
+        ("weight", np.float64),  # factor of the topic's H in the weighted sum
         ("period_us", np.int64),  # rate limit: at most one message a period; 0 for none
-        ("limit", np.int64),  # messages of it in the buffer at most
+        ("limit", np.int64),  # most messages of this topic in the buffer
         ("no_drop", np.int64),  # 1: may not be dropped
         ("deadline_us", np.int64),  # a message is late when it is older than this at the server
-        ("v_start", np.int64),  # where its V begins in the array of all V
-        # what the sender knows of the past
+        ("v_start", np.int64),  # where the topic's V begins in the array of all V
+        # the topic's past, as the sender knows it
         ("queued", np.int64),  # messages in the buffer
         ("arrived", np.int64),
         ("kept_us", np.int64),  # arrival time of the message enqueued last
-        ("previous_us", np.int64),  # arrival time of its arrival before the one at hand, kept or not
+        ("previous_us", np.int64),  # arrival time of the topic's previous message, kept or not
         ("previous_x", np.float64),
-        ("step_us", np.int64),  # time between its last two arrivals
+        ("step_us", np.int64),  # time between the topic's last two arrivals
         ("step_x", np.float64),
         ("dequeued", np.int64),  # messages the socket dequeued
-        ("dequeued_arrival_us", np.int64),  # arrival time of the last of them
+        ("dequeued_arrival_us", np.int64),  # arrival time of the message dequeued last
         ("dequeued_x", np.float64),
-        ("last_dequeue_us", np.int64),  # when it was dequeued
-        # what the server has of it: statistics that the robot does not know
+        ("last_dequeue_us", np.int64),  # time at which it was dequeued
+        # the topic at the server: statistics that the robot does not know
         ("received", np.int64),
         ("newest_us", np.int64),  # arrival time of the newest received
-        ("aged_us", np.int64),  # until when its age has been counted
+        ("aged_us", np.int64),  # time up to which the topic's age has been counted
         ("aged", np.float64),  # its age, integrated over that time, s^2
         # scratch of kernels that walk along the queue
         ("mark", np.int64),
@@ -75,7 +75,7 @@ MAX_CAPACITY = 10**6
 
 
 def check_limits(capacity: int, max_bytes: int | None) -> None:
-    """An error unless these can be L, messages, and B, bytes (None for no limit)."""
+    """Check the limits L, messages, and B, bytes or None for no limit; raise a BufgymError if one is unusable."""
     if isinstance(capacity, bool) or not isinstance(capacity, int | np.integer) or not 1 <= capacity <= MAX_CAPACITY:
         raise BufgymError(f"capacity = {capacity!r}: L must be a whole number from 1 to {MAX_CAPACITY}")
     if max_bytes is not None and not (isinstance(max_bytes, int | np.integer) and 1 <= max_bytes < UNLIMITED_BYTES):
@@ -85,17 +85,17 @@ def check_limits(capacity: int, max_bytes: int | None) -> None:
 @bundle
 @documented
 class Buffer(NamedTuple):
-    """All that a policy may see: what the robot knows on board when a message arrives. Do not write to it.
+    """What a robot knows on board when a message arrives: all that a policy may see. Do not write to it.
 
     Nothing here needs feedback from the server or a measurement of the link's bandwidth.
     """
 
     slots: NDArray[Any]
-    """MESSAGE[occupancy]: the queued messages, 0 = oldest; without the one in transmission, which can't be dropped."""
+    """MESSAGE[occupancy]: the queued messages, 0 = oldest. The message in transmission, never dropped, is not here."""
     capacity: int
     """L, messages."""
     max_bytes: int
-    """B, bytes; UNLIMITED_BYTES where only L counts."""
+    """B, bytes; UNLIMITED_BYTES for no byte limit."""
     backlog_bytes: int
     """Bytes queued."""
     now_us: int
@@ -103,23 +103,23 @@ class Buffer(NamedTuple):
     dequeued: int
     """Messages dequeued so far (delivered, or in transmission)."""
     dequeued_arrival_us: int
-    """Arrival time of the message dequeued last, us; before the first, that of the oldest queued message, else of the
-    previous arrival. With several topics this, ``dequeued_x`` and the previous arrival's two are of the
-    newcomer's topic."""
+    """Arrival time of the message dequeued last, us. Before the first dequeue: of the oldest queued message, or of the
+    previous arrival if the queue is empty. With several topics this field, ``dequeued_x``, ``previous_us`` and
+    ``previous_x`` describe the newcomer's topic."""
     dequeued_x: float
     """Coordinate x of the message dequeued last."""
     dequeued_seq: int
-    """Place (``seq``) among all arrivals of the message dequeued last, of whatever topic; before the first likewise."""
+    """``seq`` of the message dequeued last, on any topic. Before the first dequeue: as for ``dequeued_arrival_us``."""
     previous_us: int
     """Time of the previous arrival, kept or not, us."""
     previous_x: float
     """Coordinate x of the previous arrival, kept or not."""
     busy: int
-    """1 while a message is in transmission, else 0."""
+    """1 while a message is in transmission, otherwise 0."""
     left_bytes: int
-    """Bytes of the message in transmission that are not yet transmitted."""
+    """Bytes of the message in transmission that the link has not carried yet."""
     left_fraction: float
-    """The same as a fraction of that message, in [0, 1]."""
+    """``left_bytes`` as a fraction of that message, in [0, 1]."""
     stalled_us: int
     """Time since a message was last dequeued, us."""
     period_us: float
@@ -127,47 +127,49 @@ class Buffer(NamedTuple):
     departures: int
     """Messages dequeued since the previous arrival."""
     service_ratio: float
-    """Running mean of departures per arrival: 1 = the link keeps up, 0 = it stands still."""
+    """Running mean of departures per arrival: 1 when the link keeps up, 0 when it stands still."""
     period_square: float
-    """Running mean of the squared time between arrivals, us^2; how far it exceeds ``period_us`` ** 2 says how bursty
-    they are."""
+    """Running mean of the squared time between arrivals, us^2. Its excess over ``period_us`` ** 2 measures how bursty
+    arrivals are."""
     drained_bytes: int
     """Bytes that left the socket between the previous arrival and this one."""
     drained_us: int
-    """How much of that time it had bytes to send, us."""
+    """Time since the previous arrival in which the socket had bytes to send, us."""
     short_rate_bytes_per_s: float
-    """The link's rate, bytes/s: what left the socket in the time that it had bytes to send, a running mean over about
-    the last 0.1 s of that time; 0 before the first."""
+    """The link's rate, bytes/s: a running mean of the bytes sent, over about the last 0.1 s in which the socket had
+    bytes to send. 0 before the first."""
     medium_rate_bytes_per_s: float
-    """The same over about 0.5 s."""
+    """The same mean over about 0.5 s."""
     long_rate_bytes_per_s: float
-    """The same over about 2 s."""
+    """The same mean over about 2 s."""
     v: NDArray[np.float64]
-    """float64[entries]: the value function, for ``qoi.value(buffer.v, distance)``; with several topics each from its
-    ``v_start`` on."""
+    """float64[entries]: the value function, for ``qoi.value(buffer.v, distance)``. With several topics, the V of each
+    begins at its ``v_start``."""
     topics: NDArray[Any]
-    """TOPIC[topics]: settings and past of each topic; a single queue keeps settings there and nothing else."""
+    """TOPIC[topics]: settings and past of each topic. A single queue has one row, which holds settings only."""
     window: int
-    """n_T: messages that may be sent and not yet acked."""
+    """n_T, the most messages that may be sent and not yet acked."""
     in_flight: int
-    """Messages sent and not yet acked (without acks: not yet transmitted)."""
+    """Messages sent and not yet acked; on a link without acks, not yet transmitted."""
     evictions: int
-    """Messages evicted so far for the arrival at hand: 0 when it is asked about first, more where it is asked again
-    because B still has no room for it. A policy that counts arrivals counts where this is 0."""
+    """Messages evicted so far for the current arrival. It is 0 at the first question; the policy is asked again while
+    B still has no room. A policy that counts arrivals counts only where this is 0."""
     parameters: NDArray[np.float64] = NO_PARAMETERS
-    """float64[parameters], read-only: the policy's own settings, in the order of its registration, or its weights."""
+    """float64[parameters], read-only: the policy's own settings in the order of its registration, or its weights."""
 
 
 @kernel
 def running_mean(mean: float, amount: float, us: float, seen_us: float, window_us: float) -> float:
-    """``mean`` (of amounts per us) after ``us`` more, in which so much came: over about ``window_us``, or all
-    ``seen_us`` where that is less."""
+    """Update ``mean``, in units per us, by an ``amount`` that came in the next ``us``.
+
+    The mean covers about ``window_us``, or all the time so far (``seen_us``) if that is less.
+    """
     return mean + (amount - mean * us) / (us + min(window_us, seen_us))
 
 
 @kernel
 def push(slots: NDArray[Any], i: int, first: int, occupancy: int, arrival: Any) -> int:
-    """Put ``arrival`` behind the tail of row ``i``; return the head's index, which moves when the row is packed."""
+    """Put ``arrival`` behind the tail of row ``i``; return the head's index, which changes when the row is packed."""
     if first + occupancy == slots.shape[1]:
         for k in range(occupancy + 1):
             slots[i, k] = slots[i, first - 1 + k]
@@ -195,19 +197,19 @@ def row_width(capacity: int) -> int:
 
 @kernel
 def has_space(buffer: Buffer, arrival: Any) -> bool:
-    """Whether the newcomer fits as the queue is, by messages and by bytes."""
+    """Whether the newcomer fits into the queue as it is, by messages and by bytes."""
     return bool(len(buffer.slots) < buffer.capacity and buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes)
 
 
 @kernel
 def fill(buffer: Buffer) -> float:
-    """How full the queue is, by messages or by bytes, whichever is more: 1 = full."""
+    """Fill level of the queue by messages or by bytes, whichever is higher; 1 when full."""
     return max(len(buffer.slots) / buffer.capacity, buffer.backlog_bytes / buffer.max_bytes)
 
 
 @kernel
 def before(buffer: Buffer, k: int, topic: int) -> int:
-    """The slot kept before slot ``k`` on the same topic, -1 where there is none."""
+    """The slot before slot ``k`` on the same topic, or -1 if there is none."""
     j = k - 1
     if len(buffer.topics) > 1:
         while j >= 0 and item(buffer.slots, j).topic != topic:
@@ -217,7 +219,7 @@ def before(buffer: Buffer, k: int, topic: int) -> int:
 
 @kernel
 def after(buffer: Buffer, k: int, topic: int) -> int:
-    """The slot kept after slot ``k`` on the same topic, ``len(buffer.slots)`` where there is none."""
+    """The slot after slot ``k`` on the same topic, or ``len(buffer.slots)``."""
     j = k + 1
     if len(buffer.topics) > 1:
         while j < len(buffer.slots) and item(buffer.slots, j).topic != topic:
@@ -227,13 +229,13 @@ def after(buffer: Buffer, k: int, topic: int) -> int:
 
 @kernel
 def is_first(buffer: Buffer, k: int) -> bool:
-    """Whether slot ``k`` is the oldest of its topic: a topic's messages are sent in order."""
+    """Whether slot ``k`` is the oldest of its topic. Each topic's messages are sent in order."""
     return before(buffer, k, item(buffer.slots, k).topic) < 0
 
 
 @kernel
 def _gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int, float, float]:
-    """(time gaps, us, then gaps in x) of slot ``k`` to the messages kept before it and after it on its topic."""
+    """Time gaps (us), then gaps in x, from slot ``k`` to the messages kept before and after it on its topic."""
     s = len(buffer.slots)
     message = arrival if k == s else item(buffer.slots, k)
     at_us, x, topic = message.arrival_us, message.x, message.topic
@@ -261,10 +263,10 @@ def _gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int, float, float]
 
 @kernel
 def time_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int]:
-    """Time from slot ``k`` back to the message kept before it on its topic and on to the one kept after it, us.
+    """Times between slot ``k`` and the messages kept before and after it on its topic, us.
 
-    The newcomer is slot ``len(buffer.slots)``. What follows it is still to come: one more step like the last is
-    expected, so its second gap is the time since the previous arrival. The same goes for the last of another topic.
+    The newcomer is slot ``len(buffer.slots)``. Its successor is still to come: the next step is expected to be as long
+    as the last one, so its second gap is the time since the previous arrival. The same goes for a topic's last message.
     """
     back_us, on_us, _, _ = _gaps(buffer, arrival, k)
     return back_us, on_us
@@ -272,14 +274,14 @@ def time_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int]:
 
 @kernel
 def motion_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
-    """The same as ``time_gaps`` in the coordinate x: what the scene moved before slot ``k`` and after it."""
+    """Distances in x between slot ``k`` and the messages kept before and after it, as ``time_gaps``."""
     _, _, back_x, on_x = _gaps(buffer, arrival, k)
     return back_x, on_x
 
 
 @kernel
 def arrival_gain(buffer: Buffer, arrival: Any) -> float:
-    """V of the newcomer's gap to the message kept before it: what accepting it adds. 0 for the very first message."""
+    """V of the newcomer's gap to the message kept before it, gained by accepting it; 0 for the first message."""
     s = len(buffer.slots)
     if len(buffer.topics) == 1:
         if s > 0:
@@ -293,9 +295,9 @@ def arrival_gain(buffer: Buffer, arrival: Any) -> float:
 
 @kernel
 def loss(buffer: Buffer, arrival: Any, k: int) -> float:
-    """QoI lost if slot ``k`` went and nothing else: V(a) + V(b) - V(a + b) for its gaps a, b; >= 0 as V is concave.
+    """QoI lost by dropping slot ``k`` alone, V(a) + V(b) - V(a + b) for its gaps a and b.
 
-    With several topics, times the weight of its topic.
+    It is never negative, as V is concave. With several topics it is multiplied by the weight of the slot's topic.
     """
     a, b = motion_gaps(buffer, arrival, k)
     if len(buffer.topics) == 1:

@@ -1,4 +1,4 @@
-"""Rules for numbers that parameters share; each function raises a BufgymError that names the parameter and the rule."""
+"""Shared rules for numbers; each function raises a BufgymError that names the parameter and the broken rule."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ MAX_WINDOW = 10**6
 
 
 def is_number(value: Any) -> bool:
-    """Whether ``value`` is an int or a float, Python's or numpy's; True and False are not."""
+    """Whether ``value`` is an int or a float of Python or numpy; True and False are not."""
     return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
 def above_0(name: str, number: Any) -> None:
-    """``number`` is finite and > 0."""
+    """Check that ``number`` is finite and > 0."""
     if not (is_number(number) and 0 < number <= sys.float_info.max):
         raise BufgymError(f"{name} = {number!r}: must be a number > 0")
 
 
 def between(name: str, number: Any, low: float, high: float, unit: str = "") -> None:
-    """``number`` lies in [low, high]; ``unit`` is added to the message."""
+    """Check that ``number`` lies in [low, high]; the message appends ``unit``."""
     if not is_number(number):
         raise BufgymError(f"{name} = {number!r}: must be a number")
     if not low <= number <= high:
@@ -34,9 +34,9 @@ def between(name: str, number: Any, low: float, high: float, unit: str = "") -> 
 
 
 def whole(name: str, number: Any, least: int = 0, most: int | None = None, *, symbol: str = "") -> int:
-    """``number`` as an int, from ``least`` to ``most``; ``symbol``: what it is called in formulas, for the message."""
+    """Check that ``number`` is whole and within the limits; return it as an int. The message shows ``symbol``."""
     if type(number) is int and number >= least and (most is None or number <= most):
-        return number  # nearly always, and environments draw thousands of episodes a second
+        return number  # the usual case: environments draw thousands of episodes a second
     if (
         isinstance(number, bool)
         or not isinstance(number, int | np.integer)
@@ -49,18 +49,18 @@ def whole(name: str, number: Any, least: int = 0, most: int | None = None, *, sy
 
 
 def check_window(window: Any) -> int:
-    """n_T, messages on their way and not acked, or an error."""
+    """Check n_T, the most messages sent and not yet acked."""
     return whole("window", window, 1, MAX_WINDOW, symbol="n_T")
 
 
 def check_name(what: str, name: Any) -> None:
-    """``name`` can stand in lists of names with settings, as in ``"decimate:every=2,afr"``; ``what`` has it."""
+    """Check a name that must fit into lists with settings, such as ``"decimate:every=2,afr"``."""
     if not isinstance(name, str) or not name or any(c in ":,= \t\n" for c in name):
         raise BufgymError(f"{what} {name!r}: a name must be non-empty, without spaces, ':', ',' or '='")
 
 
 def named_settings(what: str, spec: str) -> tuple[str, dict[str, float]]:
-    """``"decimate:every=2"`` -> its name and its settings; ``what`` it is, for the message."""
+    """Split ``"decimate:every=2"`` into its name and its settings; ``what`` is the kind of thing, for the message."""
     name, _, settings = spec.partition(":")
     numbers: dict[str, float] = {}
     for setting in filter(None, settings.split(",")):
@@ -73,7 +73,7 @@ def named_settings(what: str, spec: str) -> tuple[str, dict[str, float]]:
 
 
 def changed(what: str, parameters: Mapping[str, float], settings: Mapping[str, float]) -> dict[str, float]:
-    """The ``parameters`` with these ``settings``; an error for an unknown name or an unusable number."""
+    """Replace ``parameters`` by the given ``settings``; raise for an unknown name or an unusable number."""
     for name, number in settings.items():
         if name not in parameters:
             raise BufgymError(f"{what}: no parameter {name!r}; it has: {', '.join(parameters) or 'none'}")

@@ -1,4 +1,4 @@
-"""Field descriptions of named tuples, where ``help`` finds them."""
+"""Field descriptions of named tuples, in the place where ``help`` finds them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Class = TypeVar("Class", bound=type[Any])
 
 
 def documented(named_tuple: Class) -> Class:
-    """Give each field the string below it as its docstring; ``help`` would say "Alias for field number 7" otherwise."""
+    """Make the string below each field its docstring; ``help`` would otherwise show "Alias for field number 7"."""
     definition = ast.parse(textwrap.dedent(inspect.getsource(named_tuple))).body[0]
     assert isinstance(definition, ast.ClassDef)
     for field, text in zip(definition.body, definition.body[1:], strict=False):

@@ -1,12 +1,11 @@
 """The link: a capacity trace turned into delivery times, exactly, in whole microseconds and bytes.
 
-A trace gives the bytes C(t) that the link could have carried by time t, linear between its knots. The socket is serial
-and work-conserving: a message that starts at byte position u (u = C(t) for an idle link, else where the one before it
-ended) has been transmitted at the first microsecond t with C(t) >= u + bytes. Positions, not times, are passed on from
-message to message, so nothing is lost to rounding however many follow each other.
+A trace gives C(t), the bytes that the link could have carried by time t, linear between knots. The socket sends one
+message at a time and never idles while one waits. A message starts at a byte position u: C(t) on an idle link,
+otherwise the position where its predecessor ended. It has been transmitted at the first microsecond t with C(t) >= u +
+bytes. Messages pass on positions, not times, so rounding errors never add up.
 
-After the trace's end the link may *loop* (the trace begins again), *hold* (the last segment's rate goes on) or *stop*
-(it carries nothing more).
+After the trace's end the link may *loop* to its beginning, *hold* the last segment's rate or *stop* for good.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ _AFTER = {"loop": LOOP, "hold": HOLD, "stop": STOP}
 
 @dataclass(frozen=True)
 class Link:
-    """One sender's link: a trace from an offset on, and a propagation delay."""
+    """One sender's link: a trace from an offset on, with a propagation delay."""
 
     trace: Trace
-    """Capacity over time, and what follows its end."""
+    """Capacity over time, and how it continues after the end."""
     offset_us: int = 0
     """Where on the trace the episode begins, us."""
     propagation_us: int = 0
-    """From the end of a message's transmission to its receipt at the server, us."""
+    """Time from the end of a message's transmission to its receipt at the server, us."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.trace, Trace):
@@ -50,10 +49,11 @@ class Link:
         whole("propagation_us", self.propagation_us, 0, MAX_TIME_US)
 
     def check_reach(self, last_us: int, total_bytes: int, pauses: int = 0, pause_us: int = 0) -> None:
-        """An error unless every time and byte position of a run over this link stays within 64 bits.
+        """Raise a BufgymError unless every time and byte position of a run over this link stays within 64 bits.
 
-        Messages of ``total_bytes`` in all arrive until ``last_us``; the socket pauses so many times, for acks. What
-        it takes is bounded by whole laps of what repeats at the trace's end, two more for each time that it begins.
+        Messages of ``total_bytes`` in all arrive until ``last_us``. The socket pauses ``pauses`` times for acks, each
+        time for ``pause_us``. The bound counts whole laps of the part that repeats, and two more for each start or
+        restart.
         """
         trace = self.trace
         # Python's integers, which do not overflow.
@@ -72,7 +72,7 @@ class Link:
             )
 
     def carried_by(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]:
-        """C at these times (int64[n], us, not decreasing): int64[n], bytes, rounded down as in ``position_at``."""
+        """C at the given times (int64[n], us, not decreasing) as int64[n], bytes, rounded down."""
         carried = np.empty(len(t_us), np.int64)
         trace = self.trace
         _positions(trace.time_us, trace.cumulative_bytes, _AFTER[trace.after], t_us + self.offset_us, carried)
@@ -93,19 +93,19 @@ class Link:
 
     @property
     def carries_bytes(self) -> int:
-        """All bytes that the link will ever carry; FOREVER where it never stops."""
+        """All bytes that the link will ever carry; FOREVER if it never stops."""
         carried = self.trace.cumulative_bytes
         ends = self.trace.after == "stop" or (self.trace.after == "hold" and carried[-1] == carried[-2])
         return int(carried[-1]) if ends else FOREVER
 
 
 KEPT_KNOTS = 2**20
-"""As many knots are stored (16 MB) before those of a trace that no sender follows any more make room for others."""
+"""Knots to store (16 MB) before traces that no sender uses make room for others."""
 
 
 @dataclass(eq=False)
 class _Place:
-    """Where the knots of a trace lie, and how many senders follow it."""
+    """Where the knots of a trace lie, and how many senders use them."""
 
     trace: Trace  # kept, as an id is only unique while its object lives
     first: int
@@ -114,10 +114,10 @@ class _Place:
 
 
 class Knots:
-    """The knots of several traces in two flat arrays, as kernels read them; each trace is stored once.
+    """The knots of several traces in two flat arrays, which kernels read; each trace is stored once.
 
-    Traces that come again stay stored, and so do all that a sender follows; of the others it forgets those that were
-    left first, when it needs their room: a new trace for every episode takes no more and more memory.
+    A trace stays stored while a sender uses it, and afterwards until its room is needed; the trace left first goes
+    first. So memory stays bounded even if every episode brings a new trace.
     """
 
     def __init__(self) -> None:
@@ -129,7 +129,7 @@ class Knots:
         self._idle: dict[int, _Place] = {}
 
     def place(self, trace: Trace, sender: int) -> tuple[int, int, int]:
-        """(first knot, last knot, what follows the end) of ``trace``, which ``sender`` follows from now on."""
+        """Store ``trace`` for ``sender`` and return (first knot, last knot, code for what follows the end)."""
         left = self._followed.pop(sender, None)
         if left is not None:
             left.senders -= 1
@@ -150,13 +150,13 @@ class Knots:
         return place
 
     def _room(self, knots: int) -> tuple[int, int]:
-        """(first, how many) knots that may be written."""
+        """Find room for so many knots; return (first knot, size of the room)."""
         if self._end + knots > max(KEPT_KNOTS, len(self.us)):
             for place in self._idle.values():
                 if place.room >= knots:
                     self._forget(place)
                     return place.first, place.room
-            # None of them alone has it; those at the end together may.
+            # No single idle trace leaves enough room; dropping all of them may free enough at the end.
             for place in list(self._idle.values()):
                 self._forget(place)
             self._end = max((place.first + place.room for place in self._places.values()), default=0)
@@ -172,7 +172,7 @@ class Knots:
 
 @kernel
 def segment(knots: NDArray[np.int64], first: int, last: int, hint: int, point: int) -> int:
-    """k with knots[k] <= point < knots[k + 1], first <= k < last. ``hint``: where it was last time, often still so."""
+    """Find k with knots[k] <= point < knots[k + 1] and first <= k < last; try ``hint``, the last answer, first."""
     for k in range(hint, min(hint + 4, last)):
         if item(knots, k) <= point < item(knots, k + 1):
             return k
@@ -188,7 +188,7 @@ def segment(knots: NDArray[np.int64], first: int, last: int, hint: int, point: i
 
 @kernel
 def share(part: int, whole: int, amount: int) -> Any:
-    """part / whole of ``amount``, rounded down; none is negative, which spares Numba a look at the signs."""
+    """Compute part / whole of ``amount``, rounded down; no argument is negative, so Numba need not check signs."""
     return np.int64(np.uint64(part * amount) // np.uint64(whole))
 
 
@@ -196,7 +196,7 @@ def share(part: int, whole: int, amount: int) -> Any:
 def position_at(
     us: NDArray[np.int64], size: NDArray[np.int64], first: int, last: int, after: int, hint: int, t_us: int
 ) -> tuple[int, int]:
-    """(C(t) rounded down, bytes; segment it lies in) on the trace with knots ``first..last``."""
+    """Bytes C(t), rounded down, and the segment that t lies in, on the trace with knots ``first..last``."""
     duration, total = us[last], size[last]
     laps, t = 0, t_us
     if t_us >= duration:
@@ -217,7 +217,7 @@ def position_at(
 def time_of(
     us: NDArray[np.int64], size: NDArray[np.int64], first: int, last: int, after: int, hint: int, position: int
 ) -> tuple[int, int]:
-    """(first t with C(t) >= position, us; segment it lies in); FOREVER where that never comes. position > 0."""
+    """First time t (us) with C(t) >= ``position`` > 0, or FOREVER, and the segment that t lies in."""
     duration, total = us[last], size[last]
     laps, within = 0, position
     if position > total:
@@ -234,7 +234,7 @@ def time_of(
     k = segment(size, first, last, hint, within - 1)  # size[k] < within <= size[k + 1]
     from_us, from_bytes = item(us, k), item(size, k)
     span, carried = item(us, k + 1) - from_us, item(size, k + 1) - from_bytes
-    # rounded up: the whole span less what is left of it, rounded down
+    # Rounded up: the segment's span minus the rest, rounded down.
     return laps * duration + from_us + span - share(from_bytes + carried - within, carried, span), k
 
 
@@ -242,7 +242,7 @@ def time_of(
 def carried_by(knot_us: NDArray[np.int64], knot_bytes: NDArray[np.int64], link: Any, t_us: int) -> int:
     """Bytes that a link has carried by the sender's time ``t_us``.
 
-    ``link``: a record with the fields first_knot, last_knot, after, offset_us, segment_now and segment_finish.
+    ``link`` is a record with the fields first_knot, last_knot, after, offset_us, segment_now and segment_finish.
     """
     position, link.segment_now = position_at(
         knot_us, knot_bytes, link.first_knot, link.last_knot, link.after, link.segment_now, t_us + link.offset_us
@@ -252,7 +252,7 @@ def carried_by(knot_us: NDArray[np.int64], knot_bytes: NDArray[np.int64], link: 
 
 @kernel
 def finish_of(knot_us: NDArray[np.int64], knot_bytes: NDArray[np.int64], link: Any, position: int) -> int:
-    """The sender's time at which a link (a record as above) has carried so many bytes, us; FOREVER if it never will."""
+    """The sender's time (us) at which the same kind of ``link`` has carried ``position`` bytes, or FOREVER."""
     t_us, link.segment_finish = time_of(
         knot_us, knot_bytes, link.first_knot, link.last_knot, link.after, link.segment_finish, position
     )
@@ -263,7 +263,7 @@ def finish_of(knot_us: NDArray[np.int64], knot_bytes: NDArray[np.int64], link: A
 def _positions(
     us: NDArray[np.int64], size: NDArray[np.int64], after: int, t_us: NDArray[np.int64], carried: NDArray[np.int64]
 ) -> None:
-    """``carried[k]`` = C(t_us[k])."""
+    """Write C(t_us[k]) into ``carried[k]``."""
     hint = 0
     for k in range(len(t_us)):
         carried[k], hint = position_at(us, size, 0, len(us) - 1, after, hint, t_us[k])

@@ -1,12 +1,12 @@
-"""Quantity of Information: how much of the scene the server has seen (AFR [wang2022afr], Eq. 2-6).
+"""Quantity of Information, a measure of how much of the scene the server has seen; AFR [wang2022afr], Eq. 2-6.
 
 For the received messages in order, with coordinates x_1 <= x_2 <= ...,
 
-    H = 1 + sum of V(x_i - x_{i-1}),
+    H = 1 + sum of V(x_i - x_{i-1}).
 
-where V(d) is what a message adds at a distance d after the one before it: V(0) = 0, V <= 1, V does not decrease, and
-V is concave (Eq. 3-6). The coordinate is the frame index (time-based QoI, as in the paper) or the accumulated motion
-of the camera (motion-based QoI); V is the same for both.
+V(d) is the information that a message adds at distance d from its predecessor. V starts at V(0) = 0, never decreases,
+never exceeds 1, and is concave. The coordinate is the frame index, for the paper's time-based QoI, or the accumulated
+motion of the camera, for motion-based QoI. The same V serves both.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ EXPONENTIAL, SATURATING, TABULATED = 0, 1, 2
 
 @kernel
 def value(v: NDArray[np.float64], d: float) -> float:
-    """V(d): what a message adds at distance ``d >= 0`` from the one received before it, in [0, 1].
+    """V(d) in [0, 1], the information added at distance ``d >= 0`` from the message received before.
 
-    ``v`` is ``Value.array``: the kind, its parameter, and for a table its distances and then its values.
+    ``v`` is ``Value.array``: the kind and its parameter, or for a table the number of points, distances and values.
     """
     if v[0] == EXPONENTIAL:
         return 1.0 - math.exp(d * v[1])  # b^d with v[1] = ln b
@@ -51,15 +51,15 @@ def value(v: NDArray[np.float64], d: float) -> float:
 
 @kernel
 def merging_loss(v: NDArray[np.float64], a: float, value_a: float, b: float, value_b: float) -> float:
-    """V(a) + V(b) - V(a + b), given V(a) and V(b): the QoI lost when the message between two gaps goes; >= 0."""
+    """QoI lost when the message between gaps a and b goes, V(a) + V(b) - V(a + b), from V(a) and V(b); never < 0."""
     if v[0] == EXPONENTIAL:
-        return value_a * value_b  # the same: (1 - p) + (1 - q) - (1 - pq) = (1 - p)(1 - q)
+        return value_a * value_b  # the same number: (1 - p) + (1 - q) - (1 - pq) = (1 - p)(1 - q)
     return value_a + value_b - value(v, a + b)
 
 
 @kernel
 def straight(v: NDArray[np.float64]) -> bool:
-    """Whether V rises straight and then is flat, as min(1, d / D): what is best then does not depend on the future."""
+    """Whether V is straight and then flat, like min(1, d / D): the best decision then ignores the future."""
     if v[0] == TABULATED:
         points = int(v[1])
         return bool(v[3 + points] == v[1 + 2 * points])
@@ -68,7 +68,7 @@ def straight(v: NDArray[np.float64]) -> bool:
 
 @kernel
 def information(v: NDArray[np.float64], x: NDArray[np.float64]) -> float:
-    """H of the received messages with coordinates ``x`` (shape [received], in order of receipt); 0 for none."""
+    """H of messages received with coordinates ``x``, float64[received], in order of receipt; 0 for none."""
     if len(x) == 0:
         return 0.0
     gained = 0.0
@@ -77,20 +77,21 @@ def information(v: NDArray[np.float64], x: NDArray[np.float64]) -> float:
     return 1.0 + gained
 
 
-_value = getattr(value, "py_func", value)  # plain Python: one number is not worth compiling it
+_value = getattr(value, "py_func", value)  # plain Python: compiling does not pay for a single number
 
 
 @dataclass(frozen=True)
 class Value:
-    """A concave V with V(0) = 0, non-decreasing, at most 1: made by ``exponential``, ``saturating``, ``tabulated``.
+    """A concave V with V(0) = 0, never decreasing, at most 1.
 
-    Call it for V(d); BufgymError for a d that is negative or no number.
+    ``exponential``, ``saturating`` and ``tabulated`` make one. Calling it returns V(d). A d that is negative or no
+    number raises a BufgymError.
     """
 
     name: str
-    """As ``parse`` reads it, except for tables."""
+    """Text that ``parse`` reads; for a table, a description."""
     array: NDArray[np.float64] = field(repr=False, compare=False)
-    """What the kernels read: see ``value``."""
+    """Kind and parameters, as the kernel ``value`` reads them."""
 
     def __call__(self, d: float) -> float:
         if not d >= 0:
@@ -98,7 +99,7 @@ class Value:
         return float(_value(self.array, float(d)))
 
     def information(self, x: Sequence[float] | NDArray[np.float64]) -> float:
-        """H of messages received with these coordinates, which must be finite and must not decrease (Eq. 2)."""
+        """H of messages received with these coordinates, which must be finite and must not decrease."""
         coordinates = np.ascontiguousarray(x, np.float64)
         if not (np.isfinite(coordinates).all() and (np.diff(coordinates) >= 0).all()):
             raise BufgymError("H: the coordinates must be finite numbers and must not decrease")
@@ -106,7 +107,7 @@ class Value:
 
 
 def _checked(name: str, array: list[float], distances: NDArray[np.float64]) -> Value:
-    """A ``Value`` that satisfies Eq. 3-6 at the given distances, or an error that says which one it breaks."""
+    """Make a ``Value`` and check Eq. 3-6 at the given distances; the error names the equation that it breaks."""
     v = Value(name, np.array(array, np.float64))
     v.array.flags.writeable = False
     levels = np.array([v(d) for d in distances])
@@ -128,7 +129,7 @@ def _checked(name: str, array: list[float], distances: NDArray[np.float64]) -> V
 
 
 def exponential(base: float = 0.618) -> Value:
-    """V(d) = 1 - base^d. The paper's Fig. 5 has base 0.618: a camera moving back from a wall."""
+    """Make V(d) = 1 - base^d. The paper's Fig. 5 has base 0.618, for a camera moving back from a wall."""
     if not 0 < base < 1:
         raise BufgymError(f"V = exponential: base = {base}: must lie strictly between 0 and 1")
     scale = -1 / math.log(base)
@@ -136,14 +137,14 @@ def exponential(base: float = 0.618) -> Value:
 
 
 def saturating(distance: float) -> Value:
-    """V(d) = min(1, d / distance): turning in place or driving along a corridor."""
+    """Make V(d) = min(1, d / distance), for turning in place or driving along a corridor."""
     if not 0 < distance < math.inf:
         raise BufgymError(f"V = saturating: distance = {distance}: must be a number > 0")
     return _checked(f"saturating:{distance:g}", [SATURATING, distance], np.linspace(0, 2 * distance, 33))
 
 
 def tabulated(distances: Sequence[float], values: Sequence[float]) -> Value:
-    """Your own V, linear between the given points and constant after the last; checked against Eq. 3-6."""
+    """Make your own V, linear between the given points and constant after the last; Eq. 3-6 are checked."""
     d, levels = np.asarray(distances, np.float64), np.asarray(values, np.float64)
     if d.ndim != 1 or d.shape != levels.shape or len(d) < 2:
         raise BufgymError(f"V = tabulated: {d.shape} distances and {levels.shape} values: need two equal lists of 2+")
@@ -151,7 +152,7 @@ def tabulated(distances: Sequence[float], values: Sequence[float]) -> Value:
         raise BufgymError("V = tabulated: every distance and value must be a finite number")
     if d[0] != 0 or (np.diff(d) <= 0).any():
         raise BufgymError(f"V = tabulated: distances {d.tolist()}: must begin at 0 and increase")
-    # Beyond the table V is constant: one more point lets the check see that corner too.
+    # V is constant after the table: one more point lets the check see that corner too.
     check = np.append(d, 2 * d[-1])
     return _checked(f"tabulated:{len(d)} points", _table(d.tolist(), levels.tolist()), check)
 
@@ -162,9 +163,9 @@ def _table(distances: Sequence[float], levels: Sequence[float]) -> list[float]:
 
 
 def of_function(v: Callable[[float], float], name: str = "") -> Value:
-    """Your own V(d) as a table of ``POINTS`` points, denser near 0, up to where it hardly grows; checked there.
+    """Make a table of ``POINTS`` points from your own V, denser near 0, up to where V hardly grows.
 
-    Between two points it is straight: for V = 1 - b^d that is at most 0.002 below.
+    The points are checked against Eq. 3-6. The table is straight between them, at most 0.002 too low for V = 1 - b^d.
     """
     name = name or getattr(v, "__name__", "function")
 
@@ -183,7 +184,7 @@ def of_function(v: Callable[[float], float], name: str = "") -> Value:
             break
         until *= 2
     below, top = 0.0, at(until)
-    for _ in range(60):  # where V ends in a corner, that is where the table ends
+    for _ in range(60):  # if V ends in a corner, the table ends there
         middle = (below + until) / 2
         below, until = (below, middle) if at(middle) >= top * (1 - 1e-12) else (middle, until)
     distances = [0.0, *np.geomspace(until / 1e4, until, POINTS - 1).tolist()]
@@ -191,13 +192,13 @@ def of_function(v: Callable[[float], float], name: str = "") -> Value:
 
 
 POINTS = 65
-"""Of a table made of a function."""
+"""Points of a table made from a function."""
 _SMALLEST, _LARGEST, _FLAT = 1e-3, 1e9, 1e-3
-"""Where the search for the end of a table begins and ends, and how little V may still grow there."""
+"""Where the search for a table's end starts and stops, and the relative growth of V that still counts as flat."""
 
 
 def parse(text: str) -> Value:
-    """``exponential:0.618``, ``saturating:4`` or ``tabulated:0=0,1=0.6,4=1``, as written on the command line."""
+    """Read a V from the command line: ``exponential:0.618``, ``saturating:4`` or ``tabulated:0=0,1=0.6,4=1``."""
     kinds: dict[str, Callable[..., Value]] = {"exponential": exponential, "saturating": saturating}
     kind, _, number = text.partition(":")
     if kind == "tabulated":
@@ -224,9 +225,10 @@ def _parse_table(text: str, points: str) -> Value:
 
 
 def load(v: Any) -> Value:
-    """V as a scenario takes it: a ``Value``, a function V(d), what ``parse`` reads, or ``module:function``.
+    """Make a ``Value`` from a scenario's setting: a ``Value``, a function V(d), or text.
 
-    That function is V(d) itself, or without arguments makes a V; its module is imported (see ``bufgym.modules``).
+    The text is for ``parse``, or ``module:function`` names V(d) itself or a function without arguments that returns a
+    V.
     """
     name = ""
     if isinstance(v, str):

@@ -1,8 +1,8 @@
-"""Topics: what a robot publishes side by side over one uplink, and what its operator asks for each.
+"""Topics: the streams that a robot publishes side by side over one uplink, with the operator's rules for each.
 
-The terms are Robofleet's [sikand2021robofleet]: a topic has a priority, may have a rate limit, and may be ``no_drop``.
-Beyond Robofleet, every topic has a weight and a V of its own, so that H = sum of weight x H of the topic, and may have
-a deadline, after which its messages count as late.
+The terms come from Robofleet [sikand2021robofleet]: a topic has a priority, may have a rate limit, and may be
+``no_drop``. Beyond Robofleet, every topic has a weight and a V of its own, so H is the sum of weight x H over topics.
+A topic may also have a deadline, after which its messages count as late.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ class Topic:
     name: str
     """Unique among the topics of a client."""
     priority: float = 1.0
-    """p of Robofleet's schedulers: of two topics that wait equally long, the higher priority is sent first. With 0 it
-    goes when nothing else waits."""
+    """p of Robofleet's schedulers. Of two topics that wait equally long, the one of higher priority is sent first; a
+    topic of priority 0 goes when nothing else waits."""
     rate_limit_hz: float | None = None
-    """Messages that come sooner than 1 / rate after the last one kept are dropped, on a no_drop topic too; None for no
-    limit."""
+    """Rate limit, Hz; None for no limit. A message less than 1 / rate after the last one kept is dropped, even on a
+    no_drop topic."""
     no_drop: bool = False
-    """Its messages may not be dropped, once the rate limit has let them pass."""
+    """Whether messages that passed the rate limit may never be dropped."""
     limit: int | None = None
-    """Its messages in the buffer at most (a publisher's queue size); None for as many as the buffer holds."""
+    """Most messages of the topic in the buffer (a publisher's queue size); None for as many as the buffer holds."""
     weight: float | None = None
-    """What its H counts in the weighted sum; None for its priority."""
+    """Factor of the topic's H in the weighted sum; None for its priority."""
     value: Value | None = None
-    """V over its coordinate x; None for that of the scenario."""
+    """V over the topic's coordinate x; None for the scenario's V."""
     deadline_s: float | None = None
-    """A message older than this when it reaches the server is late; None for never."""
+    """Age at which a message arrives late at the server, s; None for never."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -80,18 +80,18 @@ class Topic:
     def period_us(self) -> int:
         """Least time between two kept messages, us; 0 without a rate limit.
 
-        Rounded down, so that a publisher at exactly the rate limit loses no message.
+        Rounded down, so that a publisher exactly at the rate limit loses no message.
         """
         return int(min(1e6 / self.rate_limit_hz, NO_DEADLINE_US)) if self.rate_limit_hz else 0
 
     @property
     def share(self) -> float:
-        """What its H counts in the weighted sum."""
+        """Factor of the topic's H in the weighted sum."""
         return self.priority if self.weight is None else self.weight
 
 
 def check_topics(topics: Sequence[Topic]) -> tuple[Topic, ...]:
-    """These topics, or an error: each a ``Topic``, names unique."""
+    """Check that these are Topics with unique names; return them as a tuple."""
     known: set[str] = set()
     for topic in topics:
         if not isinstance(topic, Topic):
@@ -105,7 +105,7 @@ def check_topics(topics: Sequence[Topic]) -> tuple[Topic, ...]:
 
 
 def copies_of(topics: Sequence[Topic], consumers: int) -> list[Topic]:
-    """The topics of a client that sends one copy to each consumer; together they weigh as much as before."""
+    """The topics of a client that sends one copy to each consumer; the total weight stays the same."""
     return [
         replace(topic, name=f"{topic.name} to {c + 1}", weight=topic.share / consumers)
         for c in range(consumers)
@@ -114,12 +114,12 @@ def copies_of(topics: Sequence[Topic], consumers: int) -> list[Topic]:
 
 
 def check_ack_delay(ack_delay_us: Any) -> int:
-    """The time from a message's last byte on the link to its ack, us, or an error."""
+    """Check the time from a message's last byte on the link to its ack, us."""
     return whole("ack_delay_us", ack_delay_us, 0, MAX_ACK_DELAY_US)
 
 
 def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """(TOPIC[topics] with their settings, all their V in one array); without topics, one row that sets no limits."""
+    """The topics' settings as TOPIC[topics], and all their V in one array; no topics give one row without limits."""
     # A single topic with rules gets a companion without messages: one row means "no rules, whatever the topic number".
     table = records(max(2, len(topics)) if topics else 1, TOPIC)
     arrays: list[NDArray[np.float64]] = [v.array]
@@ -138,7 +138,7 @@ def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArr
         if topic.deadline_s is not None:
             row["deadline_us"] = round(topic.deadline_s * 1e6)
     if topics:
-        table["priority"][len(topics) :] = table["weight"][len(topics) :] = 0.0  # the companion has no weight
+        table["priority"][len(topics) :] = table["weight"][len(topics) :] = 0.0  # the companion weighs nothing
     values = v.array if len(arrays) == 1 else np.concatenate(arrays)
     values.flags.writeable = False
     return table, values

@@ -1,9 +1,9 @@
-"""What an agent observes and is rewarded for: tables of fields, and the kernels that fill them from a robot's view.
+"""Observations and rewards of an agent: tables of fields, and the kernels that fill them from a robot's view.
 
-``@field`` and ``@reward_term`` add one's own.
+``@field`` and ``@reward_term`` add your own.
 """
 
-from bufgym.observe import terms as _terms  # noqa: F401  (registers those that are computed where they are named)
+from bufgym.observe import terms as _terms  # noqa: F401  (registers the terms that are computed where named)
 from bufgym.observe.fields import (
     CONTEXT_FIELDS,
     FIELDS,

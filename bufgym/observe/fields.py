@@ -1,16 +1,16 @@
-"""What an agent observes and what it is rewarded for: one table each, from which spaces, code and docs are made.
+"""Observation fields and reward terms, one table each, from which spaces, code and docs are made.
 
-Every field is computed from the ``Buffer`` view and the arrival alone, that is from what a robot has on board: its
-buffer, clock and odometry, and what its own socket still holds. Nothing comes from the server or the link's future.
+Every field is computed from the ``Buffer`` view and the arrival alone, that is from a robot's own buffer, clock,
+odometry and socket. Nothing comes from the server or the link's future.
 
-Every field lies in [0, 1] and is free of scale. Lengths g (of time, motion, bytes) appear as g / (g + r) with a
-stated reference r, so 0.5 means "as long as the reference". For gaps r is the *even spacing*: the distance from the
-message dequeued last to the newcomer, divided by L + 1. That is the gap between neighbours if L messages thin this
-stretch evenly (AFR's aim). So one set of weights serves every L and frame rate.
+Every field lies in [0, 1] and is free of scale. Lengths g (of time, motion, bytes) appear as g / (g + r) with a stated
+reference r, so 0.5 means "as long as the reference". For gaps r is the *even spacing*: the distance from the message
+dequeued last to the newcomer, divided by L + 1. That is the gap between neighbours if L messages thin this stretch
+evenly (AFR's aim). So one set of weights serves every L and frame rate.
 
-With several topics a message's neighbours are those of its own topic; the even spacing is the distance from the topic's
-message dequeued last to its last arrival, divided by one more than its queued messages; and values are weighted: QoI is
-in units of the largest weight. Further fields describe the topics.
+With several topics a message's neighbours belong to its own topic. The even spacing is the distance from the topic's
+message dequeued last to its last arrival, divided by one more than its queued messages. Values are weighted: QoI is in
+units of the largest weight. Further fields describe the topics.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ class Field:
     name: str
     """Unique over all tables."""
     per: str
-    """"slot": L + 1 entries, the newcomer's last; "context": one."""
+    """"slot" for L + 1 entries, the newcomer's last; "context" for one."""
     group: str
-    """What it takes to know it: queue (counting), time (a clock), motion (odometry), value (V), link (its own socket)
-    or topic (the topics' settings and past)."""
+    """Knowledge that it needs: queue (counting), time (a clock), motion (odometry), value (V), link (its own socket) or
+    topic (the topics' settings and past)."""
     unit: str
     """Its unit, or how it is scaled to [0, 1]."""
     meaning: str
-    """What it says."""
+    """Meaning in words."""
     low: float = 0.0
     """Least value."""
     high: float = 1.0
@@ -87,7 +87,7 @@ TOPIC_CONTEXT_FIELDS = (
     Field("in_flight", "context", "topic", "n/(n+r), r = n_T", "messages sent and not yet acknowledged"),
 )
 TOPIC_FIELDS = TOPIC_SLOT_FIELDS + TOPIC_CONTEXT_FIELDS
-"""Observed besides ``FIELDS`` where there are several topics."""
+"""Fields observed besides ``FIELDS`` with several topics."""
 
 _COLUMN = {
     field.name: column
@@ -111,22 +111,22 @@ SOCKET_ASKS, IN_FLIGHT = _COLUMN["socket_asks"], _COLUMN["in_flight"]
 
 @dataclass(frozen=True)
 class RewardTerm:
-    """One named reward; an environment rewards a weighted sum of them and reports each by name in ``info``."""
+    """A named reward; an environment rewards a weighted sum of them and reports each by name in ``info``."""
 
     name: str
     """Unique over all terms."""
     unit: str
     """Its unit."""
     meaning: str
-    """What it rewards."""
+    """Meaning in words."""
 
 
 REWARD_TERMS = (
     RewardTerm("delivered", "QoI", "V gained when a message arrives at the server; sums to H - 1"),
     RewardTerm("retained", "QoI", "change of the H that delivering all that is kept would give; sums to H - 1 too"),
 )
-"""``retained`` is ``delivered`` shaped by a potential (Ng, Harada and Russell 1999): the QoI held, not yet delivered.
-It gives at once what a decision costs or gains, and telescopes to the same total."""
+"""``retained`` is ``delivered`` shaped by a potential, the QoI held and not yet delivered (Ng, Harada and Russell
+1999). It shows at once what a decision costs or gains, and telescopes to the same total."""
 TOPIC_REWARD_TERMS = (
     RewardTerm("age", "s^2", "minus the weighted mean age of information at the server, integrated over time"),
     RewardTerm("late", "messages", "minus the weight of each message that reaches the server after its deadline"),

@@ -1,6 +1,7 @@
-"""Fields that come with bufgym besides those of the tables: computed where an environment's ``fields``, or a learned
-policy, names one. The link's rate as its own socket shows it, how arrivals come, V's shape, the room under B; and of a
-slot its gaps counted in messages.
+"""Built-in fields outside the tables, computed if an environment's ``fields`` or a learned policy names them.
+
+They describe the link's rate as the robot's own socket shows it, the rhythm of arrivals, V's shape, the room under B,
+and each slot's gaps counted in messages.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from bufgym.observe.own import OWN_FIELDS, Function, OwnField
 from bufgym.observe.queue import TINY, squash
 
 ON_BOARD_FIELDS: list[OwnField] = []
-"""Those of the context, in the order in which ``observe_on_board`` writes them."""
+"""Context fields, in the order in which ``observe_on_board`` writes them."""
 ON_BOARD_SLOT_FIELDS: list[OwnField] = []
-"""Those of slots, in the order in which ``observe_on_board_slots`` writes them."""
+"""Slot fields, in the order in which ``observe_on_board_slots`` writes them."""
 
 
 def _field(per: str, group: str, unit: str) -> Callable[[Function], Function]:
-    """Register the decorated function as a field of its own name; kernels may call what comes back."""
+    """Register the decorated function as a field of its own name; kernels may call the returned function."""
 
     def add(function: Function) -> Function:
         name, meaning = function.__name__, first_line(function)
@@ -41,13 +42,13 @@ def _field(per: str, group: str, unit: str) -> Callable[[Function], Function]:
 
 @kernel
 def mean_bytes(buffer: Buffer, arrival: Any) -> float:
-    """Of the queued messages and the newcomer."""
+    """Mean size of the queued messages and the newcomer."""
     return float((buffer.backlog_bytes + arrival.size_bytes) / (len(buffer.slots) + 1))
 
 
 @kernel
 def demand(buffer: Buffer, arrival: Any) -> float:
-    """What the robot would like to send: a message of mean size at each arrival, bytes/s."""
+    """Rate that the robot would like to send at, bytes/s: a message of mean size at each arrival."""
     return 1e6 * mean_bytes(buffer, arrival) / max(buffer.period_us, 1.0)
 
 
@@ -105,7 +106,7 @@ def burstiness(buffer: Buffer, arrival: Any) -> float:
 
 @kernel
 def bend_at(buffer: Buffer, arrival: Any, evens: float) -> float:
-    """(2 V(d) - V(2 d)) / V(d) at d = so many even motion spacings; with several topics of the newcomer's."""
+    """(2 V(d) - V(2 d)) / V(d) at d = ``evens`` even motion spacings, of the newcomer's topic."""
     v, gap = buffer.v, arrival.x - buffer.dequeued_x
     if len(buffer.topics) > 1:
         v = v[buffer.topics[arrival.topic].v_start :]
@@ -156,7 +157,7 @@ def observe_on_board(buffer: Buffer, arrival: Any, context: NDArray[np.floating[
 def index_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
     """Arrivals since the message kept before slot ``k``, and the gap left if that is dropped; of any topic.
 
-    After the newcomer one more is expected, as the other gaps expect one more step.
+    After the newcomer one more arrival is expected, just as other gaps expect one more step.
     """
     s = len(buffer.slots)
     before = buffer.slots[k - 1].seq if k > 0 else buffer.dequeued_seq

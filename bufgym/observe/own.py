@@ -16,8 +16,8 @@
 
     env = gym.make("bufgym/Uplink-v0", fields=["rank", "loss", "waiting"], reward={"retained": 1, "drops": 0.1})
 
-They take part where they are named; in text that has to stand alone, ``module:function`` imports what registers them.
-``compile=True`` promises that Numba can compile the function, which is then called from compiled code.
+Fields and terms take part only where they are named. Text that has to stand alone names ``module:function``, which
+imports the module that registers them. ``compile=True`` promises that Numba can compile the function.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ class OwnField(Field):
 
     _: KW_ONLY
     function: Function
-    """(buffer, arrival) -> number for a field of the context, (buffer, arrival, k) -> number for one of slots."""
+    """(buffer, arrival) -> number for a context field, (buffer, arrival, k) -> number for a slot field."""
     compile: bool = False
-    """Promises that Numba can compile the function; if not, it runs as ordinary Python."""
+    """Promises that Numba can compile the function; otherwise it runs as ordinary Python."""
 
 
 @dataclass(frozen=True)
@@ -67,24 +67,24 @@ class OwnTerm(RewardTerm):
     parameters: Mapping[str, float] = entry(default_factory=dict)
     """Names and values of its settings, which the function reads as ``step.parameters``."""
     memory: Mapping[str, float] = entry(default_factory=dict)
-    """Names and values at an episode's begin of what it remembers, float64[entries]."""
+    """Names and initial values of its memory, float64[entries], at an episode's begin."""
     one_queue: bool = False
-    """Whether it is made for one queue alone: with several topics there is no such term, or a built-in one."""
+    """Whether it is for one queue only: with several topics the term is missing, or a built-in one of that name."""
     compile: bool = False
-    """As of ``OwnField``."""
+    """As in ``OwnField``."""
 
     @property
     def parameter_array(self) -> NDArray[np.float64]:
-        """What the function reads: float64[parameters], read-only."""
+        """Numbers for ``step.parameters``: float64[parameters], read-only."""
         numbers = np.array(list(self.parameters.values()), np.float64)
         numbers.flags.writeable = False
         return numbers
 
 
 OWN_FIELDS: dict[str, OwnField] = {}
-"""By name, in the order of their registration."""
+"""Your own fields by name, in the order of their registration."""
 OWN_TERMS: dict[str, OwnTerm] = {}
-"""Likewise; those that come with bufgym stand in ``bufgym.observe.terms``."""
+"""Terms likewise; the built-in ones are in ``bufgym.observe.terms``."""
 
 Entry = TypeVar("Entry", OwnField, OwnTerm)
 
@@ -144,9 +144,9 @@ def reward_term(
 ) -> Callable[[Function], Function]:
     """Register the decorated function ``f(step, memory)`` as the reward term ``name``; it comes back unchanged.
 
-    Environments whose ``reward`` names it compute it at each step: ``reward={"retained": 1, "late:deadline_s=2": 0.1}``
-    sets a parameter; a weight of 0 reports it without counting it. ``step`` is a ``bufgym.envs.own.Step``, ``memory``
-    float64[entries] of its own for each sender and episode. The other arguments are those of ``OwnTerm`` and ``field``.
+    Environments whose ``reward`` names it compute it at each step. ``reward={"retained": 1, "late:deadline_s=2": 0.1}``
+    sets a parameter. A weight of 0 reports the term without counting it. ``step`` is a ``bufgym.envs.own.Step``, and
+    ``memory`` is float64[entries] for each sender and episode. The other arguments are as in ``OwnTerm`` and ``field``.
 
     Raises:
         BufgymError: the name is taken or no name, or the function does not take two arguments.
@@ -164,12 +164,12 @@ def reward_term(
 
 
 def own_field(text: str) -> OwnField | None:
-    """The field of that name, or that ``module:function`` registers; None if there is none."""
+    """The field of that name, or the field that ``module:function`` registers; None if there is none."""
     return _found(text, OWN_FIELDS, "field")
 
 
 def own_term(text: str) -> OwnTerm | None:
-    """The term of that name, ``name:parameter=number`` or ``module:function``, named as in ``text``; None likewise."""
+    """The term that ``text`` names, also by ``name:parameter=number`` or ``module:function``; None if there is none."""
     if modules.is_named(text):
         return _found(text, OWN_TERMS, "reward term")
     name, settings = named_settings("reward term", text)

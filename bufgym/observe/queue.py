@@ -1,4 +1,4 @@
-"""One queue: the fields of ``fields.SLOT_FIELDS`` and ``CONTEXT_FIELDS``, computed."""
+"""Fields of one queue: the kernels for ``fields.SLOT_FIELDS`` and ``CONTEXT_FIELDS``."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ ROUNDING = 1e-12
 
 @kernel
 def squash(g: float, reference: float) -> float:
-    """g / (g + reference), in [0, 1]; 0 where both are 0."""
+    """Map a length g >= 0 to [0, 1] by g / (g + reference); 0 if both are 0."""
     return g / (g + max(reference, TINY))
 
 
 @kernel
 def squash_row(row: NDArray[np.floating[Any]], reference: float) -> None:
-    """``squash`` of every entry, in place and in single precision."""
+    """Apply ``squash`` to every entry, in place and in single precision."""
     r = np.float32(max(reference, TINY))
     for k in range(len(row)):
         row[k] = row[k] / (row[k] + r)
@@ -34,7 +34,7 @@ def squash_row(row: NDArray[np.floating[Any]], reference: float) -> None:
 
 @kernel
 def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
-    """V of the even motion spacing, and the QoI lost where two such gaps become one."""
+    """V of the even motion spacing, and the QoI lost by merging two such gaps."""
     even = (arrival.x - buffer.dequeued_x) / (buffer.capacity + 1)
     gain = value(buffer.v, even)
     return gain, merging_loss(buffer.v, even, gain, even, gain)
@@ -42,7 +42,7 @@ def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
 
 @kernel
 def observe_link(buffer: Buffer, context: NDArray[np.floating[Any]]) -> None:
-    """Write what does not depend on the arrival into ``context``: how full the buffer is, how its link does."""
+    """Write the fields that do not depend on the arrival into ``context``: state of the buffer and its link."""
     context[fields.OCCUPANCY] = len(buffer.slots) / buffer.capacity
     context[fields.BACKLOG] = buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0
     context[fields.BUSY] = buffer.busy
@@ -66,10 +66,10 @@ def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[A
 
 @kernel
 def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
-    """Write every SLOT_FIELDS value into ``rows`` (float[fields, L + 1]); empty slots are 0, the newcomer is last.
+    """Write every SLOT_FIELDS value into ``rows``, float[fields, L + 1]; empty slots are 0, the newcomer is last.
 
-    The gaps are those of ``buffer.time_gaps`` and ``motion_gaps``, the loss is that of ``buffer.loss``, computed in one
-    pass along the queue; gaps and relative losses are squashed row by row afterwards.
+    Gaps equal ``buffer.time_gaps`` and ``motion_gaps``, and losses equal ``buffer.loss``, here computed in one pass
+    along the queue. Gaps and relative losses are squashed row by row afterwards.
     """
     s, last = len(buffer.slots), buffer.capacity
     per_rank = 1 / (s + 1)
@@ -90,7 +90,7 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
         rows[fields.MOTION_BEFORE, k] = slot_x - before_x
         rows[fields.MOTION_MERGED, k] = after_x - before_x
         lost = merging_loss(buffer.v, slot_x - before_x, gain, after_x - slot_x, after_gain)
-        rows[fields.LOSS, k] = max(lost, 0.0)  # it may be rounded to less
+        rows[fields.LOSS, k] = max(lost, 0.0)  # rounding may make it negative
         rows[fields.RELATIVE_LOSS, k] = rows[fields.LOSS, k]
         rows[fields.SIZE, k] = slot.size_bytes
         before_us, before_x = slot_us, slot_x
@@ -105,7 +105,7 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
     rows[fields.MOTION_BEFORE, last] = arrival.x - before_x
     rows[fields.MOTION_MERGED, last] = arrival.x - before_x + step_x
     rows[fields.LOSS, last] = max(
-        0.0,  # nothing is lost with a first message, which has no gap before it to merge
+        0.0,  # a first message has no gap before it to merge, so nothing is lost with it
         merging_loss(buffer.v, arrival.x - before_x, newcomer_gain, step_x, value(buffer.v, step_x)),
     )
     rows[fields.RELATIVE_LOSS, last] = rows[fields.LOSS, last]

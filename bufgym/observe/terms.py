@@ -1,6 +1,6 @@
-"""Reward terms that come with bufgym besides those of the tables: computed where an environment's ``reward`` names one.
+"""Built-in reward terms outside the tables, computed where an environment's ``reward`` names one.
 
-Each is a cost, hence negative: a weight > 0 makes less of it better. What a step is: ``bufgym.envs.own.Step``.
+Each is a cost, hence negative: a weight > 0 rewards less of it. Steps are ``bufgym.envs.own.Step``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def age(step: Any, memory: Any) -> float:
     "minus the age of information at the server, integrated over time (s^2), from the first arrival to the last"
     if len(step.messages) == 0:
         return 0.0
-    if memory[0] < 0:  # what counts as received before anything is
+    if memory[0] < 0:  # before the first receipt, the first arrival counts
         memory[0] = memory[1] = step.messages[0].arrival_us
     last_us = step.messages[len(step.messages) - 1].arrival_us
     area = 0.0

@@ -1,4 +1,4 @@
-"""Several topics: the same fields, each message's neighbours being those of its own topic, and ``TOPIC_FIELDS``."""
+"""Fields with several topics: the fields of one queue, with neighbours of the same topic, and ``TOPIC_FIELDS``."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ def fill_gaps(
     weight: float,
     rows: NDArray[np.floating[Any]],
 ) -> None:
-    """The gaps and losses of the message in column ``k``, of topic ``number``, whose successor is one step after it.
+    """Write gaps and losses of the message in column ``k``, of topic ``number``, whose successor is one step after it.
 
-    Its row holds the plain gaps to its predecessor; ``weight``: the largest of all topics.
+    Its row holds the plain gaps to its predecessor. ``weight`` is the largest of all topics.
     """
     topic = buffer.topics[number]
     v = buffer.v[topic.v_start :]
@@ -72,14 +72,14 @@ def fill_gaps(
 
 @kernel
 def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDArray[np.floating[Any]]) -> None:
-    """Write every SLOT_FIELDS and TOPIC_SLOT_FIELDS value into ``rows`` (float[fields, L + 1]).
+    """Write every SLOT_FIELDS and TOPIC_SLOT_FIELDS value into ``rows``, float[fields, L + 1].
 
-    Empty slots are 0. The newcomer is last; when the socket asks (not ``arriving``) its column is empty too.
+    Empty slots are 0. The newcomer is last; if the socket asks (not ``arriving``) its column is empty too.
     """
     s, capacity = len(buffer.slots), buffer.capacity
     priority, weight = largest(buffer)
     for number in range(len(buffer.topics)):
-        buffer.topics[number].mark = -1  # the column of the topic's message before the one at hand
+        buffer.topics[number].mark = -1  # the column of the topic's previous message
     rows[:, s:] = 0.0
     count = s + 1 if arriving else s
     size_sum, gain_sum = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""What policies are measured against: the best possible in one interruption, on any link, and without knowing T."""
+"""Bounds for policies: the best possible in one interruption, on any link, and without knowing T."""
 
 from bufgym.oracle.clairvoyant import Plan, clairvoyant
 from bufgym.oracle.interruption import by_length, ideal, integer

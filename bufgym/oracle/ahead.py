@@ -1,9 +1,9 @@
-"""What can still be gained, from any moment of an episode: the clairvoyant for states that policies come to.
+"""The gain still attainable from any moment of an episode: the clairvoyant for states that policies reach.
 
-As in ``labels``, sizes are equal (b bytes) and C(t) counts the bytes that the link can carry. ``F(i, e)`` is the most
-that can be gained after message i, if that is sent, ends at byte e and nothing else of what arrived before it is kept.
-As a function of e it is a falling staircase, and the staircase of message i follows from those of all later ones: one
-backward sweep over the episode (``find_steps``) finds all of them exactly. ``from_queue`` adds what is queued.
+As in ``labels``, sizes are equal (b bytes) and C(t) counts the bytes that the link can carry. ``F(i, e)`` is the
+largest gain after message i if it is sent, ends at byte e, and no other message that arrived before it is kept. As a
+function of e it is a falling staircase. The staircase of message i follows from those of all later messages, so one
+backward sweep over the episode (``find_steps``) finds all of them exactly. ``from_queue`` adds the queued messages.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from bufgym.model.qoi import value
 from bufgym.sim.state import Batch
 
 ALWAYS = 2**62
-"""A byte that no message ends after."""
+"""A byte beyond every message's end."""
 
 NO_ROOM, NO_WORK_SPACE = -1, -2
-"""What ``find_steps`` returns where it ran out of something."""
+"""Results of ``find_steps`` that ran out of room or of work space."""
 
 TIE = 1e-12
-"""A gain must be better by so much to replace another."""
+"""Least difference by which a gain must be better to replace another."""
 
 
 class Ahead(NamedTuple):
@@ -33,11 +33,11 @@ class Ahead(NamedTuple):
     Fields:
         c: int64[n, messages], bytes that the link can have carried when the message arrives.
         between, idle: int64[n, messages], as in ``programme.Problem``.
-        link: int64[n, 3]: b, bytes of every message; R, messages for which there is room; the link's last byte.
+        link: int64[n, 3], b (bytes of every message), R (messages for which there is room), the link's last byte.
         begin, stop: int64[n, messages], the steps of a message are ``begin : stop`` of the arrays below.
-        latest: int64[room], F(i, e) >= ``gain`` for e <= ``latest``; of one message falling, from ``ALWAYS`` on.
-        gain: float64[room], of one message rising, from 0 on.
-        follow: int32[room], the message that is sent next to gain as much; -1 for none.
+        latest: int64[room], F(i, e) >= ``gain`` for e <= ``latest``; falls within a message, beginning at ``ALWAYS``.
+        gain: float64[room], rises within a message, beginning at 0.
+        follow: int32[room], the message to send next for this gain; -1 for none.
     """
 
     c: NDArray[np.int64]
@@ -61,14 +61,14 @@ def find_steps(
     gain: NDArray[np.float64],
     follow: NDArray[np.int32],
 ) -> int:
-    """Find the steps of sender ``i``'s episode and put them at ``place``: where they end, NO_ROOM or NO_WORK_SPACE.
+    """Write the steps of sender ``i``'s episode from ``place`` on; return their end, NO_ROOM or NO_WORK_SPACE.
 
-    ``latest``, ``gain``, ``follow``: [2, room for the steps of one message], work space.
+    ``latest``, ``gain`` and ``follow`` are work space, each [2, room for the steps of one message].
     """
     b, room, ends = ahead.link[i, 0], ahead.link[i, 1], ahead.link[i, 2]
     v = batch.v[batch.senders[i].v_start :]
     for m in range(batch.senders[i].arrivals - 1, -1, -1):
-        now, held = 0, 1  # which of the two lists, how many steps it has
+        now, held = 0, 1  # which of the two lists, and its number of steps
         latest[0, 0], gain[0, 0], follow[0, 0] = ALWAYS, 0.0, -1
         c, x = at(ahead.c, i, m), at(batch.arrivals, i, m).x
         soonest, reach = c + b, c + (room + 1) * b
@@ -85,7 +85,7 @@ def find_steps(
                     break
                 furthest += 1
             if stop - begin == 1 or ahead.latest[begin + 1] < reach:
-                furthest = batch.senders[i].arrivals  # nothing follows m + 1 best: that is later than any
+                furthest = batch.senders[i].arrivals  # nothing follows m + 1 best: this is later than any message
         for j in range(m + 1, min(furthest + 1, batch.senders[i].arrivals)):
             enough = soonest
             if at(ahead.between, i, j) > m:
@@ -97,7 +97,7 @@ def find_steps(
                 break
             top = min(c_j + room * b, ends - b, reach)
             added = value(v, at(batch.arrivals, i, j).x - x)
-            # Steps of j from the highest that may be reached late enough, down to the last that is late enough.
+            # Steps of j from the highest one within reach, down to the last that is late enough.
             begin, stop = at(ahead.begin, i, j), at(ahead.stop, i, j)
             k = begin
             while k + 1 < stop and ahead.latest[k + 1] - b >= top:
@@ -140,7 +140,7 @@ def find_steps(
 
 @kernel
 def step_of(ahead: Ahead, i: int, m: int, e: int) -> int:
-    """Where the step lies that message ``m`` of sender ``i`` is on if it ends at byte ``e``."""
+    """Index of the step that message ``m`` of sender ``i`` is on if it ends at byte ``e``."""
     low, high = at(ahead.begin, i, m), at(ahead.stop, i, m)
     while high - low > 1:
         middle = (low + high) // 2
@@ -153,9 +153,9 @@ def step_of(ahead: Ahead, i: int, m: int, e: int) -> int:
 
 @kernel
 def sends(ahead: Ahead, i: int, m: int, e: int) -> float:
-    """The most that follows if message ``m`` is sent next, after byte ``e``, apart from what it adds itself.
+    """Largest gain after message ``m`` if it is sent next, from byte ``e`` on, without its own gain.
 
-    -1: it found no room; -2: neither it nor any later one can be delivered any more.
+    -1 if it found no room; -2 if neither it nor any later message can be delivered any more.
     """
     b, c = ahead.link[i, 0], at(ahead.c, i, m)
     u = max(e, c)

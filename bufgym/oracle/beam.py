@@ -1,9 +1,9 @@
 """A good plan for messages of unequal sizes: beam search along the episode, guided by the priced programme.
 
-For each message a few *states* are kept: ways to send it last, each with the byte at which it ends, its gain, and the
-message and state before it. So the queue that a later arrival meets is known exactly: those messages of the state that
-have not begun by then. States are ranked by what they have gained, less what they paid, plus what the programme
-(``programme``) promises.
+For each message the search keeps a few *states*, ways to send it last. A state has the byte at which the message ends,
+its gain, and the message and state before it. So the queue at a later arrival is known exactly: all messages of the
+state that have not begun by then. States are ranked by their gain, less the prices paid, plus the gain that the
+programme (``programme``) promises.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ class States(NamedTuple):
     """The states at each message, best first; arrays over [messages, width]."""
 
     used: NDArray[np.int64]
-    """[messages]: states in use."""
+    """[messages]: number of states in use."""
     end: NDArray[np.int64]
-    """The byte at which the message ends."""
+    """Byte at which the message ends."""
     gain: NDArray[np.float64]
     net: NDArray[np.float64]
-    """The gain, less the prices paid."""
+    """Gain less the prices paid."""
     promise: NDArray[np.float64]
-    """``net``, and what may still be gained: the rank of the state."""
+    """Rank of the state: ``net`` plus an upper bound of the gain to come."""
     parent: NDArray[np.int64]
-    """[messages, width, 2]: the message sent before, and its state; -1: none."""
+    """[messages, width, 2]: the message sent before, and its state; -1 for none."""
     latest: NDArray[np.int64]
     """[messages]: the latest end of any state at this message or one before it."""
 
 
 def new_states(messages: int, width: int) -> States:
-    """Room for so many states."""
+    """Make room for ``width`` states at each message."""
     shape = (messages, width)
     return States(
         np.zeros(messages, np.int64),
@@ -58,7 +58,7 @@ def ends_too_early(p: Problem, i: int, e: int, j: int) -> bool:
 
 @kernel
 def search(p: Problem, room: Room, states: States, plan: NDArray[np.int64]) -> tuple[int, float]:
-    """(length, gain) of the best plan found; its messages go to ``plan``, the last one first."""
+    """Find a good plan; return (length, gain) and write its messages to ``plan``, the last one first."""
     best_gain, best_message, best_state = 0.0, -1, -1
     for j in range(len(p.c)):
         states.used[j] = 0
@@ -87,7 +87,7 @@ def search(p: Problem, room: Room, states: States, plan: NDArray[np.int64]) -> t
 
 @kernel
 def offer(p: Problem, room: Room, states: States, j: int, i: int, w: int) -> None:
-    """Send message j after state ``w`` of message i (-1: first of all), if it finds room and is among the best."""
+    """Add "message j after state ``w`` of message i" if j finds room and is among the best; i = -1 for none."""
     e = states.end[i, w] if i >= 0 else 0
     s = max(e, p.c[j])
     if s - p.c[j] > p.limit[j] or s + p.size[j] > p.ends:
@@ -105,7 +105,7 @@ def offer(p: Problem, room: Room, states: States, j: int, i: int, w: int) -> Non
         return
     for other in range(k):
         if states.end[j, other] == end and states.net[j, other] == net:
-            return  # the same by all that ranks it
+            return  # equal in rank, end and gain
     k = min(k, width - 1)
     states.used[j] = k + 1
     while k > 0 and states.promise[j, k - 1] < promise:
@@ -120,9 +120,9 @@ def offer(p: Problem, room: Room, states: States, j: int, i: int, w: int) -> Non
 
 @kernel
 def has_room(p: Problem, room: Room, states: States, i: int, w: int, j: int) -> bool:
-    """Whether message j fits into the queue that state ``w`` of message i has left, by messages and by bytes."""
+    """Whether message j fits, by messages and by bytes, into the queue left by state ``w`` of message i."""
     queued, backlog = 1, p.size[j]
-    # Messages began in the order in which they were sent: those that wait still are the last ones.
+    # Messages begin in the order of sending: the last ones still wait.
     while i >= 0 and states.end[i, w] - p.size[i] > p.c[j]:
         queued += 1
         backlog += p.size[i]

@@ -1,15 +1,16 @@
 """The clairvoyant: the best QoI that any policy could reach on an episode, knowing the whole link and workload.
 
-Let C(t) be the bytes that the link can carry by time t, c_i = C(arrival time of message i), b_i its size. In hindsight
-a policy is the set of messages that it sent. Message i of that set begins at byte s_i = max(c_i, e) of the link and
-ends at e_i = s_i + b_i, where e is the end of the message sent before it: the socket is serial and never idle while
-a message waits. Rejecting all other messages at their arrival keeps the queue shortest. With equal sizes b, the queue
-(message i included) then holds ceil((s_i - c_i) / b) messages after arrival i, so there is room for i if and only if
+Let C(t) be the bytes that the link can carry by time t, b_i the size of message i and c_i = C(its arrival time). In
+hindsight a policy is the set of messages that it sent. If e is the end of the message sent before, message i begins at
+byte s_i = max(c_i, e) of the link and ends at e_i = s_i + b_i. The reason is that the socket sends one message at a
+time and never idles while a message waits. Rejecting all other messages at their arrival keeps the queue shortest. With
+equal sizes b, the queue (message i included) then holds ceil((s_i - c_i) / b) messages after arrival i. So there is
+room for i if and only if
 
     s_i - c_i <= L b.
 
 ``labels.py`` finds the best set under that condition. With unequal sizes the room left depends on which messages wait:
-``unequal.py`` finds a good set and an upper bound that is close to it.
+``unequal.py`` finds a good set and a close upper bound.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from bufgym.policies.registry import register
 from bufgym.scenario import Episode
 
 _SHORT = 2_000
-"""Messages of an episode whose plan is found in a fraction of a second on any link."""
+"""Messages of an episode whose plan takes a fraction of a second on any link."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,9 @@ class Plan:
     qoi: float
     """The best H, or an upper bound of it: no policy with this L and B reaches more."""
     kept: NDArray[np.bool_]
-    """bool[messages]: which to accept; the others are rejected at their arrival."""
+    """bool[messages]: True to accept a message, False to reject it at its arrival."""
     certified: bool
-    """Whether these decisions, at every arrival of a sender, reach ``qoi``; if not, ``qoi`` is an upper bound."""
+    """Whether these decisions, asked at every arrival, reach ``qoi``; if not, ``qoi`` is an upper bound."""
 
 
 def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | None = None) -> Plan:
@@ -59,7 +60,7 @@ def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | N
 
 
 def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> Plan:
-    """See ``clairvoyant``."""
+    """Compute the plan for ``clairvoyant``."""
     arrivals = np.asarray(episode.arrivals)
     n = len(arrivals)
     capacity = min(capacity, n)
@@ -72,11 +73,11 @@ def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> P
         limit = np.full(n, room * size[0] if room else NEVER)
         sent, gain = labels.best(c, size, limit, x, v.array, ends)
     elif _fits(c, size, capacity, most_bytes, ends, np.empty(n, np.int64)):
-        sent, gain = np.arange(n), v.information(x) - 1.0  # as V is concave, no plan is better than to send all
+        sent, gain = np.arange(n), v.information(x) - 1.0  # V is concave, so no plan beats sending all messages
     else:
         limit = np.empty(n, np.int64)
         _relaxed_limits(c, size, capacity, most_bytes, np.empty(n, np.int64), np.empty(capacity, np.int64), limit)
-        # Where no more bytes wait than the L smallest messages have, fewer than L wait.
+        # While no more bytes wait than in the L smallest messages, fewer than L messages wait.
         certain = np.minimum(np.minimum(limit, np.sort(size)[:capacity].sum()), most_bytes - size)
         sent, gain = unequal.best(c, size, limit, certain, x, v.array, ends, capacity, most_bytes)
     kept = np.zeros(n, np.bool_)
@@ -84,7 +85,7 @@ def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> P
     qoi = 1.0 + gain if len(sent) else 0.0
     reached = v.information(x[sent]) >= qoi - 1e-9
     fits = bool(_fits(c[sent], size[sent], capacity, most_bytes, ends, np.empty(len(sent), np.int64)))
-    # Arrivals without a decision are accepted where there is room.
+    # Arrivals without a decision are accepted if there is room.
     undecided = ~kept
     undecided[episode.first_decision : episode.last_decision + 1] = False
     return Plan(qoi, kept, reached and fits and not undecided.any())
@@ -100,11 +101,11 @@ def _relaxed_limits(
     largest: NDArray[np.int64],
     limit: NDArray[np.int64],
 ) -> None:
-    """``limit[i]``: there is no room for message i if more bytes than this have to pass before it.
+    """Fill ``limit``: message i finds no room if more than ``limit[i]`` bytes have to pass before it.
 
-    What passes before i is the rest of the message in transmission and at most L - 1 queued ones: together no more
-    than the L largest of those that can still be on their way, and without the one in transmission no more than B less
-    the size of i. ``reach`` and ``largest`` are work space, int64[messages] and int64[L].
+    Before i pass the rest of the message in transmission and at most L - 1 queued ones. They have at most the bytes of
+    the L largest messages that can still be on their way. Without the one in transmission they have at most B less the
+    size of i. ``reach`` and ``largest`` are work space, int64[messages] and int64[L].
     """
     for i in range(len(c)):
         held = 0  # entries of ``largest`` in use, in falling order
@@ -135,9 +136,9 @@ def _relaxed_limits(
 def _fits(
     c: NDArray[np.int64], size: NDArray[np.int64], capacity: int, max_bytes: int, ends: int, leaves: NDArray[np.int64]
 ) -> bool:
-    """Whether a sender has room for each of these messages, if nothing else arrives, and the link carries them all.
+    """Whether a sender with no other arrivals has room for each of these messages, and the link carries them all.
 
-    ``leaves[k]``: message k is queued until the link has carried so many bytes.
+    Message k is queued until the link has carried ``leaves[k]`` bytes.
     """
     head, backlog, e = 0, 0, 0
     for k in range(len(c)):
@@ -168,7 +169,7 @@ def follow(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
 
 
 def integer_plan(episode: Episode, capacity: int, max_bytes: int, v: Value) -> NDArray[np.float64]:
-    """``evenly_kept`` as a policy's memory; an error unless the episode is one interruption."""
+    """Write ``evenly_kept`` as a policy's memory; raise unless the episode is one interruption."""
     arrivals = np.asarray(episode.arrivals)
     T, size = len(arrivals) - 2, int(arrivals["size_bytes"][0])
     stands = T >= 1 and episode.link.carried_by(arrivals["arrival_us"])[T] == 0

@@ -1,10 +1,10 @@
-"""From a queue on: the value of every action, where ``ahead`` knows what comes after what is queued.
+"""The value of every action at a queue, combining the queued messages with ``ahead`` for later arrivals.
 
-A plan first sends some of the s messages that are queued after the action, and then only later arrivals, from where F
-knows the rest. But a queue of s messages is s transmissions without a pause, whatever is decided: decisions exchange
-messages, one an arrival, and never make the queue shorter. So the t-th of these, which begins at byte u_t, can send
-message m only if m was there before byte u_t, and s - t later ones were, too. A plan without this condition is a bound;
-nearly always it meets the condition anyway. If not, ``forced`` finds the best.
+A plan first sends some of the s messages queued after the action, then only later arrivals, for which F is known. A
+queue of s messages means s transmissions without a pause, whatever the policy decides: a decision exchanges one message
+per arrival and never shortens the queue. Let the t-th transmission begin at byte u_t. It can send message m only if m
+and s - t later messages were there before byte u_t. Plans without this condition give a bound, and nearly always they
+meet it anyway. If not, ``forced`` finds the best.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ class Work(NamedTuple):
     """Work space of ``find_values`` for queues of up to L messages.
 
     Fields:
-        x: float64[L + 1], of the queued messages and the newcomer, its last.
-        first: float64[L + 1], what each adds if it is sent next.
-        pair: float64[L + 1, L + 1], what the second adds if it is sent after the first.
-        own: float64[L + 2, L + 1], the most of so many of the queue's own messages, of which this is the last.
-        jump: float64[L + 2, L + 1], the most after these, if only later arrivals follow.
-        target: int64[L + 2, L + 1], the first of those; -1 for none.
-        slots: int64[L + 1], what is queued after the action.
+        x: float64[L + 1], coordinates of the queued messages and of the newcomer, its last.
+        first: float64[L + 1], gain of each if it is sent next.
+        pair: float64[L + 1, L + 1], gain of the second if it is sent after the first.
+        own: float64[L + 2, L + 1], best gain of so many of the queue's own messages, of which this is the last.
+        jump: float64[L + 2, L + 1], best gain after these if only later arrivals follow.
+        target: int64[L + 2, L + 1], the first of those arrivals; -1 for none.
+        slots: int64[L + 1], messages queued after the action.
         arrived: int64[L + 2], arrivals after the newcomer by the time of the t-th transmission.
-        future: float64[messages], of each later arrival.
-        forced: float64[2, L + 1 + messages], of each candidate.
+        future: float64[messages], gain after each later arrival.
+        forced: float64[2, L + 1 + messages], gain of each candidate.
     """
 
     x: NDArray[np.float64]
@@ -49,7 +49,7 @@ class Work(NamedTuple):
 
 
 def new_work(capacity: int, messages: int) -> Work:
-    """Work space for L = ``capacity`` and episodes of so many ``messages``."""
+    """Make work space for L = ``capacity`` and episodes of so many ``messages``."""
     L = capacity
     table = (L + 2, L + 1)
     return Work(
@@ -68,7 +68,7 @@ def new_work(capacity: int, messages: int) -> Work:
 
 @kernel
 def find_values(batch: Batch, ahead: Ahead, work: Work, action_mask: NDArray[np.int8], values: NDArray[Any]) -> None:
-    """``values``, float64[n, L + 2]: the best H attainable with each action now, in hindsight; NaN if it is invalid."""
+    """Fill ``values``, float64[n, L + 2]: the best H attainable in hindsight with each action; NaN if invalid."""
     for i in range(len(batch.senders)):
         sender = batch.senders[i]
         values[i, :] = np.nan
@@ -84,7 +84,7 @@ def find_values(batch: Batch, ahead: Ahead, work: Work, action_mask: NDArray[np.
                 continue
             values[i, action] = h
             if e > ahead.link[i, 2]:
-                continue  # nothing is delivered any more
+                continue  # no further message is delivered
             count = 0
             for k in range(own):
                 gone = k == action if action < sender.capacity else action == sender.capacity and k == own - 1
@@ -96,7 +96,7 @@ def find_values(batch: Batch, ahead: Ahead, work: Work, action_mask: NDArray[np.
 
 @kernel
 def so_far(batch: Batch, i: int, ends: int) -> tuple[float, int]:
-    """(H of all that the socket has taken, byte at which the last of it ends); without what is never delivered."""
+    """H of all messages that the socket took and the link will carry, and the byte at which the last of them ends."""
     sender = batch.senders[i]
     gain, counted = sender.delivered_gain, sender.dequeued
     e = sender.position
@@ -120,7 +120,7 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
     for k in range(own):
         x = at(batch.arrivals, i, n).x if k == own - 1 else at(batch.slots, i, sender.first + k).x
         work.x[k] = x
-        work.first[k] = value(v, x - last_x) if sent else 1.0  # the very first is the 1 in H
+        work.first[k] = value(v, x - last_x) if sent else 1.0  # the very first message gains the 1 in H
         for j in range(k):
             work.pair[j, k] = value(v, x - work.x[j])
     count = 0
@@ -132,17 +132,17 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
         u = e + (t - 1) * b  # t - 1 of the queue are sent, then a later arrival
         known, chosen = n, n + 1
         for k in range(max(0, t - 2), own if t > 1 else 1):
-            # Of a later message the best to follow is no earlier: V is concave.
+            # The best successor of a later message is no earlier: V is concave.
             most, target, m = 0.0, -1, chosen
             while m < sender.arrivals:
                 if at(ahead.between, i, m) > n and at(ahead.idle, i, m) >= u:
-                    break  # something could be sent in the meantime
+                    break  # another message could be sent in the meantime
                 if m > known:
                     work.future[m] = sends(ahead, i, m, u)
                     known = m
                 after = work.future[m]
                 if after < -1 or (after >= 0 and after + 1 <= most):
-                    break  # with a later message there is not more to follow
+                    break  # a later message has no larger gain after it
                 if after >= 0:
                     x = at(batch.arrivals, i, m).x
                     added = value(v, x - (last_x if t == 1 else work.x[k])) if sent or t > 1 else 1.0
@@ -155,7 +155,7 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
 
 @kernel
 def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int) -> float:
-    """The most that is still gained with the first ``count`` of ``work.slots`` queued and the socket free at ``e``."""
+    """Best gain with the first ``count`` of ``work.slots`` queued and the socket free at byte ``e``."""
     b, ends = ahead.link[i, 0], ahead.link[i, 2]
     until = min(count, (ends - e) // b)  # transmissions of this queue that are delivered
     most, sent, target = work.jump[0, 0], 0, work.target[0, 0]
@@ -169,7 +169,7 @@ def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int
                     j = work.slots[before]
                     gain = max(gain, work.own[t - 1, j] + work.pair[j, k])
             work.own[t, k] = gain
-            # Of equals those that send more: they are less often impossible.
+            # Of equal plans those that send more: they are less often impossible.
             if gain + work.jump[t, k] >= most - TIE:
                 most, sent, target = gain + work.jump[t, k], t, work.target[t, k]
     if possible(ahead, work, i, batch.senders[i].next, e, count, until, sent, target):
@@ -179,7 +179,7 @@ def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int
 
 @kernel
 def possible(ahead: Ahead, work: Work, i: int, n: int, e: int, count: int, until: int, sent: int, target: int) -> bool:
-    """Whether a plan that sends so many of the queue and then ``target`` keeps the socket as busy as it has to be."""
+    """Whether a plan with ``sent`` of the queue's messages and then ``target`` keeps the socket busy enough."""
     b, m = ahead.link[i, 0], target
     for t in range(sent + 1, until + 1):
         if m < 0 or m - n > work.arrived[t] - (count - t):
@@ -190,9 +190,9 @@ def possible(ahead: Ahead, work: Work, i: int, n: int, e: int, count: int, until
 
 @kernel
 def forced(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int, until: int) -> float:
-    """``best_from``, with the condition kept by each of the first ``until`` transmissions.
+    """Compute ``best_from`` with the condition kept by each of the first ``until`` transmissions.
 
-    Candidates are numbered: what is queued from 0 on, later arrivals from ``count`` on.
+    Candidates are numbered: the queue from 0 on, later arrivals from ``count`` on.
     """
     b, n = ahead.link[i, 0], batch.senders[i].next
     v = batch.v[batch.senders[i].v_start :]

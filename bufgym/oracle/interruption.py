@@ -1,10 +1,10 @@
 """The best possible QoI in one interruption whose length T is known (AFR [wang2022afr], Sec. III-C).
 
-Message 0 was sent before, message T + 1 is sent after, and L of the T between can be kept: L + 1 gaps that add up to
-T + 1. V is concave, so equal gaps are best. ``ideal`` and ``integer`` count the information gained after message 0, as
-the paper does: they compare with H - 1 of a run.
+Message 0 was sent before and message T + 1 is sent after; L of the T messages between can be kept. This makes L + 1
+gaps that add up to T + 1. V is concave, so equal gaps are best. ``ideal`` and ``integer`` count the information gained
+after message 0, as the paper does: compare them with H - 1 of a run.
 
-``by_length`` scores a policy for every T at once: up to an arrival nothing that a policy sees depends on T, so the
+``by_length`` scores a policy for every T at once. Until an arrival, nothing that a policy sees depends on T. So the
 longest interruption holds all shorter ones, and one run gives the exact mean over any law of T.
 """
 
@@ -24,14 +24,14 @@ def _check(capacity: int, T: int) -> None:
 
 
 def ideal(capacity: int, T: int, v: Value) -> float:
-    """``oracle-ideal``: (L + 1) V((T + 1) / (L + 1)), as if gaps could be real numbers; T + 1 gaps of 1 for T <= L."""
+    """``oracle-ideal``: (L + 1) V((T + 1) / (L + 1)) with real-numbered gaps; for T <= L, T + 1 gaps of 1."""
     _check(capacity, T)
     gaps = min(capacity, T) + 1
     return gaps * v((T + 1) / gaps)
 
 
 def integer(capacity: int, T: int, v: Value) -> float:
-    """``oracle``: the best whole-numbered gaps, as equal as they can be (some q, the others q + 1)."""
+    """``oracle``: the best whole-numbered gaps, as equal as possible, some of q and the others of q + 1."""
     _check(capacity, T)
     gaps = min(capacity, T) + 1
     q, longer = divmod(T + 1, gaps)
@@ -39,17 +39,17 @@ def integer(capacity: int, T: int, v: Value) -> float:
 
 
 def evenly_kept(capacity: int, T: int) -> NDArray[np.int64]:
-    """Of messages 1..T those that ``integer`` keeps; none where there is no room for any."""
+    """Messages of 1..T that ``integer`` keeps; empty if there is no room for any."""
     gaps = min(capacity, T) + 1
     kept: NDArray[np.int64] = np.arange(1, gaps) * (T + 1) // gaps
     return kept
 
 
 def by_length(dropped: NDArray[np.int64], v: Value) -> NDArray[np.float64]:
-    """H of each interruption of T = 0..t_max messages (float64[t_max + 1]), from a run through the longest of them.
+    """H of each interruption of T = 0..t_max messages, float64[t_max + 1], from one run through the longest.
 
-    ``dropped``, int64[t_max + 2]: for message 0..t_max + 1 of that run, at which arrival it was dropped (1 = the first
-    of the interruption); a number after t_max if it never was.
+    ``dropped``, int64[t_max + 2], tells for each message 0..t_max + 1 of that run at which arrival it was dropped (1 =
+    the first of the interruption). A number after t_max means never.
     """
     h, kept = np.ones(len(dropped) - 1), np.zeros(len(dropped), np.int64)
     _by_length(np.ascontiguousarray(dropped, np.int64), v.array, kept, h)

@@ -1,22 +1,22 @@
 """The dynamic programme behind the clairvoyant: which messages to send for the most information.
 
-Message i may be sent after message j, which ends at byte e of the link, if s = max(e, c_i) leaves s - c_i <= limit_i;
-it then ends at s + size_i and adds V(x_i - x_j). A *label* (end, gain) at message i is a way to send i last. A label
-is dominated by another at the same message that ends no later and has gained no less: whatever can follow the first
-can follow the second. Dropping dominated labels loses nothing, so the best label of all is the optimum.
+Message i may be sent after message j, which ends at byte e of the link, if s = max(e, c_i) leaves s - c_i <= limit_i.
+It then ends at s + size_i and adds V(x_i - x_j). A *label* (end, gain) at message i is a way to send i last. A label is
+dominated by another at the same message that ends no later and has gained no less, as every continuation of the first
+also fits the second. Dropping dominated labels loses nothing, so the best label of all is the optimum.
 
 Two observations keep the labels few.
 
 *Idle time is never worth leaving out a message.* If some m between j and i could be sent whole before i arrives, the
-plan j, m, i ends where j, i ends and has gained no less: V(a) + V(b) >= V(a + b). So only those j count after which
-nothing else could have been sent in time.
+plan j, m, i ends where j, i ends and has gained no less, as V(a) + V(b) >= V(a + b). So j counts only if nothing else
+could have been sent in time after it.
 
-*Bounds.* With ends rounded down to a grid, the labels at a message are a fixed array, filled backwards in one sweep:
-``future``, an upper bound of what can still be gained. A label whose gain and future together stay below what is
-known to be reachable can be dropped. The search first assumes that the optimum lies close to the upper bound; if it
-finds nothing there, it looks further down, at last from the gain of a plan that ``future`` itself has led to.
+*Bounds.* With ends rounded down to a grid, the labels at a message are a fixed array. One backward sweep fills it with
+``future``, an upper bound of the gain to come. A label can be dropped if its gain and future together stay below a
+known reachable gain. The search first assumes that the optimum lies close to the upper bound. If it finds nothing
+there, it looks further down, at last from the gain of a plan that ``future`` itself has led to.
 
-Sizes are equal here. For others see ``unequal``.
+Sizes are equal here; ``unequal`` handles others.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ GRID = 16
 """Grid steps to a message."""
 
 SHARES = (1 / 16, 1 / 4, 1.0)
-"""How far below the upper bound to look for the optimum: shares of the way down to a plan that is known."""
+"""Distances below the upper bound at which to look for the optimum, as shares of the way down to a known plan."""
 
 LABELS = 1 << 14
-"""Room for so many labels at first; it doubles whenever it runs out."""
+"""Initial room for labels; it doubles whenever it runs out."""
 
 _ROUNDING = 1e-9
 """Tolerance: the bounds add the same numbers in another order."""
 
 
 class Labels(NamedTuple):
-    """All labels, message by message: those of message i are ``first[i] : first[i + 1]``, by rising end and gain.
+    """All labels, message by message; message i has ``first[i] : first[i + 1]``, by rising end and gain.
 
     Fields:
-        first: int64[messages + 1], where the labels of a message begin.
+        first: int64[messages + 1], index of a message's first label.
         latest: int64[messages + 1], the latest end of any label at the messages before it.
         end: int64[room], the byte at which the label's last message ends.
-        gain: float64[room], what the messages so far have added to H.
+        gain: float64[room], the gain in H by the messages so far.
         parent: int64[room], the label before it; -1 at the first message of a plan.
     """
 
@@ -69,7 +69,7 @@ def best(
     v: NDArray[np.float64],
     ends: int,
 ) -> tuple[NDArray[np.int64], float]:
-    """(messages of the best plan in order, its gain: H - 1)."""
+    """Find the best plan; return its messages in order and its gain, H - 1."""
     n = len(c)
     problem, guide = new_problem(c, size, limit, limit, x, v, ends, GRID), np.empty(n, np.int64)
     find_future(problem, None)
@@ -86,13 +86,13 @@ def best(
 
 
 def no_labels(messages: int) -> Labels:
-    """Room for the labels of so many messages."""
+    """Make room for the labels of so many messages."""
     first, latest = np.zeros((2, messages + 1), np.int64)
     return Labels(first, latest, np.empty(LABELS, np.int64), np.empty(LABELS), np.empty(LABELS, np.int64))
 
 
 def fill(problem: Problem, enough: float, labels: Labels) -> Labels:
-    """All labels that can lead to a gain of ``enough``, in the arrays of ``labels`` or in larger ones."""
+    """Compute all labels that can lead to a gain of ``enough``, in the arrays of ``labels`` or in larger ones."""
     i = extend(problem, enough, 0, labels)
     while i < len(problem.c):
         room = 2 * len(labels.end)
@@ -103,11 +103,13 @@ def fill(problem: Problem, enough: float, labels: Labels) -> Labels:
 
 
 def plan_of(labels: Labels) -> tuple[NDArray[np.int64], float]:
-    """(messages on the way to the best label, the last of equals, its gain); none and 0 if nothing can be sent."""
+    """Messages on the way to the best label (the last one if several are equal) and its gain; none and 0 if none is
+    sent.
+    """
     count = int(labels.first[-1])
     if count == 0:
         return np.zeros(0, np.int64), 0.0
-    # Of equals the last one: it may have sent more messages than the others.
+    # The last of equal labels: it may have sent more messages than the others.
     label = count - 1 - int(np.argmax(labels.gain[:count][::-1]))
     gain, way = float(labels.gain[label]), []
     while label >= 0:
@@ -121,13 +123,13 @@ def plan_of(labels: Labels) -> tuple[NDArray[np.int64], float]:
 
 @kernel
 def after(p: Problem, i: int, e: int) -> float:
-    """``future`` of message i that ends at byte e."""
+    """Look up ``future`` of message i that ends at byte e."""
     return float(p.future[i, e // p.grid - p.c[i] // p.grid])
 
 
 @kernel
 def most(p: Problem) -> float:
-    """No plan gains more than this."""
+    """Upper bound of the gain of every plan."""
     gain = 0.0
     for i in range(len(p.c)):
         if p.limit[i] >= 0 and p.c[i] + p.size[i] <= p.ends:
@@ -137,7 +139,7 @@ def most(p: Problem) -> float:
 
 @kernel
 def guided(p: Problem, plan: NDArray[np.int64]) -> tuple[int, float]:
-    """(length, gain) of one good plan, whose next message is always the one that looks best by ``future``."""
+    """Write one good plan, taking as next message always the best by ``future``; return (length, gain)."""
     i, e, gain, length = -1, 0, 0.0, 0
     while True:
         best_look, chosen, chosen_e, chosen_gain = -1.0, -1, 0, 0.0
@@ -164,7 +166,7 @@ def guided(p: Problem, plan: NDArray[np.int64]) -> tuple[int, float]:
 
 @kernel
 def extend(p: Problem, enough: float, begin: int, labels: Labels) -> int:
-    """Find the labels of messages ``begin``, begin + 1, ...; return the one at which the room ran out, or n."""
+    """Compute the labels of messages ``begin``, begin + 1, ...; return the one at which the room ran out, or n."""
     first, latest, end, gain = labels.first, labels.latest, labels.end, labels.gain
     room, enough = len(end), enough - _ROUNDING
     for i in range(begin, len(p.c)):
@@ -193,7 +195,7 @@ def extend(p: Problem, enough: float, begin: int, labels: Labels) -> int:
                     if stop == room:
                         return i
                 if s == c_i:
-                    break  # earlier ends of j do not help i to begin earlier, and have gained less
+                    break  # earlier ends of j do not let i begin earlier, and have gained less
         first[i + 1] = stop
         latest[i + 1] = max(latest[i], end[stop - 1] if stop > at else 0)
     return len(p.c)
@@ -201,13 +203,13 @@ def extend(p: Problem, enough: float, begin: int, labels: Labels) -> int:
 
 @kernel
 def insert(labels: Labels, at: int, stop: int, e: int, g: float, label: int) -> int:
-    """Put (e, g) among the labels ``at..stop``, unless one is better, and drop those that it beats: the new stop.
+    """Insert (e, g) among the labels ``at..stop`` unless one is better, drop the labels it beats, return the new stop.
 
-    ``label``: its parent. Of two that are the same the new one stays: its way there began with an older message.
+    ``label`` is its parent. A new label replaces an equal one, as its way there began with an older message.
     """
     end, gain, parent = labels.end, labels.gain, labels.parent
     low, high = at, stop
-    while low < high:  # the first that ends later than e
+    while low < high:  # find the first label that ends later than e
         middle = (low + high) // 2
         if end[middle] <= e:
             low = middle + 1

@@ -1,7 +1,7 @@
 """A policy's regret in one interruption, exact over every length T that the law allows.
 
-Up to an arrival nothing that a policy sees depends on T, so a run through the longest interruption holds all shorter
-ones (``by_length``): some 400 decisions give the mean over T without sampling noise.
+Until an arrival, nothing that a policy sees depends on T, so a run through the longest interruption holds all shorter
+ones (``by_length``). Some 400 decisions give the mean over T without sampling noise.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class EveryLength:
         return int(self._senders.batch.senders["arrivals"].sum())
 
     def qoi(self, policy: Policy) -> NDArray[np.float64]:
-        """H by row and T, float64[capacities, t_max + 1]."""
+        """H for each row and T, float64[capacities, t_max + 1]."""
         batch = self._senders.batch
         batch.senders[:], batch.log[:] = self._loaded
         self._senders.run(policy)
@@ -58,6 +58,6 @@ class EveryLength:
         return np.array([by_length(row, self.scenario.value) for row in dropped])
 
     def regrets(self, policy: Policy) -> list[float]:
-        """1 - mean H / mean H of the best that knows T, by capacity."""
+        """1 - mean H / mean H of the best that knows T, for each capacity."""
         pairs = zip(self.qoi(policy), self._best, strict=True)
         return [1 - float(self._law @ h) / best for h, best in pairs]

@@ -1,15 +1,15 @@
 """The online optimum: the best that any policy can do in one interruption whose length T it does not know.
 
-The model is ``bufgym.scenario.Interruption``: message 0 is sent before, messages 1..T arrive one a period, T + 1 is
+The model is ``bufgym.scenario.Interruption``. Message 0 is sent before, messages 1..T arrive one a period, and T + 1 is
 sent after; at most L are kept meanwhile. T has a known law; at each arrival a policy learns only that T is not smaller.
 The optimum is exact, by dynamic programming backwards over the sets of kept messages.
 
-Two facts keep the programme small. First, an arrival for which there is room is best accepted: V is concave, so more
+Two facts keep the programme small. First, accepting an arrival is best while there is room. V is concave, so more
 messages never inform less, and a policy that keeps a superset can imitate every later decision. So only full queues
 need a decision: L of the messages 1..t after t arrivals. Second, sets are numbered in colexicographic order
-(combinatorial number system): the set p_1 < ... < p_L is number C(p_1 - 1, 1) + ... + C(p_L - 1, L), whatever t is. The
-sets without message t + 1 come before those with it, so the values after t arrivals overwrite those after t + 1 in
-place, and the decision on message t + 1 is numbered like the set of L + 1 messages of which one must go.
+(combinatorial number system): the set p_1 < ... < p_L is number C(p_1 - 1, 1) + ... + C(p_L - 1, L), whatever t is.
+Sets without message t + 1 come before those with it, so values after t arrivals overwrite values after t + 1 in place.
+The decision on message t + 1 has the number of the set of L + 1 messages of which one must go.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from bufgym.scenario import Interruption
 OBJECTIVES = ("ratio", "qoi")
 
 _MOST = 2**61
-"""Binomial coefficients are cut off here: larger ones belong to no state that fits into memory."""
+"""Cut-off for binomial coefficients: larger ones belong to no state that fits into memory."""
 
 
 def law(scenario: Interruption) -> NDArray[np.float64]:
-    """P(T = t) for t = 0..t_max (shape [t_max + 1]), exactly as ``scenario.draw_length`` draws T."""
+    """P(T = t) for t = 0..t_max, float64[t_max + 1], exactly as ``scenario.draw_length`` draws T."""
     if not isinstance(scenario, Interruption):
         raise BufgymError(f"law: {scenario!r} is not an Interruption")
     t_min, t_max = scenario.t_min, scenario.t_max
@@ -71,13 +71,13 @@ class OnlineOptimum:
     value_function: Value
     """V."""
     probabilities: NDArray[np.float64]
-    """float64[t_max + 1]: P(T = t), t = 0..t_max, the longest possible length."""
+    """float64[t_max + 1]: P(T = t) for t = 0..t_max, the longest possible length."""
     objective: str
     """One of ``OBJECTIVES``."""
     value: float
-    """The optimum: mean of (H - 1) / ``oracle.integer`` for "ratio", of H - 1 for "qoi" (H counts message 0)."""
+    """The optimum: mean of (H - 1) / ``oracle.integer`` for "ratio", of H - 1 for "qoi". H counts message 0."""
     decisions: NDArray[Any] = field(repr=False)
-    """int[C(t_max, L + 1)], by number of the set of L + 1 messages: which is dropped (0 = oldest, L = newcomer)."""
+    """int[C(t_max, L + 1)], by number of the set of L + 1 messages: the one dropped (0 = oldest, L = newcomer)."""
 
     @property
     def t_max(self) -> int:
@@ -88,7 +88,7 @@ class OnlineOptimum:
         """The decision when the last of ``positions``, 1 <= p_1 < ... <= t_max, arrives and the others are queued.
 
         A position counts arrivals: message p is the p-th of the interruption. Returns a slot to evict (0 = oldest),
-        REJECT, or ACCEPT where there is room.
+        REJECT, or ACCEPT if there is room.
         """
         if not self._knows(positions):
             raise BufgymError(
@@ -106,10 +106,10 @@ class OnlineOptimum:
     def policy(self) -> Policy:
         """The optimum as a policy for this L, in the simulator and the environments; it runs uncompiled.
 
-        A message's position is its arrival time after that of the message the socket took last, in periods (their
-        running mean), rounded. Sequence numbers would do in ``Interruption`` alone: times also fit a link that stops
-        in mid-stream. A full queue that the table lacks (an arrival after t_max, two messages in one period) is left
-        to min-gap. A buffer with another L is an error.
+        A message's position is the time from the arrival of the message dequeued last to its own, rounded to periods by
+        their running mean. Sequence numbers would do in ``Interruption`` alone; times also fit a link that stops in
+        mid-stream. Min-gap decides for a full queue that the table lacks (an arrival after t_max, two messages in one
+        period). A buffer with another L is an error.
         """
         return Policy(f"online-optimum:L={self.capacity}", self._on_arrival, source="dynamic programme, exact")
 
@@ -137,8 +137,8 @@ def online_optimum(
 ) -> OnlineOptimum:
     """Solve for L = ``capacity`` and P(T = t), t = 0, 1, ... (such as ``law(scenario)``).
 
-    ``objective``: "ratio" for the mean of (H - 1) / ``oracle.integer``, "qoi" for the mean of H - 1. There are
-    C(t_max + 1, L + 1) states, at most 9 bytes each; more than ``max_states`` are refused.
+    ``objective`` is "ratio" for the mean of (H - 1) / ``oracle.integer``, or "qoi" for the mean of H - 1. There are
+    C(t_max + 1, L + 1) states of at most 9 bytes each; more than ``max_states`` raise a BufgymError.
     """
     L, p = whole("capacity", capacity, 1, symbol="L"), _checked(probabilities)
     if not isinstance(v, Value):
@@ -155,7 +155,7 @@ def online_optimum(
         best = np.empty(math.comb(t_max, L))
         binomials, work = _binomials(t_max, L), np.zeros(L + 2, np.int64)
         interruptible(lambda: _solve(gain, weight, binomials, work, best, decisions))
-        value += best[0]  # of messages 1..L
+        value += best[0]  # the set of messages 1..L
     for array in (p, decisions):
         array.flags.writeable = False
     return OnlineOptimum(L, v, p, objective, float(value), decisions)
@@ -172,9 +172,9 @@ def _solve(
 ) -> None:
     """Fill ``best`` and ``decisions`` backwards from t_max arrivals to L; ties drop the oldest.
 
-    ``gain``: V(0..t_max + 1); ``weight``: what T = t counts; ``binomial[n, k]`` = C(n, k); ``kept``: int64[L + 2],
-    work space for message 0, the queued ones, and the one sent after. ``best[r]``: what is still to be expected with
-    the queued set number r, times the probability of having come so far.
+    ``gain`` is V(0..t_max + 1), ``weight`` the weight of each T = t, and ``binomial[n, k]`` = C(n, k). ``kept``,
+    int64[L + 2], is work space for message 0, the queued ones, and the one sent after. ``best[r]`` is the expected gain
+    to come with the queued set number r, times the probability of having come so far.
     """
     t_max, L = len(weight) - 1, len(kept) - 2
     for t in range(t_max, L - 1, -1):
@@ -187,7 +187,7 @@ def _solve(
                 gained += gain[kept[k + 1] - kept[k]]
             later = 0.0
             if t < t_max:
-                # The number of the next set, with message t + 1: those behind the evicted move up a place.
+                # The number of the next set, with message t + 1: messages after the evicted one move up a place.
                 evicted = binomial[t, L]
                 for k in range(2, L + 1):
                     evicted += binomial[kept[k] - 1, k - 1]
@@ -218,7 +218,7 @@ def _binomials(t_max: int, L: int) -> NDArray[np.int64]:
 
 
 def _checked(probabilities: ArrayLike) -> NDArray[np.float64]:
-    """A copy without the impossible lengths at its end; BufgymError if these are no probabilities."""
+    """Copy without the impossible lengths at the end; BufgymError if these are no probabilities."""
     try:
         p = np.array(probabilities, np.float64)
     except (TypeError, ValueError):

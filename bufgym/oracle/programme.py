@@ -1,6 +1,6 @@
-"""The dynamic programme over (message, end) behind the clairvoyant: what a plan can still gain, on a grid of bytes.
+"""The dynamic programme over (message, end) behind the clairvoyant: gains still possible, on a grid of bytes.
 
-For equal sizes ``labels`` takes its bounds from it, for unequal ones ``unequal`` its prices and its bound.
+``labels`` takes its bounds from it for equal sizes, ``unequal`` its prices and its bound for others.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from bufgym.kernel import kernel
 from bufgym.model.qoi import value
 
 NEVER = -1
-"""As a limit: there is never room for the message."""
+"""A limit that leaves no room for the message."""
 
 MAX_CELLS = 1 << 23
-"""Entries of ``future`` at most (8 bytes each); a coarser grid then does."""
+"""Most entries of ``future``, 8 bytes each; longer episodes take a coarser grid."""
 
 
 class Problem(NamedTuple):
@@ -50,7 +50,7 @@ class Problem(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Room in the queue, and what a message pays for waiting in it (see ``unequal``).
+    """Room in the queue, and the price that a message pays for waiting in it (see ``unequal``).
 
     Fields:
         capacity: L, messages.
@@ -75,7 +75,7 @@ def new_problem(
     ends: int,
     steps: int,
 ) -> Problem:
-    """One episode on a grid of so many ``steps`` to a mean message, or of fewer (``MAX_CELLS``); ``future`` is 0.
+    """Set up one episode on a grid of ``steps`` to a mean message, or fewer (``MAX_CELLS``); ``future`` is 0.
 
     A message that waits for at most ``certain`` bytes finds room, whichever messages wait.
     """
@@ -106,7 +106,7 @@ def find_idle(
 
 @kernel
 def waiting_cost(p: Problem, room: Room, j: int, step: int) -> float:
-    """What message j pays for waiting until it begins at this grid step."""
+    """Price that message j pays for waiting until it begins at this grid step."""
     message = room.until[0, step] - room.before[0, j]
     byte = room.until[1, step] - room.before[1, j]
     return float(max(0.0, message) + p.size[j] * max(0.0, byte))
@@ -114,7 +114,7 @@ def waiting_cost(p: Problem, room: Room, j: int, step: int) -> float:
 
 @kernel
 def find_future(p: Problem, room: Room | None) -> None:
-    """Fill ``future`` (zeros so far), from the last message back. Waiting costs what ``room`` says; None: nothing."""
+    """Fill ``future`` (zeros so far) from the last message back; waiting costs the prices of ``room``, if any."""
     n, steps = p.future.shape
     for i in range(n - 1, -1, -1):
         step_i, reach = p.c[i] // p.grid, p.c[i] + p.limit[i] + p.size[i]

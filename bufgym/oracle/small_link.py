@@ -1,18 +1,18 @@
-"""The online optimum over a small link: the best that any policy can do that knows the law of the link, not its future.
+"""The online optimum over a small link, for a policy that knows the link's law but not its future.
 
-A message arrives each period. In a period the link carries 0, 1/4, 1/2 or one message; which, is a Markov chain
-(``Chain``). V is constant from a distance D on, so a gap counts as one of 1..D, and all that matters at an arrival is
+A message arrives each period. In a period the link carries 0, 1/4, 1/2 or one message, as a Markov chain (``Chain``)
+decides. V is constant from a distance D on, so a gap counts as one of 1..D. The state at an arrival is
 
     how many messages wait (n <= L), the gap of each to the one before it, and that of the newcomer to the tail,
     how many quarters of the message in the socket are left (0: the socket is idle), and the rate of the last period.
 
-That is little enough for an exact dynamic programme, backwards from the last arrival, after which all that waits is
-sent. A policy on board knows all of it while the socket is busy: the rate is what left the socket. An idle socket takes
-the newcomer at once (``asked="busy"``). ``asked="always"`` decides there too, and is told the rate: it bounds what that
-could gain. ``asked="full"`` accepts wherever there is room.
+This is small enough for an exact dynamic programme, backwards from the last arrival, after which all waiting messages
+are sent. A policy on board knows the whole state while the socket is busy, as the rate shows in the bytes that left. An
+idle socket takes the newcomer at once (``asked="busy"``). ``asked="always"`` decides there too and is told the rate, to
+bound the possible gain. ``asked="full"`` accepts whenever there is room.
 
-A queue of n messages has the number first[n] + (its n + 1 gaps less 1, the oldest first, as digits to the base D).
-So the head leaves by a modulo. Behind a decision the last digit is the time since the arrival kept last.
+A queue of n messages has the number first[n] + (its n + 1 gaps less 1, the oldest first, as digits to the base D). So
+the head leaves by a modulo. After a decision the last digit is the time since the last accepted arrival.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from bufgym.model.qoi import Value, tabulated
 from bufgym.policies.registry import Policy
 
 QUARTERS = np.array([0, 1, 2, 4])
-"""What the link carries in a period, in quarters of a message, by the state of the chain."""
+"""Quarters of a message that the link carries in a period, by state of the chain."""
 MESSAGE = 4
 """Quarters of a message."""
 ASKED = ("full", "busy", "always")
-"""Where a decision is asked for: at a full queue, at a busy socket, at each arrival."""
+"""When a decision is asked for: at a full queue, at a busy socket, at each arrival."""
 _MOST = 2**30
-"""Decisions kept at most."""
+"""Most decisions to keep."""
 
 
 @dataclass(frozen=True)
 class Chain:
-    """The link's rate stays as it is from one period to the next, or becomes one of the others, all alike."""
+    """The link's rate stays from one period to the next, or becomes one of the others with equal probability."""
 
     stays: float = 0.9
-    """Probability that it stays."""
+    """Probability that the rate stays."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.stays <= 1:
@@ -53,12 +53,12 @@ class Chain:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """P(next state | state), [4, 4]; in the long run all four are equally likely."""
+        """P(next state | state), [4, 4]; in the long run all four states are equally likely."""
         n = len(QUARTERS)
         return np.where(np.eye(n, dtype=bool), self.stays, (1 - self.stays) / (n - 1))
 
     def draw(self, periods: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The states of so many periods, the one before them drawn evenly."""
+        """Draw the states of so many periods; the state before them is uniform."""
         law, states = self.matrix.cumsum(axis=1), [int(rng.integers(len(QUARTERS)))]
         for uniform in rng.random(periods):
             states.append(min(int(np.searchsorted(law[states[-1]], uniform, side="right")), len(QUARTERS) - 1))
@@ -66,7 +66,7 @@ class Chain:
 
 
 def cut_off(v: Value, distance: int) -> Value:
-    """V up to ``distance``, constant behind it; V is read at whole distances alone."""
+    """V up to ``distance``, constant after it; V is read at whole distances only."""
     gaps = range(distance + 1)
     return tabulated(list(gaps), [v(float(d)) for d in gaps])
 
@@ -82,13 +82,13 @@ class SmallLink:
     value: float
     """E[H] of the optimum."""
     decisions: NDArray[np.int8] = field(repr=False)
-    """[arrivals to come, queue, quarters left, state]: a slot, REJECT or ACCEPT. Far from the end it no longer changes;
-    the last entry serves for all that is farther away."""
+    """[arrivals to come, queue, quarters left, state]: a slot, REJECT or ACCEPT. Decisions far from the end no longer
+    change, so the last entry serves for all of them."""
     arrivals: int
-    """Of an episode."""
+    """Arrivals of an episode."""
 
     def decide(self, number: int, gaps: list[int], left: int, state: int) -> int:
-        """At arrival ``number`` (0 is the first), for the gaps of the queued messages and of the newcomer."""
+        """The decision at arrival ``number`` (from 0), for the gaps of the queued messages and of the newcomer."""
         depth, code = len(self.gain) - 1, 0
         for gap in gaps:
             code = code * depth + min(gap, depth) - 1
@@ -114,10 +114,10 @@ class SmallLink:
 def small_link(
     capacity: int, v: Value, chain: Chain, *, arrivals: int, depth: int = 8, kept: int = 24, asked: str = "busy"
 ) -> SmallLink:
-    """Solve for L = ``capacity`` and episodes of so many arrivals; V is cut off at D = ``depth``.
+    """Solve for L = ``capacity`` and episodes of so many ``arrivals``; V is cut off at D = ``depth``.
 
     Args:
-        kept: decisions are kept for so many arrivals to come.
+        kept: number of arrivals to come for which decisions are kept.
         asked: one of ``ASKED``.
     """
     L, D, T = whole("capacity", capacity, 1, symbol="L"), whole("depth", depth, 1), whole("arrivals", arrivals, 1)
@@ -146,13 +146,13 @@ def small_link(
 
 
 def _first(depth: int, capacity: int) -> NDArray[np.int64]:
-    """Where the queues of 0, 1, ..., L messages begin, and how many queues there are."""
+    """Numbers of the first queue with 0, 1, ..., L messages, then the number of all queues."""
     return np.cumsum([0] + [depth ** (n + 1) for n in range(capacity + 1)])
 
 
 @kernel
 def _end(gain: NDArray[np.float64], first: NDArray[np.int64], behind: NDArray[np.float64]) -> None:
-    """``behind``: behind the last decision all that waits is sent."""
+    """Fill ``behind`` for the last decision, after which all waiting messages are sent."""
     D = len(gain) - 1
     for n in range(len(first) - 1):
         for code in range(first[n + 1] - first[n]):
@@ -171,7 +171,7 @@ def _carry(
     ahead: NDArray[np.float64],
     behind: NDArray[np.float64],
 ) -> None:
-    """``behind`` each decision from ``ahead`` of the next: the link carries what it does in the period between them."""
+    """Compute ``behind`` each decision from ``ahead`` of the next; the link carries its rate in the period between."""
     D = len(gain) - 1
     for n in range(len(first) - 1):
         head = (first[n + 1] - first[n]) // D  # the oldest gap's place value
@@ -208,7 +208,7 @@ def _decide(
     ahead: NDArray[np.float64],
     decisions: NDArray[Any],
 ) -> None:
-    """``ahead`` of each decision, and the decision; of equals ACCEPT, then the oldest slot."""
+    """Compute ``ahead`` of each decision, and the decision; ties prefer ACCEPT, then the oldest slot."""
     L, D = len(first) - 2, len(gain) - 1
     for n in range(L + 1):
         for code in range(first[n + 1] - first[n]):

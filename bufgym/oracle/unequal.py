@@ -1,4 +1,4 @@
-"""Messages of unequal sizes: a good plan, and an upper bound that is close to it.
+"""Messages of unequal sizes: a good plan, and a close upper bound.
 
 With unequal sizes the room left at an arrival depends on which messages wait, which a label (end, gain) cannot carry.
 So room gets a price (Lagrangian relaxation: Fisher, Management Science 27(1), 1981). A message that waits while message
@@ -6,16 +6,15 @@ i arrives pays ``price_i``; in return every plan receives L x the sum of all pri
 
     max over all plans of  gain + sum over i of price_i (L - messages queued after arrival i)
 
-is an upper bound of the best plan's gain: a plan that keeps to L loses nothing by it. What message j pays depends only
-on the byte at which it begins, as it waits during the arrivals j, j + 1, ... whose byte lies before that one. So the
-``programme`` finds the maximum. Under a byte limit B the bytes that wait are priced likewise. As in ``labels``, leaving
-a message out while the link is idle is never worth it; here that is used only where the message finds room whichever
-messages wait.
+is an upper bound of the best plan's gain, as a plan that keeps to L loses nothing by it. The payment of message j
+depends only on the byte at which it begins, as j waits during the arrivals j, j + 1, ... before that byte. So the
+``programme`` finds the maximum. Under a byte limit B waiting bytes have prices too. As in ``labels``, leaving a message
+out while the link is idle is never worth it. This is used only if the message finds room whichever messages wait.
 
 The plan comes from a beam search (``beam``) that the programme guides. Prices follow the subgradient (Held, Wolfe and
-Crowder, Mathematical Programming 6, 1974): they rise where the programme's own plan queues too much and fall where it
-leaves room, in steps of Polyak's length towards the best plan known, which are halved when the bound stands still.
-Every round gives a bound; the least of all is returned.
+Crowder, Mathematical Programming 6, 1974). They rise where the programme's own plan queues too much and fall where it
+leaves room. Steps have Polyak's length towards the best plan known, and are halved when the bound stands still. Every
+round gives a bound; the least of all is returned.
 """
 
 from __future__ import annotations
@@ -30,15 +29,15 @@ from bufgym.oracle import beam
 from bufgym.oracle.programme import Problem, Room, find_future, new_problem, waiting_cost
 
 ROUNDS = 40
-"""Price updates at most."""
+"""Most price updates."""
 ENOUGH = 1e-4
-"""They end when the bound is this close to the plan, as a fraction of the bound."""
+"""Gap between bound and plan, as a fraction of the bound, at which updates end."""
 PATIENCE = 3
 """Rounds without progress after which the step is halved."""
 GRID, FINE_GRID = 12, 96
-"""Grid steps to a mean message while prices are sought, and for the last bound."""
+"""Grid steps to a mean message: in the search for prices, and for the last bound."""
 WIDTH, LAST_WIDTH = 8, 64
-"""States a message in the beam, likewise."""
+"""States per message in the beam, likewise."""
 
 
 def best(
@@ -52,7 +51,7 @@ def best(
     capacity: int,
     max_bytes: int,
 ) -> tuple[NDArray[np.int64], float]:
-    """(messages of a plan that keeps to L and B, in order; an upper bound of any such plan's gain, H - 1)."""
+    """Find messages of a plan that keeps to L and B, in order, and an upper bound of any such plan's gain, H - 1."""
     n = len(c)
     byte_limit = max_bytes < UNLIMITED_BYTES
     rooms = np.array([[capacity], [max_bytes if byte_limit else 0]], np.float64)
@@ -95,7 +94,7 @@ def best(
 
 
 def _priced(p: Problem, prices: NDArray[np.float64], capacity: int, max_bytes: int) -> Room:
-    """Room at these prices [2, messages]; fills the programme's ``future`` under them."""
+    """Make room at these prices [2, messages], and fill the programme's ``future`` under them."""
     before = np.concatenate([np.zeros((2, 1)), np.cumsum(prices, axis=1)], axis=1)
     positions = np.arange(int(p.c[-1]) // p.grid + p.future.shape[1] + 1) * p.grid
     until = np.ascontiguousarray(before[:, np.searchsorted(p.c, positions, side="left")])
@@ -107,9 +106,9 @@ def _priced(p: Problem, prices: NDArray[np.float64], capacity: int, max_bytes: i
 
 @kernel
 def follow(p: Problem, room: Room, message: NDArray[np.int64], begin: NDArray[np.int64]) -> tuple[int, float]:
-    """(length, gain less prices) of the programme's own best plan, which need not keep to the room.
+    """Write the programme's own best plan, which need not keep to the room; return (length, gain less prices).
 
-    ``message`` and ``begin``, the byte at which each begins: int64[messages], filled up to the length.
+    ``message`` and ``begin``, the byte at which each begins, are int64[messages], filled up to the length.
     """
     n, length, i, step, total = len(p.c), 0, -1, 0, 0.0
     while True:
@@ -150,7 +149,7 @@ def follow(p: Problem, room: Room, message: NDArray[np.int64], begin: NDArray[np
 def count_queued(
     p: Problem, message: NDArray[np.int64], begin: NDArray[np.int64], length: int, queued: NDArray[np.float64]
 ) -> None:
-    """``queued``, float64[2, messages]: messages, and bytes, that this plan has in the queue after each arrival."""
+    """Fill ``queued``, float64[2, messages]: messages and bytes that this plan has in the queue after each arrival."""
     queued[:, :] = 0.0
     for k in range(length):
         j = message[k]

@@ -1,4 +1,4 @@
-"""Drop policies by name: ``get("afr")``, ``names()``, ``register`` for your own, ``load`` for a learned one's file."""
+"""Drop policies by name: ``get("afr")``, ``names()``, ``register`` for your own, and ``load`` for a learned one."""
 
 import functools
 import os
@@ -43,8 +43,8 @@ __all__ = [
 
 
 def load(path: str | os.PathLike[str]) -> Policy:
-    """The learned policy in a file: see ``bufgym.policies.weights.load``."""
-    from bufgym.policies import weights  # not at start-up: few need safetensors
+    """Load the learned policy in a file, as ``bufgym.policies.weights.load``."""
+    from bufgym.policies import weights  # not at start-up: few users need safetensors
 
     return weights.load(path)
 

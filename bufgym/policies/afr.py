@@ -1,14 +1,15 @@
 """AFR, Adaptive Frame Rate [wang2022afr]: thin the queue to an even, adaptive frame rate.
 
-Variables are the paper's: dropping rate r, counter c, dropping position p; L the capacity, s the queued messages. One
-message in r is kept; among those kept before r grew, every second one is evicted, oldest pair first.
+Variables are the paper's: dropping rate r, counter c, dropping position p, capacity L, queued messages s. AFR keeps one
+arrival in r. Whenever the queue is full it evicts every second of the messages kept before r grew, oldest pair first.
 
-Under a byte limit B the queue is full where the newcomer does not fit, and a pass ends at its last message; r halves
-where at most 2/3 of L and of B are taken. An arrival that is asked about again goes on with the pass: it counts once.
+Under a byte limit B the queue is full when the newcomer does not fit, and a pass ends at its last message. r halves
+when at most 2/3 of L and of B are taken. If AFR is asked again about an arrival, it goes on with the pass and counts
+the arrival once.
 
-`afr` is the released code (github Jrdevil-Wang/AFR, transport_subscriber_link.cpp), `afr-paper` the literal text of
-the paper. They differ in the bound for halving r (3s <= 2L against s/L < 2/3) and in what a departure does to p: the
-code moves p along with the queue, the text says nothing about it.
+`afr` is the released code (github Jrdevil-Wang/AFR, transport_subscriber_link.cpp), `afr-paper` the literal text of the
+paper. They differ in the bound for halving r: 3s <= 2L in the code, s/L < 2/3 in the text. At departures the code moves
+p along with the queue; the text does not mention p.
 """
 
 from __future__ import annotations
@@ -23,31 +24,31 @@ MEMORY = {"r": 1.0, "c": 0.0, "p": 0.0}
 
 @kernel
 def thin(r: float, c: float, p: float, gap: float, buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """The part that code and text share, after r was halved or not: count, and evict at p when full.
+    """Count the arrival, and evict at p when full. Code and text share this part, which follows the halving of r.
 
-    ``gap``: arrivals until the next one is kept; r in AFR (``checkpointing.py`` has another).
+    ``gap`` is the number of arrivals until the next one is kept: r in AFR, another in ``checkpointing.py``.
     """
     s = len(buffer.slots)
     if buffer.evictions == 0:
         c += 1
         if c < gap:
             memory[R], memory[C], memory[P] = r, c, p
-            return REJECT  # even when there is room: the rate has been lowered to one in r
-        c = (c - gap) % 1.0  # 0 in AFR; where a gap is no whole number, its fraction is carried on
+            return REJECT  # even when there is room: only one arrival in r is kept
+        c = (c - gap) % 1.0  # 0 in AFR; a fractional gap carries its fraction on
     decision = ACCEPT
     if not has_space(buffer, arrival):
-        if p >= s:  # only under B, where fewer messages are queued than when this pass began
+        if p >= s:  # only under B, if fewer messages are queued than when this pass began
             r, p = 2 * r, 0.0
         decision = int(p)
         p += 1
-        if p >= s:  # a whole pass done: every second message is gone, half the rate is left
+        if p >= s:  # the pass is done: every second message is gone, half the rate is left
             r, p = 2 * r, 0.0
     memory[R], memory[C], memory[P] = r, c, p
     return decision
 
 
 def afr_departure(buffer: Buffer, memory: Memory) -> None:
-    """The head is gone, so the same message is now one slot further to the front."""
+    """Follow the departure of the head: the same message is now one slot further to the front."""
     memory[P] = max(0.0, memory[P] - 1)
 
 

@@ -1,6 +1,7 @@
-"""Active queue management of the Internet: CoDel and RED, made to keep a router's queue short.
+"""Active queue management of the Internet, CoDel and RED, designed to keep a router's queue short.
 
-Both drop early to tell TCP senders to slow down. A camera does not slow down, so here they show what early drops cost.
+Both drop early to tell TCP senders to slow down. A camera does not slow down, so here they show the cost of early
+drops.
 """
 
 from __future__ import annotations
@@ -12,21 +13,22 @@ from bufgym.model.buffer import REJECT, Buffer
 from bufgym.policies.classic import keep_first
 from bufgym.policies.registry import Arrival, Memory, register
 
-TARGET_MS, INTERVAL_MS = range(2)  # where CoDel's parameters lie
-FIRST_ABOVE, DROP_NEXT, DROPS, LAST_DROPS, DROPPING, AGAIN, MAX_PACKET = range(7)  # and its memory
+TARGET_MS, INTERVAL_MS = range(2)  # indices of CoDel's parameters
+FIRST_ABOVE, DROP_NEXT, DROPS, LAST_DROPS, DROPPING, AGAIN, MAX_PACKET = range(7)  # indices of its memory
 
 
 @kernel
 def control_law(t_us: float, count: float, interval_us: float) -> float:
-    """When to drop next: the more drops so far, the sooner."""
+    """Time of the next drop, us: the more drops so far, the sooner."""
     return t_us + interval_us / math.sqrt(count)
 
 
 @kernel
 def ok_to_drop(buffer: Buffer, memory: Memory) -> bool:
-    """RFC 8289, 5.6 (dodequeue): whether sojourn times have been above target for a whole interval.
+    """Whether sojourn times have been above target for a whole interval (RFC 8289, 5.6, dodequeue).
 
-    Never where at most one message ("maxpacket", the largest seen) waits behind the head: the link must not starve.
+    The answer is no while at most one "maxpacket", the largest message seen, waits behind the head: the link must not
+    starve.
     """
     now_us, head = buffer.now_us, buffer.slots[0]
     memory[MAX_PACKET] = max(memory[MAX_PACKET], head.size_bytes)
@@ -41,10 +43,10 @@ def ok_to_drop(buffer: Buffer, memory: Memory) -> bool:
 
 
 def codel_dequeue(buffer: Buffer, memory: Memory) -> bool:
-    """RFC 8289, 5.5 (dequeue), one head a call: the RFC's loop goes on for as long as the answer is True.
+    """RFC 8289, 5.5 (dequeue), for one head a call; the RFC's loop goes on while the answer is True.
 
-    ``AGAIN`` marks that the loop has just dropped the head before this one. After the first drop of a dropping state
-    the RFC sends the next packet without looking at drop_next; here it is sent because drop_next still lies ahead.
+    ``AGAIN`` marks that the loop has just dropped the previous head. After the first drop of a dropping state the RFC
+    sends the next packet without looking at drop_next; here it is sent because drop_next still lies ahead.
     """
     now_us, interval_us = buffer.now_us, 1e3 * buffer.parameters[INTERVAL_MS]
     ok, again = ok_to_drop(buffer, memory), memory[AGAIN] == 1
@@ -62,7 +64,7 @@ def codel_dequeue(buffer: Buffer, memory: Memory) -> bool:
         return True
     if ok:
         memory[DROPPING] = 1.0
-        # Soon after the last dropping state the rate that controlled the queue then is a good one to begin with.
+        # Soon after the last dropping state, the rate that controlled the queue then is a good start.
         delta = memory[DROPS] - memory[LAST_DROPS]
         memory[DROPS] = delta if delta > 1 and now_us - memory[DROP_NEXT] < 16 * interval_us else 1.0
         memory[DROP_NEXT] = control_law(now_us, memory[DROPS], interval_us)
@@ -89,8 +91,8 @@ def codel(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return keep_first(buffer, arrival)
 
 
-MIN_TH, MAX_TH, MAX_P, WEIGHT = range(4)  # where RED's parameters lie
-AVERAGE, COUNT = range(2)  # and its memory
+MIN_TH, MAX_TH, MAX_P, WEIGHT = range(4)  # indices of RED's parameters
+AVERAGE, COUNT = range(2)  # indices of its memory
 
 
 @register(
@@ -101,9 +103,9 @@ AVERAGE, COUNT = range(2)  # and its memory
     compile=True,
 )
 def red(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """RED: rejects at random, the more the higher the average occupancy; a full queue drops the tail.
+    """RED: rejects at random, the more often the higher the average occupancy; a full queue drops the tail.
 
-    Thresholds are fractions of L, or of B where bytes fill it more. The paper's term for idle times needs the link's
+    Thresholds are fractions of L, or of B if bytes fill it more. The paper's term for idle times needs the link's
     bandwidth and is left out: an arrival at an empty queue is one sample of 0.
     """
     min_th, max_th, max_p = buffer.parameters[MIN_TH], buffer.parameters[MAX_TH], buffer.parameters[MAX_P]

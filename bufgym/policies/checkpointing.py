@@ -1,10 +1,10 @@
-"""Online checkpointing: keep L of a growing stream, as evenly as can be without knowing where it ends.
+"""Online checkpointing: keep L messages of a growing stream, as evenly as possible without knowing its end.
 
-`linear-alpha` is AFR with gaps that grow within a pass: the kept times are proportional to i^alpha. In the worst case
-its largest gap is 1.59 times the even one as L grows (alpha = 1.302), where AFR's (alpha = 1) is 2 times that; ln 4 is
-the least that any rule can reach (Bringmann et al., arXiv 1302.4216; Bar-On et al., arXiv 1704.02659).
+`linear-alpha` is AFR with gaps that grow within a pass: kept times are proportional to i^alpha. Its largest gap is in
+the worst case 1.59 times the even one as L grows, with alpha = 1.302. AFR has alpha = 1 and reaches 2 times. No rule
+can stay below ln 4 (Bringmann et al., arXiv 1302.4216; Bar-On et al., arXiv 1704.02659).
 
-`steady` writes the n-th arrival as n = m 2^h with m odd, and keeps the last few of each m: those with the largest h.
+`steady` writes the n-th arrival as n = m 2^h with m odd, and for each m keeps the last few, with the largest h.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bufgym.policies.registry import Arrival, Memory, register
 
 @kernel
 def full_length(buffer: Buffer, arrival: Arrival) -> int:
-    """How many messages a full queue holds: L, or if B has less room than that, as many like these as it has for."""
+    """Messages in a full queue: L, or as many like those now waiting as fit into B, if fewer."""
     like_these = float(buffer.max_bytes) * (len(buffer.slots) + 1) / (buffer.backlog_bytes + arrival.size_bytes)
     return int(min(float(buffer.capacity), like_these))
 
@@ -27,7 +27,7 @@ def full_length(buffer: Buffer, arrival: Arrival) -> int:
 def growing_gap(r: float, p: float, L: int, alpha: float) -> float:
     """Arrivals from kept message r (L + p) to the next one kept, r (L + p + 1); message i is kept at L (i / L)^alpha.
 
-    Written so that it is exactly r for alpha = 1.
+    The form of the expression gives exactly r for alpha = 1.
     """
     return float(r**alpha * L ** (1 - alpha) * ((L + p + 1) ** alpha - (L + p) ** alpha))
 
@@ -51,7 +51,7 @@ def linear_alpha(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         c = c % gap
     if r == 1 and has_space(
         buffer, arrival
-    ):  # the paper's stream never drains; here, with every pass undone, what finds room is kept
+    ):  # unlike the paper's stream this queue drains; with every pass undone, an arrival that finds room is kept
         memory[R], memory[C] = r, 0.0
         return ACCEPT
     return thin(r, c, p, gap, buffer, arrival, memory)
@@ -59,10 +59,10 @@ def linear_alpha(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 @kernel
 def site(n: int, s: int) -> int:
-    """Where the steady algorithm stores the n-th item, n >= 1, of 2^s sites; -1: nowhere.
+    """The index of the site, of 2^s, where the steady algorithm stores the n-th item (n >= 1), or -1 for none.
 
-    n = m 2^h with m = 2i + 1. The first segment of sites belongs to m = 1 and is s + 1 wide; then come 1, 2, 4, ...
-    segments of s - 1, s - 2, s - 3, ... sites for the next m. Within its segment, h goes round as in a ring.
+    n = m 2^h with m = 2i + 1. The first segment of sites belongs to m = 1 and is s + 1 wide. Then come 1, 2, 4, ...
+    segments of s - 1, s - 2, s - 3, ... sites for the next m. Each segment is a ring that h goes round.
     """
     h = 0
     while n % 2 == 0:
@@ -103,5 +103,5 @@ def steady(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     for k in range(len(buffer.slots)):
         if site(buffer.slots[k].seq - first + 1, s) == place:
             return k
-    # Every site is some message's only where some were queued unasked, or bytes are short: then the head makes room.
+    # The sites can only run out if some messages were queued unasked or bytes are short: then the head makes room.
     return keep_last(buffer, arrival, L)

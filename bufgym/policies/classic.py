@@ -1,4 +1,4 @@
-"""What middleware and network queues do today: decide by position alone."""
+"""Drop rules of today's middleware and network queues, which decide by position alone."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from bufgym.policies.registry import Arrival, Memory, register
 
 @kernel
 def keep_last(buffer: Buffer, arrival: Arrival, depth: float) -> int:
-    """Keep the newest ``depth`` messages: where so many are queued, or the newcomer does not fit, the head goes."""
+    """Keep the newest ``depth`` messages: the head goes if as many are queued or the newcomer does not fit."""
     return ACCEPT if len(buffer.slots) < depth and has_space(buffer, arrival) else 0
 
 
 @kernel
 def keep_first(buffer: Buffer, arrival: Arrival) -> int:
-    """Keep what is queued: the newcomer enters where there is room."""
+    """Keep the queued messages: the newcomer enters only if there is room."""
     return ACCEPT if has_space(buffer, arrival) else REJECT
 
 
 @kernel
 def uniform_draw(buffer: Buffer, arrival: Arrival) -> float:
-    """The arrival's uniform draw; each time that it is asked about again, the next of a congruential sequence."""
+    """The arrival's uniform draw; for each further question about it, the next of a congruential sequence."""
     u = arrival.uniform
     for _ in range(buffer.evictions):
         u = 7919 * u % 1

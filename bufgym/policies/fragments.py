@@ -1,15 +1,15 @@
 """Middleware that cuts a message into fragments, all of which must arrive: Zenoh, and DDS over UDP.
 
-What fits in part is sent in part. A message that loses a fragment is lost, yet its other fragments use up the link; on
-a link that is somewhat too slow for the stream this can leave next to nothing that arrives. The sender here carries
-whole messages only, so each policy keeps an account of the bytes ahead of a newcomer, lost fragments included
-(``Pipe``), and rejects a message that would lose one. What it knows is what a robot knows: its queue, its clock, and
-how much of the message in transmission has left, hence the rate at which the link drains.
+A message that fits only in part is sent in part. Losing one fragment loses the message, yet its other fragments use up
+the link. On a link somewhat too slow for the stream, next to nothing may arrive. The sender here carries whole messages
+only. So each policy keeps an account (``Pipe``) of the bytes ahead of a newcomer, lost fragments included, and rejects
+a message that would lose a fragment. It uses a robot's knowledge: its queue, its clock and the transmitted part of the
+current message, which gives the rate of the link.
 
-Limits of this model. Lost fragments delay later decisions, not the messages that are queued. While only fragments of
-lost messages would cross, the rate can't be seen: it is taken to be what it was, for `rate_memory_s` (a setting of this
-model, not of the program); then the link is taken to be free and the next message measures it. So on a link that stays
-too slow about one message in `rate_memory_s` arrives that really would not.
+Limits of this model. Lost fragments delay later decisions, not the queued messages. The rate is invisible while only
+fragments of lost messages would cross. It then counts as unchanged for `rate_memory_s`, a setting of this model and not
+of the program. Afterwards the link counts as free, and the next message measures it. So on a link that stays too slow,
+about one message in `rate_memory_s` arrives that in reality would not.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from bufgym.policies.classic import keep_first, keep_last
 from bufgym.policies.registry import Arrival, Memory, register
 
 UNKNOWN = 1e6
-"""bytes/us, 1 TB/s: the rate of a link of which nothing is known."""
-AHEAD, SINCE, OWN, RATE, SEEN = range(5)  # where the account of a pipe lies in the memory
+"""Rate of a link that has not been measured, bytes/us: 1 TB/s."""
+AHEAD, SINCE, OWN, RATE, SEEN = range(5)  # indices of a pipe's account in the memory
 PIPE = {"ahead_bytes": 0.0, "since_us": 0.0, "own_bytes": 0.0, "bytes_per_us": UNKNOWN, "seen_us": 0.0}
-"""Bytes not yet transmitted, lost fragments included, and when that was; those of whole messages among them; the link's
-rate, and when it was last seen."""
+"""Account of a pipe: bytes not yet transmitted, with lost fragments, and the time of that count; those of whole
+messages; the link's rate and the time it was last seen."""
 
 
 @kernel
 def unsent(buffer: Buffer) -> int:
-    """Bytes of whole messages, queued or in transmission, that have not been transmitted."""
+    """Bytes of whole messages, queued or in transmission, not yet transmitted."""
     return buffer.backlog_bytes + buffer.left_bytes
 
 
 @kernel
 def ahead_of_newcomer(buffer: Buffer, memory: Memory, rate_memory_s: float) -> float:
-    """Bytes ahead of the newcomer, lost fragments included; brings the rate up to date.
+    """Bytes ahead of the newcomer, lost fragments included; updates the rate.
 
-    The rate is that of the time since the previous arrival. If all had left before now, the link was faster than that,
-    and a link that is unknown remains so: it keeps up.
+    The rate is measured since the previous arrival. If all bytes had left before now, the link was faster than that; an
+    unmeasured link then stays unmeasured, as it keeps up.
     """
     now_us, own_bytes = buffer.now_us, unsent(buffer)
     left_bytes, passed_us = memory[OWN] - own_bytes, now_us - memory[SINCE]
@@ -50,17 +50,17 @@ def ahead_of_newcomer(buffer: Buffer, memory: Memory, rate_memory_s: float) -> f
         memory[SEEN] = now_us
     if now_us - memory[SEEN] > 1e6 * rate_memory_s:
         memory[RATE] = UNKNOWN
-    # In whole bytes, so that without lost fragments these are the queue's own.
+    # In whole bytes, so without lost fragments this equals the queue's own count.
     return float(max(own_bytes, math.floor(memory[AHEAD] - memory[RATE] * passed_us)))
 
 
 @kernel
 def account(buffer: Buffer, memory: Memory, ahead_bytes: float, kept_bytes: float) -> None:
-    """From now on so many bytes are to be transmitted, ``kept_bytes`` of them the newcomer's."""
+    """Enter ``ahead_bytes`` to transmit from now on, ``kept_bytes`` of them the newcomer's."""
     memory[AHEAD], memory[SINCE], memory[OWN] = ahead_bytes, buffer.now_us, unsent(buffer) + kept_bytes
 
 
-BATCH, BATCHES, SOCKET, WAIT, MORE, FORGETS = range(6)  # where the parameters of Zenoh lie
+BATCH, BATCHES, SOCKET, WAIT, MORE, FORGETS = range(6)  # indices of Zenoh's parameters
 
 
 @register(
@@ -80,11 +80,11 @@ BATCH, BATCHES, SOCKET, WAIT, MORE, FORGETS = range(6)  # where the parameters o
 def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Zenoh DROP: put cuts the newcomer into batches and drops it when one of them finds no room in time.
 
-    Room is `queue_size` batches of `batch_size` bytes and the socket's buffer, of which the kernel grants twice what
-    `so_sndbuf` asks for (bytes; unset, the kernel chooses it itself). The first batch waits `wait_before_drop` us. Each
-    further one extends the time by twice as much as the one before it did, all together by at most
-    `max_wait_before_drop_fragments` us: 1, 3, 7, 15, 31, 51 ms. The batches before one that finds no room are sent in
-    vain. L holds too: when full the newcomer is dropped.
+    Room is `queue_size` batches of `batch_size` bytes and the socket's buffer. The kernel grants twice the `so_sndbuf`
+    asked for, in bytes; unset, it chooses the buffer itself. The first batch waits `wait_before_drop` us. Each further
+    one extends the time by twice as much as its predecessor, all together by at most `max_wait_before_drop_fragments`
+    us: 1, 3, 7, 15, 31, 51 ms. The batches before one that finds no room are sent in vain. L holds too: when full the
+    newcomer is dropped.
     """
     batch_bytes, wait_us, more_us = buffer.parameters[BATCH], buffer.parameters[WAIT], buffer.parameters[MORE]
     room_bytes = buffer.parameters[BATCHES] * batch_bytes + 2 * buffer.parameters[SOCKET]
@@ -116,9 +116,9 @@ def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 def ros2_best_effort(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ROS 2, best effort over UDP: all packets of the newcomer go at once; lost unless the link's queue takes them all.
 
-    `queue_kb`: what the link's own queue holds (a driver's, a modem's), kB. Packets that find it full are lost, the
-    others cross in vain. A message larger than this queue never arrives; in truth a few do, for even a burst takes
-    time. L holds too: when full the newcomer is dropped.
+    `queue_kb` is the size of the link's own queue, such as a driver's or a modem's, kB. Packets that find it full are
+    lost, and the others cross in vain. A message larger than this queue never arrives; in reality a few do, as even a
+    burst takes time. L holds too: when full the newcomer is dropped.
     """
     room_bytes, rate_memory_s = 1e3 * buffer.parameters[0], buffer.parameters[1]
     ahead_bytes = ahead_of_newcomer(buffer, memory, rate_memory_s)
@@ -138,17 +138,18 @@ def ros2_best_effort(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     compile=True,
 )
 def ros2_reliable_udp(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """ROS 2, reliable over UDP: what the link's queue loses is sent again, until `depth` newer messages overwrite it.
+    """ROS 2, reliable over UDP: packets lost in the link's queue are sent again until `depth` newer messages come.
 
-    All messages of the history send again what they lack, and so share the link. One that does not fit into the link's
-    queue (`queue_kb`) at once is complete in time only if the link, in `depth` periods, carries what is ahead of it and
-    as many messages like it as arrive by then; else it is lost, and its packets have crossed in vain. Left out: the
-    time until a loss is noticed, packets sent twice, and the end of a stream, whose last `depth` messages do arrive.
+    All messages of the history send their missing packets again and share the link. A message that does not fit into
+    the link's queue (`queue_kb`) at once is complete in time only if in `depth` periods the link carries the bytes
+    ahead of it and as many messages of its size as arrive by then. Otherwise it is lost, and its packets have crossed
+    in vain. The model leaves out the time until a loss is noticed, packets sent twice, and the end of a stream, whose
+    last `depth` messages do arrive.
     """
     room_bytes, rate_memory_s = 1e3 * buffer.parameters[0], buffer.parameters[2]
     depth = min(buffer.parameters[1], buffer.capacity)
     decision = keep_last(buffer, arrival, depth)
-    if buffer.evictions > 0:  # asked again about a newcomer that the account has already
+    if buffer.evictions > 0:  # asked again about a newcomer that is already in the account
         if decision >= 0:
             memory[OWN] -= buffer.slots[0].size_bytes
         return decision
@@ -161,6 +162,6 @@ def ros2_reliable_udp(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     kept_bytes = 0.0 if decision == REJECT else float(arrival.size_bytes)
     if decision >= 0:
         kept_bytes -= buffer.slots[0].size_bytes  # overwritten
-    most_bytes = unsent(buffer) + history_bytes  # older messages than the history holds are sent no more
+    most_bytes = unsent(buffer) + history_bytes  # messages older than the history are no longer sent
     account(buffer, memory, min(ahead_bytes + arrival.size_bytes, most_bytes), kept_bytes)
     return decision

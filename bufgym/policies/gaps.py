@@ -1,4 +1,4 @@
-"""Policies that look at the gaps between messages: drop the one whose neighbours replace it best.
+"""Policies that look at the gaps between messages: drop the message whose neighbours replace it best.
 
 Dropping slot k merges its two gaps into one; the smaller the merged gap, the less is lost. Time gaps need a clock only,
 motion gaps the robot's odometry.
@@ -15,12 +15,12 @@ from bufgym.observe.on_board import index_gaps
 from bufgym.policies.registry import Arrival, Memory, register
 
 MOTION, MESSAGES = 1, 2
-"""What a gap may be measured in."""
+"""Units of a gap."""
 
 
 @kernel
 def smallest_time_gap(buffer: Buffer, arrival: Arrival, slots: int) -> int:
-    """Among the first ``slots`` slots, the one that would leave the smallest merged time gap; of equals the oldest."""
+    """The slot, of the first ``slots``, that would leave the smallest merged time gap; the oldest if several do."""
     victim, smallest = 0, np.inf
     for k in range(slots):
         before, after = time_gaps(buffer, arrival, k)
@@ -31,7 +31,7 @@ def smallest_time_gap(buffer: Buffer, arrival: Arrival, slots: int) -> int:
 
 @kernel
 def come(buffer: Buffer, arrival: Arrival, measured_in: int) -> float:
-    """How far the scene has moved on, or how many messages have come, since the message dequeued last."""
+    """Motion of the scene, or number of messages, since the message dequeued last."""
     if measured_in == MESSAGES:
         return float(arrival.seq - buffer.dequeued_seq)
     return float(arrival.x - buffer.dequeued_x)
@@ -39,7 +39,7 @@ def come(buffer: Buffer, arrival: Arrival, measured_in: int) -> float:
 
 @kernel
 def gaps_of(buffer: Buffer, arrival: Arrival, k: int, measured_in: int) -> tuple[float, float]:
-    """The gap before slot ``k`` (as many as are queued: the newcomer), and the one that is left if it goes."""
+    """The gap before slot ``k`` and the merged gap if it goes; ``k`` = len(slots) is the newcomer."""
     if measured_in == MESSAGES:
         return index_gaps(buffer, arrival, k)
     before, after = motion_gaps(buffer, arrival, k)
@@ -48,15 +48,15 @@ def gaps_of(buffer: Buffer, arrival: Arrival, k: int, measured_in: int) -> tuple
 
 @kernel
 def gap_left(buffer: Buffer, arrival: Arrival, victim: int, measured_in: int) -> float:
-    """The gap that is left if ``victim`` goes: a slot, or REJECT for the newcomer."""
+    """The merged gap if ``victim`` goes: a slot, or REJECT for the newcomer."""
     return gaps_of(buffer, arrival, len(buffer.slots) if victim == REJECT else victim, measured_in)[1]
 
 
 @kernel
 def smallest_gap(buffer: Buffer, arrival: Arrival, measured_in: int, discount: float) -> int:
-    """The slot that would leave the smallest gap, REJECT for the newcomer; of equals the oldest.
+    """The slot that would leave the smallest gap, or REJECT for the newcomer; the oldest if several do.
 
-    That of slot k of s counts ``discount`` (1 - k / s) less.
+    The gap of slot k of s is discounted by ``discount`` (1 - k / s).
     """
     s, victim, smallest = len(buffer.slots), REJECT, np.inf
     for k in range(s + 1):
@@ -87,8 +87,8 @@ def min_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue rejects a newcomer nearer than beta even gaps T / (s + 1) to the tail, else as min-gap.
 
-    T is the time from the arrival of the message dequeued last to now, which the s queued messages should divide evenly
-    (L of them, but where B is what is full).
+    T is the time since the arrival of the message dequeued last. The s queued messages should divide it evenly; s is L
+    unless the byte limit B is full.
     """
     beta, s = buffer.parameters[0], len(buffer.slots)
     if has_space(buffer, arrival):
@@ -117,9 +117,9 @@ def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 def paced_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue rejects a newcomer nearer than ``pace`` even spacings to the tail, else drops a small old gap.
 
-    The even spacing is X / (s + 1): X is the motion since the message dequeued last was taken, which the s queued
-    messages should divide evenly (L of them, but where B is what is full). What goes leaves the smallest merged motion
-    gap; that of slot k counts ``discount`` (1 - k / s) less, as the head is soon sent and the tail must last.
+    The even spacing is X / (s + 1). X is the motion since the message dequeued last was taken, which the s queued
+    messages should divide evenly; s is L unless the byte limit B is full. The victim leaves the smallest merged motion
+    gap. The gap of slot k is discounted by ``discount`` (1 - k / s), as the head is soon sent and the tail must last.
     """
     pace, discount = buffer.parameters[0], buffer.parameters[1]
     s = len(buffer.slots)
@@ -146,10 +146,10 @@ def paced_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 def orbbuf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops the message whose neighbours are most similar, first of equals; the newcomer is always kept.
 
-    The head's older neighbour is the message that left last; while none has left, the head stays. (After slot 0 or 1
-    was dropped the code compares the head with the newest message instead, its `last_frame_`; that is not followed.)
-    The tail stays, but for L < 3, where it goes. The released similarity compares images (and is a random stub there);
-    without images, Sim = 1 - V(motion gap).
+    The head's older neighbour is the message that left last; until one has left, the head stays. The tail stays too,
+    except for L < 3, where it goes. Two things differ from the released code. After slot 0 or 1 was dropped, the code
+    compares the head with the newest message instead, its `last_frame_`. And its similarity compares images (in a
+    random stub); without images, Sim = 1 - V(motion gap).
     """
     L = len(buffer.slots)
     if has_space(buffer, arrival):
@@ -168,13 +168,13 @@ def greedy_qoi(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue takes the decision that leaves the most information at this moment: a trap.
 
     Rejecting adds nothing; evicting slot k adds the newcomer's gain less the loss of k. Once the gaps are even,
-    replacing the tail costs least, arrival after arrival: the old prefix stays, and nothing that follows it is kept.
+    replacing the tail costs least at every arrival. So the old prefix stays, and none of the later messages are kept.
     """
     if has_space(buffer, arrival):
         return ACCEPT
     decision, most = REJECT, 0.0
     for k in range(len(buffer.slots)):
-        # For the tail the loss counts its gap to the newcomer too: together V(a + b) - V(a).
+        # The tail's loss counts its gap to the newcomer too: together V(a + b) - V(a).
         added = arrival_gain(buffer, arrival) - loss(buffer, arrival, k)
         if added > most:
             decision, most = k, added

@@ -1,28 +1,27 @@
 """Learned policies: a slot scorer's weights from a file, decided by a compiled forward pass. No torch, no code.
 
-Every candidate (each queued message, and the newcomer) is scored by one small network from its own features and the
-context's (``bufgym.observe``), so one set of weights serves every L; ``scoring`` has the formula. The *drop* network
-scores dropping the candidate, the *accept* network accepting the newcomer, which counts where there is room. The policy
-does what scores highest; ties go to the oldest message.
+One small network scores every candidate, a queued message or the newcomer. Its inputs are the features of the candidate
+and of the context (``bufgym.observe``), so one set of weights serves every L; ``scoring`` has the formula. The *drop*
+network scores dropping the candidate. The *accept* network scores accepting the newcomer, where there is room. The
+policy takes the decision that scores highest; ties go to the oldest message.
 
-The context c may also change how much the candidate's own features s count (``mix`` M): c M s is added to the score of
-dropping it. So one agent can weigh a rank or a gap differently where V is straight and where it is flat.
+The context c may also change the weights of the candidate's own features s, by the matrix ``mix`` M: the score of
+dropping it grows by c M s. So one agent can weigh a rank or a gap differently where V is straight and where it is flat.
 
-A second scorer over the same fields, with hidden layers of its own, may decide while the link stands *still*
-(``STILL``): thinning a queue that nothing leaves, for an unknown time, is a different task from keeping up with a slow
-link.
+While the link stands *still* (``STILL``), a second scorer may decide over the same fields, with hidden layers of its
+own. To thin a queue for an unknown time while nothing leaves is a different task from keeping up with a slow link.
 
-An agent may leave to others what they do better, as can be told on board (``shortcuts``). Where V is straight and then
-flat, ``greedy-qoi`` decides: gaps of the length where V bends lose nothing, and no plan is better, however long an
-interruption is. It does so on a steady link too, where motion is uneven: the queue is sent as it stands, there is no
-trap. And while nothing leaves at all a queue of four messages at most follows the exact plan (``small_queue``). An
-agent that does not read motion takes these only where each message moves the scene equally far, as V of a number of
-messages is then known: x and V serve it for that alone.
+With ``shortcuts`` an agent leaves some decisions to better rules, if it can tell on board that they are better. If V is
+straight and then flat, ``greedy-qoi`` decides: gaps up to the bend of V lose nothing, so no plan is better for any
+length of interruption. ``greedy-qoi`` also decides on a steady link with uneven motion, where the queue is sent as it
+stands and there is no trap. While nothing leaves at all, a queue of at most four messages follows the exact plan
+(``small_queue``). An agent that does not read motion takes shortcuts only where each message moves the scene equally
+far. V of a number of messages is then known, and x and V serve it for that alone.
 
-An agent may also thin its queue to the link (``thins``), with room too: once something has been sent, ``target_gap``
-knows better what to do than any scorer so far, and on a steady link ``thinning`` what to drop with room. The scorers
-decide where there is no target, and the rest on steady links. Gaps are measured in motion where the agent reads it,
-else in messages.
+With ``thins`` an agent also thins its queue to the link, even with room. Once something has been sent, ``target_gap``
+decides better than any scorer so far; on a steady link ``thinning`` says what to drop with room. The scorers decide
+where there is no target, and the rest on steady links. Gaps are measured in motion if the agent reads it, otherwise in
+messages.
 
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
@@ -73,31 +72,31 @@ SLOT_NAMES = tuple(field.name for field in (*SLOT_FIELDS, *ON_BOARD_SLOT_FIELDS)
 CONTEXT_NAMES = tuple(field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS))
 NAMES = SLOT_NAMES + CONTEXT_NAMES
 SLOTS, CONTEXT = len(SLOT_NAMES), len(CONTEXT_NAMES)
-# Those that come after are observed only where they are read.
+# Fields beyond these are observed only if they are read.
 TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
 
 STILL = 0.07
-"""The link stands still while its service ratio (running mean of departures per arrival) is below this: from the first
-arrival of an interruption on (1/16), or 41 arrivals after a link that kept up has stopped."""
+"""The link stands still while its service ratio, a running mean of departures per arrival, is below this. That is so
+from the first arrival of an interruption on (1/16), and 41 arrivals after a link that kept up has stopped."""
 FLOWS, FEW = 0.18, 3
-"""A queue is soon sent where at least ``FLOWS`` messages leave per arrival, or L is at most ``FEW``."""
+"""A queue is soon sent if at least ``FLOWS`` messages leave per arrival, or L is at most ``FEW``."""
 LEAVES, THINS, SEES_MOTION = 1, 2, 4
-"""What the first of an agent's numbers says of it."""
+"""Flags whose sum is the first of an agent's parameters."""
 OWN = len(REMEMBERED)
-"""Numbers of memory that come before the scratch, where an agent thins."""
+"""Memory entries before the scratch, in an agent that thins."""
 _greedy_qoi = kernel(greedy_qoi)
 
 
 @kernel
 def even(buffer: Buffer, arrival: Arrival) -> bool:
-    """Whether the scene moves evenly, from message to message."""
+    """Whether the scene moves evenly from message to message."""
     moved, step = arrival.x - buffer.dequeued_x, arrival.x - buffer.previous_x
     return bool(abs(step * (arrival.seq - buffer.dequeued_seq) - moved) <= STEADY * moved)
 
 
 @kernel
 def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """The decision that scores highest, or that of what decides instead."""
+    """The best decision: of a shortcut, of the target gap, or else of the scorer."""
     flags, end, runs_evenly = int(buffer.parameters[0]), len(buffer.parameters), even(buffer, arrival)
     thins, measured_in = bool(flags & THINS), MOTION if flags & SEES_MOTION else MESSAGES
     leaves = flags & LEAVES and (flags & SEES_MOTION or runs_evenly)
@@ -113,7 +112,7 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
             smallest = smallest_gap(buffer, arrival, measured_in, 0.0)
             if spare(buffer, arrival, smallest, measured_in):
                 return smallest
-        # No trap for greed: the queue is soon sent. Where the scene moves evenly the scorer is nearer to even gaps.
+        # Greed has no trap here, as the queue is soon sent. Where the scene moves evenly the scorer does better.
         if leaves and not runs_evenly and (buffer.service_ratio >= FLOWS or buffer.capacity <= FEW):
             return _greedy_qoi(buffer, arrival, memory)
     elif thins:
@@ -133,7 +132,7 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 @kernel
 def scored(buffer: Buffer, arrival: Arrival, scorer: Scorer, measured_in: int, memory: Memory) -> int:
-    """The decision that scores highest, with room also where it can be spared (``measured_in`` not 0)."""
+    """The decision with the highest score; unless ``measured_in`` is 0, a queue with room may drop a spare message."""
     s, L = len(buffer.slots), buffer.capacity
     scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
     observe_context(buffer, arrival, scratch.context[:TABLE])
@@ -182,22 +181,21 @@ class Weights(ScorerWeights):
     mix: NDArray[np.float32] | None = None
     """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
     still: Weights | None = None
-    """Decides while the link stands still, from the same fields; None: these weights do."""
+    """Weights over the same fields that decide while the link stands still; None to use these weights."""
     shortcuts: bool = False
-    """Whether ``greedy-qoi`` and exact plans decide where they do better."""
+    """Whether ``greedy-qoi`` and exact plans decide where they are better."""
     thins: bool = False
-    """Whether the queue is thinned to the link."""
+    """Whether the agent thins the queue to the link."""
 
     def parameters(self) -> NDArray[np.float64]:
-        """As the policy reads them: what it does (``LEAVES`` and so on, added up), this scorer, the one for a link that
-        stands still, the shortcuts' plans."""
+        """The policy's numbers: flags, this scorer, the scorer for a standing link, and the shortcuts' plans."""
         scorers = [self] if self.still is None else [self, self.still]
         plans = [packed()] if self.shortcuts else []
         flags = LEAVES * self.shortcuts + THINS * self.thins + SEES_MOTION * ("motion_merged" in self.fields)
         return np.concatenate([[float(flags)], *(scorer.pack(scorer.mix) for scorer in scorers), *plans])
 
     def reading(self, fields: tuple[str, ...]) -> Weights:
-        """The same decisions by weights that read these fields too: what is new counts nothing."""
+        """Weights for more ``fields`` that give the same decisions; the new fields have weight 0."""
         new = tuple(name for name in fields if name not in self.fields)
         drop, accept = (network.with_inputs(len(new)) for network in (self.drop, self.accept))
         still = self.still and self.still.reading(fields)
@@ -209,7 +207,7 @@ class Weights(ScorerWeights):
 
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
-    """The policy that these weights make; it works for every L."""
+    """Make the policy of these weights; it works for every L."""
     scratch = max(scorer.scratch for scorer in (weights, weights.still or weights))
     numbers = tuple(weights.parameters().tolist())
     return Policy(

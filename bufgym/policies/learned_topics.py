@@ -1,13 +1,13 @@
-"""Learned scheduling: a slot scorer for several topics, which decides both what is dropped and what goes next.
+"""Learned scheduling: a slot scorer for several topics, which decides both which message to drop and which to send.
 
-As in ``learned``, every candidate is scored by one small network from its own features and the context's, here those of
+As in ``learned``, one small network scores every candidate from its own features and the context's, here with
 ``observe.TOPIC_FIELDS`` too. At an arrival the *drop* network scores each message that may be evicted, and the newcomer
-if it may be rejected; the *accept* network scores the newcomer where there is room. When the socket is free the *send*
-network scores the oldest message of each topic. The policy does what scores highest; ties go to the oldest message. It
+if it may be rejected. The *accept* network scores the newcomer if there is room. When the socket is free the *send*
+network scores the oldest message of each topic. The policy takes the highest score; ties go to the oldest message. It
 never holds the socket back.
 
-One rule is not learned: ``no_drop`` messages go first, as Robofleet sends them. Such a message is lost only where the
-queue holds nothing else, and no better score is worth that risk.
+One rule is not learned: ``no_drop`` messages go first, as in Robofleet. A ``no_drop`` message is lost only if the queue
+holds nothing else, and no better score is worth that risk.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NAMES = tuple(field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS + CONTEXT_
 
 @kernel
 def observed(buffer: Buffer, arrival: Arrival, arriving: bool, memory: Memory) -> tuple[Scorer, Scratch]:
-    """The scorer, and the memory with all that it observes in it."""
+    """Unpack the scorer, and write its observation into the memory."""
     scorer = scoring.unpack(buffer.parameters, 0, 3)
     scratch = scoring.divide(memory, scorer, CONTEXT, SLOTS, buffer.capacity)
     observe_topic_context(buffer, arrival, arriving, scratch.context)
@@ -50,7 +50,7 @@ def observed(buffer: Buffer, arrival: Arrival, arriving: bool, memory: Memory) -
 
 @kernel
 def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """The decision that scores highest."""
+    """The decision with the highest score."""
     scorer, scratch = observed(buffer, arrival, True, memory)
     newcomer, no_drop = buffer.capacity, buffer.topics[arrival.topic].no_drop == 1
     common = scoring.begin(scorer, DROP, scratch)
@@ -73,7 +73,7 @@ def best_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 @kernel
 def best_send(buffer: Buffer, memory: Memory) -> int:
-    """The oldest message of the topic that scores highest."""
+    """The oldest message of the topic with the highest score."""
     scorer, scratch = observed(buffer, buffer.slots[0], False, memory)
     common = scoring.begin(scorer, SEND, scratch)
     best, choice = -np.inf, HOLD
@@ -85,18 +85,18 @@ def best_send(buffer: Buffer, memory: Memory) -> int:
     return choice
 
 
-# Kernels return numbers alone to Python: the scorer's views stay inside them.
+# Kernels return only numbers to Python: the scorer's views stay inside them.
 
 
 def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A trained scheduler."""
     if len(buffer.topics) == 1:
-        return make_room(buffer, arrival)  # one queue has no topics to tell apart
+        return make_room(buffer, arrival)  # a single queue has no topics to tell apart
     return best_drop(buffer, arrival, memory)
 
 
 def on_send(buffer: Buffer, memory: Memory) -> int:
-    """The oldest no_drop message if there is one; else what scores highest."""
+    """The oldest no_drop message if there is one, otherwise the message with the highest score."""
     if len(buffer.topics) == 1:
         return 0
     kept = next_no_drop(buffer, 0)
@@ -105,7 +105,7 @@ def on_send(buffer: Buffer, memory: Memory) -> int:
 
 @dataclass(frozen=True)
 class TopicWeights(ScorerWeights):
-    """A scheduler's weights: three networks, of one hidden layer at most."""
+    """A scheduler's weights: three networks with at most one hidden layer."""
 
     SLOT_NAMES = NAMES[:SLOTS]
     CONTEXT_NAMES = NAMES[SLOTS:]
@@ -116,12 +116,12 @@ class TopicWeights(ScorerWeights):
     """Scores sending the oldest message of a topic."""
 
     def parameters(self) -> NDArray[np.float64]:
-        """As the policy reads them."""
+        """All weights as numbers for the policy."""
         return self.pack()
 
 
 def policy(name: str, weights: TopicWeights, summary: str = "", source: str = "") -> Policy:
-    """The policy that these weights make; it works for every L and any topics."""
+    """Make the policy of these weights; it works for every L and any topics."""
     return Policy(
         name,
         on_arrival,

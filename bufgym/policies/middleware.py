@@ -1,7 +1,7 @@
-"""What robots' middleware does today: ROS, DDS, Zenoh, Foxglove and rosbridge, with their own names for settings.
+"""Drop rules of robots' middleware today: ROS, DDS, Zenoh, Foxglove and rosbridge, with their own names for settings.
 
-Most keep the newest messages or reject the newcomer, as `drop-oldest` and `drop-newest` do; they have their own names
-here so that their users find them in a table. None knows what a message is worth.
+Most keep the newest messages or reject the newcomer, as `drop-oldest` and `drop-newest` do. They have their own names
+here so that their users find them in a table. None knows the worth of a message.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def dds_keep_all(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 
 def expired(buffer: Buffer, memory: Memory) -> bool:
-    """Whether the head has outlived its lifespan; the messages behind it are younger."""
+    """Whether the head has outlived its lifespan; later messages are younger."""
     return bool(buffer.now_us - buffer.slots[0].arrival_us > 1e6 * buffer.parameters[0])
 
 
@@ -43,7 +43,7 @@ def expired(buffer: Buffer, memory: Memory) -> bool:
 def lifespan(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS LIFESPAN: nothing older than `lifespan_s` is sent; the head goes when full.
 
-    DDS removes a message when it expires; here it goes when it would be sent. Until then it is the next to go anyway.
+    DDS removes a message when it expires. Here it goes when it would be sent; until then it would be next to go anyway.
     """
     return keep_last(buffer, arrival, buffer.capacity)
 
@@ -57,7 +57,7 @@ def lifespan(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 def time_filter(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS TIME_BASED_FILTER: accepts at most one message in `separation_s`; the head goes when full."""
     s, separation_us = len(buffer.slots), 1e6 * buffer.parameters[0]
-    # The message accepted last: the tail is never dropped before the head.
+    # The tail is the message accepted last, as it is never dropped before the head.
     last_us = buffer.slots[s - 1].arrival_us if s > 0 else buffer.dequeued_arrival_us
     if s + buffer.dequeued > 0 and arrival.arrival_us - last_us < separation_us:
         return REJECT

@@ -6,11 +6,11 @@ A policy is a plain function ``on_arrival(buffer, arrival, memory) -> decision``
     on_dequeue(buffer, memory) -> bool     says whether to drop the head that the socket is about to take, as CoDel does
     on_send(buffer, memory) -> slot        chooses the message to send next, or HOLD: a scheduler
 
-``buffer`` is a ``bufgym.model.buffer.Buffer``, ``arrival`` a MESSAGE record. A decision is the slot to evict for the
-newcomer (0 = oldest), REJECT or ACCEPT. The policy's settings are its ``parameters``: read-only, set by name
-(``keep-even:every=3``), read as ``buffer.parameters``. Its state is ``memory``, a float64 array of its own for each
-sender. Both are laid out in the order of the registration. ``arrival.uniform`` is a uniform draw in [0, 1) for policies
-that randomise; the functions themselves are deterministic.
+``buffer`` is a ``bufgym.model.buffer.Buffer``, ``arrival`` a MESSAGE record. A decision is REJECT, ACCEPT or the slot
+to evict for the newcomer, 0 being the oldest. Settings are ``parameters``, which a user sets by name as in
+``keep-even:every=3``; functions read them as ``buffer.parameters``. State is ``memory``, a float64 array for each
+sender. Both follow the order of the registration. ``arrival.uniform`` is a uniform draw in [0, 1) for policies that
+randomise; the functions themselves are deterministic.
 
     from bufgym.policies import ACCEPT, REJECT, register
 
@@ -22,7 +22,7 @@ that randomise; the functions themselves are deterministic.
         memory[0] += 1
         return REJECT if memory[0] % buffer.parameters[0] else 0
 
-That name now works wherever the built-in ones do. With ``compile=True`` the same function runs compiled.
+The name then works like those of built-in policies. With ``compile=True`` the same function runs compiled.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ Fields = ParamSpec("Fields")
 
 
 def _ignore(buffer: Buffer, memory: Memory) -> None:
-    """The ``on_departure`` of a policy that does not track departures."""
+    """The ``on_departure`` of a policy that ignores departures."""
 
 
 def _keep(buffer: Buffer, memory: Memory) -> bool:
-    """The ``on_dequeue`` of a policy that drops nothing there."""
+    """The ``on_dequeue`` of a policy that never drops there."""
     return False
 
 
@@ -72,16 +72,16 @@ def _send_head(buffer: Buffer, memory: Memory) -> int:
 
 @dataclass(frozen=True)
 class ClientSettings:
-    """How the client program around a policy sends, where that is not the policy's to decide."""
+    """How the client program around a policy sends, as far as the policy does not decide it."""
 
     encoding: str = ""
-    """Which of an episode's encodings its messages use; empty for their own sizes."""
+    """The episode's encoding of its messages; empty for their own sizes."""
     awaits_acks: bool = True
     """Whether it keeps to the scenario's in-flight window n_T; if not, it sends whenever the link is free."""
     limit_at_send: bool = False
     """Whether rate limits hold messages back at the socket, keeping the latest, instead of dropping at arrival."""
     limit_since_sent: bool = False
-    """Whether rate limits at arrival count from the message of the topic that was sent last, not the one kept last."""
+    """Whether rate limits at arrival count from the topic's message sent last, not from the one kept last."""
     flush_no_drop: bool = False
     """Whether no_drop messages are sent even when the window is full."""
     copies: bool = False
@@ -90,93 +90,92 @@ class ClientSettings:
 
 @dataclass(frozen=True)
 class Policy:
-    """One drop policy: the functions that decide, their parameters and memory, and where it comes from."""
+    """A drop policy: the functions that decide, their parameters and memory, and its source."""
 
     name: str
     """Unique in the registry; after ``with_parameters`` it also names the settings."""
     on_arrival: OnArrival
-    """(buffer, arrival, memory) -> the slot to evict for the newcomer, REJECT or ACCEPT."""
+    """(buffer, arrival, memory) -> REJECT, ACCEPT or the slot to evict for the newcomer."""
     _: KW_ONLY
     on_departure: OnDeparture = _ignore
-    """(buffer, memory): is told of each message that the socket has taken."""
+    """(buffer, memory), called after the socket has taken a message."""
     on_dequeue: OnDequeue = _keep
-    """(buffer, memory) -> whether to drop the head that the socket is about to take; if so, it is asked again."""
+    """(buffer, memory) -> whether to drop the head that the socket is about to take; if so, it is called again."""
     on_send: OnSend = _send_head
     """(buffer, memory) -> the slot that the free socket takes, or HOLD."""
     parameters: Mapping[str, float] = field(default_factory=dict)
     """Names and values of its settings, which its functions read as ``buffer.parameters``."""
     weights: tuple[float, ...] = ()
-    """A learned policy's numbers: its functions read these as ``buffer.parameters``, and it has no settings."""
+    """Numbers of a learned policy, which has no settings; its functions read them as ``buffer.parameters``."""
     memory: Mapping[str, float] = field(default_factory=dict)
     """Names and initial values of the memory's entries."""
     work: tuple[int, int] = (0, 0)
-    """Scratch entries behind those of the memory: so many, and so many more for each of L + 1 candidates."""
+    """Scratch entries after the memory: a fixed count, and a count for each of L + 1 candidates."""
     source: str = ""
     """The paper, specification or program that it follows."""
     about: str = ""
-    """What it does, in a sentence; empty to take the first line of ``on_arrival``'s docstring."""
+    """A sentence on its rule; empty to take the first line of ``on_arrival``'s docstring."""
     compile: bool = False
-    """Promises that Numba can compile its functions; if not, they run as ordinary Python."""
+    """Promises that Numba can compile its functions; otherwise they run as ordinary Python."""
     unbounded: bool = False
-    """Whether its queue grows without limit, whatever L is; no bound for L messages holds for it."""
+    """Whether its queue grows without limit, whatever L is; bounds for L messages do not hold for it."""
     privileged: Privileged | None = None
-    """(episode, L, B, V) -> memory, for policies that know the future, which no robot does."""
+    """(episode, L, B, V) -> memory, for policies that know the future, as no robot does."""
     reads_rate: bool = False
-    """Whether a policy that comes with bufgym reads the link's rate, which is measured for those alone that do, as it
-    takes time; for all others it is."""
+    """Whether a built-in policy reads the link's rate, which takes time to measure. Others may always read it."""
     client: ClientSettings = ClientSettings()
     """How the program around it sends."""
     for_topics: bool = False
-    """Whether it is made for several topics; on one queue it says little, and is left out unless it is named."""
+    """Whether it is made for several topics; on one queue it is left out unless named."""
     named_only: bool = False
-    """Whether ``names`` leaves it out: it takes part where it is named, as it can't play everywhere."""
+    """Whether ``names`` leaves it out, as it can't play everywhere."""
 
     @property
     def schedules(self) -> bool:
-        """Whether it chooses which message goes next."""
+        """Whether it chooses the message to send next."""
         return self.on_send is not _send_head
 
     @property
     def hears_departures(self) -> bool:
-        """Whether it is told of departures."""
+        """Whether ``on_departure`` is called."""
         return self.on_departure is not _ignore
 
     @property
     def drops_at_dequeue(self) -> bool:
-        """Whether it is asked about each head before the socket takes it."""
+        """Whether ``on_dequeue`` is called."""
         return self.on_dequeue is not _keep
 
     @property
     def measures(self) -> bool:
-        """Whether the link's rate is to be measured for it."""
+        """Whether the link's rate must be measured for it."""
         return self.reads_rate or not getattr(self.on_arrival, "__module__", "").startswith("bufgym.")
 
     @property
     def unranked_because(self) -> str:
-        """Why it does not compete with the others; empty if it does."""
+        """The reason why it does not compete with the others; empty if it does."""
         if self.unbounded:
             return "its queue is unbounded"
         return "it knows the future" if self.privileged is not None else ""
 
     @property
     def ranked(self) -> bool:
-        """Whether it plays by the rules: L messages at most, nothing known beforehand."""
+        """Whether it competes: at most L messages, and no knowledge of the future."""
         return not self.unranked_because
 
     @property
     def summary(self) -> str:
-        """What it does: ``about``, or the first line of the function's docstring."""
+        """Its rule in a sentence: ``about``, or the first line of the function's docstring."""
         return self.about or first_line(self.on_arrival)
 
     @property
     def parameter_array(self) -> NDArray[np.float64]:
-        """What its functions read as ``buffer.parameters``: float64[parameters], read-only."""
+        """Numbers for ``buffer.parameters``: float64[parameters], read-only."""
         numbers = np.array(self.weights or list(self.parameters.values()), np.float64)
         numbers.flags.writeable = False
         return numbers
 
     def new_memory(self, senders: int = 1, capacity: int = 0) -> NDArray[np.float64]:
-        """Fresh memory for so many senders with L = ``capacity``, float64[senders, entries]."""
+        """Make fresh memory for ``senders`` senders with L = ``capacity``, float64[senders, entries]."""
         scratch, per_candidate = self.work
         entries = len(self.memory) + scratch + per_candidate * (capacity + 1)
         memory = np.zeros((senders, max(1, entries)))
@@ -184,7 +183,7 @@ class Policy:
         return memory
 
     def with_parameters(self, **settings: float) -> Policy:
-        """This policy with other settings, named accordingly; an error for an unknown name or an unusable number."""
+        """This policy with other settings and a new name; raises for an unknown name or an unusable number."""
         parameters = changed(f"policy {self.name}", self.parameters, settings)
         if not settings:
             return self
@@ -199,7 +198,7 @@ class Policy:
 
 @functools.lru_cache(maxsize=256)
 def _compiled(*functions: Any) -> Functions:
-    """Once for all policies that share these functions, whatever their parameters or weights."""
+    """Compile once for all policies that share these functions, whatever their parameters or weights."""
     return cast(Functions, tuple(map(compile_for, signatures(), functions)))
 
 
@@ -232,12 +231,12 @@ def signatures() -> tuple[Any, Any, Any, Any]:
 
 
 class Later(NamedTuple):
-    """A policy that is made when it is first asked for."""
+    """A policy that is made at its first use."""
 
     make: Callable[[], Policy]
-    """Makes it."""
+    """The function that makes it."""
     for_topics: bool
-    """As in ``Policy``, as the next."""
+    """As in ``Policy``, like the next field."""
     named_only: bool
 
 
@@ -291,14 +290,15 @@ register = _registration(Policy)
 def register_later(
     name: str, make: Callable[[], Policy], *, for_topics: bool = False, named_only: bool = False
 ) -> None:
-    """Register a policy that is made when it is first asked for; an entry of this name stays as it is."""
+    """Register a policy that is made at its first use; an existing entry of this name stays."""
     _REGISTRY.setdefault(name, Later(make, for_topics, named_only))
 
 
 def names(*, for_topics: bool | None = None, named_only: bool = False) -> Iterator[str]:
-    """All registered names, in the order of their registration; True: those made for topics only, False: the others.
+    """All registered names, in the order of their registration.
 
-    ``named_only``: instead those that take part only where they are named.
+    ``for_topics`` selects policies made for topics only (True) or the others (False). ``named_only`` gives instead the
+    policies that take part only where they are named.
     """
     chosen = []
     for name, entry in _REGISTRY.items():
@@ -310,7 +310,7 @@ def names(*, for_topics: bool | None = None, named_only: bool = False) -> Iterat
 def get(spec: str | Policy | OnArrival) -> Policy:
     """The policy that ``spec`` names: ``"afr"``, or with settings ``"decimate:every=2"``.
 
-    A policy function that is not registered makes one of its own name.
+    An unregistered policy function makes a policy of its own name.
     """
     if isinstance(spec, Policy):
         return spec
@@ -329,7 +329,7 @@ def get(spec: str | Policy | OnArrival) -> Policy:
 
 
 def registered_as(function: OnArrival) -> Policy | None:
-    """The policy that ``register`` made of this function; None if there is none."""
+    """The policy that ``register`` made of this function, or None."""
     made = (entry for entry in _REGISTRY.values() if isinstance(entry, Policy))
     return next((policy for policy in made if policy.on_arrival is function), None)
 

@@ -1,14 +1,14 @@
 """Robofleet's client, as published and as released, and native ROS; `rosbridge` is in ``middleware.py``.
 
-Robofleet [sikand2021robofleet] limits each topic's rate, queues ``no_drop`` messages, keeps one slot for any other
-topic, and sends while fewer than n_T messages are in flight: sent, and not yet acknowledged (by a pong, in its terms).
+Robofleet [sikand2021robofleet] limits each topic's rate, queues ``no_drop`` messages, and keeps one slot for any other
+topic. It sends while fewer than n_T messages are in flight, that is sent and not yet acked (by a pong, in its terms).
 In the paper the topic with the largest priority x wait goes first. The released scheduler (MessageSchedulerLib.hpp of
-github ut-amrl/robofleet_client_lib) sorts by the same product in ascending order, so that the smallest goes first. Here
-a rate limit counts from the message kept last; in the paper's words t_tau is the time since the topic was last
-transmitted, which is `robofleet-literal`.
+github ut-amrl/robofleet_client_lib) sorts the same product in ascending order, so the smallest goes first. Here a rate
+limit counts from the message kept last. In the paper t_tau is the time since the topic was last transmitted;
+`robofleet-literal` follows this wording.
 
-Robofleet's queue of ``no_drop`` messages has no limit. Here it has the sender's L, and makes room as the other
-schedulers do. On a sender that knows one topic only, both clients keep one slot, and native ROS drops its oldest.
+Robofleet's queue of ``no_drop`` messages has no limit. Here it has the sender's L, and makes room like the other
+schedulers. On a sender with a single topic, both clients keep one slot, and native ROS drops its oldest.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from bufgym.policies.schedulers import fits, make_room, oldest, oldest_of_own, t
 
 @kernel
 def overwrite(buffer: Buffer, arrival: Arrival) -> int:
-    """One slot a topic, overwritten by the newcomer; ``no_drop`` messages are not overwritten but queued."""
+    """Keep one slot a topic, which the newcomer overwrites; ``no_drop`` messages are queued instead."""
     own = oldest_of_own(buffer, arrival)
     return own if own != REJECT else make_room(buffer, arrival)
 
 
 @kernel
 def next_no_drop(buffer: Buffer, start: int) -> int:
-    """The oldest ``no_drop`` message from slot ``start`` on, HOLD if there is none."""
+    """The oldest ``no_drop`` message from slot ``start`` on, or HOLD."""
     for k in range(start, len(buffer.slots)):
         if topic_of(buffer, buffer.slots[k]).no_drop == 1:
             return k
@@ -39,19 +39,19 @@ def next_no_drop(buffer: Buffer, start: int) -> int:
 
 @kernel
 def prioritised_wait(buffer: Buffer, k: int) -> float:
-    """Priority x time since slot ``k``'s topic was last sent, us; since time 0 if it never was."""
+    """Priority x time since slot ``k``'s topic was last sent, us; time counts from 0 before the first."""
     topic = topic_of(buffer, buffer.slots[k])
     return float(topic.priority * (buffer.now_us - topic.last_dequeue_us))
 
 
 @kernel
 def goes_before(buffer: Buffer, k: int, rank: float, other: int, other_rank: float) -> bool:
-    """Whether slot ``k`` goes before slot ``other``: by the smaller rank, of equals the first topic."""
+    """Whether slot ``k`` goes before slot ``other``: the smaller rank, or the first topic if equal."""
     return rank < other_rank or (rank == other_rank and buffer.slots[k].topic < buffer.slots[other].topic)
 
 
 def longest_wait(buffer: Buffer, memory: Memory) -> int:
-    """All ``no_drop`` first, in order of arrival; then the largest priority x wait, of equals the first topic."""
+    """All ``no_drop`` first, in order of arrival; then the largest priority x wait, the first topic if equal."""
     best = next_no_drop(buffer, 0)
     if best != HOLD:
         return best
@@ -87,7 +87,7 @@ def robofleet(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 def robofleet_literal(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Robofleet by the letter: as `robofleet`, but a topic's rate limit counts from when it was last sent, not kept.
 
-    A message that waits in its slot is overwritten for as long as nothing of its topic was sent.
+    A waiting message is overwritten until a message of its topic is sent.
     """
     return overwrite(buffer, arrival)
 
@@ -96,10 +96,10 @@ FLUSHING = 0
 
 
 def shortest_wait(buffer: Buffer, memory: Memory) -> int:
-    """One pass of the released scheduler, at an arrival or an ack; of equals the first topic.
+    """One pass of the released scheduler, at an arrival or an ack; the first topic if equal.
 
-    It begins only while fewer than n_T are in flight. Then all ``no_drop`` messages go, however many there are; after
-    them, for as long as n_T allows, the smallest priority x wait of the topics whose rate limits allow it.
+    It begins only while fewer than n_T are in flight. Then all ``no_drop`` messages go, however many there are. After
+    them go messages with the smallest priority x wait, as long as n_T and their topics' rate limits allow.
     """
     full = buffer.in_flight >= buffer.window
     if not full or memory[FLUSHING] == 1:
@@ -132,15 +132,15 @@ def shortest_wait(buffer: Buffer, memory: Memory) -> int:
 def robofleet_released(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Robofleet as released: rate limits at the socket, no_drop flushed past n_T, the smallest priority x wait first.
 
-    Left out: the code counts a topic's first wait from its first message instead of time 0, in whole milliseconds; it
-    sends from a topic only later than 1 / rate after the last time, not exactly then; it pings again and reconnects
+    Left out: the code counts a topic's first wait from its first message instead of time 0, in whole milliseconds. It
+    sends from a topic only later than 1 / rate after the last time, not exactly then. It pings again and reconnects
     after 2 s.
     """
     return overwrite(buffer, arrival)
 
 
 def longest_ago(buffer: Buffer, memory: Memory) -> int:
-    """The oldest message of the topic served longest ago, where never is time 0; of equals the first topic."""
+    """The oldest message of the topic served longest ago, at time 0 if never; the first topic if equal."""
     best, earliest_us = 0, buffer.now_us + 1
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
@@ -162,11 +162,11 @@ def ros_native(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Native ROS: each topic drops its oldest; topics take turns; one copy for each consumer; no acks.
 
     ROS has a TCP connection per subscriber, and these share the link. With one socket the closest model is round robin
-    by message: the topic served longest ago goes next (a copy to each consumer is a topic of its own). Left out are
-    fairness by bytes (a topic of large messages gets more of the link than one of small ones, which wait for whole
-    large ones) and the sockets' own buffers.
+    by message: the topic served longest ago goes next, and a copy to each consumer is a topic of its own. Two things
+    are left out, the sockets' own buffers and fairness by bytes. Here a topic of large messages gets a larger share of
+    the link, and small messages wait for whole large ones.
 
-    Topics have queues of their own in ROS. Where L is too small for all of them, the oldest message of any goes.
+    Topics have queues of their own in ROS. If L is too small for all of them, the oldest message of any topic goes.
     """
     if fits(buffer, arrival):
         return ACCEPT

@@ -10,7 +10,7 @@ SEEN = 0
 
 
 def reservoir_departure(buffer: Buffer, memory: Memory) -> None:
-    """The link moves again: what is still queued is the sample that a new interruption begins with."""
+    """Start anew when the link moves again: the messages still queued are the first sample of the next interruption."""
     memory[SEEN] = len(buffer.slots)
 
 
@@ -24,7 +24,7 @@ def reservoir_departure(buffer: Buffer, memory: Memory) -> None:
 def reservoir(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Reservoir sampling: every arrival of the interruption is kept with the same probability.
 
-    Where one place is not enough for its bytes, others of the sample, drawn alike, go as well.
+    If one place has too few bytes for it, further messages of the sample, drawn alike, go as well.
     """
     s = len(buffer.slots)
     candidates = float(s)
@@ -65,7 +65,7 @@ def decimate(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     compile=True,
 )
 def keyframe(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Motion keyframes: accepts what is `step` in x beyond the keyframe before it; the head goes when full."""
+    """Motion keyframes: accepts messages `step` in x beyond the last keyframe; the head goes when full."""
     s, step = len(buffer.slots), buffer.parameters[0]
     last_x = buffer.slots[s - 1].x if s > 0 else buffer.dequeued_x  # the tail is never dropped before the head
     if s + buffer.dequeued > 0 and arrival.x - last_x < step:

@@ -1,8 +1,8 @@
 """Schedulers for several topics over one uplink: which message goes next, and which one makes room for a newcomer.
 
-`fifo`, `strict-priority`, `age-greedy` and `edf` differ only in what goes next; at an arrival all four follow
+`fifo`, `strict-priority`, `age-greedy` and `edf` differ only in the message sent next; at an arrival all four follow
 ``make_room``. A topic's messages are sent in the order of their arrival, so the candidates are the oldest queued
-message of each topic. On a sender that knows one topic only, each is a queue that drops its oldest message.
+message of each topic. On a sender with a single topic, each is a queue that drops its oldest message.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bufgym.policies.registry import Arrival, Memory, register
 
 @kernel
 def topic_of(buffer: Buffer, message: Any) -> Any:
-    """The TOPIC row of a message; a sender that knows one topic only has one row for all."""
+    """The TOPIC row of a message; a sender with a single topic has one row for all."""
     return buffer.topics[message.topic if len(buffer.topics) > 1 else 0]
 
 
@@ -38,7 +38,7 @@ def fits(buffer: Buffer, arrival: Arrival) -> bool:
 
 @kernel
 def could_fit(buffer: Buffer, arrival: Arrival) -> bool:
-    """Whether the newcomer would fit by its bytes if all went that may be dropped."""
+    """Whether the newcomer's bytes would fit if every droppable message went."""
     spare_bytes, k = buffer.max_bytes - buffer.backlog_bytes - arrival.size_bytes, 0
     while spare_bytes < 0 and k < len(buffer.slots):
         if topic_of(buffer, buffer.slots[k]).no_drop == 0:
@@ -49,7 +49,7 @@ def could_fit(buffer: Buffer, arrival: Arrival) -> bool:
 
 @kernel
 def makes_room(buffer: Buffer, arrival: Arrival, k: int) -> bool:
-    """Whether slot ``k`` may be dropped for the newcomer, which fits then or once more have gone."""
+    """Whether slot ``k`` may be dropped for the newcomer, which fits then or after further drops."""
     slot, topic = buffer.slots[k], topic_of(buffer, arrival)
     within_limit = same_topic(buffer, slot, arrival) or topic.queued < topic.limit
     return bool(topic_of(buffer, slot).no_drop == 0 and within_limit and could_fit(buffer, arrival))
@@ -57,7 +57,7 @@ def makes_room(buffer: Buffer, arrival: Arrival, k: int) -> bool:
 
 @kernel
 def oldest(buffer: Buffer, arrival: Arrival) -> int:
-    """The oldest message that makes room, REJECT if none does."""
+    """The oldest message that makes room, or REJECT."""
     for k in range(len(buffer.slots)):
         if makes_room(buffer, arrival, k):
             return k
@@ -66,7 +66,7 @@ def oldest(buffer: Buffer, arrival: Arrival) -> int:
 
 @kernel
 def oldest_of_own(buffer: Buffer, arrival: Arrival) -> int:
-    """The oldest message of the newcomer's topic that makes room, REJECT if none does."""
+    """The oldest message of the newcomer's topic that makes room, or REJECT."""
     for k in range(len(buffer.slots)):
         if same_topic(buffer, buffer.slots[k], arrival) and makes_room(buffer, arrival, k):
             return k
@@ -90,7 +90,7 @@ def oldest_of_lowest(buffer: Buffer, arrival: Arrival) -> int:
 
 @kernel
 def make_room(buffer: Buffer, arrival: Arrival) -> int:
-    """Accept what fits; else the oldest of the newcomer's topic goes, else the oldest of the lowest priority."""
+    """Accept a message that fits; else the oldest of its topic goes, else the oldest of the lowest priority."""
     if fits(buffer, arrival):
         return ACCEPT
     own = oldest_of_own(buffer, arrival)
@@ -107,7 +107,7 @@ def fifo(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 
 def highest_priority(buffer: Buffer, memory: Memory) -> int:
-    """The highest priority; of equals the oldest."""
+    """The message of the highest priority; the oldest if several have it."""
     best, highest = 0, -math.inf
     for k in range(len(buffer.slots)):
         priority = topic_of(buffer, buffer.slots[k]).priority
@@ -129,7 +129,7 @@ def strict_priority(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 
 def most_aged(buffer: Buffer, memory: Memory) -> int:
-    """Among the oldest of each topic, the one with the largest weight x age; of equals the oldest."""
+    """The message with the largest weight x age, among the oldest of each topic; the oldest if equal."""
     best, most = 0, -math.inf
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
@@ -149,18 +149,18 @@ def most_aged(buffer: Buffer, memory: Memory) -> int:
     compile=True,
 )
 def age_greedy(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """The topic with the largest weight x age of information first.
+    """The topic with the largest weight x age of information goes first.
 
-    The age of a topic is the time since its newest *sent* message arrived at the sender: the age at the server once
-    everything sent is there [kaul2012status]. A topic that has sent nothing is as old as its oldest queued message.
-    Candidates are the oldest of each topic. This is the greedy policy of [kadota2018scheduling], which sends where the
-    age is highest, with the ages weighted as in their sum.
+    The age of a topic is the time since its newest *sent* message arrived at the sender, which is the age at the server
+    once every sent message is there [kaul2012status]. A topic that has sent nothing is as old as its oldest queued
+    message. Candidates are the oldest of each topic. This is the greedy policy of [kadota2018scheduling], which sends
+    where the age is highest; here ages are weighted.
     """
     return make_room(buffer, arrival)
 
 
 def earliest_deadline(buffer: Buffer, memory: Memory) -> int:
-    """The earliest absolute deadline; of equals, and of those without one, the oldest."""
+    """The earliest absolute deadline; the oldest if equal, or if none has a deadline."""
     best, earliest_us = 0, 0
     for k in range(len(buffer.slots)):
         deadline_us = buffer.slots[k].arrival_us + topic_of(buffer, buffer.slots[k]).deadline_us
@@ -177,5 +177,5 @@ def earliest_deadline(buffer: Buffer, memory: Memory) -> int:
     compile=True,
 )
 def edf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Earliest deadline first: arrival + its topic's deadline; a message that is already late is still sent."""
+    """Earliest deadline first: arrival + its topic's deadline; a message already late is still sent."""
     return make_room(buffer, arrival)

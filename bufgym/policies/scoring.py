@@ -1,7 +1,7 @@
-"""The slot scorer that learned policies share: its networks, their layout as parameters, and the forward pass.
+"""The slot scorer shared by learned policies: its networks, their layout as parameters, and the forward pass.
 
-A candidate (a queued message, or the newcomer) has features f: the context's fields first, then its own. A network
-scores it as
+A candidate is a queued message or the newcomer. Its features f are the context's fields, then its own. A network scores
+it as
 
     h = relu(W1 f + b1), then once more if there is a second layer;  score = w h + skip f + b
 
@@ -23,49 +23,50 @@ from numpy.typing import NDArray
 from bufgym.kernel import kernel
 
 HEADER = 6
-"""Numbers before the fields: fields read, those of the context among them, widths of both layers, numbers of one
-network, mixing weights."""
+"""Numbers before the fields: fields read, the context's share of them, widths of both layers, numbers of one network,
+mixing weights."""
 DROP, KEEP, SEND = range(3)
-"""The networks of a scorer, in the order of its parameters: of dropping a candidate, accepting it, sending it."""
+"""Networks of a scorer, in the order of its parameters: they score dropping, accepting and sending a candidate."""
 
 
 class Scorer(NamedTuple):
-    """A scorer's parameters, unpacked: sizes and views."""
+    """A scorer's parameters, unpacked into sizes and views."""
 
     context: int
-    """Fields that are the context's."""
+    """Number of context fields."""
     first: int
     """Width of the first hidden layer; 0 if there is none."""
     second: int
     """Width of the second hidden layer; 0 if there is none."""
     fields: NDArray[np.float64]
-    """[inputs]: where each field stands in the observation of its kind, the context's fields first."""
+    """[inputs]: position of each field in the observation of its kind, the context's fields first."""
     networks: NDArray[np.float64]
-    """One after another, ``size`` numbers each: skip and b; W1 (a row for each input) and b1; W2 and b2; w."""
+    """One after another, ``size`` numbers each: skip and b, then W1 (a row for each input) and b1, then W2 and b2, then
+    w."""
     size: int
     """Numbers of one network."""
     mix: NDArray[np.float64]
-    """[context fields, slot fields], or nothing."""
+    """[context fields, slot fields], or empty."""
 
 
 class Scratch(NamedTuple):
     """A policy's memory while it decides."""
 
     f: NDArray[np.float64]
-    """[inputs]: the features of the candidate at hand, the context's fields first."""
+    """[inputs]: the features of the present candidate, the context's fields first."""
     skip: NDArray[np.float64]
-    """[slot fields]: how much each of the candidate's own fields counts directly."""
+    """[slot fields]: direct weights of the candidate's own fields."""
     h: NDArray[np.float64]
-    """[2 first + second]: sums of the hidden layers; those of the first for the context alone come first."""
+    """[2 first + second]: sums of the hidden layers; the first layer's sums for the context alone come first."""
     context: NDArray[np.float64]
-    """[context fields in all]: the observed context."""
+    """[all context fields]: the observed context."""
     rows: NDArray[np.float64]
-    """[slot fields in all, L + 1]: the observed slots, the newcomer's last."""
+    """[all slot fields, L + 1]: the observed slots, the newcomer's last."""
 
 
 @kernel
 def end_of(parameters: NDArray[np.float64], begin: int, networks: int) -> int:
-    """Where the parameters of a scorer of so many networks end that begin at ``begin``."""
+    """End of a scorer's parameters that begin at ``begin`` and hold so many networks."""
     inputs, size, mixing = int(parameters[begin]), int(parameters[begin + 4]), int(parameters[begin + 5])
     return begin + HEADER + inputs + networks * size + mixing
 
@@ -83,7 +84,7 @@ def unpack(parameters: NDArray[np.float64], begin: int, networks: int) -> Scorer
 
 @kernel
 def divide(memory: NDArray[np.float64], scorer: Scorer, contexts: int, slots: int, capacity: int) -> Scratch:
-    """The memory as room for one decision: ``contexts`` and ``slots`` fields are observed in all."""
+    """Divide the memory into room for one decision, with ``contexts`` and ``slots`` observed fields."""
     skip = len(scorer.fields)
     h = skip + len(scorer.fields) - scorer.context
     context = h + 2 * scorer.first + scorer.second
@@ -101,7 +102,7 @@ def read_context(scorer: Scorer, scratch: Scratch) -> None:
 
 @kernel
 def begin(scorer: Scorer, which: int, scratch: Scratch) -> float:
-    """What the context adds to every score by network ``which``; its part of the first layer goes to ``scratch.h``."""
+    """The context's part of every score by network ``which``; its part of the first layer goes to ``scratch.h``."""
     net = scorer.networks[which * scorer.size : (which + 1) * scorer.size]
     f, h, skip = scratch.f, scratch.h, scratch.skip
     n, c, first = len(f), scorer.context, scorer.first
@@ -126,7 +127,7 @@ def begin(scorer: Scorer, which: int, scratch: Scratch) -> float:
 
 @kernel
 def score(scorer: Scorer, which: int, common: float, k: int, scratch: Scratch) -> float:
-    """The score of candidate ``k`` (L: the newcomer) by network ``which``, whose ``begin`` gave ``common``."""
+    """The score of candidate ``k`` by network ``which``, given ``common`` from ``begin``; k = L is the newcomer."""
     net = scorer.networks[which * scorer.size : (which + 1) * scorer.size]
     n, c, first, second = len(scorer.fields), scorer.context, scorer.first, scorer.second
     h, slot, own_fields = scratch.h, scratch.f[c:], scorer.fields[c:]
@@ -171,7 +172,7 @@ class Network:
     layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
     """Weights [inputs, outputs] and bias [outputs] of each hidden layer."""
     out: NDArray[np.float32]
-    """[outputs of the last hidden layer]; empty if there is none."""
+    """[outputs of the last hidden layer]; empty without one."""
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -179,21 +180,21 @@ class Network:
         return tuple(len(bias) for _, bias in self.layers)
 
     def flat(self, order: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
-        """All its numbers as in ``Scorer.networks``, inputs in this order."""
+        """All numbers as in ``Scorer.networks``, with the inputs in this order."""
         parts = [self.skip[order], self.bias.reshape(1)]
         for k, (weight, bias) in enumerate(self.layers):
             parts += [(weight if k else weight[order]).reshape(-1), bias]
         return np.concatenate([*parts, self.out]).astype(np.float64)
 
     def tensors(self) -> dict[str, NDArray[np.float32]]:
-        """By name: skip, bias, 0.weight, 0.bias, 1.weight, ..., out."""
+        """Name -> tensor: skip, bias, 0.weight, 0.bias, 1.weight, ..., out."""
         tensors = {"skip": self.skip, "bias": self.bias}
         for k, (weight, bias) in enumerate(self.layers):
             tensors |= {f"{k}.weight": weight, f"{k}.bias": bias}
         return tensors | {"out": self.out}
 
     def with_inputs(self, n: int) -> Network:
-        """The same with n more inputs at the end, which count nothing."""
+        """A copy with n more inputs at the end, of weight 0."""
         layers = tuple(
             (weight if k else np.pad(weight, ((0, n), (0, 0))), bias) for k, (weight, bias) in enumerate(self.layers)
         )
@@ -201,7 +202,7 @@ class Network:
 
     @staticmethod
     def of(tensors: Mapping[str, NDArray[np.float32]]) -> Network:
-        """The network of these ``tensors``."""
+        """Make the network of these ``tensors``."""
         hidden = sum(name.endswith(".weight") for name in tensors)
         layers = tuple((tensors[f"{k}.weight"], tensors[f"{k}.bias"]) for k in range(hidden))
         return Network(tensors["skip"], tensors["bias"], layers, tensors["out"])
@@ -217,16 +218,16 @@ class Network:
 
 @dataclass(frozen=True)
 class ScorerWeights:
-    """Which fields a scorer reads, and its networks."""
+    """The fields that a scorer reads, and its networks."""
 
     SLOT_NAMES: ClassVar[tuple[str, ...]]
-    """All fields that a candidate has of its own, in the order of the observation."""
+    """All fields of a candidate, in the order of the observation."""
     CONTEXT_NAMES: ClassVar[tuple[str, ...]]
     """All fields of the context."""
     NETWORKS: ClassVar[tuple[str, ...]]
     """The fields here that are networks, in the order of the parameters."""
     LAYERS: ClassVar[int]
-    """Hidden layers at most."""
+    """Most hidden layers."""
 
     fields: tuple[str, ...]
     """Names of the fields read, in the order of the networks' inputs."""
@@ -237,28 +238,28 @@ class ScorerWeights:
 
     @property
     def context(self) -> tuple[str, ...]:
-        """The fields that are the context's."""
+        """The context's fields."""
         return tuple(name for name in self.fields if name in self.CONTEXT_NAMES)
 
     @property
     def slot(self) -> tuple[str, ...]:
-        """The fields that each candidate has of its own."""
+        """The candidate's own fields."""
         return tuple(name for name in self.fields if name in self.SLOT_NAMES)
 
     @property
     def widths(self) -> tuple[int, int]:
-        """Of the two hidden layers; 0: none."""
+        """Widths of the two hidden layers; 0 for none."""
         first, second, *_ = *self.drop.widths, 0, 0
         return first, second
 
     @property
     def scratch(self) -> int:
-        """Numbers that a decision needs room for, besides the observed slots (see ``divide``)."""
+        """Numbers of working memory for a decision, apart from the observed slots; see ``divide``."""
         first, second = self.widths
         return 2 * len(self.fields) - len(self.context) + 2 * first + second + len(self.CONTEXT_NAMES)
 
     def pack(self, mix: NDArray[np.float32] | None = None) -> NDArray[np.float64]:
-        """The scorer as parameters (see ``unpack``)."""
+        """The scorer as parameters for ``unpack``."""
         order = [self.fields.index(name) for name in (*self.context, *self.slot)]
         places = [*map(self.CONTEXT_NAMES.index, self.context), *map(self.SLOT_NAMES.index, self.slot)]
         networks = [getattr(self, name).flat(order) for name in self.NETWORKS]

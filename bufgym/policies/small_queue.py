@@ -1,13 +1,13 @@
-"""Queues of up to four messages on a link that stands still: the best that can be done, looked up.
+"""The exact best decisions for a queue of up to four messages on a link that stands still, from a table.
 
-An interruption of unknown length T tells nothing but that it goes on. So the best policy for it is one plan, a list of
-what each arrival evicts. For V = 1 - b^d and T log-uniform the exact optimum (``bufgym.oracle.online_optimum``) gives
-it, up to the T that its table can hold; a beam search goes on from there. ``small_queue.txt`` has plans for bases b
-from 0.24 to 0.99: base, L, and a digit for each arrival from L + 1 on, the slot that goes (0 = oldest, L = the
-newcomer). ``python -m agents.small_queue`` makes it.
+An interruption of unknown length T reveals nothing but that it goes on. So its best policy is one plan, a list of
+evictions, one for each arrival. For V = 1 - b^d and T log-uniform, the exact optimum (``bufgym.oracle.online_optimum``)
+gives the plan up to the largest T that fits its table. A beam search continues it from there. ``small_queue.txt`` has
+plans for bases b from 0.24 to 0.99. Each line has the base, L, and for each arrival from L + 1 on a digit, the slot
+that goes (0 = oldest, L = the newcomer). ``python -m agents.small_queue`` makes it.
 
-They count where each arrival moves the scene on by the same step, with that step's V, and while the queue holds just
-what the plan has kept so far.
+A plan applies if each arrival moves the scene on by the same step, with V of that step as its V, and only while the
+queue holds exactly the messages that the plan has kept so far.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from bufgym.model.buffer import REJECT, Buffer
 from bufgym.model.qoi import EXPONENTIAL
 
 CAPACITIES = (1, 2, 3, 4)
-"""L."""
+"""Values of L."""
 LONGEST = 400
-"""Arrivals of the longest interruption that plans know."""
+"""Arrivals of the longest interruption in the plans."""
 _RATIO = (math.log(0.618) / math.log(0.9)) ** (1 / 7)
 BASES = tuple(math.exp(math.log(0.9) * _RATIO**k) for k in range(-10, 13))
-"""b, evenly spaced in the logarithm of ln b, 0.9 and 0.618 among them."""
+"""Bases b, evenly spaced in the logarithm of ln b; 0.9 and 0.618 are among them."""
 DIGITS = 16
-"""Of a plan in one number, three bits each."""
+"""Digits of a plan in one number, three bits each."""
 PLAN = -(-LONGEST // DIGITS)
-"""Numbers of one."""
+"""Numbers of one plan."""
 NUMBERS = len(BASES) * len(CAPACITIES) * PLAN
-"""How many numbers hold all plans."""
+"""Numbers of all plans."""
 NONE = -3
-"""No plan says what to do."""
+"""Answer where no plan applies."""
 # For the kernel, and for C.
 SLACK = 1e-6
 FIRST, STEP = math.log(BASES[0]), math.log(_RATIO)
@@ -59,14 +59,14 @@ def packed() -> NDArray[np.float64]:
 
 @kernel
 def nearest(log_base: float) -> int:
-    """The place in ``BASES`` of the base with about this logarithm (< 0), -1 if none is near."""
+    """Index in ``BASES`` of the base with about this logarithm (< 0), or -1."""
     place = math.floor(math.log(log_base / FIRST) / STEP + 0.5)
     return int(place) if 0 <= place < COUNT else -1
 
 
 @kernel
 def planned(buffer: Buffer, arrival: Any, plans: NDArray[np.float64]) -> int:
-    """What the plan for this queue evicts, or REJECT; NONE where there is no plan. ``plans``: as ``packed``."""
+    """The slot that the plan for this queue evicts, REJECT, or NONE without a plan; ``plans`` come from ``packed``."""
     L, step = buffer.capacity, arrival.x - buffer.previous_x
     if L > 4 or len(buffer.slots) != L or buffer.v[0] != EXPONENTIAL or len(buffer.topics) > 1 or step <= 0:
         return NONE

@@ -1,11 +1,11 @@
-"""The target gap: how far apart messages should be sent, so that the link and the queue carry what is to come.
+"""The target gap: a distance between sent messages that suits the link, the queue and the messages to come.
 
     m <- motion per time: since the message dequeued last, and over ``PACE_US``
     r <- messages per time that the link sends: its rates over 0.1 s and 2 s, and over ``LINK_US``
     g <- m T / (r T + L - s)
 
-In the next T the scene moves on by m T, the link sends r T messages and the queue finds room for L - s more: g is their
-gap if it is even. It is wide where the queue is full, or the link sends few messages for the motion.
+In the next T the scene moves on by m T, the link sends r T messages and the queue takes L - s more. Their even gap is
+g. It is wide if the queue is full, or if the link sends few messages for the motion.
 
     soon <- whether the socket is free before ``NEAR`` more arrivals
     if there is room, and the queue is empty or the socket idle: accept
@@ -14,13 +14,13 @@ gap if it is even. It is wide where the queue is full, or the link sends few mes
     elif the smallest gap that can be left is at most g: it goes, though there is room
     else: accept
 
-So the head is looked at once more when its turn comes: until then the link's rate may change. Blackouts in mid-stream
-are no exception. On a steady link, where g is known, the even spacing is made behind the head (``thinning``).
+The head is thus checked once more when its turn comes, as the link's rate may have changed. Blackouts in mid-stream are
+no exception. On a steady link, where g is known, the even spacing is made behind the head (``thinning``).
 
-There is no target where the future is not to be told from the past: in bursts (an empty queue would leave the link
-idle; one long pause counts as one for some seconds), for queues of fewer than ``LEAST`` messages, before anything has
-been sent, and until the stream has run for as long as a full queue takes to be sent. Then the smallest gap goes, and
-``thinning`` says whether with room, too.
+No target is set while the past does not predict the future. In bursts an empty queue would leave the link idle; one
+long pause counts as a burst for some seconds. Nor is there a target for queues of fewer than ``LEAST`` messages, before
+anything has been sent, or until the stream has run for as long as a full queue takes to be sent. Then the smallest gap
+goes, and ``thinning`` says whether it goes with room too.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from bufgym.policies.registry import Arrival, Memory, register
 from bufgym.policies.thinning import places, spare, steady
 
 HORIZON_US = 5e6
-"""T."""
+"""T, us."""
 SHORT, LONG = 0.25, 0.25
 """Weights of the link's rates over 0.1 s and 2 s in r; the rest is that of the rate over ``LINK_US``."""
 REST = 1 - SHORT - LONG
@@ -43,25 +43,25 @@ PACED, PACE_US = 0.4, 15e6
 NEAR = 1.5
 """Arrivals."""
 DISCOUNT = 0.165
-"""By how much less the gap left by the head counts than that left by the tail."""
+"""Discount on the gap at the head of the queue, compared with the tail's."""
 LEAST = 4
-"""L from which on the target is followed."""
+"""Smallest L that follows the target."""
 BURSTY, LATE = 1.5, 1 / 32
-"""Arrivals come in bursts where the mean square of the time between them is over so many times the square of its mean:
-2 for a Poisson process, 10 for bursts of ten. The newest time weighs ``LATE`` in both means, so that a whole burst does
-not look like an even stream."""
+"""Arrivals are bursty if the mean square of the time between them exceeds ``BURSTY`` times the square of its mean. The
+ratio is 2 for a Poisson process and 10 for bursts of ten. The newest time has weight ``LATE`` in both means, so that
+a whole burst does not look like an even stream."""
 WITHIN = 1.001
-"""A gap may be longer than g by rounding."""
+"""Factor by which a gap may exceed g through rounding."""
 
 RATE, SENT_US, PACE, SEEN_US, PERIOD, SQUARE = range(6)
 REMEMBERED = {"rate": 0.0, "sent_us": 0.0, "pace": 0.0, "seen_us": 0.0, "period": 0.0, "square": 0.0}
-"""The policy's memory: the link's rate over ``LINK_US`` (bytes/us), how long it has sent, the motion (or messages) per
-us over ``PACE_US``, how long the stream has run, the mean time between arrivals and its mean square."""
+"""Memory of the policy: the link's rate over ``LINK_US`` (bytes/us) and how long it has sent; motion or messages per us
+over ``PACE_US`` and how long the stream has run; the mean time between arrivals and its mean square."""
 
 
 @kernel
 def remember(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int) -> None:
-    """Renew the long means; to be called at every arrival."""
+    """Update the long means; call it at every arrival."""
     if buffer.evictions > 0:
         return
     sent_us = float(buffer.drained_us)
@@ -86,14 +86,14 @@ def bursty(memory: Memory) -> bool:
 
 @kernel
 def link_rate(buffer: Buffer, memory: Memory) -> float:
-    """The rate that is expected, bytes/us."""
+    """The expected rate, bytes/us."""
     recent = SHORT * buffer.short_rate_bytes_per_s + LONG * buffer.long_rate_bytes_per_s
     return float(recent / 1e6 + REST * memory[RATE])
 
 
 @kernel
 def target(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int) -> float:
-    """g, in motion or in messages; 0 where it cannot be told (see the module's text)."""
+    """g, in motion or in messages; 0 if unknown (see the module's text)."""
     s, L = len(buffer.slots), places(buffer, arrival)
     elapsed_us = float(arrival.arrival_us - buffer.dequeued_arrival_us)
     if L < LEAST or len(buffer.topics) > 1 or elapsed_us <= 0 or memory[RATE] <= 0 or memory[PACE] <= 0:

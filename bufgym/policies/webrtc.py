@@ -1,12 +1,12 @@
-"""WebRTC's frame dropper: a leaky bucket in front of the encoder (modules/video_coding/utility/frame_dropper.cc).
+"""WebRTC's frame dropper, a leaky bucket in front of the encoder (modules/video_coding/utility/frame_dropper.cc).
 
-Each frame that is kept fills the bucket with its bits, each frame time leaks what the target bit rate allows. While the
-bucket is above half a second of it, a filtered share of the frames is dropped, evenly. An unusually large frame fills
-the bucket bit by bit over half a second of frames.
+Each frame that is kept fills the bucket with its bits. In each frame time the bucket leaks as much as the target bit
+rate allows. While it holds more than half a second of that rate, a filtered share of the frames is dropped, evenly. An
+unusually large frame fills the bucket bit by bit over half a second of frames.
 
-WebRTC's target comes from the receiver's feedback. A robot's queue has none; here it is the rate at which the socket
-drains (``fragments.ahead_of_newcomer``), and until that is known nothing is dropped. With a target of 0 WebRTC pauses
-the encoder: every frame is dropped. There are no key frames among these messages: each counts as a delta frame.
+WebRTC's target comes from the receiver's feedback. A robot's queue has no feedback: its target is the rate at which the
+socket drains (``fragments.ahead_of_newcomer``), and nothing is dropped until that is known. With a target of 0 WebRTC
+pauses the encoder, so every frame is dropped. These messages have no key frames: each counts as a delta frame.
 """
 
 from __future__ import annotations
@@ -20,24 +20,25 @@ from bufgym.policies.registry import Arrival, Memory, register
 BUCKET_S = 0.5
 """Size of the bucket, s of the target rate: above it frames are dropped."""
 MOST_S = 3.0
-"""The bucket never holds more than so many seconds of the target rate."""
+"""Most seconds of the target rate in the bucket."""
 MOST_DROPS_S = 4.0
-"""Frames are dropped in a row for at most so long."""
+"""Longest run of dropped frames, s."""
 LARGE = 3.0
-"""A frame of more than so many times the average is large."""
+"""A frame larger than the average by this factor is large."""
 SIZE_ALPHA, RATIO_ALPHA, FAST_RATIO_ALPHA = 0.9, 0.9, 0.8
-"""What the filters of frame size and drop ratio keep of their value; the ratio's while the bucket runs far over."""
+"""Shares of the old value that the filters keep: of frame size, of drop ratio, and of drop ratio while the bucket runs
+far over."""
 MOST_RATIO = 0.96
 FORGETS_S = 1e6
-"""The target stays what it was until a message has shown another."""
+"""Time for which an old target holds until a message has shown another."""
 
 LEVEL, TARGET, AVERAGE, RATIO, COUNT, LARGE_LEFT, LARGE_PART, ABOVE = range(len(PIPE), len(PIPE) + 8)
-"""Where the dropper's state lies, behind that of the pipe."""
+"""Indices of the dropper's state, after the pipe's."""
 
 
 @kernel
 def retarget(memory: Memory, target: float) -> None:
-    """A new target, bytes/us; a bucket over its new size shrinks along with the target."""
+    """Set a new target, bytes/us; a bucket over its new size shrinks along with it."""
     if target < memory[TARGET] and memory[LEVEL] > 1e6 * BUCKET_S * target:
         memory[LEVEL] *= target / memory[TARGET]
     memory[TARGET] = target
@@ -46,7 +47,7 @@ def retarget(memory: Memory, target: float) -> None:
 
 @kernel
 def leak(memory: Memory, period_us: float) -> None:
-    """One frame time: the bucket leaks, and the drop ratio follows its level."""
+    """Pass one frame time: the bucket leaks, and the drop ratio follows its level."""
     drained = memory[TARGET] * period_us
     if memory[LARGE_LEFT] > 0:
         drained -= memory[LARGE_PART]
@@ -63,7 +64,7 @@ def leak(memory: Memory, period_us: float) -> None:
 
 @kernel
 def drops_frame(memory: Memory, period_us: float) -> bool:
-    """Whether to drop this frame: from a ratio of 1/2 on so many drops for each frame kept, below it the other way."""
+    """Whether to drop this frame: a ratio of 1/2 or more drops several for each frame kept."""
     ratio = memory[RATIO]
     if ratio >= 0.5:
         most = int(1e6 * MOST_DROPS_S / period_us)
@@ -82,7 +83,7 @@ def drops_frame(memory: Memory, period_us: float) -> bool:
 
 @kernel
 def fill(memory: Memory, size_bytes: float, period_us: float) -> None:
-    """A frame was kept: its bytes go into the bucket, those of a large one in equal parts over the next half second."""
+    """Add a kept frame's bytes to the bucket; a large frame goes in by equal parts over the next half second."""
     average = memory[AVERAGE]
     if average > 0 and size_bytes > LARGE * average and memory[LARGE_LEFT] == 0:
         memory[LARGE_LEFT] = int(max(0.5e6 / period_us, 5.0) + 0.5)
@@ -104,7 +105,7 @@ def fill(memory: Memory, size_bytes: float, period_us: float) -> None:
     compile=True,
 )
 def webrtc_frame_dropper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """WebRTC's frame dropper: a leaky bucket at the rate the socket drains at; a full queue drops the newcomer."""
+    """WebRTC's frame dropper: a leaky bucket at the socket's own rate; a full queue drops the newcomer."""
     ahead_bytes, period_us = ahead_of_newcomer(buffer, memory, FORGETS_S), max(1.0, buffer.period_us)
     decision = keep_first(buffer, arrival)
     if memory[RATE] < UNKNOWN:

@@ -1,9 +1,9 @@
 """Learned policies in files: safetensors with JSON metadata, which is read without running code.
 
-The tensors are those of ``learned.Weights``, float32, by name: ``drop.skip`` [inputs], ``drop.bias`` [1], for each
-hidden layer ``drop.0.weight`` [inputs, outputs] and ``drop.0.bias`` [outputs], ``drop.out`` [outputs of the last];
-``accept.*`` likewise, and ``send.*`` in a scheduler's (``learned_topics``). The header's metadata has one entry,
-``bufgym``, a JSON object that describes the file:
+The file has the float32 tensors of ``learned.Weights`` by name. ``drop.skip`` is [inputs] and ``drop.bias`` [1]. Each
+hidden layer has ``drop.0.weight`` [inputs, outputs] and ``drop.0.bias`` [outputs]. ``drop.out`` is [outputs of the last
+layer]. The names ``accept.*`` follow, and in a scheduler's file (``learned_topics``) ``send.*``. The header's metadata
+has one entry, ``bufgym``, a JSON object that describes the file:
 
     format        number of this format
     name          the policy's
@@ -13,7 +13,7 @@ hidden layer ``drop.0.weight`` [inputs, outputs] and ``drop.0.bias`` [outputs], 
     bufgym        version that wrote the file
     sha256        of fields and tensors
 
-and whatever its author notes: the training command, seeds, suite, scores. A file is accepted whole or refused.
+The author may add notes: the training command, seeds, suite, scores. A file is accepted whole or refused.
 """
 
 from __future__ import annotations
@@ -47,25 +47,25 @@ Kind = type[Weights] | type[TopicWeights]
 
 FORMAT = 1
 MAX_BYTES = 1 << 20
-"""A larger file is refused: a slot scorer has a few kilobytes."""
+"""Largest file accepted, bytes: a slot scorer has a few kilobytes."""
 MAX_WIDTH = 256
-"""Units of a hidden layer at most."""
+"""Most units of a hidden layer."""
 KEY = "bufgym"
 """The entry of the header's metadata that holds the JSON text."""
 FLAGS = ("shortcuts", "thins")
-"""What an agent for one queue may do besides scoring."""
+"""Flags of an agent for one queue that may do more than scoring."""
 WRITTEN = ("format", "fields", "observation", "bufgym", "sha256", *FLAGS)
 """Metadata that ``save`` itself writes."""
 MIX = "drop.mix"
-"""A tensor that a file may lack."""
+"""An optional tensor."""
 STILL = "still."
-"""Prefix of the second scorer's tensors, whose hidden layers are its own; a file may lack them all."""
+"""Prefix of the second scorer's tensors, with hidden layers of its own; all are optional."""
 
 
 def observation_hash(topics: bool = False, names: Sequence[str] = ()) -> str:
     """SHA-256 of the fields' definitions: weights trained on other definitions would decide nonsense.
 
-    ``topics``: with the fields that only several topics have; those beside the tables count where ``names`` has them.
+    ``topics`` adds the fields of several topics. Fields beside the tables count only if they are in ``names``.
     """
     beside = [field for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.name in names]
     fields = [*FIELDS, *(TOPIC_FIELDS if topics else ()), *beside]
@@ -74,7 +74,7 @@ def observation_hash(topics: bool = False, names: Sequence[str] = ()) -> str:
 
 
 def load(path: StrPath) -> Policy:
-    """The policy in a file, for every L; it runs compiled, as the built-in ones do.
+    """Load the policy in a file, for every L; it runs compiled, like built-in policies.
 
     Raises:
         BufgymError: no such file, or one that breaks a rule of the format.
@@ -88,7 +88,7 @@ def load(path: StrPath) -> Policy:
 
 
 def load_shipped(name: str, path: Path) -> Policy:
-    """One of the agents that come with bufgym; its metadata must name it as its file does."""
+    """Load an agent that comes with bufgym; its metadata must name it as its file does."""
     policy = load(path)
     if policy.name != name:
         raise BufgymError(where(path, None, policy.name, f"must be {name}, as the file", field="name"))
@@ -103,8 +103,8 @@ def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any
 
     Args:
         path: the file; an existing one is replaced.
-        weights: what the policy decides by.
-        about: ``name`` of the policy, ``about`` (a sentence), and whatever else its author notes, as JSON can hold it.
+        weights: the policy's weights.
+        about: ``name`` of the policy, ``about`` (a sentence), and further notes of the author, as JSON can hold them.
 
     Raises:
         BufgymError: the file cannot be written, or could not be read again.
@@ -128,7 +128,7 @@ def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any
     except (TypeError, ValueError) as error:
         raise BufgymError(f"{target}: metadata that JSON cannot hold: {error}") from None
     data = serialized(tensors, metadata={KEY: text})
-    _parsed(target, data)  # whatever could not be read is not written
+    _parsed(target, data)  # an unreadable file is never written
     try:
         with replaced(target) as temporary:
             temporary.write_bytes(data)
@@ -138,7 +138,7 @@ def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any
 
 
 def _tensors(weights: Weights | TopicWeights) -> Tensors:
-    """By name, little-endian and in C order, as in the file."""
+    """Name -> tensor, little-endian and in C order, as in the file."""
     tensors = {
         f"{network}.{name}": np.ascontiguousarray(tensor, "<f4")
         for network in weights.NETWORKS
@@ -152,7 +152,7 @@ def _tensors(weights: Weights | TopicWeights) -> Tensors:
 
 
 def _sha256(fields: Sequence[str], tensors: Tensors) -> str:
-    """Over the fields, and the tensors' names, shapes and bytes in the order of the names."""
+    """Hash of the fields, and of the tensors' names, shapes and bytes in the order of the names."""
     state = hashlib.sha256(",".join(fields).encode())
     for name in sorted(tensors):
         state.update(f"{name}{list(tensors[name].shape)}".encode())
@@ -176,7 +176,7 @@ def read(path: StrPath) -> tuple[Weights, dict[str, Any]]:
 
 
 def read_any(path: StrPath) -> tuple[Weights | TopicWeights, dict[str, Any]]:
-    """As ``read``, of either kind."""
+    """As ``read``, for either kind."""
     return _parsed(path, read_whole(path, MAX_BYTES))
 
 
@@ -200,7 +200,7 @@ def _parsed(path: StrPath, data: bytes) -> tuple[Weights | TopicWeights, dict[st
 
 
 def _weights(kind: Any, fields: Sequence[str], tensors: Tensors) -> Any:
-    """Weights of that ``Kind``."""
+    """Make weights of that ``Kind``."""
     weights = kind(tuple(fields), *(Network.of(_below(f"{network}.", tensors)) for network in kind.NETWORKS))
     still = _below(STILL, tensors)
     if kind is Weights:
@@ -213,8 +213,8 @@ def _below(prefix: str, tensors: Tensors) -> Tensors:
 
 
 def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
-    """The JSON object in the header, its rules checked."""
-    # 8 bytes: the header's length; then the header, which the library has read without complaint.
+    """The JSON object in the header, checked."""
+    # 8 bytes hold the header's length; then comes the header, which the library has read without complaint.
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     text = (header.get("__metadata__") or {}).get(KEY)
     if text is None:
@@ -263,12 +263,12 @@ def _no_number(constant: str) -> NoReturn:
 
 
 def _refuse(path: StrPath, name: str, rule: str, *, what: str = "", value: object = None) -> NoReturn:
-    """``what`` of the tensor ``name`` (the tensor itself by default) breaks a rule."""
+    """Raise an error for a broken rule: ``what``, by default the tensor ``name`` itself."""
     raise BufgymError(where(path, None, value, rule, field=f"{what}tensor {name}"))
 
 
 def _checked_tensors(path: StrPath, entries: dict[str, Any], fields: Sequence[str], kind: Kind) -> Tensors:
-    """The tensors by name, each of them float32, finite, and of the shape that the others require."""
+    """Name -> tensor; each is float32, finite, and of the shape that the others require."""
     shapes = {name: tuple(entry["shape"]) for name, entry in entries.items()}
     two = kind is Weights and any(name.startswith(STILL) for name in shapes)
     for prefix in ("", STILL) if two else ("",):
@@ -288,7 +288,7 @@ def _checked_tensors(path: StrPath, entries: dict[str, Any], fields: Sequence[st
 def _check_shapes(
     path: StrPath, prefix: str, shapes: Mapping[str, tuple[int, ...]], fields: Sequence[str], kind: Kind
 ) -> None:
-    """Whether the tensors of one scorer, their names behind ``prefix``, are complete and fit each other."""
+    """Check that the tensors of one scorer, with names after ``prefix``, are complete and fit each other."""
 
     def refuse_shape(name: str, rule: str) -> NoReturn:
         _refuse(path, name, rule, what="shape of ", value=list(shapes[name]))

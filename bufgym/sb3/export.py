@@ -26,13 +26,13 @@ from bufgym.sim import run
 from bufgym.sim.metrics import received, weighted_qoi
 
 CHECKED = (4, 8, 16, 32)
-"""L of the regrets that are noted in the file."""
+"""Values of L for the regrets noted in the file."""
 
 
 def export(
     model: StrPath, out: StrPath, *, name: str, about: str = "", shortcuts: bool = False, thins: bool = False
 ) -> Path:
-    """Write the agent in ``model`` to ``out``, with what its run's folder says of its training.
+    """Write the agent in ``model`` to ``out``, with its training notes from the run's folder.
 
     Args:
         model: an evolved agent's ``model.safetensors``, which gets its name and its scores; or the zip of a model of
@@ -40,8 +40,8 @@ def export(
             own alone.
         out: the file to write, .safetensors.
         name: the policy's name.
-        about: a sentence: what it was trained for.
-        shortcuts: leave to others what they do better (``bufgym.policies.learned``).
+        about: a sentence on what it was trained for.
+        shortcuts: leave some decisions to better rules (``bufgym.policies.learned``).
         thins: thin the queue to the link.
 
     Raises:
@@ -64,7 +64,7 @@ def export(
 
 
 def read_policy(path: StrPath) -> BasePolicy:
-    """The policy network in a saved model's zip, of whatever algorithm.
+    """Read the policy network from a saved model's zip, for any algorithm.
 
     Raises:
         BufgymError: no such file, or no model of stable-baselines3.
@@ -79,14 +79,14 @@ def read_policy(path: StrPath) -> BasePolicy:
             saved["observation_space"], saved["action_space"], lambda _: 0.0, **arguments
         )
         policy.load_state_dict(dict(parameters["policy"]))
-    except Exception as error:  # of whatever kind a zip of pickles raises
+    except Exception as error:  # a zip of pickles can raise any kind
         raise BufgymError(f"{path}: no model of stable-baselines3: {type(error).__name__}: {error}") from None
     policy.set_training_mode(False)
     return policy
 
 
 def weights_of(model: Any) -> Weights:
-    """The actor of a model with ``SlotPolicy`` (or of that policy); the critic served training alone."""
+    """Weights of the actor of a model with ``SlotPolicy``, or of that policy; the critic only served training."""
     policy = getattr(model, "policy", model)
     features, scorer = (getattr(policy, part, None) for part in ("features_extractor", "mlp_extractor"))
     if not isinstance(features, SlotExtractor) or not isinstance(scorer, SlotScorer):
@@ -114,7 +114,7 @@ def _array(parameter: Any) -> NDArray[np.float32]:
 
 
 def regrets(policy: Policy) -> dict[str, float]:
-    """Its exact regret in interruption-v1's test split, for a test to find again: in each V, at each of ``CHECKED``."""
+    """The policy's exact regret in interruption-v1's test split, for each V and L of ``CHECKED``, as a test value."""
     rounded = {}
     for label, setting in suites.get("interruption-v1").settings("test").items():
         for L, regret in zip(CHECKED, EveryLength(setting.scenario, CHECKED).regrets(policy), strict=True):
@@ -123,7 +123,7 @@ def regrets(policy: Policy) -> dict[str, float]:
 
 
 def topics_qoi(policy: Policy) -> dict[str, float]:
-    """A scheduler's weighted QoI, for a test to find again: on the first test episode of each setting of topics-v1."""
+    """A scheduler's weighted QoI on the first test episode of each setting of topics-v1, as a test value."""
     suite = suites.get("topics-v1")
     rounded = {}
     for label, setting in suite.settings("test").items():
@@ -137,7 +137,7 @@ def topics_qoi(policy: Policy) -> dict[str, float]:
 
 
 def run_notes(model: Path) -> dict[str, Any]:
-    """What train.py noted beside the model (``notes.json``): command, seeds and scores; {} elsewhere."""
+    """Notes that train.py left beside the model (``notes.json``): command, seeds and scores; {} without them."""
     path = model.with_name("notes.json")
     if not path.is_file():
         return {}

@@ -1,7 +1,7 @@
 """The slot network, which scores each slot with the same small network, and a plain one over all numbers at once.
 
-Scoring slots one by one builds in what is known of the problem: what a message is worth depends on its neighbours (the
-slot's own features) and on the link (the context), not on the number of its slot. One set of weights serves every L.
+Scoring slots one by one builds knowledge of the problem in. A message's worth depends on its neighbours (the slot's own
+features) and on the link (the context), not on the number of its slot. One set of weights serves every L.
 
     from sb3_contrib import MaskablePPO
     from bufgym.sb3 import SlotExtractor, SlotPolicy, make_vec_env
@@ -29,7 +29,7 @@ ACCEPT_BIAS = 2.0
 
 
 def field_names(space: spaces.Dict) -> tuple[list[str], list[str]]:
-    """(slot fields, context fields) of a bufgym observation: L + 1 >= 2 entries, and one entry."""
+    """Names of the slot fields (L + 1 >= 2 entries) and context fields (one entry) of a bufgym observation."""
     if not isinstance(space, spaces.Dict) or {"slots", "context"} & set(space.spaces):
         raise BufgymError('a slot network observes named fields: make its environment with observation="dict"')
     slots = [name for name, box in space.items() if (box.shape or (1,))[0] > 1]
@@ -37,7 +37,7 @@ def field_names(space: spaces.Dict) -> tuple[list[str], list[str]]:
 
 
 class SlotExtractor(BaseFeaturesExtractor):
-    """[n, (L + 1) x (slot fields + context fields)]: each slot's features, with the context beside each."""
+    """[n, (L + 1) x (slot fields + context fields)]: each slot's features, followed by the context's."""
 
     def __init__(self, observation_space: spaces.Dict) -> None:
         self.slot_fields, self.context_fields = field_names(observation_space)
@@ -56,13 +56,13 @@ class SlotExtractor(BaseFeaturesExtractor):
 
 
 class SlotScorer(nn.Module):
-    """Logits of all L + 2 actions, and the latent that the value is read from.
+    """Logits of all L + 2 actions, and the latent that the critic's value is read from.
 
     Args:
-        features: says how the numbers lie.
-        width: of the hidden layers.
-        masked: empty slots are never chosen, so they are not scored. Their logits are 0, for the mask to take away.
-        accept_bias: what the logit of accepting begins with.
+        features: the extractor, which knows the layout of the numbers.
+        width: units of each hidden layer.
+        masked: whether actions are masked. Empty slots are then never chosen, so they get the logit 0 unscored.
+        accept_bias: initial logit of accepting.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class SlotScorer(nn.Module):
         self.occupied = features.slot_fields.index("occupied") if "occupied" in features.slot_fields else None
         self.masked = masked and self.occupied is not None
         self.score = _perceptron(inputs, width, 1)
-        """Slot -> logit of dropping it; the last slot is the newcomer, so its logit is that of rejecting."""
+        """Slot -> logit of dropping it; the last slot is the newcomer, so its logit is for rejecting."""
         self.accept = _perceptron(inputs, width, 1, bias=accept_bias)
         """The newcomer's features -> logit of accepting it."""
         self.worth = nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
@@ -92,7 +92,7 @@ class SlotScorer(nn.Module):
         return self._latent(*self._slots(features))
 
     def _slots(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """[n, slots, inputs], and [n, slots]: which of them hold a message."""
+        """Slots [n, slots, inputs] and whether each holds a message [n, slots]."""
         slots = features.reshape(-1, *self.shape)
         if self.occupied is None:
             return slots, torch.ones(slots.shape[:2], dtype=torch.bool)
@@ -106,7 +106,7 @@ class SlotScorer(nn.Module):
         return torch.cat([drop, self.accept(slots[:, -1])], dim=1)
 
     def _latent(self, slots: Tensor, occupied: Tensor) -> Tensor:
-        """From the mean over messages and from the newcomer: its width is independent of L."""
+        """Latent from the mean over messages and from the newcomer, whose width is independent of L."""
         total = torch.zeros(len(slots), self.latent_dim_vf)
         total = total.index_add(0, occupied.nonzero()[:, 0], self.worth(slots[occupied]))
         mean = total / occupied.sum(dim=1, keepdim=True).clamp(min=1)
@@ -115,7 +115,7 @@ class SlotScorer(nn.Module):
 
 
 def _perceptron(inputs: int, width: int, outputs: int, bias: float = 0.0) -> nn.Sequential:
-    """Two hidden layers, and outputs that begin close to ``bias``."""
+    """Make two hidden layers, and outputs that begin close to ``bias``."""
     last = nn.Linear(width, outputs)
     nn.init.uniform_(last.weight, -0.1 / width**0.5, 0.1 / width**0.5)
     nn.init.constant_(last.bias, bias)
@@ -123,11 +123,11 @@ def _perceptron(inputs: int, width: int, outputs: int, bias: float = 0.0) -> nn.
 
 
 class SlotPolicy(MaskableMultiInputActorCriticPolicy):
-    """Actor and critic made of a ``SlotScorer``, for MaskablePPO or (``masked=False``) for PPO."""
+    """Actor and critic from a ``SlotScorer``, for MaskablePPO or, with ``masked=False``, for PPO."""
 
     def __init__(self, *args: Any, width: int = 32, masked: bool = True, **kwargs: Any) -> None:
         self.width, self.masked = width, masked
-        kwargs.pop("use_sde", None)  # PPO says so to every policy, MaskablePPO to none; actions are discrete
+        kwargs.pop("use_sde", None)  # PPO passes it to every policy, MaskablePPO to none; actions are discrete
         kwargs.setdefault("features_extractor_class", SlotExtractor)
         # Layers are initialised here as torch does; the library's orthogonal scheme would undo the accept bias.
         kwargs["ortho_init"] = False
@@ -140,7 +140,7 @@ class SlotPolicy(MaskableMultiInputActorCriticPolicy):
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
-        # The scorer's outputs are the logits already. The optimizer is made anew without the layer that goes.
+        # The scorer's outputs are the logits already. The optimizer is made anew without the removed layer.
         self.action_net = nn.Identity()
         settings = {"lr": lr_schedule(1), **self.optimizer_kwargs}
         self.optimizer = self.optimizer_class(self.parameters(), **settings)
@@ -150,7 +150,7 @@ class SlotPolicy(MaskableMultiInputActorCriticPolicy):
 
 
 def policy_of(network: str, width: int, masked: bool = True) -> tuple[Any, dict[str, Any]]:
-    """(actor and critic, their arguments) for "slots" or "plain"."""
+    """Actor-critic class and its arguments for "slots" or "plain"."""
     if network == "slots":
         return SlotPolicy, {"width": width, "masked": masked}
     plain = MaskableMultiInputActorCriticPolicy if masked else MultiInputActorCriticPolicy

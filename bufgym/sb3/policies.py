@@ -41,11 +41,11 @@ from bufgym.sb3.networks import SlotScorer
 def as_policy(
     model: BaseAlgorithm | BasePolicy | StrPath, name: str = "", *, fields: Sequence[str] | None = None
 ) -> Policy:
-    """A trained model as a bufgym policy, which takes the model's most likely (or most valued) action.
+    """Make a bufgym policy of a trained model; it takes the model's most likely or most valued action.
 
     A network that scores slots with masks (``SlotPolicy`` under MaskablePPO) runs compiled and serves every L. Any
-    other network runs in torch, one decision at a time, and serves the L it was trained for. Action masks are given to
-    algorithms that take them; an invalid action of the others does what it does in the environment.
+    other network runs in torch, one decision at a time, and serves the L it was trained for. Algorithms that take
+    action masks get them. For others, an invalid action does the same as in the environment.
 
         policy = as_policy("model.zip", "mine")
         bufgym.benchmark.run.run([policy, policies.get("afr")], scenario, capacities=[8], seeds=10)
@@ -54,11 +54,11 @@ def as_policy(
         model: the model, its ``policy``, or the path of a saved one. A zip holds pickles, and reading it can run any
             code: read your own alone.
         name: the policy's name; by default that of the file or class.
-        fields: what an observation "flat" or "slots" is made of, in the environment's own order; by default every
-            field. A "dict" names its fields.
+        fields: fields of a "flat" or "slots" observation, in the environment's own order; by default every field. A
+            "dict" names its fields.
 
     Raises:
-        BufgymError: no such file, or a model that was trained on something else than a bufgym environment.
+        BufgymError: no such file, or a model that was not trained on a bufgym environment.
     """
     agent: Any = model if isinstance(model, BaseAlgorithm | BasePolicy) else read_policy(model)
     if not name:
@@ -82,7 +82,7 @@ def takes_masks(agent: Any) -> bool:
 
 
 class _Decisions:
-    """What a model decides from a robot's view, one decision at a time."""
+    """Decisions of a model from a robot's view, one at a time."""
 
     def __init__(self, name: str, agent: Any, masked: bool, fields: Sequence[str] | None) -> None:
         self.name, self.agent, self.masked = name, agent, masked
@@ -129,7 +129,7 @@ class _Decisions:
         return action if action < self.capacity else HOLD
 
     def _action(self, buffer: Buffer, arrival: Any, arriving: bool, valid: Sequence[bool]) -> int:
-        """The model's action; ``valid``: whether each queued slot's action is valid, then those of L and L + 1."""
+        """The model's action; ``valid`` has an entry for each queued slot's action, then for L and L + 1."""
         L = buffer.capacity
         if L != self.capacity:
             raise BufgymError(

@@ -1,7 +1,7 @@
-"""Native Gymnasium vector environments for stable-baselines3, which accepts nothing but its own ``VecEnv``.
+"""Native Gymnasium vector environments for stable-baselines3, which accepts only its own ``VecEnv``.
 
-stable-baselines3 itself batches single environments, one Python call a step and environment. ``GymVecEnv`` gives it a
-``gymnasium.vector.VectorEnv`` instead, so that a compiled batch stays one call:
+stable-baselines3 itself batches single environments, with one Python call per step and environment. ``GymVecEnv`` gives
+it a ``gymnasium.vector.VectorEnv`` instead, so a compiled batch stays one call:
 
     from bufgym.sb3 import make_vec_env
     from sb3_contrib import MaskablePPO
@@ -44,15 +44,15 @@ def make_vec_env(
     wrapper_kwargs: dict[str, Any] | None = None,
     **kwargs: Any,
 ) -> VecEnv:
-    """``n_envs`` environments for stable-baselines3, with the arguments of its own ``make_vec_env``.
+    """Make ``n_envs`` environments for stable-baselines3, with the arguments of its own ``make_vec_env``.
 
-    The native batch where the id has one that can reset in the same step (all of bufgym's can), else
+    The native batch is used if the id has one that can reset in the same step, as all of bufgym's can. Otherwise it is
     stable-baselines3's own batch of single environments. With a ``seed``, environment i starts from seed + i at the
     first reset. ``kwargs`` go to the environment, as ``env_kwargs`` do.
 
-    On the native batch ``monitor_dir`` gets one file, ``<start_index>.monitor.csv``, with the episodes of all rows
-    (``load_results`` reads it); ``monitor_kwargs`` are ``info_keywords`` and ``override_existing``; ``wrapper_class``
-    is a ``gymnasium.vector.VectorWrapper``. Wrappers of single environments and ``vec_env_cls`` are errors there.
+    On the native batch ``monitor_dir`` gets one file, ``<start_index>.monitor.csv``, with the episodes of all rows;
+    ``load_results`` reads it. ``monitor_kwargs`` are ``info_keywords`` and ``override_existing``. ``wrapper_class`` is
+    a ``gymnasium.vector.VectorWrapper``. Wrappers of single environments and ``vec_env_cls`` are errors there.
     """
     own = _settings(env_kwargs) | kwargs
     if "num_envs" in own:
@@ -102,23 +102,23 @@ def _settings(given: dict[str, Any] | None) -> dict[str, Any]:
 
 
 def _has_native_batch(env_id: Any) -> bool:
-    """Whether Gymnasium knows the id, and a native batch of it that can reset in the same step."""
+    """Whether Gymnasium knows the id and a native batch of it that can reset in the same step."""
     if not isinstance(env_id, str):
         return False
     entry = gym.spec(env_id).vector_entry_point
     native = load_env_creator(entry) if isinstance(entry, str) else entry
-    # Gymnasium's own native batches know NEXT_STEP only.
+    # Gymnasium's own native batches support NEXT_STEP only.
     return native is not None and "autoreset_mode" in inspect.signature(native).parameters
 
 
 class GymVecEnv(VecEnv):
     """A native ``gymnasium.vector.VectorEnv`` with SAME_STEP autoreset as a stable-baselines3 ``VecEnv``.
 
-    In the step that ends an episode its info has all that the environment reports at the end, ``terminal_observation``,
-    ``TimeLimit.truncated``, and ``episode`` = {r: sum of rewards, l: steps, t: seconds since this object was made}, as
-    stable-baselines3's ``Monitor`` writes it, with the ``info_keywords`` of the last info, and to ``results`` if given.
-    Infos of the steps between are empty (n dicts a step cost more than a compiled step of n environments) unless
-    ``step_infos``.
+    At an episode's end ``info`` has all the environment's final entries, ``terminal_observation``,
+    ``TimeLimit.truncated`` and ``episode``. As with stable-baselines3's ``Monitor``, ``episode`` is {r: sum of rewards,
+    l: steps, t: seconds since this object was made} plus the ``info_keywords`` of the last info; it also goes to
+    ``results`` if given. Infos of other steps are empty unless ``step_infos``, as n dicts cost more than a compiled
+    step of n environments.
 
     ``env_method(name)`` calls the batch's method once and returns its rows, so ``action_masks`` costs one call.
     """
@@ -149,7 +149,7 @@ class GymVecEnv(VecEnv):
         self._born = time.perf_counter()
 
     def reset(self) -> VecEnvObs:
-        # Vector environments take a seed each, too, though the base class does not say so.
+        # Vector environments take a seed each, although the base class does not say so.
         seeds: Any = None if all(seed is None for seed in self._seeds) else self._seeds
         observation, info = self.envs.reset(seed=seeds, options=self._vector_options)
         self.reset_infos = [_row(info, i) for i in range(self.num_envs)]
@@ -182,7 +182,7 @@ class GymVecEnv(VecEnv):
         return observation, np.asarray(rewards, np.float32), done, infos
 
     def _episode(self, i: int, last: Mapping[str, Any]) -> dict[str, Any]:
-        """What ``Monitor`` tells of the episode that environment ``i`` has ended with the info ``last``."""
+        """Entries of ``Monitor`` for the episode that environment ``i`` has ended with the info ``last``."""
         episode = {
             "r": float(self._returns[i]),
             "l": int(self._lengths[i]),
@@ -224,7 +224,7 @@ class GymVecEnv(VecEnv):
         setattr(self.envs.unwrapped, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call the method on the whole batch; each index's row of what it returns."""
+        """Call the method on the whole batch, and return each index's row of the result."""
         returned = getattr(self.envs.unwrapped, method_name)(*args, **kwargs)
         by_row = isinstance(returned, np.ndarray | list | tuple) and len(returned) == self.num_envs
         return [returned[i] if by_row else returned for i in self._get_indices(indices)]
@@ -250,11 +250,11 @@ class GymVecEnv(VecEnv):
 
 
 _SINGLE = {"observation_space": "single_observation_space", "action_space": "single_action_space"}
-"""What stable-baselines3 calls an attribute of one environment -> what a vector environment calls it."""
+"""stable-baselines3's name of an attribute of one environment -> its name in a vector environment."""
 
 
 def _row(info: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """Environment ``i``'s info out of a vector environment's, where ``_key`` masks the rows that have ``key``."""
+    """Extract environment ``i``'s info from a vector environment's, where ``_key`` masks the rows that have ``key``."""
     own: dict[str, Any] = {}
     for key, column in info.items():
         if key.startswith("_") and key[1:] in info:
@@ -271,5 +271,5 @@ def _row(info: Mapping[str, Any], i: int) -> dict[str, Any]:
 
 
 def _final_observation(final: Any, i: int) -> Any:
-    """Environment ``i``'s last observation from ``final_obs``: one array an environment, or a batched dict."""
+    """Environment ``i``'s last observation from ``final_obs``, an array per environment or a batched dict."""
     return _row(final, i) if isinstance(final, Mapping) else final[i]

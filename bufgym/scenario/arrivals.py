@@ -15,7 +15,7 @@ from bufgym.model.link import MAX_TIME_US
 from bufgym.model.topics import MAX_TOPICS
 
 MAX_TOTAL_BYTES = 2**60
-"""Of all messages of an episode: with what a link carries meanwhile it stays far below 2**63."""
+"""Most bytes of all messages of an episode: with the link's bytes meanwhile they stay far below 2**63."""
 
 _RULES = {
     "seq": "must be its place in the list of arrivals, {k}",
@@ -25,7 +25,7 @@ _RULES = {
     "x": "must be a finite number, and not less than that of the message before it on its topic",
     "uniform": "must lie in [0, 1)",
 }
-"""What is demanded of each field."""
+"""Requirement for each field."""
 _FIELDS = tuple(_RULES)
 _SEQ, _TIME, _SIZE, _TOPIC, _X, _UNIFORM = range(len(_FIELDS))
 _LARGEST = sys.float_info.max
@@ -43,7 +43,7 @@ def messages(
 def unchecked_messages(
     arrival_us: NDArray[np.int64], size_bytes: NDArray[np.int64] | int, x: NDArray[np.float64] | None
 ) -> NDArray[Any]:
-    """``messages`` for columns that an ``Episode`` checks before anything else is done with them."""
+    """Make ``messages`` from columns that an ``Episode`` checks before anything else is done with them."""
     arrivals = records(len(arrival_us), MESSAGE)
     arrivals["seq"] = np.arange(len(arrival_us))
     arrivals["arrival_us"], arrivals["size_bytes"] = arrival_us, size_bytes
@@ -52,13 +52,13 @@ def unchecked_messages(
 
 
 def read_only(arrivals: NDArray[Any]) -> NDArray[Any]:
-    """The same array, which its maker hands over: nobody writes to it any more, so that nobody needs a copy."""
+    """The same array, handed over by its maker: nobody writes to it any more, so nobody needs a copy."""
     arrivals.flags.writeable = False
     return arrivals
 
 
 def sealed(arrivals: Any) -> NDArray[Any]:
-    """These messages where nobody writes to them: copied, unless they and the array that they lie in are read-only."""
+    """A read-only version of these messages: a copy, unless they and the array that they lie in are read-only."""
     if not isinstance(arrivals, np.ndarray) or arrivals.dtype != MESSAGE or arrivals.ndim != 1:
         raise BufgymError("arrivals: must be MESSAGE[n], as bufgym.scenario.messages makes it")
     memory = arrivals if arrivals.base is None else arrivals.base
@@ -67,9 +67,10 @@ def sealed(arrivals: Any) -> NDArray[Any]:
 
 
 def check_messages(arrivals: NDArray[Any]) -> tuple[int, bool]:
-    """(bytes of all messages, whether x never falls from one to the next); an error for what breaks ``_RULES``.
+    """Check ``_RULES``; return (bytes of all messages, whether x never falls from one to the next).
 
-    Kernels rely on it: they find a message's entries by its ``seq``, and count bytes and microseconds in 64 bits.
+    Kernels rely on the rules: they find a message's entries by its ``seq``, and count bytes and microseconds in 64
+    bits.
     """
     if len(arrivals) == 0:
         raise BufgymError("an episode needs at least one message")
@@ -84,7 +85,7 @@ def check_messages(arrivals: NDArray[Any]) -> tuple[int, bool]:
 
 @kernel
 def _checked(arrivals: NDArray[Any]) -> tuple[int, int, int, bool]:
-    """(the field that breaks its rule or -1, the message, bytes of all, whether x falls nowhere)."""
+    """Find (the field that breaks its rule or -1, the message, bytes of all, whether x never falls)."""
     before_us, total_bytes, before_x, rises = 0, 0, -_LARGEST, True
     for k in range(len(arrivals)):
         message = item(arrivals, k)
@@ -110,9 +111,9 @@ def _checked(arrivals: NDArray[Any]) -> tuple[int, int, int, bool]:
 
 @kernel
 def _checked_by_topic(arrivals: NDArray[Any], latest_x: NDArray[np.float64]) -> tuple[int, int]:
-    """(the field, the message) where x falls on one topic, -1 if nowhere.
+    """Find (the field, the message) where x falls on one topic; -1 if nowhere.
 
-    ``latest_x``: of each topic that can have an x of its own; all others count as one with the last of these.
+    ``latest_x`` is of each topic that can have an x of its own; all other topics count as one, with the last entry.
     """
     for k in range(len(arrivals)):
         topic = min(item(arrivals, k).topic, len(latest_x) - 1)

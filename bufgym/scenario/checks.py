@@ -32,43 +32,43 @@ __all__ = [
 ]
 
 MAX_RATE_HZ = 100_000
-"""Arrivals are counted in whole microseconds: ten to a period at least."""
+"""Highest arrival rate: times are whole microseconds, at least ten to a period."""
 
 
 def positive(scenario: object, *names: str) -> None:
-    """These parameters are finite numbers > 0."""
+    """Check that these parameters are finite numbers > 0."""
     for name in names:
         above_0(name, getattr(scenario, name))
 
 
 def rate(rate_hz: Any) -> None:
-    """``rate_hz`` is a number > 0, at most ``MAX_RATE_HZ``, and gives a message in the longest time there is."""
+    """Check that ``rate_hz`` is > 0, at most ``MAX_RATE_HZ``, and gives a message in the longest possible time."""
     above_0("rate_hz", rate_hz)
     if not 1 / MAX_DURATION_S <= rate_hz <= MAX_RATE_HZ:
         raise BufgymError(f"rate_hz = {rate_hz}: must be at most {MAX_RATE_HZ}, and at least {1 / MAX_DURATION_S:g}")
 
 
 def duration(duration_s: Any) -> None:
-    """``duration_s`` is a number > 0 and at most that of a trace."""
+    """Check that ``duration_s`` is > 0 and at most the longest duration of a trace."""
     above_0("duration_s", duration_s)
     if duration_s > MAX_DURATION_S:
         raise BufgymError(f"duration_s = {duration_s}: must be at most {MAX_DURATION_S}")
 
 
 def delay(name: str, us: Any) -> None:
-    """A delay in whole microseconds, at most the longest time there is."""
+    """Check a delay in whole microseconds, up to the longest possible time."""
     whole(name, us, 0, MAX_TIME_US)
 
 
 def message_bytes(name: str, size: Any) -> None:
-    """The (mean) size of messages: a number > 0, at most ``MAX_MESSAGE_BYTES``."""
+    """Check the (mean) size of messages: a number > 0, at most ``MAX_MESSAGE_BYTES``."""
     above_0(name, size)
     if size > MAX_MESSAGE_BYTES:
         raise BufgymError(f"{name} = {size}: must be at most {MAX_MESSAGE_BYTES}")
 
 
 def check_stream(stream: Any) -> None:
-    """The parameters that every stream of messages has: rate_hz, size_bytes, jitter and size_cv."""
+    """Check the parameters of every stream of messages: rate_hz, size_bytes, jitter and size_cv."""
     rate(stream.rate_hz)
     message_bytes("size_bytes", stream.size_bytes)
     between("jitter", stream.jitter, 0, 1, "of a period")
@@ -76,16 +76,17 @@ def check_stream(stream: Any) -> None:
 
 
 def check_value(scenario: object) -> None:
-    """The parameter ``value`` is a ``Value``; text or a function becomes one (``qoi.load``)."""
+    """Check the parameter ``value``; text or a function becomes a ``Value`` (``qoi.load``)."""
     value = getattr(scenario, "value")  # noqa: B009  (every kind of scenario has it)
     if not isinstance(value, Value):
         object.__setattr__(scenario, "value", qoi.load(value))
 
 
 def recordings(scenario: object) -> None:
-    """The parameters ``traces`` and ``motion`` become tuples of Trace and Motion; a single one becomes a tuple, too.
+    """Make tuples of Trace and Motion of the parameters ``traces`` and ``motion``, even of a single one.
 
-    Text names a shipped recording, a file, or for traces a generator (``links``); the motion "none" is none.
+    Text names a shipped recording, a file, or for traces a generator (``links``); the motion "none" stands for no
+    motion.
     """
     if getattr(scenario, "motion") in ("none", ["none"]):  # noqa: B009
         object.__setattr__(scenario, "motion", ())
@@ -96,9 +97,9 @@ def recordings(scenario: object) -> None:
 def as_tuple(
     scenario: object, name: str, kind: Any, what: str, load: Callable[[str], Sequence[Any]] | None = None
 ) -> None:
-    """The parameter becomes a tuple whose items are of that kind, ``what`` in words; a single one becomes a tuple.
+    """Make the parameter a tuple, even of a single item, and check its items; ``what`` names their kind in words.
 
-    ``load``: makes items of text.
+    ``load`` makes items from text.
     """
     value = getattr(scenario, name)
     items = list(value if isinstance(value, Sequence) and not isinstance(value, str) else (value,))
@@ -111,15 +112,15 @@ def as_tuple(
 
 
 GENERATED = 8
-"""Links that a generator makes where no seeds are given."""
+"""Links that a generator makes without given seeds."""
 _GENERATOR = re.compile(r"([A-Za-z_][\w.]*:[A-Za-z_]\w*)(?::(\d+)-(\d+))?")
 
 
 def links(text: str) -> list[Trace]:
-    """The traces that text names: a shipped one, a file, or a generator ``module:function``, a function seed -> Trace.
+    """The traces that text names: a shipped one, a file, or a generator, which is a function seed -> Trace.
 
-    ``module:function:100-119`` makes those of these seeds, ``module:function`` of 0 to ``GENERATED`` - 1. The module is
-    imported (see ``bufgym.modules``).
+    ``module:function:100-119`` names a generator and its seeds; the seeds of ``module:function`` are 0 to ``GENERATED``
+    - 1. The module is imported (see ``bufgym.modules``).
     """
     match = _GENERATOR.fullmatch(text)
     if match is None or Path(text).exists():

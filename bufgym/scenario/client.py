@@ -1,6 +1,6 @@
-"""A robot's client: many topics over one uplink, as a Robofleet client has them.
+"""A robot's client: many topics over one uplink, like a Robofleet client.
 
-Each ``Stream`` publishes one topic; the ``Client`` sends them all over one link, with at most n_T messages in flight.
+Each ``Stream`` publishes one topic. The ``Client`` sends them all over one link, with at most n_T messages in flight.
 ``bufgym.scenario.configuration`` has Robofleet's example client and reads configurations from files.
 """
 
@@ -38,12 +38,12 @@ from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace
 
 ENCODINGS = ("ros", "json")
-"""What rivals send instead of Robofleet's flatbuffers (``Policy.client.encoding``)."""
+"""Encodings of rivals, in place of Robofleet's flatbuffers (``Policy.client.encoding``)."""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """What publishes on one topic: ``rate_hz`` messages a second of ``size_bytes`` each."""
+    """A publisher on one topic: ``rate_hz`` messages a second of ``size_bytes`` each."""
 
     topic: Topic
     """Its name and the rules for its messages."""
@@ -52,13 +52,13 @@ class Stream:
     size_bytes: int
     """Mean bytes of a message."""
     jitter: float = 0.1
-    """Each message is moved within its period by up to this part of it."""
+    """Largest shift of a message within its period, as a fraction of the period."""
     size_cv: float = 0.0
-    """Coefficient of variation of the sizes, which are log-normal; 0: all equal."""
+    """Coefficient of variation of the log-normal sizes; 0 for equal sizes."""
     moves: bool = False
-    """Whether its x is the robot's motion; else time, in periods of its rate limit (or its own rate)."""
+    """Whether its x is the robot's motion; otherwise x is time, in periods of its rate limit or its own rate."""
     encodings: Mapping[str, int] = field(default_factory=dict)
-    """Mean bytes in other encodings, by name; the same as ``size_bytes`` where not given."""
+    """Mean bytes in other encodings, by name; ``size_bytes`` for encodings not given."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.topic, Topic):
@@ -77,7 +77,7 @@ class Stream:
 
     @property
     def unit_hz(self) -> float:
-        """Steps of x a second, where x is time."""
+        """Steps of x a second, if x is time."""
         return min(self.rate_hz, self.topic.rate_limit_hz or self.rate_hz)
 
     def count(self, duration_s: float) -> int:
@@ -90,7 +90,7 @@ class Client:
     """Streams over one uplink: its link is one of ``traces`` from a random offset, times ``scale``."""
 
     streams: tuple[Stream, ...]
-    """What it publishes; topic k of an episode is that of stream k."""
+    """The streams; topic k of an episode belongs to stream k."""
     traces: tuple[Trace, ...]
     """Links; one of them carries an episode."""
     motion: tuple[Motion, ...] = ()
@@ -100,13 +100,13 @@ class Client:
     scale: float = 1.0
     """Factor on the link's capacity."""
     random_offset: bool = True
-    """Whether links, motion and streams begin at random places; else at their beginnings."""
+    """Whether links, motion and streams begin at random places; otherwise they begin at the start."""
     window: int = 1
-    """n_T: Robofleet's paper has 1 in its experiments, the released client 5 by default."""
+    """n_T: 1 in the experiments of Robofleet's paper, 5 by default in the released client."""
     propagation_us: int = 20_000
-    """From a message's last byte on the link to the server, us."""
+    """Time from a message's last byte on the link to the server, us."""
     round_trip_us: int | None = None
-    """From a message's last byte on the link to its ack, us; None: twice the propagation delay."""
+    """Time from a message's last byte on the link to its ack, us; None for twice the propagation delay."""
     consumers: int = 1
     """Receivers of each message."""
     value: Value = field(default_factory=lambda: qoi.exponential(0.618))
@@ -146,7 +146,7 @@ class Client:
 
     @property
     def ack_delay_us(self) -> int:
-        """From a message's last byte on the link to its ack, us."""
+        """Time from a message's last byte on the link to its ack, us."""
         return 2 * self.propagation_us if self.round_trip_us is None else self.round_trip_us
 
     @functools.cached_property
@@ -154,7 +154,7 @@ class Client:
         return tuple(scaled(trace, self.scale) for trace in self.traces)
 
     def draw(self, streams: Streams) -> Episode:
-        """One episode."""
+        """Draw one episode."""
         rng = streams.arrival
         moving = place(self.motion, rng, self.random_offset) if self.motion else None
         columns = [self._published(k, stream, moving, rng) for k, stream in enumerate(self.streams)]
@@ -177,7 +177,7 @@ class Client:
     def _published(
         self, number: int, stream: Stream, moving: tuple[Motion, int] | None, rng: np.random.Generator
     ) -> tuple[NDArray[Any], ...]:
-        """(time, topic, bytes, x) of one stream's messages; streams begin at moments of their own."""
+        """Time, topic, bytes and x of one stream's messages; each stream begins at its own moment."""
         n, period_us = stream.count(self.duration_s), 1e6 / stream.rate_hz
         phase = rng.random() if self.random_offset else 0.0
         time_us = ((np.arange(n) + phase + stream.jitter * rng.random(n)) * period_us).astype(np.int64)
@@ -191,7 +191,7 @@ class Client:
         return time_us, np.full(n, number, np.int64), size, x - x[0]
 
     def _encoded_bytes(self, arrivals: NDArray[Any], encoding: str) -> NDArray[np.int64]:
-        """int64[messages], the messages' bytes in another encoding: each by its topic's ratio."""
+        """int64[messages], the messages' bytes in another encoding, by the ratio of each topic."""
         ratios = np.array(
             [stream.encodings.get(encoding, stream.size_bytes) / stream.size_bytes for stream in self.streams]
         )

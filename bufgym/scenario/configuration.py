@@ -19,10 +19,10 @@ from bufgym.scenario.draws import shipped
 def robofleet_example() -> tuple[Stream, ...]:
     """The topics of Robofleet's example client configuration.
 
-    Priorities and rate limits are those of the example: localization 10 Hz, priority 20; odometry 15 Hz, 20; laser
-    scans 15 Hz, 2; point cloud and images 10 Hz, 1; visualization 10 Hz, 2; status 1 Hz; subscriptions no_drop. What
-    it leaves open is assumed: publish rates as common drivers have them, sizes as the paper's Table I has them or as
-    such messages encode, deadlines, and what x is.
+    Priorities and rate limits are the example's: localization 10 Hz, priority 20; odometry 15 Hz, 20; laser scans 15
+    Hz, 2; point cloud and images 10 Hz, 1; visualization 10 Hz, 2; status 1 Hz; subscriptions no_drop. The rest is
+    assumed. Publish rates are those of common drivers. Sizes come from the paper's Table I or from encoding such
+    messages. Deadlines and the meaning of x are our choice.
     """
     fast = qoi.exponential(0.618)
     view = qoi.exponential(math.exp(-1))
@@ -56,11 +56,11 @@ _CLIENT_KEYS = {"window", "propagation_us", "round_trip_us", "consumers", "durat
 
 
 def read_client(path: str | Path, **parameters: Any) -> Client:
-    """A client from a TOML file: ``[[topic]]`` tables with what ``Topic`` and ``Stream`` take, ``window`` and the like.
+    """Read a client from a TOML file with ``[[topic]]`` tables for ``Topic`` and ``Stream``, ``window`` and the like.
 
-    A topic's ``value`` is written as on the command line (``"exponential:0.618"``), its sizes in other encodings as
-    ``encodings = {json = 28000}``. ``parameters``: what the file does not have, such as ``traces`` and ``motion``;
-    without ``traces`` the shipped LTE links and motions, as ``bufgym topics --config`` has them.
+    A topic's ``value`` has the form of the command line (``"exponential:0.618"``). Its sizes in other encodings look
+    like ``encodings = {json = 28000}``. ``parameters`` add settings that the file lacks, such as ``traces`` and
+    ``motion``. Without ``traces`` the client gets the shipped LTE links and motions, as in ``bufgym topics --config``.
 
     Raises BufgymError, one line that names the file, for a file that can't be read or breaks a rule.
     """

@@ -1,4 +1,4 @@
-"""What uplinks and clients have in common: shipped recordings, places on them, and message sizes."""
+"""Draws that uplinks and clients share: shipped recordings, places on them, and message sizes."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from bufgym.traces import Motion, Trace
 
 
 def beside(rng: np.random.Generator, number: int) -> np.random.Generator:
-    """Another generator, which follows from where ``rng`` stands and from ``number``; ``rng`` stays where it is."""
+    """Make another generator from the state of ``rng`` and ``number``; ``rng`` stays where it is."""
     return np.random.default_rng([_state(rng)["state"]["state"], number])
 
 
 def skip(rng: np.random.Generator, count: int) -> None:
-    """Leave ``rng`` as ``rng.random(count)`` does, whatever the count."""
+    """Advance ``rng`` as ``rng.random(count)`` does, without drawing."""
     before = _state(rng)
     cast(Any, rng.bit_generator).advance(count)
-    rng.bit_generator.state = {**before, "state": _state(rng)["state"]}  # with the half word that ``advance`` forgets
+    rng.bit_generator.state = {**before, "state": _state(rng)["state"]}  # keeps the half word that ``advance`` forgets
 
 
 def _state(rng: np.random.Generator) -> dict[str, Any]:
-    """Of a PCG64, the bit generator of ``Streams``."""
+    """State of a PCG64, the bit generator of ``Streams``."""
     return cast(dict[str, Any], rng.bit_generator.state)
 
 
 def place(recordings: tuple[Motion, ...], rng: np.random.Generator, random_offset: bool) -> tuple[Motion, int]:
-    """(one of the recordings, where on it an episode begins, us); at its beginning without ``random_offset``."""
+    """Draw a recording and an offset on it, us, where an episode begins; 0 without ``random_offset``."""
     motion = recordings[int(rng.integers(len(recordings)))]
     return motion, int(rng.integers(motion.time_us[-1])) if random_offset else 0
 
@@ -38,7 +38,7 @@ def place(recordings: tuple[Motion, ...], rng: np.random.Generator, random_offse
 def place_link(
     links: tuple[Trace, ...], rng: np.random.Generator, random_offset: bool, within_s: tuple[float, float] | None = None
 ) -> tuple[Trace, int]:
-    """(one of the links, where on it an episode begins, us); ``within_s``: from..to, None for anywhere."""
+    """Draw a link and an offset on it, us; ``within_s`` limits the offset to from..to, None to anywhere."""
     trace = links[int(rng.integers(len(links)))]
     if not random_offset:
         return trace, 0
@@ -47,7 +47,7 @@ def place_link(
 
 
 def sizes(n: int, mean_bytes: int, cv: float, rng: np.random.Generator) -> NDArray[np.int64]:
-    """int64[n] bytes: log-normal with that mean and coefficient of variation, at least 1; all equal for ``cv`` 0."""
+    """Draw int64[n] log-normal sizes, bytes, of that mean and coefficient of variation, at least 1."""
     if not cv:
         return np.full(n, int(mean_bytes), np.int64)
     spread = math.sqrt(math.log1p(cv**2))

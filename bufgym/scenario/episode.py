@@ -1,4 +1,4 @@
-"""What a scenario draws: an ``Episode``, from separate random streams."""
+"""An ``Episode``, drawn by a scenario from separate random streams."""
 
 from __future__ import annotations
 
@@ -49,25 +49,25 @@ class Episode:
     """
 
     arrivals: NDArray[Any]
-    """MESSAGE[n], read-only, in order of arrival (``arrival_us`` never falls, nor does x on any topic)."""
+    """MESSAGE[n], read-only, in order of arrival; ``arrival_us`` never falls, nor does x on any topic."""
     link: Link
-    """The capacity trace that carries them, and where on it the episode begins."""
+    """The link that carries the messages: a capacity trace and the episode's offset on it."""
     first_decision: int = 0
-    """Sequence number of the first arrival that a policy decides on; those before it are accepted."""
+    """Sequence number of the first arrival that a policy decides on; earlier ones are accepted."""
     last_decision: int = 2**31
-    """Sequence number of the last arrival that a policy decides on; those after it are accepted."""
+    """Sequence number of the last arrival that a policy decides on; later ones are accepted."""
     window: int = 1
-    """n_T: messages in flight (sent and not yet acknowledged) at most."""
+    """n_T: most messages in flight, sent and not yet acked."""
     ack_delay_us: int = 0
-    """From a message's last byte on the link to its ack, us; 0: the sender does not wait for acks."""
+    """Time from a message's last byte on the link to its ack, us; 0 if the sender does not wait for acks."""
     encodings: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
-    """int64[n], bytes of the messages in other encodings, by name; where one is missing, sizes stay the same."""
+    """int64[n], bytes of the messages in other encodings, by name; sizes stay the same in a missing one."""
     consumers: int = 1
-    """Receivers of each message: a client that sends copies sends so many."""
+    """Receivers of each message, and copies that a copying client sends."""
     value: Value | None = None
-    """The V that its QoI is measured with; None for that of its scenario."""
+    """V for the episode's QoI; None for the scenario's."""
     one_scene: bool = field(init=False, repr=False)
-    """Whether x falls nowhere, topics apart: only then all messages can share one queue."""
+    """Whether x never falls, even across topics: only then can all messages share one queue."""
 
     def __post_init__(self) -> None:
         check_window(self.window)
@@ -88,7 +88,7 @@ class Episode:
         self.link.check_reach(int(arrivals["arrival_us"][-1]), total_bytes, pauses, self.ack_delay_us)
 
     def check_one_queue(self) -> None:
-        """An error unless one queue without topics can hold the messages: then x must not fall on any of them."""
+        """Raise unless one queue without topics can hold the messages: x must not fall from one to the next."""
         if not self.one_scene:
             raise BufgymError(
                 "episode: x falls from one message to the next, as each topic has its own: not for one queue"
@@ -96,14 +96,14 @@ class Episode:
 
     def valued(self, value: Value) -> Episode:
         """The same episode with a V of its own."""
-        episode = copy.copy(self)  # nothing that is checked changes
+        episode = copy.copy(self)  # all checked fields stay the same
         object.__setattr__(episode, "value", value)
         return episode
 
     def with_uniforms(self, rng: np.random.Generator) -> Episode:
         """The same episode with a fresh uniform draw beside each arrival, for randomised policies.
 
-        ``Scenario.draw`` leaves these draws at 0: an agent in an environment has randomness of its own. Where a policy
+        ``Scenario.draw`` leaves these draws at 0, as an agent in an environment has randomness of its own. If a policy
         plays there, ``Senders.draw_uniforms`` adds them.
         """
         arrivals = self.arrivals.copy()
@@ -129,26 +129,26 @@ class Episode:
 
 
 def check_link(link: Any) -> Link:
-    """The link, or an error if it is none."""
+    """Check that this is a link, and return it."""
     if not isinstance(link, Link):
         raise BufgymError(f"link: {link!r} is not a bufgym.model.link Link")
     return link
 
 
 class Scenario(Protocol):
-    """A family of episodes, frozen: what derives from its parameters is computed from them."""
+    """A family of episodes, frozen; all that derives from its parameters is computed from them."""
 
     @property
     def value(self) -> Value:
-        """The V that its QoI is measured with."""
+        """V for the QoI."""
 
     @property
     def max_messages(self) -> int:
-        """No episode has more arrivals than this."""
+        """Most arrivals of any episode."""
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """The rules of its topics; none where there is one queue."""
+        """The rules of its topics; empty for one queue."""
 
     def draw(self, streams: Streams) -> Episode:
-        """One episode."""
+        """Draw one episode."""

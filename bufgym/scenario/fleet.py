@@ -1,4 +1,4 @@
-"""Robots in one cell: the same camera on each, each with a motion of its own, and one link that they share."""
+"""Robots in one cell: the same camera on each, each with its own motion, and one link that they share."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from bufgym.scenario.episode import Episode, Streams, check_link
 from bufgym.scenario.uplink import Uplink
 
 MAX_ROBOTS = 256
-"""Robots of a cell at most."""
+"""Most robots of a cell."""
 
 
 @dataclass(frozen=True, eq=False)
 class FleetEpisode:
-    """One drawn episode of a cell, checked when it is made as an ``Episode`` is; nothing in it is random any more."""
+    """One drawn episode of a cell, checked when it is made like an ``Episode``; nothing in it is random any more."""
 
     arrivals: tuple[NDArray[Any], ...]
     """MESSAGE[n] of each robot, read-only, in order of arrival."""
     link: Link
-    """The cell's, shared by all."""
+    """The cell's link, shared by all."""
 
     def __post_init__(self) -> None:
         check_robots(len(self.arrivals))
@@ -57,7 +57,7 @@ class FleetEpisode:
         return all(np.array_equal(first, arrivals["arrival_us"]) for arrivals in self.arrivals)
 
     def episode(self, robot: int) -> Episode:
-        """The episode of that robot if it had the cell to itself."""
+        """The episode of one robot as if it had the cell to itself."""
         return Episode(self.arrivals[robot], self.link)
 
     def with_uniforms(self, rng: np.random.Generator) -> FleetEpisode:
@@ -70,17 +70,17 @@ class FleetEpisode:
 class FleetScenario:
     """``robots`` robots in one cell, each with the stream of ``uplink``.
 
-    The cameras tick together: frame k of every robot arrives at the same time (jitter moves the tick, not one robot's
-    frame), so that in an environment one step is one tick. Sizes and motion are each robot's own: a recording chosen
-    at random for each, from a random offset on. The cell is one of ``uplink.traces`` times ``uplink.scale`` times
-    ``robots``: a factor of 1 gives each robot the capacity that ``uplink`` alone would have, on average, so the load
-    is the same for any number of robots. A fleet of one meets the very episodes of ``uplink``.
+    The cameras tick together: frame k of every robot arrives at the same time, so one step of an environment is one
+    tick. Jitter moves the tick, not one robot's frame. Sizes and motion are each robot's own: a recording chosen at
+    random for each, from a random offset on. The cell is one of ``uplink.traces`` times ``uplink.scale`` times
+    ``robots``. With a factor of 1 each robot has on average the capacity of ``uplink`` alone, so the load is the same
+    for any number of robots. A fleet of one meets exactly the episodes of ``uplink``.
     """
 
     robots: int = 4
     """N."""
     uplink: Uplink = field(default_factory=lambda: _uplink("lte"))
-    """What each robot would have if it were alone."""
+    """The uplink that each robot would have alone."""
 
     def __post_init__(self) -> None:
         check_robots(self.robots)
@@ -91,22 +91,22 @@ class FleetScenario:
 
     @staticmethod
     def of(robots: int, scenario: str | Uplink | FleetScenario = "lte", **parameters: Any) -> FleetScenario:
-        """So many robots with the stream of that scenario, its ``parameters`` changed."""
+        """Make a fleet of ``robots`` robots with the stream of that scenario and changed ``parameters``."""
         uplink = scenario.uplink if isinstance(scenario, FleetScenario) else scenario
         return FleetScenario(robots, _uplink(uplink, **parameters))
 
     @property
     def value(self) -> Value:
-        """The V that each robot's QoI is measured with."""
+        """V for each robot's QoI."""
         return self.uplink.value
 
     @property
     def max_messages(self) -> int:
-        """No robot has more arrivals than this."""
+        """Most arrivals of any robot."""
         return self.uplink.max_messages
 
     def draw(self, streams: Streams) -> FleetEpisode:
-        """One episode."""
+        """Draw one episode."""
         first = self._cell.draw(streams)
         others = [self._beside(first.arrivals["arrival_us"], streams, robot) for robot in range(1, self.robots)]
         return FleetEpisode((first.arrivals, *others), first.link)
@@ -120,7 +120,7 @@ class FleetScenario:
 
     @functools.cached_property
     def _cell(self) -> Uplink:
-        """The first robot's stream over the link of all."""
+        """The first robot's stream over the cell's link."""
         return replace(self.uplink, scale=tuple(s * self.robots for s in self.uplink.scale))
 
 
@@ -132,5 +132,5 @@ def _uplink(spec: str | Uplink, **parameters: Any) -> Uplink:
 
 
 def check_robots(robots: Any) -> int:
-    """N, or an error."""
+    """Check N and return it."""
     return whole("robots", robots, 1, MAX_ROBOTS)

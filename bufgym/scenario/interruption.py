@@ -27,14 +27,14 @@ LAWS = ("fixed", "uniform", "log-uniform", "geometric")
 class Interruption:
     """One interruption of unknown length (AFR paper, Sec. III-B).
 
-    Message 0 is in transmission when the link stops; for messages 1..T, which arrive one a period, the policy decides;
-    then the link resumes, all that is kept is delivered, and message T + 1 after it. T is hidden and drawn from
+    Message 0 is in transmission when the link stops. The policy decides on messages 1..T, which arrive one a period.
+    Then the link resumes, and all kept messages are delivered, with message T + 1 last. T is hidden and drawn from
     ``law``: ``fixed`` (t_max), ``uniform`` or ``log-uniform`` on t_min..t_max, ``geometric`` from t_min on with mean
     ``t_mean``, cut off at t_max.
     """
 
     law: str = "log-uniform"
-    """How T is drawn: one of ``LAWS``."""
+    """Law of T, one of ``LAWS``."""
     t_min: int = 1
     """Shortest T, messages; not used by ``fixed``."""
     t_max: int = 400
@@ -46,12 +46,12 @@ class Interruption:
     size_bytes: int = 230_000
     """Bytes of every message."""
     value: Value = field(default_factory=qoi.exponential)
-    """V that QoI is measured with."""
+    """V for the QoI."""
     lengths: tuple[int, ...] = ()
-    """If any are given: T is drawn again until it is one of these."""
+    """Allowed T, if any are given: T is drawn again until it is one of them."""
 
     topics: ClassVar[tuple[Topic, ...]] = ()
-    """None: one queue."""
+    """Empty: one queue."""
 
     def __post_init__(self) -> None:
         if self.law not in LAWS:
@@ -120,12 +120,12 @@ class Interruption:
         return self._episodes[T]
 
     def draw(self, streams: Streams) -> Episode:
-        """One episode."""
+        """Draw one episode."""
         return self.episode(self.draw_length(streams.link))
 
     @functools.cached_property
     def _episodes(self) -> dict[int, Episode]:
-        """By length, those used so far: the length is all that differs, so each is made once."""
+        """Episodes used so far, by length. They differ only in length, so each is made once."""
         return {}
 
     @functools.cached_property

@@ -1,4 +1,4 @@
-"""Which episode a seed stands for: the same in a row of a benchmark and in the reset of an environment."""
+"""Episodes by seed: the same in a row of a benchmark and in the reset of an environment."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from bufgym.model.checks import whole
 from bufgym.scenario.episode import Streams
 
 SEEDS_PER_TRACE = 1000
-"""In a suite, episode s of trace k has the seed 1000 k + s: no two traces of a scenario share a draw."""
+"""Episode s of trace k in a suite has the seed 1000 k + s, so no two traces of a scenario share a draw."""
 
 
 def draw(scenario: Any, seed: int) -> Any:
-    """The episode of this seed, with the uniform draws of randomised policies."""
+    """Draw the episode of this seed, with the uniform draws of randomised policies."""
     streams = Streams.seeded(seed)
     return scenario.draw(streams).with_uniforms(streams.policy)
 
 
 def by_trace(scenario: Any) -> list[tuple[str, Any]]:
-    """The scenario split into one for each of its traces: (label, scenario). Equal names get a number."""
+    """Split the scenario into one part per trace, as (label, part); equal names get a number."""
     uplink = getattr(scenario, "uplink", None)
-    if uplink is not None:  # of robots that share it
+    if uplink is not None:  # a fleet's uplink, which its robots share
         return [(label, replace(scenario, uplink=part)) for label, part in by_trace(uplink)]
     traces = getattr(scenario, "traces", None)
     if traces is None:
@@ -35,13 +35,13 @@ def by_trace(scenario: Any) -> list[tuple[str, Any]]:
 
 
 def numbered(family: Any, seed: Any = None, trace: str | int | None = None, scenario: str | None = None) -> Any:
-    """The episode that the row of a benchmark with this seed, trace and scenario is about.
+    """The episode of the benchmark row with this seed, trace and scenario.
 
     Args:
-        family: a ``Scenario``; that of a suite has ``members``.
+        family: a ``Scenario``; a suite's has ``members``.
         seed: the row's.
-        trace: the row's, or its number from 0 on. To be left out where there is one alone, and in a suite: there the
-            seed tells it (``SEEDS_PER_TRACE``).
+        trace: the row's, or its number from 0 on. Leave it out if there is only one, or in a suite: there the seed
+            tells it (``SEEDS_PER_TRACE``).
         scenario: the row's; only in a suite.
 
     Raises:

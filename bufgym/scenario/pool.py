@@ -1,4 +1,4 @@
-"""A fixed set of a scenario's episodes, from which rows take theirs without drawing each anew."""
+"""A fixed set of a scenario's episodes, from which rows take theirs instead of drawing new ones."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from bufgym.scenario.episode import Streams
 
 MAX_EPISODES = 10**6
 _SEED = 704_251
-"""Apart from seeds that people use: what is learned on a pool was not seen in a benchmark's rows."""
+"""A seed that people do not use, so that rows of a benchmark differ from the episodes of a pool."""
 
 
 class Pool:
-    """So many episodes of what ``draw`` draws, the same for everyone who makes a pool of it.
+    """``episodes`` episodes that ``draw`` draws, the same for everyone who makes a pool of it.
 
-    Called with a row's streams, as ``draw`` is, it hands out one of them, each as likely. An episode is drawn when it
-    is first taken; then it stays in memory (56 bytes a message).
+    Called with a row's streams, as ``draw`` is, it returns one of them at random. An episode is drawn at its first use
+    and then stays in memory, 56 bytes a message.
     """
 
     def __init__(self, draw: Callable[[Streams], Any], episodes: int) -> None:

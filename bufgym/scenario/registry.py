@@ -30,7 +30,7 @@ SCENARIOS: dict[str, tuple[Callable[[], Scenario], str]] = {
     "topics": (client_over_lte, "the topics of Robofleet's example client over the shipped synthetic LTE traces"),
     "suite": (_suite, "the scenarios of a suite's split, one of them drawn for each episode"),
 }
-"""Name -> (what makes it, one line about it)."""
+"""Name -> (function or class that makes it, one line about it)."""
 
 
 Maker = TypeVar("Maker", bound=Callable[[], Any])
@@ -38,10 +38,10 @@ _BUILT_IN = frozenset(SCENARIOS)
 
 
 def register(name: str, about: str = "") -> Callable[[Maker], Maker]:
-    """Register what it decorates as the scenario ``name``; it comes back unchanged.
+    """Register the decorated class or function as the scenario ``name``; it comes back unchanged.
 
-    That is a class, or a function without arguments that returns a ``Scenario``. ``about``: a line about it, by default
-    the first of the docstring.
+    A function takes no arguments and returns a ``Scenario``. ``about`` is a line about it, by default the first of the
+    docstring.
 
     Raises:
         BufgymError: the name is a built-in scenario's, empty, or holds a blank, ":" or "=".
@@ -67,7 +67,7 @@ def _named(name: str) -> Scenario:
 
 
 def checked(scenario: Any, name: str) -> Scenario:
-    """The scenario, or an error that says what a scenario must have."""
+    """Check that this has all that a scenario needs, and return it."""
     if not isinstance(getattr(scenario, "value", None), Value):
         raise BufgymError(f"scenario {name}: {scenario!r} has no `value`, a bufgym.model.qoi Value")
     for what, holds in (
@@ -85,10 +85,10 @@ def _is_count(number: Any) -> bool:
 
 
 def get(spec: str | Scenario, **overrides: Any) -> Scenario:
-    """The scenario of that name (or ``spec`` itself), with these parameters changed; BufgymError for unknown ones.
+    """The scenario of that name, or ``spec`` itself, with changed parameters; BufgymError for unknown ones.
 
-    A name that ends in .toml is that of a client's configuration (``read_client``); ``module:function`` is imported
-    (see ``bufgym.modules``) and makes a scenario without arguments, or is one.
+    A name that ends in .toml names a client's configuration (``read_client``). ``module:function`` is imported (see
+    ``bufgym.modules``); it is a scenario or makes one without arguments.
     """
     if isinstance(spec, str) and spec.endswith(".toml"):
         spec = read_client(spec)

@@ -24,56 +24,57 @@ from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import Workload
 
 _JITTER_HZ = 30.0
-"""At any rate an episode leaves its stream where the jitter of so many messages a second does, so that motion and all
-that follows are the same whatever ``rate_hz``, ``jitter`` and ``size_cv`` are."""
+"""Reference rate. At any rate an episode leaves its stream where the jitter of so many messages a second does. So
+motion and all later draws are the same for every ``rate_hz``, ``jitter`` and ``size_cv``."""
 _TIMES, _SIZES = 0, 1
-"""Generators ``beside`` the stream: of jitter at other rates, and of sizes (of robot r: r more)."""
+"""Numbers of the generators ``beside`` the stream: jitter at other rates, and sizes (of robot r: r more)."""
 
 
 @dataclass(frozen=True)
 class Uplink:
     """A camera stream over capacity traces.
 
-    Frames arrive at ``rate_hz``; the link is one of ``traces``, chosen at random, times one of ``scale``, from a random
-    offset on. x is one of the recordings in ``motion`` from a random offset on, or without one the frame index. For one
-    seed, jitter, sizes and motion are drawn apart: other rates, jitters or sizes meet the same link and motion.
+    Frames arrive at ``rate_hz``. The link is one of ``traces``, chosen at random, times one of ``scale``, from a random
+    offset on. x is one of the recordings in ``motion`` from a random offset on, or without one the frame index. Jitter,
+    sizes and motion have draws of their own, so one seed gives the same link and motion for other rates, jitters or
+    sizes.
 
-    With a ``workload``, a robot's recording is played as it is in place of the stream that ``rate_hz``, ``jitter``,
+    A ``workload``, a robot's recording, is played as it is. It replaces the stream that ``rate_hz``, ``jitter``,
     ``size_bytes``, ``size_cv`` and ``duration_s`` describe. All its topics share the queue; it gives x if it has one.
 
-    In place of an object, text is taken as on the command line: ``traces="lte-synthetic-0"`` (a shipped name or a file,
+    Text in place of an object is read as on the command line: ``traces="lte-synthetic-0"`` (a shipped name or a file,
     or a list of them), ``motion="drive-0"`` (or "none"), ``value="saturating:0.5"``, ``workload="drive.mcap"``.
     """
 
     traces: tuple[Trace, ...] = ()
     """Links; one of them carries an episode."""
     motion: tuple[Motion, ...] = ()
-    """Recordings that give x; without one x is the frame index."""
+    """Recordings that give x; without them x is the frame index."""
     rate_hz: float = 30.0
     """Messages a second."""
     jitter: float = 0.1
-    """Each message is moved within its period by up to this part of it."""
+    """Largest shift of a message within its period, as a fraction of the period."""
     size_bytes: int = 230_000
     """Mean bytes of a message."""
     size_cv: float = 0.0
-    """Coefficient of variation of the sizes, which are log-normal; 0: all equal."""
+    """Coefficient of variation of the log-normal sizes; 0 for equal sizes."""
     duration_s: float = 30.0
     """Length of an episode's arrivals, s."""
     scale: tuple[float, ...] = (1.0,)
     """Factors on the link's capacity; one of them is drawn for an episode."""
     random_offset: bool = True
-    """Whether link and motion begin at a random place; else at their beginnings."""
+    """Whether link and motion begin at a random place; otherwise they begin at the start."""
     link_offset_s: tuple[float, float] | None = None
-    """Where on the trace an episode begins, at random from..to, s; None: anywhere."""
+    """Range of the episode's random offset on the trace, s; None for anywhere."""
     propagation_us: int = 20_000
-    """From a message's last byte on the link to the server, us."""
+    """Time from a message's last byte on the link to the server, us."""
     value: Value = field(default_factory=lambda: qoi.exponential(math.exp(-1)))
-    """V that QoI is measured with."""
+    """V for the QoI."""
     workload: Workload | None = None
     """A recording to play; None for the stream."""
 
     topics: ClassVar[tuple[Topic, ...]] = ()
-    """None: one queue."""
+    """Empty: one queue."""
 
     def __post_init__(self) -> None:
         recordings(self)
@@ -113,14 +114,14 @@ class Uplink:
         return tuple(scaled(trace, factor) for trace in self.traces for factor in self.scale)
 
     def draw(self, streams: Streams) -> Episode:
-        """One episode."""
+        """Draw one episode."""
         arrivals = self._stream(streams.arrival) if self.workload is None else _replayed(self.workload)
         self.move(arrivals, streams.arrival)
         trace, offset_us = place_link(self._links, streams.link, self.random_offset, self.link_offset_s)
         return Episode(read_only(arrivals), Link(trace, offset_us, int(self.propagation_us)))
 
     def move(self, arrivals: NDArray[Any], rng: np.random.Generator) -> None:
-        """Give these messages the x of one of the recordings, if there are any, from a place drawn at random."""
+        """Give these messages the x of a recording, if there are any, from a random place on."""
         if self.motion:
             motion, start_us = place(self.motion, rng, self.random_offset)
             x = motion.at(arrivals["arrival_us"] + start_us)
@@ -142,7 +143,7 @@ class Uplink:
         return unchecked_messages(arrival_us, size, None)
 
     def drawn_sizes(self, rng: np.random.Generator, robot: int = 0) -> NDArray[np.int64]:
-        """int64[n] bytes of the messages of one stream, or in a fleet of a robot's; ``rng`` stays where it is."""
+        """int64[n] bytes of the messages of one stream, or of a fleet's robot; ``rng`` stays where it is."""
         return sizes(
             self.max_messages, self.size_bytes, self.size_cv, beside(rng, _SIZES + robot) if self.size_cv else rng
         )
@@ -156,13 +157,13 @@ def _replayed(workload: Workload) -> NDArray[Any]:
 
 
 RGBD_BYTES = 1280 * 720 * (3 + 2)
-"""An uncompressed frame of 1280 x 720, as of a RealSense D455: a pixel has three bytes of colour and two of depth."""
+"""Bytes of an uncompressed frame of 1280 x 720, as from a RealSense D455: three of colour and two of depth a pixel."""
 
 
 def uplink_over_lte() -> Uplink:
-    """An RGB-D camera on a driving robot over the shipped synthetic LTE links, which carry about two of its 30 frames a
-    second. V(1) = 0.95: a frame that shares nothing with the one before it is worth nearly a whole one.
+    """An RGB-D camera on a driving robot over the shipped LTE links, which carry about two of its 30 frames a second.
 
-    Both were chosen so that the choice matters: Drop Oldest loses about 10 % of the clairvoyant's H, AFR about 7 %.
+    V(1) = 0.95: a frame that shares nothing with its predecessor is worth nearly a whole one. Link and V were chosen so
+    that the choice matters: Drop Oldest loses about 10 % of the clairvoyant's H, AFR about 7 %.
     """
     return Uplink(**shipped(), size_bytes=RGBD_BYTES, value=qoi.exponential(0.05))

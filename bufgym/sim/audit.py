@@ -1,7 +1,7 @@
-"""After a run: whether what a policy saw is still what happened.
+"""A check after a run that a policy did not change the records of its sender.
 
-Compiled policies see the sender's own records, which spares a copy at every decision, and Numba lets them write there.
-So a benchmark's run is checked when it is over: a policy that changed a message, or a topic's rules, has no result.
+Compiled policies see the sender's own records, which spares a copy at every decision, but Numba lets them write there.
+So every benchmark run is checked at its end: a policy that changed a message or a topic's rules has no result.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bufgym.sim.state import NEVER, Batch
 
 _ARRIVAL, _QUEUED, _BYTES, _LOG, _TOPIC, _QOI = range(1, 7)
 _ROUNDING = 1e-9
-"""H is added up in another order here."""
+"""Tolerance: H is added up in another order here."""
 _FOUND = {
     _ARRIVAL: "a message that arrived is not as the episode has it",
     _QUEUED: "a queued message is not as it arrived",
@@ -29,7 +29,7 @@ _FOUND = {
 
 
 def check_untouched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArray[Any], policy: str) -> None:
-    """An error if sender ``i``'s finished run does not agree with its episode: MESSAGE[n] and TOPIC[topics]."""
+    """Raise if sender ``i``'s finished run does not agree with its episode, MESSAGE[n] and TOPIC[topics]."""
     found = _touched(batch, i, arrivals, topics)
     if found:
         raise BufgymError(
@@ -52,7 +52,7 @@ def _same(a: Any, b: Any) -> bool:
 
 @kernel
 def _touched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArray[Any]) -> int:
-    """What does not agree, 0 if all does."""
+    """A code for the record that does not agree, or 0."""
     sender = batch.senders[i]
     dequeued, dropped, backlog_bytes, last = 0, 0, 0, -1
     for k in range(len(arrivals)):
@@ -76,7 +76,7 @@ def _touched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArray[Any])
         last = slot.seq
     if backlog_bytes != sender.backlog_bytes:
         return _BYTES
-    # Each of them writes one entry: as many entries as events means that no two were about one message.
+    # Each event writes one entry: as many entries as events means that no two were about one message.
     counted = dequeued == sender.dequeued and dropped == sender.evicted + sender.rejected
     if not counted or dequeued + dropped + sender.occupancy != sender.next:
         return _LOG
@@ -102,7 +102,7 @@ def _touched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArray[Any])
 
 @kernel
 def _gained(batch: Batch, i: int, arrivals: NDArray[Any], topic: int) -> float:
-    """What sender ``i`` has gained by the received messages of one topic, or of its one queue, without the 1."""
+    """Gain of sender ``i`` from the received messages of one topic, or of its one queue, without the 1."""
     sender, gained, before = batch.senders[i], 0.0, -1
     several = sender.topics > 1
     weight, v_start = 1.0, sender.v_start

@@ -16,10 +16,10 @@ from bufgym.sim.shared_link import load_cell, new_shares
 
 
 class Fleet:
-    """Cells with N robots each: robot r of cell c is row c N + r of ``senders``, whose L, B and V all of them share."""
+    """Cells with N robots each. Robot r of cell c is row c N + r of ``senders``, which all share L, B and V."""
 
     def __init__(self, senders: Senders, robots: int) -> None:
-        """``robots``: N; as many cells as the senders make. Nothing is loaded yet."""
+        """Make as many cells of N = ``robots`` robots as there are senders for; nothing is loaded yet."""
         self.robots = check_robots(robots)
         if len(senders) % self.robots or senders.topics:
             raise BufgymError(
@@ -36,7 +36,7 @@ class Fleet:
         return range(c * self.robots, (c + 1) * self.robots)
 
     def load(self, c: int, episode: FleetEpisode, uniforms: np.random.Generator | None = None) -> None:
-        """Begin ``episode`` in cell ``c``: empty buffers, idle sockets, nothing arrived; ``uniforms`` as of Senders."""
+        """Begin ``episode`` in cell ``c``: empty buffers, idle sockets, nothing arrived; ``uniforms`` as in Senders."""
         if not isinstance(episode, FleetEpisode):
             raise BufgymError(f"episode: {episode!r} is not a bufgym.scenario FleetEpisode")
         if episode.robots != self.robots:
@@ -45,7 +45,7 @@ class Fleet:
         load_cell(self.senders.batch, self.shares, c)
 
     def run(self, policy: Policy, memory: NDArray[np.float64] | None = None) -> None:
-        """Run every loaded cell to its end, ``policy`` on each robot; ``memory``: float64[rows, entries]."""
+        """Run every loaded cell to its end with ``policy`` on each robot; ``memory`` is float64[rows, entries]."""
         if policy.privileged is not None:
             raise BufgymError(f"policy {policy.name}: it plans with a link of its own, which no robot in a cell has")
         self.senders.run(policy, memory, self.shares)
@@ -61,7 +61,7 @@ def run_fleet(
     decide_at: str = "arrival",
     memory: NDArray[np.float64] | None = None,
 ) -> Fleet:
-    """The fleet after ``policy`` ran on every robot through each of ``episodes``, one cell each.
+    """Run ``policy`` on every robot through each of ``episodes``, one cell each; return the fleet afterwards.
 
     ``metrics.outcome(fleet.senders, i)`` for i in ``fleet.rows(c)`` gives the statistics of the robots of cell c.
     """

@@ -1,4 +1,4 @@
-"""Carrying out what was decided: at an arrival, at the head of the queue, and which message the socket dequeues."""
+"""Carrying out decisions: at an arrival, at the head of the queue, and on the message to dequeue."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bufgym.sim.state import (
 
 # Weights of the running means: about the last 8 arrivals for the period, 16 for the service ratio.
 _PERIOD_WEIGHT, _SERVICE_WEIGHT = 1 / 8, 1 / 16
-# Over how much sending time the link's rate is averaged, us.
+# Sending time over which the link's rate is averaged, us.
 _SHORT_US, _MEDIUM_US, _LONG_US = 100_000, 500_000, 2_000_000
 
 # --- at an arrival ----------------------------------------------------------------------------------------------------
@@ -30,7 +30,7 @@ _SHORT_US, _MEDIUM_US, _LONG_US = 100_000, 500_000, 2_000_000
 
 @kernel
 def arrive(batch: Batch, i: int) -> int:
-    """The next message arrives: DECISION if it asks for one; else NOTHING, and it is enqueued where there is room."""
+    """Let the next message arrive: DECISION if it asks for one; else NOTHING, and it is enqueued if there is room."""
     sender = batch.senders[i]
     arrival = at(batch.arrivals, i, sender.next)
     arrives_us = arrival.arrival_us
@@ -57,7 +57,7 @@ def arrive(batch: Batch, i: int) -> int:
             sender.evictions = 0
             asked = asked and not (sender.ask_when_full == 1 and has_room(batch, i))
             if arrival.size_bytes > sender.max_bytes:
-                asked, decision = False, REJECT  # it can't fit, whatever goes
+                asked, decision = False, REJECT  # it can't fit, whatever is evicted
         if asked:
             sender.waiting = ARRIVAL_WAITS
             return DECISION
@@ -69,10 +69,10 @@ def arrive(batch: Batch, i: int) -> int:
 
 @kernel
 def measure_rate(batch: Batch, i: int) -> None:
-    """How fast the link carried what left the socket since the previous arrival, as the bytes left in it tell.
+    """Measure the link's rate since the previous arrival, by the bytes that left the socket.
 
-    A running mean over about the time w gives an interval of u us the weight u / (u + w); before so much has been seen
-    w is what has been seen. Time without bytes to send says nothing, and counts for nothing.
+    A running mean over about the time w gives an interval of u us the weight u / (u + w). Before a time w has been
+    seen, w is the time seen so far. Time without bytes to send does not count.
     """
     sender = batch.senders[i]
     held = held_bytes(batch, i)
@@ -91,7 +91,7 @@ def measure_rate(batch: Batch, i: int) -> None:
 
 @kernel
 def has_room(batch: Batch, i: int) -> bool:
-    """Whether the arrival at hand fits without a drop, by messages and by bytes."""
+    """Whether the present arrival fits without a drop, by messages and by bytes."""
     sender = batch.senders[i]
     arrival = at(batch.arrivals, i, sender.next)
     if sender.occupancy >= sender.capacity or rules.at_limit(batch, i, arrival.topic):
@@ -101,9 +101,10 @@ def has_room(batch: Batch, i: int) -> bool:
 
 @kernel
 def can_evict(batch: Batch, i: int, k: int) -> bool:
-    """Whether slot ``k`` may go for the arrival at hand: any of one queue, even where more have to follow.
+    """Whether slot ``k`` may go for the present arrival. In one queue any may, even if more have to follow.
 
-    With several topics it is droppable, of the newcomer's topic if that is at its limit, and in the end bytes suffice.
+    With several topics it must be droppable, and of the newcomer's topic if that is at its limit. In the end bytes must
+    suffice.
     """
     sender = batch.senders[i]
     if not 0 <= k < sender.occupancy:
@@ -119,9 +120,9 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
 
 @kernel
 def can_reject(batch: Batch, i: int) -> bool:
-    """Whether the arrival at hand may be dropped: always, but for a no_drop message that could be kept somehow.
+    """Whether the present arrival may be dropped: always, except a no_drop message that could be kept somehow.
 
-    Its rate limit comes first: what comes too soon is dropped even on a no_drop topic.
+    The rate limit comes first: a message that comes too soon is dropped even on a no_drop topic.
     """
     if batch.several is None:
         return True
@@ -132,10 +133,10 @@ def can_reject(batch: Batch, i: int) -> bool:
 
 @kernel
 def decide(batch: Batch, i: int, decision: int) -> bool:
-    """Carry out a decision on the arrival at hand; False if it was invalid and did what a queue does instead.
+    """Carry out a decision on the present arrival; False if it was invalid and did what a queue does instead.
 
-    That is: accept where there is room, reject where there is none; for a no_drop message evict the oldest message of
-    the lowest priority. If B has no room even after an eviction, the arrival waits on and the policy is asked again.
+    That is: accept if there is room, reject if there is none; for a no_drop message evict the oldest message of the
+    lowest priority. If B has no room even after an eviction, the arrival waits on and the policy is asked again.
     """
     sender = batch.senders[i]
     arrival = at(batch.arrivals, i, sender.next)
@@ -180,7 +181,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
 
 @kernel
 def remove(batch: Batch, i: int, k: int) -> None:
-    """Evict slot ``k``: its gap and the one behind it on its topic become one."""
+    """Evict slot ``k``: its gap and the next one on its topic become one."""
     sender = batch.senders[i]
     gone = at(batch.slots, i, sender.first + k)
     sender.backlog_bytes -= gone.size_bytes
@@ -201,7 +202,7 @@ def remove(batch: Batch, i: int, k: int) -> None:
 
 @kernel
 def answer_dequeue(batch: Batch, i: int, drop: bool) -> None:
-    """The policy's answer to DEQUEUE: drop the head, or let it go. A no_drop message is never dropped."""
+    """Take the policy's answer to DEQUEUE: drop the head, or let it go. A no_drop message is never dropped."""
     sender = batch.senders[i]
     if drop and not rules.no_drop(batch, i, at(batch.slots, i, sender.first).topic):
         remove(batch, i, 0)
@@ -214,7 +215,7 @@ def answer_dequeue(batch: Batch, i: int, drop: bool) -> None:
 
 @kernel
 def can_send(batch: Batch, i: int, k: int) -> bool:
-    """Whether the socket may dequeue slot ``k``: the oldest of its topic, by n_T and by its rate limit."""
+    """Whether the socket may dequeue slot ``k``: it is the oldest of its topic, and n_T and its rate limit allow it."""
     sender = batch.senders[i]
     if not 0 <= k < sender.occupancy:
         return False
@@ -224,7 +225,7 @@ def can_send(batch: Batch, i: int, k: int) -> bool:
 
 @kernel
 def can_hold(batch: Batch, i: int) -> bool:
-    """Whether the socket may wait: for something that is still to come, or because nothing may be sent."""
+    """Whether the socket may wait: an event is still to come, or nothing may be sent."""
     sender = batch.senders[i]
     if sender.next < sender.arrivals or sender.acked < sender.dequeued:
         return True
@@ -233,7 +234,7 @@ def can_hold(batch: Batch, i: int) -> bool:
 
 @kernel
 def oldest_sendable(batch: Batch, i: int) -> int:
-    """The oldest slot that the socket may dequeue, HOLD if there is none."""
+    """The oldest slot that the socket may dequeue, or HOLD."""
     for k in range(batch.senders[i].occupancy):
         if can_send(batch, i, k):
             return k
@@ -242,7 +243,7 @@ def oldest_sendable(batch: Batch, i: int) -> int:
 
 @kernel
 def choose(batch: Batch, i: int, k: int) -> None:
-    """The socket dequeues slot ``k`` next; HOLD: nothing before the next arrival or ack, and then all is asked anew."""
+    """Let the socket dequeue slot ``k`` next; HOLD waits for the next arrival or ack, which asks again."""
     sender = batch.senders[i]
     if k == HOLD:
         sender.socket = HELD
@@ -252,9 +253,9 @@ def choose(batch: Batch, i: int, k: int) -> None:
 
 @kernel
 def answer_send(batch: Batch, i: int, k: int) -> bool:
-    """The scheduler's answer to SEND: the slot that the socket dequeues, or HOLD; False if it was invalid.
+    """Take the scheduler's answer to SEND: the slot that the socket dequeues, or HOLD; False if it was invalid.
 
-    Then the oldest message that may be sent goes, and the socket waits if there is none.
+    An invalid answer sends the oldest message that may be sent; if there is none, the socket waits.
     """
     sender = batch.senders[i]
     sender.waiting = NOTHING_WAITS

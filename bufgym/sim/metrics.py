@@ -1,7 +1,7 @@
 """Statistics of a finished run: one definition of each, computed from the log of every message.
 
-Times of transmission are those at which a message's last byte crossed the link; it reaches the server a propagation
-delay later.
+A time of transmission is the time at which a message's last byte crossed the link. The message reaches the server a
+propagation delay later.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Outcome:
     """The statistics of one finished run of one sender."""
 
     qoi: float
-    """H = 1 + sum of V over the messages received; 0 if none was. With several topics the weighted sum of theirs."""
+    """H = 1 + sum of V over the messages received; 0 if none was. With several topics, their weighted sum."""
     arrived: int
     """Messages that arrived at the sender."""
     delivered: int
@@ -30,7 +30,7 @@ class Outcome:
     dropped: int
     """Messages evicted or rejected."""
     in_transmission: int
-    """1 where the link stopped for good with a message on it; with n_T > 1 perhaps more."""
+    """1 if the link stopped for good with a message on it; with n_T > 1 perhaps more."""
     buffered: int
     """Messages still queued at the end, for the same reason."""
     longest_gap: float
@@ -40,16 +40,16 @@ class Outcome:
     mean_sojourn_s: float
     """Time from arrival at the sender to the end of transmission, mean over the messages delivered, s."""
     p95_sojourn_s: float
-    """95th percentile of the same, s."""
+    """95th percentile of the sojourn time, s."""
     mean_age_s: float
     """Age of information at the server (now - arrival time of the newest received), mean over time from the first
     receipt to the last, s."""
     peak_age_s: float
-    """Age just before each receipt that lowers it, mean over these, s."""
+    """Mean of the age just before each receipt that lowers it, s."""
     max_age_s: float
     """Largest age just before any receipt, s."""
     peak_backlog_bytes: int
-    """Largest number of bytes queued; a message that goes straight to an idle socket counts as queued as well."""
+    """Largest number of bytes queued; a message that goes straight to an idle socket counts as queued too."""
     invalid: int
     """Decisions that could not be carried out as given."""
 
@@ -58,7 +58,7 @@ METRICS = tuple(f.name for f in fields(Outcome))
 
 
 def received(senders: Senders, i: int) -> NDArray[Any]:
-    """MESSAGE[delivered]: what sender ``i`` transmitted, in that order."""
+    """MESSAGE[delivered]: messages that sender ``i`` transmitted, in that order."""
     batch = senders.batch
     order: NDArray[np.int64] = batch.order[i, : batch.senders[i]["transmitted"]]
     messages: NDArray[Any] = np.asarray(batch.arrivals[i])[order]
@@ -116,7 +116,7 @@ class TopicOutcome:
     mean_sojourn_s: float
     """Time from arrival at the sender to receipt at the server, propagation included, s; NaN if none was received."""
     p95_sojourn_s: float
-    """95th percentile of the same, s."""
+    """95th percentile of the sojourn time, s."""
     mean_age_s: float
     """Age of information at the server, mean over time from the topic's first arrival to the episode's last, s."""
     peak_age_s: float
@@ -172,7 +172,7 @@ def weighted_qoi(senders: Senders, i: int, messages: NDArray[Any]) -> float:
 
 
 def sojourns_s(sojourn_us: NDArray[np.int64]) -> tuple[float, float]:
-    """(mean, 95th percentile) of these sojourn times, s; NaN if there are none."""
+    """Mean and 95th percentile of these sojourn times, s; NaN if there are none."""
     if len(sojourn_us) == 0:
         return NAN, NAN
     sojourn_s = sojourn_us / 1e6
@@ -182,9 +182,9 @@ def sojourns_s(sojourn_us: NDArray[np.int64]) -> tuple[float, float]:
 def ages_between_s(
     received_us: NDArray[np.int64], arrival_us: NDArray[np.int64], from_us: int, until_us: int
 ) -> tuple[float, float]:
-    """(mean, largest) age of information from ``from_us`` to ``until_us``, s; at the beginning it is 0.
+    """Mean and largest age of information from ``from_us`` to ``until_us``, s; at the beginning it is 0.
 
-    ``received_us`` must not decrease. NaN where that time has no length.
+    ``received_us`` must not decrease. NaN for a time of length 0.
     """
     if until_us <= from_us:
         return NAN, NAN
@@ -198,9 +198,9 @@ def ages_between_s(
 
 
 def ages_s(received_us: NDArray[np.int64], arrival_us: NDArray[np.int64]) -> tuple[float, float, float]:
-    """(mean, mean peak, largest) age of information, s (Kaul, Yates and Gruteser 2012); NaN with fewer than 2 receipts.
+    """Mean, mean peak and largest age of information, s (Kaul, Yates and Gruteser 2012); NaN below 2 receipts.
 
-    Between two receipts the age grows from (first receipt - newest arrival time so far) at slope 1: a trapezium.
+    Between two receipts the age grows with slope 1 from first receipt - newest arrival time so far: a trapezium.
     """
     if len(received_us) < 2:
         return NAN, NAN, NAN

@@ -25,7 +25,7 @@ from bufgym.sim.transition import move_on, next_event, sender_of
 from bufgym.sim.view import arrival_of, view
 
 _SHORT = 200_000
-"""Arrivals times numbers that a policy reads at each: a rollout below that takes no more than some milliseconds."""
+"""Arrivals times numbers read at each, for a rollout that takes at most some milliseconds."""
 
 
 def rollout(
@@ -45,7 +45,7 @@ def rollout(
             if not again:
                 event = move_on(batch, shares, c)
             again = False
-            # One view for all events: the kernels are inlined, and so the loop's code stays small.
+            # One view for all events: the kernels are inlined, so the loop's code stays small.
             if event == END or (event == DEPARTURE and not hears_departures):
                 continue
             i = sender_of(shares, c)
@@ -65,10 +65,10 @@ def rollout(
 
 @functools.cache
 def compiled_rollout(shared: bool, several: bool) -> Any:
-    """``rollout`` compiled once for every policy (policies arrive as values of one function type).
+    """``rollout`` compiled once for every policy, as policies arrive as values of one function type.
 
-    ``shared``: for the cells of a shared link; else for senders with links of their own. ``several``: for several
-    topics; else for one queue.
+    ``shared`` means the cells of a shared link, otherwise senders with links of their own. ``several`` means several
+    topics, otherwise one queue.
     """
     functions = tuple(numba.types.FunctionType(signature) for signature in signatures())
     memory = numba.types.Array(numba.types.float64, 2, "C")
@@ -80,9 +80,9 @@ _view = getattr(view, "py_func", view)
 
 
 def python_view(batch: Batch, i: int) -> Buffer:
-    """``view`` for Python callers, over a ``named`` batch: the compiled kernel must not hand its arrays to Python.
+    """Make a ``view`` for Python over a ``named`` batch: the compiled kernel must not hand its arrays to Python.
 
-    It is read-only. Kernels keep marks in the rows of several topics: these are a copy.
+    It is read-only. Kernels keep marks in the rows of several topics, so these rows are a copy.
     """
     buffer: Buffer = _view(batch, i)
     buffer.slots.flags.writeable = False
@@ -93,9 +93,9 @@ def python_view(batch: Batch, i: int) -> Buffer:
 
 
 def python_arrival(batch: Batch, i: int, before: int = 0) -> Any:
-    """The arrival that waits for a decision, read-only, for Python callers over a ``named`` batch.
+    """The arrival that waits for a decision, read-only, for Python over a ``named`` batch.
 
-    ``before``: the one so many before it.
+    ``before`` picks an earlier arrival: the one so many before it.
     """
     row = batch.arrivals[i]
     row.flags.writeable = False
@@ -103,7 +103,7 @@ def python_arrival(batch: Batch, i: int, before: int = 0) -> Any:
 
 
 def answer_of(policy: Policy, hook: str, answer: Any) -> int:
-    """The answer of a policy in ordinary Python as a whole number (or a yes or no); a BufgymError for anything else."""
+    """Convert the answer of a policy in Python to a whole number (or a yes or no); BufgymError for anything else."""
     try:
         number = int(answer)
     except (TypeError, ValueError, OverflowError):
@@ -114,7 +114,7 @@ def answer_of(policy: Policy, hook: str, answer: Any) -> int:
 
 
 def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
-    """``rollout`` for a policy in ordinary Python: the transition stays compiled, views are made in Python."""
+    """Run a policy in ordinary Python: the transition stays compiled, views are made in Python."""
     records = named(batch)
     for c in range(len(batch.senders) if shares is None else len(shares.cells)):
         while (event := next_event(batch, shares, c)) != END:
@@ -136,13 +136,13 @@ def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float
 
 
 def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
-    """Run every sender to its end under ``policy``, compiled where the policy is."""
+    """Run every sender to its end under ``policy``, compiled if the policy is."""
     if not runs_compiled(policy):
         python_rollout(batch, shares, memory, policy)
         return
     compiled = compiled_rollout(shares is not None, bool(batch.several))
     arguments = batch, shares, memory, *policy.compiled, policy.hears_departures
-    # What it may do at each arrival grows with what it remembers and reads.
+    # Its work at each arrival grows with its memory and the numbers it reads.
     if batch.senders["arrivals"].sum() * (memory.shape[1] + len(batch.parameters)) < _SHORT:
         compiled(*arguments)
     else:

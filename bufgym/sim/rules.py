@@ -1,11 +1,11 @@
-"""Rules of topics: each has gaps, limits and rights of its own. A single queue is the case of one topic without limits.
+"""Rules of topics: each has gaps, limits and rights of its own. A single queue is one topic without limits.
 
 A topic's messages are sent in the order of their arrival. ``no_drop`` messages are neither evicted nor rejected while
-anything else could make room for them. Rate limits, ``no_drop`` and the in-flight window are Robofleet's
-(github ut-amrl/robofleet_client_lib); the published and the released client differ, and both are settings here.
+anything else could make room for them. Rate limits, ``no_drop`` and the in-flight window come from Robofleet (github
+ut-amrl/robofleet_client_lib). The published and the released client differ, and both are settings here.
 
-A single queue ignores the messages' topic numbers and reads row 0 of the topic table. It keeps no score in that row:
-so its limits never bind, and what the row would say is in the sender's record. That saves a tenth of a rollout's time.
+A single queue ignores the messages' topic numbers and reads row 0 of the topic table. It keeps no score in that row, so
+its limits never bind; the sender's record has the score instead. That saves a tenth of a rollout's time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bufgym.sim.state import Batch
 
 @kernel
 def kept_before(batch: Batch, i: int, k: int, topic: int) -> int:
-    """The slot before slot ``k`` on the same topic, -1 where there is none."""
+    """The slot before slot ``k`` on the same topic, or -1."""
     sender = batch.senders[i]
     j = k - 1
     if batch.several is not None:
@@ -30,7 +30,7 @@ def kept_before(batch: Batch, i: int, k: int, topic: int) -> int:
 
 @kernel
 def kept_after(batch: Batch, i: int, k: int, topic: int) -> int:
-    """The slot after slot ``k`` on the same topic, the occupancy where there is none."""
+    """The slot after slot ``k`` on the same topic, or the occupancy."""
     sender = batch.senders[i]
     j = k + 1
     if batch.several is not None:
@@ -41,9 +41,9 @@ def kept_after(batch: Batch, i: int, k: int, topic: int) -> int:
 
 @kernel
 def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
-    """Weight times V of the gap from what is kept before slot ``k`` on its topic to ``x``; 0 for its first message."""
+    """Weight times V of the gap to ``x`` from the message kept before slot ``k``; 0 for a topic's first message."""
     sender = batch.senders[i]
-    if batch.several is None:  # in slot -1 lies the message dequeued last
+    if batch.several is None:  # slot -1 holds the message dequeued last
         if k == 0 and sender.dequeued == 0:
             return 0.0
         return value(batch.v[sender.v_start :], x - at(batch.slots, i, sender.first + k - 1).x)
@@ -60,7 +60,7 @@ def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
 
 @kernel
 def arrived_on_topic(batch: Batch, i: int, message: Any, enqueued: bool) -> None:
-    """``message`` has arrived, and was enqueued or not."""
+    """Record that ``message`` has arrived, and was enqueued or not."""
     topic = at(batch.topics, i, message.topic)
     if topic.arrived > 0:
         topic.step_us, topic.step_x = message.arrival_us - topic.previous_us, message.x - topic.previous_x
@@ -79,7 +79,7 @@ def arrived_on_topic(batch: Batch, i: int, message: Any, enqueued: bool) -> None
 
 @kernel
 def dequeued_on_topic(batch: Batch, i: int, message: Any) -> None:
-    """The socket has dequeued ``message``."""
+    """Record that the socket has dequeued ``message``."""
     topic = at(batch.topics, i, message.topic)
     topic.queued -= 1
     topic.dequeued += 1
@@ -89,7 +89,7 @@ def dequeued_on_topic(batch: Batch, i: int, message: Any) -> None:
 
 @kernel
 def received_on_topic(batch: Batch, i: int, message: Any, received_us: int) -> None:
-    """``message`` has reached the server: its topic is younger again, and it may have come too late."""
+    """Record that ``message`` has reached the server: its topic is younger again, and it may be late."""
     age_until(batch, i, message.topic, received_us)
     topic = at(batch.topics, i, message.topic)
     topic.received += 1
@@ -102,7 +102,7 @@ def received_on_topic(batch: Batch, i: int, message: Any, received_us: int) -> N
 def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
     """Count the age of a topic's information at the server up to ``until_us``, times its weight.
 
-    It begins with the topic's first arrival and ends with the episode's last, whatever a policy does.
+    Counting begins with the topic's first arrival and ends with the episode's last, whatever a policy does.
     """
     sender = batch.senders[i]
     rules = at(batch.topics, i, topic)
@@ -121,7 +121,7 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
 
 @kernel
 def too_soon(batch: Batch, i: int, topic: int) -> bool:
-    """Whether the arrival at hand comes sooner after the last one kept (or sent) than its topic's rate limit allows."""
+    """Whether the present arrival is too close to its topic's last message kept (or sent) for the rate limit."""
     sender = batch.senders[i]
     rules = at(batch.topics, i, topic)
     if sender.limit_since_sent == 1:
@@ -131,7 +131,7 @@ def too_soon(batch: Batch, i: int, topic: int) -> bool:
 
 @kernel
 def at_limit(batch: Batch, i: int, topic: int) -> bool:
-    """Whether as many messages of this topic are queued as may be."""
+    """Whether this topic has as many queued messages as it may have."""
     if batch.several is None:
         return False
     rules = at(batch.topics, i, topic)
@@ -148,7 +148,7 @@ def no_drop(batch: Batch, i: int, topic: int) -> bool:
 
 @kernel
 def could_fit(batch: Batch, i: int) -> bool:
-    """Whether the arrival at hand would fit by its bytes if all went that may be dropped."""
+    """Whether the present arrival's bytes would fit if every droppable message went."""
     sender = batch.senders[i]
     spare_bytes = sender.max_bytes - sender.backlog_bytes - at(batch.arrivals, i, sender.next).size_bytes
     k = 0
@@ -162,7 +162,7 @@ def could_fit(batch: Batch, i: int) -> bool:
 
 @kernel
 def refuge(batch: Batch, i: int) -> int:
-    """The slot that goes for a no_drop message when nothing else helps: lowest priority, oldest; -1 if none may."""
+    """The slot to evict for a no_drop message as a last resort: lowest priority, oldest; -1 if none may go."""
     sender = batch.senders[i]
     best = -1
     lowest = 0.0
@@ -178,9 +178,9 @@ def refuge(batch: Batch, i: int) -> int:
 
 @kernel
 def sendable(batch: Batch, i: int, k: int) -> bool:
-    """Whether slot ``k`` may be sent by the window and, where rate limits hold back at the socket, by its own.
+    """Whether slot ``k`` may be sent by the window and, if rate limits hold back at the socket, by its own.
 
-    There a ``no_drop`` topic is not limited: the client that does so, Robofleet's released one, has no such limit.
+    Limits at the socket spare ``no_drop`` topics, as in Robofleet's released client.
     """
     sender = batch.senders[i]
     full = sender.dequeued - sender.acked >= sender.window

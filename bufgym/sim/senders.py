@@ -22,7 +22,7 @@ from bufgym.sim.shared_link import Shares
 from bufgym.sim.state import FRESH, SENDER, beginning, new_batch
 
 Begun = tuple[int, Episode, np.random.Generator | None]
-"""Which sender begins which episode, and what its uniform draws come from: the arguments of ``Senders.load``."""
+"""Arguments of ``Senders.load``: a sender, the episode it begins, and the generator of its uniform draws."""
 
 _EPISODE = ("arrivals", "first_decision", "last_decision")
 _TRACE = ("first_knot", "last_knot", "after", "segment_now", "segment_finish")
@@ -34,9 +34,9 @@ _LOADED = np.array([list(cast(Any, SENDER.names)).index(name) for name in (*_EPI
 class Senders:
     """A batch of n senders that share L, B and V, each with an episode of its own.
 
-    ``capacity`` (L, messages), ``max_bytes`` (B), ``decide_at``, ``value`` (V) and ``topics`` are the shared settings,
-    ``batch`` the arrays (see ``Batch``), ``episodes`` what each sender has loaded, None for nothing, ``begun``,
-    int64[n], how many it has begun. An episode of one queue may have a V of its own.
+    Shared settings are ``capacity`` (L, messages), ``max_bytes`` (B), ``decide_at``, ``value`` (V) and ``topics``.
+    ``batch`` has the arrays (see ``Batch``). ``episodes`` has each sender's episode, or None. ``begun``, int64[n],
+    counts the episodes begun. An episode of one queue may have a V of its own.
     """
 
     def __init__(
@@ -50,9 +50,9 @@ class Senders:
         decide_at: str = "arrival",
         topics: Sequence[Topic] = (),
     ) -> None:
-        """n senders with room for L = ``capacity`` messages (and B = ``max_bytes`` bytes), without episodes so far.
+        """Make n senders with room for L = ``capacity`` messages and B = ``max_bytes`` bytes, without episodes so far.
 
-        ``topics``: the rules of each topic, by the topic numbers of the messages; none for one queue without rules.
+        ``topics`` has the rules of each topic, by the messages' topic numbers; empty for one queue without rules.
         """
         check_limits(capacity, max_bytes)
         if decide_at not in ("arrival", "overflow"):
@@ -69,10 +69,6 @@ class Senders:
         self._uniforms: list[np.random.Generator | None] = [None] * n
         self._knots = Knots()
         self.batch = new_batch(n, self.capacity, max_messages, len(self._topic_table), values)
-        batch = self.batch
-        self._arrivals, self._log, self._topics, self._senders = (
-            whole.view(np.int64) for whole in (batch.arrivals, batch.log, batch.topics, batch.senders)
-        )  # NumPy copies records field by field; as whole words it copies them five times as fast
         self._rules = self._topic_table.view(np.int64)
         self._unlogged = np.tile(FRESH, max_messages)
         when_full = int(decide_at == "overflow")
@@ -90,13 +86,13 @@ class Senders:
     def load(self, i: int, episode: Episode, uniforms: np.random.Generator | None = None) -> None:
         """Begin ``episode`` at sender ``i``: empty buffer, idle socket, nothing arrived.
 
-        ``uniforms``: what ``draw_uniforms`` draws from; None for an episode that has its uniform draws.
+        ``uniforms`` is the generator for ``draw_uniforms``; None if the episode has its uniform draws.
         """
         self.load_all([(i, episode, uniforms)])
 
     def load_all(self, begun: Sequence[Begun]) -> None:
-        """``load`` for each of ``begun`` at once."""
-        v_starts = [self._checked(episode) for _, episode, _ in begun]  # before any of them is touched
+        """Call ``load`` for each of ``begun`` at once."""
+        v_starts = [self._checked(episode) for _, episode, _ in begun]  # before any sender is changed
         for (i, episode, uniforms), v_start in zip(begun, v_starts, strict=True):
             self._begin(i, episode, v_start)
             self.episodes[i], self._uniforms[i] = episode, uniforms
@@ -105,7 +101,7 @@ class Senders:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
 
     def _checked(self, episode: Episode) -> int:
-        """Where the V of the episode begins in the array of all V; an error if these senders can't play it."""
+        """Index of the episode's V in the array of all V; raise if these senders can't play the episode."""
         if not isinstance(episode, Episode):
             raise BufgymError(f"episode: {episode!r} is not a bufgym.scenario Episode")
         n = len(episode.arrivals)
@@ -122,24 +118,27 @@ class Senders:
         """Put sender ``i`` at the beginning of ``episode``."""
         link, n, words = episode.link, len(episode.arrivals), episode.arrivals.view(np.int64)
         first_knot, last_knot, after = self._knots.place(link.trace, i)
-        self._arrivals[i, : len(words)] = words
-        self._log[i, : n * len(FRESH)] = self._unlogged[: n * len(FRESH)]
-        self._topics[i] = self._rules
-        beginning = self._beginning
+        # NumPy copies records field by field; as whole words it copies them five times as fast.
+        batch, beginning = self.batch, self._beginning
+        batch.arrivals.view(np.int64)[i, : len(words)] = words
+        batch.log.view(np.int64)[i, : n * len(FRESH)] = self._unlogged[: n * len(FRESH)]
+        batch.topics.view(np.int64)[i] = self._rules
         beginning[_LOADED] = (
             *(n, episode.first_decision, episode.last_decision),
             *(first_knot, last_knot, after, first_knot, first_knot),
             *(link.offset_us, link.propagation_us, episode.window, episode.ack_delay_us, v_start),
         )
-        self._senders[i * len(beginning) : (i + 1) * len(beginning)] = beginning
+        batch.senders.view(np.int64)[i * len(beginning) : (i + 1) * len(beginning)] = beginning
 
     def value_of(self, i: int) -> Value:
-        """The V that the QoI of sender ``i``'s episode is measured with; without topics."""
+        """The V for the QoI of sender ``i``'s episode; without topics."""
         episode = self.episodes[i]
         return self.value if episode is None or episode.value is None else episode.value
 
     def draw_uniforms(self, i: int) -> None:
-        """Draw the uniforms of sender ``i``'s episode, unless it has them. Late, as only policies that play look."""
+        """Draw the uniforms of sender ``i``'s episode unless it has them. Late, as only policies that play look at
+        them.
+        """
         rng, episode = self._uniforms[i], self.episodes[i]
         if rng is None or episode is None:
             return
@@ -147,7 +146,7 @@ class Senders:
         self.batch.arrivals["uniform"][i, : len(episode.arrivals)] = episode.arrivals["uniform"]
 
     def _v_start(self, v: Value) -> int:
-        """Where V begins in the array of all V; a new one is put at its end."""
+        """Index of V in the array of all V; a new V goes to its end."""
         key = v.array.tobytes()
         if key not in self._v_starts:
             if self.topics:
@@ -159,16 +158,16 @@ class Senders:
         return self._v_starts[key]
 
     def new_memory(self, policy: Policy, i: int) -> NDArray[np.float64]:
-        """Fresh memory of ``policy`` for the episode of sender ``i``, float64[entries]."""
+        """Make fresh memory of ``policy`` for the episode of sender ``i``, float64[entries]."""
         memory: NDArray[np.float64] = policy.new_memory(1, self.capacity)[0]
         if policy.privileged is not None:
             memory = policy.privileged(self.episodes[i], self.capacity, self.max_bytes, self.value_of(i))
         return memory
 
     def run(self, policy: Policy, memory: NDArray[np.float64] | None = None, shares: Shares | None = None) -> None:
-        """Run every loaded sender to its end under ``policy``; ``memory``: float64[n, entries], fresh by default.
+        """Run every loaded sender to its end under ``policy``; ``memory`` is float64[n, entries], fresh by default.
 
-        ``shares``: the cells whose links the senders share (see ``bufgym.sim.cell.Fleet``); None if each has its own.
+        ``shares`` are the cells whose links the senders share (see ``bufgym.sim.cell.Fleet``); None for own links.
         """
         if memory is None and policy.privileged is not None:
             memory = padded([self.new_memory(policy, i) for i in range(len(self))])
@@ -178,7 +177,7 @@ class Senders:
         roll_out(self.batch._replace(parameters=policy.parameter_array), shares, memory, policy)
 
     def follow(self, policy: Policy) -> None:
-        """Ask where ``policy`` wants to be asked, and send as the client around it does."""
+        """Configure when ``policy`` is asked, and how the client around it sends."""
         senders, client = self.batch.senders, policy.client
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
         senders["measures"] = policy.measures
@@ -188,14 +187,14 @@ class Senders:
             senders["window"], senders["ack_delay_us"] = 1, 0
 
     def check_untouched(self, policy: Policy) -> None:
-        """An error if ``policy`` has written to what it saw while it ran every sender to its end."""
+        """Raise if ``policy`` has written to its view while it ran every sender to its end."""
         for i, episode in enumerate(self.episodes):
             if episode is not None:
                 check_untouched(self.batch, i, episode.arrivals, self._topic_table, policy.name)
 
 
 def padded(rows: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
-    """float64[rows, longest]: rows of different lengths as one array, filled up with zeros."""
+    """float64[rows, longest]: rows of different lengths as one array, padded with zeros."""
     table = np.zeros((len(rows), max(map(len, rows))))
     for i, row in enumerate(rows):
         table[i, : len(row)] = row
@@ -213,9 +212,9 @@ def run(
     memory: NDArray[np.float64] | None = None,
     topics: Sequence[Topic] = (),
 ) -> Senders:
-    """The senders after ``policy`` ran through each of ``episodes``, one sender each.
+    """Run ``policy`` through each of ``episodes``, one sender each; return the senders afterwards.
 
-    The queue of an unbounded policy has room for all messages, whatever ``capacity`` and ``max_bytes`` say.
+    The queue of an unbounded policy has room for all messages, whatever ``capacity`` and ``max_bytes`` are.
     """
     if not episodes:
         raise BufgymError("no episode to run")

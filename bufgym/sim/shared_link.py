@@ -1,11 +1,11 @@
 """Processor sharing in whole bytes and microseconds: the link that the robots of a cell share.
 
 With n senders busy, one byte for each moves the cell n bytes along its trace. So the cell counts ``served``, the bytes
-that a sender would have been given had it been busy from the beginning: a message of b bytes that starts at S has been
-transmitted at ``served`` = S + b, whoever else comes and goes, and the next to finish is the one with the least such
-goal. When a sender joins, each is given the whole bytes that its share has come to; the rest, less than one byte for
-each, stays with the cell (``position`` keeps it) and is shared among all who are busy from then on. So no byte of
-capacity is lost or given twice.
+given to a sender that is busy from the beginning. A message of b bytes that starts at S has been transmitted at
+``served`` = S + b, whoever else comes and goes. The message with the least such goal finishes next. When a sender
+joins, every busy sender is given the whole bytes that its share has come to. The rest, less than one byte for each,
+stays with the cell (in ``position``) and is shared among all who are busy from then on. So no byte of capacity is lost
+or given twice.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ CELL = np.dtype(
     [
         # settings
         ("robots", np.int64),  # N: rows c N .. c N + N - 1 of the batch are in cell c
-        ("first_knot", np.int64),  # of its trace, in the batch's knots
+        ("first_knot", np.int64),  # first knot of the cell's trace, in the batch's knots
         ("last_knot", np.int64),
         ("after", np.int64),  # what follows the trace's end: LOOP, HOLD or STOP
         ("offset_us", np.int64),
         # clock
         ("tick_us", np.int64),  # the time of the arrivals under way
-        ("next_us", np.int64),  # the time of those after them
-        ("robot", np.int64),  # the first robot that may still have one of those under way; N: all have come
+        ("next_us", np.int64),  # the time of the next arrivals
+        ("robot", np.int64),  # the first robot that may still have an arrival now; N: all have come
         ("row", np.int64),  # the sender that the last event is about, and whose socket may be free
         # capacity
         ("busy", np.int64),  # n: senders with a message in transmission
         ("served", np.int64),  # bytes given to each sender that has been busy all the time
-        ("position", np.int64),  # bytes of the trace used up by that
+        ("position", np.int64),  # bytes of the trace used up by ``served``
         ("reached", np.int64),  # bytes that the trace has come to at ``tick_us``
-        ("segment_now", np.int64),  # where on the trace the clock and the sockets were last looked up
+        ("segment_now", np.int64),  # segment of the trace where clock and sockets were last looked up
         ("segment_finish", np.int64),
     ],
     align=True,
@@ -57,10 +57,9 @@ class Shares(NamedTuple):
     cells: NDArray[Any]
     """CELL[cells]: settings and state of each cell."""
     goals: NDArray[np.int64]
-    """int64[cells, N]: ``served`` at which the message in transmission will have been transmitted; FOREVER for a free
-    socket."""
+    """int64[cells, N]: ``served`` at the end of the message in transmission; FOREVER for a free socket."""
     due_us: NDArray[np.int64]
-    """int64[cells, N]: when the next message arrives, us; FOREVER after the last."""
+    """int64[cells, N]: time of the next arrival, us; FOREVER after the last."""
 
 
 def new_shares(cells: int, robots: int) -> Shares:
@@ -77,7 +76,7 @@ def shares_type() -> Any:
 
 @kernel
 def load_cell(batch: Batch, shares: Shares, c: int) -> None:
-    """Put cell ``c`` at the beginning of the episodes that its senders have been given: same link, nothing arrived."""
+    """Begin the episodes that the senders of cell ``c`` have loaded: same link, nothing arrived."""
     cell = shares.cells[c]
     robots = shares.goals.shape[1]
     first = c * robots
@@ -95,7 +94,7 @@ def load_cell(batch: Batch, shares: Shares, c: int) -> None:
 
 @kernel
 def least(numbers: NDArray[np.int64]) -> int:
-    """The least of the numbers, FOREVER if there are none."""
+    """The least of the numbers, or FOREVER if there are none."""
     smallest = FOREVER
     for number in numbers:
         smallest = min(smallest, number)
@@ -118,11 +117,11 @@ def settle(batch: Batch, shares: Shares, c: int) -> None:
 
 @kernel
 def join(batch: Batch, shares: Shares, i: int) -> None:
-    """Sender ``i`` begins with a message: at once behind the one before it, or from ``tick_us`` on."""
+    """Let sender ``i`` begin with a message, right after its previous one or from ``tick_us`` on."""
     c, robot = i // shares.goals.shape[1], i % shares.goals.shape[1]
     cell, sender = shares.cells[c], batch.senders[i]
     if cell.busy == 0 and sender.link == IDLE:
-        cell.position = max(cell.reached, cell.position)  # what an idle cell could have carried is gone
+        cell.position = max(cell.reached, cell.position)  # an idle cell's capacity is gone
     sender.link, sender.began_us = CARRIES, sender.now_us
     cell.busy += 1
     shares.goals[c, robot] = cell.served + next_size_bytes(batch, i)
@@ -130,7 +129,7 @@ def join(batch: Batch, shares: Shares, i: int) -> None:
 
 @kernel
 def next_finish(batch: Batch, shares: Shares, c: int) -> tuple[int, int, int]:
-    """(goal, position and time, us) of the message that will be transmitted first; time FOREVER if none ever will."""
+    """Goal, position and time (us) of the message that will be transmitted first; time FOREVER if none ever will."""
     cell = shares.cells[c]
     if cell.busy == 0:
         return FOREVER, cell.position, FOREVER
@@ -141,7 +140,7 @@ def next_finish(batch: Batch, shares: Shares, c: int) -> tuple[int, int, int]:
 
 @kernel
 def finish_in_cell(batch: Batch, shares: Shares, c: int, goal: int, position: int, at_us: int) -> None:
-    """The message with the least goal has been transmitted, and its sender's socket is free; of equals, one of them."""
+    """Finish the message with the least goal (one, if several are equal), and free its sender's socket."""
     cell = shares.cells[c]
     robot = 0
     while shares.goals[c, robot] != goal:
@@ -158,12 +157,12 @@ def finish_in_cell(batch: Batch, shares: Shares, c: int, goal: int, position: in
 
 @kernel
 def next_in_cell(batch: Batch, shares: Shares, c: int) -> int:
-    """What comes next in cell ``c``: a message transmitted, a tick, an arrival at one of its robots, or the END.
+    """The next event in cell ``c``: a message transmitted, a tick, an arrival at one of its robots, or the END.
 
-    The order of things is that of a sender: what the link finishes up to and including a time leaves, and successors
-    start; then the arrivals of that time come, in the order of the robots. No decision and no start among them changes
-    what is in transmission at that time, so all of them may also be gathered before the first is answered. NOTHING
-    unless an arrival asks for a DECISION.
+    The order is the same as for one sender. Messages that the link finishes up to and including a time leave, and
+    successors start. Then the arrivals of that time come, in the order of the robots. No decision and no start among
+    them changes the transmissions at that time, so all of them may also be gathered before the first is answered.
+    NOTHING unless an arrival asks for a DECISION.
     """
     cell = shares.cells[c]
     if cell.robot < cell.robots:
@@ -181,7 +180,7 @@ def next_in_cell(batch: Batch, shares: Shares, c: int) -> int:
 
 @kernel
 def arrive_in_cell(batch: Batch, shares: Shares, c: int) -> int:
-    """The next of the arrivals under way, if one is left: DECISION if it asks for one, else NOTHING."""
+    """Let the next arrival of this tick come, if one is left: DECISION if it asks for one, else NOTHING."""
     cell = shares.cells[c]
     robot = cell.robot
     while robot < cell.robots and shares.due_us[c, robot] != cell.tick_us:
@@ -194,7 +193,7 @@ def arrive_in_cell(batch: Batch, shares: Shares, c: int) -> int:
         following = sender.next + 1
         due_us = batch.arrivals[i, following].arrival_us if following < sender.arrivals else FOREVER
         shares.due_us[c, robot] = due_us
-        # Where its link, were it alone, would have to be so that the bytes left are the ones left of its share.
+        # The position at which a link of its own would have the same bytes left.
         sender.position = shares.goals[c, robot] - cell.served + cell.reached if sender.busy > 0 else 0
         cell.row = i
         event = arrive(batch, i)

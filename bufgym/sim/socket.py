@@ -1,4 +1,4 @@
-"""The socket: what it dequeues, what has been transmitted, when its ack comes, what has reached the server."""
+"""The socket: dequeueing, transmission, acks, and receipt at the server."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def may_dequeue(batch: Batch, i: int) -> bool:
 
 @kernel
 def dequeue(batch: Batch, i: int, k: int) -> None:
-    """Slot ``k`` goes from the buffer to the socket; the link has yet to begin with it."""
+    """Move slot ``k`` from the buffer to the socket; the link has yet to begin with it."""
     sender = batch.senders[i]
     first = sender.first
     if k > 0:
-        # All but its gain stands in the list of arrivals as well.
+        # Everything but its gain is in the list of arrivals too.
         sent = at(batch.slots, i, first + k)
         place, gain = place_of(batch, i, sent), sent.gain
         for j in range(first + k, first, -1):
@@ -77,7 +77,7 @@ def held_bytes(batch: Batch, i: int) -> int:
 
 @kernel
 def left_of(batch: Batch, i: int, total_bytes: int) -> int:
-    """Those of the ``held_bytes`` that are not yet transmitted."""
+    """Bytes of ``held_bytes`` not yet transmitted."""
     sender = batch.senders[i]
     if sender.busy == 0 or (sender.busy == 1 and sender.last_dequeue_us == sender.now_us):
         return total_bytes
@@ -89,7 +89,7 @@ def left_of(batch: Batch, i: int, total_bytes: int) -> int:
 
 @kernel
 def begin_transmission(batch: Batch, i: int) -> None:
-    """The link of sender ``i`` alone begins with the next message in the socket: at once if it was freed, else now."""
+    """Let the link of sender ``i`` alone begin with the next message in the socket: at once if freed, else now."""
     sender = batch.senders[i]
     if sender.link == IDLE:
         sender.position = max(carried_by(batch.knot_us, batch.knot_bytes, sender, sender.now_us), sender.position)
@@ -100,7 +100,7 @@ def begin_transmission(batch: Batch, i: int) -> None:
 
 @kernel
 def finish_transmission(batch: Batch, i: int, at_us: int) -> None:
-    """The last byte of the message in transmission crosses the link; without acks to wait for, its place is free."""
+    """Let the last byte of the message in transmission cross the link; without acks its place is free."""
     sender = batch.senders[i]
     at(batch.log, i, at(batch.order, i, sender.transmitted)).transmitted_us = at_us
     sender.carried_us += at_us - sender.began_us
@@ -114,7 +114,7 @@ def finish_transmission(batch: Batch, i: int, at_us: int) -> None:
 
 @kernel
 def next_ack_us(batch: Batch, i: int) -> int:
-    """When the next ack comes for a message that has been transmitted; FOREVER if none is on its way."""
+    """Time of the next ack for a transmitted message; FOREVER if none is on its way."""
     sender = batch.senders[i]
     if sender.acked == sender.transmitted:  # always so without acks to wait for
         return FOREVER
@@ -123,7 +123,7 @@ def next_ack_us(batch: Batch, i: int) -> int:
 
 @kernel
 def credit(batch: Batch, i: int, until_us: int) -> None:
-    """Count the information of what reached the server by ``until_us``, propagation included."""
+    """Count the information that reached the server by ``until_us``, propagation included."""
     sender = batch.senders[i]
     while sender.credited < sender.transmitted:
         seq = at(batch.order, i, sender.credited)

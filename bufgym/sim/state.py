@@ -1,4 +1,4 @@
-"""What a batch of senders consists of: arrays that the caller owns and the kernels change in place."""
+"""Arrays of a batch of senders, which the caller owns and the kernels change in place."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ NOTHING = -1
 """No event: time moves on without a question or a departure."""
 
 NOTHING_WAITS, ARRIVAL_WAITS, SOCKET_WAITS = range(3)
-"""What a sender may be ``waiting`` for: nothing, a decision on its arrival, or the choice of what to send."""
+"""What a sender may be ``waiting`` for: nothing, a decision on its arrival, or the choice of a message to send."""
 
 UNASKED, CLEARED, CHOSEN, HELD = range(4)
-"""States of a sender's ``socket``. UNASKED: nothing is decided about what it dequeues next. CLEARED: the policy does
-not drop the head. CHOSEN: it dequeues slot ``chosen``. HELD: it dequeues nothing before the next arrival or ack."""
+"""States of a sender's ``socket``. UNASKED: its next message is undecided. CLEARED: the policy does not drop the head.
+CHOSEN: it dequeues slot ``chosen``. HELD: it dequeues nothing before the next arrival or ack."""
 
 IDLE, FREED, CARRIES = range(3)
-"""States of a sender's ``link``. IDLE: nothing to carry. FREED: it has just finished a message, so that the next one
-follows without a pause. CARRIES: a message is in transmission."""
+"""States of a sender's ``link``. IDLE: nothing to carry. FREED: it has just finished a message, so the next one follows
+without a pause. CARRIES: a message is in transmission."""
 
 SENDER = np.dtype(
     [
@@ -42,7 +42,7 @@ SENDER = np.dtype(
         ("measures", np.int64),  # 1: the link's rate is measured at each arrival; 0: nobody reads it
         ("ask_at_send", np.int64),  # 1: a scheduler chooses which message the socket dequeues
         ("topics", np.int64),  # 1: one queue, whatever the messages' topics; else each topic has rules of its own
-        ("window", np.int64),  # n_T: messages sent and not yet acked, at most
+        ("window", np.int64),  # n_T: most messages sent and not yet acked
         ("ack_delay_us", np.int64),  # from the end of a message's transmission to its ack
         ("limit_at_send", np.int64),  # 1: rate limits hold back at the socket, 0: they drop at arrival
         (
@@ -50,14 +50,14 @@ SENDER = np.dtype(
             np.int64,
         ),  # 1: at arrival they count from the message sent last, 0: from the one kept last
         ("flush_no_drop", np.int64),  # 1: no_drop messages are sent even when the window is full
-        ("v_start", np.int64),  # of one queue: where its V begins in the array of all V
+        ("v_start", np.int64),  # for one queue: where its V begins in the array of all V
         # episode
         ("arrivals", np.int64),  # messages in all
         ("first_decision", np.int64),  # arrivals from this one to
         ("last_decision", np.int64),  # this one ask for a decision
-        ("first_seq", np.int64),  # ``seq`` of the message in the first column; 0 but in a live row, which forgets
-        ("forgotten", np.int64),  # messages that it dequeued before those in ``order``; 0 but there
-        ("first_knot", np.int64),  # of its trace, in the batch's knots
+        ("first_seq", np.int64),  # ``seq`` in the first column; 0 except in a live row, which forgets
+        ("forgotten", np.int64),  # messages dequeued before those in ``order``; 0 except in a live row
+        ("first_knot", np.int64),  # first knot of its trace, in the batch's knots
         ("last_knot", np.int64),
         ("after", np.int64),  # what follows the trace's end: LOOP, HOLD or STOP
         ("offset_us", np.int64),
@@ -79,7 +79,7 @@ SENDER = np.dtype(
         # link
         ("link", np.int64),  # IDLE, FREED or CARRIES
         ("position", np.int64),  # bytes of the trace used up when the message in transmission has been transmitted
-        ("finish_us", np.int64),  # when that is; FOREVER while the link is idle
+        ("finish_us", np.int64),  # time of this end; FOREVER while the link is idle
         ("began_us", np.int64),  # when the link began with the message in transmission
         ("carried_us", np.int64),  # time that the link took for all messages before it
         ("segment_now", np.int64),  # where on the trace the clock and the socket were last looked up
@@ -101,10 +101,10 @@ SENDER = np.dtype(
         ("period_us", np.float64),  # running mean of the time between arrivals
         ("service_ratio", np.float64),  # running mean of departures per arrival
         ("period_square", np.float64),  # running mean of the squared time between arrivals, us^2
-        ("left_bytes", np.int64),  # in the socket when the arrival at hand came
-        ("sent_bytes", np.int64),  # that had left the socket by then
+        ("left_bytes", np.int64),  # in the socket when the present arrival came
+        ("sent_bytes", np.int64),  # bytes that had left the socket by then
         ("sending_us", np.int64),  # time that the link had carried this sender's bytes by then
-        ("drained_bytes", np.int64),  # of both the part since the previous arrival
+        ("drained_bytes", np.int64),  # the parts of both since the previous arrival
         ("drained_us", np.int64),
         ("short_rate", np.float64),  # running means of the link's rate while it carries, bytes/us
         ("medium_rate", np.float64),
@@ -129,13 +129,13 @@ LOG_ENTRY = np.dtype(
     align=True,
 )
 NEVER = -1
-"""A time in LOG_ENTRY: it has not happened."""
+"""A time in LOG_ENTRY for an event that has not happened."""
 
 _FRESH = {"dequeued_us": NEVER, "transmitted_us": NEVER, "dropped_us": NEVER}
 _BEGINNING = {"first": 1, "finish_us": FOREVER, "measures": 1}
 
 NOT_YET = FOREVER - 1
-"""The arrival time of a message that a live row still waits for: the row stops there."""
+"""Arrival time of a message that a live row still waits for: the row stops there."""
 
 
 @bundle
@@ -146,11 +146,11 @@ class Batch(NamedTuple):
     senders: NDArray[Any]
     """SENDER[n]: settings, state and counts of each sender."""
     slots: NDArray[Any]
-    """MESSAGE[n, 1 + 2 L]: the message dequeued last and those queued (see ``bufgym.model.buffer``)."""
+    """MESSAGE[n, 1 + 2 L]: the message dequeued last and the queued ones (see ``bufgym.model.buffer``)."""
     arrivals: NDArray[Any]
     """MESSAGE[n, messages]: the episode, in order of arrival."""
     log: NDArray[Any]
-    """LOG_ENTRY[n, messages]: what became of each message."""
+    """LOG_ENTRY[n, messages]: the fate of each message."""
     order: NDArray[np.int64]
     """int64[n, messages]: sequence numbers in the order in which the socket dequeued them."""
     knot_us: NDArray[np.int64]
@@ -162,13 +162,13 @@ class Batch(NamedTuple):
     topics: NDArray[Any]
     """TOPIC[n, topics]: the rules and the past of each topic; one row for a single queue."""
     parameters: NDArray[np.float64] = NO_PARAMETERS
-    """float64[parameters], read-only: those of the policy at hand, which ``view`` shows it."""
+    """float64[parameters], read-only: parameters of the present policy, as ``view`` shows them."""
     several: bool | None = None
-    """True where messages have several topics; None for one queue, whose kernels know no topics."""
+    """True for several topics; None for one queue, whose kernels know no topics."""
 
 
 def new_batch(n: int, capacity: int, messages: int, topics: int, v: NDArray[np.float64]) -> Batch:
-    """The arrays of n senders of at most L = ``capacity`` queued and ``messages`` arriving messages; no traces yet."""
+    """Make arrays for n senders with L = ``capacity`` and at most ``messages`` arriving messages; no traces yet."""
     return Batch(
         records(n, SENDER),
         records((n, row_width(capacity)), MESSAGE),
@@ -185,7 +185,7 @@ def new_batch(n: int, capacity: int, messages: int, topics: int, v: NDArray[np.f
 
 @kernel
 def place_of(batch: Batch, i: int, message: Any) -> int:
-    """Where ``message`` stands in the log: by its ``seq``, but inside it, whatever a compiled policy wrote there."""
+    """Index of ``message`` in the log: its ``seq``, kept in range whatever a compiled policy wrote there."""
     return int(max(0, min(message.seq - batch.senders[i].first_seq, batch.senders[i].arrivals - 1)))
 
 

@@ -1,7 +1,7 @@
 """The transition: one function moves a sender, or the robots of a cell that share a link, on to the next event.
 
-``shares`` is what differs: None where every sender has a link of its own, and *cell* c is then sender c; else the cells
-of ``bufgym.sim.shared_link``. Numba compiles each case for itself.
+``shares`` tells the two cases apart. It is None if every sender has a link of its own; *cell* c is then sender c.
+Otherwise it holds the cells of ``bufgym.sim.shared_link``. Numba compiles each case separately.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def next_event(batch: Batch, shares: Shares | None, c: int) -> int:
 
 @kernel
 def move_on(batch: Batch, shares: Shares | None, c: int) -> int:
-    """``next_event`` for a cell in which no arrival waits."""
+    """Compute ``next_event`` for a cell in which no arrival waits."""
     while True:
         i = sender_of(shares, c)
         if shares is None and batch.senders[i].link != CARRIES and batch.senders[i].busy > 0:
@@ -65,9 +65,9 @@ def sender_of(shares: Shares | None, c: int) -> int:
 
 @kernel
 def offer(batch: Batch, shares: Shares | None, i: int) -> int:
-    """Let the socket of sender ``i`` dequeue: DEPARTURE where it does, NOTHING where it may not.
+    """Let the socket of sender ``i`` dequeue: DEPARTURE if it does, NOTHING if it may not.
 
-    DEQUEUE or SEND where the policy is to be asked first.
+    DEQUEUE or SEND if the policy must be asked first.
     """
     sender = batch.senders[i]
     if may_dequeue(batch, i):
@@ -91,7 +91,7 @@ def offer(batch: Batch, shares: Shares | None, i: int) -> int:
 
 @kernel
 def next_on_link(batch: Batch, i: int) -> int:
-    """What comes next for a sender with a link of its own: a message transmitted, an ack, an arrival, or the END.
+    """The next event of a sender with its own link: a message transmitted, an ack, an arrival, or the END.
 
     At one time acks come first, then the end of a transmission, then arrivals. NOTHING unless an arrival asks for a
     DECISION.

@@ -1,4 +1,4 @@
-"""What a policy sees of its sender."""
+"""A policy's view of its sender."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def view(batch: Batch, i: int) -> Buffer:
         dequeued_arrival_us, dequeued_x = previous_us, previous_x
         dequeued_seq = at(batch.arrivals, i, max(sender.next - 1, 0)).seq
         if occupancy > 0:
-            # a scheduler holds the first of all back
+            # a scheduler holds back the first of all
             oldest = at(batch.slots, i, first)
             dequeued_arrival_us, dequeued_x, dequeued_seq = oldest.arrival_us, oldest.x, oldest.seq
     if batch.several is not None and sender.waiting == ARRIVAL_WAITS:
-        # gaps are those of the newcomer's topic
+        # these gaps belong to the newcomer's topic
         arrival = at(batch.arrivals, i, sender.next)
         topic = at(batch.topics, i, arrival.topic)
         previous_us, previous_x = arrival.arrival_us, arrival.x

@@ -17,10 +17,12 @@ from tests.conftest import COMPILED, REPO
 TALE = """
 from typing import NamedTuple
 import math
+import numba.extending
 import numpy as np
 from bufgym.kernel import kernel
 
 READ, UNREAD, TABLE = 2, 3, np.array([1.0, 2.0])
+RECORDS = np.zeros(1, [("near", np.int64), ("far", np.int64)])
 
 class Pair(NamedTuple):
     a: int
@@ -34,6 +36,10 @@ def shifted_by(step):
 
 shift = shifted_by(5)
 
+@numba.extending.register_jitable
+def helper(k):
+    return k * 3
+
 @kernel
 def innermost(k):
     return k * READ + math.floor(0.5)
@@ -41,7 +47,7 @@ def innermost(k):
 @kernel
 def inner(k, factor=7):
     "Says what it does."
-    return innermost(k) + shift(k) + int(TABLE[1]) * factor
+    return innermost(k) + shift(k) + int(TABLE[1]) * factor + RECORDS["near"][0] + helper(k)
 
 @kernel
 def outer(k):
@@ -91,6 +97,8 @@ needs_compilation = pytest.mark.skipif(not COMPILED, reason="nothing is kept wit
         ("factor=7", "factor=8"),
         ("shifted_by(5)", "shifted_by(6)"),
         ("math.floor", "math.ceil"),
+        ('RECORDS["near"]', 'RECORDS["far"]'),
+        ("return k * 3", "return k + 3"),
         ("    a: int\n    b: int = 1", "    b: int\n    a: int = 1"),
         ("    b: int = 1", "    b: int = 2"),
     ],

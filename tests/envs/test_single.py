@@ -1,6 +1,8 @@
 """The single environment: Gymnasium's own checks, rewards worked by hand, masks, observations, wrong use."""
 
+import copy
 import math
+import pickle
 from typing import Any
 
 import gymnasium as gym
@@ -97,6 +99,19 @@ def test_same_seed_same_episode(env_id: str) -> None:
     """And the episodes that follow without a seed are the same, too; another seed gives another."""
     assert played(env_id, 5) == played(env_id, 5)
     assert played(env_id, 5) != played(env_id, 6)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_plays_on_and_begins_anew_as_the_original(copied: Any) -> None:
+    def rest(env: SenderEnv) -> list[Any]:
+        seen = [(env.step(4)[1], env.action_masks().tolist()) for _ in range(5)]
+        obs, _ = env.reset()
+        return [*seen, {key: obs[key].tolist() for key in obs}, [env.step(k % 5)[:2] for k in range(10)]]
+
+    env = begun()
+    env.step(4)
+    other = copied(env)
+    assert str(rest(other)) == str(rest(env))
 
 
 @pytest.mark.skipif(not COMPILED, reason="all runs as plain Python")

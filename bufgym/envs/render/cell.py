@@ -1,4 +1,4 @@
-"""The robots of one cell, as lines of text and as an image: a line each."""
+"""The robots of one cell as text and as an image, a line for each."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from bufgym.envs.rows import Rows
 
 _QUEUED, _FREE = "■", "·"
 _WIDEST = 32
-"""Up to this L the text has a character for every slot of the buffer, beyond it two numbers."""
+"""Largest L for which the text has a character for every slot; above it, two numbers."""
 _MOST_LABELS = 32
-"""Up to so many robots have room for a label in the image."""
+"""Most robots that have room for a label in the image."""
 
 
 def cell_ansi(rows: Rows, names: list[str]) -> str:
-    """One line a robot: its buffer, whether it is sending, and what has become of its messages."""
+    """A line for each robot: its buffer, whether it is sending, and the fate of its messages."""
     senders = rows.senders.batch.senders
     lines = [_head(rows)]
     for i, name in enumerate(names):
@@ -33,7 +33,7 @@ def cell_ansi(rows: Rows, names: list[str]) -> str:
 
 
 def cell_rgb_array(rows: Rows, names: list[str]) -> NDArray[np.uint8]:
-    """The same as an image uint8[400, 800, 3]: each robot's messages so far as a bar, and its buffer as another.
+    """An image uint8[400, 800, 3] with two bars for each robot: its messages so far and its buffer.
 
     Raises DependencyNotInstalled without matplotlib (the extra ``plot``).
     """

@@ -18,19 +18,19 @@ COLOURS = ("#2a9d5c", "#2f6fde", "#e0a100", "#d1495b", "#8e3bb8")
 _GREY, _EMPTY, _RED = "#999999", "#f4f4f4", COLOURS[DROPPED]
 _WIDTH_PX, _HEIGHT_PX, _DPI = 800, 400, 100
 _WINDOW_S = 10.0
-"""Length of the time axis, s; longer while an older message is still held."""
+"""Length of the time axis, s; it grows while an older message is still held."""
 _BINS = 150
 """Points of the capacity curve."""
 _MOST_BOXES = 64
-"""Up to this L every slot is drawn as a box, beyond it as one bar."""
+"""Largest L for which every slot is drawn as a box; above it, one bar."""
 _MOST_NAMES = 24
-"""So many lanes have room for their topics' names."""
+"""Most lanes with room for their topics' names."""
 
 
 def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:
     """Sender ``i`` as an image uint8[400, 800, 3]: link capacity, messages by state over time, and the slots.
 
-    Raises ResetNeeded where it has no episode, DependencyNotInstalled without matplotlib (the extra ``plot``).
+    Raises ResetNeeded without an episode, DependencyNotInstalled without matplotlib (the extra ``plot``).
     """
     figure, canvas = canvas_of()
     scene = scene_of(senders, i)
@@ -59,7 +59,7 @@ def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:
 
 
 def canvas_of(width_px: int = _WIDTH_PX, height_px: int = _HEIGHT_PX) -> tuple[Any, Any]:
-    """(figure, canvas) of so many pixels; DependencyNotInstalled without matplotlib."""
+    """Make a figure and its canvas of the given size, px; DependencyNotInstalled without matplotlib."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -72,7 +72,7 @@ def canvas_of(width_px: int = _WIDTH_PX, height_px: int = _HEIGHT_PX) -> tuple[A
 
 
 def pixels(canvas: Any) -> NDArray[np.uint8]:
-    """What is drawn there, uint8[height, width, 3]."""
+    """The canvas as an image, uint8[height, width, 3]."""
     canvas.draw()
     return np.asarray(canvas.buffer_rgba(), np.uint8)[..., :3].copy()
 
@@ -100,7 +100,7 @@ def _draw_link(axes: Any, senders: Senders, i: int, scene: Scene, start_s: float
 
 
 def _draw_timeline(axes: Any, scene: Scene) -> None:
-    """One lane for each state, so that kept and dropped messages stay apart where they are dense."""
+    """Draw one lane for each state, so that kept and dropped messages stay apart where they are dense."""
     lanes = np.array((3, 2, 1, 0, 1))  # the newcomer stands in line with the queue
     _draw_messages(axes, scene, lanes[scene.states], "|ss|D", (9, 5, 5, 9, 5), 1.2)
     axes.set_ylim(-0.6, 3.6)
@@ -110,9 +110,9 @@ def _draw_timeline(axes: Any, scene: Scene) -> None:
 
 
 def _draw_lanes(axes: Any, scene: Scene) -> None:
-    """One lane for each topic: dropped messages below the line, waiting ones on it, sent ones above."""
+    """Draw one lane for each topic: dropped messages below the line, waiting ones on it, sent ones above."""
     lanes = len(scene.topics)
-    lane_points = 190 / lanes  # height of a lane, a little less
+    lane_points = 190 / lanes  # a little less than the height of a lane
     offsets = np.array((0.2, 0.2, 0.0, -0.24, 0.0))
     sizes = [max(2.0, min(9.0, share * lane_points)) for share in (0.4, 0.4, 0.25, 0.3, 0.3)]
     _draw_messages(axes, scene, -scene.arrivals["topic"] + offsets[scene.states], "||s|D", sizes, 2.5)
@@ -134,7 +134,7 @@ def _draw_lanes(axes: Any, scene: Scene) -> None:
 def _draw_messages(
     axes: Any, scene: Scene, heights: NDArray[Any], markers: str, sizes: Sequence[float], sending_width: float
 ) -> None:
-    """A marker for each message at its time of arrival and ``heights``; markers and sizes (points) by state."""
+    """Draw a marker for each message at its time of arrival and ``heights``; markers and sizes (points) go by state."""
     arrival_s = scene.arrivals["arrival_us"] / 1e6
     for state, name in enumerate(STATES):
         chosen = scene.states == state
@@ -154,7 +154,7 @@ def _draw_messages(
 
 
 def _draw_slots(axes: Any, scene: Scene) -> None:
-    """The buffer's slots, head first; between neighbours the number of messages missing there; then the newcomer."""
+    """Draw the slots, head first, then the newcomer; between neighbours stands the number of messages missing there."""
     from matplotlib.patches import Rectangle
 
     L, occupancy = scene.capacity, len(scene.queue)

@@ -1,4 +1,4 @@
-"""What a picture of one sender shows, read from the sender's arrays."""
+"""The content of a picture of one sender, read from the sender's arrays."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from bufgym.model.link import position_at
 from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, Senders
 
 DELIVERED, SENDING, QUEUED, DROPPED, NEWCOMER = range(5)
-"""The states that a message can be in."""
+"""States of a message."""
 STATES = ("delivered", "in transmission", "queued", "dropped", "newcomer")
 
 LETTERS = string.ascii_letters
 
 
 class Scene(NamedTuple):
-    """What the pictures show of one sender.
+    """The content of a picture of one sender.
 
     Fields:
-        now_us: its clock, us.
+        now_us: the sender's clock, us.
         arrivals: MESSAGE[m], the messages that have arrived so far, the newcomer last.
-        states: int64[m], the state of each of them.
+        states: int64[m], the state of each arrival.
         queue: int64[queued], sequence numbers of the queued messages, 0 = oldest.
         dequeued: sequence number of the message that the socket took last; -1 if none.
         capacity: L, messages.
-        demand: bytes that arrive per second; 0 where that has no meaning (one message).
-        counts: messages in each state but the newcomer's, by its name.
-        qoi: H of what was delivered so far.
-        topics: names of the topics; none where there is one queue.
-        question: who asks for a decision; empty where there is one queue, or nobody asks.
+        demand: bytes that arrive per second; 0 for a single message, which has no rate.
+        counts: messages in each state but the newcomer's, by the state's name.
+        qoi: H of the messages delivered so far.
+        topics: names of the topics; empty for one queue.
+        question: who asks for a decision; empty for one queue, or if nobody asks.
     """
 
     now_us: int
@@ -51,7 +51,7 @@ class Scene(NamedTuple):
 
     @property
     def newcomers(self) -> list[int]:
-        """The sequence number of the newcomer; none where no arrival waits."""
+        """The sequence number of the newcomer; empty if no arrival waits."""
         return [len(self.arrivals) - 1] if self.states[-1] == NEWCOMER else []
 
     def letter(self, seq: int) -> str:
@@ -59,13 +59,13 @@ class Scene(NamedTuple):
         return letter(int(self.arrivals["topic"][seq]))
 
     def missing(self) -> list[tuple[int, int]]:
-        """(sequence number, messages missing before it) of the queued messages and the newcomer, in order."""
+        """Sequence number of each queued message and the newcomer, in order, and the number missing before it."""
         seqs = [*self.queue.tolist(), *self.newcomers]
         return [(seq, seq - before - 1) for seq, before in zip(seqs, [self.dequeued, *seqs], strict=False)]
 
 
 def letter(topic: int) -> str:
-    """What stands for a topic where there is no room for its name."""
+    """A letter for a topic, used where its name has no room."""
     return LETTERS[topic % len(LETTERS)]
 
 

@@ -19,17 +19,17 @@ _COLOURS = (_GREEN, _BLUE, _YELLOW, _RED, _MAGENTA)
 """The colour of each state."""
 _LEVELS = "_▁▂▃▄▅▆▇█"
 _LABEL, _TOPIC_LABEL = 10, 16
-"""Columns that a line's label takes; where labels are topics' names."""
+"""Columns of a line's label, and of a label that is a topic's name."""
 _NARROWEST = 60
-"""Fewer columns than this can't hold the counts."""
+"""Fewest columns that hold the counts."""
 
 
 def ansi(senders: Senders, i: int, width: int = 100) -> str:
-    """Sender ``i`` as lines of text: counts, link capacity, messages, queue (``width`` >= 60 columns), legend.
+    """Sender ``i`` as lines of text: counts, link capacity, messages, queue, legend; ``width`` is at least 60 columns.
 
-    One column of the capacity and of the messages is one arrival: its mark below, the link's mean capacity from it to
-    the next one above. The latest arrivals are shown, as many as fit. With several topics there is a line of messages
-    for each, and the queue is a row of their letters.
+    One column of capacity and messages is one arrival: its mark below, and above it the link's mean capacity until the
+    next arrival. The latest arrivals are shown, as many as fit. With several topics each has a line of messages, and
+    the queue is a row of their letters.
     """
     scene = scene_of(senders, i)
     width, label = max(width, _NARROWEST), _TOPIC_LABEL if scene.topics else _LABEL
@@ -56,7 +56,7 @@ def _mark(state: int) -> tuple[str, str]:
 
 
 def _painted(marks: Iterable[tuple[str, str]]) -> str:
-    """(colour, text) pairs as text; neighbours of one colour share its codes."""
+    """Text of (colour, text) pairs; neighbours of one colour share its codes."""
     runs = [
         (colour, "".join(text for _, text in run)) for colour, run in itertools.groupby(marks, lambda mark: mark[0])
     ]
@@ -81,7 +81,7 @@ def _capacity_line(senders: Senders, i: int, scene: Scene, latest: slice) -> str
 
 
 def _message_lines(scene: Scene, latest: slice, label: int) -> list[str]:
-    """A mark for each message; a line for each topic."""
+    """Lines with a mark for each message, one line for each topic."""
     marks = [_mark(state) for state in scene.states[latest]]
     if not scene.topics:
         return ["messages".ljust(label) + _painted(marks)]
@@ -94,7 +94,7 @@ def _message_lines(scene: Scene, latest: slice, label: int) -> list[str]:
 
 
 def _topic_queue_line(scene: Scene, columns: int) -> str:
-    """The topics' letters: of the message that the socket took last, of the slots, and of the newcomer."""
+    """The topics' letters of the message that the socket took last, of the slots, and of the newcomer."""
     sent = [scene.dequeued] if scene.dequeued >= 0 else []
     letters = [(_COLOURS[int(scene.states[seq])], scene.letter(seq)) for seq in [*sent, *scene.queue.tolist()]]
     letters += [(_PLAIN, "_")] * (scene.capacity - len(scene.queue))
@@ -102,7 +102,7 @@ def _topic_queue_line(scene: Scene, columns: int) -> str:
 
 
 def _queue_line(scene: Scene, columns: int) -> str:
-    """The message that the socket took last, the slots and the newcomer, and how many are missing between them."""
+    """The message that the socket took last, the slots and the newcomer, with the number missing between them."""
     slots: list[tuple[str, str]] = []
     last: list[tuple[str, str]] = []
     if scene.dequeued >= 0:
@@ -118,7 +118,7 @@ def _queue_line(scene: Scene, columns: int) -> str:
 
 
 def _fitted(marks: list[tuple[str, str]], last: list[tuple[str, str]], columns: int) -> str:
-    """``marks`` and then ``last`` with spaces between; where they do not fit, ``marks`` end with three dots."""
+    """``marks`` and then ``last``, with spaces between; three dots replace the end of ``marks`` if they do not fit."""
     room = columns - sum(len(text) + 1 for _, text in last) - len("... ")
     ends = list(itertools.accumulate(len(text) + 1 for _, text in marks))
     if ends and ends[-1] > room:

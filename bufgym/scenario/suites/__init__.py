@@ -1,13 +1,12 @@
-"""Benchmark suites: frozen, versioned sets of episodes that results are quoted on.
+"""Benchmark suites: frozen, versioned sets of episodes on which results are quoted.
 
 A suite has scenarios, capacities, and episodes in three splits: ``train`` to learn from, ``validation`` to choose
-parameters by, ``test`` to report. Splits share no bandwidth trace and no motion recording (no length T, where there is
-one interruption): a policy that knows a trace by heart gains nothing elsewhere. A suite never changes; an improved one
+parameters by, ``test`` to report. Splits share no bandwidth trace and no motion recording; with one interruption they
+share no length T. So knowing a trace by heart gains nothing in another split. A suite never changes; an improved one
 gets the next version.
 
-``Suite.kind`` names the task that the scenarios are for: one queue, the same under stress, the topics of one client, or
-a fleet of robots.
-Messages of one queue have equal sizes, so that the clairvoyant's bound is exact.
+``Suite.kind`` names the task of the scenarios: one queue, the same under stress, the topics of one client, or a fleet
+of robots. Messages of one queue have equal sizes, so that the clairvoyant's bound is exact.
 """
 
 from __future__ import annotations

@@ -15,9 +15,9 @@ from bufgym.scenario.episode import Episode, Scenario, Streams
 
 @dataclass(frozen=True)
 class SuiteScenario:
-    """Every episode is of one of the scenarios in a split of a suite, each as likely as the others.
+    """Every episode is of one of the scenarios in a split of a suite, all equally likely.
 
-    Episodes have the V of their own scenario. Suites of one queue alone.
+    Episodes have the V of their own scenario. Only suites of one queue are allowed.
     """
 
     suite: str = "lte-v1"
@@ -28,7 +28,7 @@ class SuiteScenario:
     """Folder of recordings, for suites that need one."""
 
     topics: ClassVar[tuple[Topic, ...]] = ()
-    """None: one queue."""
+    """Empty: one queue."""
 
     def __post_init__(self) -> None:
         suite = suites.get(self.suite)
@@ -47,7 +47,7 @@ class SuiteScenario:
 
     @property
     def value(self) -> Value:
-        """V of the first of them, as every episode brings its own."""
+        """V of the first scenario; every episode brings its own."""
         return next(iter(self.members.values())).value
 
     @property
@@ -56,7 +56,7 @@ class SuiteScenario:
         return max(member.max_messages for member in self.members.values())
 
     def draw(self, streams: Streams) -> Episode:
-        """One episode."""
+        """Draw one episode."""
         members = list(self.members.values())
         member = members[int(streams.link.integers(len(members)))]
         return member.draw(streams).valued(member.value)

@@ -47,11 +47,11 @@ def _belgium(split: str, data: Path | None) -> dict[str, Setting]:
 
 
 _MOST_TRACES = 12
-"""Recordings in a split; of a folder that holds more, evenly spaced ones in the order of their names."""
+"""Most recordings in a split; a larger folder gives evenly spaced ones, in the order of their names."""
 
 
 def _recorded(pattern: str, size_bytes: int) -> Build:
-    """All files of a pattern in the order of their names: of every five, three train, one validates and one tests."""
+    """All files of a pattern, by name: of every five, three are for training, one validates and one tests."""
 
     def build(split: str, data: Path | None) -> dict[str, Setting]:
         assert data is not None
@@ -67,7 +67,7 @@ def _recorded(pattern: str, size_bytes: int) -> Build:
 
 
 _DAYS = {"train": ("20241101", "20241102", "20241103"), "validation": ("20241104",), "test": ("20241105",)}
-"""Of the drive from Los Angeles to Boston, by split: no two splits share a day, or a place."""
+"""Days of the drive from Los Angeles to Boston, by split: no two splits share a day, or a place."""
 
 _FAILED = ("20241101_170456963", "20241102_104344891", "20241103_110904624", "20241104_132730722")
 """Runs that their server ended with an error."""
@@ -82,7 +82,7 @@ def _uplink_5g(split: str, data: Path | None) -> dict[str, Setting]:
 
 
 _PLACES = {"train": "loc2", "validation": "loc1", "test": "loc3"}
-"""Of the shipyard, by split. loc3, where links are slowest, tests; runs that name no place are left out."""
+"""Places in the shipyard, by split. loc3, with the slowest links, tests; runs that name no place are left out."""
 
 
 def _uplink_wifi(split: str, data: Path | None) -> dict[str, Setting]:
@@ -112,7 +112,7 @@ Item = TypeVar("Item")
 
 
 def _evenly(data: Path, pattern: str, split: str, belongs: Callable[[str], bool]) -> list[Path]:
-    """The files of a pattern whose names belong to the split, at most so many as it has traces elsewhere."""
+    """The files of a pattern whose names belong to the split, at most as many as other suites have traces."""
     names = sorted(path for path in data.glob(pattern) if belongs(path.name))
     if not names:
         raise BufgymError(f"{data / pattern}: holds no recording of the split {split}; this suite needs some")
@@ -120,7 +120,7 @@ def _evenly(data: Path, pattern: str, split: str, belongs: Callable[[str], bool]
 
 
 def _at_most(items: Sequence[Item], most: int) -> list[Item]:
-    """All, or of more than ``most`` so many, evenly spaced."""
+    """All items, or ``most`` evenly spaced ones if there are more."""
     if len(items) <= most:
         return list(items)
     return [items[k * len(items) // most] for k in range(most)]

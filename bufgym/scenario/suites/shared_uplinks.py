@@ -36,9 +36,9 @@ def _with_dropouts(trace: Trace, seed: int) -> Trace:
 
 
 CLIENT_MEANS = {"scarce": 0.5e6, "half": 1.2e6, "ample": 2.5e6}
-"""Bytes/s of the link while it is up; the example client wants 2.8 MB/s once rates are limited."""
+"""Bytes/s of the link while it is up. The example client wants 2.8 MB/s after rate limits."""
 CLIENT_WINDOWS = {"": 1, "-window-5": 5}
-"""n_T of Robofleet's experiments, where an ack may take longer than a message, and of its released client."""
+"""n_T in Robofleet's experiments, where an ack may take longer than a message, and in its released client."""
 
 
 def _topics(split: str, data: Path | None) -> dict[str, Setting]:
@@ -59,7 +59,7 @@ def _topics(split: str, data: Path | None) -> dict[str, Setting]:
 
 
 def _fleet(split: str, data: Path | None) -> dict[str, Setting]:
-    """What one robot meets in lte-v1's motion setting, for 16 robots: the cell has 16 times that capacity."""
+    """The motion setting of lte-v1 for 16 robots: the cell has 16 times that capacity."""
     alone = synthetic.LTE.settings(split)["motion"]
     about = f"{alone.about}, of each robot"
     return {"motion": Setting(FleetScenario(16, alone.scenario), about)}

@@ -1,7 +1,7 @@
 """stress-v1: conditions that nobody trained on, each in a scenario of its own, for the worst cell of every policy.
 
-Other suites ask how good a policy is where a robot usually is; this one asks whether it is safe elsewhere. Episodes are
-short and few, because what counts is a factor of two, not a per cent.
+Other suites measure a policy where a robot usually is; this one asks whether it is safe elsewhere. Episodes are short
+and few, because a factor of two matters here, not a per cent.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from bufgym.scenario.uplink import Uplink
 from bufgym.traces import Motion, Trace, Workload, synthetic_lte
 
 CAPACITIES = (1, 2, 3, 15, 64, 200)
-"""L far from those of the other suites, and one of theirs."""
+"""Values of L far from those of the other suites, and one of theirs."""
 
 _TRACES = 2
 _MESSAGES = 600
@@ -41,7 +41,7 @@ _MOTION_TABLE = "tabulated:0=0,0.05=0.4,0.5=0.7,3=1"
 
 
 def _fading(split: str, demand_bytes_per_s: float, share: float = _FADING) -> tuple[Trace, ...]:
-    """LTE of a driving robot."""
+    """Links of a driving robot over LTE."""
     mean = share * demand_bytes_per_s
     return tuple(synthetic_lte(FIRST_SEED[split] + k, mean_bytes_per_s=mean) for k in range(_TRACES))
 
@@ -59,8 +59,8 @@ def _both(label: str, about: str, split: str, max_bytes: int | None = None, **ch
 
 
 def _valued(split: str) -> dict[str, Setting]:
-    """Other V over a fading link. Where V saturates after n frames, the link carries one in n on average: were it much
-    better, nothing would be lost.
+    """Other V over a fading link. If V saturates after n frames, the link carries one in n on average; on a much better
+    link nothing would be lost.
     """
     timed, moving = (setting.scenario for setting in _both("", "", split).values())
     settings = {}
@@ -87,7 +87,7 @@ def _arrivals(split: str, kind: str) -> Workload:
 
 
 def _jumping(split: str, kind: str, every_s: float, views: float, lasting_s: float) -> Motion:
-    """A camera that stands still, but for moves of so many fields of view, at random times."""
+    """A camera that stands still except for moves of so many fields of view, at random times."""
     rng = np.random.default_rng(FIRST_SEED[split])
     at_s = np.cumsum(lasting_s + rng.exponential(every_s, 100))
     edges_s = np.concatenate([[0.0], np.column_stack([at_s - lasting_s, at_s]).ravel()])

@@ -1,4 +1,4 @@
-"""What a suite is: a name, scenarios in three splits, capacities, and a number of episodes."""
+"""The parts of a suite: a name, scenarios in three splits, capacities, and a number of episodes."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Setting:
     scenario: Any
     """A ``Scenario``; for a suite of fleets a ``FleetScenario``."""
     about: str
-    """What it is, in one line without a full stop."""
+    """Description in one line without a full stop."""
     outage_s: float | None = None
-    """Length of the episode's one blackout, s; None where it has none of a known length."""
+    """Length of the episode's one blackout, s; None without one of a known length."""
     max_bytes: int | None = None
     """B of every sender, bytes; None for no limit."""
 
@@ -39,19 +39,19 @@ class Suite:
     """A named set of episodes that results are quoted on."""
 
     name: str
-    """With its version, such as ``lte-v1``."""
+    """Name with its version, such as ``lte-v1``."""
     about: str
-    """What it is, in one line without a full stop."""
+    """Description in one line without a full stop."""
     build: Build
-    """Makes the scenarios of a split; ``settings`` calls it and remembers what it made."""
+    """Makes the scenarios of a split; ``settings`` calls it and keeps the result."""
     capacities: tuple[int, ...] = CAPACITIES
-    """L, messages; of a fleet: of each robot."""
+    """L, messages; for a fleet, L of each robot."""
     seeds: int = 5
     """Episodes on each trace."""
     needs: str = ""
-    """What a folder of recordings must hold; empty if the suite brings all it needs."""
+    """Required contents of a folder of recordings; empty if the suite needs none."""
     kind: str = "queue"
-    """The task that its scenarios are for: a name in ``bufgym.benchmark.tasks``."""
+    """Task of its scenarios: a name in ``bufgym.benchmark.tasks``."""
 
     def settings(self, split: str, data: str | Path | None = None) -> dict[str, Setting]:
         """The scenarios of one split by label.

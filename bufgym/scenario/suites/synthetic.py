@@ -1,4 +1,4 @@
-"""Suites over links that are made up: LTE, generated like recordings, blackouts, steady links, one interruption."""
+"""Suites over made-up links: LTE, generated like recordings, blackouts, steady links, one interruption."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DEMAND_BYTES_PER_S = RATE_HZ * SIZE_BYTES
 EPISODE_S = 60.0
 
 
-# Checking a Value takes compiled code, which is slow to load: it is made when first asked for, not for `bufgym list`.
+# Checking a Value takes compiled code, which is slow to load: it is made at its first use, not for `bufgym list`.
 
 
 @functools.cache
@@ -43,7 +43,7 @@ FIRST_SEED = {"train": 1000, "validation": 2000, "test": 3000}
 """Seeds of generated traces and motions count up from here; those of the shipped ones are 0..7."""
 
 TRACES = {"train": 24, "validation": 6, "test": 12}
-"""Links in a split; some suites have a half or a third of them for each of their scenarios."""
+"""Links in a split; some suites have a half or a third as many for each of their scenarios."""
 
 
 def motions_of(split: str, count: int = 4) -> tuple[Motion, ...]:
@@ -126,7 +126,7 @@ def _blackout(seed: int, outage_s: int) -> Trace:
 
 SHARES = {"quarter": 0.25, "half": 0.5, "three-quarters": 0.75}
 _SHIFT = {"train": 0.0, "validation": 1 / 3, "test": 5 / 6}
-"""Shifts the rates of a split by this part of their spacing, so that no two splits share a rate."""
+"""Shift of a split's rates, as a fraction of their spacing, so that no two splits share a rate."""
 
 
 def steady_links(split: str, label: str, share: float, count: int) -> tuple[Trace, ...]:

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 from bufgym.errors import BufgymError
 
 MAX_HEAD_BYTES = 2**20
-"""Of headers, or of trailers."""
+"""Most bytes of headers, or of trailers."""
 
 _SHOWN_CHARACTERS = 200
 # Request timeout, too early, too many requests, and errors inside the server: they may pass.
@@ -78,7 +78,7 @@ class _Metered(io.RawIOBase):
         self._left: float = math.inf
 
     def allow(self, most_s: float, most_bytes: float) -> None:
-        """From now on."""
+        """Set new limits from now on."""
         self._until_s, self._left = time.monotonic() + most_s, most_bytes
 
     def readable(self) -> bool:

@@ -1,7 +1,7 @@
 """Download a file from an http or https address over a network that breaks off.
 
-The bytes go into a part file. A record beside it says which file they belong to: its address, its version (by ETag, or
-else by the Last-Modified date) and its length. Another attempt, in this process or a later one, asks for the rest alone
+The bytes go into a part file. A record beside it identifies the file by its address, its length and its version, which
+is the ETag or else the Last-Modified date. Another attempt, in this process or a later one, asks for the rest alone
 (RFC 9110: Range with If-Range, 206 and Content-Range). It starts over when the file has changed in the meantime or the
 server does not support ranges.
 
@@ -45,7 +45,7 @@ _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+|\*)")
 
 @dataclass(frozen=True)
 class Patience:
-    """How often, how soon and how long to try."""
+    """Number of attempts, pauses between them, and time limit."""
 
     attempts: int = 5
     """Give up after so many failures in a row."""

@@ -161,7 +161,7 @@ def _rounded_quantiles(values: Float64Array, probabilities: Sequence[float]) -> 
 
 
 def _with_memory(link: LinkParameters, rows: Rows) -> LinkParameters:
-    """The link with the shares, stay and memory whose generated rates are correlated most like those of `rows`."""
+    """The link with shares, stay and memory whose generated rates are correlated most like the `rows`."""
     real, pairs = autocorrelation(rows, LAGS_S)
     within = autocorrelation(centred(rows), LAGS_S)[0]
     sets = max(1, _TRIAL_S // link.seconds)
@@ -216,7 +216,7 @@ def _fit_outages(rows: Rows, low: float) -> OutageParameters | None:
 
 
 def _fit_lengths(lengths_s: Float64Array) -> tuple[float, float]:
-    """Tail and scale in s of maximum likelihood: P(over k) = (1 + k / scale)**-tail."""
+    """Maximum likelihood fit of tail and scale (s) in P(over k) = (1 + k / scale)**-tail."""
     best, chosen = -math.inf, (_TAILS[0], _SCALES_S[0])
     for tail, scale in itertools.product(_TAILS, _SCALES_S):
         chance = (1 + (lengths_s - 1) / scale) ** -tail - (1 + lengths_s / scale) ** -tail

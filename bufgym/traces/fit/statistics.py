@@ -64,7 +64,7 @@ def beside_outages(low: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 
 
 def shoulder_of(rows: Rows, low_bytes_per_s: float) -> float:
-    """Mean rate beside outages over that of the other seconds outside of them, at most 1; 1 if there are none."""
+    """Mean rate beside outages over the mean rate of other seconds outside outages, at most 1; 1 without any."""
     near = np.concatenate([row[beside_outages(row < low_bytes_per_s)] for row in rows])
     far = np.concatenate([row[~beside_outages(row < low_bytes_per_s) & (row >= low_bytes_per_s)] for row in rows])
     return min(1.0, round(float(near.mean() / far.mean()), 2)) if near.size and far.size else 1.0
@@ -110,4 +110,4 @@ STATISTICS: Final[Mapping[str, Callable[[Rows], float]]] = {
     "mean spacing of outages, s": lambda rows: _of_any(outage_gaps(rows), np.mean),
     "median spacing of outages, s": lambda rows: _of_any(outage_gaps(rows), np.median),
 }
-"""Name -> statistic of the recordings of one mode; NaN where it is not defined."""
+"""Name -> statistic of the recordings of one mode; NaN if undefined."""

@@ -1,10 +1,10 @@
 """Zip archives as folders of text files: finds one member by name, and opens it with bounds.
 
-`archive.zip` stands for its only member, `archive.zip:name` for the member with that name or with that ending (`name`
-or `.../name`), as long as only one has it. Folders, hidden files and the `__MACOSX` twins that some systems add do not
-count. An archive is refused if its list of members is over 4 MiB (some 50,000 of them), and a member if it is encrypted
-or neither stored nor deflated (other methods may ask for gigabytes to unpack a few bytes). How much may come out of a
-member is `text.MAX_TEXT_BYTES`.
+`archive.zip` stands for its only member. `archive.zip:name` stands for the member with that name or ending (`name` or
+`.../name`), as long as only one has it. Folders, hidden files and the `__MACOSX` twins that some systems add do not
+count. An archive is refused if its list of members is over 4 MiB (some 50,000 of them). A member is refused if it is
+encrypted or neither stored nor deflated, as other methods may unpack a few bytes to gigabytes. A member's limit is
+`text.MAX_TEXT_BYTES`.
 """
 
 from __future__ import annotations

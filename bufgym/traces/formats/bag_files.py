@@ -1,9 +1,9 @@
-"""The files of recordings: every message that an MCAP file, a ROS 1 bag or a rosbag2 holds, in the order of the file.
+"""The files of recordings: every message in an MCAP file, a ROS 1 bag or a rosbag2, in the order of the file.
 
-A recording may be a stranger's. Nothing that it says of itself is trusted: a record is no longer than the file, a chunk
-unpacks to no more than MAX_CHUNK_BYTES, and all of it to no more than `files.unpacked_limit` of its size. rosbag2's
-SQLite files are read by two plain queries, and of its `metadata.yaml` four entries, line by line: SQLite views and YAML
-can make a small file endless.
+A recording may be a stranger's, so none of its own figures is trusted. A record is no longer than the file, a chunk
+unpacks to no more than MAX_CHUNK_BYTES, and the whole to no more than `files.unpacked_limit` of its size. SQLite views
+and YAML can make a small file endless. So rosbag2's SQLite files are read by two plain queries, and four entries of its
+`metadata.yaml` line by line.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def _chunk(chunk: Any, unpacked: _Unpacked) -> bytes:
 
 
 def _unzstd(packed: bytes, most_bytes: int) -> bytes:
-    """At most one byte more than that."""
+    """Decompress to at most one byte more than ``most_bytes``."""
     with _zstd(io.BytesIO(packed)) as reader:
         data = bytearray()
         while len(data) <= most_bytes and (piece := reader.read(min(_PIECE_BYTES, most_bytes + 1 - len(data)))):
@@ -296,4 +296,4 @@ def _limited(decompress: Callable[[bytes], bytes], unpacked: _Unpacked) -> Calla
 
 
 SOURCES: Final = {"mcap": mcap, "ros1": ros1, "rosbag2": rosbag2}
-"""What reads each kind of recording."""
+"""Reader of each kind of recording."""

@@ -14,7 +14,7 @@ StrPath = str | PathLike[str]
 def fault(
     path: StrPath, rule: str, *, line: int | None = None, value: object | None = None, field: str | None = None
 ) -> TraceError:
-    """The error to raise about a file; the arguments are those of `bufgym.errors.where`."""
+    """Make the error about a file; arguments are as in `bufgym.errors.where`."""
     return TraceError(where(path, line, value, rule, field=field))
 
 

@@ -110,7 +110,7 @@ class Rate(NamedTuple):
 def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
     """The capacity when each rate holds until the next line's time, and the last one for the median interval.
 
-    The first time becomes 0. Of lines with the same time (30 of the Lumos5G files have some) the last counts. Each
+    The first time becomes 0. If several lines have the same time, as in 30 of the Lumos5G files, the last counts. Each
     interval's bytes are rounded to a whole number, so the total is off by at most half a byte a line.
     """
     intervals = Intervals()

@@ -1,16 +1,16 @@
 """Mahimahi packet-delivery traces: a whole number of ms a line, each an opportunity to deliver one 1500-byte packet.
 
-Format: the README of mahimahi's `traces/`, and `src/frontend/link_queue.cc` [netravali2015mahimahi]. A repeated
-number means several packets in that ms. After the last line the trace begins again, shifted by the last line's time.
+Format: the README of mahimahi's `traces/`, and `src/frontend/link_queue.cc` [netravali2015mahimahi]. A repeated number
+means several packets in that ms. After the last line the trace begins again, shifted by the last line's time.
 
-How delivery opportunities become capacity: the packets of ms m are through *at* m, so their bytes accrue at an even
-rate during the ms that ends there, (m - 1, m]. Ms 0 has none before it; its packets accrue together with those of ms 1.
-So the total is exactly 1500 bytes a line, no packet is through before its time, the trace lasts as long as its last
-line says, and a file with the single line "1" is a steady 12 Mbit/s, as in mahimahi.
+The packets of ms m are through *at* m, so their bytes accrue at an even rate during the ms that ends there, (m - 1, m].
+Ms 0 has no ms before it, so its packets accrue together with those in ms 1. The total is then exactly 1500 bytes a
+line, and no packet is through before its time. The trace lasts as long as its last line says. A file with the single
+line "1" is a steady 12 Mbit/s, as in mahimahi.
 
 A gigabyte of lines can hold a hundred million distinct ms, more than should be held in memory. A trace of more than
-MAX_KNOTS knots is therefore read in bins of 2 ms, 4 ms, ... by the same rule: the packets of a bin accrue evenly in it,
-the total and the duration stay exact, and the trace's `source` states the bin.
+MAX_KNOTS knots is therefore read in bins of 2 ms, 4 ms, ... by the same rule. The packets of a bin accrue evenly in it,
+and the total and the duration stay exact. The trace's `source` states the bin.
 """
 
 from __future__ import annotations

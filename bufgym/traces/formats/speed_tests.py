@@ -23,7 +23,7 @@ from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 # --- nuttcp ----------------------------------------------------------------------------------------------------------
 
 MAX_INTERVAL_S: Final = 3600
-"""Of a speed test; a longer interval is no measurement of a link that changes."""
+"""Longest interval of a speed test, s; a longer one does not measure a changing link."""
 
 _STAMP: Final = r"(?:\[[0-9T:.+ -]+\] *)?"
 _INTERVAL: Final = re.compile(_STAMP + r"([0-9.]+) +MB +/ +([0-9.]+) +sec += +([0-9.]+) +Mbps\b(?!.*%)(.*)")
@@ -135,10 +135,10 @@ def _seconds(line: Line, measured: dict[str, Any], name: str) -> float:
 
 MAX_RUNS: Final = 16
 RUNS: Final = tuple(f"run {number}" for number in range(1, MAX_RUNS + 1))
-"""What `column` chooses from."""
+"""Values of `column`."""
 
 RUN_STEP_S: Final = 0.1
-"""Between the samples of a run without times; the runs that have times have this step."""
+"""Time between the samples of a run without times, s; runs with times have this step."""
 
 _RUN: Final = re.compile(r"Run ([0-9]{1,3})")
 _RULER: Final = re.compile(r"#{3,}")

@@ -84,7 +84,7 @@ def detect_pose_format(path: StrPath) -> str:
 def read_rows(path: StrPath, read_row: RowReader, skip: int = 0) -> tuple[Int64Array, Float64Array]:
     """Times int64[n] in microseconds from 0, and values float64[n, columns], of the lines after number `skip`.
 
-    Of lines with the same time (freiburg2_desk has some) the last counts.
+    If several lines have the same time, as in freiburg2_desk, the last counts.
     """
     times = array("q")
     rows: list[list[float]] = []

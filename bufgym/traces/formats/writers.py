@@ -1,7 +1,7 @@
 """Bandwidth traces into files, and how much a copy differs from its original.
 
-`write_csv` is exact. A Mahimahi file holds packets of 1500 bytes at whole ms, so any other trace loses something;
-`difference` says how much, from the trace and what was read back.
+`write_csv` is exact. A Mahimahi file holds packets of 1500 bytes at whole ms, so any other trace loses something.
+`difference` compares the trace with its copy.
 """
 
 from __future__ import annotations
