@@ -23,12 +23,12 @@ def add(commands: Commands) -> None:
     option("--to", choices=("safetensors", "c"), default="safetensors", help="kind of file (%(default)s)")
     weights = parser.add_argument_group("weights (--to safetensors)")
     weights.add_argument("--name", metavar="N", help="the policy's name; must be given")
-    weights.add_argument("--about", metavar="TEXT", help="a sentence: what it was trained for")
+    weights.add_argument("--about", metavar="TEXT", help="a sentence on the purpose of its training")
     weights.add_argument(
         "--shortcuts",
         action="store_true",
         default=None,
-        help="leave to greedy-qoi and exact plans what they do better",
+        help="use greedy-qoi and exact plans where they do better",
     )
     weights.add_argument(
         "--thins",

@@ -63,11 +63,11 @@ def add(commands: Commands) -> None:
     validate.add_argument("--out", metavar="DIR", help="write there a page with pictures, and every run (JSON)")
 
     view = command(parts, "view", _view, "what a queue does, from its log: queue, drops, rates, QoI")
-    view.add_argument("log", metavar="LOG.mcap", help="what send --log writes, also while it writes")
+    view.add_argument("log", metavar="LOG.mcap", help="log of send --log, even a growing one")
     view.add_argument("--follow", action="store_true", help="show it again as the log grows; Ctrl-C ends it")
 
     replay = command(parts, "replay", _replay, "a queue's log through the simulator: the same decisions?")
-    replay.add_argument("log", metavar="LOG.mcap", help="what send --log wrote")
+    replay.add_argument("log", metavar="LOG.mcap", help="log of send --log")
     policy_file(replay)
 
 
@@ -89,7 +89,7 @@ def _add_ends(parts: Commands) -> None:
     receive.add_argument("--port", type=natural, default=PORT, help="(%(default)s)")
     receive.add_argument("--host", default="127.0.0.1", help="address to listen on (%(default)s: this machine alone)")
     receive.add_argument("--transport", choices=TRANSPORTS, default="tcp", help="(%(default)s)")
-    receive.add_argument("--out", metavar="FILE.mcap", help="write there what comes")
+    receive.add_argument("--out", metavar="FILE.mcap", help="write received messages to this file")
     receive.add_argument("--messages", type=count, help="stop after so many")
 
 

@@ -13,11 +13,9 @@ def add(commands: Commands) -> None:
     perf = command(commands, "perf", _perf, "measure bufgym's own speed on this machine")
     perf.add_argument("--json", metavar="FILE", help="also write the figures to FILE")
     perf.add_argument("--repeats", type=count, default=3, help="best of so many (%(default)s)")
-    perf.add_argument(
-        "--profile", action="store_true", help="what the time of a step goes into, in place of the figures"
-    )
+    perf.add_argument("--profile", action="store_true", help="profile the parts of a step instead")
     perf.add_argument("--peers", action="store_true", help="beside CartPole of gymnasium, envpool, pufferlib, if here")
-    perf.add_argument("--queue", action="store_true", help="what a live queue costs a robot, in place of the figures")
+    perf.add_argument("--queue", action="store_true", help="measure a live queue's cost to a robot instead")
     perf.add_argument("--quick", action="store_true", help="tiny sizes: does it run at all?")
 
 

@@ -25,7 +25,7 @@ def add(commands: Commands) -> None:
     play.add_argument("--policies", default="afr", metavar="NAME", help="the policy, as in bench (%(default)s)")
     play.add_argument("--env", default="Uplink-v0", help="environment (%(default)s)")
     play.add_argument("--capacity", type=count, default=8, metavar="L", help="L, messages (%(default)s)")
-    play.add_argument("--seed", type=natural, default=0, help="which episode: that of bench's seed (%(default)s)")
+    play.add_argument("--seed", type=natural, default=0, help="the episode of this seed in bench (%(default)s)")
     play.add_argument("--speed", type=least_0, default=5.0, help="decisions a second; 0: no pause (%(default)s)")
     play.add_argument("--steps", type=count, default=200, help="stop after so many decisions (%(default)s)")
     play.add_argument("--out", type=Path, metavar="FILE", help=f"write a film in place ({', '.join(FILMS)})")

@@ -23,7 +23,7 @@ def add(commands: Commands) -> None:
 def _add_server(parts: Any) -> None:
     serve = command(parts, "serve", _serve, "the server, with what a configuration allows; Ctrl-C ends it")
     serve.add_argument("--config", required=True, metavar="FILE.toml", help="as examples/relay.toml")
-    serve.add_argument("--check", action="store_true", help="only read it, and say what it allows")
+    serve.add_argument("--check", action="store_true", help="only read it and print its permissions")
 
 
 def _serve(options: argparse.Namespace) -> None:

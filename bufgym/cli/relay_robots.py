@@ -43,7 +43,7 @@ def add(parts: Commands) -> None:
     _add_session(foxglove)
     foxglove.add_argument("--name", default="foxglove", help="(%(default)s)")
     foxglove.add_argument("--port", type=natural, default=8765, help="where they connect to (%(default)s)")
-    foxglove.add_argument("--topics", default="^/", metavar="REGEX", help="what is shown (%(default)s)")
+    foxglove.add_argument("--topics", default="^/", metavar="REGEX", help="topics to show (%(default)s)")
 
 
 def _add_session(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from bufgym.errors import printable
 
 def add(commands: Commands) -> None:
     parser = command(commands, "report", _report, "the page of a suite's run: one HTML file that works offline")
-    parser.add_argument("folder", metavar="DIR", help="what bench --suite wrote with --out")
+    parser.add_argument("folder", metavar="DIR", help="folder of bench --suite --out")
     parser.add_argument("--markdown", action="store_true", help="print tables for a README instead")
 
 

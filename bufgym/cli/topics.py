@@ -24,7 +24,7 @@ def add(commands: Commands) -> None:
     topics = command(commands, "topics", _topics, "run policies side by side on several topics over one uplink")
     suite_options(topics, SUITE)
     option = topics.add_argument_group("or a client of your own").add_argument
-    option("--config", metavar="FILE.toml", help="its topics and what each wants, as in examples/client.toml")
+    option("--config", metavar="FILE.toml", help="its topics and their rules, as in examples/client.toml")
     option("--trace", nargs="+", metavar="FILE", help="bandwidth traces, files or shipped names (default: shipped LTE)")
     option("--scale", type=positive, metavar="X", help="the traces' capacity times X (default: 1)")
     option("--motion", nargs="+", metavar="FILE", help="motion recordings, likewise (default: shipped); or 'none'")

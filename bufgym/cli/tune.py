@@ -17,7 +17,7 @@ def add(commands: Commands) -> None:
     option("--data", metavar="DIR", help="folder of recordings, for suites over real links")
     option("--seeds", type=episodes, metavar="N", help="episodes on each trace (default: the suite's)")
     option("--jobs", type=int, metavar="N", help="processes side by side (default: one a core)")
-    option("--write", action="store_true", help="keep what was chosen, for bufgym bench --suite")
+    option("--write", action="store_true", help="keep the choices for bufgym bench --suite")
 
 
 def _tune(options: argparse.Namespace) -> None:
