@@ -8,7 +8,7 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parent.parent
 WINGS = ("c", "live", "perception", "relay", "reproduce", "ros1", "ros2")
 """Rooms that the core does not import (see ``[tool.importlinter]`` in pyproject.toml)."""
-LIMITS = {"package": 49_020, "core": 31_550, "tests": 26_000}
+LIMITS = {"package": 49_090, "core": 31_620, "tests": 26_050}
 """The aim is 40,000 and 25,000 lines of package and core."""
 LONGEST = 350
 """Lines of a file."""
