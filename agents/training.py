@@ -161,7 +161,7 @@ def training_env(settings: Settings) -> VecEnv:
 
 
 def new_ppo(settings: Settings, env: VecEnv) -> MaskablePPO | PPO:
-    """An untrained actor and critic. Without masks an invalid action does what a queue does; the agent finds out."""
+    """Make an untrained actor and critic; without masks an invalid action does what a queue does."""
     masked = settings.algo == "maskable-ppo"
     policy, policy_settings = policy_of(settings.network, settings.width, masked)
     return (MaskablePPO if masked else PPO)(

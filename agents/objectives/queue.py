@@ -210,9 +210,7 @@ class QueueObjective(Objective):
 
     @functools.cached_property
     def _validation(self) -> ValidationSets:
-        """Validation sets, made at first use: a worker that evaluates candidates needs neither them nor the run's
-        folder.
-        """
+        """Validation sets, made at first use: a worker that evaluates candidates needs none."""
         return ValidationSets(self.settings, self.folder)
 
     @functools.cached_property

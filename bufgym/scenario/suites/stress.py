@@ -59,9 +59,7 @@ def _both(label: str, about: str, split: str, max_bytes: int | None = None, **ch
 
 
 def _valued(split: str) -> dict[str, Setting]:
-    """Other V over a fading link. If V saturates after n frames, the link carries one in n on average; on a much better
-    link nothing would be lost.
-    """
+    """Other V over a fading link; if V saturates after n frames, the link carries one in n on average."""
     timed, moving = (setting.scenario for setting in _both("", "", split).values())
     settings = {}
     for frames in (4, 8, 16, 32):
