@@ -26,7 +26,7 @@ class FleetVecEnv(SenderVectorEnv):
 
     **Action, observation, episode end** of each row and the other arguments are as in ``SenderVectorEnv``, with these
     differences. The robots of a cell begin and end together. ``reset(seed=s)`` seeds cell c with s + c N.
-    ``options["episodes"]`` holds a ``FleetEpisode`` for each cell. ``parameters`` replace those of the uplink.
+    ``options["episodes"]`` holds a ``FleetEpisode`` for each cell. ``parameters`` replace the uplink's parameters.
 
     **Reward** "team" gives each robot the mean over its cell of ``term``, the reward of the other environments; "own"
     gives each robot its own. ``info["reward_terms"]`` has each robot's own terms in any case.

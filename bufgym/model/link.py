@@ -129,7 +129,7 @@ class Knots:
         self._idle: dict[int, _Place] = {}
 
     def place(self, trace: Trace, sender: int) -> tuple[int, int, int]:
-        """Store ``trace`` for ``sender`` and return (first knot, last knot, code for what follows the end)."""
+        """Store ``trace`` for ``sender`` and return (first knot, last knot, code of the behaviour after the end)."""
         left = self._followed.pop(sender, None)
         if left is not None:
             left.senders -= 1

@@ -9,7 +9,7 @@ messages never inform less, and a policy that keeps a superset can imitate every
 need a decision: L of the messages 1..t after t arrivals. Second, sets are numbered in colexicographic order
 (combinatorial number system): the set p_1 < ... < p_L is number C(p_1 - 1, 1) + ... + C(p_L - 1, L), whatever t is.
 Sets without message t + 1 come before those with it, so values after t arrivals overwrite values after t + 1 in place.
-The decision on message t + 1 has the number of the set of L + 1 messages of which one must go.
+The decision on message t + 1 is numbered by the set of L + 1 messages; one of them must go.
 """
 
 from __future__ import annotations

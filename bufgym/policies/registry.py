@@ -22,7 +22,7 @@ randomise; the functions themselves are deterministic.
         memory[0] += 1
         return REJECT if memory[0] % buffer.parameters[0] else 0
 
-The name then works like those of built-in policies. With ``compile=True`` the same function runs compiled.
+The name then works like a built-in policy's. With ``compile=True`` the same function runs compiled.
 """
 
 from __future__ import annotations

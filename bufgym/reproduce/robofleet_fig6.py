@@ -3,7 +3,7 @@
 Native ROS sends one copy to each consumer over the uplink. Robofleet sends one copy to its server, which copies it.
 Only the uplink is simulated; the server's own links are left out. The paper gives neither the size of a cloud nor the
 publisher's queue, so we show several of each; the link can carry the smallest clouds eight times. Only messages
-received while clouds are published count, not those that full queues deliver afterwards.
+received while clouds are published count, not messages that full queues deliver afterwards.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ def robofleet_example() -> tuple[Stream, ...]:
 
     Priorities and rate limits are the example's: localization 10 Hz, priority 20; odometry 15 Hz, 20; laser scans 15
     Hz, 2; point cloud and images 10 Hz, 1; visualization 10 Hz, 2; status 1 Hz; subscriptions no_drop. The rest is
-    assumed. Publish rates are those of common drivers. Sizes come from the paper's Table I or from encoding such
+    assumed. Publish rates are common drivers' rates. Sizes come from the paper's Table I or from encoding such
     messages. Deadlines and the meaning of x are our choice.
     """
     fast = qoi.exponential(0.618)

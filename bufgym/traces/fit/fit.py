@@ -14,7 +14,7 @@ Everything is searched on grids or by a fixed number of steps and rounded, so th
 - Gaps between outages: expectation-maximisation for two geometric distributions. A gap cut off by a recording's end
   counts as "at least as long"; what precedes its first outage, as a long gap.
 
-With under 10 outages, their lengths and rates are those of all modes together, and gaps have a single distribution.
+With under 10 outages, their lengths and rates are taken over all modes together, and gaps have a single distribution.
 """
 
 from __future__ import annotations

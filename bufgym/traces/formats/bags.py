@@ -6,7 +6,7 @@
 | ROS 1 bag (`.bag`), rosbag2 with sqlite3 storage (its folder, or the `.db3` alone) | `rosbags` |
 
 Both come with the extra ``ros``. The kind is recognised by the content, not by the name. A message arrives when the
-recorder logged it, and its size is that of its serialised form (CDR or ROS 1), which is what a bridge forwards. A
+recorder logged it, and its size is the size of its serialised form (CDR or ROS 1), which is what a bridge forwards. A
 message without content counts as 1 byte. Poses come from nav_msgs/Odometry, geometry_msgs/PoseStamped and
 PoseWithCovarianceStamped, and from tf, at the same arrival times.
 

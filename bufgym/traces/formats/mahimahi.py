@@ -108,7 +108,7 @@ class _KnotBuilder:
         self._last_ms = 0
 
     def add(self, stamps_ms: Int64Array) -> None:
-        """Add packets at `stamps_ms` (int64[n], n >= 1, in order and not before those of earlier calls)."""
+        """Add packets at `stamps_ms` (int64[n], n >= 1, in order, and not before earlier packets)."""
         counts = np.arange(self.packets + 1, self.packets + stamps_ms.size + 1)
         self._pieces.append(_Bins(np.maximum(stamps_ms, 1), counts).of(self._bin_ms))
         self.packets += stamps_ms.size

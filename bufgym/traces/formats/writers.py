@@ -46,7 +46,7 @@ def write_csv(trace: Trace, path: StrPath) -> None:
 def write_mahimahi(trace: Trace, path: StrPath) -> None:
     """Write the `mahimahi` format: a line for each packet, at the first whole ms by which its 1500 bytes are through.
 
-    So no packet is ahead of the trace, and none is behind by more than what is left of its ms. The last line says how
+    So no packet is ahead of the trace, and none is late by more than the rest of its ms. The last line says how
     long the trace lasts, so there is a packet at the end (the next whole ms) even if not all its bytes are through by
     then. A trace that came from Mahimahi is preserved exactly (its packets of ms 0 as packets of ms 1).
 
