@@ -2,8 +2,8 @@
 
 As in ``labels``, sizes are equal (b bytes) and C(t) counts the bytes that the link can carry. ``F(i, e)`` is the
 largest gain after message i if it is sent, ends at byte e, and no other message that arrived before it is kept. As a
-function of e it is a falling staircase. Message i's staircase follows from all later messages' staircases, so one backward
-sweep over the episode (``find_steps``) finds all of them exactly. ``from_queue`` adds the queued messages.
+function of e it is a falling staircase. Message i's staircase follows from all later messages' staircases, so one
+backward sweep over the episode (``find_steps``) finds all of them exactly. ``from_queue`` adds the queued messages.
 """
 
 from __future__ import annotations
