@@ -254,13 +254,15 @@ def _registration(
         Raises:
             BufgymError: the name is empty, holds one of ``:,=`` or a blank, or another policy has it.
         """
+        if _is_built_in(name):
+            raise BufgymError(f"policy {name!r}: a built-in policy has this name")
         check_name("policy", name)
 
         def add(on_arrival: OnArrival) -> OnArrival:
             if not callable(on_arrival):
                 raise BufgymError(f"policy {name!r}: {on_arrival!r} is not a function")
-            if owner := _owner(name, on_arrival):
-                raise BufgymError(f"policy {name!r}: {owner} has this name")
+            if other := _other(name, on_arrival):
+                raise BufgymError(f"policy {name!r}: the function {other} has this name")
             policy = make(name, on_arrival, *args, **kwargs)
             for what, entries in (("parameters", policy.parameters), ("memory", policy.memory)):
                 if not isinstance(entries, Mapping):
@@ -273,15 +275,19 @@ def _registration(
     return register
 
 
-def _owner(name: str, on_arrival: OnArrival) -> str:
-    """The other policy of this name, in words, or nothing. A function may replace itself, as a notebook runs again."""
+def _is_built_in(name: str) -> bool:
+    """Whether the package's own policy has this name."""
     entry = _REGISTRY.get(name)
-    if entry is None:
+    return isinstance(entry, Later) or (entry is not None and entry.on_arrival.__module__.startswith("bufgym."))
+
+
+def _other(name: str, on_arrival: OnArrival) -> str:
+    """The function that has this name, if it is another. One may replace itself, as a notebook runs again."""
+    entry = _REGISTRY.get(name)
+    if not isinstance(entry, Policy):
         return ""
-    if isinstance(entry, Later) or entry.on_arrival.__module__.startswith("bufgym."):
-        return "a built-in policy"
     places = [(function.__module__, function.__qualname__) for function in (entry.on_arrival, on_arrival)]
-    return "" if places[0] == places[1] else f"the function {'.'.join(places[0])}"
+    return "" if places[0] == places[1] else ".".join(places[0])
 
 
 register = _registration(Policy)

@@ -8,7 +8,7 @@ import bufgym
 from bufgym import policies, scenario
 from bufgym.benchmark.run import run
 from bufgym.errors import BufgymError
-from bufgym.policies import REJECT
+from bufgym.policies import REJECT, registry
 
 
 def stubborn(buffer, arrival, memory):
@@ -50,6 +50,7 @@ def test_a_frame() -> None:
 
 def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     Path("mine.py").write_text("def every_other(buffer, arrival, memory):\n    return -1 if arrival.seq % 2 else -2\n")
     assert bufgym.make_policy("decimate:every=3").parameters["every"] == 3
     assert bufgym.make_policy(stubborn).name == "stubborn"
