@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from agents.runs import prepare
 from agents.settings import Settings
-from bufgym.errors import BufgymError
-from bufgym.files import locked
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import locked
 
 
 def main(settings: Settings | None = None) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import coverage
 
 REPO = Path(__file__).resolve().parent.parent
-ROOMS = ("model", "sim", "policies", "oracle", "observe", "envs")
+ROOMS = ("model", "sim", "policies", "oracle", "envs")
 """Rooms of the core. All kernels that decide what a sender does are in these."""
 LEAST = 0.95
 """Share of lines that must run."""

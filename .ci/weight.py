@@ -6,7 +6,7 @@ Fails where one grew beyond its limit. Limits only ever fall: lower them when so
 from pathlib import Path
 
 REPO = Path(__file__).resolve().parent.parent
-WINGS = ("c", "live", "perception", "relay", "reproduce", "ros1", "ros2")
+WINGS = ("papers", "relay", "robot")
 """Rooms that the core does not import (see ``[tool.importlinter]`` in pyproject.toml)."""
 LIMITS = {"package": 49_090, "core": 31_620, "tests": 26_050}
 """The aim is 40,000 and 25,000 lines of package and core."""

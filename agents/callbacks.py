@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.runs import Numbers, Record, Validations, seed_bar
 from agents.settings import Settings
-from bufgym.files import replaced
+from bufgym.ground.files import replaced
 
 
 def checkpoints(home: Path) -> list[Path]:

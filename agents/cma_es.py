@@ -32,7 +32,7 @@ from agents.objectives.objective import Objective, Vector, policy_of, to_vector,
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Settings
 from bufgym.benchmark.cluster import connected
-from bufgym.files import replaced
+from bufgym.ground.files import replaced
 from bufgym.policies import weights
 from bufgym.policies.learned import Weights
 from bufgym.policies.learned_topics import TopicWeights

@@ -23,7 +23,7 @@ from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.run import run as run_policies
 from bufgym.benchmark.score import DISCRIMINATIVE, regret
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.oracle import measure
 from bufgym.oracle.measure import BASELINE, normalised_score
 from bufgym.policies import Policy

@@ -20,11 +20,12 @@ from tyro.conf import Positional
 from agents.evaluation import EvaluationSet, Numbers
 from agents.page import columns_of, command, publish, table, written
 from agents.runs import MODEL, read_settings
-from bufgym import files, policies
+from bufgym import policies
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.score import regret, scores
 from bufgym.benchmark.sweep import Sweep
-from bufgym.errors import BufgymError
+from bufgym.ground import files
+from bufgym.ground.errors import BufgymError
 from bufgym.oracle import law, online_optimum
 from bufgym.oracle.lengths import EveryLength
 from bufgym.oracle.measure import BASELINE

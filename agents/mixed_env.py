@@ -20,7 +20,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from bufgym.envs.rows import Rows
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Episode, Scenario, suites
 
 Observation = dict[str, NDArray[np.float32]]

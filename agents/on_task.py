@@ -26,7 +26,7 @@ from agents.settings import MOTION
 from bufgym import policies
 from bufgym.benchmark.bootstrap import percentile_interval, stream, times_drawn
 from bufgym.benchmark.run import by_trace, draw
-from bufgym.perception import worth
+from bufgym.papers.perception import worth
 from bufgym.policies import Policy
 from bufgym.policies.learned import Weights
 from bufgym.sim import Senders

@@ -10,7 +10,7 @@ import tyro
 
 from bufgym.benchmark import bootstrap
 from bufgym.benchmark.bootstrap import Interval
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:

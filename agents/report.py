@@ -26,7 +26,7 @@ from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.table import aligned, same, told_once, unranked
 from bufgym.benchmark.tasks import TASKS
-from bufgym.files import shipped
+from bufgym.ground.files import shipped
 from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy, registry, weights
 

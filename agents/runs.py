@@ -19,8 +19,8 @@ from tqdm import tqdm
 
 from agents.settings import Settings
 from bufgym.benchmark.cluster import end_with
-from bufgym.errors import BufgymError
-from bufgym.files import locked, replaced
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import locked, replaced
 
 RUNS = Path("runs")
 MODEL = "model.safetensors"

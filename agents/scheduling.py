@@ -12,7 +12,7 @@ from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.summary import Standing, plain
 from bufgym.benchmark.tasks import TASKS
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 PAGE = """# Learned scheduling on topics-v1
 

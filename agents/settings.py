@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Literal, NamedTuple, NoReturn, get_args, get_origin, get_type_hints
 
 from bufgym import ENVIRONMENTS
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.policies.learned import NAMES
 from bufgym.policies.weights import MAX_WIDTH
 from bufgym.scenario import Interruption, Uplink, suites

@@ -9,7 +9,7 @@ import tyro
 from numpy.typing import NDArray
 from tyro.conf import Positional
 
-from bufgym.files import replaced
+from bufgym.ground.files import replaced
 from bufgym.model import qoi
 from bufgym.model.buffer import REJECT
 from bufgym.oracle import law, online_optimum

@@ -35,7 +35,7 @@ from agents.settings import Settings
 from bufgym.benchmark.cluster import begun
 from bufgym.benchmark.rows import Row
 from bufgym.envs.fleet_vec import FleetVecEnv
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import load as load_policy
 from bufgym.policies import weights
 from bufgym.sb3 import GymVecEnv, make_vec_env, weights_of

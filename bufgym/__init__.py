@@ -28,7 +28,7 @@ ENVIRONMENTS = {
 
 ON_TASKS = {
     "bufgym/Mapping-v0": (
-        "bufgym.perception.worth:mapping",
+        "bufgym.papers.perception.worth:mapping",
         "a made-up room is filmed: what are the frames worth?",
     ),
 }

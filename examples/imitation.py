@@ -10,7 +10,7 @@ It trains on six of the eight shipped links and is tested on the other two, on t
 In DAgger (Ross, Gordon and Bagnell 2011) the network plays a batch of episodes, the clairvoyant labels every state
 visited, and the network learns from all states so far. Two points are special here.
 
-- **A label is a number for each action**: the H that the action loses for good, from ``bufgym.expert``. Most decisions
+- **A label is a number for each action**: the H that it loses for good, from ``bufgym.envs.expert``. Most decisions
   are close, so the network learns probabilities, softmax(-regret / temperature). A close second costs little.
 - **Hindsight knows the future.** Where the link decides later which action was right, labels of equal states disagree
   and the network learns their mean. That is worth more than AFR, but even a perfect pupil would not reach a score of 1.
@@ -28,8 +28,9 @@ import numpy as np
 import torch
 
 import bufgym  # noqa: F401  (registers the environments)
-from bufgym import expert, policies, scenario
+from bufgym import policies, scenario
 from bufgym.benchmark.run import run
+from bufgym.envs import expert
 from bufgym.oracle.measure import normalised_score
 from bufgym.sb3 import SlotPolicy, as_policy
 

@@ -32,9 +32,9 @@ from torch import Tensor
 
 from bufgym import policies, scenario
 from bufgym.benchmark.run import run
+from bufgym.envs.expert import dataset
 from bufgym.envs.observation import ObservationForm
-from bufgym.expert import dataset
-from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
+from bufgym.model.observe import CONTEXT_FIELDS, SLOT_FIELDS
 from bufgym.oracle.measure import normalised_score
 from bufgym.sb3 import SlotPolicy, as_policy
 

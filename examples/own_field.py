@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 import bufgym  # noqa: F401  (registers the environments)
-from bufgym.observe import field
+from bufgym.model.observe import field
 
 
 @field("waited_s", per="slot", high=1e4, compile=True)

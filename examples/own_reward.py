@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 
 import bufgym  # noqa: F401  (registers the environments)
-from bufgym.observe import reward_term
+from bufgym.model.observe import reward_term
 
 
 @reward_term("restless", unit="drops", memory={"drops": 0}, compile=True)

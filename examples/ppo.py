@@ -32,7 +32,7 @@ from torch.distributions import Categorical
 import bufgym  # noqa: F401  (registers the environments)
 from bufgym import policies, scenario
 from bufgym.benchmark.run import run
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
 TEST = ["lte-synthetic-6", "lte-synthetic-7"]

@@ -3,7 +3,7 @@
     pip install small_gicp
     python examples/trackers.py [--recording FOLDER] [--frames 600] [--every 1 2 4 6 8 10]
 
-All follow one rule, from `bufgym.perception.tracking`: a tracker is lost at the first step that is more than 10 cm or 5
+All follow the rule of `bufgym.papers.perception.tracking`: a tracker is lost at the first step that is more than 10 cm or 5
 degrees off, or that it refuses. FOLDER is any that `open_sequence` reads; by default the made-up room.
 """
 
@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 import small_gicp
 
-from bufgym.perception.frames import Sequence, open_sequence
-from bufgym.perception.mapping import grid_of, points_of
-from bufgym.perception.room import room
-from bufgym.perception.tracking import Tracker, TrackingSettings, difference
+from bufgym.papers.perception.frames import Sequence, open_sequence
+from bufgym.papers.perception.mapping import grid_of, points_of
+from bufgym.papers.perception.room import room
+from bufgym.papers.perception.tracking import Tracker, TrackingSettings, difference
 
 WIDTH = 160
 Follow = Callable[[np.ndarray], "np.ndarray | None"]

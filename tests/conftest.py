@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from bufgym import kernel
+from bufgym.ground import kernel
 
 kernel.compile_silently()  # tests count lines on stderr
 kernel.compile_here()  # and what is tested is compiled, in the first test too

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from bufgym.kernel import JIT
+from bufgym.ground.kernel import JIT
 
 PATIENCE_S = 600
 """Ends a test that hangs. No test waits for it."""

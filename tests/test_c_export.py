@@ -10,13 +10,13 @@ from cli_cases import fails, shown
 
 from bufgym import policies
 from bufgym.benchmark.run import draw
-from bufgym.c import CALL, SUPPORTED, header, random_episode, recorded
-from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.policies import Policy, learned
 from bufgym.policies.learned import NAMES, Network, Weights
+from bufgym.robot.c import CALL, SUPPORTED, header, random_episode, recorded
 from bufgym.scenario import Episode, Interruption, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import received

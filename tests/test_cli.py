@@ -15,7 +15,7 @@ from bufgym import __version__, cli, policies, scenario, traces
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run
 from bufgym.cli import main
-from bufgym.kernel import JIT
+from bufgym.ground.kernel import JIT
 from bufgym.policies import registry
 from bufgym.traces.generate.shipped import shipped_calls
 

@@ -21,7 +21,7 @@ from agents.runs import MODEL, prepare
 from agents.settings import LINK, MOTION, SEES, Settings
 from bufgym import policies
 from bufgym.benchmark import cluster
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import exponential
 from bufgym.oracle import integer, law
 from bufgym.oracle.lengths import EveryLength

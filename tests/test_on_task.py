@@ -8,8 +8,8 @@ for extra in ("sb3_contrib", "cma", "cv2", "rvl"):
 
 from agents import on_task  # noqa: E402  (these need the extras)
 from bufgym import policies, sim  # noqa: E402
-from bufgym.kernel import JIT  # noqa: E402
-from bufgym.perception import streams, worth  # noqa: E402
+from bufgym.ground.kernel import JIT  # noqa: E402
+from bufgym.papers.perception import streams, worth  # noqa: E402
 
 pytestmark = pytest.mark.skipif(not JIT, reason="without compilation a room takes minutes to draw")
 

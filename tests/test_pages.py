@@ -20,7 +20,7 @@ import bufgym
 from agents.settings import Settings
 from bufgym import cli, policies
 from bufgym.cli import main
-from bufgym.observe import FIELDS, TOPIC_FIELDS
+from bufgym.model.observe import FIELDS, TOPIC_FIELDS
 from bufgym.policies import registry
 from bufgym.scenario.suites import SUITES
 from website import cards, commands, environments, markdown, pages, papers, suites
@@ -127,7 +127,7 @@ def test_what_the_programs_import_is_there() -> None:
 
 
 def _is_there(module: str, name: str) -> bool:
-    if module == "bufgym.ros2":  # it needs ROS 2
+    if module == "bufgym.robot.ros2":  # it needs ROS 2
         return importlib.util.find_spec(module) is not None
     return hasattr(importlib.import_module(module), name) or importlib.util.find_spec(f"{module}.{name}") is not None
 
@@ -225,7 +225,7 @@ PROGRAMS = [block for block in blocks() if block.language == "python" and block.
 @pytest.mark.parametrize("block", PROGRAMS, ids=[f"{block.page}-{k}" for k, block in enumerate(PROGRAMS)])
 def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     needed = {"sb3_contrib": "sb3_contrib", "cma": "agents.objectives", "pettingzoo": "parallel_env"}
-    for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym.perception"}).items():
+    for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym.papers.perception"}).items():
         if sign in block.text:
             pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)

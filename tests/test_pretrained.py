@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from bufgym import files, policies
+from bufgym import policies
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.run import run as rows_of
+from bufgym.ground import files
 from bufgym.model import qoi
 from bufgym.oracle import integer, law
 from bufgym.policies import learned, weights

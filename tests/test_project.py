@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bufgym import errors
+from bufgym.ground import errors
 
 REPO = Path(__file__).resolve().parent.parent
 
@@ -76,7 +76,7 @@ def test_sb3_without_its_extra_names_it() -> None:
     """``stable_baselines3`` set to None cannot be imported, as if it were not installed."""
     program = (
         "import sys\nsys.modules['stable_baselines3'] = None\n"
-        "from bufgym.errors import BufgymError\n"
+        "from bufgym.ground.errors import BufgymError\n"
         "try:\n    import bufgym.sb3\nexcept BufgymError as error:\n    print(error)"
     )
     told = output_of(program)

@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 import bufgym
 from bufgym.benchmark.run import draw
 from bufgym.envs import SenderVectorEnv
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.sb3 import GymVecEnv, SlotPolicy, as_policy, make_vec_env
 from bufgym.scenario import Interruption
 from bufgym.scenario import get as scenario_of

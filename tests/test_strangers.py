@@ -13,7 +13,7 @@ from cli_cases import Capsys, fails, shown
 
 from bufgym.benchmark import leaderboard, tuned
 from bufgym.cli import main
-from bufgym.errors import BufgymError, printable
+from bufgym.ground.errors import BufgymError, printable
 from bufgym.scenario import read_client
 
 REPO = Path(__file__).resolve().parents[1]

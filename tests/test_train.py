@@ -15,7 +15,7 @@ from agents import held_out, runs, training
 from agents.callbacks import Curve, checkpoints
 from agents.settings import Settings
 from bufgym.benchmark.rows import read_rows
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
 from bufgym.scenario import suites
 

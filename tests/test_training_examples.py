@@ -13,7 +13,7 @@ import pytest
 from cli_cases import Capsys, Patch
 
 from bufgym.benchmark import leaderboard
-from bufgym.kernel import JIT
+from bufgym.ground.kernel import JIT
 
 pytestmark = pytest.mark.skipif(not JIT, reason="they train and measure, which takes compiled code")
 

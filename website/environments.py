@@ -9,7 +9,7 @@ from typing import Any
 
 import bufgym
 from bufgym import scenario
-from bufgym.observe import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS
+from bufgym.model.observe import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS
 from bufgym.scenario import FleetScenario
 from website.films import FILMS
 from website.markdown import code, parameters, table

@@ -20,9 +20,9 @@ from bufgym.benchmark import picture
 from bufgym.benchmark.picture import fading, play
 from bufgym.benchmark.run import draw
 from bufgym.envs import SenderEnv
+from bufgym.envs.expert import Player
 from bufgym.envs.render.image import COLOURS, canvas_of, pixels
-from bufgym.errors import BufgymError
-from bufgym.expert import Player
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Episode, Interruption, Scenario, get, suites
 from bufgym.scenario.numbered import numbered
 from website import interactive
@@ -129,7 +129,7 @@ def _rendered_topics(name: str, episode: Episode) -> list[NDArray[np.uint8]]:
 
 
 def _mapping() -> Frames:
-    scenario = get("bufgym.perception.worth:mapping")
+    scenario = get("bufgym.papers.perception.worth:mapping")
     return _compared(QUEUE, draw(scenario, 2), scenario, "A made-up room is filmed over LTE, L = 8")
 
 

@@ -19,7 +19,7 @@ from bufgym import policies
 from bufgym.benchmark import tasks
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.sweep import Sweep
-from bufgym.files import shipped
+from bufgym.ground.files import shipped
 from bufgym.policies import Policy, weights
 from bufgym.policies.learned import Weights
 from bufgym.scenario import FleetEpisode, FleetScenario, suites

@@ -16,10 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.objectives.objective import Objective
-from bufgym import files, policies
+from bufgym import policies
 from bufgym.benchmark import tasks
 from bufgym.benchmark.run import draw
-from bufgym.errors import BufgymError
+from bufgym.ground import files
+from bufgym.ground.errors import BufgymError
 from bufgym.model.link import FOREVER
 from bufgym.policies import Policy
 from bufgym.policies.learned import Network

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.episodes import Numbers
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 
 class Interval(NamedTuple):

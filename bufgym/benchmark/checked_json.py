@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from bufgym.errors import BufgymError, where
-from bufgym.files import read_utf8
+from bufgym.ground.errors import BufgymError, where
+from bufgym.ground.files import read_utf8
 
 MAX_JSON_BYTES = 64 * 2**20
 """Size limit; a timeline of 100,000 messages has some 20 MB."""

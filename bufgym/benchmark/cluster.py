@@ -17,7 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
-from bufgym.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, install
 
 BACKENDS = ("loky", "threading", "sequential", "ray", "dask")
 

@@ -17,7 +17,7 @@ from bufgym.benchmark import report, sources, table
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, install
 from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 from bufgym.policies.registry import OnArrival

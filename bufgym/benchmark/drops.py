@@ -13,8 +13,8 @@ import numpy as np
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.table import aligned
 from bufgym.benchmark.tasks.bound import meet
-from bufgym.errors import BufgymError
-from bufgym.files import replaced
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import replaced
 from bufgym.policies import Policy
 from bufgym.scenario import Uplink
 from bufgym.sim import NEVER

@@ -11,7 +11,7 @@ from bufgym.benchmark import manifest
 from bufgym.benchmark.checked_json import check, read_object
 from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.tasks import TASKS, Task
-from bufgym.errors import BufgymError, where
+from bufgym.ground.errors import BufgymError, where
 
 _ROWS = ("rows.parquet", "rows.csv")
 _TIMELINE = {"scenario": str, "capacity": int, "arrival_s": list, "x": list, "rate": dict, "policies": dict}

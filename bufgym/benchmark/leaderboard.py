@@ -18,8 +18,8 @@ from bufgym.benchmark.rows import Row
 from bufgym.benchmark.summary import shown
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.tasks import TASKS, Task
-from bufgym.errors import BufgymError, where
-from bufgym.files import read_utf8, replaced
+from bufgym.ground.errors import BufgymError, where
+from bufgym.ground.files import read_utf8, replaced
 from bufgym.scenario import suites
 
 COLUMNS = ("suite", "policy", "rank", "cells", "quantity", "value", "low", "high", "bufgym", "command")

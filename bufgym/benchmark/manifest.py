@@ -9,8 +9,8 @@ from typing import Any
 
 from bufgym.benchmark.checked_json import check, read_object
 from bufgym.benchmark.tasks import TASKS
-from bufgym.errors import BufgymError, where
-from bufgym.files import replaced
+from bufgym.ground.errors import BufgymError, where
+from bufgym.ground.files import replaced
 
 FORMAT = 2
 """Version of the folder's layout, raised when manifest, rows or timeline change their meaning."""

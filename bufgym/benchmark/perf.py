@@ -26,8 +26,8 @@ from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
 from bufgym.envs.step import StepOutput, write_mask, write_observation
-from bufgym.files import replaced
-from bufgym.kernel import JIT, compile_here, kernel
+from bufgym.ground.files import replaced
+from bufgym.ground.kernel import JIT, compile_here, kernel
 from bufgym.sim import NOTHING_WAITS, Batch, Senders
 
 ENVIRONMENTS = {"bufgym/Uplink-v0": 10e6, "bufgym/Interruption-v0": 8e6}

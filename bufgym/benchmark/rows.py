@@ -9,8 +9,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from bufgym.errors import BufgymError, install
-from bufgym.files import replaced
+from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.files import replaced
 from bufgym.sim.metrics import Outcome
 
 Row = dict[str, Any]

@@ -14,7 +14,7 @@ from typing import Any
 
 from bufgym.benchmark import tasks
 from bufgym.benchmark.rows import Row
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, get, names
 from bufgym.policies.registry import OnArrival
 from bufgym.scenario.numbered import by_trace, draw

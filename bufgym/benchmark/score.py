@@ -34,7 +34,7 @@ from bufgym.benchmark.bootstrap import (
     times_drawn,
 )
 from bufgym.benchmark.episodes import Cell, Numbers, Table
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.oracle.measure import BASELINE, TIE, normalised_score
 
 DISCRIMINATIVE = 0.01

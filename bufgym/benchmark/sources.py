@@ -17,8 +17,9 @@ from collections.abc import Iterable
 from dataclasses import fields, replace
 from pathlib import Path
 
-from bufgym import modules, policies
-from bufgym.errors import BufgymError
+from bufgym import policies
+from bufgym.ground import modules
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, registry
 
 _FILES = (".zip", ".safetensors")

@@ -27,7 +27,7 @@ from bufgym.benchmark.bootstrap import (
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores
 from bufgym.benchmark.table import Rows, in_blocks
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 
 class Quantity(NamedTuple):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from bufgym import policies
-from bufgym.errors import BufgymError, printable
+from bufgym.ground.errors import BufgymError, printable
 from bufgym.oracle.measure import BASELINE, normalised_score
 
 Rows = Sequence[Mapping[str, Any]]

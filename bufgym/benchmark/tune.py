@@ -24,7 +24,7 @@ from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.scenario import suites
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from bufgym import policies
 from bufgym.benchmark.checked_json import read_object
-from bufgym.errors import BufgymError, where
-from bufgym.files import replaced
+from bufgym.ground.errors import BufgymError, where
+from bufgym.ground.files import replaced
 
 FILE = Path(__file__).with_name("tuned.json")
 """{suite: {policy: {"setting", "score", "default_score", "split", "command", "bufgym", ...}}}."""

@@ -9,9 +9,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from bufgym import kernel, policies, scenario
+from bufgym import policies, scenario
 from bufgym.benchmark.run import run
 from bufgym.envs import FleetVecEnv, SenderVectorEnv
+from bufgym.ground import kernel
 from bufgym.scenario import FleetScenario, Interruption
 
 _L = 2

@@ -15,7 +15,7 @@ import re
 import sys
 from collections.abc import Sequence
 
-from bufgym import __version__, modules
+from bufgym import __version__
 from bufgym.cli import (
     bench,
     dataset,
@@ -37,7 +37,8 @@ from bufgym.cli import (
 )
 from bufgym.cli.listing import _LISTS, KINDS, environments
 from bufgym.cli.options import Parser, split_policies
-from bufgym.errors import BufgymError, printable
+from bufgym.ground import modules
+from bufgym.ground.errors import BufgymError, printable
 
 __all__ = ["KINDS", "_LISTS", "environments", "main", "split_policies"]
 

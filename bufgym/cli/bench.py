@@ -11,8 +11,8 @@ from bufgym.cli.options import Commands, command, count, load_policies, loaded, 
 from bufgym.cli.scenarios import OWN, scenario, scenario_options
 from bufgym.cli.suite import SUITE_OPTIONS, out_options, run_suite, suite_options, target, who_options
 from bufgym.cli.trace_bags import WORKLOAD_OPTIONS
-from bufgym.errors import BufgymError
-from bufgym.files import replaced
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import replaced
 
 if TYPE_CHECKING:
     from bufgym.policies import Policy

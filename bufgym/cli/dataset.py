@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from bufgym.cli.options import Commands, Parser, count, episodes, natural
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 
 def add(commands: Commands) -> None:
@@ -33,7 +33,7 @@ def add(commands: Commands) -> None:
 
 
 def _make(options: argparse.Namespace) -> None:
-    from bufgym.expert import dataset
+    from bufgym.envs.expert import dataset
 
     if options.suite is not None and options.env is not None:
         raise BufgymError("--suite and --env: give one of them")

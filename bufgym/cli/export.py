@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from bufgym.cli.options import Commands, command, count, refuse
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 _FOR_C = ("capacity", "max_bytes", "value")
 _FOR_WEIGHTS = ("name", "about", "shortcuts", "thins")
@@ -69,8 +69,9 @@ def _as_weights(options: argparse.Namespace, out: str) -> object:
 
 
 def _as_c(options: argparse.Namespace, out: str) -> object:
-    from bufgym import c, policies
+    from bufgym import policies
     from bufgym.model import qoi
+    from bufgym.robot import c
 
     refuse(options, _FOR_WEIGHTS, "belongs to --to safetensors")
     is_file = options.model.endswith(".safetensors")

@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 
 from bufgym.cli.options import Commands, columns, command
-from bufgym.errors import BufgymError
-from bufgym.files import read_whole, replaced
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import read_whole, replaced
 
 
 def add(commands: Commands) -> None:
@@ -29,7 +29,7 @@ def add(commands: Commands) -> None:
 
 
 def _reproduce(options: argparse.Namespace) -> None:
-    from bufgym import reproduce
+    from bufgym import papers
 
     if options.live and options.claims is not None:
         raise BufgymError("--live: not with --claims, whose numbers are simulated")
@@ -37,12 +37,12 @@ def _reproduce(options: argparse.Namespace) -> None:
     if data is not None and not data.is_dir():
         raise BufgymError(f"{data}: no such folder (--data)")
     if not options.names and options.claims is None:
-        print("figures (bufgym reproduce NAME..., or all)\n" + columns(list(reproduce.FIGURES.items())))
+        print("figures (bufgym reproduce NAME..., or all)\n" + columns(list(papers.FIGURES.items())))
         return
     for name in options.names:
-        if name != "all" and name not in reproduce.FIGURES:
-            raise BufgymError(f"unknown figure {name!r}; known: all, {', '.join(reproduce.FIGURES)}")
-    names = list(reproduce.FIGURES) if "all" in options.names else list(dict.fromkeys(options.names))
+        if name != "all" and name not in papers.FIGURES:
+            raise BufgymError(f"unknown figure {name!r}; known: all, {', '.join(papers.FIGURES)}")
+    names = list(papers.FIGURES) if "all" in options.names else list(dict.fromkeys(options.names))
     out = Path(options.out)
     if options.claims is not None:
         _claims(Path(options.claims), names, out, data)
@@ -54,7 +54,7 @@ def _reproduce(options: argparse.Namespace) -> None:
 
 def _claims(page: Path, names: list[str], out: Path, data: Path | None) -> None:
     """Write the page of claims, or renew the rows of these figures in it."""
-    from bufgym.reproduce.page import claims_page, renewed
+    from bufgym.papers.page import claims_page, renewed
 
     text = renewed(read_whole(page, 2**20).decode(), names, data, out) if names else claims_page(data, out)
     with replaced(page) as temporary:
@@ -64,15 +64,15 @@ def _claims(page: Path, names: list[str], out: Path, data: Path | None) -> None:
 
 def _text(name: str, out: Path, data: Path | None, *, named: bool, live: bool) -> str:
     """Make the figure; if it was not named, leave it out where it can't be made, such as without a library."""
-    from bufgym import reproduce
+    from bufgym import papers
 
-    needs = reproduce.NEEDS_DATA.get(name)
+    needs = papers.NEEDS_DATA.get(name)
     if needs is not None and data is None and not named:
         return f"{name}: left out; it needs a folder of recordings (--data DIR) with {needs}"
     try:
         if live:
-            return reproduce.run_live(name, out, partial(_steps, name))
-        return reproduce.run(name, out, **({"data": data} if name in reproduce.TAKES_DATA else {}))
+            return papers.run_live(name, out, partial(_steps, name))
+        return papers.run(name, out, **({"data": data} if name in papers.TAKES_DATA else {}))
     except BufgymError as error:
         if named:
             raise

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from bufgym.cli.options import Commands, command
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 DEFAULT = "docs/leaderboard.csv"
 

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 
 from bufgym.cli.options import Commands, columns, command, load_policies, policy_file
-from bufgym.modules import first_line
+from bufgym.ground.modules import first_line
 
 
 def add(commands: Commands) -> None:
@@ -89,7 +89,7 @@ def _list_values() -> str:
 
 
 def _list_rewards() -> str:
-    from bufgym.observe import OWN_TERMS, REWARD_TERMS, TOPIC_REWARD_TERMS
+    from bufgym.model.observe import OWN_TERMS, REWARD_TERMS, TOPIC_REWARD_TERMS
 
     parts = {
         "": REWARD_TERMS,
@@ -101,7 +101,7 @@ def _list_rewards() -> str:
 
 
 def _list_observations() -> str:
-    from bufgym.observe import FIELDS, OWN_FIELDS, TOPIC_FIELDS
+    from bufgym.model.observe import FIELDS, OWN_FIELDS, TOPIC_FIELDS
 
     parts = {"": FIELDS, _SEVERAL: TOPIC_FIELDS, "where `fields` names it": tuple(OWN_FIELDS.values())}
     return _in_parts({title: [(f.name, f.per, f.group, f.unit, f.meaning) for f in parts[title]] for title in parts})

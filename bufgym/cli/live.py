@@ -22,10 +22,10 @@ from bufgym.cli.options import (
     policy_file,
     positive,
 )
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 if TYPE_CHECKING:
-    from bufgym.live.validate import Play
+    from bufgym.robot.validate import Play
 
 PORT = 7410
 """Default port of a receiver."""
@@ -112,8 +112,8 @@ def _link(options: argparse.Namespace) -> None:
     import asyncio
 
     from bufgym import traces
-    from bufgym.live.shaped import ShapedLink
     from bufgym.model.link import Link
+    from bufgym.robot.shaped import ShapedLink
 
     trace, target = traces.load(options.trace).scaled(options.scale), address(options.to)
 
@@ -129,9 +129,9 @@ def _link(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from bufgym import policies, traces
-    from bufgym.live.margins import margins
-    from bufgym.live.runs import save, table
-    from bufgym.live.validate import validate
+    from bufgym.robot.margins import margins
+    from bufgym.robot.runs import save, table
+    from bufgym.robot.validate import validate
     from bufgym.scenario import Uplink
 
     load_policies(options.policy_file)
@@ -160,7 +160,7 @@ def _validate(options: argparse.Namespace) -> None:
     )
     print("\n".join([table(runs), "", *map(str, margins(runs))]))
     if options.out is not None:
-        from bufgym.live import report as page
+        from bufgym.robot import report as page
 
         print(f"\nwrote {page.write(save(runs, about, _command(options), Path(options.out)))}")
 
@@ -168,14 +168,14 @@ def _validate(options: argparse.Namespace) -> None:
 def _play_over(transport: str) -> Play:
     """Find the player for a transport; raise an error if it is not installed."""
     if transport == "ros1":
-        from bufgym.ros1 import episode as ros1
+        from bufgym.robot.ros1 import episode as ros1
 
         return ros1.player()
     if transport == "ros2":
-        from bufgym.ros2 import episode as ros2
+        from bufgym.robot.ros2 import episode as ros2
 
         return ros2.player()
-    from bufgym.live.validate import over
+    from bufgym.robot.validate import over
 
     return over(transport)
 
@@ -191,7 +191,7 @@ def _command(options: argparse.Namespace) -> str:
 
 
 def _replay(options: argparse.Namespace) -> None:
-    from bufgym.live import replay
+    from bufgym.robot import replay
 
     load_policies(options.policy_file)
     played = replay(options.log)
@@ -218,8 +218,8 @@ def _redraw(text: str) -> None:
 def _view(options: argparse.Namespace) -> None:
     import time
 
-    from bufgym.live import read_log
-    from bufgym.live.view import View
+    from bufgym.robot import read_log
+    from bufgym.robot.view import View
 
     size_bytes = -1
     while options.follow or size_bytes < 0:
@@ -236,12 +236,12 @@ def _send(options: argparse.Namespace) -> None:
     import math
 
     from bufgym import policies, traces
-    from bufgym.live import LogFile, PolicyQueue
-    from bufgym.live.channels import TRANSPORTS as CONNECT
-    from bufgym.live.log import Record
-    from bufgym.live.sender import Sender
-    from bufgym.live.view import View
     from bufgym.model import qoi
+    from bufgym.robot import LogFile, PolicyQueue
+    from bufgym.robot.channels import TRANSPORTS as CONNECT
+    from bufgym.robot.log import Record
+    from bufgym.robot.sender import Sender
+    from bufgym.robot.view import View
 
     load_policies(options.policy_file)
     (name,) = loaded([options.policies])[0]
@@ -288,7 +288,7 @@ def _receive(options: argparse.Namespace) -> None:
     import asyncio
     import contextlib
 
-    from bufgym.live.receiver import Received, Receiver, Recording
+    from bufgym.robot.receiver import Received, Receiver, Recording
 
     async def take(record: Any) -> None:
         enough = asyncio.Event()

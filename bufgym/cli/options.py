@@ -7,8 +7,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, TypeAlias, TypeVar
 
-from bufgym import modules
-from bufgym.errors import BufgymError, printable
+from bufgym.ground import modules
+from bufgym.ground.errors import BufgymError, printable
 
 T = TypeVar("T")
 

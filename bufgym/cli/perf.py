@@ -28,7 +28,7 @@ def _perf(options: argparse.Namespace) -> None:
     elif sys.stderr.isatty():
         print("measuring; this takes about half a minute ...", file=sys.stderr)
     if options.queue:
-        from bufgym.live import cost
+        from bufgym.robot import cost
 
         print(cost.report(1 if options.quick else 20))
         return

@@ -13,8 +13,8 @@ from typing import Any
 
 from bufgym.cli.listing import environments
 from bufgym.cli.options import Commands, command, count, least_0, load_policies, loaded, natural, policy_file
-from bufgym.errors import BufgymError, install
-from bufgym.files import replaced
+from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.files import replaced
 
 FILMS = {".gif": "GIF", ".webp": "WEBP", ".png": "PNG"}
 """Suffix of a film -> Pillow's name of the format."""
@@ -39,7 +39,7 @@ def _play(options: argparse.Namespace) -> None:
 
     from bufgym import policies
     from bufgym.benchmark.run import draw
-    from bufgym.expert import Player
+    from bufgym.envs.expert import Player
 
     load_policies(options.policy_file)
     (name,) = loaded([options.policies])[0]

@@ -9,7 +9,7 @@ from typing import Any
 
 from bufgym.cli.live import run_async
 from bufgym.cli.options import Commands, command, count, load_policies, loaded, natural, policy_file
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 CAPACITY = 32
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from bufgym.cli.options import Commands, command
-from bufgym.errors import printable
+from bufgym.ground.errors import printable
 
 
 def add(commands: Commands) -> None:

@@ -38,8 +38,8 @@ def _say(text: str) -> None:
 def _send(options: argparse.Namespace) -> None:
     import contextlib
 
-    from bufgym.live import LogFile
-    from bufgym.ros2.relay import Robot
+    from bufgym.robot import LogFile
+    from bufgym.robot.ros2.relay import Robot
     from bufgym.scenario import read_client
 
     client = read_client(options.config)
@@ -64,6 +64,6 @@ def _send(options: argparse.Namespace) -> None:
 
 
 def _receive(options: argparse.Namespace) -> None:
-    from bufgym.ros2.relay import receive
+    from bufgym.robot.ros2.relay import receive
 
     run_async(receive(options.port, options.host, options.transport, _say))

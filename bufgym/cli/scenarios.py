@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from bufgym import modules
 from bufgym.cli.options import count, given, least_0, positive, refuse
 from bufgym.cli.trace_bags import (
     WORKLOAD_OPTIONS,
@@ -17,7 +16,8 @@ from bufgym.cli.trace_bags import (
     workload_lines,
     workload_options,
 )
-from bufgym.errors import BufgymError, printable
+from bufgym.ground import modules
+from bufgym.ground.errors import BufgymError, printable
 
 if TYPE_CHECKING:
     from bufgym.model.qoi import Value

@@ -18,7 +18,7 @@ from bufgym.cli.options import (
     policies_option,
     policy_file,
 )
-from bufgym.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, install
 
 if TYPE_CHECKING:
     from bufgym.benchmark.rows import Row

@@ -9,7 +9,7 @@ from typing import Any
 
 from bufgym.cli.options import Commands, command, given, load_policies, loaded, positive, refuse
 from bufgym.cli.suite import SUITE_OPTIONS, out_options, run_suite, suite_options, target, who_options
-from bufgym.errors import BufgymError, printable
+from bufgym.ground.errors import BufgymError, printable
 
 SUITE = "topics-v1"
 CAPACITY = 32

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bufgym.cli.options import Commands, command, positive
-from bufgym.errors import BufgymError, printable
+from bufgym.ground.errors import BufgymError, printable
 
 if TYPE_CHECKING:
     from bufgym.traces import MotionSettings, Workload

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from bufgym.cli.options import Commands, columns, command
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 if TYPE_CHECKING:
     from bufgym.traces.datasets.fetch import Fetched

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bufgym.cli.options import Commands, columns, command, count
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 if TYPE_CHECKING:
     from bufgym.traces.trace import Float64Array

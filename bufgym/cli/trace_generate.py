@@ -10,7 +10,7 @@ import inspect
 from collections.abc import Callable
 
 from bufgym.cli.options import Commands, Parser, command, count, least_0, natural, number, positive
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 
 def add(commands: Commands) -> None:

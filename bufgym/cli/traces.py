@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from bufgym.cli import trace_bags, trace_fetch, trace_fit, trace_generate
 from bufgym.cli.options import Commands, columns, command
-from bufgym.errors import BufgymError, TraceError, install, printable
+from bufgym.ground.errors import BufgymError, TraceError, install, printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

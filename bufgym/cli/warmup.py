@@ -16,8 +16,8 @@ def _warmup(options: argparse.Namespace) -> None:
     from concurrent.futures import ProcessPoolExecutor, as_completed
     from multiprocessing import get_context
 
-    from bufgym import kernel
     from bufgym.benchmark import warmup
+    from bufgym.ground import kernel
 
     if not kernel.JIT:
         print("compilation is off (NUMBA_DISABLE_JIT): nothing to do")

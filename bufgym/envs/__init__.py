@@ -11,7 +11,7 @@ from bufgym import oracle  # noqa: F401  (registers the clairvoyant as a policy 
 from bufgym.envs.fleet_vec import FleetVecEnv
 from bufgym.envs.single import SenderEnv
 from bufgym.envs.vector import SenderVectorEnv
-from bufgym.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, install
 
 if TYPE_CHECKING:
     from bufgym.envs.fleet import FleetEnv, parallel_env

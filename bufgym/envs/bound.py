@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bufgym import policies
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.oracle import clairvoyant
 from bufgym.oracle.measure import BASELINE, normalised_score, regret

@@ -16,7 +16,7 @@ from pettingzoo import ParallelEnv
 from bufgym.envs.fleet_rows import FleetRows
 from bufgym.envs.observation import Observation
 from bufgym.envs.rows import check_render_mode
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import FleetScenario, Uplink
 
 Infos = dict[str, dict[str, Any]]
@@ -34,7 +34,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     **Agents** ``robot_0`` .. ``robot_{N-1}``, N up to 256.
 
     **Action, observation** of each robot are as in ``SenderEnv``: actions are ``Discrete(L + 2)``. The observation is
-    a Dict with one key for each field of ``bufgym.observe`` and holds what that robot has on board.
+    a Dict with one key for each field of ``bufgym.model.observe`` and holds what that robot has on board.
     ``infos[agent]["action_mask"]``, int8[L + 2], marks the valid actions; with ``mask_in_observation`` so does
     ``observation["action_mask"]``. ``state()`` has every field of every robot, for critics that may see them all.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bufgym.envs.rows import NO_ACTIONS, Rows
 from bufgym.envs.step import step_cells
 from bufgym.envs.threads import Threads
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import FleetScenario
 from bufgym.sim.cell import Fleet
 

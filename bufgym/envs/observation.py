@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.observe import OWN_FIELDS, Field, own_field
+from bufgym.ground.errors import BufgymError
+from bufgym.model.observe import OWN_FIELDS, Field, own_field
 
 Observation = Any
 """A dict of arrays; for "flat", one array."""

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from bufgym.envs.observation import ObservationForm, Place
 from bufgym.envs.step import StepOutput
-from bufgym.errors import BufgymError
-from bufgym.kernel import at, compile_for, kernel, local, named, stretch
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import at, compile_for, kernel, local, named, stretch
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
-from bufgym.observe import OwnField, OwnTerm
+from bufgym.model.observe import OwnField, OwnTerm
 from bufgym.policies.registry import view_type
 from bufgym.sim import ARRIVAL_WAITS, NOTHING_WAITS, Batch, python_arrival, python_view, view
 from bufgym.sim.state import LOG_ENTRY, batch_type

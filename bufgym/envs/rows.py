@@ -21,9 +21,9 @@ from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.step import StepOutput, step_rows
 from bufgym.envs.threads import Threads
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import is_number
-from bufgym.observe import (
+from bufgym.model.observe import (
     CONTEXT_FIELDS,
     OWN_TERMS,
     SLOT_FIELDS,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.observation import Observation
 from bufgym.envs.rows import NUMBERED, Rows, check_render_mode
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Scenario
 
 _ROW = np.zeros(1, np.int64)
@@ -27,12 +27,12 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     If B has no room for the newcomer even after an eviction, the next step is about the same arrival again. An arrival
     larger than B is dropped without a step.
 
-    **Observation** a Dict with one float32 array for each field of ``bufgym.observe.FIELDS``, all in [0, 1]. Slot
+    **Observation** a Dict with one float32 array for each field of ``bufgym.model.observe.FIELDS``, all in [0, 1]. Slot
     fields have shape (L + 1,), with the newcomer last; context fields have shape (1,). With ``observation="flat"`` the
     same numbers are one array, slot fields first. With "slots" they are a Dict of ``slots`` [L + 1, slot fields] and
     ``context``.
 
-    **Reward** one of the terms of ``bufgym.observe.REWARD_TERMS`` or a weighted sum of them. Over an episode both
+    **Reward** one of the terms of ``bufgym.model.observe.REWARD_TERMS`` or a weighted sum of them. Over an episode both
     ``delivered`` and ``retained`` add up to H - 1, or to 0 if nothing was delivered. ``info["reward_terms"]`` has each
     term.
 
@@ -41,8 +41,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     be the oldest of its topic, and L + 1 is invalid. L *holds* the socket until the next arrival or ack, as long as one
     is to come. An invalid choice sends the oldest message. At an arrival all is as above, but a ``no_drop`` message can
     be neither evicted nor rejected while another message can make room. If an action tries this and the queue is full,
-    the oldest message of the lowest priority goes. The fields of ``bufgym.observe.TOPIC_FIELDS`` and the terms ``age``
-    and ``late`` of ``TOPIC_REWARD_TERMS`` are added. H is the weighted sum over the topics, so ``delivered`` and
+    the oldest message of the lowest priority goes. The fields of ``TOPIC_FIELDS`` and the terms ``age`` and ``late`` of
+    ``TOPIC_REWARD_TERMS`` (both in ``bufgym.model.observe``) are added. H is the weighted sum over the topics, so ``delivered`` and
     ``retained`` add up to H minus the weights of all topics with a delivery.
 
     **Episode end** ``terminated`` when the episode's last message has left; never ``truncated``. In the step that ends
@@ -56,7 +56,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``capacity``: L, messages.
     - ``max_bytes``: B, bytes, by default without limit.
     - ``decide_at``: "arrival", or "overflow" to ask only when the buffer is full.
-    - ``reward``: a term's name, or weights by name; terms of ``bufgym.observe.OWN_TERMS`` take part only if named.
+    - ``reward``: a term's name, or weights by name; terms of your own take part only if named.
     - ``fields``: names of the fields to observe, your own included; by default all fields of the tables.
     - ``observation``: "dict", "flat" or "slots".
     - ``info``: "full"; "steady" adds the summary so far in every step, for recorders; "mask" has the action mask alone,

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import bundle, direct, kernel, local, prefetch, stretch, table
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import bundle, direct, kernel, local, prefetch, stretch, table
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.link import FOREVER
-from bufgym.observe import (
+from bufgym.model.observe import (
     CONTEXT_FIELDS,
     REWARD_TERMS,
     SLOT_FIELDS,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bufgym.envs.observation import Observation
 from bufgym.envs.rows import Rows, check_render_mode
 from bufgym.envs.step import StepOutput
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
 

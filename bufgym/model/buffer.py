@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import bundle, item, kernel
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import bundle, item, kernel
 from bufgym.model.documented import documented
 from bufgym.model.qoi import merging_loss, value
 

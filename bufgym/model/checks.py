@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 MAX_WINDOW = 10**6
 

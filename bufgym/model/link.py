@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import item, kernel
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import item, kernel
 from bufgym.model.checks import whole
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Trace
 

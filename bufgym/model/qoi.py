@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import modules
-from bufgym.errors import BufgymError
-from bufgym.kernel import kernel
+from bufgym.ground import modules
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import kernel
 from bufgym.model.checks import is_number
 
 EXPONENTIAL, SATURATING, TABULATED = 0, 1, 2

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import records
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import records
 from bufgym.model.buffer import MAX_CAPACITY, TOPIC
 from bufgym.model.checks import is_number, whole
 from bufgym.model.qoi import Value

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import at, kernel
+from bufgym.ground.kernel import at, kernel
 from bufgym.model.qoi import value
 from bufgym.sim.state import Batch
 

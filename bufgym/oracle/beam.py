@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.qoi import value
 from bufgym.oracle.programme import Problem, Room, waiting_cost
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import at, kernel
+from bufgym.ground.kernel import at, kernel
 from bufgym.model.qoi import value
 from bufgym.oracle.ahead import TIE, Ahead, sends, step_of
 from bufgym.sim.state import ARRIVAL_WAITS, CARRIES, Batch

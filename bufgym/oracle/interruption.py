@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import kernel
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import kernel
 from bufgym.model.qoi import Value, value
 
 

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import interruptible, kernel
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import interruptible, kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.model.checks import whole
 from bufgym.model.qoi import Value, tabulated

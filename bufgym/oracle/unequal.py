@@ -22,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.qoi import value
 from bufgym.oracle import beam

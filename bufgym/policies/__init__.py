@@ -4,7 +4,7 @@ import functools
 import os
 from pathlib import Path
 
-from bufgym import files
+from bufgym.ground import files
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, after, before, has_space, is_first
 from bufgym.policies import (  # noqa: F401  (each registers its policies)
     afr,

@@ -14,7 +14,7 @@ p along with the queue; the text does not mention p.
 
 from __future__ import annotations
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, fill, has_space
 from bufgym.policies.registry import Arrival, Memory, register
 

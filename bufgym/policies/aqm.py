@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.policies.classic import keep_first
 from bufgym.policies.registry import Arrival, Memory, register

@@ -9,7 +9,7 @@ can stay below ln 4 (Bringmann et al., arXiv 1302.4216; Bar-On et al., arXiv 170
 
 from __future__ import annotations
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, fill, has_space
 from bufgym.policies.afr import MEMORY, C, P, R, afr_departure, thin
 from bufgym.policies.classic import keep_last

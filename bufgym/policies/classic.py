@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
 from bufgym.policies.registry import Arrival, Memory, register
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first, keep_last
 from bufgym.policies.registry import Arrival, Memory, register

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, has_space, loss, motion_gaps, time_gaps
+from bufgym.model.observe.on_board import index_gaps
 from bufgym.model.qoi import value
-from bufgym.observe.on_board import index_gaps
 from bufgym.policies.registry import Arrival, Memory, register
 
 MOTION, MESSAGES = 1, 2

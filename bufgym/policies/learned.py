@@ -1,7 +1,7 @@
 """Learned policies: a slot scorer's weights from a file, decided by a compiled forward pass. No torch, no code.
 
 One small network scores every candidate, a queued message or the newcomer. Its inputs are the features of the candidate
-and of the context (``bufgym.observe``), so one set of weights serves every L; ``scoring`` has the formula. The *drop*
+and of the context (``model.observe``), so one set of weights serves every L; ``scoring`` has the formula. The *drop*
 network scores dropping the candidate. The *accept* network scores accepting the newcomer, where there is room. The
 policy takes the decision that scores highest; ties go to the oldest message.
 
@@ -34,10 +34,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
-from bufgym.model.qoi import straight
-from bufgym.observe import (
+from bufgym.model.observe import (
     CONTEXT_FIELDS,
     ON_BOARD_FIELDS,
     ON_BOARD_SLOT_FIELDS,
@@ -47,6 +46,7 @@ from bufgym.observe import (
     observe_on_board_slots,
     observe_slots,
 )
+from bufgym.model.qoi import straight
 from bufgym.policies.gaps import MESSAGES, MOTION, greedy_qoi, smallest_gap
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.scoring import (

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
-from bufgym.observe import (
+from bufgym.model.observe import (
     CONTEXT_FIELDS,
     SLOT_FIELDS,
     TOPIC_CONTEXT_FIELDS,

@@ -37,11 +37,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import BundleType, compile_for
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import BundleType, compile_for
+from bufgym.ground.modules import first_line
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.checks import changed, check_name, named_settings
-from bufgym.modules import first_line
 
 Arrival = Any
 """A MESSAGE record."""

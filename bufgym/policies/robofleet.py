@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.policies.registry import Arrival, ClientSettings, Memory, register
 from bufgym.policies.schedulers import fits, make_room, oldest, oldest_of_own, topic_of

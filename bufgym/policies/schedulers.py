@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, is_first
 from bufgym.policies.registry import Arrival, Memory, register
 

@@ -20,7 +20,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 
 HEADER = 6
 """Numbers before the fields: fields read, the context's share of them, widths of both layers, numbers of one network,

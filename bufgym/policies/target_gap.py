@@ -25,9 +25,9 @@ goes, and ``thinning`` says whether it goes with room too.
 
 from __future__ import annotations
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, Buffer, has_space, running_mean
-from bufgym.observe.on_board import mean_bytes
+from bufgym.model.observe.on_board import mean_bytes
 from bufgym.policies.gaps import MESSAGES, MOTION, come, gap_left, gaps_of, smallest_gap
 from bufgym.policies.registry import Arrival, Memory, register
 from bufgym.policies.thinning import places, spare, steady

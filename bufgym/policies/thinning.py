@@ -14,9 +14,9 @@ On a small, exactly solved link, early drops make up most of the best policy's g
 
 from __future__ import annotations
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import Buffer
-from bufgym.observe.on_board import mean_bytes
+from bufgym.model.observe.on_board import mean_bytes
 from bufgym.policies.gaps import come, gap_left
 from bufgym.policies.registry import Arrival
 

@@ -11,7 +11,7 @@ pauses the encoder, so every frame is dropped. These messages have no key frames
 
 from __future__ import annotations
 
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first
 from bufgym.policies.fragments import PIPE, RATE, UNKNOWN, account, ahead_of_newcomer

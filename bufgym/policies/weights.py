@@ -9,7 +9,7 @@ has one entry, ``bufgym``, a JSON object that describes the file:
     name          the policy's
     about         a sentence: what it does (may be absent)
     fields        the observation's fields that it reads, in the order of the networks' inputs
-    observation   hash of what defines them (``bufgym.observe.FIELDS``, and those on board among them)
+    observation   hash of what defines them (``bufgym.model.observe.FIELDS``, and those on board among them)
     bufgym        version that wrote the file
     sha256        of fields and tensors
 
@@ -32,9 +32,9 @@ from numpy.typing import NDArray
 from safetensors.numpy import save as serialized
 
 from bufgym import __version__
-from bufgym.errors import BufgymError, where
-from bufgym.files import read_whole, replaced
-from bufgym.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, TOPIC_FIELDS
+from bufgym.ground.errors import BufgymError, where
+from bufgym.ground.files import read_whole, replaced
+from bufgym.model.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, TOPIC_FIELDS
 from bufgym.policies import learned, learned_topics
 from bufgym.policies.learned import Weights
 from bufgym.policies.learned_topics import TopicWeights

@@ -12,7 +12,7 @@ from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym.errors import printable
+from bufgym.ground.errors import printable
 from bufgym.relay.config import Rotation
 
 FILE: Final = "audit.jsonl"

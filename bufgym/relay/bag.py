@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
 from bufgym.relay import ros_messages
 from bufgym.relay.robot import Robot

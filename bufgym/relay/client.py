@@ -21,14 +21,14 @@ from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from bufgym.errors import BufgymError
-from bufgym.live.log import Record
-from bufgym.live.queue import Item, PolicyQueue
+from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
 from bufgym.relay import wire
 from bufgym.relay.session import Session
+from bufgym.robot.log import Record
+from bufgym.robot.queue import Item, PolicyQueue
 
 _POLL_S: Final = (0.001, 0.016)
 """Time between two checks for departures: at first, and when nothing moves."""

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym.errors import BufgymError
-from bufgym.files import check_keys, read_toml
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import check_keys, read_toml
 from bufgym.model.checks import above_0, check_window, whole
 from bufgym.relay.patterns import pattern
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import WebSocketException
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.relay import policies, replay, wire
 from bufgym.relay.config import DEFAULT_CAPACITY

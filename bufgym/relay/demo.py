@@ -12,7 +12,6 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from bufgym.live.shaped import ShapedLink
 from bufgym.model.link import Link
 from bufgym.policies import registry
 from bufgym.policies.registry import Policy
@@ -21,6 +20,7 @@ from bufgym.relay.config import Config, Rule
 from bufgym.relay.madeup import CONFIG, MadeUp
 from bufgym.relay.robot import Robot
 from bufgym.relay.server import Server
+from bufgym.robot.shaped import ShapedLink
 from bufgym.scenario import read_client
 from bufgym.traces import Trace
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 
-from bufgym.live import extra
+from bufgym.robot import extra
 
 
 def needs(library: str) -> AbstractContextManager[None]:

@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Final
 
-from bufgym.errors import BufgymError
-from bufgym.live.extra import needs
+from bufgym.ground.errors import BufgymError
 from bufgym.relay import ros_messages, wire
 from bufgym.relay.config import Foxglove, Rule
 from bufgym.relay.recorder import SCHEMAS
 from bufgym.relay.rules import FOXGLOVE, Permissions
 from bufgym.relay.session import Session
+from bufgym.robot.extra import needs
 
 MAX_CHANNELS: Final = 10_000
 """Limit on channels, which clients open by topic and type; further channels are not shown."""

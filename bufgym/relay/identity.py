@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from bufgym.errors import BufgymError
-from bufgym.files import read_utf8
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import read_utf8
 from bufgym.relay.config import Tls, Tokens
 from bufgym.relay.extra import needs
 from bufgym.relay.quota import RefusedError

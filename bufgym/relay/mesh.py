@@ -17,8 +17,7 @@ import json
 import threading
 from typing import Any, Final
 
-from bufgym.errors import BufgymError
-from bufgym.live.extra import needs
+from bufgym.ground.errors import BufgymError
 from bufgym.relay import policies, wire
 from bufgym.relay.config import DEFAULT_CAPACITY, Mesh, Rule
 from bufgym.relay.hub import OWN, Frame, Hub
@@ -27,6 +26,7 @@ from bufgym.relay.quota import RefusedError
 from bufgym.relay.rules import Identity, Permissions
 from bufgym.relay.store import Session
 from bufgym.relay.subscriber import Subscription, next_lane
+from bufgym.robot.extra import needs
 
 ROOT: Final = "bufgym/relay"
 ANSWER_S: Final = 3.0

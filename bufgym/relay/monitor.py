@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
-from bufgym.live.log import Record
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
+from bufgym.robot.log import Record
 
 RATE_S: Final = 1.0
 """Time before now over which rates are computed."""

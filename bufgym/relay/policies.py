@@ -14,11 +14,11 @@ import threading
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 if TYPE_CHECKING:
-    from bufgym.live import PolicyQueue
     from bufgym.policies.registry import Policy
+    from bufgym.robot import PolicyQueue
 
 SKIP_PENDING: Final = "skip-pending"
 PLACES: Final = 32
@@ -44,8 +44,8 @@ def check(names: Iterable[str]) -> None:
 
 def new_queue(chosen: Policy, capacity: int) -> PolicyQueue:
     """Make a queue for up to ``PLACES`` topics, or for one topic if the policy knows none."""
-    from bufgym.live import PolicyQueue
     from bufgym.model.topics import Topic
+    from bufgym.robot import PolicyQueue
 
     topics = tuple(Topic(f"/{k}") for k in range(PLACES)) if chosen.for_topics else ()
     return PolicyQueue(chosen, capacity, topics=topics, room=ROOM)
@@ -73,7 +73,7 @@ def compiled(chosen: Policy) -> Policy:
 
 def kept(chosen: Policy) -> bool:
     """Whether the policy is in the compiler's cache; if so, load it."""
-    from bufgym.kernel import NotKeptError, only_kept
+    from bufgym.ground.kernel import NotKeptError, only_kept
 
     try:
         with only_kept():

@@ -16,7 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.relay.extra import needs
 
 MOST_BYTES: Final = 4 * 2**20

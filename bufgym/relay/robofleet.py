@@ -19,7 +19,7 @@ import struct
 import time
 from typing import Any, Final, NamedTuple
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.relay import policies, wire
 from bufgym.relay.config import DEFAULT_CAPACITY
 from bufgym.relay.connection import Connection

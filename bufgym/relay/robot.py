@@ -14,15 +14,15 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from typing import Any, Final, Protocol
 
-from bufgym.errors import BufgymError
-from bufgym.live.odometry import Odometry
-from bufgym.live.tasks import Tasks, until_one_ends
+from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
 from bufgym.relay import ros_messages, wire
 from bufgym.relay.client import Client
 from bufgym.relay.monitor import Monitor
+from bufgym.robot.odometry import Odometry
+from bufgym.robot.tasks import Tasks, until_one_ends
 from bufgym.scenario import Stream
 
 STATUS_S: Final = 1.0

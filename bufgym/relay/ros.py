@@ -11,11 +11,11 @@ from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.relay import ros_messages, wire
 from bufgym.relay.robot import Robot
-from bufgym.ros2.names import Published, published
-from bufgym.ros2.relay import LOOK_S, matched, own_node, resolved
+from bufgym.robot.ros2.names import Published, published
+from bufgym.robot.ros2.relay import LOOK_S, matched, own_node, resolved
 from bufgym.scenario import Stream
 
 NODE: Final = "bufgym_robot"

@@ -18,8 +18,7 @@ from websockets.exceptions import NegotiationError
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from bufgym.errors import BufgymError
-from bufgym.live.sockets import DEAD_AFTER_S, set_option, small_buffers
+from bufgym.ground.errors import BufgymError
 from bufgym.relay import pages, policies, wire
 from bufgym.relay.config import Config
 from bufgym.relay.connection import HELLO_BYTES, Connection
@@ -29,6 +28,7 @@ from bufgym.relay.mesh import Others
 from bufgym.relay.quota import RefusedError
 from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
+from bufgym.robot.sockets import DEAD_AFTER_S, set_option, small_buffers
 
 if TYPE_CHECKING:
     from bufgym.relay.foxglove import Window

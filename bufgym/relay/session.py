@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from bufgym.errors import BufgymError
-from bufgym.files import read_utf8
-from bufgym.live.sockets import connected, unacked_bytes
-from bufgym.live.tasks import Tasks
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import read_utf8
 from bufgym.relay import wire
 from bufgym.relay.extra import needs
 from bufgym.relay.unanswered import Unanswered
+from bufgym.robot.sockets import connected, unacked_bytes
+from bufgym.robot.tasks import Tasks
 
 TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
 RETRY_S: Final = 0.5

@@ -15,8 +15,8 @@ from bufgym.relay.patterns import Pattern
 from bufgym.relay.policies import PLACES, new_queue
 
 if TYPE_CHECKING:
-    from bufgym.live import Item, PolicyQueue
     from bufgym.policies.registry import Policy
+    from bufgym.robot import Item, PolicyQueue
 
 MAX_QUEUES: Final = 64
 """Limit on the queues of a subscription; further topics share queues."""

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple, NoReturn
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 PATH: Final = "/relay"
 SUBPROTOCOL: Final = "bufgym.relay.v1"

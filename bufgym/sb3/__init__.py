@@ -9,7 +9,7 @@
 ``export`` (or ``bufgym export``) writes a slot network to a file that bufgym runs without torch.
 """
 
-from bufgym.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, install
 
 try:
     from bufgym.sb3.export import export, weights_of

@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 from torch import nn
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.oracle.lengths import EveryLength
 from bufgym.policies import Policy, learned, learned_topics
 from bufgym.policies import weights as files

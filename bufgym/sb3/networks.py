@@ -22,7 +22,7 @@ from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 ACCEPT_BIAS = 2.0
 """Initial logit of accepting: exploration that drops messages where there is room learns little."""

@@ -15,9 +15,9 @@ from stable_baselines3.common.policies import BasePolicy
 
 from bufgym.envs.observation import ObservationForm
 from bufgym.envs.own import write_in_python
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
-from bufgym.observe import (
+from bufgym.model.observe import (
     CONTEXT_FIELDS,
     SLOT_FIELDS,
     TOPIC_CONTEXT_FIELDS,

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import item, kernel, records
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import item, kernel, records
 from bufgym.model.buffer import MESSAGE
 from bufgym.model.link import MAX_TIME_US
 from bufgym.model.topics import MAX_TOPICS

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bufgym import modules, traces
-from bufgym.errors import BufgymError
+from bufgym import traces
+from bufgym.ground import modules
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.checks import above_0, between, whole
 from bufgym.model.link import MAX_TIME_US
@@ -120,7 +121,7 @@ def links(text: str) -> list[Trace]:
     """The traces that text names: a shipped one, a file, or a generator, which is a function seed -> Trace.
 
     ``module:function:100-119`` names a generator and its seeds; the seeds of ``module:function`` are 0 to ``GENERATED``
-    - 1. The module is imported (see ``bufgym.modules``).
+    - 1. The module is imported (see ``bufgym.ground.modules``).
     """
     match = _GENERATOR.fullmatch(text)
     if match is None or Path(text).exists():

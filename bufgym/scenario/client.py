@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import records
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import records
 from bufgym.model import qoi
 from bufgym.model.buffer import MESSAGE
 from bufgym.model.checks import check_window, whole

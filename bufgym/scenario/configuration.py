@@ -8,8 +8,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from bufgym.errors import BufgymError
-from bufgym.files import check_keys, read_toml
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import check_keys, read_toml
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.scenario.client import Client, Stream

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value

@@ -9,8 +9,8 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from bufgym import modules
-from bufgym.errors import BufgymError
+from bufgym.ground import modules
+from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.scenario.configuration import client_over_lte, read_client
 from bufgym.scenario.episode import Scenario
@@ -88,7 +88,7 @@ def get(spec: str | Scenario, **overrides: Any) -> Scenario:
     """The scenario of that name, or ``spec`` itself, with changed parameters; BufgymError for unknown ones.
 
     A name that ends in .toml names a client's configuration (``read_client``). ``module:function`` is imported (see
-    ``bufgym.modules``); it is a scenario or makes one without arguments.
+    ``bufgym.ground.modules``); it is a scenario or makes one without arguments.
     """
     if isinstance(spec, str) and spec.endswith(".toml"):
         spec = read_client(spec)

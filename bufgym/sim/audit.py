@@ -10,8 +10,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import at, item, kernel
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import at, item, kernel
 from bufgym.model.qoi import value
 from bufgym.sim.state import NEVER, Batch
 

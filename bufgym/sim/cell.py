@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy
 from bufgym.scenario.fleet import FleetEpisode, check_robots

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bufgym.kernel import at, kernel
+from bufgym.ground.kernel import at, kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, push, running_mean
 from bufgym.sim import rules
 from bufgym.sim.socket import held_bytes, left_of

@@ -12,8 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import compile_for, interruptible, local, named
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import compile_for, interruptible, local, named
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
 from bufgym.policies.registry import Policy, runs_compiled, signatures

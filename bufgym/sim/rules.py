@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bufgym.kernel import at, kernel
+from bufgym.ground.kernel import at, kernel
 from bufgym.model.qoi import value
 from bufgym.sim.state import Batch
 

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.link import Knots
 from bufgym.model.qoi import Value

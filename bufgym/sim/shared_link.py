@@ -17,7 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import bundle, kernel, records
+from bufgym.ground.kernel import bundle, kernel, records
 from bufgym.model.documented import documented
 from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.decisions import arrive

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bufgym.kernel import at, kernel
+from bufgym.ground.kernel import at, kernel
 from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.rules import dequeued_on_topic, received_on_topic, sendable
 from bufgym.sim.state import CARRIES, FREED, HELD, IDLE, UNASKED, Batch, place_of

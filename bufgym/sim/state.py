@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.kernel import bundle, kernel, records
+from bufgym.ground.kernel import bundle, kernel, records
 from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC, row_width
 from bufgym.model.documented import documented
 from bufgym.model.link import FOREVER

@@ -6,7 +6,7 @@ Otherwise it holds the cells of ``bufgym.sim.shared_link``. Numba compiles each 
 
 from __future__ import annotations
 
-from bufgym.kernel import at, kernel
+from bufgym.ground.kernel import at, kernel
 from bufgym.sim.decisions import arrive, choose, oldest_sendable
 from bufgym.sim.shared_link import Shares, join, next_in_cell
 from bufgym.sim.socket import begin_transmission, dequeue, finish_transmission, may_dequeue, next_ack_us

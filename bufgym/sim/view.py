@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bufgym.kernel import at, kernel, stretch
+from bufgym.ground.kernel import at, kernel, stretch
 from bufgym.model.buffer import Buffer
 from bufgym.sim.socket import held_bytes, left_of
 from bufgym.sim.state import ARRIVAL_WAITS, Batch

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.poses import Poses, angles, longest_s, unit
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array, first_true, freeze
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bufgym import files
+from bufgym.ground import files
 from bufgym.traces.formats.archives import split_member
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import read_trace

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.poses import longest_s
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Array, freeze
 

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 
 import bufgym
-from bufgym import expert
+from bufgym.envs import expert
 
 TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
 envs = gym.make_vec(

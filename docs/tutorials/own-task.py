@@ -47,8 +47,8 @@ class BetweenHalls:
 # `k = len(buffer.slots)`. `compile=True` promises that Numba can compile it.
 
 # %%
-from bufgym.observe import field as observed
-from bufgym.observe import reward_term
+from bufgym.model.observe import field as observed
+from bufgym.model.observe import reward_term
 
 
 @observed("staleness", per="slot", compile=True)
@@ -122,7 +122,7 @@ import matplotlib
 matplotlib.use("agg")
 import matplotlib.pyplot as plt
 
-from bufgym import expert
+from bufgym.envs import expert
 
 envs = gym.make_vec("bufgym/Uplink-v0", 20, reward={"retained": 1.0, "waited": 0.0}, **task)
 figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")

@@ -7,7 +7,7 @@ import pytest
 import bufgym
 from bufgym import policies, scenario
 from bufgym.benchmark.run import run
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import REJECT, registry
 
 

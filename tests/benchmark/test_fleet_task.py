@@ -13,7 +13,7 @@ from bufgym.benchmark.run import run
 from bufgym.benchmark.summary import plain
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.fleet import ROWS
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.scenario import FleetScenario, Uplink
 from bufgym.traces import Trace

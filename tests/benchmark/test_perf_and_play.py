@@ -16,9 +16,9 @@ from bufgym.benchmark import perf
 from bufgym.benchmark.run import draw, run
 from bufgym.benchmark.warmup import PARTS
 from bufgym.cli import main
-from bufgym.errors import BufgymError
-from bufgym.expert import Player
-from bufgym.kernel import FOLDER, JIT
+from bufgym.envs.expert import Player
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import FOLDER, JIT
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import run as run_senders

@@ -12,8 +12,8 @@ import pytest
 from cli_cases import fails, shown
 from sweep_cases import THREE, bufgym, ended
 
-from bufgym.files import locked
-from bufgym.kernel import announce
+from bufgym.ground.files import locked
+from bufgym.ground.kernel import announce
 
 pytest.importorskip("joblib", reason="a sweep needs joblib")
 

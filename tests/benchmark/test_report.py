@@ -16,7 +16,7 @@ from bufgym.benchmark import folder as inputs
 from bufgym.benchmark import report
 from bufgym.benchmark.report import timeline
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import FleetScenario, suites
 
 pytest.importorskip("jinja2", reason="the report needs Jinja")

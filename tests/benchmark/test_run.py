@@ -14,8 +14,8 @@ from bufgym import oracle, policies
 from bufgym.benchmark import run
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
 from bufgym.benchmark.tasks.timeline import choose, timeline
-from bufgym.errors import BufgymError
-from bufgym.files import replaced
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import replaced
 from bufgym.model import qoi
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink

@@ -11,7 +11,7 @@ import pytest
 
 from bufgym.benchmark import score, table
 from bufgym.benchmark.score import CellScore, Interval, Scores, Standing
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 
 def rows_of(

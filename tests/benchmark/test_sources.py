@@ -11,7 +11,7 @@ from cli_cases import Capsys, Patch, fails, shown
 from bufgym import policies
 from bufgym.benchmark import sources
 from bufgym.benchmark.rows import read_rows
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
 
 MODULE = """

@@ -21,9 +21,9 @@ from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import score
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.stress import ratios
-from bufgym.errors import BufgymError
-from bufgym.live.margins import margins
-from bufgym.live.runs import Run as LiveRun
+from bufgym.ground.errors import BufgymError
+from bufgym.robot.margins import margins
+from bufgym.robot.runs import Run as LiveRun
 from bufgym.scenario import Uplink, suites
 from bufgym.traces import Trace
 

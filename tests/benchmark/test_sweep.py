@@ -15,7 +15,7 @@ from bufgym.benchmark import run, sweep
 from bufgym.benchmark.rows import read_rows, write_rows
 from bufgym.benchmark.sweep import Sweep
 from bufgym.cli.options import load_policies
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Uplink, suites
 from bufgym.traces import Trace
 

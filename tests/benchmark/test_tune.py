@@ -13,7 +13,7 @@ from bufgym import policies
 from bufgym.benchmark import tune, tuned
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tune import Choice
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, suites
 

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from bufgym.kernel import records
+from bufgym.ground.kernel import records
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, MESSAGE, NO_PARAMETERS, REJECT, TOPIC, UNLIMITED_BYTES, Buffer
 from bufgym.model.link import Link

@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 from naive_cell import Cell
 
 from bufgym import policies
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.model.link import Link

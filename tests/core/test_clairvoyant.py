@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from bufgym import policies, scenario
 from bufgym.benchmark.run import draw
-from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.oracle import clairvoyant, integer, labels, programme

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym import scenario, traces
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.scenario import Client, Stream, Streams, read_client, robofleet_example

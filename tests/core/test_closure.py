@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from bufgym import kernel
-from bufgym.kernel.closure import closure, told_types
+from bufgym.ground import kernel
+from bufgym.ground.kernel.closure import closure, told_types
 from tests.conftest import COMPILED, REPO
 
 TALE = """
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import math
 import numba.extending
 import numpy as np
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 
 READ, UNREAD, TABLE = 2, 3, np.array([1.0, 2.0])
 RECORDS = np.zeros(1, [("near", np.int64), ("far", np.int64)])
@@ -171,11 +171,10 @@ def test_a_stale_callee_is_never_used(tmp_path: Path) -> None:
     """The caller's own file does not change; what it calls does, and a constant of that."""
     (tmp_path / "bufgym").symlink_to(REPO / "bufgym")
     (tmp_path / "number.py").write_text("STEP = 1\n")
-    callee = "from bufgym.kernel import kernel\nfrom number import STEP\n@kernel\ndef callee(k):\n    return k + STEP\n"
+    head = "from bufgym.ground.kernel import kernel\n"
+    callee = head + "from number import STEP\n@kernel\ndef callee(k):\n    return k + STEP\n"
     (tmp_path / "callee.py").write_text(callee)
-    caller = (
-        "from bufgym.kernel import kernel\nfrom callee import callee\n@kernel\ndef caller(k):\n    return callee(k)\n"
-    )
+    caller = head + "from callee import callee\n@kernel\ndef caller(k):\n    return callee(k)\n"
     (tmp_path / "caller.py").write_text(caller)
 
     def run(answer: int) -> list[str]:
@@ -194,7 +193,7 @@ def test_a_stale_callee_is_never_used(tmp_path: Path) -> None:
 
 def test_every_kernel_has_a_closure_that_any_process_finds_again() -> None:
     """No constant that a kernel reads is told by its address."""
-    from bufgym.kernel import closure as module
+    from bufgym.ground.kernel import closure as module
 
     seen: list[str] = []
 

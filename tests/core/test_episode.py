@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bufgym import policies, scenario
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import MESSAGE
 from bufgym.model.link import MAX_TIME_US, Link

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bufgym.kernel import JIT, interruptible
+from bufgym.ground.kernel import JIT, interruptible
 
 LONG = """
 import signal

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bufgym.kernel import announce, bundle, cache, direct, kernel, local
+from bufgym.ground.kernel import announce, bundle, cache, direct, kernel, local
 from tests.conftest import COMPILED
 
 TALE = """
 import os
 {before}
-from bufgym.kernel import kernel
+from bufgym.ground.kernel import kernel
 
 @kernel
 def double(k):
@@ -72,7 +72,7 @@ def test_damaged_code_is_compiled_anew(tmp_path: Path, left: float) -> None:
 
 @needs_compilation
 def test_long_compiling_is_announced_once_and_code_from_the_cache_never(tmp_path: Path) -> None:
-    impatient = f"from bufgym.kernel import announce as k; k.PATIENCE_S = 0.0; {OURS}"
+    impatient = f"from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 0.0; {OURS}"
     assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == announce.NOTICE + "\n"
     assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
 
@@ -81,9 +81,9 @@ def test_long_compiling_is_announced_once_and_code_from_the_cache_never(tmp_path
 @pytest.mark.parametrize(
     "before",
     [
-        "from bufgym.kernel import announce as k; k.PATIENCE_S = 0.0",
-        f"from bufgym.kernel import announce as k; k.PATIENCE_S = 1e6; {OURS}",
-        f"from bufgym.kernel import announce as k; k.PATIENCE_S = 0.0; k.compile_silently(); {OURS}",
+        "from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 0.0",
+        f"from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 1e6; {OURS}",
+        f"from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 0.0; k.compile_silently(); {OURS}",
     ],
     ids=["not ours", "quick", "silent"],
 )
@@ -95,7 +95,7 @@ def test_what_is_not_announced(tmp_path: Path, before: str) -> None:
 def test_who_wants_only_what_is_kept_compiles_nothing(tmp_path: Path) -> None:
     asked = """
 import sys
-from bufgym.kernel import NotKeptError, only_kept
+from bufgym.ground.kernel import NotKeptError, only_kept
 try:
     with only_kept():
         print(double(21))
@@ -119,7 +119,7 @@ def test_where_no_folder_can_be_written_a_temporary_one_serves(tmp_path: Path) -
 
 @needs_compilation
 def test_a_full_disk_keeps_no_code(tmp_path: Path) -> None:
-    full = "import bufgym.kernel.cache as c\ndef full(*_): raise OSError(28, 'no space left')\n"
+    full = "import bufgym.ground.kernel.cache as c\ndef full(*_): raise OSError(28, 'no space left')\n"
     run(tmp_path, before=full + "c.replaced = full", NUMBA_CACHE_DIR=str(tmp_path / "code"))
     assert not list((tmp_path / "code").rglob("*.nbc"))
 
@@ -146,7 +146,7 @@ def test_a_direct_call_is_the_call() -> None:
 
 SMALL = """
 from typing import Any, NamedTuple
-from bufgym.kernel import bundle, direct, kernel
+from bufgym.ground.kernel import bundle, direct, kernel
 
 @bundle
 class Rows(NamedTuple):
@@ -174,7 +174,7 @@ def test_few_rows_run_as_plain_python_while_another_process_compiles(tmp_path: P
 import sys
 import numpy as np
 from small import Rows, double
-from bufgym.kernel import only_kept, records
+from bufgym.ground.kernel import only_kept, records
 if not {possible}:
     sys.executable = "/nowhere"
 rows = Rows(records(3, np.dtype([("number", np.int64)])))

@@ -13,15 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from weight_cases import network, score
 
-from bufgym import files, policies
+from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
 from bufgym.cli import export as command
 from bufgym.cli.options import Parser
-from bufgym.errors import BufgymError
+from bufgym.ground import files
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.observe import (
+from bufgym.model.observe import (
     CONTEXT_FIELDS,
     FIELDS,
     ON_BOARD_FIELDS,

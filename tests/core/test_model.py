@@ -9,8 +9,8 @@ from cases import VALUES, queue_of, trace, traces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import records
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import records
 from bufgym.model import link, qoi
 from bufgym.model.buffer import MESSAGE, arrival_gain, evict, loss, motion_gaps, push, row_width, time_gaps
 from bufgym.model.link import FOREVER, Knots, Link, position_at, segment, time_of

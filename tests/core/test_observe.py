@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from topic_cases import CONTEXT_NAMES, SLOT_NAMES, TWIN_V, TopicCase, observed, topic_cases
 
-from bufgym.kernel import named
+from bufgym.ground.kernel import named
 from bufgym.model.buffer import ACCEPT, UNLIMITED_BYTES
 from bufgym.model.link import Link
+from bufgym.model.observe import FIELDS, TOPIC_FIELDS
 from bufgym.model.qoi import saturating
 from bufgym.model.topics import Topic
-from bufgym.observe import FIELDS, TOPIC_FIELDS
 from bufgym.scenario import Episode, messages
 from bufgym.sim import DECISION, END, Senders, decide, next_event, python_view
 from bufgym.traces import Trace

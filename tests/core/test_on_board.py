@@ -12,7 +12,7 @@ from test_sender import MS, V, line
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.observe import (
+from bufgym.model.observe import (
     ON_BOARD_FIELDS,
     ON_BOARD_SLOT_FIELDS,
     SLOT_FIELDS,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.oracle import integer

@@ -12,16 +12,17 @@ from cases import VALUES, newcomer, queue_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym import files, policies
-from bufgym.errors import BufgymError
+from bufgym import policies
+from bufgym.ground import files
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import REJECT
 from bufgym.oracle import by_length, clairvoyant, ideal, integer, law, online_optimum
 from bufgym.oracle.lengths import EveryLength
 from bufgym.oracle.small_link import ASKED, QUARTERS, Chain, cut_off, small_link
+from bufgym.papers.small_link import episode
 from bufgym.policies import small_queue
 from bufgym.policies.small_queue import BASES, CAPACITIES, LONGEST, NONE
-from bufgym.reproduce.small_link import episode
 from bufgym.scenario import Interruption, Streams, registry
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome

@@ -13,7 +13,7 @@ import bufgym  # noqa: F401  (registers the environments)
 from bufgym import scenario
 from bufgym.benchmark.rows import read_rows
 from bufgym.cli import main
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import SCENARIOS, Episode, Interruption, Uplink, messages, registry

@@ -10,7 +10,7 @@ from naive_policies import twins
 from policy_cases import interruption, kept
 
 from bufgym import policies
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.policies import ACCEPT, REJECT, register, registry
 from bufgym.sim.metrics import outcome

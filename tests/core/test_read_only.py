@@ -9,8 +9,8 @@ from bufgym import scenario
 from bufgym.benchmark import run as bench
 from bufgym.benchmark.tasks.queue import QueueTask
 from bufgym.envs import SenderEnv
-from bufgym.errors import BufgymError
-from bufgym.expert import Player
+from bufgym.envs.expert import Player
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic

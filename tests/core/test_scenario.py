@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym import policies, scenario
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import LAWS, SCENARIOS, Interruption, Streams, Uplink, messages
 from bufgym.scenario.draws import place
 from bufgym.sim import run

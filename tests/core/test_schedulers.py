@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from cases import log, order, trace
 
-from bufgym import files, policies
+from bufgym import policies
+from bufgym.ground import files
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic

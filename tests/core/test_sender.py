@@ -11,7 +11,7 @@ import pytest
 from cases import log, order, same, trace
 
 from bufgym import policies
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic

@@ -10,7 +10,7 @@ import pytest
 
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.sweep import Sweep
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Interruption, Uplink, suites
 
 EMBEDDED = [name for name, suite in suites.SUITES.items() if suite.kind in ("queue", "stress") and not suite.needs]

@@ -5,7 +5,7 @@ import pytest
 from cases import log, order, trace
 
 from bufgym import policies
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, motion_gaps, time_gaps
 from bufgym.model.checks import check_window

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from topic_cases import topic_cases
 
-from bufgym import kernel, policies, sim
+from bufgym import policies, sim
+from bufgym.ground import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, arrival_gain, before, is_first, loss, motion_gaps, time_gaps
 from bufgym.model.buffer import after as slot_after
 from bufgym.model.link import FOREVER

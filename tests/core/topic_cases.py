@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from bufgym import policies, sim
 from bufgym.model import qoi
-from bufgym.model.topics import Topic
-from bufgym.observe import (
+from bufgym.model.observe import (
     CONTEXT_FIELDS,
     SLOT_FIELDS,
     TOPIC_CONTEXT_FIELDS,
@@ -25,6 +24,7 @@ from bufgym.observe import (
     observe_topic_context,
     observe_topic_slots,
 )
+from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
 from bufgym.sim import Senders
 

@@ -10,7 +10,7 @@ from safetensors.numpy import load as tensors_of
 from safetensors.numpy import save as safetensors
 
 from bufgym import policies
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import weights
 from bufgym.policies.learned import Network, Weights
 from bufgym.policies.learned_topics import TopicWeights

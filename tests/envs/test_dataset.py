@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bufgym import expert, oracle
+from bufgym import oracle
 from bufgym.cli import main
-from bufgym.envs import SenderEnv, SenderVectorEnv
-from bufgym.errors import BufgymError
-from bufgym.expert.record import KINDS, record
+from bufgym.envs import SenderEnv, SenderVectorEnv, expert
+from bufgym.envs.expert.record import KINDS, record
+from bufgym.ground.errors import BufgymError
 
 SHORT = {"duration_s": 2.0, "size_bytes": 500_000}
 
@@ -64,7 +64,7 @@ def test_a_data_set_recovers_its_environment(tmp_path: Path, monkeypatch: pytest
 
 def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
     pytest.importorskip("minari")
-    from bufgym.expert import dataset
+    from bufgym.envs.expert import dataset
 
     with pytest.raises(BufgymError, match="for equal sizes only"):
         dataset.make("Uplink-v0", "random", 2, out=tmp_path, size_cv=0.5, **SHORT)

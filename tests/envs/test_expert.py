@@ -10,9 +10,9 @@ from env_cases import valid_action
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym import expert, oracle, policies
-from bufgym.envs import SenderEnv, SenderVectorEnv
-from bufgym.errors import BufgymError
+from bufgym import oracle, policies
+from bufgym.envs import SenderEnv, SenderVectorEnv, expert
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.oracle.online import law, online_optimum

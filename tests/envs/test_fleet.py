@@ -11,9 +11,9 @@ from gymnasium.vector import AutoresetMode
 
 from bufgym import policies
 from bufgym.envs import FleetVecEnv, SenderEnv
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
-from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
+from bufgym.model.observe import CONTEXT_FIELDS, SLOT_FIELDS
 from bufgym.scenario import FleetEpisode, FleetScenario, Streams, messages
 from bufgym.sim.cell import run_fleet
 from bufgym.traces import Trace

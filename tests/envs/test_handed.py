@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from bufgym.envs.observation import Handed, ObservationForm
-from bufgym.observe import CONTEXT_FIELDS, SLOT_FIELDS
+from bufgym.model.observe import CONTEXT_FIELDS, SLOT_FIELDS
 
 FORM = ObservationForm("dict", SLOT_FIELDS, CONTEXT_FIELDS, 3)
 NUMBERS = FORM.numbers

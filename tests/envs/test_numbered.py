@@ -14,8 +14,8 @@ from bufgym import policies
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.envs import SenderEnv, SenderVectorEnv
-from bufgym.errors import BufgymError
-from bufgym.expert import Player
+from bufgym.envs.expert import Player
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Uplink, suites
 from bufgym.scenario.numbered import draw

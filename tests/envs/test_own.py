@@ -12,10 +12,10 @@ from env_cases import SMALL, valid_action
 
 import bufgym
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
-from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import JIT
 from bufgym.model.link import Link
-from bufgym.observe import OWN_FIELDS, OWN_TERMS, field, reward_term
+from bufgym.model.observe import OWN_FIELDS, OWN_TERMS, field, reward_term
 from bufgym.scenario import Episode, Uplink, messages
 from bufgym.sim.metrics import outcome, received
 from bufgym.traces import Trace
@@ -190,7 +190,7 @@ def test_a_fleet_has_them_too() -> None:
 
 
 MODULE = """
-from bufgym.observe import field, reward_term
+from bufgym.model.observe import field, reward_term
 
 @field("from_a_module", per="context")
 def seen(buffer, arrival):

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Streams, Uplink
 from bufgym.scenario.pool import Pool
 from bufgym.traces import Trace

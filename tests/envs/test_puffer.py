@@ -11,7 +11,7 @@ import pufferlib.vector
 
 from bufgym.envs import SenderVectorEnv
 from bufgym.envs.puffer import PufferSenders
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Interruption
 
 N, L = 3, 4

@@ -14,13 +14,13 @@ from gymnasium.utils.env_checker import check_env
 import bufgym
 from bufgym.envs import SenderEnv
 from bufgym.envs.step import step_cells, step_rows
-from bufgym.errors import BufgymError
-from bufgym.kernel import named
-from bufgym.kernel.meanwhile import Meanwhile
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import named
+from bufgym.ground.kernel.meanwhile import Meanwhile
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
 from bufgym.model.link import Link
-from bufgym.observe import FIELDS
+from bufgym.model.observe import FIELDS
 from bufgym.scenario import Episode, Interruption, Scenario, Uplink, messages
 from bufgym.sim import python_view
 from bufgym.traces import Trace, drive_motion

@@ -9,12 +9,12 @@ from env_cases import LINKS, client, same, text, valid_action
 
 from bufgym.envs import SenderEnv, SenderVectorEnv, render
 from bufgym.envs.render import scene
-from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
+from bufgym.model.observe import REWARD_TERMS, TOPIC_REWARD_TERMS
 from bufgym.model.topics import Topic
-from bufgym.observe import REWARD_TERMS, TOPIC_REWARD_TERMS
 from bufgym.scenario import Client, Episode, Stream, messages
 from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, answer_send
 from bufgym.sim.metrics import topic_outcomes

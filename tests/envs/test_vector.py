@@ -12,7 +12,7 @@ from gymnasium.wrappers.vector import DictInfoToList, FlattenObservation, Record
 
 import bufgym
 from bufgym.envs import SenderEnv, SenderVectorEnv
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Scenario, Uplink
 from bufgym.scenario.suites.mixture import SuiteScenario

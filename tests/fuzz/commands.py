@@ -28,7 +28,7 @@ cli.relay.run_async cli.relay_robots.run_async live.validate.validate expert.dat
 
 
 def leave_out_work() -> None:
-    from bufgym.errors import BufgymError
+    from bufgym.ground.errors import BufgymError
 
     def left_out(*given: object, **__: object) -> NoReturn:
         for one in given:

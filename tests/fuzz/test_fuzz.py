@@ -26,7 +26,7 @@ from mutations import COUNT, SEED, limited, mutated
 
 from bufgym import policies
 from bufgym.benchmark import leaderboard, report
-from bufgym.errors import BufgymError, TraceError
+from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.model import qoi
 from bufgym.policies import weights as weight_files
 from bufgym.scenario import Streams, Uplink, read_client

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import pytest
 from loop_cases import pytest_pyfunc_call, runner  # noqa: F401
 
-from bufgym.live import sender
-from bufgym.live.sockets import free_port
+from bufgym.robot import sender
+from bufgym.robot.sockets import free_port
 
 
 @pytest.fixture(autouse=True)

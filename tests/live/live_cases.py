@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from loop_cases import beside
 
-from bufgym.live import PolicyQueue
-from bufgym.live.channels import TRANSPORTS
-from bufgym.live.log import Record
-from bufgym.live.receiver import Received, Receiver
-from bufgym.live.sender import Sender
+from bufgym.robot import PolicyQueue
+from bufgym.robot.channels import TRANSPORTS
+from bufgym.robot.log import Record
+from bufgym.robot.receiver import Received, Receiver
+from bufgym.robot.sender import Sender
 
 LIBRARIES = {"websocket": "websockets", "zenoh": "zenoh", "mqtt": "paho.mqtt", "dds": "cyclonedds"}
 OVER_TCP = [transport for transport in TRANSPORTS if transport != "dds"]

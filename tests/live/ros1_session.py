@@ -11,7 +11,7 @@ from typing import Any
 
 from rosmaster.master import Master
 
-from bufgym import ros1
+from bufgym.robot import ros1
 
 MESSAGES = 60
 """Of each topic; not more than five of them are on their way at a time."""

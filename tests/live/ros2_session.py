@@ -18,7 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-from bufgym.ros2 import Publisher
+from bufgym.robot.ros2 import Publisher
 
 ROBOT = 20 + os.getpid() % 40 * 2
 BASE = ROBOT + 1

@@ -10,10 +10,10 @@ import pytest
 from live_cases import Bench
 
 from bufgym.cli import main
-from bufgym.live import LogFile
-from bufgym.live.sockets import free_port
-from bufgym.live.view import View
 from bufgym.model import qoi
+from bufgym.robot import LogFile
+from bufgym.robot.sockets import free_port
+from bufgym.robot.view import View
 from bufgym.traces.formats import bags
 
 FAST = ["--size", "1000", "--rate", "300", "--duration", "0.1", "--capacity", "64"]

@@ -14,18 +14,18 @@ from live_cases import OVER_TCP, in_order, meeting_port, put, receiving, sending
 from loop_cases import beside, until
 
 from bufgym.cli import live as command
-from bufgym.errors import BufgymError
-from bufgym.live import LogFile, PolicyQueue, read_log, replay
-from bufgym.live import buses as libraries
-from bufgym.live.bus_channel import BusChannel, BusServer
-from bufgym.live.buses import BUSES
-from bufgym.live.channels import TRANSPORTS, TcpChannel
-from bufgym.live.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, Frame, FrameError, header, parse
-from bufgym.live.receiver import Received, Recording, listener
-from bufgym.live.sender import Sender
-from bufgym.live.shaped import ShapedLink
-from bufgym.live.tasks import Tasks
+from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
+from bufgym.robot import LogFile, PolicyQueue, read_log, replay
+from bufgym.robot import buses as libraries
+from bufgym.robot.bus_channel import BusChannel, BusServer
+from bufgym.robot.buses import BUSES
+from bufgym.robot.channels import TRANSPORTS, TcpChannel
+from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, Frame, FrameError, header, parse
+from bufgym.robot.receiver import Received, Recording, listener
+from bufgym.robot.sender import Sender
+from bufgym.robot.shaped import ShapedLink
+from bufgym.robot.tasks import Tasks
 from bufgym.traces import Trace
 
 CUT_S = float(os.environ.get("BUFGYM_CUT_S", "5"))

@@ -10,7 +10,7 @@ from cli_cases import fails
 from loop_cases import compiled
 
 from bufgym.cli import main
-from bufgym.reproduce import figure, run_live
+from bufgym.papers import figure, run_live
 
 SMALL: dict[str, dict[str, Any]] = {
     "robofleet-fig3": {"rates_hz": (10,), "duration_s": 0.5},
@@ -64,7 +64,7 @@ def test_on_an_easy_link_nothing_is_dropped_live_either() -> None:
 def test_the_command_says_how_far_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from bufgym.reproduce.robofleet_fig5 import Reproduction
+    from bufgym.papers.robofleet_fig5 import Reproduction
 
     monkeypatch.setattr(Reproduction, "LIVE", {**Reproduction.LIVE, **SMALL["robofleet-fig5"], "live": 8.0})
     assert main(["reproduce", "robofleet-fig5", "--live", "--out", str(tmp_path)]) == 0

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from bufgym import policies
-from bufgym.errors import BufgymError
-from bufgym.live import programs as live
-from bufgym.live.odometry import Odometry
-from bufgym.live.programs import pose_stamp, programs, publish_in_time, received
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.ros1 import episode as ros1
-from bufgym.ros2 import episode as ros2
+from bufgym.robot import programs as live
+from bufgym.robot.odometry import Odometry
+from bufgym.robot.programs import pose_stamp, programs, publish_in_time, received
+from bufgym.robot.ros1 import episode as ros1
+from bufgym.robot.ros2 import episode as ros2
 from bufgym.scenario import Episode, messages
 from bufgym.traces import Trace
 
@@ -59,7 +59,7 @@ def test_a_program_is_spoken_to_and_may_be_silent() -> None:
 
 PARENT = """
 import multiprocessing, os, signal, sys, threading, time
-from bufgym.live.programs import programs
+from bufgym.robot.programs import programs
 ours = signal.signal
 signal.signal = lambda *what: (time.sleep(float(sys.argv[1])), ours(*what))  # the program's first step
 with programs(idle=lambda parent: threading.Event().wait()):

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from live_cases import Bench
 
 from bufgym import policies
-from bufgym.errors import BufgymError
-from bufgym.live import PolicyQueue, replay
+from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
+from bufgym.robot import PolicyQueue, replay
 
 PLAYABLE = [name for name in policies.names() if policies.get(name).ranked]
 ONE_QUEUE = [name for name in policies.names(for_topics=False) if policies.get(name).ranked]

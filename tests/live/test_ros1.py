@@ -17,14 +17,13 @@ from live_cases import VALIDATE, as_simulated
 from loop_cases import compiled
 from ros1_cases import played
 
-from bufgym import ros1
-from bufgym.errors import BufgymError
-from bufgym.live import PolicyQueue, replay
-from bufgym.live.log import of, read_log
-from bufgym.live.odometry import Odometry
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import get
-from bufgym.ros1.__main__ import main as command
-from bufgym.ros1.connection import PolicyConnection
+from bufgym.robot import PolicyQueue, replay, ros1
+from bufgym.robot.log import of, read_log
+from bufgym.robot.odometry import Odometry
+from bufgym.robot.ros1.__main__ import main as command
+from bufgym.robot.ros1.connection import PolicyConnection
 from bufgym.traces import MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses, unit
 
@@ -78,7 +77,7 @@ def test_without_ros_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     monkeypatch.setitem(sys.modules, "rospy", None)
     with pytest.raises(BufgymError, match=r"bufgym\.ros1 needs rospy: .* python3-rospy"):
         ros1.install("afr")
-    fails([*VALIDATE[1:], "ros1"], "bufgym.ros1 needs rospy", capsys)
+    fails([*VALIDATE[1:], "ros1"], "bufgym.robot.ros1 needs rospy", capsys)
 
 
 @pytest.fixture
@@ -107,7 +106,7 @@ def test_the_command_names_what_is_wrong(
 ) -> None:
     assert command(options) == 2
     told = capsys.readouterr().err
-    assert told.startswith("bufgym.ros1: error: ") and words in told and told.count("\n") == 1
+    assert told.startswith("bufgym.robot.ros1: error: ") and words in told and told.count("\n") == 1
 
 
 def test_the_node_finds_itself_as_if_run_alone(topics: Any, tmp_path: Path) -> None:

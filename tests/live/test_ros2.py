@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from live_cases import VALIDATE, as_simulated
 from ros1_cases import played
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
-from bufgym.live import replay
-from bufgym.live.frames import FrameError
-from bufgym.live.log import of, read_log
-from bufgym.ros2.names import Published, parse
-from bufgym.ros2.relay import Robot
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import JIT
+from bufgym.robot import replay
+from bufgym.robot.frames import FrameError
+from bufgym.robot.log import of, read_log
+from bufgym.robot.ros2.names import Published, parse
+from bufgym.robot.ros2.relay import Robot
 from bufgym.scenario import read_client
 
 REPO = Path(__file__).resolve().parents[2]
@@ -110,5 +110,5 @@ def test_the_command_names_what_is_wrong(
     fails(["ros2", "send", "--config", str(config), "--policies", "oracle"], "oracle", capsys)
     monkeypatch.setitem(sys.modules, "rclpy", None)
     for words in (["receive", "--port", "0"], ["send", "--config", str(config)]):
-        fails(["ros2", *words], "bufgym.ros2 needs rclpy", capsys)
-    fails([*VALIDATE[1:], "ros2"], "bufgym.ros2 needs rclpy", capsys)
+        fails(["ros2", *words], "bufgym.robot.ros2 needs rclpy", capsys)
+    fails([*VALIDATE[1:], "ros2"], "bufgym.robot.ros2 needs rclpy", capsys)

@@ -14,14 +14,14 @@ from live_cases import OVER_TCP, in_order, meeting_port
 from loop_cases import compiled
 
 from bufgym import policies
-from bufgym.errors import BufgymError
-from bufgym.live import PolicyQueue, replay, shaped
-from bufgym.live.log import Record
-from bufgym.live.runs import Run, orders, save, table
-from bufgym.live.shaped import ShapedLink
-from bufgym.live.validate import over, play, validate
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
+from bufgym.robot import PolicyQueue, replay, shaped
+from bufgym.robot.log import Record
+from bufgym.robot.runs import Run, orders, save, table
+from bufgym.robot.shaped import ShapedLink
+from bufgym.robot.validate import over, play, validate
 from bufgym.scenario import Episode, Uplink, messages
 from bufgym.traces import Trace
 
@@ -111,7 +111,7 @@ async def test_nothing_is_compiled_while_the_episodes_time_runs(monkeypatch: pyt
             done.append("put")
             return super().put(*arguments, **settings)
 
-    monkeypatch.setattr("bufgym.live.validate.PolicyQueue", Queue)
+    monkeypatch.setattr("bufgym.robot.validate.PolicyQueue", Queue)
     monkeypatch.setattr(ShapedLink, "begin", lambda link: done.append("begin"))
     await live(fade(2, size_bytes=1000))
     assert done == ["put", "begin", "put", "put"]
@@ -158,7 +158,7 @@ def test_orders_by_hand() -> None:
 def report() -> Any:
     pytest.importorskip("jinja2", reason="the page needs Jinja")
     pytest.importorskip("plotly", reason="the page needs plotly")
-    from bufgym.live import report as live
+    from bufgym.robot import report as live
 
     return live
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bufgym.perception.frames import Camera, Depth, Image, Sequence
+from bufgym.papers.perception.frames import Camera, Depth, Image, Sequence
 
 cv2 = pytest.importorskip("cv2", reason="the extra perception is not installed")
 

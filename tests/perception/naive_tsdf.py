@@ -1,10 +1,10 @@
-"""Slow and obvious twins of the kernels in bufgym/perception/tsdf.py and icp.py."""
+"""Slow and obvious twins of the kernels in bufgym/papers/perception/tsdf.py and icp.py."""
 
 import numpy as np
 
-from bufgym.perception.frames import Camera, Depth
-from bufgym.perception.mapping import FAR_M, Grid
-from bufgym.perception.tsdf import NEAR_M
+from bufgym.papers.perception.frames import Camera, Depth
+from bufgym.papers.perception.mapping import FAR_M, Grid
+from bufgym.papers.perception.tsdf import NEAR_M
 
 
 def integrate(grid: Grid, depth: Depth, camera: Camera, pose: np.ndarray, tsdf: np.ndarray, weight: np.ndarray) -> None:

@@ -9,9 +9,9 @@ import frame_cases
 import numpy as np
 import pytest
 
-from bufgym.errors import BufgymError
-from bufgym.perception.extra import library
-from bufgym.perception.frames import Camera, encoded_bytes, open_sequence
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.perception.extra import library
+from bufgym.papers.perception.frames import Camera, encoded_bytes, open_sequence
 
 LAYOUTS = {"tum": frame_cases.tum, "7-scenes": frame_cases.seven_scenes, "packed": frame_cases.packed}
 

@@ -5,9 +5,9 @@ import naive_tsdf
 import numpy as np
 import pytest
 
-from bufgym.errors import BufgymError
-from bufgym.perception.frames import Camera
-from bufgym.perception.mapping import COVERED_M, Grid, Map, error, fuse, grid_of
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.perception.frames import Camera
+from bufgym.papers.perception.mapping import COVERED_M, Grid, Map, error, fuse, grid_of
 
 pytestmark = pytest.mark.kernels
 CAMERA = Camera(8, 6, 4.0, 4.0, 3.5, 2.5)

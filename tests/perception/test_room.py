@@ -6,11 +6,11 @@ import frame_cases  # noqa: F401  skips where the extra is absent
 import numpy as np
 import pytest
 
-from bufgym.errors import BufgymError
-from bufgym.perception import rays
-from bufgym.perception.mapping import grid_of
-from bufgym.perception.rays import BASELINE_M
-from bufgym.perception.room import FREE_M, Room, Scene, room
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.perception import rays
+from bufgym.papers.perception.mapping import grid_of
+from bufgym.papers.perception.rays import BASELINE_M
+from bufgym.papers.perception.room import FREE_M, Room, Scene, room
 from bufgym.traces.poses import Poses
 
 # In the middle of a room of 6 x 4 x 2 m, looking along +x: z of the camera is the world's x, x its -y, y its -z.

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from bufgym import scenario, sim
-from bufgym.errors import BufgymError
-from bufgym.perception import streams
-from bufgym.perception.frames import Camera, Depth, Image, Sequence
-from bufgym.perception.orb import OrbSimilarity, decision_ms, orbbuf_by
-from bufgym.perception.views import Coverage, overlap_information, seen_shares
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.perception import streams
+from bufgym.papers.perception.frames import Camera, Depth, Image, Sequence
+from bufgym.papers.perception.orb import OrbSimilarity, decision_ms, orbbuf_by
+from bufgym.papers.perception.views import Coverage, overlap_information, seen_shares
 from bufgym.policies import get
 from bufgym.scenario.numbered import draw
 from bufgym.traces import Trace
@@ -111,7 +111,7 @@ def test_with_motion_for_images_it_decides_as_orbbuf() -> None:
 
 def test_images_are_like_themselves_less_like_what_moved_and_hardly_like_others() -> None:
     pytest.importorskip("cv2")
-    from bufgym.perception.room import room
+    from bufgym.papers.perception.room import room
 
     # Squares of noise, which have corners.
     noise = np.random.default_rng(0).integers(0, 255, (2, 30, 40), np.uint8).repeat(8, 1).repeat(8, 2)

@@ -6,13 +6,13 @@ import frame_cases
 import numpy as np
 import pytest
 
-from bufgym.errors import BufgymError
-from bufgym.perception import icp
-from bufgym.perception.frames import Camera, Sequence
-from bufgym.perception.mapping import Grid, Map, fuse, lens_of
-from bufgym.perception.room import Room, room
-from bufgym.perception.tracking import Tracker, TrackingSettings, difference, smoothed, track
-from bufgym.perception.tsdf import raycast
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.perception import icp
+from bufgym.papers.perception.frames import Camera, Sequence
+from bufgym.papers.perception.mapping import Grid, Map, fuse, lens_of
+from bufgym.papers.perception.room import Room, room
+from bufgym.papers.perception.tracking import Tracker, TrackingSettings, difference, smoothed, track
+from bufgym.papers.perception.tsdf import raycast
 
 CAMERA = Camera(8, 6, 4.0, 4.0, 3.5, 2.5)
 NOWHERE = np.zeros((6, 8), np.float32)

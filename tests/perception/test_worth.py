@@ -6,12 +6,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import JIT
 
 pytest.importorskip("cv2", reason="the extra perception is not installed")
 pytest.importorskip("rvl", reason="the extra perception is not installed")
-from bufgym.perception import streams, views, worth
+from bufgym.papers.perception import streams, views, worth
 
 pytestmark = pytest.mark.skipif(not JIT, reason="without compilation a room takes minutes to draw")
 

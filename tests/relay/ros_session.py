@@ -14,7 +14,7 @@ from typing import Any
 from loop_cases import beside, until
 from relay_cases import relay, settings
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.relay.session import Session
 from bufgym.relay.wire import Message
 

@@ -6,7 +6,7 @@ import pytest
 import relay_cases  # noqa: F401  (skips where the extra is missing)
 
 from bufgym import cli
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.relay.config import Config, Foxglove, Rotation, Rule, load
 
 REPO = Path(__file__).resolve().parents[2]

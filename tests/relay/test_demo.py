@@ -18,12 +18,12 @@ from loop_cases import beside, until
 from relay_cases import client, nothing
 
 from bufgym.cli import main
-from bufgym.errors import BufgymError
-from bufgym.live.sockets import free_port
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
 from bufgym.policies.registry import Policy
 from bufgym.relay import demo, policies
 from bufgym.relay.session import Session
+from bufgym.robot.sockets import free_port
 
 
 async def test_the_page_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from relay_cases import ALL, client, relay, settings
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.relay.audit import FILE, Audit
 from bufgym.relay.config import Rotation, Rule
 from bufgym.relay.recorder import FOLDER, Recorder

@@ -13,7 +13,7 @@ pytest.importorskip("foxglove", reason="no foxglove here: the extra foxglove")
 from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.relay import ros_messages
 from bufgym.relay.config import Foxglove, Rule
 from bufgym.relay.foxglove import Bridge, Screen

@@ -14,7 +14,7 @@ import pytest
 from relay_cases import client, relay, settings
 from websockets.exceptions import WebSocketException
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.relay import identity
 from bufgym.relay.config import Rule, Tls, Tokens
 

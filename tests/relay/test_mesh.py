@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 from relay_cases import Client, client, nothing, process, relay, settings
 
-from bufgym.live.sockets import free_port
 from bufgym.relay.config import Mesh, Rule
 from bufgym.relay.server import Server
 from bufgym.relay.wire import Message
+from bufgym.robot.sockets import free_port
 
 pytest.importorskip("zenoh", reason="no Zenoh here: the extra zenoh")
 

@@ -15,11 +15,11 @@ import pytest
 from loop_cases import beside, until
 from relay_cases import Corner, client, nothing, process, relay, settings
 
-from bufgym.errors import BufgymError
-from bufgym.live.sockets import free_port
+from bufgym.ground.errors import BufgymError
 from bufgym.relay import session
 from bufgym.relay.config import Rule, Store
 from bufgym.relay.session import Session
+from bufgym.robot.sockets import free_port
 
 CONFIG = settings(store=Store(window=2, messages=4))
 KILLS = int(os.environ.get("BUFGYM_KILLS", "2"))

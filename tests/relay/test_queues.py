@@ -3,7 +3,7 @@
 import pytest
 from relay_cases import Corner, Server, relay, settings
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.relay import policies
 from bufgym.relay.config import POLICIES, Config
 from bufgym.relay.patterns import MAX_CHARACTERS, pattern

@@ -10,8 +10,7 @@ import pytest
 from loop_cases import beside, compiled, until
 from relay_cases import Corner, relay, settings
 
-from bufgym.errors import BufgymError
-from bufgym.live.shaped import ShapedLink
+from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
 from bufgym.relay import session
@@ -19,6 +18,7 @@ from bufgym.relay.client import Client
 from bufgym.relay.session import RefusedError, Session, security, token
 from bufgym.relay.unanswered import Unanswered
 from bufgym.relay.wire import Message
+from bufgym.robot.shaped import ShapedLink
 from bufgym.traces import Trace
 
 

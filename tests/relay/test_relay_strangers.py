@@ -16,7 +16,7 @@ from relay_cases import Server, client, connect, relay, settings, stranger
 from test_identity import Issuer
 from websockets.exceptions import WebSocketException
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.relay import identity, outbox, pages, wire
 from bufgym.relay.config import Limits, Rule
 from bufgym.relay.wire import Message

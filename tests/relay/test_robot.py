@@ -14,7 +14,7 @@ import pytest
 from loop_cases import beside, compiled, until
 from relay_cases import Corner, settings
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.relay import robot, ros_messages, wire

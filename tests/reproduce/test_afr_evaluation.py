@@ -6,12 +6,11 @@ from typing import Any
 
 import pytest
 
-from bufgym import reproduce
 from bufgym.benchmark.run import draw
 from bufgym.cli import main
-from bufgym.errors import BufgymError
-from bufgym.reproduce import NEEDS_DATA, afr_fig8_gap, figure, run
-from bufgym.reproduce import afr_evaluation as common
+from bufgym.ground.errors import BufgymError
+from bufgym.papers import NEEDS_DATA, afr_fig8_gap, figure, run
+from bufgym.papers import afr_evaluation as common
 from bufgym.scenario.suites import motion_value
 from bufgym.traces import Trace, write_csv
 

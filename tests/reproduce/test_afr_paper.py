@@ -11,7 +11,7 @@ from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
-from bufgym.reproduce import afr_fig2, afr_fig4, afr_fig5, afr_fig9, afr_theorems, afr_vs_random
+from bufgym.papers import afr_fig2, afr_fig4, afr_fig5, afr_fig9, afr_theorems, afr_vs_random
 from bufgym.scenario import Interruption
 
 # Typed from the paper's figure: (T, dropped, r, c, p) with L = 8, the state after the decision. At T = 16 the pass is

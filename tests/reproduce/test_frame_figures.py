@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bufgym.reproduce import afr_fig7, afr_fig8, afr_overlap, frame_tasks
-from bufgym.reproduce.correlation import spearman, spearman_over
-from bufgym.reproduce.frame_tasks import Store, Task, carry_out
-from bufgym.reproduce.rows import Rows
+from bufgym.papers import afr_fig7, afr_fig8, afr_overlap, frame_tasks
+from bufgym.papers.correlation import spearman, spearman_over
+from bufgym.papers.frame_tasks import Store, Task, carry_out
+from bufgym.papers.rows import Rows
 from bufgym.traces import Trace
 
 LINK = Trace.constant(1e6, 10.0, name="link")

@@ -10,11 +10,11 @@ import pytest
 from cli_cases import fails
 
 from bufgym.cli import main
-from bufgym.errors import BufgymError
-from bufgym.kernel import JIT
-from bufgym.reproduce import FIGURES, afr_fig5, page, run
-from bufgym.reproduce.figure import statements
-from bufgym.reproduce.page import claim_rows
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import JIT
+from bufgym.papers import FIGURES, afr_fig5, page, run
+from bufgym.papers.figure import statements
+from bufgym.papers.page import claim_rows
 
 LTE = {"trace": "lte-synthetic-0"}
 SHORT: dict[str, Any] = {**LTE, "frames": 40, "capacities": (2, 4), "runs": 2, "sweep_kb": (500,)}

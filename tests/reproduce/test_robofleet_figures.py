@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
-from bufgym.reproduce import figure
-from bufgym.reproduce.robofleet_evaluation import BYTES, Sent, cloud_bytes, send, stream
-from bufgym.reproduce.robofleet_fig4 import length_for, recovery_s
-from bufgym.reproduce.robofleet_table1 import PAPER
+from bufgym.papers import figure
+from bufgym.papers.robofleet_evaluation import BYTES, Sent, cloud_bytes, send, stream
+from bufgym.papers.robofleet_fig4 import length_for, recovery_s
+from bufgym.papers.robofleet_table1 import PAPER
 from bufgym.scenario import Stream
 from bufgym.traces import Trace
 
@@ -89,7 +89,7 @@ def test_sizes_are_table1s() -> None:
     assert all(BYTES[kind] == PAPER[kind] for kind in set(BYTES) & set(PAPER))
     pytest.importorskip("rosbags")
     pytest.importorskip("flatbuffers")
-    from bufgym.reproduce.encodings import sizes
+    from bufgym.papers.encodings import sizes
 
     for points in (100, 10_000):
         encoded = sizes("PointCloud2", points=points)

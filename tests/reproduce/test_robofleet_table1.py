@@ -16,10 +16,10 @@ pytest.importorskip("flatbuffers", reason="extra robofleet")
 from flatbuffers.number_types import Float32Flags
 from flatbuffers.table import Table
 
-from bufgym.errors import BufgymError, install
-from bufgym.reproduce import encodings
-from bufgym.reproduce.encodings import ENCODINGS, KINDS, content, encode, sizes, stores
-from bufgym.reproduce.robofleet_table1 import PAPER, Reproduction, fitted, of_paper
+from bufgym.ground.errors import BufgymError, install
+from bufgym.papers import encodings
+from bufgym.papers.encodings import ENCODINGS, KINDS, content, encode, sizes, stores
+from bufgym.papers.robofleet_table1 import PAPER, Reproduction, fitted, of_paper
 
 HEADER = 4 + 8 + 4  # seq, stamp, length of frame_id
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from link_files import SAMPLES, written
 
-from bufgym.errors import BufgymError, TraceError
+from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces import load, members, read_trace
 from bufgym.traces.datasets import unpack as unpacking
 from bufgym.traces.datasets.unpack import unpack

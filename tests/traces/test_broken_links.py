@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from link_files import HEADER, UCC_HEADER, written
 
-from bufgym.errors import BufgymError, TraceError
+from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces import FORMATS, read_trace
 from bufgym.traces.formats import links, mahimahi
 from bufgym.traces.formats import text as text_files

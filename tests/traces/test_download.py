@@ -18,7 +18,7 @@ from urllib.request import Request
 import pytest
 from http_server import DATA, HASTY, SHA256, Site, get, left
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.datasets import connection
 from bufgym.traces.datasets import download as downloading
 from bufgym.traces.datasets.download import Patience, download

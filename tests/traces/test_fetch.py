@@ -13,7 +13,7 @@ from cli_cases import Capsys, Patch, fails, shown
 from http_server import DATA, SHA256, Site, get, left, of
 
 from bufgym.cli import main
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.datasets import table
 from bufgym.traces.datasets.fetch import cache_folder, fetch_dataset
 from bufgym.traces.datasets.table import Remote, datasets

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from cli_cases import Capsys, fails, shown
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import suites
 from bufgym.scenario.suites.synthetic import both_values
 from bufgym.traces import write_csv

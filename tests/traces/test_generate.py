@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym import traces
-from bufgym.errors import BufgymError, TraceError
+from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces import describe, load, load_motion, outage, read_motion, read_trace, synthetic_lte
 from bufgym.traces.generate.driving import Driving, drive_motion
 from bufgym.traces.generate.frames import FrameModel, frame_sizes

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from link_files import written
 
-from bufgym.errors import BufgymError, TraceError
+from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces import Motion, MotionSettings, Poses, motion_from_poses, read_motion, write_motion_csv
 from bufgym.traces.formats.trajectories import detect_pose_format, read_poses
 from bufgym.traces.poses import angles, quaternions, rotations, slerp

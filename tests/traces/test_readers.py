@@ -10,7 +10,7 @@ from cli_cases import fails, shown
 from link_files import HEADER, SAMPLES, UCC_HEADER, knots, written
 
 from bufgym.cli import main
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces import detect_format, read_trace
 from bufgym.traces.formats import mahimahi
 

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_files import written
 
-from bufgym.errors import BufgymError, TraceError, where
+from bufgym.ground.errors import BufgymError, TraceError, where
 from bufgym.traces import Trace, describe, difference, read_trace, write_csv, write_mahimahi
 
 # 2 s at 1 MB/s, 1 s of nothing, 1 s at 0.3 MB/s.

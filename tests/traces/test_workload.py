@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from bufgym import policies, scenario
 from bufgym.benchmark import drops
-from bufgym.errors import BufgymError, TraceError
+from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces import Motion, Trace, Workload, read_workload_csv, write_workload_csv
 from bufgym.traces.formats.recordings import read_workload
 

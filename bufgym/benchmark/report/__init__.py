@@ -11,8 +11,8 @@ from pathlib import Path
 from bufgym.benchmark.folder import Run, read
 from bufgym.benchmark.report import page, tables
 from bufgym.benchmark.summary import Summary
-from bufgym.errors import BufgymError
-from bufgym.files import replaced
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import replaced
 
 __all__ = ["markdown", "plain", "write"]
 

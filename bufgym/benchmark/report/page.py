@@ -15,7 +15,7 @@ from bufgym.benchmark.report.charts import Chart, Context
 from bufgym.benchmark.report.timeline import timeline
 from bufgym.benchmark.score import DISCRIMINATIVE, CellScore
 from bufgym.benchmark.summary import Summary, title
-from bufgym.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, install
 
 CHARTS = (charts.ranking, charts.capacities, charts.outages, costs.delays, timeline, costs.memory)
 """Functions that make the charts; each returns None if the run has nothing to show."""

@@ -14,7 +14,7 @@ from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import Quantity, Run, Summary, by_run, summarise
 from bufgym.benchmark.table import decimal, percent, score
 from bufgym.benchmark.tasks.task import Result, Task, counted
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.oracle.measure import TIE
 from bufgym.policies import Policy, get, names
 from bufgym.scenario import FleetEpisode, FleetScenario

@@ -13,7 +13,7 @@ from bufgym.benchmark.table import REGRET_AT_MOST, percent, score
 from bufgym.benchmark.tasks import bound, timeline
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.benchmark.tuned import tuned
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.policies import Policy, names
 from bufgym.scenario import Episode

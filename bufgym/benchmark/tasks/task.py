@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from bufgym.benchmark.rows import Layout, Row
 from bufgym.benchmark.summary import Quantity, Summary
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy
 from bufgym.scenario.suites import Setting
 

@@ -14,7 +14,7 @@ from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import KEY, Quantity, Summary, by_run, summarise, title
 from bufgym.benchmark.table import Column, Rows, decimal, in_blocks, mean, percent, score, written
 from bufgym.benchmark.tasks.task import Result, Task, counted
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, names
 from bufgym.scenario import Client, Episode
 from bufgym.sim import Senders, run

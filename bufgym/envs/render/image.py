@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.render.scene import DROPPED, NEWCOMER, QUEUED, SENDING, STATES, Scene, letter, link_rates, scene_of
-from bufgym.errors import install
+from bufgym.ground.errors import install
 from bufgym.sim import Senders
 
 COLOURS = ("#2a9d5c", "#2f6fde", "#e0a100", "#d1495b", "#8e3bb8")

@@ -11,7 +11,7 @@ of robots. Messages of one queue have equal sizes, so that the clairvoyant's bou
 
 from __future__ import annotations
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario.suites import recorded, shared_uplinks, stress, synthetic
 from bufgym.scenario.suites.suite import CAPACITIES, SPLITS, Setting, Suite
 from bufgym.scenario.suites.synthetic import EPISODE_S, RATE_HZ, SIZE_BYTES, motion_value, time_value

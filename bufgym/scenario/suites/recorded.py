@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario.suites.suite import Build, Setting, Suite
 from bufgym.scenario.suites.synthetic import SIZE_BYTES, TRACES, both_sizes, both_values
 from bufgym.traces import Motion, read_motion, read_trace

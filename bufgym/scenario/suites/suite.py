@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 SPLITS = ("train", "validation", "test")
 

@@ -19,7 +19,7 @@ from typing import IO, Any
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 MAX_HEAD_BYTES = 2**20
 """Most bytes of headers, or of trailers."""

@@ -26,7 +26,7 @@ from typing import IO, Final, TypeAlias
 from urllib.parse import urlsplit
 
 from bufgym import __version__
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.datasets.connection import BrokenError, in_words, opened
 
 Progress: TypeAlias = "Callable[[int, int | None], None]"

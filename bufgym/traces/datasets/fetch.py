@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from bufgym import files
-from bufgym.errors import BufgymError, where
+from bufgym.ground import files
+from bufgym.ground.errors import BufgymError, where
 from bufgym.traces.datasets.download import Patience, Progress, discard, disk, download, refuse_page
 from bufgym.traces.datasets.table import Dataset, Remote, datasets
 from bufgym.traces.datasets.unpack import ending, unpack

@@ -21,8 +21,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, Final
 
-from bufgym.errors import BufgymError, where
-from bufgym.files import unpacked_limit
+from bufgym.ground.errors import BufgymError, where
+from bufgym.ground.files import unpacked_limit
 from bufgym.traces.datasets.connection import in_words
 from bufgym.traces.datasets.download import disk
 

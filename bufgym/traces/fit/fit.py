@@ -29,7 +29,7 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.fit.statistics import (
     LOW_BYTES_PER_S,
     Rows,

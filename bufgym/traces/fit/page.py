@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.fit.compare import KS_DISTANCE, SETS, HeldOut, Row, compare, generated_sets, held_out
 from bufgym.traces.fit.statistics import Rows, autocorrelation, outage_gaps, outage_lengths
 from bufgym.traces.formats.faults import os_errors

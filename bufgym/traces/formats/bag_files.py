@@ -20,7 +20,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import IO, Any, Final
 
-from bufgym.files import read_utf8, unpacked_limit
+from bufgym.ground.files import read_utf8, unpacked_limit
 from bufgym.traces.formats.bag_poses import Channel
 
 # A chunk of a recording has some MB, a robot some hundred topics; more is a mistake, or a bomb.

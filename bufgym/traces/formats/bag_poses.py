@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.trajectories import MAX_POSITION_M, NORM_TOLERANCE
 from bufgym.traces.poses import Poses, unit

@@ -26,7 +26,7 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, install
 from bufgym.traces.formats.bag_files import MAX_TOPICS, SOURCES, Message
 from bufgym.traces.formats.bag_poses import PoseCollector
 from bufgym.traces.formats.faults import StrPath, fault, os_errors

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 
-from bufgym.errors import TraceError, where
+from bufgym.ground.errors import TraceError, where
 
 StrPath = str | PathLike[str]
 
@@ -14,7 +14,7 @@ StrPath = str | PathLike[str]
 def fault(
     path: StrPath, rule: str, *, line: int | None = None, value: object | None = None, field: str | None = None
 ) -> TraceError:
-    """Make the error about a file; arguments are as in `bufgym.errors.where`."""
+    """Make the error about a file; arguments are as in `bufgym.ground.errors.where`."""
     return TraceError(where(path, line, value, rule, field=field))
 
 

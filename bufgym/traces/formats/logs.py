@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import Final, NoReturn
 
-from bufgym.errors import TraceError
+from bufgym.ground.errors import TraceError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots
 from bufgym.traces.formats.tables import MAX_MBIT_PER_S

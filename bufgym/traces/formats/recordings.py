@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats import bags
 from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.links import trace_name

@@ -17,8 +17,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
-from bufgym.errors import TraceError
-from bufgym.files import replaced
+from bufgym.ground.errors import TraceError
+from bufgym.ground.files import replaced
 from bufgym.traces.formats.archives import ZIP_MAGIC, damage_errors, open_member, split_member
 from bufgym.traces.formats.faults import StrPath, fault, os_errors
 

@@ -22,7 +22,7 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.text import Line, open_text, split_cells
 from bufgym.traces.poses import Poses, quaternions, unit

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.motions import MAX_COORDINATE

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.trace import Float64Array
 
 # Uniforms that make one nearly normal number: the variance of twelve is 1.

@@ -7,7 +7,7 @@ from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate.draws import stream
 from bufgym.traces.motion import Motion, MotionSettings
 from bufgym.traces.trace import US_PER_S

@@ -18,7 +18,7 @@ from typing import Annotated
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate.draws import NORMAL_UNIFORMS, nearly_normal, stream
 from bufgym.traces.generate.ranges import Between, check_ranges
 from bufgym.traces.motion import Motion

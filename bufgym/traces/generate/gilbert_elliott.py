@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate.draws import stream
 from bufgym.traces.generate.ranges import checked
 from bufgym.traces.trace import US_PER_S, Trace

@@ -23,7 +23,7 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate.draws import NORMAL_UNIFORMS, stream
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Trace
 

@@ -30,7 +30,7 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate.draws import NORMAL_UNIFORMS, nearly_normal, second_stream, stream
 from bufgym.traces.generate.parameters import DEVIATIONS, SHOULDER_S, LinkParameters, OutageParameters, fitted_links
 from bufgym.traces.generate.ranges import checked

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault, os_errors
 from bufgym.traces.formats.text import write_text
 from bufgym.traces.generate.ranges import Between, check_ranges, checked, is_finite

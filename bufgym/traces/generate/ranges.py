@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, get_type_hints
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 
 
 class Between(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate.ranges import checked
 from bufgym.traces.trace import US_PER_S, After, Trace
 

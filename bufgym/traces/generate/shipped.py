@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from bufgym.errors import BufgymError
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, os_errors
 from bufgym.traces.formats.motions import write_motion_csv
 from bufgym.traces.formats.writers import write_csv

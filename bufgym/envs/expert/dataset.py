@@ -1,0 +1,130 @@
+"""Minari data sets of bufgym's environments (extra ``dataset``), recorded from the native batch."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from bufgym.envs import SenderVectorEnv
+from bufgym.envs.expert.record import KINDS, ROWS, record
+from bufgym.ground.errors import BufgymError, install
+
+VARIABLE = "MINARI_DATASETS_PATH"
+"""Environment variable for the folder of Minari's data sets; unset, ``~/.minari/datasets``."""
+
+
+def make(
+    env: str = "bufgym/Uplink-v0",
+    kind: str = "expert",
+    episodes: int = 100,
+    *,
+    name: str | None = None,
+    out: str | Path | None = None,
+    medium: str = "afr",
+    seed: int = 0,
+    regret: bool = True,
+    **options: Any,
+) -> str:
+    """Record ``episodes`` and write them as one Minari data set; return its id, for ``minari.load_dataset``.
+
+    The data set appears whole or not at all. Infos hold ``action_mask``, ``qoi`` and ``regret``; entry t of ``regret``
+    is about action t. ``options`` are the environment's, as text or numbers, since the data set stores them.
+
+    Args:
+        env: the environment's id.
+        kind: who plays, one of ``KINDS``.
+        episodes: number of episodes.
+        name: the id; None for ``bufgym/<environment>/<kind>-v0``.
+        out: folder of data sets; None for Minari's own (``VARIABLE``).
+        medium: the policy of "medium", and of a third of the episodes of "mixed".
+        seed: seed of the batch, as in ``reset``.
+        regret: whether to compute each decision's regret, which takes most of the time; equal sizes only.
+    """
+    try:
+        import minari
+        import pyarrow  # noqa: F401  (Minari's storage format here)
+        from minari import namespace as namespaces
+        from minari.data_collector import EpisodeBuffer
+    except ImportError as error:
+        raise BufgymError(f"data sets need {error.name}: {install('dataset')}") from None
+    env = env if "/" in env else f"bufgym/{env}"
+    known = [id for id in gym.registry if id.startswith("bufgym/")]
+    if env not in known:
+        raise BufgymError(f"unknown environment {env!r}; known: {', '.join(known)}")
+    if kind not in KINDS:
+        raise BufgymError(f"kind = {kind!r}: must be one of {', '.join(KINDS)}")
+    name = name or f"{env.lower().rsplit('-', 1)[0]}/{kind}-v0"
+    single: Any = gym.make(env, **options)
+    try:
+        single.spec.to_json()
+    except (TypeError, ValueError):
+        raise BufgymError("options: give them as text or numbers, so that the environment can be recovered") from None
+    envs = SenderVectorEnv(min(episodes, ROWS), **{**gym.spec(env).kwargs, **options, "info": "none"})
+
+    def buffers() -> Iterator[Any]:
+        recorded = record(envs, kind, episodes, medium=medium, seed=seed, regret=regret)
+        for number, episode in enumerate(recorded):
+            infos: dict[str, Any] = {"action_mask": episode.action_mask, "qoi": episode.qoi.tolist()}
+            if episode.regret is not None:
+                infos["regret"] = episode.regret.tolist()
+            T = len(episode.actions)
+            yield EpisodeBuffer(
+                id=number,
+                options={"player": episode.player},
+                observations=episode.observations,
+                actions=episode.actions,
+                rewards=episode.rewards,
+                terminations=[False] * (T - 1) + [True],
+                truncations=[False] * T,
+                infos=infos,
+            )
+
+    # For a relative folder Minari writes Arrow files beside it.
+    root = Path(out or os.environ.get(VARIABLE) or Path.home() / ".minari" / "datasets").absolute()
+    if (root / name).exists():
+        raise BufgymError(f"{root / name}: exists already; remove it or give another --name")
+    root.mkdir(parents=True, exist_ok=True)
+    players = {"expert": "clairvoyant", "medium": medium, "random": "random", "mixed": f"clairvoyant, {medium}, random"}
+    with tempfile.TemporaryDirectory(prefix=".bufgym-", dir=root) as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # Minari asks for an author and the like
+        with _datasets_in(folder):
+            try:
+                minari.create_dataset_from_buffers(
+                    name,
+                    buffers(),
+                    env=single,
+                    algorithm_name=players[kind],
+                    description=f"bufgym: {players[kind]} in {env}, {options or 'default settings'}, seed {seed}",
+                    data_format="arrow",
+                    requirements=["bufgym"],
+                )
+            except ValueError as error:
+                if "dataset ID" not in str(error):
+                    raise
+                raise BufgymError(f"--name {name}: must be of the form (namespace/)name-v0") from None
+        with _datasets_in(root):
+            namespace = name.rpartition("/")[0]
+            if namespace and namespace not in namespaces.list_local_namespaces():
+                namespaces.create_namespace(namespace)
+        os.replace(Path(folder) / name, root / name)
+    return name
+
+
+@contextlib.contextmanager
+def _datasets_in(folder: str | Path) -> Iterator[None]:
+    """Make Minari read and write in ``folder`` while the block runs."""
+    before = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = str(folder)
+    try:
+        yield
+    finally:
+        del os.environ[VARIABLE]
+        if before is not None:
+            os.environ[VARIABLE] = before

@@ -1,0 +1,79 @@
+"""Policies as experts: the action that a policy would choose in an environment's state."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import policies
+from bufgym.envs.expert.player import Player
+from bufgym.envs.fleet_rows import FleetRows
+from bufgym.envs.rows import Rows
+from bufgym.ground.errors import BufgymError
+from bufgym.oracle import law, online_optimum
+from bufgym.policies import Policy
+from bufgym.scenario import Interruption
+
+_STATE = ("next", "evictions", "now_us", "dequeued", "waiting")
+"""Fields of SENDER that tell one decision of an episode from the next."""
+
+
+def rows_of(env: Any) -> Rows:
+    """The rows of a bufgym environment, below its wrappers and the adapter of stable-baselines3."""
+    env = getattr(env, "envs", env)
+    rows = getattr(getattr(env, "unwrapped", env), "rows", None)
+    if not isinstance(rows, Rows):
+        raise BufgymError(f"expert: {env!r} is no environment of bufgym, nor a native batch of them")
+    return rows
+
+
+class PolicyExpert:
+    """One policy, asked about the decisions of an environment that anybody may play.
+
+    Ask at every decision, so that the policy's memory misses nothing. Asked twice, it gives the same answer.
+    """
+
+    def __init__(self, env: Any, policy: Policy) -> None:
+        self.rows = rows_of(env)
+        if isinstance(self.rows, FleetRows) and policy.privileged is not None:
+            raise BufgymError(f"policy {policy.name}: it plans with a link of its own, which no robot in a cell has")
+        n = len(self.rows)
+        self._player = Player(policy, n)
+        self._asked = np.full((n, 1 + len(_STATE)), -1)
+        self._actions = np.zeros(n, np.int64)
+
+    @property
+    def policy(self) -> Policy:
+        """The policy that chooses the actions."""
+        return self._player.policy
+
+    def actions(self) -> NDArray[np.int64]:
+        """int64[n]: the policy's actions now; L, which has no effect, where no decision is due."""
+        senders = self.rows.senders
+        state = np.column_stack([senders.begun, *(senders.batch.senders[name] for name in _STATE)])
+        new = np.flatnonzero((state != self._asked).any(axis=1))
+        if len(new):
+            self._actions[new] = self._player.actions(senders, new)[new]
+            self._asked[new] = state[new]
+        return self._actions.copy()
+
+
+def policy(env: Any, name: str | Policy) -> PolicyExpert:
+    """Make any policy an expert: a ``Policy``, or a registered name with settings such as ``"decimate:every=2"``."""
+    return PolicyExpert(env, policies.get(name))
+
+
+def online(env: Any, *, objective: str = "ratio", max_states: int = 50_000_000) -> PolicyExpert:
+    """Make an expert of the best policy that does not know T, for ``bufgym/Interruption-v0`` with few slots or short T.
+
+    The arguments are those for ``oracle.online_optimum``.
+    """
+    rows = rows_of(env)
+    if not isinstance(rows.scenario, Interruption):
+        raise BufgymError(f"expert.online: known for bufgym/Interruption-v0, not for {type(rows.scenario).__name__}")
+    best = online_optimum(
+        rows.capacity, law(rows.scenario), rows.scenario.value, objective=objective, max_states=max_states
+    )
+    return PolicyExpert(env, best.policy())

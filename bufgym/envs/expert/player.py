@@ -1,0 +1,163 @@
+"""A fixed policy as the player of an environment, decision by decision."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.envs.step import action_of
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import compile_for, entry, local, located, named
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT
+from bufgym.policies import Policy
+from bufgym.policies.registry import runs_compiled, signatures
+from bufgym.sim import (
+    ARRIVAL_WAITS,
+    NOTHING_WAITS,
+    SOCKET_WAITS,
+    Batch,
+    Senders,
+    answer_of,
+    arrival_of,
+    python_arrival,
+    python_view,
+    view,
+)
+from bufgym.sim.state import batch_type
+
+
+class Player:
+    """Owns a policy's memory for each of ``n`` senders and turns its decisions into an environment's actions.
+
+    Just before a decision the policy is called once for every departure since the last one, with the buffer as it is
+    now. Uniform draws belong to the episode; if an environment drew the episode, they come from its seed. The policy is
+    asked once per decision: at arrivals and, with several topics, for the message to send next. It forgets everything
+    at a new episode. A policy that drops at dequeue or has an unbounded queue raises a BufgymError.
+    """
+
+    def __init__(self, policy: Policy, n: int = 1) -> None:
+        if policy.drops_at_dequeue or policy.unbounded:
+            reason = "drops at dequeue" if policy.drops_at_dequeue else "has an unbounded queue"
+            raise BufgymError(f"policy {policy.name} {reason}: it can be benchmarked, but not play in an environment")
+        self.policy = policy
+        self._parameters = policy.parameter_array
+        self._functions = tuple(map(located, signatures(), policy.compiled)) if runs_compiled(policy) else None
+        self._memory = np.zeros((n, 1))
+        self._begun = np.zeros(n, np.int64)
+        self._heard = np.zeros(n, np.int64)
+
+    def action(self, senders: Senders, i: int = 0) -> int:
+        """The action for sender ``i``, whose decision is due: 0..L-1 evict, L reject, L + 1 accept.
+
+        Where the socket asks, 0..L-1 send and L holds. BufgymError if no decision is due or the policy gave no valid
+        one.
+        """
+        if senders.batch.senders["waiting"][i] not in (ARRIVAL_WAITS, SOCKET_WAITS):
+            raise BufgymError(f"sender {i}: no decision is due")
+        self._begin(senders, np.array([i]))
+        batch = named(senders.batch._replace(parameters=self._parameters))
+        sender, buffer, memory = batch.senders[i], python_view(batch, i), self._memory[i]
+        if self.policy.hears_departures:
+            for _ in range(int(sender.dequeued - self._heard[i])):
+                self.policy.on_departure(buffer, memory)
+        self._heard[i] = sender.dequeued
+        if sender.waiting == SOCKET_WAITS:
+            return self._sends(answer_of(self.policy, "on_send", self.policy.on_send(buffer, memory)), senders.capacity)
+        answer = self.policy.on_arrival(buffer, python_arrival(batch, i), memory)
+        return self._drops(answer_of(self.policy, "on_arrival", answer), senders.capacity)
+
+    def actions(self, senders: Senders, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """int64[n]: ``action`` of every sender in ``rows`` (by default all) whose decision is due, L elsewhere.
+
+        A compiled policy takes one compiled call.
+        """
+        waiting = senders.batch.senders["waiting"]
+        # Whole numbers of another size would be misread.
+        rows = np.arange(len(senders)) if rows is None else np.ascontiguousarray(rows, np.int64)
+        rows = rows[waiting[rows] != NOTHING_WAITS]
+        actions = np.full(len(senders), senders.capacity)
+        if self._functions is None:
+            actions[rows] = [self.action(senders, i) for i in rows.tolist()]
+            return actions
+        self._begin(senders, rows)
+        batch = senders.batch._replace(parameters=self._parameters)
+        on_arrival, on_departure, _, on_send = self._functions
+        hears, answers = self.policy.hears_departures, actions.copy()
+        compiled_ask(bool(batch.several))(
+            batch, self._memory, self._heard, rows, on_arrival, on_departure, on_send, hears, answers
+        )
+        dropped = rows[waiting[rows] == ARRIVAL_WAITS]
+        actions[dropped] = self._all_drops(answers[dropped], senders.capacity)
+        for i in rows[waiting[rows] == SOCKET_WAITS].tolist():
+            actions[i] = self._sends(int(answers[i]), senders.capacity)
+        return actions
+
+    def _begin(self, senders: Senders, rows: NDArray[np.int64]) -> None:
+        """Give fresh memory to the ``rows`` that have begun another episode."""
+        for i in rows[self._begun[rows] != senders.begun[rows]].tolist():
+            senders.draw_uniforms(i)
+            memory = senders.new_memory(self.policy, i)
+            if len(memory) > self._memory.shape[1]:
+                wider = np.zeros((len(self._memory), len(memory)))
+                wider[:, : self._memory.shape[1]] = self._memory
+                self._memory = wider
+            self._memory[i] = 0.0
+            self._memory[i, : len(memory)] = memory
+            self._heard[i] = 0
+            self._begun[i] = senders.begun[i]
+
+    def _sends(self, choice: int, capacity: int) -> int:
+        if not HOLD <= choice < capacity:
+            raise BufgymError(f"policy {self.policy.name}: sends slot {choice}: must be 0..{capacity - 1}, or HOLD")
+        return capacity if choice == HOLD else choice
+
+    def _drops(self, decision: int, capacity: int) -> int:
+        try:
+            return action_of(decision, capacity)
+        except BufgymError as error:
+            raise BufgymError(f"policy {self.policy.name}: {error}") from None
+
+    def _all_drops(self, decisions: NDArray[np.int64], capacity: int) -> NDArray[np.int64]:
+        wrong = decisions[(decisions < ACCEPT) | (decisions >= capacity)]
+        if len(wrong):
+            self._drops(int(wrong[0]), capacity)
+        return np.where(decisions >= 0, decisions, np.where(decisions == REJECT, capacity, capacity + 1))
+
+
+def ask(
+    batch: Batch,
+    memory: NDArray[np.float64],
+    heard: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    on_arrival: Any,
+    on_departure: Any,
+    on_send: Any,
+    hears_departures: bool,
+    answers: NDArray[np.int64],
+) -> None:
+    """Write the policy's answer for each of ``rows`` into ``answers``; ``heard``, int64[n], counts departures."""
+    for i in rows:
+        sender = batch.senders[i]
+        buffer = local(view(batch, i))
+        if hears_departures:
+            for _ in range(sender.dequeued - heard[i]):
+                on_departure(buffer, memory[i])
+        heard[i] = sender.dequeued
+        if sender.waiting == SOCKET_WAITS:
+            answers[i] = on_send(buffer, memory[i])
+        else:
+            answers[i] = on_arrival(buffer, arrival_of(batch, i), memory[i])
+
+
+@functools.cache
+def compiled_ask(several: bool) -> Any:
+    """``ask`` compiled once for every policy, like the rollout."""
+    on_arrival, on_departure, _, on_send = map(numba.types.FunctionType, signatures())
+    types = numba.types
+    numbers, memory = types.Array(types.int64, 1, "C"), types.Array(types.float64, 2, "C")
+    kinds = batch_type(several), memory, numbers, numbers, on_arrival, on_departure, on_send, types.boolean, numbers
+    return entry(compile_for(types.void(*kinds), ask))

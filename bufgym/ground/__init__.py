@@ -1,0 +1,1 @@
+"""What every room stands on: the one error, files written whole or not at all, objects by name, compiled kernels."""

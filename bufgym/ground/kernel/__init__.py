@@ -1,0 +1,39 @@
+"""Compiled functions.
+
+A *kernel* is a plain Python function over arrays that the caller owns. Numba compiles it on its first call and keeps
+the machine code on disk; with ``NUMBA_DISABLE_JIT=1`` the same source runs as ordinary Python, which is how the tests
+check the compiled code against its own text.
+"""
+
+from bufgym.ground.kernel.announce import compile_silently
+from bufgym.ground.kernel.arrays import at, item, prefetch, records, stretch, table
+from bufgym.ground.kernel.bundle import BundleType, bundle, local
+from bufgym.ground.kernel.cache import FOLDER, NotKeptError, only_kept
+from bufgym.ground.kernel.compile import compile_for, compile_here, direct, entry, interruptible, kernel, located
+from bufgym.ground.kernel.meanwhile import named
+from bufgym.ground.kernel.switch import JIT
+
+__all__ = [
+    "FOLDER",
+    "JIT",
+    "BundleType",
+    "NotKeptError",
+    "at",
+    "bundle",
+    "compile_for",
+    "compile_here",
+    "compile_silently",
+    "direct",
+    "entry",
+    "interruptible",
+    "item",
+    "kernel",
+    "local",
+    "located",
+    "named",
+    "only_kept",
+    "prefetch",
+    "records",
+    "stretch",
+    "table",
+]

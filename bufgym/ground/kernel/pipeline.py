@@ -1,0 +1,209 @@
+"""How Numba compiles kernels here: each is typed and translated once, and optimised only where Python calls it.
+
+By default Numba optimises every kernel together with all that it calls, and makes machine code of it. The innermost of
+a hundred nested kernels is then optimised a hundred times. Here the code of a *part*, a kernel inside another, stays as
+the translation made it. The kernel that Python calls links its parts, inlines them and optimises the *whole*, once.
+"""
+
+from __future__ import annotations
+
+import gc
+from typing import Any, cast
+
+from llvmlite import binding
+from numba import types
+from numba.core import codegen, compiler, ir, ir_utils, untyped_passes
+from numba.core.compiler_machinery import FunctionPass, register_pass
+
+from bufgym.ground.kernel.bundle import BundleType, local
+
+PART = "part"
+"""Marks a part among the code that is kept on disk."""
+
+# Numba has no types.
+_Library: Any = codegen.JITCodeLibrary
+_Compiler: Any = compiler.Compiler
+_Pass: Any = FunctionPass
+
+
+class PartLibrary(_Library):  # type: ignore[misc]
+    """Code of one part and of the parts that it calls, neither optimised nor made into machine code."""
+
+    def finalize(self) -> None:
+        """Link the parts that it calls. After this call nothing can be added."""
+        self._raise_if_finalized()
+        for library in dict.fromkeys(self._linking_libraries):
+            self._reload_init.update(library._reload_init)
+            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    @property
+    def codegen(self) -> Any:
+        """Where Numba sets the environments of functions: here, to no effect, as a part has no machine code."""
+        return self
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """Ignore the environment: ``set_environments`` sets it in the kernel that the part is linked into."""
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Address of the function ``name``: 0, as a part has no machine code."""
+        self._ensure_finalized()
+        return 0
+
+    def serialize_using_object_code(self) -> tuple[str, str, bytes]:
+        """(name, ``PART``, bitcode), the form stored on disk."""
+        self._ensure_finalized()
+        return self.name, PART, self._final_module.as_bitcode()
+
+    @classmethod
+    def read(cls, target: Any, kept: tuple[str, str, bytes]) -> Any:
+        """Restore the part from ``kept``, the output of ``serialize_using_object_code``."""
+        name, _, bitcode = kept
+        library = cls(target.codegen(), name)
+        library._final_module = binding.parse_bitcode(bitcode)
+        library._finalized = True
+        return library
+
+
+class WholeLibrary(_Library):  # type: ignore[misc]
+    """Code of a kernel that Python calls, with all its parts."""
+
+    def _optimize_final_module(self) -> None:
+        """Optimise once. Numba does so twice, to find pairs of reference counts; kernels count no references."""
+        passes, builder = self._codegen._module_pass_manager()
+        passes.run(self._final_module, builder)
+
+
+def set_environments(result: Any) -> None:
+    """Tell the machine code of ``result`` where the Python objects are that its parts use, such as texts to print."""
+    for environment in result._find_referenced_environments():
+        result.codegen.set_env(environment.env_name, environment)
+
+
+@cast(Any, register_pass)(mutates_CFG=True, analysis_only=False)
+class _NoneFields(_Pass):  # type: ignore[misc]
+    """Turns reads of bundles' fields that are None into None."""
+
+    _name = "bufgym_none_fields"
+
+    def __init__(self) -> None:
+        super().__init__()
+
+    def run_pass(self, state: Any) -> bool:
+        """Change the code of one kernel in place; return whether it changed."""
+        changed = False
+        for block in state.func_ir.blocks.values():
+            for statement in block.find_insts(ir.Assign):
+                read = statement.value
+                if not (isinstance(read, ir.Expr) and cast(Any, read).op == "getattr"):
+                    continue
+                source = cast(Any, ir_utils).guard(ir_utils.get_definition, state.func_ir, read.value)
+                kind = state.args[source.index] if isinstance(source, ir.Arg) else None
+                if isinstance(kind, BundleType) and kind.kind_of(read.attr) is types.none:
+                    statement.value = cast(Any, ir).Const(None, statement.loc)
+                    state.func_ir._definitions[statement.target.name] = [statement.value]
+                    changed = True
+        return changed
+
+
+@cast(Any, register_pass)(mutates_CFG=False, analysis_only=False)
+class _LocalBundles(_Pass):  # type: ignore[misc]
+    """Puts the fields of bundles that come from Python among the kernel's own variables.
+
+    Otherwise they would be read again after every store, which might have changed them.
+    """
+
+    _name = "bufgym_local_bundles"
+
+    def __init__(self) -> None:
+        super().__init__()
+
+    def run_pass(self, state: Any) -> bool:
+        """Change the code of one kernel in place; return whether it changed."""
+        changed = False
+        block = state.func_ir.blocks[min(state.func_ir.blocks)]
+        for place in reversed(range(len(block.body))):
+            statement = block.body[place]
+            source = getattr(statement, "value", None)
+            if not (isinstance(source, ir.Arg) and isinstance(state.args[source.index], BundleType)):
+                continue
+            loc, scope, made = statement.loc, statement.target.scope, cast(Any, ir)
+            given, function = (made.Var(scope, f"$bundle{source.index}.{k}", loc) for k in range(2))
+            values = source, made.Global("local", local, loc), made.Expr.call(function, [given], (), loc)
+            targets = given, function, statement.target
+            block.body[place : place + 1] = [
+                made.Assign(value, target, loc) for value, target in zip(values, targets, strict=True)
+            ]
+            for value, target in zip(values, targets, strict=True):
+                state.func_ir._definitions[target.name] = [value]
+            changed = True
+        return changed
+
+
+class Typing:
+    """Numba's typing context, which remembers the result of each operation on numbers."""
+
+    def __init__(self, context: Any) -> None:
+        self._context = context
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._context, name)
+
+    def resolve_function_type(self, function: Any, arguments: Any, named: Any) -> Any:
+        """Signature of ``function`` for arguments of these types."""
+        if (
+            named
+            or not isinstance(function, types.Function)
+            or not all(isinstance(kind, _NUMBERS) for kind in arguments)
+        ):
+            return self._context.resolve_function_type(function, arguments, named)
+        key = function, tuple(arguments)
+        if key not in _SIGNATURES:
+            _SIGNATURES[key] = self._context.resolve_function_type(function, arguments, named)
+        return _SIGNATURES[key]
+
+
+_NUMBERS = (types.Integer, types.Float, types.Boolean)
+_SIGNATURES: dict[Any, Any] = {}
+
+
+class WholeCompiler(_Compiler):  # type: ignore[misc]
+    """Compiler of the kernels that Python calls."""
+
+    library: Any = WholeLibrary
+    is_whole = True
+
+    def __init__(
+        self, typing: Any, target: Any, library: Any, arguments: Any, result: Any, flags: Any, names: Any
+    ) -> None:
+        super().__init__(typing, target, library, arguments, result, flags, names)
+        self.state.typingctx = Typing(typing)
+        self.state.library = self.library(target.codegen(), type(self).__name__)
+        self.state.library.enable_object_caching()
+
+    def compile_extra(self, function: Any) -> Any:
+        """Compile ``function``. Garbage is collected afterwards: a search among all these objects takes long."""
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return super().compile_extra(function)
+        finally:
+            if collects:
+                gc.enable()
+
+    def define_pipelines(self) -> list[Any]:
+        """Numba's own passes, with ``_NoneFields`` before all that look at types."""
+        (passes,) = super().define_pipelines()
+        passes.add_pass_after(_NoneFields, untyped_passes.IRProcessing)
+        if self.is_whole:
+            passes.add_pass_after(_LocalBundles, _NoneFields)
+        passes.finalize()
+        return [passes]
+
+
+class PartCompiler(WholeCompiler):
+    """Compiler of the kernels that go into others."""
+
+    library = PartLibrary
+    is_whole = False

@@ -1,0 +1,101 @@
+"""Your own policy, V, link generator or scenario, named in text as ``module:function``.
+
+Importing the module runs its code, and modules in the current folder count too. Names from strangers' files, such as
+leaderboards, results and configurations of clients, therefore never get here.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from bufgym.ground.errors import BufgymError, line_in
+
+_NAMED = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+"""A setting such as ``decimate:every=2`` does not match, as it has "=" after the colon."""
+
+FILES: list[str] = []
+"""Files of the modules imported here. An error that comes from one of them is the caller's own."""
+
+
+def is_named(text: str) -> bool:
+    """Whether the text has the form ``module:function``."""
+    return _NAMED.fullmatch(text) is not None
+
+
+def find(text: str, folder: str | None = None) -> Any:
+    """The object named by ``module:function``; ``folder`` (by default the current one) is searched for the module too.
+
+    Raises:
+        BufgymError: no such module or function.
+    """
+    module, _, name = text.partition(":")
+    found = getattr(imported(text, folder or os.getcwd()), name, None)
+    if found is None:
+        raise BufgymError(f"{text}: the module {module} has no {name}")
+    return found
+
+
+def imported(text: str, folder: str, also: str = "") -> Any:
+    """Import the module of ``module:function``; the error message mentions ``also``, another reading of the text."""
+    place = text.partition(":")[0]
+    # The installed command, unlike python -m bufgym, does not look for modules in the current folder.
+    if folder not in map(os.path.abspath, sys.path):
+        sys.path.append(folder)
+    try:
+        module = importlib.import_module(place)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{place}.".startswith(f"{error.name}."):
+            raise BufgymError(f"{text}: {place} imports {error.name}, which is not there") from None
+        here = f"in {folder} or among those installed"
+        what = f"neither {also} {place!r} nor a module of that name" if also else f"no module {place!r}"
+        raise BufgymError(f"{text}: {what} {here}") from None
+    except Exception as error:  # any error that the module's own code raises
+        raise BufgymError(f"{text}: cannot be imported: {type(error).__name__}: {error}") from None
+    if module.__file__ is not None and module.__file__ not in FILES:
+        FILES.append(module.__file__)
+    return module
+
+
+def run_file(path: str, option: str) -> None:
+    """Run the caller's Python file, which registers their own objects; ``option`` is the option that named the file."""
+    if not Path(path).is_file():
+        raise BufgymError(f"{path}: no such file ({option})")
+    spec = importlib.util.spec_from_file_location(
+        f"bufgym_{option.strip('-').replace('-', '_')}_{Path(path).stem}", path
+    )
+    if spec is None or spec.loader is None:
+        raise BufgymError(f"{path}: must be a Python file, named .py")
+    module = importlib.util.module_from_spec(spec)
+    # Compiled functions are pickled by their module's name.
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise BufgymError(f"{path}, line {error.lineno}: {error.msg}") from None
+
+
+def line_of(error: Exception, *files: str | None) -> str | None:
+    """The line of the caller's code that raised the error, in ``files`` or an imported module; None if elsewhere."""
+    places = (line_in(error, file) for file in [*filter(None, files), *FILES])
+    return next(filter(None, places), None)
+
+
+def first_line(documented: Any) -> str:
+    """The first line of an object's docstring, or empty text."""
+    return (inspect.getdoc(documented) or "").split("\n")[0]
+
+
+def needs(function: Any) -> int:
+    """Number of arguments without a default; -1 if unknown."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return -1
+    kinds = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+    return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters)

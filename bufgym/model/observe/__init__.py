@@ -1,0 +1,67 @@
+"""Observations and rewards of an agent: tables of fields, and the kernels that fill them from a robot's view.
+
+``@field`` and ``@reward_term`` add your own.
+"""
+
+from bufgym.model.observe import terms as _terms  # noqa: F401  (registers the terms that are computed where named)
+from bufgym.model.observe.fields import (
+    CONTEXT_FIELDS,
+    FIELDS,
+    REWARD_TERMS,
+    SLOT_FIELDS,
+    TOPIC_CONTEXT_FIELDS,
+    TOPIC_FIELDS,
+    TOPIC_REWARD_TERMS,
+    TOPIC_SLOT_FIELDS,
+    Field,
+    RewardTerm,
+)
+from bufgym.model.observe.on_board import (
+    ON_BOARD_FIELDS,
+    ON_BOARD_SLOT_FIELDS,
+    observe_on_board,
+    observe_on_board_slots,
+)
+from bufgym.model.observe.own import (
+    OWN_FIELDS,
+    OWN_TERMS,
+    OwnField,
+    OwnTerm,
+    field,
+    own_field,
+    own_term,
+    reward_term,
+    terms_for,
+)
+from bufgym.model.observe.queue import observe_context, observe_slots
+from bufgym.model.observe.topics import observe_topic_context, observe_topic_slots
+
+__all__ = [
+    "CONTEXT_FIELDS",
+    "FIELDS",
+    "ON_BOARD_FIELDS",
+    "ON_BOARD_SLOT_FIELDS",
+    "OWN_FIELDS",
+    "OWN_TERMS",
+    "REWARD_TERMS",
+    "SLOT_FIELDS",
+    "TOPIC_CONTEXT_FIELDS",
+    "TOPIC_FIELDS",
+    "TOPIC_REWARD_TERMS",
+    "TOPIC_SLOT_FIELDS",
+    "Field",
+    "OwnField",
+    "OwnTerm",
+    "RewardTerm",
+    "field",
+    "observe_context",
+    "observe_on_board",
+    "observe_on_board_slots",
+    "observe_slots",
+    "observe_topic_context",
+    "observe_topic_slots",
+    "own_field",
+    "own_term",
+    "reward_term",
+    "terms_for",
+]

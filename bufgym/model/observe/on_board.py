@@ -1,0 +1,199 @@
+"""Built-in fields outside the tables, computed if an environment's ``fields`` or a learned policy names them.
+
+They describe the link's rate as the robot's own socket shows it, the rhythm of arrivals, V's shape, the room under B,
+and each slot's gaps counted in messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.ground.kernel import kernel
+from bufgym.ground.modules import first_line
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
+from bufgym.model.observe.own import OWN_FIELDS, Function, OwnField
+from bufgym.model.observe.queue import TINY, squash
+from bufgym.model.qoi import merging_loss, value
+
+ON_BOARD_FIELDS: list[OwnField] = []
+"""Context fields, in the order in which ``observe_on_board`` writes them."""
+ON_BOARD_SLOT_FIELDS: list[OwnField] = []
+"""Slot fields, in the order in which ``observe_on_board_slots`` writes them."""
+
+
+def _field(per: str, group: str, unit: str) -> Callable[[Function], Function]:
+    """Register the decorated function as a field of its own name; kernels may call the returned function."""
+
+    def add(function: Function) -> Function:
+        name, meaning = function.__name__, first_line(function)
+        OWN_FIELDS[name] = OwnField(name, per, group, unit, meaning, function=function, compile=True)
+        (ON_BOARD_FIELDS if per == "context" else ON_BOARD_SLOT_FIELDS).append(OWN_FIELDS[name])
+        return kernel(function)
+
+    return add
+
+
+# --- the link --------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def mean_bytes(buffer: Buffer, arrival: Any) -> float:
+    """Mean size of the queued messages and the newcomer."""
+    return float((buffer.backlog_bytes + arrival.size_bytes) / (len(buffer.slots) + 1))
+
+
+@kernel
+def demand(buffer: Buffer, arrival: Any) -> float:
+    """Rate that the robot would like to send at, bytes/s: a message of mean size at each arrival."""
+    return 1e6 * mean_bytes(buffer, arrival) / max(buffer.period_us, 1.0)
+
+
+@_field("context", "link", "g/(g+r), r = demand")
+def rate_last(buffer: Buffer, arrival: Any) -> float:
+    "the link's rate since the previous arrival, as far as there was something to send; else rate_short"
+    rate = buffer.short_rate_bytes_per_s
+    if buffer.drained_us > 0:
+        rate = 1e6 * buffer.drained_bytes / buffer.drained_us
+    return squash(rate, demand(buffer, arrival))
+
+
+@_field("context", "link", "g/(g+r), r = demand")
+def rate_short(buffer: Buffer, arrival: Any) -> float:
+    "the link's rate, a running mean over about 0.1 s; demand: a message of mean size at each arrival"
+    return squash(buffer.short_rate_bytes_per_s, demand(buffer, arrival))
+
+
+@_field("context", "link", "g/(g+r), r = demand")
+def rate_medium(buffer: Buffer, arrival: Any) -> float:
+    "the same over about 0.5 s"
+    return squash(buffer.medium_rate_bytes_per_s, demand(buffer, arrival))
+
+
+@_field("context", "link", "g/(g+r), r = demand")
+def rate_long(buffer: Buffer, arrival: Any) -> float:
+    "the same over about 2 s"
+    return squash(buffer.long_rate_bytes_per_s, demand(buffer, arrival))
+
+
+@_field("context", "link", "g/(g+r), r = rate over 2 s")
+def rate_trend(buffer: Buffer, arrival: Any) -> float:
+    "the link's rate over 0.1 s beside that over 2 s: 0.5 = steady, more = it rises"
+    return squash(buffer.short_rate_bytes_per_s, buffer.long_rate_bytes_per_s)
+
+
+@_field("context", "link", "g/(g+r), r = arrival period")
+def time_to_free(buffer: Buffer, arrival: Any) -> float:
+    "time until the message in transmission has left, at the rate over 0.1 s; 1 where that is 0"
+    if buffer.left_bytes == 0:
+        return 0.0
+    at_rate = 1e6 * buffer.left_bytes
+    return at_rate / (at_rate + buffer.short_rate_bytes_per_s * max(buffer.period_us, 1.0))
+
+
+# --- arrivals, V and B -----------------------------------------------------------------------------------------------
+
+
+@_field("context", "time", "g/(g+r), r = 1")
+def burstiness(buffer: Buffer, arrival: Any) -> float:
+    "squared coefficient of variation of the times between arrivals: 0 = regular, 0.5 = as of a Poisson process"
+    square = buffer.period_us * buffer.period_us
+    return squash(max(buffer.period_square - square, 0.0), square)
+
+
+@kernel
+def bend_at(buffer: Buffer, arrival: Any, evens: float) -> float:
+    """(2 V(d) - V(2 d)) / V(d) at d = ``evens`` even motion spacings, of the newcomer's topic."""
+    v, gap = buffer.v, arrival.x - buffer.dequeued_x
+    if len(buffer.topics) > 1:
+        v = v[buffer.topics[arrival.topic].v_start :]
+    d = max(evens * gap / (buffer.capacity + 1), 0.0)
+    gain = value(v, d)
+    return float(min(max(merging_loss(v, d, gain, d, gain) / max(gain, TINY), 0.0), 1.0))
+
+
+@_field("context", "value", "fraction")
+def bend_small(buffer: Buffer, arrival: Any) -> float:
+    "the bend of V at a quarter of the even motion spacing"
+    return bend_at(buffer, arrival, 0.25)
+
+
+@_field("context", "value", "fraction")
+def bend_large(buffer: Buffer, arrival: Any) -> float:
+    "the bend of V at four times the even motion spacing"
+    return bend_at(buffer, arrival, 4.0)
+
+
+@_field("context", "queue", "g/(g+r), r = L + 1 messages of mean size")
+def room(buffer: Buffer, arrival: Any) -> float:
+    "bytes free under B; 1 where there is no byte limit"
+    if buffer.max_bytes >= UNLIMITED_BYTES:
+        return 1.0
+    return squash(max(buffer.max_bytes - buffer.backlog_bytes, 0), (buffer.capacity + 1) * mean_bytes(buffer, arrival))
+
+
+@kernel
+def observe_on_board(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
+    """Write every value of ``ON_BOARD_FIELDS`` into ``context`` (float[fields])."""
+    context[0] = rate_last(buffer, arrival)
+    context[1] = rate_short(buffer, arrival)
+    context[2] = rate_medium(buffer, arrival)
+    context[3] = rate_long(buffer, arrival)
+    context[4] = rate_trend(buffer, arrival)
+    context[5] = time_to_free(buffer, arrival)
+    context[6] = burstiness(buffer, arrival)
+    context[7] = bend_small(buffer, arrival)
+    context[8] = bend_large(buffer, arrival)
+    context[9] = room(buffer, arrival)
+
+
+# --- gaps in messages ------------------------------------------------------------------------------------------------
+
+
+@kernel
+def index_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
+    """Arrivals since the message kept before slot ``k``, and the gap left if that is dropped; of any topic.
+
+    After the newcomer one more arrival is expected, just as other gaps expect one more step.
+    """
+    s = len(buffer.slots)
+    before = buffer.slots[k - 1].seq if k > 0 else buffer.dequeued_seq
+    own = buffer.slots[k].seq if k < s else arrival.seq
+    after = arrival.seq + 1
+    if k < s:
+        after = buffer.slots[k + 1].seq if k + 1 < s else arrival.seq
+    return float(max(own - before, 0)), float(max(after - before, 0))
+
+
+@kernel
+def even_index_gap(buffer: Buffer, arrival: Any) -> float:
+    """Arrivals since the message dequeued last, divided by L + 1."""
+    return float(max(arrival.seq - buffer.dequeued_seq, 0) / (buffer.capacity + 1))
+
+
+@_field("slot", "queue", "g/(g+r), r = even spacing in messages")
+def index_before(buffer: Buffer, arrival: Any, k: int) -> float:
+    "messages that arrived since the message kept before it, itself included"
+    return squash(index_gaps(buffer, arrival, k)[0], even_index_gap(buffer, arrival))
+
+
+@_field("slot", "queue", "g/(g+r), r = 2 x even spacing in messages")
+def index_merged(buffer: Buffer, arrival: Any, k: int) -> float:
+    "gap in messages left if it is dropped"
+    return squash(index_gaps(buffer, arrival, k)[1], 2 * even_index_gap(buffer, arrival))
+
+
+@kernel
+def observe_on_board_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
+    """Write every value of ``ON_BOARD_SLOT_FIELDS`` into ``rows`` (float[fields, L + 1]); the newcomer is last."""
+    s, last = len(buffer.slots), buffer.capacity
+    even = even_index_gap(buffer, arrival)
+    for k in range(s + 1):
+        before, merged = index_gaps(buffer, arrival, k)
+        column = k if k < s else last
+        rows[0, column] = squash(before, even)
+        rows[1, column] = squash(merged, 2 * even)
+    rows[:, s:last] = 0.0

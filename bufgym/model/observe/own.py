@@ -1,0 +1,207 @@
+"""Observation fields and reward terms of one's own, by name: ``@field`` and ``@reward_term``.
+
+    from bufgym.model.observe import field, reward_term
+
+    @field("waiting", per="slot", unit="g/(g+r), r = 1 s", compile=True)
+    def waiting(buffer, arrival, k):
+        "time since slot k arrived; the newcomer is slot len(buffer.slots)"
+        arrival_us = arrival.arrival_us if k == len(buffer.slots) else buffer.slots[k].arrival_us
+        waited_us = buffer.now_us - arrival_us
+        return waited_us / (waited_us + 1_000_000)
+
+    @reward_term("drops", unit="messages", compile=True)
+    def drops(step, memory):
+        "minus the messages dropped in this step"
+        return -step.drops
+
+    env = gym.make("bufgym/Uplink-v0", fields=["rank", "loss", "waiting"], reward={"retained": 1, "drops": 0.1})
+
+Fields and terms take part only where they are named. Text that has to stand alone names ``module:function``, which
+imports the module that registers them. ``compile=True`` promises that Numba can compile the function.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import field as entry
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.ground import modules
+from bufgym.ground.errors import BufgymError
+from bufgym.model.checks import changed, check_name, is_number, named_settings
+from bufgym.model.observe.fields import (
+    FIELDS,
+    REWARD_TERMS,
+    TOPIC_FIELDS,
+    TOPIC_REWARD_TERMS,
+    Field,
+    RewardTerm,
+)
+
+Function = Callable[..., float]
+
+
+@dataclass(frozen=True)
+class OwnField(Field):
+    """An observed quantity that a function computes."""
+
+    _: KW_ONLY
+    function: Function
+    """(buffer, arrival) -> number for a context field, (buffer, arrival, k) -> number for a slot field."""
+    compile: bool = False
+    """Promises that Numba can compile the function; otherwise it runs as ordinary Python."""
+
+
+@dataclass(frozen=True)
+class OwnTerm(RewardTerm):
+    """A reward that a function computes."""
+
+    _: KW_ONLY
+    function: Function
+    """(step, memory) -> number; ``step`` is a ``bufgym.envs.own.Step``."""
+    parameters: Mapping[str, float] = entry(default_factory=dict)
+    """Names and values of its settings, which the function reads as ``step.parameters``."""
+    memory: Mapping[str, float] = entry(default_factory=dict)
+    """Names and initial values of its memory, float64[entries], at an episode's begin."""
+    one_queue: bool = False
+    """Whether it is for one queue only: with several topics the term is missing, or a built-in one of that name."""
+    compile: bool = False
+    """As in ``OwnField``."""
+
+    @property
+    def parameter_array(self) -> NDArray[np.float64]:
+        """Numbers for ``step.parameters``: float64[parameters], read-only."""
+        numbers = np.array(list(self.parameters.values()), np.float64)
+        numbers.flags.writeable = False
+        return numbers
+
+
+OWN_FIELDS: dict[str, OwnField] = {}
+"""Your own fields by name, in the order of their registration."""
+OWN_TERMS: dict[str, OwnTerm] = {}
+"""Terms likewise; the built-in ones are in ``bufgym.model.observe.terms``."""
+
+Entry = TypeVar("Entry", OwnField, OwnTerm)
+
+
+def field(
+    name: str,
+    *,
+    per: str,
+    unit: str = "",
+    low: float = 0.0,
+    high: float = 1.0,
+    meaning: str = "",
+    compile: bool = False,
+) -> Callable[[Function], Function]:
+    """Register the decorated function as the observation field ``name``; it comes back unchanged.
+
+    Args:
+        name: unlike all others; environments with ``fields=[..., name]`` observe it.
+        per: "slot": ``f(buffer, arrival, k)`` is asked for each queued message k, and for the newcomer, which is k =
+            ``len(buffer.slots)``; or "context": ``f(buffer, arrival)``. ``buffer`` is a ``bufgym.model.buffer.Buffer``,
+            ``arrival`` a MESSAGE. Where a free socket asks (several topics), ``arrival`` is the last one that came.
+        unit: for lists; how it is scaled.
+        low: least value; an empty slot and an ended episode read 0, so low <= 0 <= high.
+        high: largest value. A number outside is an error.
+        meaning: one line; by default the first of the function's docstring.
+        compile: promises that Numba can compile the function.
+
+    Raises:
+        BufgymError: the name is taken or no name, or a rule above is broken.
+    """
+    _check_name("field", name, (known.name for known in FIELDS + TOPIC_FIELDS), OWN_FIELDS)
+    if per not in ("slot", "context"):
+        raise BufgymError(f"field {name!r}: per = {per!r}: must be 'slot' or 'context'")
+    if not (is_number(low) and is_number(high) and -math.inf < low <= 0 <= high < math.inf and low < high):
+        raise BufgymError(
+            f"field {name!r}: low = {low!r}, high = {high!r}: need low <= 0 <= high, as empty slots are 0"
+        )
+
+    def add(function: Function) -> Function:
+        _check_function("field", name, function, 3 if per == "slot" else 2)
+        text = meaning or modules.first_line(function)
+        OWN_FIELDS[name] = OwnField(name, per, "own", unit, text, low, high, function=function, compile=compile)
+        return function
+
+    return add
+
+
+def reward_term(
+    name: str,
+    *,
+    unit: str = "",
+    meaning: str = "",
+    parameters: Mapping[str, float] | None = None,
+    memory: Mapping[str, float] | None = None,
+    one_queue: bool = False,
+    compile: bool = False,
+) -> Callable[[Function], Function]:
+    """Register the decorated function ``f(step, memory)`` as the reward term ``name``; it comes back unchanged.
+
+    Environments whose ``reward`` names it compute it at each step. ``reward={"retained": 1, "late:deadline_s=2": 0.1}``
+    sets a parameter. A weight of 0 reports the term without counting it. ``step`` is a ``bufgym.envs.own.Step``, and
+    ``memory`` is float64[entries] for each sender and episode. The other arguments are as in ``OwnTerm`` and ``field``.
+
+    Raises:
+        BufgymError: the name is taken or no name, or the function does not take two arguments.
+    """
+    _check_name("reward term", name, (known.name for known in REWARD_TERMS), OWN_TERMS)
+
+    def add(function: Function) -> Function:
+        _check_function("reward term", name, function, 2)
+        settings = {"parameters": dict(parameters or {}), "memory": dict(memory or {})}
+        text = meaning or modules.first_line(function)
+        OWN_TERMS[name] = OwnTerm(name, unit, text, function=function, one_queue=one_queue, compile=compile, **settings)
+        return function
+
+    return add
+
+
+def own_field(text: str) -> OwnField | None:
+    """The field of that name, or the field that ``module:function`` registers; None if there is none."""
+    return _found(text, OWN_FIELDS, "field")
+
+
+def own_term(text: str) -> OwnTerm | None:
+    """The term that ``text`` names, also by ``name:parameter=number`` or ``module:function``; None if there is none."""
+    if modules.is_named(text):
+        return _found(text, OWN_TERMS, "reward term")
+    name, settings = named_settings("reward term", text)
+    term = OWN_TERMS.get(name)
+    if term is None or not settings:
+        return term
+    return replace(term, name=text, parameters=changed(f"reward term {name}", term.parameters, settings))
+
+
+def terms_for(several_topics: bool) -> tuple[RewardTerm, ...]:
+    """The terms that every environment computes, named or not."""
+    return REWARD_TERMS + (TOPIC_REWARD_TERMS if several_topics else ())
+
+
+def _found(text: str, entries: Mapping[str, Entry], what: str) -> Entry | None:
+    if not modules.is_named(text):
+        return entries.get(text)
+    function = modules.find(text)
+    found = next((known for known in entries.values() if known.function is function), None)
+    if found is None:
+        raise BufgymError(f"{text}: is not registered as a {what}")
+    return found
+
+
+def _check_name(what: str, name: str, built_in: Any, entries: Mapping[str, Any]) -> None:
+    check_name(what, name)
+    taken = entries.get(name)
+    if name in built_in or (taken is not None and taken.function.__module__.startswith("bufgym.")):
+        raise BufgymError(f"{what} {name!r}: a built-in {what} has this name")
+
+
+def _check_function(what: str, name: str, function: Any, arguments: int) -> None:
+    if not callable(function) or modules.needs(function) != arguments:
+        shape = {2: "(buffer, arrival)", 3: "(buffer, arrival, k)"}[arguments] if what == "field" else "(step, memory)"
+        raise BufgymError(f"{what} {name!r}: {function!r} must be a function {shape}")

@@ -1,0 +1,155 @@
+"""Fields with several topics: the fields of one queue, with neighbours of the same topic, and ``TOPIC_FIELDS``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.ground.kernel import kernel
+from bufgym.model.buffer import Buffer
+from bufgym.model.observe import fields
+from bufgym.model.observe.queue import ROUNDING, TINY, observe_link, squash, squash_row
+from bufgym.model.qoi import merging_loss, value
+from bufgym.model.topics import NO_DEADLINE_US
+
+_SECOND_US = 1_000_000
+
+
+@kernel
+def largest(buffer: Buffer) -> tuple[float, float]:
+    """The highest priority and the largest weight of all topics, to divide by."""
+    priority, weight = TINY, TINY
+    for k in range(len(buffer.topics)):
+        priority = max(priority, buffer.topics[k].priority)
+        weight = max(weight, buffer.topics[k].weight)
+    return priority, weight
+
+
+@kernel
+def even_gaps(topic: Any, last_us: int, last_x: float) -> tuple[float, float]:
+    """The even spacing of a topic up to its last arrival, in time (us) and motion."""
+    if topic.dequeued == 0 and topic.queued == 0:
+        return 0.0, 0.0
+    share = 1 / (topic.queued + 1)
+    return share * max(last_us - topic.dequeued_arrival_us, 0), share * max(last_x - topic.dequeued_x, 0.0)
+
+
+@kernel
+def fill_gaps(
+    buffer: Buffer,
+    arrival: Any,
+    arriving: bool,
+    number: int,
+    k: int,
+    step_us: int,
+    step_x: float,
+    weight: float,
+    rows: NDArray[np.floating[Any]],
+) -> None:
+    """Write gaps and losses of the message in column ``k``, of topic ``number``, whose successor is one step after it.
+
+    Its row holds the plain gaps to its predecessor. ``weight`` is the largest of all topics.
+    """
+    topic = buffer.topics[number]
+    v = buffer.v[topic.v_start :]
+    before_us, before_x = float(rows[fields.TIME_BEFORE, k]), float(rows[fields.MOTION_BEFORE, k])
+    last_us, last_x = topic.previous_us, topic.previous_x
+    if arriving and number == arrival.topic:
+        last_us, last_x = arrival.arrival_us, arrival.x
+    even_us, even_x = even_gaps(topic, last_us, last_x)
+    lost = max(merging_loss(v, before_x, value(v, before_x), step_x, value(v, step_x)), 0.0)
+    even_gain = value(v, even_x)
+    even_loss = max(merging_loss(v, even_x, even_gain, even_x, even_gain), ROUNDING)
+    rows[fields.LOSS, k] = lost * topic.weight / weight
+    rows[fields.RELATIVE_LOSS, k] = squash(lost, even_loss)
+    rows[fields.TIME_MERGED, k] = squash(before_us + step_us, 2 * even_us)
+    rows[fields.MOTION_MERGED, k] = squash(before_x + step_x, 2 * even_x)
+    rows[fields.TIME_BEFORE, k] = squash(before_us, even_us)
+    rows[fields.MOTION_BEFORE, k] = squash(before_x, even_x)
+
+
+@kernel
+def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDArray[np.floating[Any]]) -> None:
+    """Write every SLOT_FIELDS and TOPIC_SLOT_FIELDS value into ``rows``, float[fields, L + 1].
+
+    Empty slots are 0. The newcomer is last; if the socket asks (not ``arriving``) its column is empty too.
+    """
+    s, capacity = len(buffer.slots), buffer.capacity
+    priority, weight = largest(buffer)
+    for number in range(len(buffer.topics)):
+        buffer.topics[number].mark = -1  # the column of the topic's previous message
+    rows[:, s:] = 0.0
+    count = s + 1 if arriving else s
+    size_sum, gain_sum = 0.0, 0.0
+    for k in range(count):
+        message, column = (buffer.slots[k], k) if k < s else (arrival, capacity)
+        topic = buffer.topics[message.topic]
+        j = topic.mark
+        before_us, before_x = message.arrival_us, message.x
+        if j >= 0:
+            before_us, before_x = buffer.slots[j].arrival_us, buffer.slots[j].x
+            step_us, step_x = message.arrival_us - before_us, message.x - before_x
+            fill_gaps(buffer, arrival, arriving, message.topic, j, step_us, step_x, weight, rows)
+        elif topic.dequeued > 0:
+            before_us, before_x = topic.dequeued_arrival_us, topic.dequeued_x
+        gain = message.gain
+        if k == s:
+            known = j >= 0 or topic.dequeued > 0
+            gain = topic.weight * value(buffer.v[topic.v_start :], arrival.x - before_x) if known else 0.0
+        age_us, known_us = buffer.now_us - message.arrival_us, topic.dequeued_arrival_us if topic.dequeued > 0 else 0
+        rows[fields.OCCUPIED, column] = 1.0
+        rows[fields.RANK, column] = (k + 1) / (s + 1)
+        rows[fields.TIME_BEFORE, column] = message.arrival_us - before_us
+        rows[fields.MOTION_BEFORE, column] = message.x - before_x
+        rows[fields.SIZE, column] = message.size_bytes
+        rows[fields.PRIORITY, column] = topic.priority / priority
+        rows[fields.WEIGHT, column] = topic.weight / weight
+        rows[fields.NO_DROP, column] = topic.no_drop
+        rows[fields.OLDEST, column] = 1.0 if j < 0 and k < s else 0.0
+        rows[fields.OWN, column] = 1.0 if arriving and message.topic == arrival.topic else 0.0
+        rows[fields.WAITED, column] = squash(age_us, _SECOND_US)
+        rows[fields.SILENCE, column] = squash(max(buffer.now_us - known_us, 0), _SECOND_US)
+        rows[fields.LATENESS, column] = squash(age_us, topic.deadline_us) if topic.deadline_us < NO_DEADLINE_US else 0.0
+        rows[fields.QUEUED, column] = topic.queued / capacity
+        rows[fields.GAIN, column] = gain / weight
+        rows[fields.GAIN_PER_BYTE, column] = float(rows[fields.GAIN, column]) / message.size_bytes
+        topic.mark = column
+        size_sum += message.size_bytes
+        gain_sum += float(rows[fields.GAIN_PER_BYTE, column])
+    for number in range(len(buffer.topics)):
+        topic = buffer.topics[number]
+        j = topic.mark
+        if j == capacity:  # the newcomer: one more step like its last
+            step_us, step_x = 0, 0.0
+            if topic.arrived > 0:
+                step_us, step_x = arrival.arrival_us - topic.previous_us, arrival.x - topic.previous_x
+        elif j >= 0:
+            tail = buffer.slots[j]
+            step_us = max(topic.previous_us - tail.arrival_us, 0) + topic.step_us
+            step_x = max(topic.previous_x - tail.x, 0.0) + topic.step_x
+        else:
+            continue
+        fill_gaps(buffer, arrival, arriving, number, j, step_us, step_x, weight, rows)
+    squash_row(rows[fields.SIZE], size_sum / max(count, 1))
+    squash_row(rows[fields.GAIN_PER_BYTE], gain_sum / max(count, 1))
+
+
+@kernel
+def observe_topic_context(buffer: Buffer, arrival: Any, arriving: bool, context: NDArray[np.floating[Any]]) -> None:
+    """Write every CONTEXT_FIELDS and TOPIC_CONTEXT_FIELDS value into ``context`` (float[fields])."""
+    observe_link(buffer, context)
+    context[fields.ARRIVAL_TIME_GAP], context[fields.ARRIVAL_MOTION_GAP] = 0.0, 0.0
+    context[fields.EVEN_VALUE], context[fields.BEND] = 0.0, 0.0
+    if arriving:
+        topic = buffer.topics[arrival.topic]
+        v = buffer.v[topic.v_start :]
+        even_us, even_x = even_gaps(topic, arrival.arrival_us, arrival.x)
+        context[fields.ARRIVAL_TIME_GAP] = squash(arrival.arrival_us - buffer.previous_us, even_us)
+        context[fields.ARRIVAL_MOTION_GAP] = squash(arrival.x - buffer.previous_x, even_x)
+        gain = value(v, even_x)
+        context[fields.EVEN_VALUE] = topic.weight * gain / largest(buffer)[1]
+        context[fields.BEND] = min(merging_loss(v, even_x, gain, even_x, gain) / max(gain, TINY), 1.0)
+    context[fields.SOCKET_ASKS] = 0.0 if arriving else 1.0
+    context[fields.IN_FLIGHT] = squash(buffer.in_flight, buffer.window)

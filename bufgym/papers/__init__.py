@@ -1,0 +1,120 @@
+"""Reproductions of the figures, tables and theorems of the AFR and Robofleet papers.
+
+``run("afr-fig5", Path("out"))`` returns a text with our numbers beside the paper's, and saves a CSV and a PNG under
+``out``. Each figure is one module with a class ``Reproduction``, imported only when the figure is asked for. Most
+numbers need bufgym alone. The figure robofleet-table1 needs the extra ``robofleet``, and the figures on frames need
+``perception`` and ``bench``. Pictures need ``bufgym[plot]``. Keys in brackets, such as [wang2022afr], refer to
+docs/references.bib.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeAlias, cast
+
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.figure import Figure, report, save_picture, statements
+from bufgym.papers.rows import Rows
+
+FIGURES: dict[str, str] = {name: texts["title"] for name, texts in statements().items() if "title" in texts}
+"""Name of a figure -> its title."""
+
+NEEDS_DATA: dict[str, str] = {name: texts["needs"] for name, texts in statements().items() if "needs" in texts}
+"""Figure that needs recordings -> the files that its option ``data``, a folder, must hold."""
+
+TAKES_DATA = (*NEEDS_DATA, *(name for name, texts in statements().items() if "data" in texts))
+"""Figures with an option ``data``, whether they need it or only show more with it."""
+
+STORE = "frame-runs.jsonl"
+"""File of finished runs on frames. Each run takes minutes; figures share them, and they survive a kill."""
+
+
+def figure(name: str, **options: Any) -> Figure:
+    """Make the figure ``name`` with these options.
+
+    Raises:
+        BufgymError: an unknown name or option, or an option's value that cannot be used.
+    """
+    kind = _kind(name)
+    known = [option.name for option in fields(kind)]
+    for option in options:
+        if option not in known:
+            raise BufgymError(f"{name}: no option {option!r}; it has: {', '.join(known)}")
+    reproduction: Figure = kind(**options)
+    return reproduction
+
+
+def _kind(name: str) -> Any:
+    if name not in FIGURES:
+        raise BufgymError(f"unknown figure {name!r}; known: {', '.join(FIGURES)}")
+    return importlib.import_module(f"bufgym.papers.{name.replace('-', '_')}").Reproduction
+
+
+def kept_under(out: Path | None, name: str, **options: Any) -> Figure:
+    """Make the figure ``name``; a figure on frames keeps its finished runs in the folder ``out``."""
+    made = figure(name, **options)
+    if out is not None and getattr(made, "store", out) is None:
+        return figure(name, **options, store=out / STORE)
+    return made
+
+
+def run(name: str, out: Path | None = None, **options: Any) -> str:
+    """Reproduce one figure; return a text that compares our numbers with the paper's.
+
+    Args:
+        name: a key of ``FIGURES``.
+        out: folder for ``<name>.csv`` and ``<name>.png``, made if absent; None saves nothing.
+        options: fields of that figure's ``Reproduction``, such as ``runs`` for afr-fig5.
+    """
+    reproduction = kept_under(out, name, **options)
+    rows = reproduction.simulate()
+    lines = report(name, reproduction, rows)
+    return "\n".join([*lines, *_saved(reproduction, rows, out, name)])
+
+
+def _saved(reproduction: Figure, rows: Rows, out: Path | None, stem: str) -> Iterator[str]:
+    """Save the numbers and the picture in ``out``, unless it is None; yield lines that say where."""
+    if out is None:
+        return
+    yield f"numbers: {rows.save(out / f'{stem}.csv')}"
+    try:
+        yield f"figure: {save_picture(reproduction, rows, out / f'{stem}.png')}"
+    except BufgymError as error:  # the numbers are useful without the picture
+        yield f"no figure: {error}"
+
+
+Watch: TypeAlias = Callable[[int, float], AbstractContextManager[Callable[[], None]]]
+"""Starts a progress display from the number of runs and their total time in s; gives a function to call per run."""
+
+
+def run_live(name: str, out: Path | None = None, watch: Watch | None = None, **options: Any) -> str:
+    """Run one figure both simulated and on real sockets, with the fewer and shorter runs of its ``LIVE`` options.
+
+    Args:
+        name: one of robofleet-fig3 to -fig7.
+        out: folder for the CSV and PNG files of both; None saves nothing.
+        watch: shows the progress of the live runs.
+        options: as for ``run``; they replace the options of ``LIVE``.
+    """
+    from bufgym.papers.on_sockets import apart  # sockets and threads, not needed to simulate
+
+    if not hasattr(_kind(name), "LIVE"):
+        raise BufgymError(f"{name}: is not played on sockets; robofleet-fig3 to robofleet-fig7 are")
+    options = {**_kind(name).LIVE, **options}
+    simulated, live = (cast(Any, figure(name, **{**options, "live": speed})) for speed in (0.0, options["live"]))
+    lengths_s: list[float] = []
+    simulated.watchers.append(lengths_s.append)
+    played = [simulated.simulate()]
+    runs, takes_s = len(lengths_s), sum(lengths_s) / live.live
+    with nullcontext(lambda: None) if watch is None else watch(runs, takes_s) as step:
+        live.watchers.append(lambda _: step())
+        played.append(live.simulate())
+    lines = [FIGURES[name], f"Options: {options}"]
+    for medium, reproduction, rows in zip(("simulated", "live"), (simulated, live), played, strict=True):
+        lines += ["", f"{medium.capitalize()}:", *reproduction.tables(rows)]
+        lines += _saved(reproduction, rows, out, f"{name}-{medium}")
+    return "\n".join([*lines, "", "Live, beside simulated:", *apart(*played)])

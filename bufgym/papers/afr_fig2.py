@@ -1,0 +1,147 @@
+"""Camera views under the three motions from which the AFR paper derives V.
+
+| motion | the view | V(d), the fraction of a view that is new d messages later |
+|---|---|---|
+| moving back from a wall | a square of the wall that grows by the same factor with each message | 1 - b^d |
+| turning in place | an angle that turns by the same angle with each message | min(1, d / D) |
+| along a corridor | a stretch of the side wall that moves on by the same length with each message | min(1, d / D) |
+
+The overlap of two views is computed from their edges and compared with the formula. V is also checked against Eq. 3-6:
+it starts at 0, does not fall, stays at most 1 and is concave.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.model import qoi
+from bufgym.model.qoi import Value
+from bufgym.papers.figure import COLOURS, Figure, legend_below, whole
+from bufgym.papers.rows import Rows
+from bufgym.scenario.checks import above_0
+
+VIEW_ANGLE = math.radians(60)
+"""The camera's field of view."""
+MESSAGES = 20
+"""V is computed for distances 0..``MESSAGES``."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One motion of the camera."""
+
+    label: str
+    """Label in the picture."""
+    view: Callable[[float], tuple[float, float]]
+    """Left and right edge of a message's view, given the message's number."""
+    dimensions: int
+    """1 if the view has edges in one direction, 2 if it has the same edges in both."""
+    formula: Value
+    """V as the paper gives it."""
+
+    def new(self, d: float) -> float:
+        """Fraction of a view that was not in the view ``d`` messages earlier."""
+        (left, right), (from_, until) = self.view(d), self.view(0)
+        overlap = max(0.0, min(right, until) - max(left, from_)) / (right - left)
+        return 1 - float(overlap**self.dimensions)
+
+    def table(self) -> NDArray[np.float64]:
+        """V(0), ..., V(MESSAGES) from the views, float64[MESSAGES + 1]."""
+        return np.array([self.new(d) for d in range(MESSAGES + 1)])
+
+
+@dataclass(frozen=True)
+class GeometryFigure(Figure):
+    """A figure of the three motions."""
+
+    base: float = 0.618
+    """Fraction of a wall's view that was in the previous message's view (Fig. 5 of the paper)."""
+    turn_degrees: float = 7.5
+    """Angle turned between two messages."""
+    step_m: float = 0.15
+    """Distance driven along the corridor between two messages."""
+    wall_m: float = 1.5
+    """Distance to the corridor's side wall, and to the other wall at the start."""
+
+    RULES = {"base": above_0, "turn_degrees": above_0, "step_m": above_0, "wall_m": above_0}
+    SIZE_INCHES = (10.0, 3.9)
+
+    def motions(self) -> dict[str, Motion]:
+        """Map a column name to its motion."""
+        half, width = math.tan(VIEW_ANGLE / 2), 2 * self.wall_m * math.tan(VIEW_ANGLE / 2)
+        turn = math.radians(self.turn_degrees)
+
+        def wall(k: float) -> tuple[float, float]:
+            edge = half * self.wall_m * self.base ** (-k / 2)
+            return -edge, edge
+
+        return {
+            "wall": Motion("moving back from a wall", wall, 2, qoi.exponential(self.base)),
+            "turn": Motion(
+                "turning in place",
+                lambda k: (k * turn - VIEW_ANGLE / 2, k * turn + VIEW_ANGLE / 2),
+                1,
+                qoi.saturating(VIEW_ANGLE / turn),
+            ),
+            "corridor": Motion(
+                "along a corridor, looking at its side",
+                lambda k: (k * self.step_m - width / 2, k * self.step_m + width / 2),
+                1,
+                qoi.saturating(width / self.step_m),
+            ),
+        }
+
+    def simulate(self) -> Rows:
+        """Return a row for each motion and distance d with V from the views and V from the formula."""
+        return Rows(
+            {"motion": name, "d": d, "V": float(v), "formula": motion.formula(d)}
+            for name, motion in self.motions().items()
+            for d, v in enumerate(motion.table())
+        )
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        # ``tabulated`` refuses a V that breaks one of Eq. 3-6.
+        values = [qoi.tabulated(range(MESSAGES + 1), rows.column("V", motion=name).tolist()) for name in self.motions()]
+        difference = float(abs(rows.column("V") - rows.column("formula")).max())
+        names = ", ".join(motion.formula.name for motion in self.motions().values())
+        return {"concave": len(values) == len(self.motions()), "formulas": difference < 1e-12, "names": names}
+
+
+@dataclass(frozen=True)
+class Reproduction(GeometryFigure):
+    """Picture of the camera's first views in each motion, seen from above."""
+
+    shown: int = 4
+    """Number of messages drawn."""
+
+    RULES = {"shown": whole()}
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        panels = figure.subplots(1, 3)
+        colours = [COLOURS[name] for name in ("afr", "random", "orange", "drop-oldest", "pink", "sky")]
+        for axes, motion in zip(panels, self.motions().values(), strict=True):
+            axes.set_title(motion.label, loc="left", fontsize=10)
+            axes.set(aspect="equal", xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+        wall, turn, corridor = panels
+        for k in range(self.shown):
+            style = {"color": colours[k % len(colours)], "linewidth": 1.4}
+            edge = self.motions()["wall"].view(k)[1]
+            distance = edge / math.tan(VIEW_ANGLE / 2)
+            wall.plot([-edge, 0, edge], [0, -distance, 0], label=f"message {k}", **style)
+            left, right = self.motions()["turn"].view(k)
+            arc = np.linspace(left, right, 30)
+            radius = 1 + 0.06 * k
+            turn.plot([0, *(radius * np.sin(arc)), 0], [0, *(radius * np.cos(arc)), 0], **style)
+            left, right = self.motions()["corridor"].view(k)
+            corridor.plot([left, (left + right) / 2, right], [0, -self.wall_m, 0], **style)
+            corridor.plot([left, right], [0.06 * (k + 1)] * 2, **style)
+        for axes in (wall, corridor):
+            axes.axhline(0, color=COLOURS["oracle"], linewidth=3)
+        legend_below(figure, self.shown, wall)

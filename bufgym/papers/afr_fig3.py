@@ -1,0 +1,32 @@
+"""V of the three motions of `afr_fig2`, computed from the overlap of views, beside the AFR paper's formulas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from bufgym.papers.afr_fig2 import MESSAGES, GeometryFigure
+from bufgym.papers.figure import COLOURS, finish
+from bufgym.papers.rows import Rows
+
+
+@dataclass(frozen=True)
+class Reproduction(GeometryFigure):
+    """Plot of V(d) for the three motions."""
+
+    SIZE_INCHES = (7.0, 4.2)
+
+    def tables(self, rows: Rows) -> list[str]:
+        return Rows(row for row in rows if row["d"] in (0, 1, 2, 4, 8, 16)).pivot("d", "motion", "V", ".4f")
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        axes = figure.add_subplot()
+        for (name, motion), colour in zip(self.motions().items(), ("afr", "random", "drop-oldest"), strict=True):
+            d = rows.column("d", motion=name)
+            axes.plot(d, rows.column("formula", motion=name), color=COLOURS[colour], linewidth=1.2)
+            label = f"{motion.label}: {motion.formula.name}"
+            axes.plot(d, rows.column("V", motion=name), "o", color=COLOURS[colour], markersize=4, label=label)
+        finish(axes, "V from the overlap of views (marks) and by the formula (lines)", ylim=(0, 1.05))
+        axes.set(xlabel="d, messages between two that are received", ylabel="V(d), part of the view that is new")
+        axes.set_xticks(range(0, MESSAGES + 1, 2))
+        axes.legend(frameon=False)

@@ -1,0 +1,136 @@
+"""Fig. 4 of the AFR paper [wang2022afr]: which messages AFR keeps as an interruption grows, step by step.
+
+Message 0 is in transmission when the link stops; message T is the T-th to arrive after that. With L = 8, the messages 9
+to 16 evict 1, 3, ..., 15, which is one pass of the dropping position p over the queue. Then the dropping rate r
+doubles. The counter c now rejects every second arrival, and the next pass begins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import policies, sim
+from bufgym.ground.errors import BufgymError
+from bufgym.model.buffer import REJECT, Buffer
+from bufgym.papers.figure import COLOURS, Figure, finish, legend_below
+from bufgym.papers.rows import Rows, table
+from bufgym.policies.afr import C, P, R
+from bufgym.scenario import Interruption
+
+PAPER_L = 8
+PAPER_T = (8, 18)
+"""First and last T of the figure."""
+PAPER_DROPS = {9: 1, 10: 3, 11: 5, 12: 7, 13: 9, 14: 11, 15: 13, 16: 15, 17: 17, 18: 2}
+"""T -> the message that the figure strikes out; 17 is the newcomer itself."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """AFR's decision on one arrival and its state afterwards."""
+
+    T: int
+    """Number of the arrival, counted from the link's stop."""
+    dropped: int | None
+    """Number of the dropped message: T if the newcomer was rejected, None if nothing was dropped."""
+    r: int
+    """Dropping rate."""
+    c: int
+    """Counter."""
+    p: int
+    """Dropping position."""
+    kept: tuple[int, ...]
+    """Numbers of the queued messages, oldest first."""
+
+
+def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr") -> list[Step]:
+    """Run the simulator and return AFR's decisions 1..``last_T`` with L = ``capacity``."""
+    afr = policies.get(policy)
+    watched: list[Step] = []
+
+    def watch(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+        decision = afr.on_arrival(buffer, arrival, memory)
+        kept = [int(seq) for seq in buffer.slots["seq"]]
+        T, dropped = int(arrival.seq), None
+        if decision == REJECT:
+            dropped = T
+        else:
+            if decision >= 0:
+                dropped = kept.pop(decision)
+            kept.append(T)
+        watched.append(Step(T, dropped, int(memory[R]), int(memory[C]), int(memory[P]), tuple(kept)))
+        return decision
+
+    # Runs uncompiled so that the watcher sees each decision; the transition function is the same.
+    watcher = replace(afr, name=f"{afr.name}-watched", on_arrival=watch, compile=False)
+    episode = Interruption(law="fixed", t_max=last_T).episode(last_T)
+    sim.run(watcher, [episode], capacity, Interruption().value)
+    return watched
+
+
+@dataclass(frozen=True)
+class Reproduction(Figure):
+    """Fig. 4 for L = ``capacity`` and T from L to ``last_T``; the paper has L = 8 and T from 8 to 18."""
+
+    capacity: int = PAPER_L
+    last_T: int = PAPER_T[1]
+
+    def __post_init__(self) -> None:
+        if self.last_T < self.capacity:
+            raise BufgymError(f"last_T = {self.last_T}: must be at least L = {self.capacity}")
+
+    def simulate(self) -> Rows:
+        return Rows(
+            {"T": s.T, "dropped": s.dropped, "r": s.r, "c": s.c, "p": s.p, "kept": " ".join(map(str, s.kept))}
+            for s in steps(self.capacity, self.last_T)
+            if s.T >= self.capacity
+        )
+
+    @property
+    def paper_drops(self) -> dict[int, int]:
+        """Map T to the message that the paper's figure strikes out; empty for another L than the paper's."""
+        return PAPER_DROPS if self.capacity == PAPER_L else {}
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines: list[list[object]] = [["T", "drops", "paper", "r", "c", "p", "kept"]]
+        for row in rows:
+            T, dropped = row["T"], row["dropped"]
+            note = "  (newcomer rejected by the counter)" if dropped == T else ""
+            cells = [T, dropped or "-", self.paper_drops.get(T, "-"), row["r"], row["c"], row["p"]]
+            lines.append([*cells, row["kept"] + note])
+        return table(lines, left=7)
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        drops = self.paper_drops
+        same = [row["dropped"] == drops[row["T"]] for row in rows if row["T"] in drops]
+        return {"drops": all(same) if same else None, "same": sum(same), "compared": len(same)}
+
+    def size_inches(self, rows: Rows) -> tuple[float, float]:
+        return 7.5, 0.34 * len(rows) + 1.6
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        axes = figure.add_subplot()
+        for row in rows:
+            kept = [int(seq) for seq in row["kept"].split()]
+            axes.plot(kept, [row["T"]] * len(kept), "o", color=COLOURS["afr"], markersize=8)
+            if row["dropped"] is not None:
+                cross = {"color": COLOURS["drop-oldest"], "markersize": 8, "markeredgewidth": 2}
+                axes.plot(row["dropped"], row["T"], "x", **cross)
+            state, place = "r={r} c={c} p={p}".format(**row), (self.last_T + 0.8, row["T"])
+            axes.annotate(state, place, va="center", fontsize=8, backgroundcolor="white")
+        axes.plot([], [], "o", color=COLOURS["afr"], label="kept")
+        axes.plot([], [], "x", color=COLOURS["drop-oldest"], markeredgewidth=2, label="dropped at this T")
+        finish(
+            axes,
+            f"AFR, L = {self.capacity}: messages kept as the interruption grows",
+            xlim=(0.3, self.last_T + 3.6),
+            xlabel="message",
+            ylabel="T, messages since the link stopped",
+            xticks=range(1, self.last_T + 1, 1 if self.last_T <= 24 else 4),
+            yticks=[row["T"] for row in rows][:: 1 if len(rows) <= 24 else 4],
+        )
+        axes.invert_yaxis()
+        legend_below(figure, 2)

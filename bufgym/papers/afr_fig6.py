@@ -1,0 +1,110 @@
+"""Fig. 6 of the AFR paper: bandwidth of the Belgium 4G log car_0002 against the camera's demand.
+
+Samples are numbered from 0, as the paper counts seconds. The paper's "about 15 MB/s" describes 4G in general. It is no
+claim about this trace.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bufgym.papers.afr_evaluation import LinkFigure
+from bufgym.papers.figure import COLOURS, finish, legend_below
+from bufgym.papers.rows import Rows, listed
+from bufgym.scenario.checks import above_0
+from bufgym.scenario.suites import RATE_HZ
+
+PAPER_LOW = [21, 23]
+"""Seconds under 500 KB/s according to the paper, counted from 0."""
+LOW = 500e3
+"""Bytes/s."""
+
+
+@dataclass(frozen=True)
+class Reproduction(LinkFigure):
+    """Fig. 6; the picture shows the first ``show_s`` seconds and the whole trace."""
+
+    show_s: float = 60.0
+
+    RULES = {"show_s": above_0}
+    SIZE_INCHES = (7.5, 5.2)
+
+    def simulate(self) -> Rows:
+        lengths_us, rates = self.link.samples()
+        ends_s = np.cumsum(lengths_us) / 1e6
+        return Rows(
+            {
+                "second": k,
+                "start_s": round(float(end_s - length_us / 1e6), 6),
+                "end_s": round(float(end_s), 6),
+                "bytes_per_s": float(rate),
+                "under_500KBps": bool(rate < LOW),
+                "streamed": k < len(self.streamed[1]),
+            }
+            for k, (length_us, end_s, rate) in enumerate(zip(lengths_us, ends_s, rates, strict=True))
+        )
+
+    @property
+    def demand(self) -> float:
+        """Bytes/s."""
+        return RATE_HZ * self.size_bytes
+
+    def tables(self, rows: Rows) -> list[str]:
+        return [
+            f"Second {row['second']}: {row['bytes_per_s'] / 1e3:.1f} KB/s, from {row['start_s']:.2f} to "
+            f"{row['end_s']:.2f} s of the trace."
+            for row in rows.where(under_500KBps=True, streamed=True)
+        ]
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        rates = rows.column("bytes_per_s", streamed=True)
+        best, best_of_all = float(rates.max()), float(rows.column("bytes_per_s").max())
+        low_seconds = [row["second"] for row in rows.where(under_500KBps=True, streamed=True)]
+        low_of_all = rows.where(under_500KBps=True).distinct("second")
+        return {
+            "low-seconds": low_seconds == PAPER_LOW,
+            "overload": bool((rates < self.demand).all()),
+            "link": self.link.name,
+            "duration_s": self.link.duration_us / 1e6,
+            "rate_hz": RATE_HZ,
+            "stream_s": self.frames / RATE_HZ,
+            "low_seconds": listed(low_seconds),
+            "low_of_all": len(low_of_all),
+            "all_low_seconds": listed(low_of_all),
+            "seconds": len(rates),
+            "seconds_of_all": len(rows),
+            "best": best / 1e6,
+            "best_of_all": best_of_all / 1e6,
+            "demand": self.demand / 1e6,
+            "frame_kb": self.size_bytes / 1e3,
+            "under": int((rates < self.demand).sum()),
+            "carried": self.share_carried(),
+        }
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        near, whole = figure.subplots(2, 1, height_ratios=[2, 1])
+        rates, edges = rows.column("bytes_per_s") / 1e6, np.append(rows.column("start_s"), rows[-1]["end_s"])
+        until_s = min(self.show_s, edges[-1])
+        dark, light = ({"color": COLOURS["drop-oldest"], "alpha": a, "linewidth": 0} for a in (0.35, 0.13))
+        light["color"] = COLOURS["other"]
+        for axes, right_s in ((near, until_s), (whole, edges[-1])):
+            axes.stairs(rates, edges, color=COLOURS["afr"], linewidth=1.2, label=self.link.name)
+            demand = self.demand / 1e6
+            axes.axhline(demand, color=COLOURS["drop-oldest"], linewidth=1.4, label=f"demand {demand:g} MB/s")
+            axes.axvspan(0, self.frames / RATE_HZ, label="stream", **light)
+            for row in rows.where(under_500KBps=True):
+                axes.axvspan(row["start_s"], row["end_s"], **dark)
+            top = max(rates.max(), demand)
+            finish(axes, xlim=(0, right_s), ylim=(0, 1.06 * top), ylabel="MB/s")
+        for k, row in enumerate(rows.where(under_500KBps=True, streamed=True)):
+            side, place = ("right", "start_s") if k == 0 else ("left", "end_s")
+            text = f"second {row['second']}\n{row['bytes_per_s'] / 1e3:.0f} KB/s"
+            shift = {"xytext": (-3 if k == 0 else 3, 8), "textcoords": "offset points", "fontsize": 8}
+            near.annotate(text, (row[place], demand), ha=side, **shift)
+        near.axvspan(-2, -1, label="under 500 KB/s", **dark)
+        near.set_title(f"{self.link.name}: the first {until_s:.0f} s, and all of it", loc="left", fontsize=10)
+        whole.set_xlabel("time since the trace's start, s")
+        legend_below(figure, 3, near)

@@ -1,0 +1,161 @@
+"""Fig. 7 of the AFR paper: error of the map made of the frames received, against the queue size.
+
+``perception.mapping`` fuses the frames with their true poses, as the paper does, and compares the map with the
+map of all frames. A second map uses the poses that tracking finds along the frames received, up to where tracking
+breaks. It shows whether tracked poses would explain a difference from the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
+from bufgym.papers.correlation import spearman
+from bufgym.papers.figure import heat_table
+from bufgym.papers.frame_runs import POLICIES, FrameFigure, Setting
+from bufgym.papers.perception import mapping
+from bufgym.papers.rows import Rows
+
+RESAMPLES = 2000
+CONFIDENCE = 0.95
+PAPER = {"drop-oldest": -0.20, "random": -0.10, "orbbuf-images": -0.10}
+"""Policy -> AFR's error relative to the policy's error, less 1, as the paper roughly gives it."""
+SHOWN = ("drop-oldest", "random", "afr", "learned-motion")
+"""Policies whose maps are drawn, at the smallest L and the paper's alignment."""
+SLICE = 30_000
+"""Number of points drawn of a map."""
+
+
+def change(rows: Rows, column: str, policy: str, other: str) -> Interval:
+    """Divide the column's mean under ``policy`` by its mean under ``other`` and subtract 1.
+
+    The interval comes from a paired bootstrap over offsets: a drawn offset brings all its runs of both policies.
+    """
+    ours, theirs = (
+        np.array([rows.mean(column, k=k, policy=name) for k in rows.distinct("k")]) for name in (policy, other)
+    )
+    weights = times_drawn(len(ours), RESAMPLES, stream(0, f"{column} {policy} {other}"))
+    return percentile_interval((weights @ ours) / (weights @ theirs) - 1, CONFIDENCE)
+
+
+def spelled(interval: Interval) -> str:
+    """Format an interval as in -7 % [-9, -4]."""
+    return f"{interval.value:+.1%} [{interval.low:+.1%}, {interval.high:+.1%}]"
+
+
+@dataclass(frozen=True)
+class Reproduction(FrameFigure):
+    """Map error of each policy at each L on each recording."""
+
+    def simulate(self) -> Rows:
+        return self.play("map", "track")
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines: list[str] = []
+        labels: dict[Any, str] = {name: style[0] for name, style in POLICIES.items()}
+        for recording in rows.distinct("recording"):
+            for title, some in (("the paper's alignment", rows.where(k=0)), ("the sweep", rows)):
+                shown = some.where(recording=recording)
+                lines += [f"{recording}, RMSE of the map in mm by L, {title}:"]
+                lines += [*shown.pivot("policy", "L", "rmse_mm", ".2f", labels), ""]
+        return lines[:-1]
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        main = self.recordings[-1]
+        facts: dict[str, Any] = {"about": self.about(), "main": main, "offsets": self.offsets, "moves": "not run"}
+        for other, paper in PAPER.items():
+            key = other.removeprefix("drop-").removesuffix("-images")
+            facts[key] = None
+            facts |= {f"{key}_{what}": "not run" for what in ("change", "paper", "slam", "lack")}
+            if {"afr", other} <= set(self.policies):
+                shown = {name: rows.where(recording=name) for name in self.recordings}
+                found = {name: change(some, "rmse_mm", "afr", other) for name, some in shown.items()}
+                first = {name: change(some.where(k=0), "rmse_mm", "afr", other) for name, some in shown.items()}
+                slam = {name: change(some, "slam_rmse_mm", "afr", other) for name, some in shown.items()}
+                lack = {name: change(some, "slam_uncovered", "afr", other) for name, some in shown.items()}
+                facts[key] = found[main].high < 0 and found[main].low <= paper
+                facts[f"{key}_change"] = "; ".join(f"{name} {spelled(i)}" for name, i in found.items())
+                facts[f"{key}_paper"] = "; ".join(f"{name} {i.value:+.1%}" for name, i in first.items())
+                facts[f"{key}_slam"] = "; ".join(f"{name} {spelled(i)}" for name, i in slam.items())
+                facts[f"{key}_lack"] = "; ".join(f"{name} {spelled(i)}" for name, i in lack.items())
+        if "drop-oldest" in self.policies and "afr" in self.policies:
+            facts["moves"] = self.where_it_moves(rows.where(recording=main))
+        return facts
+
+    def where_it_moves(self, rows: Rows) -> str:
+        """Correlate camera motion in Drop Oldest's longest gap with AFR's change of the error, over the offsets."""
+        moved, won = [], []
+        x = self.stage(rows[0]["recording"]).whole.motion().at(self.stage(rows[0]["recording"]).whole.time_us)
+        for k in rows.distinct("k"):
+            kept = [self.kept(Setting(rows[0]["recording"], k, L, "drop-oldest")) for L in self.capacities]
+            moved.append(float(np.mean([np.diff(x[list(frames)]).max() for frames in kept])))
+            won.append(rows.mean("rmse_mm", k=k, policy="afr") / rows.mean("rmse_mm", k=k, policy="drop-oldest") - 1)
+        return f"{spearman(np.array(moved), np.array(won)):+.2f}"
+
+    def size_inches(self, rows: Rows) -> tuple[float, float]:
+        return 13.0, 0.9 + 0.28 * len(self.policies) + 4.6 * len(self.recordings)
+
+    @property
+    def shown(self) -> list[str]:
+        """Policies whose maps are drawn."""
+        return [name for name in SHOWN if name in self.policies] or [self.policies[0]]
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        heights = [0.9 + 0.28 * len(self.policies), *[4.6] * len(self.recordings)]
+        above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
+        panels = above.subplots(1, 2 * len(self.recordings), squeeze=False, sharey=True)[0]
+        for n, recording in enumerate(self.recordings):
+            of_both = [self._errors(some.where(recording=recording)) for some in (rows.where(k=0), rows)]
+            least, most = np.min(of_both), np.max(of_both)
+            titles = ("the paper's alignment", f"mean of the {self.offsets} of the sweep")
+            for axes, errors, title in zip(panels[2 * n :], of_both, titles, strict=False):
+                labels = [POLICIES[policy][0] for policy in self.policies]
+                columns = [*map(str, self.capacities), "mean"]
+                heat_table(axes, errors, ".2f", labels, columns, vmin=least, vmax=most + 0.25 * (most - least))
+                axes.axvline(len(self.capacities) - 0.5, color="white", linewidth=4)
+                axes.set_title(f"{recording}: {title}", loc="left", fontsize=10)
+                axes.set_xlabel("RMSE of the map in mm, by queue size L", fontsize=9)
+        for part, recording in zip(below, self.recordings, strict=True):
+            self._maps(part, recording)
+
+    def _errors(self, rows: Rows) -> NDArray[np.float64]:
+        """Errors in mm, [policies, L and their mean]."""
+        by_L = [[rows.mean("rmse_mm", policy=policy, L=L) for L in self.capacities] for policy in self.policies]
+        return np.column_stack([by_L, np.mean(by_L, axis=1)])
+
+    def _maps(self, part: Any, recording: str) -> None:
+        """Draw the full map from above per policy and kind of pose, coloured by the distance to the policy's map."""
+        on, L = self.stage(recording), min(self.capacities)
+        limit_mm = 20.0
+        panels = part.subplots(2, len(self.shown), squeeze=False, sharex=True, sharey=True)
+        plan = _plan(on.reference.points())
+        for line, poses in zip(panels, ("true poses", "tracked"), strict=True):
+            every = (on.reference if poses == "true poses" else on.tracked_reference).points()
+            few = _some(len(every))
+            for axes, policy in zip(line, self.shown, strict=True):
+                kept = self.kept(Setting(recording, 0, L, policy))
+                made = on.map_of(kept) if poses == "true poses" else on.track_of(kept).model
+                # Distances run from the reference's points to the map, so that missing parts stand out.
+                far_mm = np.minimum(1e3 * mapping.distances(every[few], made.points()), limit_mm)
+                painted = axes.scatter(*(every[few] @ plan).T, s=0.4, c=far_mm, cmap="inferno_r", vmin=0, vmax=limit_mm)
+                axes.set_aspect("equal")
+                axes.set_axis_off()
+                axes.set_title(f"{recording}, {POLICIES[policy][0]}, {poses}", fontsize=9, loc="left")
+        label = f"distance to this map, mm (L = {L})"
+        part.colorbar(painted, ax=panels, label=label, shrink=0.7, ticks=[0, 10, 20], format="%d")
+
+
+def _some(points: int) -> NDArray[np.int64]:
+    """Choose the points to draw, the same for every map."""
+    return np.random.Generator(np.random.PCG64(0)).permutation(points)[:SLICE]
+
+
+def _plan(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Find the two directions in which the points spread most, float64[3, 2]; they span the plan."""
+    some = points[_some(len(points))[:2000]]
+    _, _, axes = np.linalg.svd(some - some.mean(axis=0), full_matrices=False)
+    return np.asarray(axes[:2].T, np.float64)

@@ -1,0 +1,131 @@
+"""Fig. 8 of the AFR paper: runs in which tracking breaks on the frames received.
+
+``perception.tracking`` aligns each frame to the model and states when tracking counts as broken. The paper
+repeats one alignment ten times; we place the fade at ten places that were fixed beforehand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bufgym.papers.figure import finish, heat_table
+from bufgym.papers.frame_runs import POLICIES, FrameFigure
+from bufgym.papers.rows import Rows, table
+
+THIRD = 1 / 3
+"""Largest ratio of AFR's failures to Drop Oldest's that passes our own check."""
+COLUMNS = 4
+"""Columns of small pictures of the camera's path."""
+
+
+@dataclass(frozen=True)
+class Reproduction(FrameFigure):
+    """Tracking failures under each policy at each L on each recording."""
+
+    def simulate(self) -> Rows:
+        return self.play("track")
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines: list[str] = []
+        for recording in rows.distinct("recording"):
+            shown = rows.where(recording=recording)
+            heads: list[object] = ["policy", *map(str, self.capacities), "all", "of", "paper's alignment, L that fail"]
+            cells: list[list[object]] = [heads]
+            for policy in self.policies:
+                counts = [failures(shown, policy=policy, L=L) for L in self.capacities]
+                first = [row["L"] for row in shown.where(policy=policy, k=0) if row["failed"]]
+                of = len(shown.where(policy=policy))
+                text = ", ".join(map(str, first)) or "none"
+                cells.append([POLICIES[policy][0], *counts, sum(counts), of, text])
+            lines += [f"{recording}, runs of {self.offsets} in which tracking breaks, by L:", *table(cells), ""]
+        return lines[:-1]
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        broken = {
+            name: {policy: failures(rows, recording=name, policy=policy) for policy in self.policies}
+            for name in self.recordings
+        }
+        runs = len(rows.where(recording=self.recordings[0], policy=self.policies[0]))
+        facts: dict[str, Any] = {"about": self.about(), "offsets": self.offsets, "runs": runs}
+        facts |= dict.fromkeys(("oldest_rate", "afr_rate", "large_count", "third_count", "learned_count"), "not run")
+        facts["counts"] = "; ".join(
+            f"{name}: " + ", ".join(f"{POLICIES[policy][0]} {count}" for policy, count in counts.items())
+            for name, counts in broken.items()
+        )
+
+        def each(spec: str, policies: tuple[str, ...], of: int = 1) -> str:
+            """Format the failures of these policies for every recording."""
+            return "; ".join(
+                f"{name} {' against '.join(format(counts[policy] / of, spec) for policy in policies)}"
+                for name, counts in broken.items()
+            )
+
+        def everywhere(rule: Callable[[dict[str, int]], bool]) -> bool:
+            return all(rule(counts) for counts in broken.values())
+
+        if {"afr", "drop-oldest"} <= set(self.policies):
+            facts["oldest"] = everywhere(lambda counts: 0.4 <= counts["drop-oldest"] / runs <= 0.6)
+            facts["oldest_rate"], facts["afr_rate"] = each(".0%", ("drop-oldest",), runs), each(".0%", ("afr",), runs)
+            facts["third_count"] = each(".0f", ("afr", "drop-oldest"))
+            large = Rows(row for row in rows if row["L"] > 10)
+            facts["large_count"] = failures(large, policy="afr")
+            facts |= dict.fromkeys(("afr", "third", "large"))
+            if everywhere(lambda counts: counts["drop-oldest"] > 0):  # else AFR has nothing to improve
+                facts["afr"] = everywhere(lambda counts: counts["afr"] / runs < 0.1)
+                facts["third"] = everywhere(lambda counts: counts["afr"] <= THIRD * counts["drop-oldest"])
+                facts["large"] = failures(large, policy="afr") == 0 if large else None
+        if {"afr", "learned-motion"} <= set(self.policies):
+            facts["learned"] = everywhere(lambda counts: counts["learned-motion"] <= counts["afr"])
+            facts["learned_count"] = each(".0f", ("learned-motion", "afr"))
+        return facts
+
+    def size_inches(self, rows: Rows) -> tuple[float, float]:
+        return 13.0, (0.4 + 1.7 * math.ceil(len(self.policies) / COLUMNS)) * len(self.recordings)
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        parts = figure.subfigures(len(self.recordings), 2, squeeze=False, width_ratios=[1, 1.7])
+        for (left, right), recording in zip(parts, self.recordings, strict=True):
+            shown = rows.where(recording=recording)
+            self._counts(left.subplots(), recording, shown)
+            self._broken(right, recording, shown)
+
+    def _counts(self, axes: Any, recording: str, shown: Rows) -> None:
+        """Draw a table of how many runs break for each policy and L."""
+        counts = np.array([[failures(shown, policy=policy, L=L) for L in self.capacities] for policy in self.policies])
+        labels = [POLICIES[policy][0] for policy in self.policies]
+        heat_table(axes, counts, "d", labels, list(map(str, self.capacities)), vmin=0, vmax=1.25 * self.offsets)
+        sums = axes.secondary_yaxis("right")
+        sums.set_yticks(range(len(labels)), [f"{line.sum()} of {line.size * self.offsets}" for line in counts])
+        sums.tick_params(length=0)
+        sums.spines[:].set_visible(False)
+        axes.set_title(f"{recording}: runs of {self.offsets} in which tracking breaks", loc="left", fontsize=10)
+        axes.set_xlabel("queue size L")
+
+    def _broken(self, part: Any, recording: str, shown: Rows) -> None:
+        """Draw the camera's path from above for each policy, and where tracking broke along it."""
+        places = self.stage(recording).whole.poses[:, :3, 3]
+        across, along = np.argsort(np.ptp(places, axis=0))[:0:-1]
+        lines = math.ceil(len(self.policies) / COLUMNS)
+        panels = part.subplots(lines, COLUMNS, squeeze=False, sharex=True, sharey=True).ravel()
+        for axes, policy in zip(panels, self.policies, strict=False):
+            axes.plot(places[:, across], places[:, along], color=".75", linewidth=1, zorder=1)
+            axes.plot(*places[0, [across, along]], ">", color=".4", markersize=5, zorder=1)
+            at = places[[row["failed_at"] for row in shown.where(policy=policy) if row["failed"]]]
+            axes.plot(at[:, across], at[:, along], "o", color=POLICIES[policy][1], alpha=0.5, markersize=5, mew=0)
+            finish(axes, POLICIES[policy][0], aspect="equal")
+            axes.tick_params(labelsize=8)
+        for axes in panels[len(self.policies) :]:
+            axes.remove()
+        for axes in panels[::COLUMNS]:
+            axes.set_ylabel("m", fontsize=8)
+        part.suptitle(f"{recording}: where, all L (the way begins at the triangle)", x=0.02, ha="left", fontsize=10)
+
+
+def failures(rows: Rows, **where: object) -> int:
+    """Count the runs in which tracking broke."""
+    return sum(bool(row["failed"]) for row in rows.where(**where))

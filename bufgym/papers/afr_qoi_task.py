@@ -1,0 +1,167 @@
+"""Quantity of Information against the robot's task: which V best predicts the map's quality and lost tracking?
+
+Every run of Fig. 7 and 8 has its coverage and its information by time, by motion and by measured overlap. It also has
+the error of the map, the missing part of the map, and whether tracking broke. Correlation is Spearman's over the runs
+of a recording, and the bootstrap draws whole offsets of the fade. *Within* compares only runs of the same queue size
+and offset. It asks whether V tells policies apart; otherwise a correlation may only show that a larger queue is better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.papers.correlation import spearman_over
+from bufgym.papers.figure import COLOURS, finish, legend_below
+from bufgym.papers.frame_runs import POLICIES, FrameFigure
+from bufgym.papers.rows import Rows, listed, table
+
+MEASURES = {
+    "H_time": "time",
+    "H_motion": "motion",
+    "H_overlap": "overlap",
+    "coverage": "coverage",
+    "least_overlap": "least overlap",
+}
+"""Column -> name of the measure. The last measure is the minimum over all steps; the others are sums."""
+TASKS = {
+    "rmse_mm": "map error",
+    "uncovered": "map's holes",
+    "failed": "tracking failure",
+    "slam_rmse_mm": "error with tracked poses",
+}
+"""Column -> name of a harm to the robot; a good measure falls where the harm grows."""
+ACROSS, WITHIN = "all runs", "within"
+
+
+@dataclass(frozen=True)
+class Reproduction(FrameFigure):
+    """Correlation of each measure of information with each measure of the task, on each recording."""
+
+    @cached_property
+    def runs(self) -> Rows:
+        """Runs of Fig. 7 and 8."""
+        return self.play("map", "track")
+
+    def simulate(self) -> Rows:
+        """Return a row for each recording, measure and task; the runs themselves are saved with Fig. 7 and 8."""
+        rows = Rows()
+        for recording in self.recordings:
+            shown = self.runs.where(recording=recording)
+            offset = np.array(shown.column("k"), np.int64)
+            cell = [(row["k"], row["L"]) for row in shown]
+            for scope in (ACROSS, WITHIN):
+                for measure in MEASURES:
+                    for task in TASKS:
+                        a, b = shown.column(measure), shown.column(task)
+                        if scope == WITHIN:
+                            a, b = _less_mean(a, cell), _less_mean(b, cell)
+                        found = spearman_over(a, b, offset, f"{recording} {measure} {task} {scope}")
+                        rows.append(
+                            {
+                                "recording": recording,
+                                "scope": scope,
+                                "measure": MEASURES[measure],
+                                "task": TASKS[task],
+                                "spearman": found.value,
+                                "low": found.low,
+                                "high": found.high,
+                                "runs": len(a),
+                            }
+                        )
+        return rows
+
+    def tables(self, rows: Rows) -> list[str]:
+        lines: list[str] = []
+        for recording, scope in rows.distinct("recording", "scope"):
+            shown = rows.where(recording=recording, scope=scope)
+            cells: list[list[object]] = [["", *TASKS.values()]]
+            for measure in MEASURES.values():
+                cells.append([measure, *(_spelled(shown.where(measure=measure, task=t)) for t in TASKS.values())])
+            lines += [f"{recording}, {scope}: Spearman's correlation [95 %]", *table(cells), ""]
+        for recording in rows.distinct("recording"):
+            shown = self.runs.where(recording=recording)
+            lines += [f"{recording}, mean of all runs (of failures: their part):", *table(_means(shown)), ""]
+            for column in (*MEASURES, "rmse_mm"):
+                order = " > ".join(POLICIES[policy][0] for policy in ranked(shown, column))
+                lines.append(f"best first by {(MEASURES | TASKS)[column]}: {order}")
+            lines.append("")
+        return lines[:-1]
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        best, reached = {}, []
+        for recording in self.recordings:
+            for task in ("map error", "tracking failure"):
+                shown = rows.where(recording=recording, scope=WITHIN, task=task)
+                known = [row for row in shown if not np.isnan(row["spearman"])]
+                if known:
+                    row = min(known, key=lambda row: float(row["spearman"]))
+                    best[recording, task] = f"{row['measure']} ({_spelled(Rows([row]))})"
+                    reached.append(shown.where(measure="motion")[0]["low"] <= row["spearman"])
+        asked = rows.where(scope=ACROSS, task="map error")
+        wrong = [f"{row['measure']} on {row['recording']}" for row in asked if not row["high"] < 0]
+        return {
+            "about": self.about(),
+            "stands": not wrong,
+            "right": len(asked) - len(wrong),
+            "asked": len(asked),
+            "wrong": listed(wrong),
+            "best": all(reached) if reached else None,
+            "ranking": "; ".join(f"{task} on {where}: {text}" for (where, task), text in best.items()) or "unknown",
+        }
+
+    def size_inches(self, rows: Rows) -> tuple[float, float]:
+        return 11.0, 3.7 * len(self.recordings) + 0.4
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        colours = (COLOURS["other"], COLOURS["afr"], COLOURS["random"], COLOURS["orange"], COLOURS["pink"])
+        pairs = rows.distinct("recording", "scope")
+        panels = figure.subplots(len(self.recordings), 2, squeeze=False, sharey=True)
+        ticks = np.arange(len(TASKS))
+        for axes, (recording, scope) in zip(panels.flat, pairs, strict=True):
+            for n, (measure, colour) in enumerate(zip(MEASURES.values(), colours, strict=True)):
+                shown = rows.where(recording=recording, scope=scope, measure=measure)
+                value, low, high = (shown.column(name) for name in ("spearman", "low", "high"))
+                aside = ticks + 0.15 * (n - (len(MEASURES) - 1) / 2)
+                axes.vlines(aside, low, high, color=colour, linewidth=1.5)
+                axes.plot(aside, value, "o", color=colour, markersize=5, label=measure)
+            axes.axhline(0, color=".4", linewidth=0.8)
+            axes.set_xticks(ticks, [text.replace(" ", "\n", 1) for text in TASKS.values()], fontsize=8)
+            whose = "all runs" if scope == ACROSS else "policies at the same L and fade"
+            finish(axes, f"{recording}: {whose}", ylim=(-1, 0.4))
+        for axes in panels[:, 0]:
+            axes.set_ylabel("Spearman's correlation\n(lower is better)")
+        legend_below(figure, 5, panels[0, 0])
+
+
+def ranked(runs: Rows, column: str) -> list[str]:
+    """Rank the policies by their mean over all runs, best first: a measure's highest, or a harm's lowest."""
+    sign = -1 if column in MEASURES else 1
+    return sorted(runs.distinct("policy"), key=lambda policy: sign * runs.mean(column, policy=policy))
+
+
+def _means(runs: Rows) -> list[list[object]]:
+    """List the means of every policy, with the best maps first."""
+    cells: list[list[object]] = [["policy", *MEASURES.values(), *TASKS.values()]]
+    for policy in ranked(runs, "rmse_mm"):
+        means = [f"{runs.mean(column, policy=policy):.3f}" for column in (*MEASURES, *TASKS)]
+        cells.append([POLICIES[policy][0], *means])
+    return cells
+
+
+def _less_mean(numbers: NDArray[np.float64], cell: list[Any]) -> NDArray[np.float64]:
+    """Subtract from each number the mean of its cell."""
+    _, place = np.unique(np.array(cell), axis=0, return_inverse=True)
+    means = np.bincount(place, numbers) / np.bincount(place)
+    return np.asarray(numbers - means[place], np.float64)
+
+
+def _spelled(rows: Rows) -> str:
+    (row,) = rows
+    if np.isnan(row["spearman"]):
+        return "-"
+    return f"{row['spearman']:+.2f} [{row['low']:+.2f}, {row['high']:+.2f}]"

@@ -1,0 +1,205 @@
+"""Base of all reproductions: options, three steps, a text and a picture.
+
+A ``Figure`` is a figure, table or theorem of a paper. Its dataclass fields are its options. ``simulate`` returns the
+numbers, ``claims`` tests the paper's sentences with them, and ``draw`` makes the picture. The sentences are in
+``afr.toml`` and ``robofleet.toml``, and our own in ``own.toml``. Each figure has a section with its sentences and the
+text around them.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import textwrap
+import tomllib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from bufgym.ground.errors import BufgymError, install
+from bufgym.papers.rows import Rows
+
+COLOURS = {
+    "afr": "#0072b2",
+    "drop-oldest": "#d55e00",
+    "random": "#009e73",
+    "oracle": "#555555",
+    "oracle-ideal": "#111111",
+    "other": "#999999",
+    "pink": "#cc79a7",
+    "orange": "#e69f00",
+    "sky": "#56b4e9",
+}
+"""Colour of each policy in every figure, from Okabe and Ito's palette for colour-blind readers."""
+
+VERDICTS = {True: "holds", False: "DIFFERS", None: "not tested here"}
+WIDTH = 120
+"""Width of the printed text in letters."""
+
+
+# --- options ---------------------------------------------------------------------------------------------------------
+
+Rule = Callable[[str, Any], None]
+"""Checks an option, given its name and value; raises a BufgymError that names it."""
+
+
+def whole(least: int = 1, most: int | None = None) -> Rule:
+    """Rule for an integer from ``least`` to ``most``; None means no limit."""
+
+    def check(name: str, number: Any) -> None:
+        if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= (most or number):
+            limits = f">= {least}" if most is None else f"from {least} to {most}"
+            raise BufgymError(f"{name} = {number!r}: must be a whole number {limits}")
+
+    return check
+
+
+def at_least_0(name: str, number: Any) -> None:
+    """Check that an option is a finite number >= 0."""
+    if isinstance(number, bool) or not isinstance(number, int | float) or not 0 <= number < math.inf:
+        raise BufgymError(f"{name} = {number!r}: must be a number >= 0")
+
+
+def several(rule: Rule) -> Rule:
+    """Rule for a list of at least one number, each checked by ``rule``."""
+
+    def check(name: str, numbers: Any) -> None:
+        if isinstance(numbers, str) or not isinstance(numbers, Sequence) or not numbers:
+            raise BufgymError(f"{name} = {numbers!r}: need at least one number")
+        for number in numbers:
+            rule(name, number)
+
+    return check
+
+
+# --- the protocol ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Figure(ABC):
+    """A figure, table or theorem of a paper; the fields of a subclass are its options."""
+
+    RULES = {"runs": whole()}
+    """Option -> its rule; a subclass adds its own."""
+    SIZE_INCHES = (7.0, 4.5)
+
+    def __post_init__(self) -> None:
+        rules: dict[str, Rule] = {}
+        for kind in reversed(type(self).__mro__):
+            rules |= vars(kind).get("RULES", {})
+        for option in fields(self):
+            if option.name in rules:
+                rules[option.name](option.name, getattr(self, option.name))
+
+    @abstractmethod
+    def simulate(self) -> Rows:
+        """The figure's numbers, written as CSV."""
+
+    @abstractmethod
+    def claims(self, rows: Rows) -> Mapping[str, Any]:
+        """Map each claim to True, False or None if it was not tested; also give the numbers that the texts quote."""
+
+    @abstractmethod
+    def draw(self, rows: Rows, figure: Any) -> None:
+        """Draw ``rows`` into an empty matplotlib figure."""
+
+    def tables(self, rows: Rows) -> list[str]:
+        """Lines of text between the heading and the claims."""
+        return []
+
+    def size_inches(self, rows: Rows) -> tuple[float, float]:
+        """(width, height) of the picture."""
+        return self.SIZE_INCHES
+
+
+@functools.cache
+def statements() -> dict[str, dict[str, Any]]:
+    """Map each figure's name to its texts: title, setup, notes, and the paper's sentences under claims."""
+    texts: dict[str, dict[str, Any]] = {}
+    for part in ("afr", "robofleet", "own"):
+        with (Path(__file__).parent / f"{part}.toml").open("rb") as file:
+            texts |= tomllib.load(file)
+    return texts
+
+
+def facts_of(figure: Figure, rows: Rows) -> dict[str, Any]:
+    """Collect what the texts may quote: the figure's options and the results of its claims."""
+    return {option.name: getattr(figure, option.name) for option in fields(figure)} | dict(figure.claims(rows))
+
+
+def report(name: str, figure: Figure, rows: Rows) -> list[str]:
+    """Lines of text: our numbers beside the paper's, and which of its claims hold."""
+    facts, texts = facts_of(figure, rows), statements()[name]
+    lines = [*_filled(f"{texts['title']}. {texts.get('setup', '')}", facts), "", *figure.tables(rows), ""]
+    for claim, text in texts.get("claims", {}).items():
+        finding = f"{VERDICTS[facts.get(claim)]}. " if claim in facts else ""
+        lines += [*_filled(f"{source(text)}: {text['says']}", facts), *_filled(f"  {finding}{text['ours']}", facts)]
+    if "notes" in texts:
+        lines += ["", *_filled(texts["notes"], facts)]
+    return lines
+
+
+def source(text: Mapping[str, Any]) -> str:
+    """Name the claim's place in the paper, or say that the claim is ours."""
+    if text.get("own"):
+        return "Our addition"
+    return str(text["place"]) if text.get("abstract") else f"{text['place']} (wording not checked)"
+
+
+def _filled(text: str, facts: Mapping[str, Any]) -> list[str]:
+    """Fill in the facts and wrap each paragraph; paragraphs that begin with spaces stay indented."""
+    lines: list[str] = []
+    for paragraph in text.format(**facts).rstrip().split("\n\n"):
+        indent = " " * (len(paragraph) - len(paragraph.lstrip(" ")))
+        words = " ".join(paragraph.split())
+        lines += textwrap.wrap(words, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
+    return lines
+
+
+# --- pictures --------------------------------------------------------------------------------------------------------
+
+
+def save_picture(reproduction: Figure, rows: Rows, path: Path) -> Path:
+    """Draw and write the PNG; return its path. An error that names the extra where matplotlib is absent."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure as Picture
+    except ImportError:
+        raise BufgymError(f"drawing needs matplotlib: {install('plot')}") from None
+    # Avoids pyplot, which opens windows and keeps global state.
+    picture = Picture(figsize=reproduction.size_inches(rows), layout="constrained")
+    FigureCanvasAgg(picture)
+    reproduction.draw(rows, picture)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture.savefig(path, dpi=150)
+    return path
+
+
+def finish(axes: Any, title: str = "", **settings: Any) -> None:
+    """Title, limits and labels as ``Axes.set`` takes them, and the grid that every panel has."""
+    axes.set(**settings)
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.grid(alpha=0.25)
+    axes.set_axisbelow(True)
+
+
+def heat_table(
+    axes: Any, numbers: Any, spec: str, lines: Sequence[str], columns: Sequence[str], **limits: float
+) -> None:
+    """Draw a table of numbers on coloured fields, from white at ``vmin`` to darkest at ``vmax``."""
+    axes.imshow(numbers, cmap="OrRd", aspect="auto", **limits)
+    for n, line in enumerate(numbers):
+        for k, number in enumerate(line):
+            axes.text(k, n, format(number, spec), ha="center", va="center", fontsize=9)
+    axes.set_xticks(range(len(columns)), columns)
+    axes.set_yticks(range(len(lines)), lines)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+
+
+def legend_below(figure: Any, columns: int, axes: Any = None) -> None:
+    """Put one legend below all panels; it describes all panels, or ``axes`` alone."""
+    entries = () if axes is None else axes.get_legend_handles_labels()
+    figure.legend(*entries, loc="outside lower center", ncols=columns, frameon=False)

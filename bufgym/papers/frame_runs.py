@@ -1,0 +1,181 @@
+"""Recordings, link and runs shared by Fig. 7 and 8 of the AFR paper when frames are really mapped and tracked.
+
+The paper streams 794 RGB-D frames at 30 Hz over car_0002. Here the same number of frames comes from a made-up room and,
+with ``--data``, from a Kinect recording of 7-Scenes. Each frame has its real encoded size. With ``--data`` the link is
+the paper's; otherwise it is a made-up fade. The link lasts as long as the stream and then repeats.
+
+Results depend strongly on where the fade meets the camera's motion. The paper shows one *alignment*, in which the link
+begins with the stream. We add a sweep that was fixed before any run: the stream begins k tenths of its length into the
+link, so the fade comes earlier by as much. k runs from 0, the paper's alignment, to ``offsets`` - 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bufgym import traces
+from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES, STYLES
+from bufgym.papers.figure import COLOURS, Figure, several, whole
+from bufgym.papers.frame_tasks import (
+    IMAGES,
+    OFFSETS,
+    SEVEN_SCENES,
+    SLOW,
+    Kind,
+    Stage,
+    Store,
+    Task,
+    carried_out,
+    carry_out,
+    stage,
+)
+from bufgym.papers.perception import streams, views
+from bufgym.papers.rows import Row, Rows
+from bufgym.scenario.suites import CAPACITIES, motion_value, time_value
+from bufgym.traces import Trace
+
+RECORDINGS = {"room": "a made-up room", "7-scenes": "7-Scenes, Kinect"}
+"""Name -> description of the recording; 7-scenes needs a folder of recordings."""
+
+POLICIES = {
+    "drop-oldest": STYLES["drop-oldest"],
+    "random": STYLES["random"],
+    IMAGES: ("ORBBuf, images", COLOURS["pink"], "D"),
+    "orbbuf": ("ORBBuf, motion", "#882255", "d"),
+    "afr": STYLES["afr"],
+    "min-motion-gap": ("min-motion-gap", COLOURS["orange"], "v"),
+    "learned-motion": ("learned-motion", COLOURS["sky"], "P"),
+    "clairvoyant": ("clairvoyant", COLOURS["oracle-ideal"], "*"),
+}
+"""Policy -> label, colour, marker. The clairvoyant plans for motion QoI."""
+
+
+def fade() -> Trace:
+    """Stand-in for the paper's link: 2.2 MB/s, about its mean, and 0.4 MB/s from second 21 to second 24."""
+    return Trace.steps([(21, 2.2e6), (3, 0.4e6), (30, 2.2e6)], name="fade")
+
+
+class Setting(NamedTuple):
+    """One run: the recording, the fade's offset k, the queue size L and the policy."""
+
+    recording: str
+    k: int
+    L: int
+    policy: str
+
+
+@dataclass(frozen=True)
+class FrameFigure(Figure):
+    """A figure with a run of every policy at each L and fade offset on each recording."""
+
+    data: Path | None = None
+    """Folder of recordings; None uses only the made-up room and fade."""
+    frames: int = PAPER_FRAMES
+    capacities: Sequence[int] = CAPACITIES
+    policies: Sequence[str] = tuple(POLICIES)
+    offsets: int = OFFSETS
+    """Runs of the sweep; each shifts the fade earlier by a tenth of the stream."""
+    jobs: int = -1
+    """Parallel processes; -1 starts one per core."""
+    store: Path | None = None
+    """File of the finished tasks' results; None keeps nothing."""
+
+    RULES = {"frames": whole(30), "capacities": several(whole()), "offsets": whole(1, OFFSETS)}
+
+    @property
+    def recordings(self) -> list[str]:
+        """Names of the recordings available."""
+        real = self.data is not None and (self.data / SEVEN_SCENES).is_dir()
+        return ["room", *(["7-scenes"] if real else [])]
+
+    @cached_property
+    def link(self) -> Trace:
+        """The paper's link if its recording is available, otherwise the made-up fade."""
+        path = None if self.data is None else self.data / LINK
+        return fade() if path is None or not path.is_file() else traces.read_trace(path)
+
+    def stage(self, recording: str) -> Stage:
+        """The recording, opened once."""
+        return stage(recording, None if self.data is None else str(self.data), self.frames)
+
+    def settings(self) -> list[Setting]:
+        """Every run, in the order of the rows."""
+        return [
+            Setting(recording, k, L, policy)
+            for recording in self.recordings
+            for k in range(self.offsets)
+            for L in self.capacities
+            for policy in self.policies
+        ]
+
+    @cached_property
+    def done(self) -> Store:
+        """Results of the finished tasks."""
+        return Store(self.store)
+
+    def task(self, kind: Kind, setting: Setting) -> Task:
+        """Make the task of this kind for a run."""
+        data = None if self.data is None else str(self.data)
+        about = (setting.k, setting.L) if kind == "kept" else self.kept(setting)
+        return Task(kind, setting.recording, data, self.frames, about, setting.policy, self.link)
+
+    def kept(self, setting: Setting) -> tuple[int, ...]:
+        """The frames that arrive in this run."""
+        if setting not in self._kept:
+            task = self.task("kept", setting)
+            if setting.policy in SLOW:
+                carry_out([task], self.done, 1)
+                self._kept[setting] = tuple(self.done[task]["kept"])
+            else:
+                self._kept[setting] = carried_out(task)[1]["kept"]
+        return self._kept[setting]
+
+    @cached_property
+    def _kept(self) -> dict[Setting, tuple[int, ...]]:
+        return {}
+
+    def play(self, *kinds: Kind) -> Rows:
+        """Return a row for each run: its frame count, its information by each V and its results of these tasks."""
+        settings = self.settings()
+        carry_out([self.task("kept", one) for one in settings if one.policy in SLOW], self.done, self.jobs)
+        carry_out([self.task(kind, setting) for kind in kinds for setting in settings], self.done, self.jobs)
+        rows = Rows()
+        for setting in settings:
+            row: Row = setting._asdict() | {"received": len(self.kept(setting))} | self.information(setting)
+            for kind in kinds:
+                row |= self.done[self.task(kind, setting)]
+            rows.append(row)
+        return rows
+
+    def information(self, setting: Setting) -> Row:
+        """Compute H of the run's frames by time, motion and measured overlap, and their coverage of the scene."""
+        kept, on = self.kept(setting), self.stage(setting.recording)
+        x = on.episode(self.link, 0).arrivals["x"][list(kept)]
+        return {
+            "H_time": time_value().information(np.array(kept, np.float64)),
+            "H_motion": motion_value().information(x),
+            "H_overlap": views.overlap_information(on.seen, kept),
+            "least_overlap": views.least_overlap(on.seen, kept),
+            "coverage": on.coverage.share(kept),
+        }
+
+    def about(self) -> str:
+        """Describe the recordings and the link in sentences."""
+        parts = []
+        for recording in self.recordings:
+            whole = self.stage(recording).whole
+            size_kb = float(streams.sizes(whole).mean()) / 1e3
+            seconds = float(whole.time_us[-1]) / 1e6
+            carried = self.stage(recording).episode(self.link, 0).link.carried_at(int(whole.time_us[-1]))
+            demand = float(streams.sizes(whole).sum())
+            parts.append(
+                f"{recording}: {RECORDINGS[recording]}, {len(whole)} frames of {size_kb:.0f} kB in {seconds:.1f} s, "
+                f"of which the link {self.link.name} carries {carried / demand:.0%}."
+            )
+        return "\n\n".join(parts)

@@ -1,0 +1,106 @@
+"""Writer of docs/claims.md, which lists every claim of the papers, the command that tests it, and the result.
+
+``bufgym reproduce --claims docs/claims.md --data DIR`` writes it. Figures that need recordings are marked as not
+checked without them. ``bufgym reproduce afr-fig7 --claims docs/claims.md`` renews the rows of one figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from bufgym.ground.errors import BufgymError
+from bufgym.papers import FIGURES, TAKES_DATA, kept_under
+from bufgym.papers.figure import facts_of, source, statements
+
+PAPERS = {
+    "afr": "AFR [wang2022afr]",
+    "robofleet": "Robofleet [sikand2021robofleet]",
+    "small": "Beside the papers: a link small enough to be solved",
+}
+"""Prefix of a section's name -> the paper with its key in references.bib, or our own claims."""
+
+VERDICTS = {True: "holds", False: "**differs**", None: "not checked"}
+
+HEAD = """\
+# The papers' claims
+
+This page lists every sentence of the two papers that we know of and that can be checked. Each row has the command that
+tests the sentence, our number, and the verdict. Keys in brackets are from [references.bib](references.bib).
+
+The sentences are in our words. Where the place names the abstract, we checked the sentence against the abstract. The
+wording of all others was not checked against the papers' text. "Our addition" marks sentences that the papers do not
+have. Where a paper leaves a parameter open, ours is a stated default of the command's figure.
+
+This page is made by
+
+    bufgym reproduce --claims docs/claims.md --data DIR
+
+DIR is the folder of recordings. `make test` compares the rows marked † with the output of the code. `make claims`
+compares all rows.
+"""
+
+
+def claim_rows(name: str, out: Path | None = None, **options: Any) -> list[str]:
+    """Return the Markdown rows of one section of ``afr.toml`` or ``robofleet.toml``; ``out`` as in ``kept_under``.
+
+    Raises:
+        BufgymError: the figure cannot be made, for example without recordings.
+    """
+    texts = statements()[name]
+    facts: dict[str, Any] = {}
+    if name in FIGURES:
+        reproduction = kept_under(out, name, **options)
+        facts = facts_of(reproduction, reproduction.simulate())
+    command = f"`{name}`{' †' if texts.get('fast') else ''}" if name in FIGURES else ""
+    lines = []
+    for claim, text in texts.get("claims", {}).items():
+        ours = " ".join(text["ours"].format(**facts).split())
+        cells = [
+            source(text),
+            text["says"].format(**facts),
+            command,
+            ours,
+            VERDICTS[facts.get(claim)],
+            text.get("why", ""),
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def _rows(name: str, data: Path | None, out: Path | None) -> list[str]:
+    return claim_rows(name, out, **({"data": data} if name in TAKES_DATA else {}))
+
+
+def claims_page(data: Path | None = None, out: Path | None = None) -> str:
+    """Run every figure and return the whole page."""
+    lines = [HEAD]
+    for paper, title in PAPERS.items():
+        lines += [f"## {title}", ""]
+        lines += ["| place | claim | `bufgym reproduce` | ours | verdict | why |", "|---|---|---|---|---|---|"]
+        for name in statements():
+            if name.startswith(f"{paper}-"):
+                try:
+                    lines += _rows(name, data, out)
+                except BufgymError as error:
+                    lines.append(f"| | {FIGURES[name]} | `{name}` | | not checked | {error} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def renewed(page: str, names: Iterable[str], data: Path | None = None, out: Path | None = None) -> str:
+    """Run only these figures and return the page with their rows renewed.
+
+    Raises:
+        BufgymError: the page has no row for one of the figures.
+    """
+    lines = page.splitlines()
+    for name in names:
+        own = [n for n, line in enumerate(lines) if f"| `{name}` |" in line or f"| `{name}` † |" in line]
+        if not own:
+            raise BufgymError(
+                f"figure {name}: no row of it in the page of claims; without names the page is written whole"
+            )
+        lines[own[0] : own[-1] + 1] = _rows(name, data, out)
+    return "\n".join(lines) + "\n"

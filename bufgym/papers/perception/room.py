@@ -1,0 +1,226 @@
+"""Made-up room in place of a recording: walls, furniture and texture, seen by a moving Kinect.
+
+Everything is drawn from a seed beforehand. Each frame is ray-cast on demand, so a reduced frame costs only its own
+pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.perception import rays
+from bufgym.papers.perception.frames import Depth, Image, Sequence, encoded_bytes
+from bufgym.papers.perception.mapping import lens_of
+from bufgym.papers.perception.recordings import SEVEN_SCENES_CAMERA, matrices
+from bufgym.traces.generate.draws import stream
+from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
+from bufgym.traces.poses import Poses, quaternions
+from bufgym.traces.shipped import load_motion
+from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
+
+SIZE_M: Final = (5.0, 4.2, 2.6)
+"""Length, width and height of the room, m; larger where a given trajectory needs it."""
+EYE_M: Final = 1.3
+"""Mean height of the camera, m."""
+FREE_M: Final = 0.45
+"""Least distance of things from the camera's path, m."""
+WALL_M: Final = 1.2
+"""Least distance of walls from a given trajectory, m."""
+BOXES: Final = 80
+BALLS: Final = 8
+MOTION: Final = "drive-0"
+"""Shipped recording whose motion the camera follows without a given trajectory."""
+PACE: Final = 0.5
+"""Its speed. The view then changes as fast as in 7-Scenes, 11.6 fields of view in 1000 frames."""
+
+_LAP_POINTS: Final = 4000
+_TRIES: Final = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Walls and furniture of a room. The floor is z = 0 and one corner is the origin."""
+
+    things: Float64Array
+    """Boxes, then balls, float64[n, 8]. A box has centre, half sizes, cosine and sine of its turn about z; the first is
+    the room itself. A ball has centre, radius and zeros."""
+    balls: int
+    """Index of the first ball."""
+
+
+class Room(Sequence):
+    """The recording of a made-up room."""
+
+    def __init__(
+        self, name: str, scene: Scene, time_us: Int64Array, poses: Float64Array, seed: int, stride: int = 1
+    ) -> None:
+        """
+        Args:
+            name: name in tables.
+            scene: walls and furniture.
+            time_us, poses: times and poses of the frames, as in `Sequence`.
+            seed: seed of noise and texture.
+            stride: step between the pixels and rows rendered.
+        """
+        self.name, self.scene, self.time_us, self.poses = name, scene, time_us, poses
+        self.camera = SEVEN_SCENES_CAMERA.every(stride)
+        self._seed, self._stride = seed, stride
+
+    def depth(self, k: int) -> Depth:
+        return self.rendered(k)[0]
+
+    def image(self, k: int) -> Image:
+        return self.rendered(k)[1]
+
+    def true_depth(self, k: int) -> Depth:
+        """The depth of frame k without a Kinect's noise and gaps."""
+        return self.rendered(k, noisy=False)[0]
+
+    def rendered(self, k: int, noisy: bool = True) -> tuple[Depth, Image]:
+        """Depth and picture of frame k."""
+        if not 0 <= k < len(self):
+            raise BufgymError(f"frame {k}: must be from 0 to {len(self) - 1}")
+        shape = (self.camera.height, self.camera.width)
+        depth, grey = np.empty(shape, np.float32), np.empty(shape, np.uint8)
+        whole, scene, pose = SEVEN_SCENES_CAMERA, self.scene, self.poses[k]
+        lens, seen = lens_of(whole), np.empty(len(scene.things), np.int64)
+        to_camera = np.linalg.inv(pose)
+        count = rays.cull(scene.things, scene.balls, lens, whole.width, whole.height, to_camera, seen)
+        bounds = np.empty((2, len(scene.things), 5))
+        for eye, aside_m in enumerate((0.0, rays.BASELINE_M)):
+            rays.bound(scene.things, scene.balls, seen, count, lens, to_camera, aside_m, bounds[eye])
+        stride, seed, face = self._stride, self._seed, np.empty(6)
+        rays.render(
+            scene.things, scene.balls, seen, count, bounds, lens, stride, pose, seed, k, noisy, face, depth, grey
+        )
+        return depth, grey
+
+    def reduced(self, stride: int) -> Sequence:
+        self.camera.every(stride)  # checks it
+        return Room(self.name, self.scene, self.time_us, self.poses, self._seed, self._stride * stride)
+
+    def size_bytes(self, k: int) -> int:
+        whole = Room(self.name, self.scene, self.time_us, self.poses, self._seed)
+        return encoded_bytes(*whole.rendered(k))
+
+
+def room(
+    seed: int,
+    poses: Poses | None = None,
+    *,
+    frames: int = 794,
+    rate_hz: float = 30.0,
+    motion: Motion | None = None,
+) -> Room:
+    """Make a recording of a made-up room, 640x480; `Sequence.reduced` renders fewer pixels.
+
+    Args:
+        seed: seed of furniture, texture and noise.
+        poses: where the camera is, z up (such as TUM's); moved into the middle of the room, which grows to hold it. By
+            default it walks round in the room and looks at the walls, turning this way and that.
+        frames: number of frames, if the trajectory is long enough; by default as many as AFR's recording has.
+        rate_hz: rate of the camera.
+        motion: speed of the camera without `poses`; by default the shipped recording `drive-0` at half speed.
+
+    Raises:
+        BufgymError: a seed below 0, less than 2 frames, a rate that is not above 0.
+    """
+    if frames < 2 or not rate_hz > 0:
+        raise BufgymError(f"frames = {frames}, rate_hz = {rate_hz}: must be at least 2, and above 0")
+    rng = stream(seed)
+    time_us = np.rint(np.arange(frames) * (US_PER_S / rate_hz)).astype(np.int64)
+    if poses is None:
+        size_m = np.array(SIZE_M)
+        recorded, pace = (motion, 1.0) if motion else (load_motion(MOTION), PACE)
+        matrix = _walk(time_us, recorded, pace, size_m)
+    else:
+        time_us = time_us[time_us <= poses.time_us[-1]]
+        if len(time_us) < 2:
+            raise BufgymError(f"the trajectory lasts {poses.time_us[-1]} us: must hold at least 2 frames")
+        matrix = matrices(poses.at(time_us))
+        place = matrix[:, :3, 3]
+        low, high = place.min(axis=0), place.max(axis=0)
+        size_m = np.maximum(SIZE_M, high - low + 2 * WALL_M)
+        matrix[:, :3, 3] += size_m / 2 - (low + high) / 2
+    return Room(f"room-{seed}", furnished(rng, size_m, matrix[:, :3, 3]), time_us, matrix, seed)
+
+
+def _walk(time_us: Int64Array, motion: Motion, pace: float, size_m: Float64Array) -> Float64Array:
+    """Poses on a closed path through the room, float64[n, 4, 4], at the pace of the motion's coordinate."""
+    phase = np.linspace(0, 2 * np.pi, _LAP_POINTS + 1)
+    centre = size_m / 2
+    place = np.stack(
+        [
+            centre[0] + (size_m[0] / 2 - 1.7) * np.cos(phase),
+            centre[1] + (size_m[1] / 2 - 1.5) * np.sin(phase),
+            EYE_M + 0.15 * np.sin(3 * phase),
+        ],
+        axis=1,
+    )
+    # It looks outwards but sways, so that it returns to places just seen.
+    yaw, pitch = phase + 0.5 * np.sin(4 * phase), np.radians(-12.0 + 9.0 * np.sin(3 * phase))
+    lap = np.tile(np.eye(4), (len(phase), 1, 1))
+    ahead = np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], axis=1)
+    right = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], axis=1)
+    lap[:, :3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=2)
+    lap[:, :3, 3] = place
+    settings = MotionSettings(fov_deg=SEVEN_SCENES_CAMERA.fov_deg, rate_hz=1e6)
+    way = motion_from_poses(
+        Poses(np.arange(len(phase), dtype=np.int64), place, quaternions(lap[:, :3, :3])), settings
+    ).coordinate
+    gone = np.mod(motion.at(time_us) * pace, way[-1])
+    nearest = np.interp(gone, way, np.arange(len(way)))
+    at = Poses(np.arange(len(way), dtype=np.int64) * US_PER_S, place, quaternions(lap[:, :3, :3]))
+    return matrices(at.at(np.rint(nearest * US_PER_S).astype(np.int64)))
+
+
+def furnished(rng: np.random.Generator, size_m: Float64Array, way: Float64Array) -> Scene:
+    """Furnish a room of this size with furniture along the walls and on the floor, and pictures and balls above.
+
+    Args:
+        rng: generator, used in a fixed order.
+        size_m: float64[3].
+        way: float64[n, 3], the camera's path, which stays free.
+    """
+    boxes = [np.array([*size_m / 2, *size_m / 2, 1.0, 0.0])]
+    balls: list[Float64Array] = []
+    for n in range(BOXES + BALLS):
+        for _ in range(_TRIES):
+            ball = n >= BOXES
+            thing = _ball(rng, size_m) if ball else _box(rng, size_m, n)
+            reach = thing[3] if ball else np.linalg.norm(thing[3:5])
+            near = np.linalg.norm(way[:, :2] - thing[:2], axis=1) < reach + FREE_M
+            near &= np.abs(way[:, 2] - thing[2]) < thing[3 if ball else 5] + FREE_M
+            if not near.any():
+                (balls if ball else boxes).append(thing)
+                break
+    return Scene(np.array(boxes + balls), len(boxes))
+
+
+def _box(rng: np.random.Generator, size_m: Float64Array, n: int) -> Float64Array:
+    """Draw box ``n``. In each group of four, one stands at a wall, one on the floor, and two hang at a wall."""
+    half = np.array([0.15 + 0.4 * rng.random(), 0.12 + 0.2 * rng.random(), 0.2 + 0.75 * rng.random()])
+    turn = 0.5 * np.pi * int(rng.integers(4))
+    if n % 4 == 1:
+        half[2] *= 0.45
+        turn = 2 * np.pi * rng.random()
+        centre = np.array([*(0.3 + rng.random(2) * (size_m[:2] - 0.6)), half[2]])
+    else:
+        along = rng.random(2) * size_m[:2]
+        wall = rng.integers(4)
+        reach = half[0] if round(turn / (0.5 * np.pi)) % 2 == wall // 2 else half[1]
+        along[wall // 2] = reach if wall % 2 else size_m[wall // 2] - reach
+        centre = np.array([*along, half[2]])
+        if n % 4 > 1:
+            half[2] *= 0.35
+            centre[2] = 0.6 + 1.5 * rng.random()
+    return np.array([*centre, *half, np.cos(turn), np.sin(turn)])
+
+
+def _ball(rng: np.random.Generator, size_m: Float64Array) -> Float64Array:
+    centre = np.array([*(rng.random(2) * size_m[:2]), 0.3 + 1.8 * rng.random()])
+    return np.array([*centre, 0.1 + 0.2 * rng.random(), 0.0, 0.0, 0.0, 0.0])

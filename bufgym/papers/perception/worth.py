@@ -1,0 +1,133 @@
+"""Scenario and rewards of `bufgym/Mapping-v0`: a made-up room is filmed, and the reward is the frames' worth.
+
+Every episode sends the same recording of a made-up room over a different part of a shipped link. At its end each of
+these terms rates the frames that arrived, in [0, 1]:
+
+| term | meaning | for |
+|---|---|---|
+| `covered` | the part of the scene that some frame has seen | a map; the default |
+| `followed` | the least part of a frame that the one before it has seen | fast stand-in for tracking |
+| `tracked` | how far tracking gets along the frames, as a part of all | tracking, seconds an episode |
+
+Train on `followed` and evaluate with `tracked`: ``reward={"followed": 1, "tracked": 0}`` reports `tracked` without
+counting it.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.ground.errors import BufgymError
+from bufgym.model.observe import reward_term
+from bufgym.papers.perception import room, streams, tracking, views
+from bufgym.papers.perception.frames import Sequence
+from bufgym.papers.perception.mapping import Grid, grid_of
+from bufgym.policies.registry import Memory
+from bufgym.scenario import Uplink
+from bufgym.scenario.draws import shipped
+from bufgym.scenario.suites import motion_value
+from bufgym.traces.workload import Workload
+
+SEED: Final = 0
+FRAMES: Final = 240
+"""Frames of the recording, 8 s."""
+SIZES: Final = (
+    *(188_078, 188_294, 189_843, 195_316, 199_698, 205_064, 210_528, 215_847, 222_067, 224_835, 224_970, 228_515),
+    *(221_105, 219_960, 220_765, 218_843, 216_128, 215_568, 215_483, 216_212, 214_161, 210_834, 207_500, 205_819),
+    198_726,
+)
+"""Bytes of every tenth frame and the last, measured once and checked by a test. So episodes begin at once and do not
+depend on the JPEG library installed."""
+WIDTH, VIEW_WIDTH = 160, 80
+"""Image widths: frames are tracked at 160 x 120, and views are compared at 80 x 60."""
+SCALE: Final = 0.25
+"""Scale of the shipped links, which then carry about half of the frames."""
+
+
+class Scene(NamedTuple):
+    """The recording and the data that the terms need."""
+
+    whole: Sequence
+    film: Sequence
+    grid: Grid
+    seen: NDArray[np.float32]
+    coverage: views.Coverage
+
+
+@functools.cache
+def recording() -> Sequence:
+    """Make the recording of the room, not yet rendered."""
+    return room.room(SEED, frames=FRAMES)
+
+
+@functools.cache
+def scene() -> Scene:
+    """Render the room once per process, in some seconds."""
+    whole = recording()
+    film = whole.reduced(whole.camera.width // WIDTH).loaded()
+    small = film.reduced(WIDTH // VIEW_WIDTH)
+    return Scene(whole, film, grid_of(film), views.seen_shares(small), views.Coverage(small))
+
+
+@functools.cache
+def mapping() -> Uplink:
+    """Make the scenario: the recording over the shipped links from any starting point."""
+    whole = recording()
+    x = whole.motion().at(whole.time_us)
+    film = Workload("room", whole.time_us, streams.between(SIZES, FRAMES), x=x - x[0])
+    return Uplink(traces=shipped()["traces"], workload=film, scale=(SCALE,), value=motion_value())
+
+
+def coverage_of(frames: NDArray[np.int64]) -> float:
+    """Part of the scene that these frames have seen."""
+    return scene().coverage.share(frames)
+
+
+def least_followed(frames: NDArray[np.int64]) -> float:
+    """Least part of a frame that the one before it has seen.
+
+    It includes the recording's first and last frame, so that sending few frames does not look good.
+    """
+    return views.least_overlap(scene().seen, np.union1d(frames, [0, FRAMES - 1]))
+
+
+def tracked_part(frames: NDArray[np.int64]) -> float:
+    """Part of the recording up to which tracking along these frames gets."""
+    if not len(frames):
+        return 0.0
+    track = tracking.track(scene().film, frames, scene().grid)
+    reached = frames[~np.isnan(track.poses[:, 0, 0])]
+    return float(reached[-1] - frames[0]) / (FRAMES - 1)
+
+
+# --- the same as rewards ---------------------------------------------------------------------------------------------
+
+
+def _arrived(step: Any) -> NDArray[np.int64]:
+    """Indices of the frames transmitted, int64[frames]."""
+    n = len(step.log)
+    if n != FRAMES:
+        raise BufgymError(f"episode of {n} messages: this reward term is for bufgym/Mapping-v0, of {FRAMES}")
+    return np.flatnonzero(np.asarray(step.log["transmitted_us"]) >= 0)
+
+
+@reward_term("covered", unit="part of the scene", one_queue=True)
+def covered(step: Any, memory: Memory) -> float:
+    """at the end, the part of the scene that the frames which arrived have seen (`bufgym/Mapping-v0`)"""
+    return coverage_of(_arrived(step)) if step.ended else 0.0
+
+
+@reward_term("followed", unit="part of a frame", one_queue=True)
+def followed(step: Any, memory: Memory) -> float:
+    """at the end, the least part of a frame that the one before it has seen: stands in for `tracked`"""
+    return least_followed(_arrived(step)) if step.ended else 0.0
+
+
+@reward_term("tracked", unit="part of the recording", one_queue=True)
+def tracked(step: Any, memory: Memory) -> float:
+    """at the end, how far tracking gets along the frames that arrived in `bufgym/Mapping-v0`; takes some seconds"""
+    return tracked_part(_arrived(step)) if step.ended else 0.0

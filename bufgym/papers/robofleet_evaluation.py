@@ -1,0 +1,283 @@
+"""Messages, sending programs and outcomes shared by Robofleet's Fig. 3 to 7.
+
+The paper [sikand2021robofleet] sends with n_T = 1 in its experiments, and so do we. Parameters that it leaves open are
+options of each figure. Runs differ only in the arrival jitter, up to a tenth of the period. Every sender meets the same
+arrivals.
+
+With ``live`` the same messages go over real sockets (``on_sockets``), in the fewer and shorter runs of a figure's
+``LIVE``. The simulation leaves out TCP, the bytes of pings and pongs, encoding time, and everything behind the server.
+Without TCP, sending resumes as soon as the link returns, unless a figure has an option for a silence.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import policies, sim
+from bufgym.benchmark.run import draw
+from bufgym.model.topics import Topic
+from bufgym.papers.figure import COLOURS, Figure, at_least_0, several, whole
+from bufgym.papers.rows import Rows
+from bufgym.scenario import Client, Stream
+from bufgym.scenario.checks import above_0
+from bufgym.traces import Trace
+
+POINTS = 10_000
+"""Points of a PointCloud2, each of ``POINT_BYTES``; the paper gives no size."""
+POINT_BYTES = 16
+BYTES = {
+    "LaserScan": (7_260, 7_328, 28_000),
+    "CompressedImage": (75_188, 75_224, 267_650),
+    "PoseStamped": (75, 240, 281),
+}
+"""Bytes as ROS binary, Robofleet flatbuffer and JSON, from the paper's Table I. PoseStamped is not in it and comes from
+robofleet-table1 with ``ros1``, ``robofleet`` and ``json-numbers``, the JSON of the paper's images."""
+_CLOUD_EXTRA = (111, 344)
+_CLOUD_JSON = 562_376 / POINTS
+"""Bytes of a PointCloud2 besides its points, and its JSON bytes per point, both from robofleet-table1."""
+
+JITTER = 0.1
+ROUND_TRIP_MS = 10.0
+"""Round trip, our choice. With n_T = 1 it limits throughput to one message per transmission plus round trip."""
+QUEUE_SIZE = 10
+"""Queue of a native ROS publisher in messages, our choice after ROS's own tutorials."""
+MBIT = 125_000
+"""Bytes/s in a Mbit/s."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A sending program: its policy and its operator's settings of the topics."""
+
+    policy: str
+    """Its name in ``bufgym.policies``."""
+    label: str
+    """Label in legends."""
+    short: str
+    """Label in tables."""
+    colour: str
+    marker: str
+    all_no_drop: bool = False
+    """Whether every topic is no_drop."""
+    queued: bool = False
+    """Whether each topic has a queue of its own, of ``queue_size`` messages."""
+
+    @property
+    def style(self) -> dict[str, Any]:
+        """How this program's line is drawn."""
+        return {"color": self.colour, "marker": self.marker, "markersize": 4.5, "linewidth": 1.4}
+
+
+PROGRAMS = {
+    "robofleet": Program("robofleet", "Robofleet, n_T = 1", "n_T = 1", COLOURS["afr"], "o"),
+    "no-drop": Program("robofleet", "Robofleet, all no_drop", "no_drop", COLOURS["drop-oldest"], "s", all_no_drop=True),
+    "no-drop-released": Program(
+        "robofleet-released", "released, all no_drop", "released", COLOURS["orange"], "^", all_no_drop=True
+    ),
+    "rosbridge": Program("rosbridge", "rosbridge", "rosbridge", COLOURS["random"], "D"),
+    "ros-native": Program("ros-native", "native ROS", "native ROS", COLOURS["pink"], "v", queued=True),
+}
+SHORT = {name: program.short for name, program in PROGRAMS.items()}
+
+
+@dataclass(frozen=True)
+class Sent:
+    """Outcome of every message of one run, in order of arrival; arrays have shape [messages]."""
+
+    topic: NDArray[np.int64]
+    """Index of the message's stream."""
+    consumer: NDArray[np.int64]
+    """Consumer of this copy if the sender makes copies, otherwise 0."""
+    arrival_s: NDArray[np.float64]
+    """Arrival time at the sender."""
+    received_s: NDArray[np.float64]
+    """Receipt time at the server; NaN for a dropped message."""
+
+    @property
+    def latency_s(self) -> NDArray[np.float64]:
+        """Time from arrival at the sender to receipt at the server; NaN for a dropped message."""
+        return self.received_s - self.arrival_s
+
+    @property
+    def received(self) -> Sent:
+        """Messages that reached the server, in order of receipt."""
+        in_order = np.argsort(self.received_s, kind="stable")  # NaN comes last
+        return self._only(in_order[: int((~np.isnan(self.received_s)).sum())])
+
+    def on(self, topic: int) -> Sent:
+        """Select the messages of one stream."""
+        return self._only(np.flatnonzero(self.topic == topic))
+
+    def between(self, from_s: float, until_s: float) -> Sent:
+        """Select the messages that arrived at the sender in this time."""
+        return self._only(np.flatnonzero((from_s <= self.arrival_s) & (self.arrival_s < until_s)))
+
+    def received_hz(self, until_s: float) -> float:
+        """Messages a second that reached the server by ``until_s``."""
+        return float((self.received_s <= until_s).sum() / until_s)
+
+    def _only(self, kept: NDArray[np.intp]) -> Sent:
+        return Sent(self.topic[kept], self.consumer[kept], self.arrival_s[kept], self.received_s[kept])
+
+    def __len__(self) -> int:
+        return len(self.arrival_s)
+
+
+def stream(kind: str, rate_hz: float, *, points: int = POINTS, jitter: float = JITTER, **topic: Any) -> Stream:
+    """Make a stream of messages of this kind; ``topic`` holds fields of ``Topic``."""
+    ros, flatbuffer, json = cloud_bytes(points) if kind == "PointCloud2" else BYTES[kind]
+    return Stream(Topic(kind, **topic), rate_hz, flatbuffer, jitter=jitter, encodings={"ros": ros, "json": json})
+
+
+def cloud_bytes(points: int) -> tuple[int, int, int]:
+    """Bytes of a PointCloud2 as ROS binary, Robofleet flatbuffer and JSON."""
+    whole(1, 10**7)("points", points)
+    ros, flatbuffer = (points * POINT_BYTES + extra for extra in _CLOUD_EXTRA)
+    return ros, flatbuffer, round(points * _CLOUD_JSON)
+
+
+def send(
+    name: str,
+    streams: Sequence[Stream],
+    link: Trace,
+    duration_s: float,
+    seed: int = 0,
+    *,
+    round_trip_ms: float = ROUND_TRIP_MS,
+    queue_size: int = QUEUE_SIZE,
+    consumers: int = 1,
+    live: float = 0.0,
+    watched_s: float = math.inf,
+) -> Sent:
+    """Send the streams' messages with one of ``PROGRAMS``; ``link`` begins at the first message.
+
+    ``live`` above 0 sends over real sockets, sped up by that factor; 0 simulates. Messages received after ``watched_s``
+    do not matter, and a live run does not wait for them.
+    """
+    program = PROGRAMS[name]
+    rules: dict[str, Any] = {"no_drop": True} if program.all_no_drop else {}
+    if program.queued:
+        rules = {"limit": queue_size, "no_drop": False}
+    round_trip_us = round(round_trip_ms * 1000)
+    client = Client(
+        tuple(replace(s, topic=replace(s.topic, **rules)) for s in streams),
+        (link,),
+        duration_s=duration_s,
+        random_offset=False,
+        propagation_us=round_trip_us // 2,
+        round_trip_us=round_trip_us,
+        consumers=consumers,
+    )
+    # Room for all messages, because a no_drop queue has no limit.
+    room = client.max_messages * consumers
+    policy = policies.get(program.policy)
+    senders = sim.run(policy, [draw(client, seed)], room, client.value, topics=client.topics)
+    sender = senders.batch.senders[0]
+    arrivals = np.asarray(senders.batch.arrivals[0])[: sender["arrivals"]]
+    transmitted_us = np.asarray(senders.batch.log[0])[: sender["arrivals"]]["transmitted_us"]
+    received_s = np.where(transmitted_us == sim.NEVER, np.nan, (transmitted_us + sender["propagation_us"]) / 1e6)
+    if live:
+        from bufgym.papers import on_sockets  # not needed to simulate
+
+        received_s = on_sockets.received_s(policy, senders, client.value, live, watched_s)
+    consumer, topic = np.divmod(arrivals["topic"], len(streams))
+    return Sent(topic, consumer, arrivals["arrival_us"] / 1e6, received_s)
+
+
+@dataclass(frozen=True)
+class ClientFigure(Figure):
+    """A figure of programs that send the same topics over one link; values are means of ``runs`` runs."""
+
+    round_trip_ms: float = ROUND_TRIP_MS
+    """Time from the end of a message's transmission to its pong; half of it is the way to the server."""
+    runs: int = 5
+    """Number of runs, which differ by arrival jitter."""
+    live: float = 0.0
+    """Speed-up of a run on real sockets; 0 simulates."""
+
+    RULES = {
+        "live": at_least_0,
+        "round_trip_ms": at_least_0,
+        "queue_size": whole(),
+        "queue_sizes": several(whole()),
+        "rate_hz": above_0,
+        "rates_hz": several(above_0),
+        "mbit_per_s": above_0,
+        "duration_s": above_0,
+    }
+
+    @functools.cached_property
+    def watchers(self) -> list[Callable[[float], None]]:
+        """Functions called after each run with its duration in s."""
+        return []
+
+    @functools.cached_property
+    def played(self) -> dict[Any, Any]:
+        """Results of earlier runs; see ``played_once``."""
+        return {}
+
+    def send(
+        self, name: str, streams: Sequence[Stream], link: Trace, duration_s: float, seed: int, **client: Any
+    ) -> Sent:
+        """Call ``send`` with the figure's own options."""
+        if "queue_size" not in client:
+            client["queue_size"] = getattr(self, "queue_size", QUEUE_SIZE)
+        sent = send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, live=self.live, **client)
+        last_s = float(np.nanmax(sent.received_s, initial=duration_s))
+        for told in self.watchers:
+            told(min(last_s, max(duration_s, client.get("watched_s", math.inf))))
+        return sent
+
+
+Kind = TypeVar("Kind", bound=ClientFigure)
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def played_once(
+    run: Callable[Concatenate[Kind, Arguments], Result],
+) -> Callable[Concatenate[Kind, Arguments], Result]:
+    """Keep the result of each run of a figure, because live runs are slow and the picture needs them again."""
+
+    @functools.wraps(run)
+    def once(figure: Kind, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+        if not figure.live:
+            return run(figure, *arguments, **named)
+        key = arguments, tuple(named.items())
+        if key not in figure.played:
+            figure.played[key] = run(figure, *arguments, **named)
+        result: Result = figure.played[key]
+        return result
+
+    return once
+
+
+@dataclass(frozen=True)
+class CloudFigure(ClientFigure):
+    """A figure of one PointCloud2 topic."""
+
+    points: int = POINTS
+    """Points of a cloud, 16 bytes each."""
+    queue_size: int = QUEUE_SIZE
+    """Queue of native ROS, messages."""
+
+
+def p95(numbers: NDArray[np.float64]) -> float:
+    """95th percentile, or NaN without numbers."""
+    return float(np.percentile(numbers, 95)) if len(numbers) else np.nan
+
+
+def curves(axes: Any, rows: Rows, x: str, y: str, names: Sequence[str], **styles: Any) -> None:
+    """Draw the mean of column ``y`` against column ``x``, one line per sender; ``styles`` apply to every line."""
+    for k, name in enumerate(names):
+        means = {at: rows.mean(y, **{x: at}, sender=name) for at in rows.where(sender=name).distinct(x)}
+        program = PROGRAMS[name]
+        style = {**program.style, "markersize": 4 + k, "zorder": 3 - 0.1 * k, **styles}  # equal lines stay visible
+        axes.plot(list(means), list(means.values()), label=program.label, **style)

@@ -1,0 +1,227 @@
+"""Fig. 4 of the Robofleet paper: time until latency is nominal again after a dropout.
+
+A sender's nominal latency is the median over messages received before the dropout. The sender has recovered once every
+further message received has at most ``factor`` times the nominal latency. Its recovery time runs from the link's return
+to the first of these messages, and is infinite if even the last message is later.
+
+The paper leaves open how long the dropout was, what was sent and how fast the link was. So we sweep the length and the
+link, for one topic of each kind, at the rates of the paper's Fig. 6 and 7.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, product
+from typing import Any
+
+import numpy as np
+
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.figure import COLOURS, at_least_0, finish, legend_below, several
+from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, CloudFigure, Sent, played_once, stream
+from bufgym.papers.rows import Rows, table
+from bufgym.scenario.checks import above_0
+from bufgym.traces import Trace
+
+SENDERS = ("robofleet", "rosbridge", "ros-native")
+RATES_HZ = {"PointCloud2": 5.0, "CompressedImage": 2.0, "LaserScan": 10.0}
+KIND_COLOURS = {
+    "PointCloud2": COLOURS["afr"],
+    "CompressedImage": COLOURS["drop-oldest"],
+    "LaserScan": COLOURS["random"],
+}
+PAPER_RATIO = 5.0
+ABOUT = (4.0, 6.0)
+"""Range of ratios that we accept as "about 5 times"."""
+BEFORE_S = 10.0
+WATCHED = 12.0
+"""Time watched after the link's return, in dropout lengths; at least ``LEAST_WATCHED_S``."""
+LEAST_WATCHED_S = 30.0
+
+
+@dataclass(frozen=True)
+class Reproduction(CloudFigure):
+    """Fig. 4 for these lengths of the dropout and these links; the picture shows the fastest link."""
+
+    dropouts_s: Sequence[float] = (1, 2, 5, 10, 20, 30)
+    links_mbit_per_s: Sequence[float] = (12, 25, 50, 100)
+    kinds: Sequence[str] = tuple(RATES_HZ)
+    """Kinds of messages, with one topic in each run."""
+    factor: float = 2.0
+    """Ratio to the nominal latency up to which a latency counts as nominal."""
+    silence_s: float = 0.0
+    """Silence after the link's return, as TCP may wait for its next retransmission."""
+    shown_s: float | None = None
+    """Dropout shown in the left panel; by default the one nearest to 10 s."""
+
+    RULES = {
+        "dropouts_s": several(above_0),
+        "links_mbit_per_s": several(above_0),
+        "silence_s": at_least_0,
+        "factor": above_0,
+    }
+    LIVE = {"dropouts_s": (2, 4), "links_mbit_per_s": (6,), "kinds": ("CompressedImage",), "runs": 1, "live": 4.0}
+    SIZE_INCHES = (11.0, 4.8)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.kinds or isinstance(self.kinds, str) or not set(self.kinds) <= set(RATES_HZ):
+            raise BufgymError(f"kinds = {self.kinds!r}: must be some of {', '.join(RATES_HZ)}")
+        if self.factor <= 1:
+            raise BufgymError(f"factor = {self.factor!r}: must be above 1")
+        if self.shown_s is not None and self.shown_s not in self.dropouts_s:
+            raise BufgymError(f"shown_s = {self.shown_s!r}: must be one of dropouts_s")
+
+    @played_once
+    def run(self, kind: str, mbit: float, dropout_s: float, name: str, seed: int) -> tuple[float, Sent]:
+        """Play one dropout; return when the link goes away, and the messages' outcome."""
+        away_s = BEFORE_S + float(np.random.default_rng(seed).random()) / RATES_HZ[kind]
+        outage_s = dropout_s + self.silence_s
+        watched_s = max(LEAST_WATCHED_S, WATCHED * outage_s)
+        link = Trace.steps([(away_s, mbit * MBIT), (outage_s, 0), (watched_s, mbit * MBIT)], after="hold")
+        streams = (stream(kind, RATES_HZ[kind], points=self.points),)
+        return away_s, self.send(name, streams, link, away_s + outage_s + watched_s, seed)
+
+    def simulate(self) -> Rows:
+        rows = Rows()
+        for kind, mbit, dropout_s, seed, name in product(
+            self.kinds, self.links_mbit_per_s, self.dropouts_s, range(self.runs), SENDERS
+        ):
+            away_s, sent = self.run(kind, mbit, dropout_s, name, seed)
+            key = {"message": kind, "link_mbit_per_s": mbit, "dropout_s": dropout_s, "run": seed, "sender": name}
+            rows.append(key | {"recovery_s": recovery_s(sent, away_s, away_s + dropout_s, self.factor)})
+        return rows
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        cells = by_cell(rows)
+        ratios = {key: ratio(cell) for key, cell in cells.items()}
+        about = [key for key, r in ratios.items() if ABOUT[0] <= r <= ABOUT[1]]
+        less = sum(r < ABOUT[0] for r in ratios.values())
+        finite = [cell for cell in cells.values() if min(cell) > 0 and math.isfinite(cell[0])]
+        nearer = [abs(math.log(cell[2] / cell[0])) < abs(math.log(cell[1] / cell[2])) for cell in finite]
+        lengths = {group: ", ".join(f"{d:g} s" for *g, d in about if tuple(g) == group) for group in groups(about)}
+        return {
+            "paper_ratio": PAPER_RATIO,
+            "about_from": ABOUT[0],
+            "about_to": ABOUT[1],
+            "watched": WATCHED,
+            "cells": len(cells),
+            "sooner_cells": sum(r > 1 for r in ratios.values()),
+            "about_cells": len(about),
+            "less": less,
+            "more": len(cells) - less - len(about),
+            "about": "; ".join(f"{kind} at {mbit:g} Mbit/s {shown}" for (kind, mbit), shown in lengths.items()),
+            "nearer": sum(nearer),
+            "finite": len(finite),
+        }
+
+    def tables(self, rows: Rows) -> list[str]:
+        cells = by_cell(rows)
+        dropouts = list(self.dropouts_s)
+        lines = [["", "load", "Robofleet", "native ROS", *(f"{d:g} s" for d in dropouts), "5x at"]]
+        for kind, mbit in groups(cells):
+            json = stream(kind, RATES_HZ[kind], points=self.points).encodings["json"]
+            group = [cells[kind, mbit, dropout] for dropout in dropouts]
+            ratios = [ratio(cell) for cell in group]
+            own, native = (f"{min(c[k] for c in group):.3f} to {max(c[k] for c in group):.3f}" for k in (0, 2))
+            load = f"{json * RATES_HZ[kind] / (mbit * MBIT):.0%}"
+            length = length_for(dropouts, ratios)
+            lines.append([f"{kind}, {mbit:g} Mbit/s", load, own, native, *(f"{r:.1f}" for r in ratios), length])
+        return table(lines)
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        left, right = figure.subplots(1, 2)
+        shown_s = min(self.dropouts_s, key=lambda s: abs(s - 10)) if self.shown_s is None else self.shown_s
+        kind, mbit = self.kinds[0], max(self.links_mbit_per_s)
+        for name in reversed(SENDERS):
+            away_s, sent = self.run(kind, mbit, shown_s, name, 0)
+            received = sent.received
+            at_s = received.received_s - away_s - shown_s
+            style = PROGRAMS[name].style | {"markersize": 3}
+            for part in ((-shown_s - 3 < at_s) & (at_s < 0), (0 <= at_s) & (at_s < shown_s + 3)):
+                left.plot(at_s[part], received.latency_s[part], **style)
+            left.plot([], [], label=PROGRAMS[name].label, **style)
+        left.axvspan(-shown_s, 0, color=COLOURS["other"], alpha=0.2, linewidth=0)
+        left.annotate("no link", (-shown_s / 2, 0.02), xycoords=("data", "axes fraction"), ha="center", fontsize=8)
+        title = f"{kind}, {mbit:g} Mbit/s, dropout of {shown_s:g} s"
+        finish(left, title, yscale="log", xlabel="receipt, s after the link's return", ylabel="latency, s")
+        left.legend(loc="upper left", frameon=False)
+        self._draw_ratios(right, by_cell(rows))
+        legend_below(figure, 4, right)
+
+    def _draw_ratios(self, axes: Any, cells: Cells) -> None:
+        links = list(self.links_mbit_per_s)
+        for kind, mbit in groups(cells):
+            k = links.index(mbit)
+            style = {"color": KIND_COLOURS[kind], "marker": "osD^vPX*"[k % 8], "markersize": 4.5, "linewidth": 1.2}
+            ratios = [ratio(cells[kind, mbit, dropout]) for dropout in self.dropouts_s]
+            axes.plot(self.dropouts_s, ratios, alpha=0.4 + 0.6 * (k + 1) / len(links), **style)
+        axes.axhspan(*ABOUT, color=COLOURS["other"], alpha=0.35, linewidth=0, label="paper, about 5")
+        for kind in self.kinds:
+            axes.plot([], [], color=KIND_COLOURS[kind], label=kind)
+        for k, mbit in enumerate(links):
+            label = f"{mbit:g} Mbit/s"
+            axes.plot([], [], color=COLOURS["oracle"], marker="osD^vPX*"[k % 8], linestyle="", label=label)
+        title = "Rosbridge's recovery time to Robofleet's"
+        finish(axes, title, xscale="log", yscale="log", xlabel="length of the dropout, s")
+        lengths = sorted(self.dropouts_s)
+        axes.set_xticks(lengths, [f"{d:g}" for d in lengths])
+        axes.set_xticks([], minor=True)
+        axes.set_yticks([1, 5, 10, 50, 100, 500], ["1", "5", "10", "50", "100", "500"])
+
+
+def recovery_s(sent: Sent, away_s: float, back_s: float, factor: float) -> float:
+    """Time from the link's return at ``back_s`` until latency stays within ``factor`` times nominal, or inf.
+
+    The nominal latency is the median over messages received before ``away_s``, when the link went away.
+    """
+    received = sent.received
+    latency_s = received.latency_s
+    before = received.received_s <= away_s
+    if not before.any():
+        raise BufgymError("nothing was received before the dropout: no latency to call nominal")
+    late = np.flatnonzero(latency_s > factor * np.median(latency_s[before]))
+    late = late[received.received_s[late] > away_s]
+    if len(late) == 0:
+        return 0.0
+    if late[-1] + 1 == len(received):
+        return math.inf
+    return max(0.0, float(received.received_s[late[-1] + 1]) - back_s)
+
+
+Cells = dict[tuple[str, float, float], tuple[float, ...]]
+"""(kind, Mbit/s, dropout in s) -> recovery of each of ``SENDERS``, s."""
+
+
+def ratio(cell: Sequence[float]) -> float:
+    """Divide rosbridge's recovery time by Robofleet's."""
+    return cell[1] / cell[0] if cell[0] > 0 and math.isfinite(cell[0]) else math.nan
+
+
+def length_for(dropouts_s: Sequence[float], ratios: Sequence[float], target: float = PAPER_RATIO) -> str:
+    """Interpolate linearly the dropout length at which the ratio is ``target``."""
+    finite = sorted((d, r) for d, r in zip(dropouts_s, ratios, strict=True) if math.isfinite(r))
+    for (d, r), (e, q) in pairwise(finite):
+        if r <= target <= q:
+            return f"{d + (e - d) * (target - r) / (q - r) if q > r else d:.3g} s"
+    if not finite:
+        return "none"
+    return f"< {finite[0][0]:g} s" if finite[0][1] > target else f"> {finite[-1][0]:g} s"
+
+
+def by_cell(rows: Rows) -> Cells:
+    """Average the recovery of each of ``SENDERS`` for each message kind, link and dropout."""
+    return {
+        (kind, mbit, dropout): tuple(
+            rows.mean("recovery_s", message=kind, link_mbit_per_s=mbit, dropout_s=dropout, sender=name)
+            for name in SENDERS
+        )
+        for kind, mbit, dropout in rows.distinct("message", "link_mbit_per_s", "dropout_s")
+    }
+
+
+def groups(cells: Iterable[tuple[str, float, float]]) -> list[tuple[str, float]]:
+    """List the distinct (kind, Mbit/s) of these cells."""
+    return list(dict.fromkeys((kind, mbit) for kind, mbit, _ in cells))

@@ -1,0 +1,267 @@
+"""Fig. 7 of the Robofleet paper: latency of each topic as a robot drives into a bad zone.
+
+The topics are PoseStamped at 10 Hz, LaserScan at 10 Hz and CompressedImage at 2 Hz. The zone begins at about message
+430, which we count on the topics of 10 Hz. The paper does not say how bad the zone was, which topic was no_drop, or
+what the priorities were. Here the link falls from one steady rate to another and poses are no_drop. Priorities follow
+Robofleet's example client: localization 20, laser scans 2, images 1. We also try lower priorities of images.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.figure import COLOURS, finish, legend_below, several, whole
+from bufgym.papers.robofleet_evaluation import (
+    BYTES,
+    MBIT,
+    PROGRAMS,
+    QUEUE_SIZE,
+    ClientFigure,
+    Sent,
+    p95,
+    played_once,
+    stream,
+)
+from bufgym.papers.rows import Row, Rows, table
+from bufgym.scenario.checks import above_0
+from bufgym.traces import Trace
+
+SENDERS = ("robofleet", "rosbridge", "ros-native")
+TOPICS = {
+    "PoseStamped": (10.0, {"priority": 20.0, "no_drop": True}),
+    "LaserScan": (10.0, {"priority": 2.0}),
+    "CompressedImage": (2.0, {"priority": 1.0}),
+}
+"""Kind -> publish rate in Hz and the operator's settings of the topic."""
+LOOKS = {
+    "PoseStamped": (COLOURS["afr"], "o", 2.5),
+    "LaserScan": (COLOURS["drop-oldest"], "s", 2.5),
+    "CompressedImage": (COLOURS["random"], "^", 5),
+}
+"""Kind -> colour, marker and its size."""
+COUNTED_HZ = 10.0
+SPIKE = 2.0
+"""Ratio to a topic's highest latency before the zone; the topic is affected until its last latency beyond that."""
+KEPT = 2.0
+"""Ratio up to which a median latency counts as kept in the zone, after allowing for slower transmission."""
+
+
+@dataclass(frozen=True)
+class Reproduction(ClientFigure):
+    """Fig. 7 for these rates in the bad zone."""
+
+    bad_mbit_per_s: Sequence[float] = (4.0, 2.0, 1.0, 0.5)
+    good_mbit_per_s: float = 10.0
+    """Link rate outside the zone. At 100 rosbridge's backlog vanishes at once, which hides its long recovery."""
+    image_priorities: Sequence[float] = (1.0, 0.1, 0.01)
+    """Priorities of Robofleet's images: the first in every zone, all of them in the zone shown."""
+    bad_from: int = 430
+    """Message of a 10 Hz topic at which the zone begins."""
+    bad_s: float = 30.0
+    """Length of the zone."""
+    after_s: float = 60.0
+    """Time of good link after the zone."""
+    queue_size: int = QUEUE_SIZE
+    """Queue of native ROS, messages per topic."""
+    shown_mbit_per_s: float | None = None
+    """Zone shown in the picture; by default the third, or the last."""
+
+    RULES = {
+        "bad_mbit_per_s": several(above_0),
+        "image_priorities": several(above_0),
+        "good_mbit_per_s": above_0,
+        "bad_from": whole(),
+        "bad_s": above_0,
+        "after_s": above_0,
+    }
+    LIVE = {
+        "bad_mbit_per_s": (1.0,),
+        "image_priorities": (1.0,),
+        "bad_from": 50,
+        "bad_s": 15.0,
+        "after_s": 25.0,
+        "runs": 1,
+        "live": 2.0,
+    }
+    SIZE_INCHES = (8.0, 7.2)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.shown_mbit_per_s is not None and self.shown_mbit_per_s not in self.bad_mbit_per_s:
+            raise BufgymError(f"shown_mbit_per_s = {self.shown_mbit_per_s!r}: must be one of bad_mbit_per_s")
+
+    @property
+    def shown(self) -> float:
+        """Link rate in the zone shown, Mbit/s."""
+        return self.shown_mbit_per_s or self.bad_mbit_per_s[:3][-1]
+
+    @property
+    def zone_s(self) -> tuple[float, float]:
+        """Begin and end of the bad zone."""
+        from_s = self.bad_from / COUNTED_HZ
+        return from_s, from_s + self.bad_s
+
+    @played_once
+    def run(self, bad: float, name: str, image_priority: float, seed: int) -> Sent:
+        """Send the messages of one drive through the zone."""
+        rates = ((self.zone_s[0], self.good_mbit_per_s), (self.bad_s, bad), (self.after_s, self.good_mbit_per_s))
+        link = Trace.steps([(length_s, mbit * MBIT) for length_s, mbit in rates], after="hold")
+        changed: dict[str, dict[str, Any]] = {"CompressedImage": {"priority": image_priority}}
+        streams = [stream(kind, hz, **(rules | changed.get(kind, {}))) for kind, (hz, rules) in TOPICS.items()]
+        return self.send(name, streams, link, self.zone_s[1] + self.after_s, seed)
+
+    def simulate(self) -> Rows:
+        first, *others = self.image_priorities
+        cases = [(bad, name, first) for bad in self.bad_mbit_per_s for name in SENDERS]
+        cases += [(self.shown, "robofleet", priority) for priority in others]
+        rows = Rows()
+        for (bad, name, priority), seed in product(cases, range(self.runs)):
+            sent = self.run(bad, name, priority, seed)
+            key = {"bad_mbit_per_s": bad, "sender": name, "image_priority": priority, "run": seed}
+            rows += [{**key, "topic": kind, **_entry(sent.on(k), self.zone_s)} for k, kind in enumerate(TOPICS)]
+        return rows
+
+    def tables(self, rows: Rows) -> list[str]:
+        first = rows.where(image_priority=self.image_priorities[0])
+        lines = [["zone", "", *(head for kind in TOPICS for head in (kind, "95 %", "lost"))]]
+        for bad, name in first.distinct("bad_mbit_per_s", "sender"):
+            cells = [f"{bad:g} Mbit/s", PROGRAMS[name].label.split(",")[0]]
+            for kind in TOPICS:
+                topic = first.where(bad_mbit_per_s=bad, sender=name, topic=kind)
+                lost = topic.mean("lost_in_zone") / topic.mean("arrived_in_zone")
+                latency_ms = (topic.mean(f"{name}_in_zone_ms") for name in ("median", "p95"))
+                cells += [*(f"{number:,.0f}" for number in latency_ms), f"{lost:.0%}"]
+            lines.append(cells)
+        return [
+            "Latency in ms of messages that came in the zone, median and 95 %, and the part of them that was dropped:",
+            *table(lines, left=2),
+            "",
+            "Robofleet in each zone, and with images of each priority:",
+            *self._kept(rows.where(sender="robofleet")),
+        ]
+
+    def _kept(self, rows: Rows) -> list[str]:
+        """Tabulate whether images are dropped and small messages keep their latency."""
+        small = ("PoseStamped", "LaserScan")
+        lines = [["", "images dropped", *(head for kind in small for head in (f"{kind}, ms", "at most", "kept"))]]
+        for bad, priority in rows.distinct("bad_mbit_per_s", "image_priority"):
+            played = rows.where(bad_mbit_per_s=bad, image_priority=priority)
+            dropped, arrived = (played.mean(f"{n}_in_zone", topic="CompressedImage") for n in ("lost", "arrived"))
+            cells = [f"{bad:g} Mbit/s, {priority:g}", f"{_yes(dropped > 0)}, {dropped:.0f} of {arrived:.0f}"]
+            for kind in small:
+                slower_ms = 1e3 * BYTES[kind][1] / MBIT * (1 / bad - 1 / self.good_mbit_per_s)
+                allowed = KEPT * (played.mean("median_before_ms", topic=kind) + slower_ms)
+                median = played.mean("median_in_zone_ms", topic=kind)
+                cells += [f"{median:.0f}", f"{allowed:.0f}", _yes(median <= allowed)]
+            lines.append(cells)
+        return table(lines)
+
+    def affected(self, rows: Rows, name: str) -> list[float]:
+        """List for each zone how long after it the last topic is still affected, s, mean over runs."""
+        first = rows.where(sender=name, image_priority=self.image_priorities[0])
+        return [
+            max(first.mean("affected_after_s", bad_mbit_per_s=bad, topic=kind) for kind in TOPICS)
+            for bad in self.bad_mbit_per_s
+        ]
+
+    def claims(self, rows: Rows) -> dict[str, Any]:
+        first = rows.where(image_priority=self.image_priorities[0], bad_mbit_per_s=self.shown)
+        native = first.where(sender="ros-native", topic="PoseStamped")
+        lost = sum(row["lost"] for row in rows.where(sender="robofleet", topic="PoseStamped"))
+        medians = (
+            f"{PROGRAMS[name].label.split(',')[0]} "
+            f"{first.mean('median_in_zone_ms', sender=name, topic='PoseStamped') / 1e3:.2f} s"
+            for name in SENDERS
+        )
+        affected = {name: self.affected(rows, name) for name in SENDERS}
+        spikes = [
+            row["highest_in_zone_ms"] > row["highest_before_ms"]
+            for row in rows.where(image_priority=self.image_priorities[0])
+        ]
+        return {
+            "spike": all(spikes),
+            "longer": all(
+                bridge > own for bridge, own in zip(affected["rosbridge"], affected["robofleet"], strict=True)
+            ),
+            "spikes": sum(spikes),
+            "played": len(spikes),
+            "spike_times": SPIKE,
+            "zones": ", ".join(f"{bad:g}" for bad in self.bad_mbit_per_s),
+            "affected": "; ".join(
+                f"{PROGRAMS[name].label.split(',')[0]} {', '.join(f'{s:.1f}' for s in seconds)} s"
+                for name, seconds in affected.items()
+            ),
+            "no-drop": lost == 0,
+            "lost": lost,
+            "from_s": self.zone_s[0],
+            "topics": "; ".join(_rules_of(kind) for kind in TOPICS),
+            "demand": sum(BYTES[kind][1] * hz for kind, (hz, _) in TOPICS.items()) / MBIT,
+            "kept": KEPT,
+            "shown": self.shown,
+            "native_lost": native.mean("lost_in_zone") / native.mean("arrived_in_zone"),
+            "pose_mbit": BYTES["PoseStamped"][0] * TOPICS["PoseStamped"][0] / MBIT,
+            "third": self.shown / len(TOPICS),
+            "medians": ", ".join(medians),
+        }
+
+    def draw(self, rows: Rows, figure: Any) -> None:
+        panels = figure.subplots(len(SENDERS), 1, sharex=True, sharey=True)
+        top_s = 0.0
+        for axes, name in zip(panels, SENDERS, strict=True):
+            sent = self.run(self.shown, name, self.image_priorities[0], 0)
+            top_s = max(top_s, float(np.nanmax(sent.latency_s)))
+            for k, (kind, (colour, marker, size)) in reversed(list(enumerate(LOOKS.items()))):
+                topic = sent.on(k)
+                received = topic.received
+                label = f"{kind}, {TOPICS[kind][0]:g} Hz"
+                style = {"color": colour, "markersize": size, "label": label}
+                axes.plot(COUNTED_HZ * received.arrival_s, received.latency_s, marker, **style)
+                dropped = COUNTED_HZ * topic.arrival_s[np.isnan(topic.received_s)]
+                # Ticks along the bottom, one line per topic.
+                ticks = {"markersize": 5, "markeredgewidth": 0.6, "transform": axes.get_xaxis_transform()}
+                axes.plot(dropped, np.full(len(dropped), 0.03 + 0.045 * k), "|", color=colour, **ticks)
+            axes.axvspan(*(COUNTED_HZ * s for s in self.zone_s), color=COLOURS["other"], alpha=0.2, linewidth=0)
+            finish(axes, PROGRAMS[name].label, yscale="log", ylabel="latency, s")
+        panels[-1].set(
+            xlabel="message of a 10 Hz topic (an image stands at the one of its time)",
+            xlim=(max(0.0, COUNTED_HZ * (self.zone_s[0] - 10)), COUNTED_HZ * (self.zone_s[1] + self.after_s)),
+            ylim=(1e-3, 2 * top_s),
+        )
+        title = f"Bad zone of {self.shown:g} Mbit/s; ticks along the bottom: dropped"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+        legend_below(figure, 4, panels[0])
+
+
+def _entry(sent: Sent, zone_s: tuple[float, float]) -> Row:
+    """Summarize one topic before the zone and in it."""
+    zone = sent.between(*zone_s)
+    latency_s, received = zone.received.latency_s, sent.received
+    before_s = sent.between(0, zone_s[0]).received.latency_s
+    late = received.latency_s > SPIKE * before_s.max()
+    return {
+        "median_before_ms": 1e3 * float(np.median(before_s)),
+        "highest_before_ms": 1e3 * float(before_s.max()),
+        "median_in_zone_ms": 1e3 * float(np.median(latency_s)) if len(latency_s) else math.nan,
+        "p95_in_zone_ms": 1e3 * p95(latency_s),
+        "arrived_in_zone": len(zone),
+        "lost_in_zone": len(zone) - len(latency_s),
+        "highest_in_zone_ms": 1e3 * float(latency_s.max()) if len(latency_s) else math.nan,
+        "affected_after_s": max(0.0, float(received.received_s[late].max(initial=0)) - zone_s[1]),
+        "lost": len(sent) - len(sent.received),
+    }
+
+
+def _rules_of(kind: str) -> str:
+    hz, rules = TOPICS[kind]
+    return f"{kind} {hz:g} Hz, " + ("no_drop" if rules.get("no_drop") else f"priority {rules['priority']:g}")
+
+
+def _yes(claim: bool) -> str:
+    return "yes" if claim else "NO"

@@ -1,0 +1,85 @@
+"""Rows of a figure's numbers: queries, and tables of text."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.ground.files import replaced
+
+Row = dict[str, Any]
+"""Column -> text, number or None."""
+
+
+class Rows(list[Row]):
+    """Rows with the same columns. In each method ``where`` selects rows whose columns have these values."""
+
+    def where(self, **values: object) -> Rows:
+        return Rows(row for row in self if all(row[name] == value for name, value in values.items()))
+
+    def column(self, name: str, **where: object) -> NDArray[np.float64]:
+        """Return one column, float64[rows]."""
+        return np.array([row[name] for row in self.where(**where)], np.float64)
+
+    def mean(self, name: str, **where: object) -> float:
+        """Mean of a column; NaN without rows."""
+        return average(self.column(name, **where))
+
+    def distinct(self, *names: str) -> list[Any]:
+        """List the distinct values of a column in row order; several columns give tuples."""
+        values = (row[names[0]] if len(names) == 1 else tuple(row[name] for name in names) for row in self)
+        return list(dict.fromkeys(values))
+
+    def pivot(self, index: str, by: str, value: str, spec: str, labels: Mapping[Any, str] | None = None) -> list[str]:
+        """Tabulate means of the column ``value``, with a line per value of ``index`` and a column per value of ``by``.
+
+        Args:
+            spec: format of a mean, such as ".1f" or ".0%".
+            labels: names of lines and columns to show instead of their values.
+        """
+        known = labels or {}
+
+        def label(value: Any) -> str:
+            return known.get(value, f"{value:g}" if isinstance(value, float) else str(value))
+
+        heads = self.distinct(by)
+        lines = [[index, *map(label, heads)]]
+        for key in self.distinct(index):
+            means = (self.mean(value, **{index: key, by: head}) for head in heads)
+            lines.append([label(key), *(format(number, spec) for number in means)])
+        return table(lines)
+
+    def save(self, path: Path) -> Path:
+        """Write the rows as CSV; return the path."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(self[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(self)
+        return path
+
+
+def average(numbers: NDArray[np.float64]) -> float:
+    """Mean, or NaN without numbers."""
+    return float(numbers.mean()) if len(numbers) else math.nan
+
+
+def table(lines: Sequence[Sequence[object]], left: int = 1) -> list[str]:
+    """Align the columns of a table; the first ``left`` columns are flush left, the others flush right."""
+    texts = [[str(cell) for cell in line] for line in lines]
+    widths = [max(map(len, cells)) for cells in zip(*texts, strict=True)]
+    return [
+        "  ".join(f"{cell:{'<' if k < left else '>'}{widths[k]}}" for k, cell in enumerate(line)).rstrip()
+        for line in texts
+    ]
+
+
+def listed(numbers: Sequence[Any]) -> str:
+    """Join as in ``1, 2, 3``; an empty sequence gives ``none``."""
+    return ", ".join(map(str, numbers)) or "none"

@@ -1,0 +1,239 @@
+"""Publish-subscribe libraries that frames may go over: Zenoh, MQTT and DDS.
+
+| name | library | the receiver | host and port |
+|---|---|---|---|
+| zenoh | ``eclipse-zenoh`` | listens, a peer of Zenoh over TCP | where the receiver listens |
+| mqtt | ``paho-mqtt`` | connects, as the sender does | the broker's |
+| dds | ``cyclonedds`` | is a participant, over UDP | its host; ports are given from this one on |
+
+All send and receive reliably, drop nothing themselves, and are given the next message when the window of acks allows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import threading
+import time
+from typing import Any, Final
+
+from bufgym.robot.bus_channel import Hear, Open, Peer
+from bufgym.robot.extra import needs
+from bufgym.robot.sockets import DEAD_AFTER_S, small_buffers
+
+ROOT: Final = "bufgym"
+MQTT_PORT: Final = 1883
+"""Standard port of an MQTT broker."""
+CONNECT_S: Final = 1.0
+"""Time for a Zenoh receiver to answer."""
+
+
+# --- Zenoh ------------------------------------------------------------------------------------------------------------
+
+
+class ZenohBus:
+    """A Zenoh session. Its full queue blocks the sender; by default it would drop."""
+
+    def __init__(self, host: str, port: int, name: str, hear: Hear, peer: Peer) -> None:
+        with needs("zenoh", "zenoh"):
+            import zenoh
+        self._zenoh, self._name = zenoh, name
+        config = zenoh.Config()
+        for key, setting in {
+            "mode": "peer",
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+            "listen/endpoints": [] if name else [f"tcp/{host}:{port}"],
+            "connect/endpoints": [f"tcp/{host}:{port}"] if name else [],
+            "connect/timeout_ms": round(CONNECT_S * 1000),
+            "connect/exit_on_failure": True,
+            "transport/shared_memory/enabled": False,  # on one machine it would carry bodies past the link
+            "transport/link/tx/lease": round(DEAD_AFTER_S * 1000),
+            "transport/link/tx/queue/congestion_control/block/wait_before_close": round(DEAD_AFTER_S * 1e6),
+        }.items():
+            config.insert_json5(key, json.dumps(setting))
+        try:
+            self._session: Any = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise ConnectionError(f"zenoh, {host}:{port}: {error}") from None
+        heard = f"{ROOT}/down/{name}" if name else f"{ROOT}/up/*"
+        self._session.declare_subscriber(
+            heard, lambda sample: hear(str(sample.key_expr).rsplit("/", 1)[1], sample.payload.to_bytes())
+        )
+        live = self._session.liveliness()
+        if name:
+            live.declare_subscriber(
+                f"{ROOT}/receiver", lambda sample: peer(sample.kind == zenoh.SampleKind.PUT), history=True
+            )
+        else:
+            self._token = live.declare_token(f"{ROOT}/receiver")
+
+    def publish(self, name: str, data: bytes) -> None:
+        zenoh, way = self._zenoh, "up" if self._name else "down"
+        try:
+            self._session.put(
+                f"{ROOT}/{way}/{name}", data, congestion_control=zenoh.CongestionControl.BLOCK, express=True
+            )
+        except zenoh.ZError as error:
+            raise ConnectionError(f"zenoh: {error}") from None
+
+    def close(self) -> None:
+        self._session.close()
+
+
+# --- MQTT -------------------------------------------------------------------------------------------------------------
+
+
+class MqttBus:
+    """A client of an MQTT broker. A retained message announces the receiver, and the broker's will its end."""
+
+    def __init__(self, host: str, port: int, name: str, hear: Hear, peer: Peer) -> None:
+        with needs("paho"):
+            from paho.mqtt.client import Client
+            from paho.mqtt.enums import CallbackAPIVersion
+        self._name, presence, self._closed = name, f"{ROOT}/receiver", False
+        self._client = Client(CallbackAPIVersion.VERSION2, reconnect_on_failure=not name)
+        joined, refused = threading.Event(), list[bool]()
+
+        def on_connect(client: Client, *_: Any) -> None:
+            client.subscribe([(f"{ROOT}/down/{name}", 0), (presence, 0)] if name else f"{ROOT}/up/+")
+            if not name:
+                client.publish(presence, b"here", qos=1, retain=True)
+
+        def on_message(_: Client, __: Any, message: Any) -> None:
+            if message.topic == presence:
+                peer(bool(message.payload))
+            else:
+                hear(message.topic.rsplit("/", 1)[1], message.payload)
+
+        def on_disconnect(*_: Any) -> None:
+            peer(False)
+            if not joined.is_set():
+                refused.append(True)
+            joined.set()
+
+        self._client.on_connect = on_connect
+        self._client.on_message = on_message
+        self._client.on_subscribe = lambda *_: joined.set()
+        self._client.on_disconnect = on_disconnect
+        self._client.on_socket_open = lambda _, __, connection: _prompt(connection)
+        if not name:
+            self._client.will_set(presence, b"", qos=1, retain=True)
+        self._presence = presence
+        self._client.connect(host, port, keepalive=round(DEAD_AFTER_S))
+        self._client.loop_start()
+        if not joined.wait(DEAD_AFTER_S) or refused:
+            self.close()
+            raise ConnectionError(f"mqtt, {host}:{port}: the broker does not answer")
+
+    def publish(self, name: str, data: bytes) -> None:
+        way = "up" if self._name else "down"
+        until_s = time.monotonic() + DEAD_AFTER_S
+        try:
+            message = self._client.publish(f"{ROOT}/{way}/{name}", data)
+            while not (message.is_published() or self._closed or time.monotonic() > until_s):
+                message.wait_for_publish(0.05)
+        except (RuntimeError, ValueError) as error:  # no connection
+            raise ConnectionError(f"mqtt: {error}") from None
+
+    def close(self) -> None:
+        self._closed = True
+        if not self._name:
+            with contextlib.suppress(RuntimeError):
+                self._client.publish(self._presence, b"", qos=1, retain=True).wait_for_publish(1)
+        self._client.disconnect()
+        self._client.loop_stop()
+
+
+def _prompt(connection: Any) -> None:
+    """Keep the system's buffers small, and send small packets at once."""
+    small_buffers(connection)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+# --- DDS --------------------------------------------------------------------------------------------------------------
+
+_DDS: Final = """<CycloneDDS><Domain Id="any">
+<General><AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+<Peers><Peer Address="{host}"/></Peers><LeaseDuration>{lease_s:g}s</LeaseDuration>
+<Ports><Base>{base}</Base><DomainGain>0</DomainGain></Ports></Discovery></Domain></CycloneDDS>"""
+_FIRST_PORT: Final = 10
+"""Offset of the first participant's port from DDS's base port."""
+_domains: Final[dict[int, Any]] = {}
+"""Domains by number; a domain's settings hold for the process."""
+
+
+class DdsBus:
+    """A DDS participant. The port sets the domain's number, so that other domains do not hear it."""
+
+    def __init__(self, host: str, port: int, name: str, hear: Hear, peer: Peer) -> None:
+        with needs("cyclonedds", "dds"):
+            from cyclonedds.core import DDSException
+            from cyclonedds.domain import Domain, DomainParticipant
+            from cyclonedds.pub import DataWriter
+            from cyclonedds.sub import DataReader
+            from cyclonedds.topic import Topic
+
+        from bufgym.robot.dds_message import QUALITY, Message
+
+        number, ways = port % 230, ("up", "down") if name else ("down", "up")
+        try:
+            if number not in _domains:
+                settings = _DDS.format(host=host, base=port - _FIRST_PORT, lease_s=DEAD_AFTER_S)
+                _domains[number] = Domain(number, settings)
+            participant = DomainParticipant(number)
+            out, back = (Topic(participant, f"{ROOT}_{way}", Message) for way in ways)
+            self._reader = DataReader(participant, back, qos=QUALITY[ways[1]])
+            self._writer = DataWriter(participant, out, qos=QUALITY[ways[0]])
+        except DDSException as error:
+            raise ConnectionError(f"dds, {host}:{port}: {error}") from None
+        self._message, self._error, self._participant = Message, DDSException, participant
+        self._closed = threading.Event()
+        threading.Thread(target=self._listen, args=(name, hear, peer), daemon=True).start()
+
+    def _listen(self, name: str, hear: Hear, peer: Peer) -> None:
+        """Hand on messages and the other end's presence.
+
+        A listener of the library would run in the library's thread. Python's garbage collector may delete a closed end
+        there, and that deletion waits for the same thread.
+        """
+        from cyclonedds.core import DDSStatus, ReadCondition, SampleState, WaitSet
+        from cyclonedds.util import duration
+
+        reader, writer, there = self._reader, self._writer, False
+        arrived = ReadCondition(reader, SampleState.NotRead)
+        waitset = WaitSet(self._participant)
+        reader.set_status_mask(DDSStatus.SubscriptionMatched)
+        writer.set_status_mask(DDSStatus.PublicationMatched)
+        for one in (arrived, reader, writer):
+            waitset.attach(one)
+        while not self._closed.is_set():
+            reader.take_status(DDSStatus.SubscriptionMatched)
+            writer.take_status(DDSStatus.PublicationMatched)
+            matched = bool(reader.get_matched_publications() and writer.get_matched_subscriptions())
+            if matched != there:
+                there = matched
+                peer(there)
+            for sample in reader.take(64, condition=arrived):
+                if isinstance(sample, self._message) and sample.name == (name or sample.name):
+                    hear(sample.name, bytes(sample.data))
+            waitset.wait(duration(milliseconds=50))
+        self._participant = self._reader = self._writer = None
+
+    def publish(self, name: str, data: bytes) -> None:
+        writer = self._writer
+        if writer is None:
+            raise ConnectionError("dds: closed")
+        try:
+            writer.write(self._message(name, data))
+        except self._error as error:
+            raise ConnectionError(f"dds: {error}") from None
+
+    def close(self) -> None:
+        self._closed.set()
+
+
+BUSES: Final[dict[str, Open]] = {"zenoh": ZenohBus, "mqtt": MqttBus, "dds": DdsBus}
+"""Name of a library -> class that opens either end."""

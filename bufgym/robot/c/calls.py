@@ -1,0 +1,131 @@
+"""Calls of a program in an episode with the simulator's decisions, the reference for the header's C."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import at, compile_for, kernel, local, records
+from bufgym.model.link import Link
+from bufgym.model.qoi import Value
+from bufgym.policies.registry import Policy, signatures
+from bufgym.scenario import Episode, messages
+from bufgym.sim import DECISION, DEPARTURE, END, Senders, arrival_of, decide, next_event, view
+from bufgym.sim.state import Batch, batch_type
+from bufgym.traces import Trace
+
+INIT, ARRIVAL, DEQUEUE, SENT = range(4)
+"""Kinds of calls, as in ``parts/parity.h``."""
+
+CALL = np.dtype(
+    [
+        ("kind", np.int64),
+        ("at_us", np.int64),
+        ("size_bytes", np.int64),  # of the message that arrives or has been sent
+        ("left_bytes", np.int64),  # in the socket, at an arrival
+        ("decision", np.int64),  # the policy's, at an arrival
+        ("x", np.float64),
+    ],
+    align=True,
+)
+"""``struct bufgym_call``."""
+
+
+@kernel
+def _note(calls: NDArray[Any], n: int, kind: int, at_us: int, size_bytes: int) -> int:
+    """Write call ``n``; return the new number of calls."""
+    call = calls[n]
+    call.kind, call.at_us, call.size_bytes = kind, at_us, size_bytes
+    call.left_bytes, call.decision, call.x = 0, 0, 0.0
+    return n + 1
+
+
+def _record(
+    batch: Batch,
+    memory: NDArray[np.float64],
+    on_arrival: Any,
+    on_departure: Any,
+    hears_departures: bool,
+    calls: NDArray[Any],
+) -> int:
+    """Run every sender of the batch to its end, record the calls and return their number."""
+    n = 0
+    for i in range(len(batch.senders)):
+        n = _note(calls, n, INIT, 0, 0)
+        event, sent = next_event(batch, None, i), 0
+        while event != END:
+            sender = batch.senders[i]
+            while sent < sender.transmitted:
+                place = at(batch.order, i, sent)
+                n = _note(
+                    calls, n, SENT, at(batch.log, i, place).transmitted_us, at(batch.arrivals, i, place).size_bytes
+                )
+                sent += 1
+            buffer = local(view(batch, i))
+            if event == DECISION:
+                arrival = arrival_of(batch, i)
+                decision = on_arrival(buffer, arrival, memory[i])
+                n = _note(calls, n, ARRIVAL, arrival.arrival_us, arrival.size_bytes)
+                calls[n - 1].x, calls[n - 1].left_bytes, calls[n - 1].decision = arrival.x, buffer.left_bytes, decision
+                decide(batch, i, decision)
+            elif event == DEPARTURE:
+                n = _note(calls, n, DEQUEUE, sender.now_us, 0)
+                if hears_departures:
+                    on_departure(buffer, memory[i])
+            event = next_event(batch, None, i)
+    return n
+
+
+@functools.cache
+def _compiled_record() -> Any:
+    """Compile ``_record`` for every compiled policy."""
+    arrives, departs, _, _ = (numba.types.FunctionType(signature) for signature in signatures())
+    memory = numba.types.Array(numba.types.float64, 2, "C")
+    calls = numba.types.Array(numba.from_dtype(CALL), 1, "C")
+    signature = numba.types.int64(batch_type(several=False), memory, arrives, departs, numba.types.boolean, calls)
+    return compile_for(signature, _record)
+
+
+def recorded(
+    policy: Policy, episodes: Sequence[Episode], capacity: int, value: Value, max_bytes: int | None = None
+) -> NDArray[Any]:
+    """Record CALL[calls] of the episodes in turn, under a policy that decides at arrivals alone.
+
+    No message may be larger than B, because such a message is dropped without a call.
+    """
+    if policy.drops_at_dequeue or policy.schedules:
+        raise BufgymError(f"policy {policy.name}: is asked when the socket is free: must decide at arrivals alone")
+    longest = max(len(episode.arrivals) for episode in episodes)
+    senders = Senders(len(episodes), capacity, value, max_messages=longest, max_bytes=max_bytes)
+    senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
+    senders.follow(policy)
+    # An arrival may need as many evictions as the queue holds, but each message is evicted only once.
+    most = sum(1 + 4 * len(episode.arrivals) for episode in episodes)
+    calls = records(most, CALL)
+    on_arrival, on_departure, _, _ = policy.compiled
+    batch = senders.batch._replace(parameters=policy.parameter_array)
+    memory = policy.new_memory(len(episodes), capacity)
+    n = _compiled_record()(batch, memory, on_arrival, on_departure, policy.hears_departures, calls)
+    return calls[:n]
+
+
+def random_episode(rng: np.random.Generator, n: int, largest_bytes: int | None = None) -> Episode:
+    """Draw n messages with random times, sizes up to the largest and motion, on a link of changing rate."""
+    period_us, size_bytes = rng.choice([10_000, 33_333, 100_000]), int(rng.choice([2_000, 60_000, 230_000]))
+    jitter, spread = rng.choice([0.0, 0.3, 3.0]), rng.choice([0.0, 0.5])
+    step_us = rng.gamma(1 / jitter, period_us * jitter, n) if jitter > 0 else np.full(n, period_us)
+    sizes = np.clip(size_bytes * np.exp(rng.normal(0, spread, n)), 1, largest_bytes)
+    step = np.ones(n) if rng.random() < 0.3 else rng.gamma(0.5, 2.0, n) * (rng.random(n) < 0.8)
+    demand = 1e6 * size_bytes / period_us
+    seconds = rng.uniform(2, 40, 12) * period_us / 1e6
+    shares = rng.choice([0.0, 0.1, 0.5, 0.9, 1.5], 12)
+    shares[0] = 1.5  # the link carries something
+    trace = Trace.steps([(s, share * demand) for s, share in zip(seconds, shares, strict=True)])
+    arrivals = messages(np.cumsum(step_us).astype(np.int64), sizes.astype(np.int64), np.cumsum(step))
+    return Episode(arrivals, Link(trace, offset_us=int(rng.integers(trace.duration_us))))

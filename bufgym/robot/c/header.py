@@ -1,0 +1,227 @@
+"""Builder of a policy's header from parts in C and the policy's numbers as constants."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym import __version__, policies
+from bufgym.ground.errors import BufgymError, printable
+from bufgym.ground.files import replaced
+from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
+from bufgym.model.observe.queue import ROUNDING, TINY
+from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value, straight
+from bufgym.policies import Policy, gaps, learned, small_queue, target_gap, thinning
+from bufgym.policies.scoring import end_of, unpack
+from bufgym.robot.c.calls import random_episode, recorded
+
+_PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
+SUPPORTED = tuple(sorted(path.stem for path in _RULES.glob("*.h")))
+"""Names of the exportable rules; learned agents for one queue are exportable too."""
+_HELPERS = {
+    "bufgym_gaps_of(": "gaps.h",
+    "bufgym_smallest_time_gap(": "time_gap.h",
+    "bufgym_spare(": "thinning.h",
+    "bufgym_approach(": "target_gap.h",
+    "bufgym_thin(": "thin.h",
+}
+"""Parts that rules share, each before its callers."""
+_LEARNED = (*("gaps.h", "thinning.h", "target_gap.h"), *("features.h", "greedy.h", "small_queue.h", "scorer.h"))
+"""Parts of a learned agent; only an agent that thins uses the target gap."""
+_TARGET = (
+    *("HORIZON_US", "SHORT", "LONG", "REST", "LINK_US", "PACED", "PACE_US", "NEAR", "DISCOUNT"),
+    *("LEAST", "BURSTY", "LATE", "WITHIN"),
+)
+"""Parameters of ``target_gap`` in C."""
+_VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
+_SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
+"""Seed, episodes and messages of the calls in the header."""
+
+
+def write(policy: Policy, out: str | Path, capacity: int, value: Value, max_bytes: int | None = None) -> Path:
+    """Write ``header`` to the file ``out``, whole or not at all.
+
+    Raises:
+        BufgymError: as ``header``, or the file cannot be written.
+    """
+    target, text = Path(out), header(policy, capacity, value, max_bytes)
+    try:
+        with replaced(target) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise BufgymError(f"{target}: cannot be written: {error.strerror}") from None
+    return target
+
+
+def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = None) -> str:
+    """Make the policy's C99 header for L = ``capacity`` and B = ``max_bytes`` with V = ``value``.
+
+    Raises:
+        BufgymError: the policy has no C, or a limit is invalid.
+    """
+    check_limits(capacity, max_bytes)
+    learns = policy.on_arrival is learned.on_arrival
+    body = _agent(policy) if learns else _rule(policy)
+    if "bufgym_departure(" not in body:
+        body += "\n" + _part("no_departure.h")
+    unlimited = max_bytes is None
+    numbers = {
+        "ABOUT": _comment(policy.summary),
+        "SOURCE": _comment(policy.source),
+        "NAME": _comment(policy.name),
+        "VERSION": __version__,
+        "CAPACITY": capacity,
+        "UNLIMITED": UNLIMITED_BYTES,
+        "MAX_BYTES": "BUFGYM_UNLIMITED" if unlimited else f"INT64_C({max_bytes})",
+        "LIMIT": "no limit" if unlimited else max_bytes,
+        "MEMORY": ", ".join(map(repr, map(float, policy.memory.values()))) or "0.0",
+        "MEMORY_SIZE": max(1, len(policy.memory)),
+        "PARAMETERS": _array("double", "bufgym_parameters", policy.parameters.values()) if policy.parameters else "",
+        "VALUE": _comment(value.name),
+        "VALUE_PART": _array("double", "bufgym_v", value.array) + _part(f"value_{_VALUES[int(value.array[0])]}.h"),
+        "SCRATCH": "",
+        "POLICY": body,
+        "TINY": repr(TINY),
+        "ROUNDING": repr(ROUNDING),
+        "STILL": repr(learned.STILL),
+        "MOTION": gaps.MOTION,
+        "MESSAGES": gaps.MESSAGES,
+        "WAITING": thinning.WAITING,
+        "SOON_US": repr(thinning.SOON_US),
+        **{name: repr(getattr(target_gap, name)) for name in _TARGET},
+        "UNPACED": repr(1 - target_gap.PACED),
+        "FLOWS": repr(learned.FLOWS),
+        "FEW": learned.FEW,
+        "STEADY_US": repr(thinning.HORIZON_US),
+        "STEADY": repr(thinning.STEADY),
+        "STRAIGHT": int(straight(value.array)),
+        "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
+    }
+    if learns:
+        numbers |= _scorers(policy) | _plans(value)
+    return _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
+
+
+def _agent(policy: Policy) -> str:
+    """Write the C of a learned agent."""
+    return "".join(_part(part) for part in _LEARNED if part != "target_gap.h" or policy.memory)
+
+
+def _rule(policy: Policy) -> str:
+    """Write the C of a rule after the parts that it shares."""
+    name = policy.name.partition(":")[0]
+    if name not in SUPPORTED or policies.get(name).on_arrival is not policy.on_arrival:
+        known = ", ".join(SUPPORTED)
+        raise BufgymError(f"policy {policy.name}: has no C; known: {known}, and learned agents for one queue")
+    rule = (_RULES / f"{name}.h").read_text(encoding="utf-8")
+    helpers = ""
+    for call, part in reversed(_HELPERS.items()):  # a helper may call the one before it
+        if call in helpers + rule:
+            helpers = _part(part) + helpers
+    return helpers + rule
+
+
+def _scorers(policy: Policy) -> dict[str, Any]:
+    """Collect the values for a learned policy's C: its scorers, their scratch and the fields."""
+    parameters, begin, networks = np.array(policy.weights), 1, len(learned.Weights.NETWORKS)
+    entries: list[str] = []
+    flags = int(parameters[0])
+    shortcuts, thins = (int(flags & flag > 0) for flag in (learned.LEAVES, learned.THINS))
+    measured_in = "MOTION" if flags & learned.SEES_MOTION else "MESSAGES"
+    end = len(parameters) - shortcuts * small_queue.NUMBERS
+    text, inputs, units = "", 1, 1
+    while begin < end:
+        scorer = getattr(unpack, "py_func", unpack)(parameters, begin, networks)
+        k, n = len(entries), len(scorer.fields)
+        text += _array("int", f"bufgym_fields_{k}", scorer.fields.astype(int))
+        text += _array("double", f"bufgym_networks_{k}", scorer.networks)
+        if len(scorer.mix):
+            text += _array("double", f"bufgym_mix_{k}", scorer.mix)
+        sizes = n, scorer.context, scorer.first, scorer.second, scorer.size, len(scorer.mix)
+        arrays = f"bufgym_fields_{k}, bufgym_networks_{k}, {f'bufgym_mix_{k}' if len(scorer.mix) else '0'}"
+        entries.append(f"    {{{', '.join(map(str, sizes))}, {arrays}}},\n")
+        inputs, units = max(inputs, n), max(units, 2 * scorer.first + scorer.second)
+        begin = end_of(parameters, begin, networks)
+    text += "/* The second one decides while the link stands still. */\n" if len(entries) > 1 else ""
+    text += f"#define BUFGYM_SCORERS {len(entries)}\n"
+    text += f"#define BUFGYM_SHORTCUTS {shortcuts}\n"
+    text += f"#define BUFGYM_THINS {thins}\n#define BUFGYM_MEASURED_IN BUFGYM_{measured_in}\n"
+    text += f"static const struct bufgym_scorer bufgym_scorers[] = {{\n{''.join(entries)}}};\n"
+    scratch = (
+        "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"
+        f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{learned.CONTEXT}];\n"
+        f"    double rows[{learned.SLOTS}][BUFGYM_CAPACITY + 1];\n"
+    )
+    return {
+        "WEIGHTS": text,
+        "SCRATCH": scratch,
+        "SLOT_FIELDS": _enum(learned.SLOT_NAMES),
+        "CONTEXT_FIELDS": _enum(learned.CONTEXT_NAMES),
+        "PLANS": _array("int64_t", "bufgym_plans", small_queue.packed() if shortcuts else [0]),
+    }
+
+
+def _plans(value: Value) -> dict[str, Any]:
+    """Collect the values for the plans of small queues, besides the plans themselves."""
+    log_base = float(value.array[1]) if value.array[0] == EXPONENTIAL else 0.0
+    return {
+        "PLAN_LOG_BASE": repr(log_base),
+        "PLAN_FIRST": repr(small_queue.FIRST),
+        "PLAN_STEP": repr(small_queue.STEP),
+        "PLAN_SLACK": repr(small_queue.SLACK),
+        "PLAN_BASES": len(small_queue.BASES),
+        "PLAN_ALL": small_queue.EACH,
+        "PLAN_SIZE": small_queue.PLAN,
+        "PLAN_LONGEST": small_queue.LONGEST,
+    }
+
+
+def _calls(policy: Policy, capacity: int, value: Value, max_bytes: int | None) -> NDArray[Any]:
+    """Record the calls in the header, whose messages all fit into B."""
+    rng = np.random.default_rng(_SEED)
+    episodes = [random_episode(rng, _MESSAGES, max_bytes) for _ in range(_EPISODES)]
+    return recorded(policy, episodes, capacity, value, max_bytes)
+
+
+# --- C text ----------------------------------------------------------------------------------------------------------
+
+
+def _part(name: str) -> str:
+    return (_PARTS / name).read_text(encoding="utf-8")
+
+
+def _filled(text: str, numbers: dict[str, Any]) -> str:
+    """Replace each @NAME@, also inside inserted text."""
+    while re.search("@[A-Z_]+@", text):
+        text = re.sub("@([A-Z_]+)@", lambda found: str(numbers[found[1]]), text)
+    return text
+
+
+def _comment(text: str) -> str:
+    """Escape text for a comment or an inserted line."""
+    return printable(text).replace("*/", "* /").replace("@", "(at)")
+
+
+def _array(kind: str, name: str, numbers: Iterable[Any]) -> str:
+    """Write ``static const kind name[] = {...};`` with numbers exact to the last bit."""
+    words = _lines(repr(float(number) if kind == "double" else int(number)) for number in numbers)
+    return f"static const {kind} {name}[] = {{\n    {words}\n}};\n"
+
+
+def _lines(words: Iterable[str]) -> str:
+    """Join the words with commas, five in a line."""
+    found = list(words)
+    return ",\n    ".join(", ".join(found[k : k + 5]) for k in range(0, len(found), 5))
+
+
+def _enum(names: Iterable[str]) -> str:
+    return f"enum {{\n    {_lines(f'BUFGYM_{name.upper()}' for name in names)}\n}};"
+
+
+def _call(call: Any) -> str:
+    return "    {" + ", ".join(repr(call[name].item()) for name in call.dtype.names) + "},\n"

@@ -1,0 +1,145 @@
+"""Connections that hide no queue: TCP, WebSocket, and the table of all transports."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final, Protocol
+
+from bufgym.robot.bus_channel import BusChannel
+from bufgym.robot.buses import BUSES
+from bufgym.robot.extra import needs
+from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, header, parse, whole
+from bufgym.robot.sockets import connected, unacked_bytes
+
+PIECE_BYTES: Final = 16_384
+"""Bytes written at a time, so that ``left_bytes`` is known while a large message is under way."""
+
+
+class Channel(Protocol):
+    """A connection on which frames go both ways."""
+
+    async def send(self, frame: Frame) -> None:
+        """Send a frame; return when the system has taken the last byte."""
+
+    async def receive(self) -> Frame:
+        """Receive the next frame; raise a ConnectionError when there are no more."""
+
+    def left_bytes(self) -> int | None:
+        """Bytes given to ``send`` that the peer's system has not acked; None if unknown."""
+
+    def close(self) -> None:
+        """Close at once."""
+
+
+class TcpChannel:
+    """Frames on a TCP socket, one after the other."""
+
+    def __init__(self, connection: socket.socket, max_body_bytes: int = MAX_BODY_BYTES) -> None:
+        self._socket = connection
+        self._max_body_bytes = max_body_bytes
+        self._unwritten_bytes = 0
+
+    @classmethod
+    async def connect(cls, host: str, port: int, *, small: bool = True) -> TcpChannel:
+        """Connect a sender; ``small=False`` leaves the system's buffers as they are."""
+        return cls(await connected(host, port, small))
+
+    async def send(self, frame: Frame) -> None:
+        loop = asyncio.get_running_loop()
+        head, body = header(frame), memoryview(frame.body)
+        self._unwritten_bytes = len(body)
+        await loop.sock_sendall(self._socket, head)
+        for start in range(0, len(body), PIECE_BYTES):
+            piece = body[start : start + PIECE_BYTES]
+            await loop.sock_sendall(self._socket, piece)
+            self._unwritten_bytes -= len(piece)
+
+    async def receive(self) -> Frame:
+        frame, body_bytes = parse(await self._exactly(HEADER_BYTES), self._max_body_bytes)
+        return frame._replace(body=await self._exactly(body_bytes)) if body_bytes else frame
+
+    async def _exactly(self, size_bytes: int) -> memoryview:
+        loop, data, got = asyncio.get_running_loop(), memoryview(bytearray(size_bytes)), 0
+        while got < size_bytes:
+            more = await loop.sock_recv_into(self._socket, data[got:])
+            if more == 0:
+                raise ConnectionResetError("the peer has closed the connection")
+            got += more
+        return data
+
+    def left_bytes(self) -> int | None:
+        unacked = unacked_bytes(self._socket)
+        return None if unacked is None else self._unwritten_bytes + unacked
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class WebSocketChannel:
+    """Frames as binary messages of a WebSocket (the library ``websockets``)."""
+
+    def __init__(self, connection: Any, max_body_bytes: int = MAX_BODY_BYTES) -> None:
+        self._connection = connection
+        self._max_body_bytes = max_body_bytes
+
+    @classmethod
+    async def connect(cls, host: str, port: int, *, small: bool = True) -> WebSocketChannel:
+        """Connect a sender; ``small=False`` leaves the library's and the system's buffers as they are."""
+        with needs("websockets"):
+            from websockets.asyncio.client import connect
+            from websockets.exceptions import WebSocketException
+        limit: dict[str, Any] = {"write_limit": (1, 0)} if small else {}
+        try:
+            connection = await connect(
+                f"ws://{host}:{port}",
+                sock=await connected(host, port, small),
+                compression=None,
+                ping_interval=None,  # a slow link answers late; TCP_USER_TIMEOUT finds a dead one
+                proxy=None,
+                **limit,
+            )
+        except WebSocketException as error:
+            raise ConnectionError(f"{host}:{port}: {error}") from None
+        return cls(connection)
+
+    async def send(self, frame: Frame) -> None:
+        with _as_connection_errors():
+            await self._connection.send(header(frame) + bytes(frame.body))
+
+    async def receive(self) -> Frame:
+        with _as_connection_errors():
+            data = await self._connection.recv()
+        if not isinstance(data, bytes):
+            raise FrameError("a text message: must be binary")
+        return whole(data, self._max_body_bytes)
+
+    def left_bytes(self) -> int | None:
+        transport = self._connection.transport
+        unacked = unacked_bytes(transport.get_extra_info("socket"))
+        return None if unacked is None else transport.get_write_buffer_size() + unacked
+
+    def close(self) -> None:
+        self._connection.transport.abort()
+
+
+@contextlib.contextmanager
+def _as_connection_errors() -> Any:
+    """Convert errors of ``websockets`` at a connection's end to a ConnectionError."""
+    from websockets.exceptions import WebSocketException
+
+    try:
+        yield
+    except WebSocketException as error:
+        raise ConnectionResetError(f"{type(error).__name__}: {error}") from None
+
+
+TRANSPORTS: Final[dict[str, Callable[..., Any]]] = {
+    "tcp": TcpChannel.connect,
+    "websocket": WebSocketChannel.connect,
+    **{name: partial(BusChannel.connect, opening) for name, opening in BUSES.items()},
+}
+"""Transport -> function that connects a sender: (host, port, small=True) -> a ``Channel``."""

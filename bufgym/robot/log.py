@@ -1,0 +1,154 @@
+"""Log of a live queue's events, with enough detail to repeat every decision in the simulator.
+
+Records are small dictionaries. In a file each is a JSON message of an MCAP recording on the channel of its event. Files
+need the extra ``live``.
+
+| event | fields besides ``us``, the time |
+|---|---|
+| settings | policy, parameters, capacity, max_bytes, v, decide_at, topics, window |
+| put | seq, size_bytes, x, topic, uniform, carried: bytes that the link had carried by then |
+| dequeued | seq: the socket took it |
+| gone | seq, carried: the link has carried it |
+| dropped | seq, why: rejected, evicted for another, limited, dropped at the head |
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+
+from bufgym.ground.errors import BufgymError
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
+from bufgym.policies.registry import Policy
+from bufgym.robot.extra import needs
+
+Record = dict[str, Any]
+
+EVENTS: Final = ("settings", "put", "dequeued", "gone", "dropped")
+MAX_RECORD_BYTES: Final = 2**20
+_FLUSH_US: Final = 500_000
+"""Time between flushes; a killed sender loses its log since the last one."""
+
+
+def settings(
+    policy: Policy,
+    capacity: int,
+    value: Value,
+    max_bytes: int | None,
+    decide_at: str,
+    topics: Sequence[Topic],
+    window: int,
+) -> Record:
+    """Make the first record of a log, with all settings of the queue; V is stored as its exact numbers."""
+    return {
+        "event": "settings",
+        "us": 0,
+        "policy": policy.name,
+        "parameters": dict(policy.parameters),
+        "capacity": int(capacity),
+        "max_bytes": max_bytes,
+        "v": _numbers(value),
+        "decide_at": decide_at,
+        "topics": [
+            {**asdict(topic), "value": None if topic.value is None else _numbers(topic.value)} for topic in topics
+        ],
+        "window": int(window),
+    }
+
+
+def _numbers(value: Value) -> Record:
+    return {"name": value.name, "numbers": value.array.tolist()}
+
+
+def value_of(v: Record) -> Value:
+    """Restore V from the record that ``settings`` made."""
+    return Value(v["name"], np.array(v["numbers"], np.float64))
+
+
+class LogFile:
+    """A log in an MCAP file; call it with each record, then close it."""
+
+    def __init__(self, path: str | Path) -> None:
+        with needs("mcap"):
+            from mcap.writer import Writer
+        self.path = Path(path)
+        self._file = self.path.open("wb")
+        # Chunks would be lost with the process.
+        self._writer = Writer(self._file, use_chunking=False)
+        self._writer.start(profile="", library="bufgym")
+        schema = self._writer.register_schema("bufgym.live.Record", "jsonschema", b'{"type": "object"}')
+        self._channels = {event: self._writer.register_channel(f"/{event}", "json", schema) for event in EVENTS}
+        self._flushed_us = 0
+
+    def __call__(self, record: Record) -> None:
+        """Write one record."""
+        now_us = record["us"]
+        self._writer.add_message(
+            self._channels[record["event"]],
+            log_time=now_us * 1000,
+            publish_time=now_us * 1000,
+            data=json.dumps(record).encode(),
+        )
+        if now_us - self._flushed_us >= _FLUSH_US:
+            self._file.flush()
+            self._flushed_us = now_us
+
+    def close(self) -> None:
+        """Finish the file; a log that was not closed can also be read."""
+        if not self._file.closed:
+            cast(Any, self._writer).finish()
+            self._file.close()
+
+    def __enter__(self) -> LogFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def read_log(path: str | Path) -> list[Record]:
+    """Read the records of a log file, which may be cut short.
+
+    Raises:
+        BufgymError: there is no such file, it is not MCAP, or a record is not one of ``EVENTS``.
+    """
+    with needs("mcap"):
+        from mcap.records import Message
+        from mcap.stream_reader import StreamReader
+    records: list[Record] = []
+    try:
+        with Path(path).open("rb") as file:
+            for entry in StreamReader(file, record_size_limit=MAX_RECORD_BYTES).records:
+                if isinstance(entry, Message):
+                    records.append(_record(path, len(records), entry.data))
+    except OSError as error:
+        raise BufgymError(f"{path}: {error.strerror or error}") from None
+    except BufgymError:
+        raise
+    except Exception as error:  # mcap raises many kinds of errors at the end of a cut file
+        if not records:
+            raise BufgymError(f"{path}: no log of a live queue: {type(error).__name__}") from None
+    if not records or records[0]["event"] != "settings":
+        raise BufgymError(f"{path}: must begin with the settings of a live queue")
+    return records
+
+
+def _record(path: str | Path, k: int, data: bytes) -> Record:
+    try:
+        record = json.loads(data)
+    except ValueError:
+        record = None
+    if not isinstance(record, dict) or record.get("event") not in EVENTS or not isinstance(record.get("us"), int):
+        raise BufgymError(f"{path}, record {k}: must be an event of a live queue at a time")
+    return record
+
+
+def of(records: Sequence[Record], event: str) -> Iterator[Record]:
+    """Select the records of one event."""
+    return (record for record in records if record["event"] == event)

@@ -1,0 +1,228 @@
+"""The receiving end: takes messages from any number of senders, acks each, and delivers none twice."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import json
+import socket
+import time
+from collections import OrderedDict, deque
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any, Final, NamedTuple, cast
+
+from bufgym.ground.errors import BufgymError
+from bufgym.robot.bus_channel import BusServer
+from bufgym.robot.buses import BUSES, MQTT_PORT
+from bufgym.robot.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel
+from bufgym.robot.extra import needs
+from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError
+from bufgym.robot.sockets import free_port
+from bufgym.robot.tasks import Tasks
+
+MAX_STREAMS: Final = 64
+"""Number of latest senders that are remembered."""
+_GREETING_S: Final = 20.0
+"""Time for a sender's greeting; later the connection is closed."""
+
+
+class Received(NamedTuple):
+    """A received message."""
+
+    stream: str
+    """Sender's stream in hexadecimal digits."""
+    number: int
+    """Index among all messages that the sender's socket dequeued."""
+    seq: int
+    """Index among all messages put."""
+    at_us: int
+    """Time of the put by the sender's clock."""
+    x: float
+    topic: int
+    body: bytes | memoryview
+    received_ns: int
+    """Time of receipt by this system's clock."""
+
+
+class _Stream:
+    """State of one sender's stream."""
+
+    def __init__(self, expected: int) -> None:
+        self.expected = expected
+        self.task: asyncio.Task[Any] | None = None
+        """Task of its connection, ended by cancelling; closing the socket would not end it."""
+
+
+class Receiver:
+    """Listens and calls ``on_message`` with each ``Received`` in its sender's order, then acks it.
+
+    It closes the connection of a peer that breaks the protocol or sends a body larger than ``max_body_bytes``.
+    """
+
+    def __init__(
+        self,
+        on_message: Callable[[Received], Awaitable[None] | None],
+        *,
+        max_body_bytes: int = MAX_BODY_BYTES,
+    ) -> None:
+        self.faults: deque[str] = deque(maxlen=100)
+        """Why connections ended, the last 100."""
+        self._on_message = on_message
+        self._max_body_bytes = max_body_bytes
+        self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
+        self._tasks = Tasks()
+        self._listener: socket.socket | None = None
+        self._server: Any = None
+        self._bus: BusServer | None = None
+
+    async def listen(self, port: int = 0, host: str = "127.0.0.1", transport: str = "tcp") -> int:
+        """Begin to listen and return the port; 0 takes any free port, or the standard one of an MQTT broker."""
+        if transport == "tcp":
+            self._listener = await listener(host, port)
+            self._tasks.begin(self._accept(self._listener))
+            return int(self._listener.getsockname()[1])
+        if transport in BUSES:
+            port = port or (MQTT_PORT if transport == "mqtt" else free_port(host))
+            self._bus = BusServer(self._serve, self._tasks.begin, self._max_body_bytes)
+            await self._bus.listen(BUSES[transport], host, port)
+            return port
+        if transport != "websocket":
+            raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
+        with needs("websockets"):
+            from websockets.asyncio.server import serve
+        self._server = await serve(
+            lambda connection: self._serve(WebSocketChannel(connection, self._max_body_bytes)),
+            host,
+            port,
+            compression=None,
+            ping_interval=None,
+            max_size=self._max_body_bytes + HEADER_BYTES,
+            max_queue=1,
+        )
+        return int(next(iter(self._server.sockets)).getsockname()[1])
+
+    async def close(self) -> None:
+        """Close all connections and stop listening."""
+        if self._bus is not None:
+            await self._bus.close()
+        await self._tasks.end()
+        if self._listener is not None:
+            self._listener.close()
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+
+    async def _accept(self, listening: socket.socket) -> None:
+        while True:
+            connection, _ = await asyncio.get_running_loop().sock_accept(listening)
+            connection.setblocking(False)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._tasks.begin(self._serve(TcpChannel(connection, self._max_body_bytes)))
+
+    async def _serve(self, channel: Channel) -> None:
+        """Serve one connection to its end."""
+        try:
+            await self._take(channel, await asyncio.wait_for(channel.receive(), _GREETING_S))
+        except (OSError, TimeoutError) as error:
+            self.faults.append(f"{type(error).__name__}: {error}")
+        finally:
+            channel.close()
+
+    async def _take(self, channel: Channel, greeting: Frame) -> None:
+        if greeting.kind != GREETING:
+            raise FrameError(f"frame of kind {greeting.kind}: must be a greeting first")
+        name = bytes(greeting.body)
+        stream = self._streams.setdefault(name, _Stream(greeting.number))
+        self._streams.move_to_end(name)
+        if stream.task is not None:
+            stream.task.cancel()  # the sender has given that connection up
+            await asyncio.wait([stream.task])
+        stream.task = asyncio.current_task()
+        if len(self._streams) > MAX_STREAMS:
+            _, oldest = self._streams.popitem(last=False)
+            if oldest.task is not None:
+                oldest.task.cancel()
+        await channel.send(Frame(GREETING, stream.expected, self._max_body_bytes))
+        while True:
+            frame = await channel.receive()
+            if frame.kind == GOODBYE:
+                self._streams.pop(name, None)
+                return
+            if frame.kind != DATA or frame.number > stream.expected:
+                raise FrameError(
+                    f"frame of kind {frame.kind}, number {frame.number}: must be message {stream.expected}"
+                )
+            if frame.number == stream.expected:
+                answer = self._on_message(
+                    Received(
+                        name.hex(),
+                        frame.number,
+                        frame.seq,
+                        frame.at_us,
+                        frame.x,
+                        frame.topic,
+                        frame.body,
+                        time.time_ns(),
+                    )
+                )
+                if inspect.isawaitable(answer):
+                    await answer
+                stream.expected += 1
+            await channel.send(Frame(ACK, frame.number))
+
+
+async def listener(host: str, port: int, receive_buffer_bytes: int | None = None) -> socket.socket:
+    """Open a listening TCP socket."""
+    found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    family, kind, protocol, _, address = found[0]
+    listening = socket.socket(family, kind, protocol)
+    try:
+        listening.setblocking(False)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if receive_buffer_bytes is not None:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
+        listening.bind(address)
+        listening.listen()
+    except OSError as error:
+        listening.close()
+        raise BufgymError(f"{host}:{port}: {error.strerror or error}") from None
+    return listening
+
+
+class Recording(contextlib.AbstractContextManager["Recording"]):
+    """Recording of received messages in an MCAP file, with bodies on ``/topic_0`` and so on, the rest on
+    ``/received``."""
+
+    def __init__(self, path: str | Path) -> None:
+        with needs("mcap"):
+            from mcap.writer import Writer
+        self._file = Path(path).open("wb")  # noqa: SIM115  (open as long as this is)
+        self._writer = Writer(self._file)
+        self._writer.start(profile="", library="bufgym")
+        schema = self._writer.register_schema("bufgym.live.Received", "jsonschema", b'{"type": "object"}')
+        self._channel = self._writer.register_channel("/received", "json", schema)
+        self._bodies: dict[int, int] = {}
+
+    def __call__(self, message: Received) -> None:
+        """Write one message; an ``on_message`` of ``Receiver``."""
+        if message.topic not in self._bodies:
+            topic = f"/topic_{message.topic}"
+            self._bodies[message.topic] = self._writer.register_channel(topic, "application/octet-stream", 0)
+        times = {"log_time": message.received_ns, "publish_time": message.at_us * 1000}
+        self._writer.add_message(
+            self._bodies[message.topic], data=bytes(message.body), sequence=message.seq % 2**32, **times
+        )
+        about = {**message._asdict(), "size_bytes": len(message.body)}
+        del about["body"]
+        self._writer.add_message(self._channel, data=json.dumps(about).encode(), sequence=message.seq % 2**32, **times)
+
+    def close(self) -> None:
+        """Finish the file."""
+        if not self._file.closed:
+            cast(Any, self._writer).finish()
+            self._file.close()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,157 @@
+"""Episode through ROS 1: a rospy node under ``install``, a shaped link, a rospy subscriber.
+
+    node (camera, odometry) -> PolicyConnection ==shaped link==> subscriber
+
+An ordinary node, unaware of any policy, publishes camera and odometry. The policy has x from the odometry's topic.
+Everything runs in real time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import math
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import Any
+
+from bufgym.ground.errors import BufgymError
+from bufgym.model.qoi import Value
+from bufgym.policies.registry import Policy
+from bufgym.robot import PolicyQueue, ros1
+from bufgym.robot.programs import (
+    CAMERA,
+    ODOMETRY,
+    START_S,
+    Program,
+    Seen,
+    check_messages,
+    drained,
+    pose_stamp,
+    programs,
+    publish_in_time,
+    received,
+)
+from bufgym.robot.receiver import Received
+from bufgym.robot.shaped import ShapedLink
+from bufgym.robot.validate import Play, warm
+from bufgym.scenario import Episode
+
+
+def player() -> Play:
+    """Plays episodes through ROS 1.
+
+    Raises:
+        BufgymError: ROS 1 is not installed.
+    """
+    with ros1.needs_rospy():
+        for module in ("rospy", "rosmaster.master"):
+            importlib.import_module(module)
+        check_messages("_md5sum")
+    return play
+
+
+def play(
+    policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
+) -> list[Received]:
+    """Play the episode; return the messages that a rospy subscriber got. Randomised policies use their own draws."""
+    if speed != 1:
+        raise BufgymError(f"speed = {speed:g}: must be 1 with ROS, whose nodes live in real time")
+    warm(PolicyQueue(policy, capacity, value=value))
+    with (
+        tempfile.TemporaryDirectory() as logs,
+        programs(
+            viewer=partial(_view, logs), camera=partial(_publish, logs, policy, episode, capacity, value)
+        ) as begun,
+    ):
+        return asyncio.run(_play(begun, episode))
+
+
+async def _play(begun: Sequence[Program], episode: Episode) -> list[Received]:
+    viewer, camera = begun
+    camera.tell(await viewer.told())  # where the master is
+    link = ShapedLink(episode.link, await viewer.told(), back=True)
+    try:
+        viewer.tell(await link.listen())
+        await camera.told()
+        began_s = time.monotonic() + START_S
+        asyncio.get_running_loop().call_at(began_s, link.begin)
+        camera.tell(began_s)
+        viewer.tell(await camera.told(patience_s=math.inf))
+        return received(await viewer.told(patience_s=math.inf), episode, began_s)
+    finally:
+        await link.close()
+
+
+def _in_ros(uri: str, logs: str, node: str) -> None:
+    """Make this process a node of that name."""
+    os.environ.update(ROS_MASTER_URI=uri, ROS_IP="127.0.0.1", ROS_LOG_DIR=logs)
+    import rospy
+
+    rospy.init_node(node, disable_signals=True, disable_rosout=True, disable_rostime=True)
+
+
+def _view(logs: str, parent: Connection) -> None:
+    """Run the master, and a subscriber that connects through the link."""
+    from rosmaster.master import Master
+
+    master = Master(0)
+    master.start()
+    uri = f"http://127.0.0.1:{master.master_node.server.socket.getsockname()[1]}"
+
+    import rospy
+    from rospy.impl.tcpros_pubsub import TCPROSHandler
+    from sensor_msgs.msg import CompressedImage
+
+    create, connected = TCPROSHandler.create_transport, threading.Event()
+
+    def through_the_link(handler: Any, name: str, uri: str, protocol: list[Any]) -> Any:
+        parent.send((protocol[1], protocol[2]))
+        port = parent.recv()
+        connected.set()
+        return create(handler, name, uri, [protocol[0], "127.0.0.1", port])
+
+    TCPROSHandler.create_transport = through_the_link
+    _in_ros(uri, logs, "viewer")
+    seen = Seen()
+    rospy.Subscriber(CAMERA, CompressedImage, seen.take, tcp_nodelay=True)
+    parent.send(uri)
+    connected.wait()
+    seen.wait(parent.recv())
+    parent.send(seen.frames)
+    parent.recv()
+
+
+def _publish(logs: str, policy: Policy, episode: Episode, capacity: int, value: Value, parent: Connection) -> None:
+    """Run the node, and report its progress to the other programs."""
+    uri = parent.recv()
+    ros1.install(policy, topics={ODOMETRY: None}, odometry=ODOMETRY, value=value)
+
+    import rospy
+    from geometry_msgs.msg import PoseStamped
+    from sensor_msgs.msg import CompressedImage
+
+    _in_ros(uri, logs, "camera")
+    camera = rospy.Publisher(CAMERA, CompressedImage, queue_size=capacity)
+    odometry = rospy.Publisher(ODOMETRY, PoseStamped, queue_size=100)
+
+    def move(k: int, metres: float) -> None:
+        pose = PoseStamped()
+        pose.header.stamp = rospy.Time(*pose_stamp(k))
+        pose.pose.position.x, pose.pose.orientation.w = metres, 1.0
+        odometry.publish(pose)
+
+    def show(k: int, size_bytes: int) -> None:
+        camera.publish(CompressedImage(format=str(k), data=bytes(size_bytes)))
+
+    while camera.get_num_connections() == 0 or odometry.get_num_connections() == 0:
+        time.sleep(0.01)
+    parent.send("both are subscribed to")
+    publish_in_time(episode, parent.recv(), move, show)
+    parent.send(drained(camera.impl.connections[0].queue, len(episode.arrivals)))
+    parent.recv()

@@ -1,0 +1,190 @@
+"""Episode through ROS 2: a rclpy node, the relay pair with a shaped link between, a rclpy viewer.
+
+    node (camera, odometry) -> relay ==shaped link==> relay -> viewer
+
+Node and viewer are ordinary nodes in two DDS domains. The relay has x from the odometry's topic. Everything runs in
+real time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import math
+import os
+import threading
+import time
+from array import array
+from collections.abc import Sequence
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import Any
+
+from bufgym.ground.errors import BufgymError
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
+from bufgym.policies.registry import Policy
+from bufgym.robot import PolicyQueue
+from bufgym.robot.log import Record
+from bufgym.robot.programs import (
+    CAMERA,
+    ODOMETRY,
+    START_S,
+    Program,
+    Seen,
+    check_messages,
+    drained,
+    pose_stamp,
+    programs,
+    publish_in_time,
+    received,
+)
+from bufgym.robot.receiver import Received
+from bufgym.robot.ros2.names import needs_rclpy
+from bufgym.robot.ros2.relay import Robot, receive
+from bufgym.robot.shaped import ShapedLink
+from bufgym.robot.validate import Play, warm
+from bufgym.scenario import Client, Episode, Stream
+from bufgym.traces import Trace, load_motion
+
+_DOMAIN = 20 + os.getpid() % 40 * 2
+"""Domain of the robot; the base has the next. Each process has its own, because two may run at a time."""
+_WARM_UP = -1
+"""Number of a frame before the first, because a new DDS publisher needs time to find its subscribers."""
+_DEPTH = 100
+"""History depth of each topic in DDS; on one machine nothing waits there for long."""
+_SETTLED_S = 1.0
+"""Time after which published messages have arrived."""
+
+
+def player() -> Play:
+    """Plays episodes through ROS 2.
+
+    Raises:
+        BufgymError: ROS 2 is not installed.
+    """
+    with needs_rclpy():
+        importlib.import_module("rclpy")
+        check_messages("get_fields_and_field_types")
+    return play
+
+
+def play(
+    policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
+) -> list[Received]:
+    """Play the episode; return the messages that a viewer got. Randomised policies use their own draws."""
+    if speed != 1:
+        raise BufgymError(f"speed = {speed:g}: must be 1 with ROS, whose nodes live in real time")
+    warm(PolicyQueue(policy, capacity, value=value))
+    with programs(
+        receive=_receive,
+        send=partial(_send, policy, capacity, value),
+        viewer=_view,
+        camera=partial(_publish, episode),
+    ) as begun:
+        return asyncio.run(_play(begun, episode))
+
+
+async def _play(begun: Sequence[Program], episode: Episode) -> list[Received]:
+    receiving, sending, viewer, camera = begun
+    link = ShapedLink(episode.link, ("127.0.0.1", await receiving.told()))
+    try:
+        sending.tell(await link.listen())
+        await viewer.told()  # of a frame before the first
+        began_s = time.monotonic() + START_S
+        asyncio.get_running_loop().call_at(began_s, link.begin)
+        camera.tell(began_s)
+        sending.tell(await camera.told(patience_s=math.inf))
+        viewer.tell(await sending.told(patience_s=math.inf))
+        return received(await viewer.told(), episode, began_s)
+    finally:
+        await link.close()
+
+
+def _on(domain: int) -> None:
+    """Put this process into a domain limited to this machine."""
+    os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
+
+
+def _node(domain: int, name: str) -> Any:
+    _on(domain)
+    import rclpy
+
+    rclpy.init(args=[])
+    return rclpy.create_node(name, enable_rosout=False, start_parameter_services=False)
+
+
+def _receive(parent: Connection) -> None:
+    def say(text: str) -> None:
+        if text.startswith("listening on "):
+            parent.send(int(text.rpartition(":")[2]))
+
+    _on(_DOMAIN + 1)
+    asyncio.run(receive(0, say=say))
+
+
+def _send(policy: Policy, capacity: int, value: Value, parent: Connection) -> None:
+    puts: list[Record] = []
+
+    def count(record: Record) -> None:
+        if record["event"] == "put":
+            puts.append(record)
+
+    stream = Stream(Topic(CAMERA), rate_hz=30.0, size_bytes=1, moves=True)
+    # Where a client is simulated, it needs a link and a motion as well.
+    client = Client((stream,), (Trace.steps([(1.0, 1e6)]),), (load_motion("drive-0"),), value=value)
+    _on(_DOMAIN)
+    robot = Robot(client, "127.0.0.1", parent.recv(), policy=policy, capacity=capacity, odometry=ODOMETRY, log=count)
+
+    def all_sent() -> None:
+        parent.recv()
+        time.sleep(_SETTLED_S)
+        parent.send(drained(robot.queue, len(puts)))
+
+    async def relay() -> None:
+        await asyncio.gather(robot.run(), asyncio.to_thread(all_sent))
+
+    asyncio.run(relay())
+
+
+def _view(parent: Connection) -> None:
+    node, seen = _node(_DOMAIN + 1, "viewer"), Seen()
+
+    import rclpy
+    from sensor_msgs.msg import CompressedImage
+
+    node.create_subscription(CompressedImage, CAMERA, seen.take, _DEPTH)
+    threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
+    seen.wait(1)
+    parent.send("a frame")
+    seen.wait(parent.recv(), _SETTLED_S)
+    parent.send([(k, at_ns) for k, at_ns in seen.frames if k != _WARM_UP])
+    parent.recv()
+
+
+def _publish(episode: Episode, parent: Connection) -> None:
+    node = _node(_DOMAIN, "camera")
+
+    from geometry_msgs.msg import PoseStamped
+    from sensor_msgs.msg import CompressedImage
+
+    camera = node.create_publisher(CompressedImage, CAMERA, _DEPTH)
+    odometry = node.create_publisher(PoseStamped, ODOMETRY, _DEPTH)
+    body = array("B", bytes(int(episode.arrivals["size_bytes"].max())))
+
+    def move(k: int, metres: float) -> None:
+        pose = PoseStamped()
+        pose.header.stamp.sec, pose.header.stamp.nanosec = pose_stamp(k)
+        pose.pose.position.x, pose.pose.orientation.w = metres, 1.0
+        odometry.publish(pose)
+
+    def show(k: int, size_bytes: int) -> None:
+        camera.publish(CompressedImage(format=str(k), data=body[:size_bytes]))
+
+    while camera.get_subscription_count() == 0 or odometry.get_subscription_count() == 0:
+        time.sleep(0.01)
+    while not parent.poll(0.5):
+        show(_WARM_UP, 1)
+    publish_in_time(episode, parent.recv(), move, show)
+    parent.send("all is published")
+    parent.recv()

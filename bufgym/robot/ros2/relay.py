@@ -1,0 +1,186 @@
+"""Relay that subscribes on the robot, sends over one uplink, and republishes at the other end.
+
+    robot's nodes -> subscription (serialized) -> PolicyQueue -> Sender ==uplink==> Receiver -> publisher -> nodes
+
+Each end is one asyncio program; the robot's subscriptions run in a thread of rclpy's executor. Commands go the other
+way through a second pair with ``no_drop`` topics.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, Final
+
+from bufgym.ground.errors import BufgymError
+from bufgym.policies.registry import Policy
+from bufgym.robot import LogFile, PolicyQueue
+from bufgym.robot.channels import TRANSPORTS
+from bufgym.robot.log import Record
+from bufgym.robot.odometry import Odometry
+from bufgym.robot.receiver import Received, Receiver
+from bufgym.robot.ros2.names import Published, needs_rclpy, parse, published
+from bufgym.robot.sender import Sender
+from bufgym.scenario import Client
+
+SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
+"""Names of the nodes. A sender ignores topics of a receiver, so a pair each way makes no loop."""
+LOOK_S: Final = 0.2
+"""Time between two searches for publishers."""
+_MATCH_S: Final = 1.0
+"""Longest wait of a new publisher's first message for a subscriber."""
+
+
+def resolved(name: str) -> str:
+    return name if name.startswith("/") else f"/{name}"
+
+
+@contextmanager
+def own_node(name: str) -> Iterator[Any]:
+    """A node of its own context."""
+    with needs_rclpy():
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node(name, context=context, enable_rosout=False, start_parameter_services=False)
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+class Robot:
+    """The sending end, which sends the topics of ``client`` over one uplink to ``host`` and ``port``."""
+
+    def __init__(
+        self,
+        client: Client,
+        host: str,
+        port: int,
+        *,
+        policy: str | Policy = "learned-scheduler",
+        capacity: int = 32,
+        odometry: str | None = None,
+        transport: str = "tcp",
+        log: LogFile | Callable[[Record], None] | None = None,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """
+        Args:
+            client: topics with their rules, and n_T; ``bufgym.scenario.read_client`` reads one.
+            policy: a drop rule for one topic, a scheduler for several.
+            capacity: L, messages of all topics together.
+            odometry: a topic with poses, which gives x to topics that move; x of other topics is time.
+            say: called with a line for each topic found.
+        """
+        moving = [stream.topic.name for stream in client.streams if stream.moves]
+        if moving and odometry is None:
+            raise BufgymError(f"topic {moving[0]!r}: moves, which needs a topic with odometry")
+        self.queue = PolicyQueue(
+            policy, capacity, value=client.value, topics=client.topics, window=client.window, log=log
+        )
+        self.sender = Sender(self.queue, lambda: TRANSPORTS[transport](host, port))
+        self._streams = client.streams
+        self._odometry_topic = odometry
+        self._odometry = Odometry()
+        self._began_s = time.monotonic()
+        self._say = say
+
+    async def run(self) -> None:
+        """Relay until cancelled."""
+        with own_node(SENDER) as node:
+            from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+            executor = SingleThreadedExecutor(context=node.context)
+            executor.add_node(node)
+
+            def spin() -> None:
+                with suppress(ExternalShutdownException):
+                    executor.spin()
+
+            tasks = [
+                asyncio.create_task(self.sender.run()),
+                asyncio.create_task(self._look(node)),
+                asyncio.create_task(asyncio.to_thread(spin)),
+            ]
+            try:
+                done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()
+            finally:
+                executor.shutdown(timeout_sec=2.0)
+                for task in tasks:
+                    task.cancel()
+                await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _look(self, node: Any) -> None:
+        """Subscribe to each topic once it has a publisher."""
+        wanted = {resolved(stream.topic.name): number for number, stream in enumerate(self._streams)}
+        if self._odometry_topic is not None:
+            wanted[resolved(self._odometry_topic)] = wanted.get(resolved(self._odometry_topic), -1)
+        while wanted:
+            for name in list(wanted):
+                topic = published(node, name, RECEIVER)
+                if topic is not None:
+                    self._subscribe(node, topic, wanted.pop(name))
+                    self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}")
+            await asyncio.sleep(LOOK_S)
+        await asyncio.Event().wait()
+
+    def _subscribe(self, node: Any, topic: Published, number: int) -> None:
+        if number >= 0:
+            stream, head = self._streams[number], topic.head()
+
+            def put(message: bytes) -> None:
+                x = self._odometry.x if stream.moves else (time.monotonic() - self._began_s) * stream.unit_hz
+                self.queue.put(head + message, len(head) + len(message), x, number)
+
+            node.create_subscription(topic.message_class, topic.name, put, topic.qos, raw=True)
+        if self._odometry_topic is not None and topic.name == resolved(self._odometry_topic):
+            node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos)
+
+
+async def receive(
+    port: int,
+    host: str = "127.0.0.1",
+    transport: str = "tcp",
+    say: Callable[[str], None] = lambda text: None,
+) -> None:
+    """Run the other end: republish messages with their publishers' quality of service, until cancelled.
+
+    Messages of a type that is not installed here are reported once and dropped.
+    """
+    with own_node(RECEIVER) as node:
+        publishers: dict[Published, Any] = {}
+
+        async def republish(message: Received) -> None:
+            topic, body = parse(message.body)
+            if topic not in publishers:
+                try:
+                    publishers[topic] = node.create_publisher(topic.message_class, topic.name, topic.qos)
+                    say(f"{topic.name}: {topic.type}")
+                except BufgymError as error:
+                    publishers[topic] = None
+                    say(f"{topic.name}: dropped: {error}")
+                else:
+                    await matched(publishers[topic].get_subscription_count)
+            if publishers[topic] is not None:
+                publishers[topic].publish(body)
+
+        receiver = Receiver(republish)
+        say(f"listening on {host}:{await receiver.listen(port, host, transport)}")
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await receiver.close()
+
+
+async def matched(subscribers: Callable[[], int]) -> None:
+    """Wait for subscribers to find a new publisher, which takes some 100 ms; earlier messages would be missed."""
+    deadline_s = time.monotonic() + _MATCH_S
+    while subscribers() == 0 and time.monotonic() < deadline_s:
+        await asyncio.sleep(0.01)
