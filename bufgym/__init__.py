@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as _gym
 
+from bufgym.ground.modules import on_demand as _on_demand
+
 if TYPE_CHECKING:
     from bufgym.benchmark.compare import Comparison, compare, make_policy
 
@@ -52,11 +54,4 @@ for _id, (_scenario, _) in ON_TASKS.items():
             kwargs={"scenario": _scenario, "reward": "covered"},
         )
 
-
-def __getattr__(name: str) -> Any:
-    """The benchmark's verbs, imported when they are first asked for: ``import bufgym`` is light."""
-    if name in ("Comparison", "compare", "make_policy"):
-        from bufgym.benchmark import compare as module
-
-        return getattr(module, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = _on_demand("bufgym.benchmark", Comparison="compare", compare="compare", make_policy="compare")

@@ -3,8 +3,8 @@
     pip install small_gicp
     python examples/trackers.py [--recording FOLDER] [--frames 600] [--every 1 2 4 6 8 10]
 
-All follow the rule of `bufgym.papers.perception.tracking`: a tracker is lost at the first step that is more than 10 cm or 5
-degrees off, or that it refuses. FOLDER is any that `open_sequence` reads; by default the made-up room.
+All follow the rule of `bufgym.papers.perception.tracking`: a tracker is lost at the first step that is more than
+10 cm or 5 degrees off, or that it refuses. FOLDER is any that `open_sequence` reads; by default the made-up room.
 """
 
 from __future__ import annotations

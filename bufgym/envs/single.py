@@ -42,8 +42,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     is to come. An invalid choice sends the oldest message. At an arrival all is as above, but a ``no_drop`` message can
     be neither evicted nor rejected while another message can make room. If an action tries this and the queue is full,
     the oldest message of the lowest priority goes. The fields of ``TOPIC_FIELDS`` and the terms ``age`` and ``late`` of
-    ``TOPIC_REWARD_TERMS`` (both in ``bufgym.model.observe``) are added. H is the weighted sum over the topics, so ``delivered`` and
-    ``retained`` add up to H minus the weights of all topics with a delivery.
+    ``TOPIC_REWARD_TERMS`` (both in ``bufgym.model.observe``) are added. H is the weighted sum over the topics, so
+    ``delivered`` and ``retained`` add up to H minus the weights of all topics with a delivery.
 
     **Episode end** ``terminated`` when the episode's last message has left; never ``truncated``. In the step that ends
     it, ``info`` also counts messages as ``arrived``, ``delivered`` and ``dropped``. Every step has ``qoi``, H of the

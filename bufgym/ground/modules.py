@@ -11,6 +11,7 @@ import inspect
 import os
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -99,3 +100,17 @@ def needs(function: Any) -> int:
         return -1
     kinds = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
     return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters)
+
+
+def on_demand(package: str, **modules: str) -> Callable[[str], Any]:
+    """Make a room's ``__getattr__``: public names that are imported only when they are first asked for.
+
+    ``modules`` maps a name to the module of ``package`` that defines it, as in ``on_demand(__name__, Server="server")``.
+    """
+
+    def get(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
+
+    return get

@@ -84,7 +84,7 @@ def test_all_leaves_them_out_without_data_which_is_passed_on(
     (data / "belgium_4g" / "csv").mkdir(parents=True)
     trace = Trace.steps([(1, 9e6), (40, 0.4e6)], name="report_car_0002")
     write_csv(trace, data / "belgium_4g" / "csv" / "report_car_0002.csv")
-    monkeypatch.setattr(reproduce, "FIGURES", {"afr-fig6": "needs data"})
+    monkeypatch.setattr("bufgym.papers.FIGURES", {"afr-fig6": "needs data"})
     for words, code, says in (
         (["all"], 0, "afr-fig6: left out; it needs a folder of recordings (--data DIR) with belgium_4g/csv/"),
         (["afr-fig6"], 2, "(--data DIR)"),
