@@ -8,7 +8,7 @@ envs = gym.make_vec("bufgym/Uplink-v0", num_envs=1024, capacity=8)
 print(bufgym.compare(["afr", "drop-oldest"], "lte", capacity=8))
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium as _gym
 
@@ -54,4 +54,6 @@ for _id, (_scenario, _) in ON_TASKS.items():
             kwargs={"scenario": _scenario, "reward": "covered"},
         )
 
-__getattr__ = _on_demand("bufgym.benchmark", Comparison="compare", compare="compare", make_policy="compare")
+__getattr__ = _on_demand(
+    __name__, Comparison="benchmark.compare", compare="benchmark.compare", make_policy="benchmark.compare"
+)

@@ -105,7 +105,7 @@ def needs(function: Any) -> int:
 def on_demand(package: str, **modules: str) -> Callable[[str], Any]:
     """Make a room's ``__getattr__``: public names that are imported only when they are first asked for.
 
-    ``modules`` maps a name to the module of ``package`` that defines it, as in ``on_demand(__name__, Server="server")``.
+    ``modules`` maps a name to the module of ``package`` that defines it: ``on_demand(__name__, Server="server")``.
     """
 
     def get(name: str) -> Any:
