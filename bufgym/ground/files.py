@@ -12,7 +12,7 @@ from typing import Any
 
 from bufgym.ground.errors import BufgymError, where
 
-PACKAGE = Path(__file__).resolve().parent
+PACKAGE = Path(__file__).resolve().parents[1]
 
 FREELY_UNPACKED_BYTES = 64 * 2**20
 MOST_UNPACKED = 100

@@ -17,12 +17,10 @@ from typing import Any, cast
 
 from numba.core import compiler, serialize
 
-from bufgym.ground.files import replaced
+from bufgym.ground.files import PACKAGE, replaced
 from bufgym.ground.kernel.closure import TOOLS, closure, told_types
 from bufgym.ground.kernel.pipeline import PART, PartLibrary, set_environments
 from bufgym.ground.kernel.switch import JIT
-
-_PACKAGE = Path(__file__).resolve().parents[2]
 
 
 def _writable(folder: Path) -> bool:
@@ -51,7 +49,7 @@ def _cache_folder() -> str:
     if os.environ.get("NUMBA_CACHE_DIR"):
         parent = Path(os.environ["NUMBA_CACHE_DIR"])
     else:
-        places = _PACKAGE / "__pycache__", Path(home) / "bufgym"
+        places = PACKAGE / "__pycache__", Path(home) / "bufgym"
         parent = next((place for place in places if _writable(place)), None) or _temporary_folder()
     return str(parent / "kernels")
 
