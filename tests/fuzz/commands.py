@@ -21,9 +21,9 @@ lte-v1 topics-v1 fleet-v1 lte-synthetic-0 drive-0 exponential:0.5 exponential:2 
 VALUES = [*WORDS.split(), "", "9" * 30, "1" * 5000, "\x1b[31m", "\n", "\u2013", "\udcff"]
 
 WORK = """benchmark.run.run benchmark.sweep.run_sweep benchmark.tune.tune benchmark.leaderboard.make
-benchmark.leaderboard.validate benchmark.perf.measure live.cost.measure traces.datasets.fetch.fetch_dataset
+benchmark.leaderboard.validate benchmark.perf.measure robot.cost.measure traces.datasets.fetch.fetch_dataset
 cli.figures._text cli.play._play cli.live.run_async cli.ros2.run_async
-cli.relay.run_async cli.relay_robots.run_async live.validate.validate expert.dataset.make"""
+cli.relay.run_async cli.relay_robots.run_async robot.validate.validate envs.expert.dataset.make"""
 """What takes long, downloads, or needs a terminal."""
 
 
