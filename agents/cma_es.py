@@ -5,10 +5,6 @@ whole episodes (``objectives``). A rollout decides two million times a second, s
 of a generation meet the same episodes (common random numbers), so only their decisions tell them apart. The next
 generation meets others, and validation episodes say which mean to keep. The optimiser is pycma (Hansen, The CMA
 Evolution Strategy: A Tutorial, arXiv 1604.00772).
-
-With a warm-up, two scorers are learned one after the other. The first is for a link that stands still and learns from
-interruptions alone, whose mean over T is exact and cheap. The second is for all other links and learns from the other
-suites.
 """
 
 from __future__ import annotations
@@ -20,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +43,15 @@ DIAGONAL = 100
 
 # --- how candidates are evaluated ------------------------------------------------------------------------------------
 
-Evaluate = Callable[[Sequence[Weights | TopicWeights], int, bool], list[tuple[float, int]]]
-"""(candidates, part of the training episodes, ``still``) -> (fitness, decisions) of each, in their order."""
+Evaluate = Callable[[Sequence[Weights | TopicWeights], int], list[tuple[float, int]]]
+"""(candidates, part of the training episodes) -> (fitness, decisions) of each, in their order."""
 
 
 def evaluation_here(objective: Objective) -> Evaluate:
     """Evaluate candidates in this process, one after the other."""
 
-    def evaluate(candidates: Sequence[Weights | TopicWeights], part: int, still: bool) -> list[tuple[float, int]]:
-        return [_evaluated(objective, candidate, part, still) for candidate in candidates]
+    def evaluate(candidates: Sequence[Weights | TopicWeights], part: int) -> list[tuple[float, int]]:
+        return [_evaluated(objective, candidate, part) for candidate in candidates]
 
     return evaluate
 
@@ -68,8 +64,8 @@ def evaluation(settings: Settings, folder: Path, seed: int, objective: Objective
         return
     with connected(settings.backend, settings.address or None) as call_each:
 
-        def evaluate(candidates: Sequence[Weights | TopicWeights], part: int, still: bool) -> list[tuple[float, int]]:
-            calls = [(settings, folder, seed, candidate, part, still) for candidate in candidates]
+        def evaluate(candidates: Sequence[Weights | TopicWeights], part: int) -> list[tuple[float, int]]:
+            calls = [(settings, folder, seed, candidate, part) for candidate in candidates]
             return call_each(evaluated_on_a_worker, calls)
 
         yield evaluate
@@ -80,11 +76,11 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 def evaluated_on_a_worker(
-    settings: Settings, folder: Path, seed: int, candidate: Weights | TopicWeights, part: int, still: bool
+    settings: Settings, folder: Path, seed: int, candidate: Weights | TopicWeights, part: int
 ) -> tuple[float, int]:
     """The fitness and the decisions of one candidate. Each process draws and bounds the episodes once."""
     with _ONE_AT_A_TIME:
-        return _evaluated(_objective(settings, folder, seed), candidate, part, still)
+        return _evaluated(_objective(settings, folder, seed), candidate, part)
 
 
 @functools.lru_cache(maxsize=32)  # several seeds, and runs one after the other, meet on one worker
@@ -92,9 +88,9 @@ def _objective(settings: Settings, folder: Path, seed: int) -> Objective:
     return OBJECTIVES[settings.kind](settings, folder, seed)
 
 
-def _evaluated(objective: Objective, candidate: Weights | TopicWeights, part: int, still: bool) -> tuple[float, int]:
-    fitness = objective.fitness(policy_of(objective.name, candidate), part, still)
-    return fitness, objective.decisions(part, still)
+def _evaluated(objective: Objective, candidate: Weights | TopicWeights, part: int) -> tuple[float, int]:
+    fitness = objective.fitness(policy_of(objective.name, candidate), part)
+    return fitness, objective.decisions(part)
 
 
 # --- the search ------------------------------------------------------------------------------------------------------
@@ -106,8 +102,6 @@ class Evolution:
 
     like: Weights | TopicWeights
     """Weights with the numbers that are not searched."""
-    still: bool
-    """Whether the search is for the scorer of links that stand still; otherwise for that of all others, or of all."""
     strategy: Any
     """pycma's strategy."""
     average: Vector
@@ -120,18 +114,14 @@ class Evolution:
     """Time spent training, s."""
 
     @staticmethod
-    def around(
-        like: Weights | TopicWeights, sigma: float, seed: int, *, still: bool = False, steps: int = 0
-    ) -> Evolution:
-        """A new search around these weights; ``still`` searches their second scorer."""
-        begin = to_vector(like.still if still and isinstance(like, Weights) and like.still else like)
+    def around(like: Weights | TopicWeights, sigma: float, seed: int) -> Evolution:
+        """A new search around these weights."""
+        begin = to_vector(like)
         options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
-        return Evolution(like, still, cma.CMAEvolutionStrategy(begin, sigma, options), begin, steps)
+        return Evolution(like, cma.CMAEvolutionStrategy(begin, sigma, options), begin)
 
     def weights(self, vector: Vector) -> Weights | TopicWeights:
         """The agent with these numbers."""
-        if self.still and isinstance(self.like, Weights) and self.like.still:
-            return replace(self.like, still=with_vector(self.like.still, vector))
         weights: Weights | TopicWeights = with_vector(self.like, vector)
         return weights
 
@@ -143,7 +133,7 @@ class Evolution:
     def generation(self, evaluate: Evaluate) -> float:
         """Ask for candidates, evaluate them and report their fitness, once; return the best fitness."""
         vectors = self.strategy.ask()
-        results = evaluate([self.weights(vector) for vector in vectors], self.generations, self.still)
+        results = evaluate([self.weights(vector) for vector in vectors], self.generations)
         fitness = [each for each, _ in results]
         self.strategy.tell(vectors, fitness)
         self.average = self.average + (self.strategy.mean - self.average) / MEMORY
@@ -164,8 +154,7 @@ def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
     if checkpoint.exists():
         state: Evolution = pickle.loads(checkpoint.read_bytes())
     else:
-        still = objective.warm_up
-        state = Evolution.around(objective.start(), objective.sigma[still], seed, still=still)
+        state = Evolution.around(objective.start(), objective.sigma, seed)
     curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), state.steps)
     validations = Validations(home, objective.columns, objective.best, settings, state.steps)
     began = time.perf_counter() - state.seconds
@@ -183,9 +172,6 @@ def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
                     print(f"seed {seed}: {state.steps:,} of {settings.steps:,} steps, {report}", flush=True)
             if state.steps >= settings.steps:
                 break
-            if state.still and state.steps >= settings.warm_up:
-                # Start from the best on validation, as a scorer of interruptions alone may come to fail elsewhere.
-                state = Evolution.around(weights.read(home / MODEL)[0], objective.sigma[False], seed, steps=state.steps)
             fitness = state.generation(evaluate)
             state.seconds = round(time.perf_counter() - began, 3)
             curve.append(state.steps, state.seconds, fitness)

@@ -11,7 +11,7 @@ from bufgym import ENVIRONMENTS
 from bufgym.ground.errors import BufgymError
 from bufgym.policies.learned import NAMES
 from bufgym.policies.weights import MAX_WIDTH
-from bufgym.scenario import Interruption, Uplink, suites
+from bufgym.scenario import Uplink, suites
 from bufgym.scenario.uplink import RGBD_BYTES
 
 TIME = ("rank", "index_before", "index_merged", "occupancy", "stalled", "service_ratio")
@@ -83,11 +83,9 @@ class Settings:
     """Fields that an evolved agent reads, such as rank,motion_merged,stalled; by default those of --sees."""
     start: str = ""
     """Go on from the agent in this file (.safetensors), which then reads --fields besides its own: these count nothing
-    at first. Its scorer of links that stand still stays as it is. With evolution of one queue's suites."""
+    at first. With evolution of one queue's suites."""
     hidden: Units = 0
     """Hidden units of an evolved agent; with none, its scores are linear in what the context makes of the slots."""
-    still_hidden: Units = 6
-    """The same for its scorer of links that stand still (``warm_up``)."""
     name: str = ""
     """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
     resume: bool = False
@@ -129,9 +127,6 @@ class Settings:
     gae_lambda: Share = 0.9
     entropy: Annotated[float, Range(0)] = 0.0
     """Weight of the entropy bonus."""
-    warm_up: Number = 0
-    """Decisions for which evolution first learns a scorer of its own for links that stand still, from interruptions
-    alone (their mean over T is exact and cheap); afterwards the one for all other links, from the other suites."""
     checkpoint_every: Count = 250_000
     """Steps."""
     validate_every: Count = 250_000
@@ -193,8 +188,8 @@ class Settings:
                     self._refuse(name, broken)
             if get_origin(hint) is Literal and value not in get_args(hint):
                 self._refuse(name, f"must be one of {', '.join(get_args(hint))}")
-        if self.start and (self.kind != "queue" or self.algo != "evolution" or self.warm_up):
-            self._refuse("start", "evolution of one queue's suites alone begins from a file, and without warm_up")
+        if self.start and (self.kind != "queue" or self.algo != "evolution"):
+            self._refuse("start", "evolution of one queue's suites alone begins from a file")
         if self.kind == "environment" and self.env not in ENVIRONMENTS:
             self._refuse("env", f"must be one of {', '.join(ENVIRONMENTS)}")
         if self.kind == "environment" and self.env == "bufgym/Topics-v0":
@@ -235,14 +230,9 @@ class Settings:
 
     def _check_suites(self) -> None:
         """Check the rules of suites of one queue."""
-        interruptions = False
         for name in self.suites:
             suite = suites.get(name)
             suite.settings("validation", self.data or None)  # raises here if recordings are missing
-            settings = suite.settings("train", self.data or None).values()
-            interruptions |= any(isinstance(setting.scenario, Interruption) for setting in settings)
-        if self.warm_up and not interruptions:
-            self._refuse("warm_up", "needs a suite of interruptions")
 
     def _refuse(self, name: str, rule: str) -> NoReturn:
         raise BufgymError(f"{name} = {getattr(self, name)!r}: {rule}")

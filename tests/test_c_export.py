@@ -9,7 +9,6 @@ import pytest
 from cli_cases import fails, shown
 
 from bufgym import policies
-from bufgym.benchmark.run import draw
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
@@ -17,7 +16,7 @@ from bufgym.model.link import Link
 from bufgym.policies import Policy, learned
 from bufgym.policies.learned import NAMES, Network, Weights
 from bufgym.robot.c import CALL, SUPPORTED, header, random_episode, recorded
-from bufgym.scenario import Episode, Interruption, messages
+from bufgym.scenario import Episode, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import received
 from bufgym.traces import Trace
@@ -85,7 +84,7 @@ def driver(folder, text, *flags):
 
 
 def every_field() -> Policy:
-    """A random agent of two layers that reads every field there is, mixes them, and has a second scorer."""
+    """A random agent of two layers that reads every field there is, and mixes them."""
     rng = np.random.default_rng(3)
 
     def some(*shape):
@@ -100,8 +99,7 @@ def every_field() -> Policy:
 
     slots = len(Weights.SLOT_NAMES)
     mix = some(len(NAMES) - slots, slots)
-    still = Weights(NAMES, network(), network())
-    return learned.policy("every-field", Weights(NAMES, network(7, 5), network(7, 5), mix=mix, still=still))
+    return learned.policy("every-field", Weights(NAMES, network(7, 5), network(7, 5), mix=mix))
 
 
 AGENTS = {**{name: policies.get(name) for name in ("learned-motion", "learned-time")}, "every-field": every_field()}
@@ -132,18 +130,6 @@ def test_it_decides_in_c_as_in_python(name, whole, tmp_path):
     """A million decisions in the night."""
     most = (250_000 if name in AGENTS else 20_000, SETTINGS, []) if whole else (2_000, SETTINGS[3:], ["-O0"])
     check(tmp_path, AGENTS.get(name) or policies.get(name), *most)
-
-
-@pytest.mark.parametrize("L", [1, 2, 3, 4])
-def test_a_small_queue_follows_its_plan_in_c_too(L, tmp_path):
-    policy = policies.get("learned-motion")
-    drawn = [draw(Interruption(t_max=400), seed) for seed in range(10 if JIT else 2)]
-    episodes = [Episode(e.arrivals, e.link) for e in drawn]
-    made = sum(len(episode.arrivals) for episode in episodes)
-    assert play_in_c(tmp_path, policy, L, episodes) == (0, made, 0)
-    if JIT:  # and it is the plan that decides
-        other = header(policy, L, EXPONENTIAL).replace("#define BUFGYM_SHORTCUTS 1", "#define BUFGYM_SHORTCUTS 0")
-        assert play_in_c(tmp_path, policy, L, episodes, text=other)[2] != 0
 
 
 def test_with_a_window_several_messages_are_in_the_socket(tmp_path):

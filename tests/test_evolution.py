@@ -48,14 +48,14 @@ def test_it_begins_with_the_smallest_merged_gap(sees: str, like: str) -> None:
 
 def agent(seed: int = 1) -> weights.Weights:
     rng = np.random.default_rng(seed)
-    return replace(queue.start(MOTION, 3, rng), still=queue.start(MOTION, 2, rng))
+    return queue.start(MOTION, 3, rng)
 
 
 def test_an_agent_that_reads_more_decides_the_same_at_first() -> None:
-    """New inputs are zeros in every layer, in the mixing and in the scorer of still links."""
+    """New inputs are zeros in every layer and in the mixing."""
     old = with_vector(agent(), np.random.default_rng(2).normal(size=len(to_vector(agent()))))
     new = old.reading(LINK)
-    assert new.fields == LINK and new.still is not None and new.still.fields == LINK
+    assert new.fields == LINK
     assert new.mix is not None and new.mix.shape == (len(new.context), len(new.slot)) == (10, 5)
     slow = Trace.steps([(1.0, 3_000_000), (2.0, 250_000), (7.0, 2_357_000)])
     episode = Uplink(traces=(slow,), duration_s=20).draw(Streams.seeded(3))
@@ -64,15 +64,14 @@ def test_an_agent_that_reads_more_decides_the_same_at_first() -> None:
 
 
 def test_it_goes_on_from_a_file(tmp_path: Path) -> None:
-    """What is evolved on other links keeps the scorer of links that stand still, and begins no worse than the file."""
+    """The agent of the file begins the search, with more fields."""
     file = weights.save(tmp_path / "old.safetensors", agent(), {"name": "old"})
     settings = replace(TINY, suite="lte-v1", start=str(file), sees="link", steps=1, name="on", test_seeds=1).checked()
     begun = queue.QueueObjective(settings, tmp_path, 0).start()
     assert begun.fields == LINK and len(to_vector(begun)) > len(to_vector(agent()))
     moved = Evolution.around(begun, 0.3, 0).weights(to_vector(begun) + 1)
-    assert moved.still is not None and begun.still is not None
-    assert (moved.still.drop.flat() == begun.still.drop.flat()).all() and (moved.drop.flat() != begun.drop.flat()).any()
-    for broken in ({"warm_up": 10}, {"algo": "ppo"}, {"suite": "topics-v1"}):
+    assert (moved.drop.flat() != begun.drop.flat()).any()
+    for broken in ({"algo": "ppo"}, {"suite": "topics-v1"}):
         with pytest.raises(BufgymError, match=r"start = .*: evolution of one queue's suites"):
             replace(settings, **{"algo": "evolution", **broken}).checked()
 
@@ -151,20 +150,6 @@ def test_a_part_is_measured_by_what_the_rivals_reach_on_all_parts() -> None:
     assert suite.over_rivals(policy, 3) == pytest.approx(regrets[1] / rival)  # parts are taken in turn
     assert suite.over_rivals(policy) == pytest.approx(np.mean(regrets) / rival)
     assert suite.decisions_of() == suite.decisions_of(0) + suite.decisions_of(1)
-
-
-def test_the_scorer_of_a_still_link_is_stateed_alone_with_its_own_hidden_layer() -> None:
-    still = queue.start(MOTION, 6, np.random.default_rng(0))
-    whole = replace(queue.start(MOTION, 0, np.random.default_rng(0)), still=still)
-    first = Evolution.around(whole, 2.0, seed=0, still=True)
-    vector = np.arange(len(to_vector(still)), dtype=float)
-    agent = first.weights(vector)
-    assert agent.still is not None and agent.still.widths == (6, 0) and agent.widths == (0, 0)
-    assert (to_vector(agent.still) == vector).all()
-    assert (to_vector(agent) == to_vector(whole)).all()
-    second = Evolution.around(agent, 0.3, seed=0)
-    again = second.weights(np.arange(len(to_vector(whole)), dtype=float))
-    assert again.still is agent.still and again.drop.skip[2] == 2
 
 
 @pytest.mark.nightly

@@ -198,7 +198,7 @@ NOT_POSITIVE = (
     *("seeds", "steps", "capacity", "size_bytes", "duration_s", "width", "num_envs", "n_steps", "batch_size", "epochs"),
     *("learning_rate", "checkpoint_every", "validate_every", "validation_episodes", "episodes"),
 )
-NEGATIVE = ("seed", "hidden", "still_hidden", "gamma", "gae_lambda", "entropy", "warm_up", "test_seeds")
+NEGATIVE = ("seed", "hidden", "gamma", "gae_lambda", "entropy", "test_seeds")
 EVOLUTION = {"algo": "evolution", "suite": "interruption-v1"}
 
 
@@ -222,7 +222,6 @@ EVOLUTION = {"algo": "evolution", "suite": "interruption-v1"}
         ({"suite": "fleet-v1", "network": "plain"}, "network = 'plain': a fleet's agent scores slots"),
         ({"algo": "evolution"}, "learns from a suite's episodes: name one"),
         ({**EVOLUTION, "fields": "rank"}, "fields = 'rank': must be rank, motion_merged, time_merged or index_merged"),
-        ({**EVOLUTION, "suite": "sustained-v1", "warm_up": 9}, "warm_up = 9: needs a suite of interruptions"),
         ({"backend": "no-such"}, "backend = 'no-such': must be one of local, ray, dask"),
         ({"backend": "dask"}, "backend = 'dask': a cluster evaluates the candidates of --algo evolution alone"),
         ({**EVOLUTION, "address": "host:1"}, "address = 'host:1': is that of a cluster: name its kind"),

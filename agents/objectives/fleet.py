@@ -48,10 +48,9 @@ def fleet_of(suite: str, split: str) -> FleetScenario:
 
 
 def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
-    """The agent with scorers that also read these fields, at weight 0, and may mix all; it thins nothing."""
-    still = agent.still and widened(agent.still, more)
+    """The agent with scorers that also read these fields, at weight 0, and may mix all."""
     mix = np.zeros((len(agent.context), len(agent.slot)), np.float32) if agent.mix is None else agent.mix
-    return replace(agent, mix=mix, still=still, thins=False).reading(more)
+    return replace(agent, mix=mix).reading(more)
 
 
 # --- episodes --------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,14 +38,12 @@ class Objective(ABC):
     """``min`` or ``max``, the better direction of that last measure."""
     message: str
     """Format of that measure in words."""
-    sigma: Mapping[bool, float]
-    """First step size; True is the scorer of links that stand still."""
+    sigma: float
+    """First step size."""
     training: Any
     """Training episodes by part; each set has ``decisions``, the approximate number per candidate."""
     judges: Any
     """The validation episodes."""
-    warm_up = False
-    """Whether the scorer for links that stand still is searched first."""
 
     def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
         self.settings, self.folder, self.seed = settings, folder, seed
@@ -58,12 +56,12 @@ class Objective(ABC):
     def measure(self, policy: Policy, episodes: Any) -> float:
         """The measure that compares candidates, on these episodes."""
 
-    def fitness(self, policy: Policy, part: int, still: bool) -> float:
+    def fitness(self, policy: Policy, part: int) -> float:
         """The fitness of a candidate on a part of the training episodes: the less the better."""
         measure = self.measure(policy, self.training[part % len(self.training)])
         return -measure if self.best is max else measure
 
-    def decisions(self, part: int, still: bool) -> int:
+    def decisions(self, part: int) -> int:
         """Decisions of one candidate on a part."""
         return sum(episodes.decisions for episodes in self.training[part % len(self.training)])
 

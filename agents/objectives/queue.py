@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +27,8 @@ from bufgym.policies.learned import Weights
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import Senders
 
-SIGMA = {True: 2.0, False: 0.3}
-"""First step size, for the scorer of a still link or of a moving one; the start's weights are of the order of 10."""
+SIGMA = 0.3
+"""First step size; the start's weights are of the order of 10."""
 SMALL = (1, 2, 3)
 """Further L to learn from, where the regret is exact and so costs next to nothing."""
 
@@ -175,9 +174,7 @@ def suite_objectives(
     return [_suite_objective(suite, settings.capacities_of(suite), *rest) for suite in settings.suites]
 
 
-@functools.lru_cache(
-    maxsize=32
-)  # bounds take a minute, and several agents may be trained in one process (the ablation)
+@functools.lru_cache(maxsize=32)  # bounds take a minute
 def _suite_objective(
     suite: str,
     capacities: tuple[int, ...],
@@ -196,17 +193,13 @@ def _suite_objective(
 
 
 class QueueObjective(Objective):
-    """All suites of a run; with a warm-up first the interruptions, then the others."""
+    """All suites of a run."""
 
     name = "evolved"
     columns = (*Verdict._fields, "over_rivals")
     best = min
     message = "regret {:.3f} x the rivals' on validation"
     sigma = SIGMA
-
-    def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
-        super().__init__(settings, folder, seed)
-        self.warm_up = settings.warm_up > 0
 
     @functools.cached_property
     def _validation(self) -> ValidationSets:
@@ -224,34 +217,24 @@ class QueueObjective(Objective):
         return suite_objectives(self.settings, "validation", VALIDATION_SEED, VALIDATION_EPISODES)
 
     def start(self) -> Weights:
-        """The rule "smallest merged gap", with a warm-up in both scorers; or an earlier agent without thinning.
-
-        Thinning to the link would keep the scorers from being asked.
-        """
+        """The rule "smallest merged gap", or an earlier agent."""
         settings, fields = self.settings, self.settings.observed
         if settings.start:
-            return replace(weights.read(settings.start)[0].reading(fields), thins=False)
-        first = start(fields, settings.hidden, np.random.default_rng(self.seed))
-        if not self.warm_up:
-            return first
-        return replace(first, still=start(fields, settings.still_hidden, np.random.default_rng(self.seed)))
+            return weights.read(settings.start)[0].reading(fields)
+        return start(fields, settings.hidden, np.random.default_rng(self.seed))
 
     def measure(self, policy: Policy, episodes: Sequence[SuiteObjective], part: int | None = None) -> float:
         """Regret over the rivals', mean over the suites."""
         return float(np.mean([objective.over_rivals(policy, part) for objective in episodes]))
 
-    def fitness(self, policy: Policy, part: int, still: bool) -> float:
-        """Regret over the rivals' on the suites that are searched on now."""
-        return self.measure(policy, self._searched(still), part)
+    def fitness(self, policy: Policy, part: int) -> float:
+        """Regret over the rivals' on a part of the training episodes."""
+        return self.measure(policy, self.training[0], part)
 
-    def decisions(self, part: int, still: bool) -> int:
-        """Decisions over these suites."""
-        return sum(objective.decisions_of(part) for objective in self._searched(still))
+    def decisions(self, part: int) -> int:
+        """Decisions over all suites."""
+        return sum(objective.decisions_of(part) for objective in self.training[0])
 
     def validate(self, policy: Policy) -> tuple[float, ...]:
         """The verdict, and the fitness on other episodes."""
         return *self._validation.run(policy), *super().validate(policy)
-
-    def _searched(self, still: bool) -> list[SuiteObjective]:
-        suites = self.training[0]
-        return [suite for suite in suites if suite.exact == still or not self.warm_up] or suites

@@ -40,7 +40,7 @@ FIELDS = CONTEXT + SLOT
 
 PARTS, EPISODES, EPISODE_S = 24, 1, 30.0
 """Parts of the training episodes, one a generation in turn; episodes per setting of the suite; their length, s."""
-SIGMA = {False: 1.0}
+SIGMA = 1.0
 """First step size."""
 AGE_SHARE, AGE_PENALTY = 0.9, 3.0
 """Target for the age of the first topics, as a share of the rival's, and the price of an excess."""

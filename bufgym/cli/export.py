@@ -8,7 +8,7 @@ from bufgym.cli.options import Commands, command, count, refuse
 from bufgym.ground.errors import BufgymError
 
 _FOR_C = ("capacity", "max_bytes", "value")
-_FOR_WEIGHTS = ("name", "about", "shortcuts", "thins")
+_FOR_WEIGHTS = ("name", "about")
 
 
 def add(commands: Commands) -> None:
@@ -24,18 +24,6 @@ def add(commands: Commands) -> None:
     weights = parser.add_argument_group("weights (--to safetensors)")
     weights.add_argument("--name", metavar="N", help="the policy's name; must be given")
     weights.add_argument("--about", metavar="TEXT", help="a sentence on the purpose of its training")
-    weights.add_argument(
-        "--shortcuts",
-        action="store_true",
-        default=None,
-        help="use greedy-qoi and exact plans where they do better",
-    )
-    weights.add_argument(
-        "--thins",
-        action="store_true",
-        default=None,
-        help="follow target-gap where it has a target, and thin the queue to a steady link",
-    )
     c = parser.add_argument_group(
         "C (--to c)",
         "One C99 header that decides as Python does. MODEL is a policy's name, as afr, or a .safetensors of weights.",
@@ -58,14 +46,7 @@ def _as_weights(options: argparse.Namespace, out: str) -> object:
     refuse(options, _FOR_C, "belongs to --to c")
     if options.name is None:
         raise BufgymError("--name must be given: the policy's name")
-    return export(
-        options.model,
-        out,
-        name=options.name,
-        about=options.about or "",
-        shortcuts=bool(options.shortcuts),
-        thins=bool(options.thins),
-    )
+    return export(options.model, out, name=options.name, about=options.about or "")
 
 
 def _as_c(options: argparse.Namespace, out: str) -> object:

@@ -58,15 +58,6 @@ def merging_loss(v: NDArray[np.float64], a: float, value_a: float, b: float, val
 
 
 @kernel
-def straight(v: NDArray[np.float64]) -> bool:
-    """Whether V is straight and then flat, like min(1, d / D): the best decision then ignores the future."""
-    if v[0] == TABULATED:
-        points = int(v[1])
-        return bool(v[3 + points] == v[1 + 2 * points])
-    return bool(v[0] == SATURATING)
-
-
-@kernel
 def information(v: NDArray[np.float64], x: NDArray[np.float64]) -> float:
     """H of messages received with coordinates ``x``, float64[received], in order of receipt; 0 for none."""
     if len(x) == 0:

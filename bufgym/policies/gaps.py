@@ -10,12 +10,8 @@ import numpy as np
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, has_space, loss, motion_gaps, time_gaps
-from bufgym.model.observe.on_board import index_gaps
 from bufgym.model.qoi import value
 from bufgym.policies.registry import Arrival, Memory, register
-
-MOTION, MESSAGES = 1, 2
-"""Units of a gap."""
 
 
 @kernel
@@ -30,37 +26,22 @@ def smallest_time_gap(buffer: Buffer, arrival: Arrival, slots: int) -> int:
 
 
 @kernel
-def come(buffer: Buffer, arrival: Arrival, measured_in: int) -> float:
-    """Motion of the scene, or number of messages, since the message dequeued last."""
-    if measured_in == MESSAGES:
-        return float(arrival.seq - buffer.dequeued_seq)
-    return float(arrival.x - buffer.dequeued_x)
+def gap_left(buffer: Buffer, arrival: Arrival, victim: int) -> float:
+    """The merged motion gap if ``victim`` goes: a slot, or REJECT for the newcomer."""
+    before, after = motion_gaps(buffer, arrival, len(buffer.slots) if victim == REJECT else victim)
+    return before + after
 
 
 @kernel
-def gaps_of(buffer: Buffer, arrival: Arrival, k: int, measured_in: int) -> tuple[float, float]:
-    """The gap before slot ``k`` and the merged gap if it goes; ``k`` = len(slots) is the newcomer."""
-    if measured_in == MESSAGES:
-        return index_gaps(buffer, arrival, k)
-    before, after = motion_gaps(buffer, arrival, k)
-    return before, before + after
-
-
-@kernel
-def gap_left(buffer: Buffer, arrival: Arrival, victim: int, measured_in: int) -> float:
-    """The merged gap if ``victim`` goes: a slot, or REJECT for the newcomer."""
-    return gaps_of(buffer, arrival, len(buffer.slots) if victim == REJECT else victim, measured_in)[1]
-
-
-@kernel
-def smallest_gap(buffer: Buffer, arrival: Arrival, measured_in: int, discount: float) -> int:
-    """The slot that would leave the smallest gap, or REJECT for the newcomer; the oldest if several do.
+def smallest_gap(buffer: Buffer, arrival: Arrival, discount: float) -> int:
+    """The slot that would leave the smallest motion gap, or REJECT for the newcomer; the oldest if several do.
 
     The gap of slot k of s is discounted by ``discount`` (1 - k / s).
     """
     s, victim, smallest = len(buffer.slots), REJECT, np.inf
     for k in range(s + 1):
-        left = gaps_of(buffer, arrival, k, measured_in)[1]
+        before, after = motion_gaps(buffer, arrival, k)
+        left = before + after
         if k < s:
             left *= 1 - discount * (1 - k / s)
         if left < smallest:
@@ -105,7 +86,7 @@ def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged motion gap (newcomer included, ties to the oldest)."""
     if has_space(buffer, arrival):
         return ACCEPT
-    return smallest_gap(buffer, arrival, MOTION, 0.0)
+    return smallest_gap(buffer, arrival, 0.0)
 
 
 @register(

@@ -40,7 +40,7 @@ NAMES = tuple(field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS + CONTEXT_
 @kernel
 def observed(buffer: Buffer, arrival: Arrival, arriving: bool, memory: Memory) -> tuple[Scorer, Scratch]:
     """Unpack the scorer, and write its observation into the memory."""
-    scorer = scoring.unpack(buffer.parameters, 0, 3)
+    scorer = scoring.unpack(buffer.parameters, 3)
     scratch = scoring.divide(memory, scorer, CONTEXT, SLOTS, buffer.capacity)
     observe_topic_context(buffer, arrival, arriving, scratch.context)
     observe_topic_slots(buffer, arrival, arriving, scratch.rows)

@@ -65,21 +65,13 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def end_of(parameters: NDArray[np.float64], begin: int, networks: int) -> int:
-    """End of a scorer's parameters that begin at ``begin`` and hold so many networks."""
-    inputs, size, mixing = int(parameters[begin]), int(parameters[begin + 4]), int(parameters[begin + 5])
-    return begin + HEADER + inputs + networks * size + mixing
-
-
-@kernel
-def unpack(parameters: NDArray[np.float64], begin: int, networks: int) -> Scorer:
-    """The scorer of so many networks whose parameters begin at ``begin``."""
-    inputs, context = int(parameters[begin]), int(parameters[begin + 1])
-    first, second, size = int(parameters[begin + 2]), int(parameters[begin + 3]), int(parameters[begin + 4])
-    nets = begin + HEADER + inputs
-    mix, end = nets + networks * size, end_of(parameters, begin, networks)
-    fields = parameters[begin + HEADER : nets]
-    return Scorer(context, first, second, fields, parameters[nets:mix], size, parameters[mix:end])
+def unpack(parameters: NDArray[np.float64], networks: int) -> Scorer:
+    """The scorer of so many networks."""
+    inputs, context = int(parameters[0]), int(parameters[1])
+    first, second, size = int(parameters[2]), int(parameters[3]), int(parameters[4])
+    nets = HEADER + inputs
+    mix = nets + networks * size
+    return Scorer(context, first, second, parameters[HEADER:nets], parameters[nets:mix], size, parameters[mix:])
 
 
 @kernel

@@ -26,9 +26,9 @@ goes, and ``thinning`` says whether it goes with room too.
 from __future__ import annotations
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import ACCEPT, Buffer, has_space, running_mean
+from bufgym.model.buffer import ACCEPT, Buffer, has_space, motion_gaps, running_mean
 from bufgym.model.observe.on_board import mean_bytes
-from bufgym.policies.gaps import MESSAGES, MOTION, come, gap_left, gaps_of, smallest_gap
+from bufgym.policies.gaps import gap_left, smallest_gap
 from bufgym.policies.registry import Arrival, Memory, register
 from bufgym.policies.thinning import places, spare, steady
 
@@ -55,12 +55,12 @@ WITHIN = 1.001
 
 RATE, SENT_US, PACE, SEEN_US, PERIOD, SQUARE = range(6)
 REMEMBERED = {"rate": 0.0, "sent_us": 0.0, "pace": 0.0, "seen_us": 0.0, "period": 0.0, "square": 0.0}
-"""Memory of the policy: the link's rate over ``LINK_US`` (bytes/us) and how long it has sent; motion or messages per us
+"""Memory of the policy: the link's rate over ``LINK_US`` (bytes/us) and how long it has sent; motion per us
 over ``PACE_US`` and how long the stream has run; the mean time between arrivals and its mean square."""
 
 
 @kernel
-def remember(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int) -> None:
+def remember(buffer: Buffer, arrival: Arrival, memory: Memory) -> None:
     """Update the long means; call it at every arrival."""
     if buffer.evictions > 0:
         return
@@ -73,7 +73,7 @@ def remember(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int)
     memory[PERIOD] += weight * (us - memory[PERIOD])
     memory[SQUARE] += weight * (us * us - memory[SQUARE])
     if us > 0:
-        step = 1.0 if measured_in == MESSAGES else arrival.x - buffer.previous_x
+        step = arrival.x - buffer.previous_x
         memory[PACE] = running_mean(memory[PACE], step, us, memory[SEEN_US], PACE_US)
         memory[SEEN_US] += us
 
@@ -92,8 +92,8 @@ def link_rate(buffer: Buffer, memory: Memory) -> float:
 
 
 @kernel
-def target(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int) -> float:
-    """g, in motion or in messages; 0 if unknown (see the module's text)."""
+def target(buffer: Buffer, arrival: Arrival, memory: Memory) -> float:
+    """g, in motion; 0 if unknown (see the module's text)."""
     s, L = len(buffer.slots), places(buffer, arrival)
     elapsed_us = float(arrival.arrival_us - buffer.dequeued_arrival_us)
     if L < LEAST or len(buffer.topics) > 1 or elapsed_us <= 0 or memory[RATE] <= 0 or memory[PACE] <= 0:
@@ -103,22 +103,22 @@ def target(buffer: Buffer, arrival: Arrival, memory: Memory, measured_in: int) -
     r = link_rate(buffer, memory) / mean_bytes(buffer, arrival)
     if L > r * memory[SEEN_US]:
         return 0.0
-    m = (1 - PACED) * come(buffer, arrival, measured_in) / elapsed_us + PACED * memory[PACE]
+    m = (1 - PACED) * (arrival.x - buffer.dequeued_x) / elapsed_us + PACED * memory[PACE]
     return float(m * HORIZON_US / (r * HORIZON_US + L - s))
 
 
 @kernel
-def approach(buffer: Buffer, arrival: Arrival, g: float, measured_in: int) -> int:
+def approach(buffer: Buffer, arrival: Arrival, g: float) -> int:
     """The decision that brings the gaps to ``g``."""
     s, room = len(buffer.slots), has_space(buffer, arrival)
     if room and (s == 0 or not buffer.busy):
         return ACCEPT
     if s > 0 and buffer.left_bytes * 1e6 < NEAR * buffer.period_us * buffer.short_rate_bytes_per_s:
-        head, merged = gaps_of(buffer, arrival, 0, measured_in)
-        if abs(merged - g) < abs(head - g):
+        head, after = motion_gaps(buffer, arrival, 0)
+        if abs(head + after - g) < abs(head - g):
             return 0
-    victim = smallest_gap(buffer, arrival, measured_in, DISCOUNT)
-    if room and gap_left(buffer, arrival, victim, measured_in) > WITHIN * g:
+    victim = smallest_gap(buffer, arrival, DISCOUNT)
+    if room and gap_left(buffer, arrival, victim) > WITHIN * g:
         return ACCEPT
     return victim
 
@@ -132,11 +132,11 @@ def approach(buffer: Buffer, arrival: Arrival, g: float, measured_in: int) -> in
 )
 def target_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Sends messages as far apart as the link's rate and the room that is left suggest; drops with room, too."""
-    remember(buffer, arrival, memory, MOTION)
-    g = target(buffer, arrival, memory, MOTION)
+    remember(buffer, arrival, memory)
+    g = target(buffer, arrival, memory)
     if g > 0 and not steady(buffer):
-        return approach(buffer, arrival, g, MOTION)
-    victim = smallest_gap(buffer, arrival, MOTION, 0.0)
-    if has_space(buffer, arrival) and (bursty(memory) or not spare(buffer, arrival, victim, MOTION)):
+        return approach(buffer, arrival, g)
+    victim = smallest_gap(buffer, arrival, 0.0)
+    if has_space(buffer, arrival) and (bursty(memory) or not spare(buffer, arrival, victim)):
         return ACCEPT
     return victim

@@ -17,7 +17,7 @@ from __future__ import annotations
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import Buffer
 from bufgym.model.observe.on_board import mean_bytes
-from bufgym.policies.gaps import come, gap_left
+from bufgym.policies.gaps import gap_left
 from bufgym.policies.registry import Arrival
 
 WAITING = 3
@@ -55,7 +55,7 @@ def places(buffer: Buffer, arrival: Arrival) -> int:
 
 
 @kernel
-def spare(buffer: Buffer, arrival: Arrival, victim: int, measured_in: int) -> bool:
+def spare(buffer: Buffer, arrival: Arrival, victim: int) -> bool:
     """Whether a queue with room can spare ``victim`` (a slot, or REJECT), by the rule in the module's text.
 
     The link's spacing is the motion since the arrival of the message dequeued last, in proportion to time.
@@ -67,5 +67,5 @@ def spare(buffer: Buffer, arrival: Arrival, victim: int, measured_in: int) -> bo
     if each_us <= 0 or L * each_us > SOON_US:
         return False
     each_us = HORIZON_US / (HORIZON_US / each_us + L - s)
-    left = gap_left(buffer, arrival, victim, measured_in)
-    return bool(left * elapsed_us <= come(buffer, arrival, measured_in) * each_us)
+    left = gap_left(buffer, arrival, victim)
+    return bool(left * elapsed_us <= (arrival.x - buffer.dequeued_x) * each_us)

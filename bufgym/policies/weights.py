@@ -52,14 +52,12 @@ MAX_WIDTH = 256
 """Most units of a hidden layer."""
 KEY = "bufgym"
 """The entry of the header's metadata that holds the JSON text."""
-FLAGS = ("shortcuts", "thins")
-"""Flags of an agent for one queue that may do more than scoring."""
-WRITTEN = ("format", "fields", "observation", "bufgym", "sha256", *FLAGS)
+RULES = ("shortcuts", "thins")
+"""Flags of agents that left decisions to rules; bufgym 0.2 wrote them."""
+WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")
 """Metadata that ``save`` itself writes."""
 MIX = "drop.mix"
 """An optional tensor."""
-STILL = "still."
-"""Prefix of the second scorer's tensors, with hidden layers of its own; all are optional."""
 
 
 def observation_hash(topics: bool = False, names: Sequence[str] = ()) -> str:
@@ -121,8 +119,6 @@ def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any
         "bufgym": __version__,
         "sha256": _sha256(weights.fields, tensors),
     }
-    if isinstance(weights, Weights):
-        metadata |= {flag: True for flag in FLAGS if getattr(weights, flag)}
     try:
         text = json.dumps(metadata, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -146,8 +142,6 @@ def _tensors(weights: Weights | TopicWeights) -> Tensors:
     }
     if isinstance(weights, Weights) and weights.mix is not None:
         tensors[MIX] = np.ascontiguousarray(weights.mix, "<f4")
-    if isinstance(weights, Weights) and weights.still is not None:
-        tensors |= {f"{STILL}{name}": tensor for name, tensor in _tensors(weights.still).items()}
     return tensors
 
 
@@ -193,19 +187,13 @@ def _parsed(path: StrPath, data: bytes) -> tuple[Weights | TopicWeights, dict[st
     if _sha256(metadata["fields"], tensors) != metadata["sha256"]:
         rule = "fields and tensors have another one: the file was changed"
         raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
-    weights = _weights(kind, metadata["fields"], tensors)
-    if isinstance(weights, Weights):
-        weights = replace(weights, shortcuts=metadata.get("shortcuts", False), thins=metadata.get("thins", False))
-    return weights, metadata
+    return _weights(kind, metadata["fields"], tensors), metadata
 
 
 def _weights(kind: Any, fields: Sequence[str], tensors: Tensors) -> Any:
     """Make weights of that ``Kind``."""
     weights = kind(tuple(fields), *(Network.of(_below(f"{network}.", tensors)) for network in kind.NETWORKS))
-    still = _below(STILL, tensors)
-    if kind is Weights:
-        return replace(weights, mix=tensors.get(MIX), still=_weights(kind, fields, still) if still else None)
-    return weights
+    return replace(weights, mix=tensors.get(MIX)) if kind is Weights else weights
 
 
 def _below(prefix: str, tensors: Tensors) -> Tensors:
@@ -237,11 +225,9 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
     name, about, fields = metadata["name"], metadata.get("about", ""), metadata.get("fields")
     if not name or not name.isprintable() or any(c in ":,= " for c in name):
         refuse("name", "must be non-empty, without spaces, ':', ',' or '='")
-    for flag in FLAGS:
-        if not isinstance(metadata.get(flag, False), bool):
-            refuse(flag, "must be true or false")
-        if metadata.get(flag) and kind is TopicWeights:
-            refuse(flag, "is for one queue, not for several topics")
+    for flag in RULES:
+        if metadata.get(flag):
+            refuse(flag, "this bufgym lets a learned agent decide alone: export it again, or use target-gap")
     if not isinstance(about, str) or not about.isprintable():
         refuse("about", "must be one line of text")
     if metadata["observation"] != observation_hash(kind is TopicWeights, fields if isinstance(fields, list) else ()):
@@ -270,10 +256,7 @@ def _refuse(path: StrPath, name: str, rule: str, *, what: str = "", value: objec
 def _checked_tensors(path: StrPath, entries: dict[str, Any], fields: Sequence[str], kind: Kind) -> Tensors:
     """Name -> tensor; each is float32, finite, and of the shape that the others require."""
     shapes = {name: tuple(entry["shape"]) for name, entry in entries.items()}
-    two = kind is Weights and any(name.startswith(STILL) for name in shapes)
-    for prefix in ("", STILL) if two else ("",):
-        own = {name: shape for name, shape in shapes.items() if not two or name.startswith(STILL) == bool(prefix)}
-        _check_shapes(path, prefix, own, fields, kind)
+    _check_shapes(path, shapes, fields, kind)
     tensors: Tensors = {}
     for name, entry in entries.items():
         if entry["dtype"] != "F32":
@@ -285,32 +268,30 @@ def _checked_tensors(path: StrPath, entries: dict[str, Any], fields: Sequence[st
     return tensors
 
 
-def _check_shapes(
-    path: StrPath, prefix: str, shapes: Mapping[str, tuple[int, ...]], fields: Sequence[str], kind: Kind
-) -> None:
-    """Check that the tensors of one scorer, with names after ``prefix``, are complete and fit each other."""
+def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: Sequence[str], kind: Kind) -> None:
+    """Check that the tensors are complete and fit each other."""
 
     def refuse_shape(name: str, rule: str) -> NoReturn:
         _refuse(path, name, rule, what="shape of ", value=list(shapes[name]))
 
     widths: list[int] = []
     for k in range(kind.LAYERS):
-        name = f"{prefix}drop.{k}.bias"
+        name = f"drop.{k}.bias"
         if name not in shapes:
-            if f"{prefix}drop.{k}.weight" in shapes:
+            if f"drop.{k}.weight" in shapes:
                 _refuse(path, name, "is missing")
             break
         if len(shapes[name]) != 1 or not 1 <= shapes[name][0] <= MAX_WIDTH:
             refuse_shape(name, f"must be one number for each of 1 to {MAX_WIDTH} hidden units")
         widths += shapes[name]
     required = {
-        f"{prefix}{network}.{name}": shape
+        f"{network}.{name}": shape
         for network in kind.NETWORKS
         for name, shape in Network.shapes(len(fields), widths).items()
     }
-    if prefix + MIX in shapes and kind is Weights:
+    if MIX in shapes and kind is Weights:
         slots = sum(name in kind.SLOT_NAMES for name in fields)
-        required[prefix + MIX] = (len(fields) - slots, slots)
+        required[MIX] = (len(fields) - slots, slots)
     for name in (*required, *shapes):
         if name not in shapes:
             _refuse(path, name, "is missing")

@@ -29,9 +29,7 @@ CHECKED = (4, 8, 16, 32)
 """Values of L for the regrets noted in the file."""
 
 
-def export(
-    model: StrPath, out: StrPath, *, name: str, about: str = "", shortcuts: bool = False, thins: bool = False
-) -> Path:
+def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
     """Write the agent in ``model`` to ``out``, with its training notes from the run's folder.
 
     Args:
@@ -41,22 +39,15 @@ def export(
         out: the file to write, .safetensors.
         name: the policy's name.
         about: a sentence on what it was trained for.
-        shortcuts: leave some decisions to better rules (``bufgym.policies.learned``).
-        thins: thin the queue to the link.
 
     Raises:
-        BufgymError: ``model`` is no agent that scores slots, ``out`` cannot be written, or ``shortcuts`` or
-            ``thins`` are asked for with several topics.
+        BufgymError: ``model`` is no agent that scores slots, or ``out`` cannot be written.
     """
     path = Path(model)
     weights = files.read_any(path)[0] if path.suffix == ".safetensors" else weights_of(read_policy(path))
     notes = {"name": name, "about": about, **run_notes(path)}
-    if (shortcuts or thins) and isinstance(weights, TopicWeights):
-        asked = "shortcuts" if shortcuts else "thins"
-        raise BufgymError(f"{path}: a scheduler for several topics: {asked} is for one queue")
     if isinstance(weights, TopicWeights):
         return files.save(out, weights, {**notes, "weighted_qoi": topics_qoi(learned_topics.policy(name, weights))})
-    weights = replace(weights, shortcuts=shortcuts or weights.shortcuts, thins=thins or weights.thins)
     return files.save(out, weights, {**notes, "regret": regrets(learned.policy(name, weights))})
 
 

@@ -9,20 +9,20 @@ from bufgym.policies import ACCEPT, REJECT
 from bufgym.policies.thinning import SOON_US
 
 
-def gaps_left(buffer, arrival, measured_in):
+def gaps_left(buffer, arrival):
     """The gap that each queued message, and last the newcomer, would leave."""
-    come = [{"x": buffer.dequeued_x, "seq": buffer.dequeued_seq}[measured_in]]
-    come += [message[measured_in] for message in buffer.slots]
-    come.append(arrival[measured_in])
+    come = [buffer.dequeued_x]
+    come += [message["x"] for message in buffer.slots]
+    come.append(arrival["x"])
     # One more step like the last is expected after the newcomer.
-    come.append(arrival["x"] + (arrival["x"] - buffer.previous_x) if measured_in == "x" else arrival["seq"] + 1)
+    come.append(arrival["x"] + (arrival["x"] - buffer.previous_x))
     steps = [float(after - before) for before, after in itertools.pairwise(come)]
     return list(map(sum, itertools.pairwise(steps)))
 
 
-def least_gap(buffer, arrival, measured_in, discount=0.0):
+def least_gap(buffer, arrival, discount=0.0):
     """What leaves the smallest gap; of equals the oldest. Slot k of s counts ``discount`` (1 - k / s) less."""
-    *queued, newcomer = gaps_left(buffer, arrival, measured_in)
+    *queued, newcomer = gaps_left(buffer, arrival)
     gaps = [gap * (1 - discount * (1 - k / len(queued))) for k, gap in enumerate(queued)] + [newcomer]
     k = gaps.index(min(gaps))
     return k if k < len(queued) else REJECT
@@ -46,7 +46,7 @@ def level(buffer):
     return bool(near and long > 0 and buffer.drained_us > 0)
 
 
-def spared(buffer, arrival, victim, measured_in):
+def spared(buffer, arrival, victim):
     """Whether a queue with room can spare ``victim``."""
     s, elapsed_us = len(buffer.slots), arrival["arrival_us"] - buffer.dequeued_arrival_us
     mean_bytes = (buffer.backlog_bytes + arrival["size_bytes"]) / (s + 1)
@@ -54,12 +54,12 @@ def spared(buffer, arrival, victim, measured_in):
     if s < 3 or not buffer.busy or len(buffer.topics) > 1 or rate == 0 or elapsed_us <= 0:
         return False
     send_us = 1e6 * mean_bytes / rate
-    last = {"x": buffer.dequeued_x, "seq": buffer.dequeued_seq}[measured_in]
-    left = gaps_left(buffer, arrival, measured_in)[s if victim == REJECT else victim]
+    last = buffer.dequeued_x
+    left = gaps_left(buffer, arrival)[s if victim == REJECT else victim]
     L = places(buffer, arrival)
     soon = L * send_us <= SOON_US
     room_us = 60e6 / (60e6 / send_us + L - s)  # a minute's messages, and those for which there is room
-    return soon and left * elapsed_us <= float(arrival[measured_in] - last) * room_us
+    return soon and left * elapsed_us <= float(arrival["x"] - last) * room_us
 
 
 class Seen:
@@ -69,14 +69,14 @@ class Seen:
         self.sent, self.moved = [], []  # (bytes, us) and (x, us) of each arrival with any time in it
         self.periods = []  # us before each arrival
 
-    def remember(self, buffer, arrival, measured_in):
+    def remember(self, buffer, arrival):
         if buffer.evictions:
             return
         if buffer.drained_us > 0:
             self.sent.append((float(buffer.drained_bytes), float(buffer.drained_us)))
         self.periods.append(float(arrival["arrival_us"] - buffer.previous_us))
         if arrival["arrival_us"] > buffer.previous_us:
-            step = arrival["x"] - buffer.previous_x if measured_in == "x" else 1.0
+            step = arrival["x"] - buffer.previous_x
             self.moved.append((float(step), float(arrival["arrival_us"] - buffer.previous_us)))
 
     @property
@@ -88,7 +88,7 @@ class Seen:
         mean, square = faded(self.periods)
         return square > 1.5 * mean * mean
 
-    def target(self, buffer, arrival, measured_in):
+    def target(self, buffer, arrival):
         """g, or None where it cannot be told."""
         L, s = places(buffer, arrival), len(buffer.slots)
         elapsed_us = float(arrival["arrival_us"] - buffer.dequeued_arrival_us)
@@ -101,8 +101,8 @@ class Seen:
         r = (recent + 0.5 * rate) / ((buffer.backlog_bytes + arrival["size_bytes"]) / (s + 1))
         if r * self.seen_us < L:
             return None
-        last = {"x": buffer.dequeued_x, "seq": buffer.dequeued_seq}[measured_in]
-        m = 0.6 * float(arrival[measured_in] - last) / elapsed_us + 0.4 * pace
+        last = buffer.dequeued_x
+        m = 0.6 * float(arrival["x"] - last) / elapsed_us + 0.4 * pace
         g = m * 5e6 / (r * 5e6 + L - s)
         return g if g > 0 else None
 
@@ -125,19 +125,19 @@ def running_mean(steps, window_us):
     return mean
 
 
-def approached(buffer, arrival, g, measured_in):
+def approached(buffer, arrival, g):
     """The decision that brings the gaps to ``g``."""
     s = len(buffer.slots)
     room = fits(buffer, arrival)
     if room and (s == 0 or not buffer.busy):
         return ACCEPT
-    left = gaps_left(buffer, arrival, measured_in)
+    left = gaps_left(buffer, arrival)
     free_soon = buffer.left_bytes * 1e6 < 1.5 * buffer.period_us * buffer.short_rate_bytes_per_s
     if s and free_soon:
-        last = {"x": buffer.dequeued_x, "seq": buffer.dequeued_seq}[measured_in]
-        if abs(left[0] - g) < abs(float(buffer.slots[0][measured_in] - last) - g):
+        last = buffer.dequeued_x
+        if abs(left[0] - g) < abs(float(buffer.slots[0]["x"] - last) - g):
             return 0
-    victim = least_gap(buffer, arrival, measured_in, discount=0.165)
+    victim = least_gap(buffer, arrival, discount=0.165)
     if room and left[s if victim == REJECT else victim] > 1.001 * g:
         return ACCEPT
     return victim

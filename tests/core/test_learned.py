@@ -8,14 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import VALUES, cases, log, newcomer, queue_of, same
-from gap_cases import Seen, approached, fits, least_gap, level, spared
+from gap_cases import fits
 from hypothesis import given
 from hypothesis import strategies as st
 from weight_cases import network, score
 
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark.run import draw
 from bufgym.cli import export as command
 from bufgym.cli.options import Parser
 from bufgym.ground import files
@@ -33,15 +32,12 @@ from bufgym.model.observe import (
     observe_on_board_slots,
     observe_slots,
 )
-from bufgym.oracle import clairvoyant
-from bufgym.policies import learned, small_queue
+from bufgym.policies import learned
 from bufgym.policies import weights as weights_file
 from bufgym.policies.learned import NAMES, Network, Weights
 from bufgym.policies.registry import Policy
-from bufgym.policies.target_gap import REMEMBERED
 from bufgym.scenario import Interruption
 from bufgym.sim import run
-from bufgym.sim.metrics import outcome
 from tests.conftest import COMPILED
 
 kernels = pytest.mark.kernels
@@ -53,50 +49,19 @@ CONTEXT_NAMES = [field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS)]
 
 @st.composite
 def weights(draw):
-    """Any fields in any order; no, one or two hidden layers, others in the scorer for a link that stands still."""
+    """Any fields in any order; no, one or two hidden layers; mixed or not."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     fields = tuple(draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True)))
-    made, other = (
-        Weights(fields, network(rng, len(fields), *widths), network(rng, len(fields), *widths))
-        for widths in (draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)])) for _ in range(2))
-    )
+    widths = draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)]))
+    made = Weights(fields, network(rng, len(fields), *widths), network(rng, len(fields), *widths))
     mix = rng.normal(0, 1, (len(made.context), len(made.slot))).astype(np.float32)
-    made, other = (replace(each, mix=draw(st.sampled_from([None, mix]))) for each in (made, other))
-    flags = {flag: draw(st.booleans()) for flag in weights_file.FLAGS}
-    return replace(made, still=draw(st.sampled_from([None, other])), **flags)
+    return replace(made, mix=draw(st.sampled_from([None, mix])))
 
 
-def twin(whole):
+def twin(made):
     """A policy that decides by these weights: every candidate is scored, the best is searched for afterwards."""
 
-    seen = Seen()
-
     def on_arrival(buffer, arrival, memory):
-        still = buffer.service_ratio < 0.07
-        measured_in = "x" if "motion_merged" in whole.fields else "seq"
-        seen.remember(buffer, arrival, measured_in)
-        thins = whole.thins and not seen.bursty
-        steps, moved = arrival.seq - buffer.dequeued_seq, arrival.x - buffer.dequeued_x
-        even = abs((arrival.x - buffer.previous_x) * steps - moved) <= moved / 100
-        shortcuts = whole.shortcuts and (even or measured_in == "x")
-        v = buffer.v
-        bends_once = v[0] == qoi.SATURATING or (v[0] == qoi.TABULATED and v[int(v[1]) + 3] == v[-1])
-        if shortcuts and bends_once:
-            return policies.get("greedy-qoi").on_arrival(buffer, arrival, memory)
-        room = fits(buffer, arrival)
-        if level(buffer):
-            smallest = least_gap(buffer, arrival, measured_in)
-            if thins and room and spared(buffer, arrival, smallest, measured_in):
-                return smallest
-            if shortcuts and not even and (buffer.service_ratio >= 0.18 or buffer.capacity <= 3):
-                return policies.get("greedy-qoi").on_arrival(buffer, arrival, memory)
-        elif thins and (g := seen.target(buffer, arrival, measured_in)) is not None:
-            return approached(buffer, arrival, g, measured_in)
-        if shortcuts and still and buffer.drained_bytes == 0:
-            plan = small_queue.planned(buffer, arrival, small_queue.packed())  # test_small_queue.py has its twin
-            if plan != small_queue.NONE:
-                return plan
-        made = whole.still if whole.still is not None and buffer.service_ratio < 0.07 else whole
         s, L = len(buffer.slots), buffer.capacity
         slots, context = np.zeros((len(SLOT_NAMES), L + 1)), np.zeros(len(CONTEXT_NAMES))
         observe_slots(buffer, arrival, slots[: len(SLOT_FIELDS)])
@@ -120,9 +85,7 @@ def twin(whole):
         choices.append((drop_score(L), REJECT))
         best = max(value for value, _ in choices)
         first = next(decision for value, decision in choices if value == best)
-        if room and thins and not still and spared(buffer, arrival, first, measured_in):
-            return first
-        if room and score(made.accept, features(L)) >= best:
+        if fits(buffer, arrival) and score(made.accept, features(L)) >= best:
             return ACCEPT
         return first
 
@@ -135,10 +98,8 @@ def test_decides_as_its_twin_compiled_and_not(case, v, made, capacity):
     case = replace(case, capacity=capacity)
     policy = learned.policy("random-weights", made)
     ours, again, memory = case.run(policy, v), case.senders(v), policy.new_memory(1, capacity)
-    own = len(REMEMBERED) if made.thins else 0
     memory[:] = np.nan  # what the scratch held before does not matter, nor what the episode left
     for _ in range(2):
-        memory[:, :own] = 0.0
         again.load(0, case.episode)
         again.run(policy, memory)
         assert same(ours, again)
@@ -193,30 +154,6 @@ def test_a_linear_scorer_of_merged_gaps_is_the_fixed_policy(field, fixed, case, 
     case = replace(case, capacity=capacity)  # one set of weights serves every L
     linear = start(("rank", field, "service_ratio"), field)
     assert same(case.run(linear, v), case.run(policies.get(fixed), v))
-
-
-def test_where_greed_is_no_trap_it_loses_nothing():
-    """Of 100 interruptions with V = min(1, d / 8) each is as good as the best; the scorer alone is not."""
-    world, L = Interruption(value=qoi.saturating(8), t_max=400), 8
-    episodes = [draw(world, seed) for seed in range(100)]
-    made = weights_file.read(SHIPPED["learned-motion"])[0]
-
-    def total(weights):
-        senders = run(learned.policy("own", weights), episodes, L, world.value)
-        return sum(outcome(senders, i).qoi for i in range(len(episodes)))
-
-    best = sum(clairvoyant(e, L, world.value).qoi for e in episodes)
-    assert total(made) == pytest.approx(best, rel=1e-12)
-    assert total(replace(made, shortcuts=False)) < 0.9999 * best
-
-
-@kernels
-def test_the_scene_moves_evenly_where_each_step_is_like_all_others():
-    buffer = queue_of(0, 8)._replace(dequeued_x=0.0, previous_x=4.0)
-    uneven, even = newcomer(), newcomer()
-    uneven["seq"], uneven["x"] = 4, 4.5  # half a step after three of more
-    even["seq"], even["x"] = 4, 16 / 3
-    assert learned.even(buffer, even) and not learned.even(buffer, uneven)
 
 
 @kernels

@@ -257,13 +257,6 @@ def test_every_v_keeps_the_rules(v, a, b, share):
     assert v(share * a + (1 - share) * b) >= share * v(a) + (1 - share) * v(b) - 1e-12
 
 
-def test_straight_and_then_flat():
-    assert [qoi.straight(v.array) for v in (qoi.exponential(0.5), qoi.saturating(3))] == [False, True]
-    assert qoi.straight(qoi.tabulated([0, 4], [0, 1]).array)
-    assert qoi.straight(qoi.tabulated([0, 4, 9], [0, 0.5, 0.5]).array)
-    assert not qoi.straight(qoi.tabulated([0, 4, 9], [0, 0.5, 0.6]).array)
-
-
 @pytest.mark.parametrize(
     ("build", "rule"),
     [

@@ -14,7 +14,6 @@ from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
 from bufgym.policies import Policy
-from bufgym.policies.gaps import MESSAGES, MOTION
 from bufgym.policies.target_gap import PACE, PERIOD, RATE, SEEN_US, SENT_US, SQUARE, approach, remember, target
 from bufgym.policies.thinning import send_us, spare, steady
 from bufgym.scenario import Episode, messages, suites
@@ -60,15 +59,14 @@ def remembered(rate=7500e-6, pace=2 / 33_333, seen_us=10e6, square=33_333.0**2):
 @kernels
 def test_the_target_is_what_comes_divided_by_what_the_link_and_the_room_carry():
     # In 5 s come 150 frames; the link sends 37.5, and three waiting leave room for 5: one in 150 / 42.5 = 3.53.
-    assert target(*fast(2, 4, 6), remembered(), MOTION) == pytest.approx(2 * 3.53, rel=1e-3)
-    assert target(*fast(2, 4, 6), remembered(pace=1 / 33_333), MESSAGES) == pytest.approx(3.53, rel=1e-3)
+    assert target(*fast(2, 4, 6), remembered()) == pytest.approx(2 * 3.53, rel=1e-3)
     full = fast(0, 1, 2, 3, 4, 5, 6, 7)
-    assert target(*full, remembered(), MOTION) == pytest.approx(2 * 4.0, rel=1e-3)  # no room: as the link sends
+    assert target(*full, remembered()) == pytest.approx(2 * 4.0, rel=1e-3)  # no room: as the link sends
     # Half the rate is that over 20 s, a quarter each that over 0.1 s and 2 s: 7500 x (0.5 + 0.25 + 0).
     slow, arrival = fast(0, 1, 2, 3, 4, 5, 6, 7, short_rate_bytes_per_s=0.0)
-    assert target(slow, arrival, remembered(), MOTION) == pytest.approx(2 * 4 / 0.75, rel=1e-3)
+    assert target(slow, arrival, remembered()) == pytest.approx(2 * 4 / 0.75, rel=1e-3)
     # Motion: 0.6 of what has come since the message dequeued last, 0.4 of the mean over 15 s.
-    assert target(*full, remembered(pace=0.5 / 33_333), MOTION) == pytest.approx(4 * (0.6 * 2 + 0.4 * 0.5), rel=1e-3)
+    assert target(*full, remembered(pace=0.5 / 33_333)) == pytest.approx(4 * (0.6 * 2 + 0.4 * 0.5), rel=1e-3)
 
 
 @kernels
@@ -78,7 +76,7 @@ def test_the_target_is_what_comes_divided_by_what_the_link_and_the_room_carry():
     ids=["short queue", "room for three", "no time"],
 )
 def test_where_the_future_is_not_to_be_told_there_is_no_target(change):
-    assert target(*fast(2, 4, **change), remembered(), MOTION) == 0
+    assert target(*fast(2, 4, **change), remembered()) == 0
 
 
 @kernels
@@ -86,72 +84,71 @@ def test_a_large_newcomer_takes_no_place_from_those_that_wait():
     # Under B of 9000 bytes eight of 1000 wait; with a newcomer of 28000 the mean is 4000, and two would fit.
     buffer, arrival = fast(0, 1, 2, 3, 4, 5, 6, 7, capacity=20, max_bytes=9000)
     arrival["size_bytes"] = 28_000
-    g = target(buffer, arrival, remembered(), MOTION)
+    g = target(buffer, arrival, remembered())
     assert g == pytest.approx(2 * 4.0 * 4, rel=1e-3)  # as the link sends messages four times as large
 
 
 @kernels
 def test_a_stream_must_have_run_for_as_long_as_the_queue_takes_to_be_sent():
     # L = 8 at 7.5 a second: 1.07 s.
-    assert target(*fast(2, 4), remembered(seen_us=1.06e6), MOTION) == 0
-    assert target(*fast(2, 4), remembered(seen_us=1.07e6), MOTION) > 0
-    assert target(*fast(2, 4), remembered(rate=0.0), MOTION) == 0
+    assert target(*fast(2, 4), remembered(seen_us=1.06e6)) == 0
+    assert target(*fast(2, 4), remembered(seen_us=1.07e6)) > 0
+    assert target(*fast(2, 4), remembered(rate=0.0)) == 0
     # Bursts are not followed.
-    assert target(*fast(2, 4), remembered(square=1.4 * 33_333.0**2), MOTION) > 0
-    assert target(*fast(2, 4), remembered(square=1.6 * 33_333.0**2), MOTION) == 0
-    assert target(*fast(2, 4), remembered(pace=0.0), MOTION) == 0
+    assert target(*fast(2, 4), remembered(square=1.4 * 33_333.0**2)) > 0
+    assert target(*fast(2, 4), remembered(square=1.6 * 33_333.0**2)) == 0
+    assert target(*fast(2, 4), remembered(pace=0.0)) == 0
 
 
 @kernels
 def test_the_head_goes_when_its_turn_comes_and_the_next_lies_nearer_to_the_target():
     near = {"left_bytes": 374}  # 1.5 arrivals of 250 bytes: before it is decided for good
-    assert approach(*fast(3, 5, 8, now=12, **near), 9.0, MOTION) == 0  # gaps of 6 or 10: 10 is nearer to 9
-    assert approach(*fast(3, 5, 8, now=12, **near), 7.9, MOTION) == ACCEPT
-    assert approach(*fast(3, 5, 8, now=12, left_bytes=376), 9.0, MOTION) == ACCEPT  # not its turn yet
-    assert approach(*fast(3, 5, 8, now=12, **near), 4.5, MESSAGES) == 0  # the same in messages: 3 or 5
+    assert approach(*fast(3, 5, 8, now=12, **near), 9.0) == 0  # gaps of 6 or 10: 10 is nearer to 9
+    assert approach(*fast(3, 5, 8, now=12, **near), 7.9) == ACCEPT
+    assert approach(*fast(3, 5, 8, now=12, left_bytes=376), 9.0) == ACCEPT  # not its turn yet
 
 
 @kernels
 def test_with_room_goes_what_leaves_a_gap_no_longer_than_the_target():
     # In x, 0 was sent, 4, 8 and 12 wait and 16 comes: each leaves 8, the newcomer 6, as 18 is expected after it.
     # That of the head counts 8 x 0.835 = 6.68.
-    assert approach(*fast(2, 4, 6), 6.0, MOTION) == REJECT
-    assert approach(*fast(2, 4, 6), 5.9, MOTION) == ACCEPT
+    assert approach(*fast(2, 4, 6), 6.0) == REJECT
+    assert approach(*fast(2, 4, 6), 5.9) == ACCEPT
     # With 14 behind 12 that leaves 4 (16 less 12), as does the newcomer: the older of both.
-    assert approach(*fast(2, 4, 6, 7), 4.0, MOTION) == 3
-    assert approach(*fast(4, 5, 6, now=12, sent=3), 4.0, MOTION) == 0
+    assert approach(*fast(2, 4, 6, 7), 4.0) == 3
+    assert approach(*fast(4, 5, 6, now=12, sent=3), 4.0) == 0
 
 
 @kernels
 def test_a_full_queue_drops_the_smallest_gap_older_ones_rather():
     # Each leaves 4 frames, the head's count 3.34; the newcomer leaves 4 where it is frame 19, 2 where it is 17.
     frames = (2, 4, 6, 8, 10, 12, 14, 16)
-    assert approach(*fast(*frames, now=19), 1.0, MOTION) == 0
-    assert approach(*fast(*frames, now=17), 1.0, MOTION) == REJECT
+    assert approach(*fast(*frames, now=19), 1.0) == 0
+    assert approach(*fast(*frames, now=17), 1.0) == REJECT
 
 
 @kernels
 def test_an_idle_or_empty_socket_takes_what_comes():
-    assert approach(*fast(2, 4, 6, busy=0), 99.0, MOTION) == ACCEPT
-    assert approach(*fast(), 99.0, MOTION) == ACCEPT
+    assert approach(*fast(2, 4, 6, busy=0), 99.0) == ACCEPT
+    assert approach(*fast(), 99.0) == ACCEPT
 
 
 @kernels
 def test_long_means_are_kept():
     memory = np.zeros(6)
     buffer, arrival = fast(2, drained_bytes=500, drained_us=20_000)
-    remember(buffer, arrival, memory, MOTION)
+    remember(buffer, arrival, memory)
     assert memory.tolist() == [500 / 20_000, 20_000, 2 / 33_333, 33_333, 33_333, 33_333**2]
-    remember(buffer._replace(evictions=1), arrival, memory, MOTION)  # the same arrival once more
+    remember(buffer._replace(evictions=1), arrival, memory)  # the same arrival once more
     assert memory[SEEN_US] == 33_333
-    remember(buffer._replace(drained_bytes=0, drained_us=10_000), arrival, memory, MESSAGES)
-    assert memory[RATE] == pytest.approx(500 / 30_000) and memory[PACE] == pytest.approx(3 / 66_666)
+    remember(buffer._replace(drained_bytes=0, drained_us=10_000), arrival, memory)
+    assert memory[RATE] == pytest.approx(500 / 30_000) and memory[PACE] == pytest.approx(4 / 66_666)
     assert memory[PERIOD] == pytest.approx(33_333) and memory[SQUARE] == pytest.approx(33_333**2)
     long = np.array([1.0, 60e6, 1.0, 60e6, 1.0, 1.0])  # windows of 20 s and 15 s, however long it has run
-    remember(buffer._replace(drained_bytes=0, drained_us=20_000_000), arrival, long, MESSAGES)
+    remember(buffer._replace(drained_bytes=0, drained_us=20_000_000), arrival, long)
     assert long[RATE] == pytest.approx(0.5)
     assert long[PERIOD] == pytest.approx(1 + 33_332 / 32)  # the newest weighs 1/32
-    assert long[PACE] == pytest.approx((15e6 + 1) / (15e6 + 33_333))
+    assert long[PACE] == pytest.approx((15e6 + 2) / (15e6 + 33_333))
 
 
 def twin():
@@ -159,12 +156,12 @@ def twin():
     seen = Seen()
 
     def on_arrival(buffer, arrival, memory):
-        seen.remember(buffer, arrival, "x")
-        g = seen.target(buffer, arrival, "x")
+        seen.remember(buffer, arrival)
+        g = seen.target(buffer, arrival)
         if g is not None and not level(buffer):
-            return approached(buffer, arrival, g, "x")
-        victim = least_gap(buffer, arrival, "x")
-        return ACCEPT if fits(buffer, arrival) and (seen.bursty or not spared(buffer, arrival, victim, "x")) else victim
+            return approached(buffer, arrival, g)
+        victim = least_gap(buffer, arrival)
+        return ACCEPT if fits(buffer, arrival) and (seen.bursty or not spared(buffer, arrival, victim)) else victim
 
     return Policy("twin", on_arrival, reads_rate=True)
 
@@ -203,35 +200,34 @@ def test_the_fastest_rate_of_late_says_how_long_a_message_takes():
 
 
 @kernels
-@pytest.mark.parametrize("measured_in", [MOTION, MESSAGES])
-def test_what_goes_leaves_no_gap_longer_than_the_link_sends(measured_in):
+def test_what_goes_leaves_no_gap_longer_than_the_link_sends():
     # Sent: 0; queued: 2, 5, 7; frame 8 comes. Without 2 a gap of 5 frames is left, without 5 one of 5, without 7 of 3.
     # The link sends one frame every four.
-    spares = [spare(*waiting(2, 5, 7), victim, measured_in) for victim in (0, 1, 2, REJECT)]
+    spares = [spare(*waiting(2, 5, 7), victim) for victim in (0, 1, 2, REJECT)]
     assert spares == [False, False, True, True]  # without 8: from 7 to 9, which is expected
-    slower = [spare(*waiting(2, 5, 7, rate_bytes_per_s=5900.0), victim, measured_in) for victim in (0, 1)]
+    slower = [spare(*waiting(2, 5, 7, rate_bytes_per_s=5900.0), victim) for victim in (0, 1)]
     assert slower == [True, True]  # one in 5.08
 
 
 @kernels
 def test_the_room_that_is_left_is_to_be_filled_in_a_minute():
     # One frame in four is sent, 450 in a minute; with 26 places more 4 x 450 / 476 = 3.78.
-    assert not spare(*waiting(1, 4, 8, now=12, capacity=29), 0, MESSAGES)  # leaves a gap of 4
-    assert spare(*waiting(1, 4, 8, now=12, capacity=3), 0, MESSAGES)
+    assert not spare(*waiting(1, 4, 8, now=12, capacity=29), 0)  # leaves a gap of 4
+    assert spare(*waiting(1, 4, 8, now=12, capacity=3), 0)
 
 
 @kernels
 def test_the_link_never_waits_for_what_was_spared():
-    assert not spare(*waiting(5, 7), REJECT, MOTION)  # two wait: three are wanted
-    assert not spare(*waiting(2, 5, 7, busy=0), 2, MOTION)
-    assert not spare(*waiting(2, 5, 7, rate_bytes_per_s=0.0), 2, MOTION)
-    assert not spare(*waiting(2, 5, 7, dequeued_arrival_us=8 * 33_333), 2, MOTION)  # all at one time: no pace
+    assert not spare(*waiting(5, 7), REJECT)  # two wait: three are wanted
+    assert not spare(*waiting(2, 5, 7, busy=0), 2)
+    assert not spare(*waiting(2, 5, 7, rate_bytes_per_s=0.0), 2)
+    assert not spare(*waiting(2, 5, 7, dequeued_arrival_us=8 * 33_333), 2)  # all at one time: no pace
 
 
 @kernels
 def test_a_long_queue_on_a_slow_link_is_kept_for_the_end_of_the_stream():
-    assert spare(*waiting(2, 5, 7, capacity=29), 2, MOTION)  # 29 x 1000 / 7500 = 3.87 s
-    assert not spare(*waiting(2, 5, 7, capacity=31), 2, MOTION)  # 4.13 s: over SOON_US
+    assert spare(*waiting(2, 5, 7, capacity=29), 2)  # 29 x 1000 / 7500 = 3.87 s
+    assert not spare(*waiting(2, 5, 7, capacity=31), 2)  # 4.13 s: over SOON_US
 
 
 @kernels

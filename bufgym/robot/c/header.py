@@ -15,9 +15,9 @@ from bufgym.ground.errors import BufgymError, printable
 from bufgym.ground.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.observe.queue import ROUNDING, TINY
-from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value, straight
-from bufgym.policies import Policy, gaps, learned, small_queue, target_gap, thinning
-from bufgym.policies.scoring import end_of, unpack
+from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
+from bufgym.policies import Policy, learned, target_gap, thinning
+from bufgym.policies.scoring import unpack
 from bufgym.robot.c.calls import random_episode, recorded
 
 _PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
@@ -31,8 +31,8 @@ _HELPERS = {
     "bufgym_thin(": "thin.h",
 }
 """Parts that rules share, each before its callers."""
-_LEARNED = (*("gaps.h", "thinning.h", "target_gap.h"), *("features.h", "greedy.h", "small_queue.h", "scorer.h"))
-"""Parts of a learned agent; only an agent that thins uses the target gap."""
+_LEARNED = ("features.h", "scorer.h")
+"""Parts of a learned agent."""
 _TARGET = (
     *("HORIZON_US", "SHORT", "LONG", "REST", "LINK_US", "PACED", "PACE_US", "NEAR", "DISCOUNT"),
     *("LEAST", "BURSTY", "LATE", "WITHIN"),
@@ -66,7 +66,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     """
     check_limits(capacity, max_bytes)
     learns = policy.on_arrival is learned.on_arrival
-    body = _agent(policy) if learns else _rule(policy)
+    body = "".join(map(_part, _LEARNED)) if learns else _rule(policy)
     if "bufgym_departure(" not in body:
         body += "\n" + _part("no_departure.h")
     unlimited = max_bytes is None
@@ -88,28 +88,17 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "POLICY": body,
         "TINY": repr(TINY),
         "ROUNDING": repr(ROUNDING),
-        "STILL": repr(learned.STILL),
-        "MOTION": gaps.MOTION,
-        "MESSAGES": gaps.MESSAGES,
         "WAITING": thinning.WAITING,
         "SOON_US": repr(thinning.SOON_US),
         **{name: repr(getattr(target_gap, name)) for name in _TARGET},
         "UNPACED": repr(1 - target_gap.PACED),
-        "FLOWS": repr(learned.FLOWS),
-        "FEW": learned.FEW,
         "STEADY_US": repr(thinning.HORIZON_US),
         "STEADY": repr(thinning.STEADY),
-        "STRAIGHT": int(straight(value.array)),
         "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
     }
     if learns:
-        numbers |= _scorers(policy) | _plans(value)
+        numbers |= _scorer(policy)
     return _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
-
-
-def _agent(policy: Policy) -> str:
-    """Write the C of a learned agent."""
-    return "".join(_part(part) for part in _LEARNED if part != "target_gap.h" or policy.memory)
 
 
 def _rule(policy: Policy) -> str:
@@ -126,32 +115,16 @@ def _rule(policy: Policy) -> str:
     return helpers + rule
 
 
-def _scorers(policy: Policy) -> dict[str, Any]:
-    """Collect the values for a learned policy's C: its scorers, their scratch and the fields."""
-    parameters, begin, networks = np.array(policy.weights), 1, len(learned.Weights.NETWORKS)
-    entries: list[str] = []
-    flags = int(parameters[0])
-    shortcuts, thins = (int(flags & flag > 0) for flag in (learned.LEAVES, learned.THINS))
-    measured_in = "MOTION" if flags & learned.SEES_MOTION else "MESSAGES"
-    end = len(parameters) - shortcuts * small_queue.NUMBERS
-    text, inputs, units = "", 1, 1
-    while begin < end:
-        scorer = getattr(unpack, "py_func", unpack)(parameters, begin, networks)
-        k, n = len(entries), len(scorer.fields)
-        text += _array("int", f"bufgym_fields_{k}", scorer.fields.astype(int))
-        text += _array("double", f"bufgym_networks_{k}", scorer.networks)
-        if len(scorer.mix):
-            text += _array("double", f"bufgym_mix_{k}", scorer.mix)
-        sizes = n, scorer.context, scorer.first, scorer.second, scorer.size, len(scorer.mix)
-        arrays = f"bufgym_fields_{k}, bufgym_networks_{k}, {f'bufgym_mix_{k}' if len(scorer.mix) else '0'}"
-        entries.append(f"    {{{', '.join(map(str, sizes))}, {arrays}}},\n")
-        inputs, units = max(inputs, n), max(units, 2 * scorer.first + scorer.second)
-        begin = end_of(parameters, begin, networks)
-    text += "/* The second one decides while the link stands still. */\n" if len(entries) > 1 else ""
-    text += f"#define BUFGYM_SCORERS {len(entries)}\n"
-    text += f"#define BUFGYM_SHORTCUTS {shortcuts}\n"
-    text += f"#define BUFGYM_THINS {thins}\n#define BUFGYM_MEASURED_IN BUFGYM_{measured_in}\n"
-    text += f"static const struct bufgym_scorer bufgym_scorers[] = {{\n{''.join(entries)}}};\n"
+def _scorer(policy: Policy) -> dict[str, Any]:
+    """Collect the values for a learned policy's C: its scorer, the scratch and the fields."""
+    scorer = getattr(unpack, "py_func", unpack)(np.array(policy.weights), len(learned.Weights.NETWORKS))
+    inputs, units = len(scorer.fields), max(1, 2 * scorer.first + scorer.second)
+    text = _array("int", "bufgym_fields", scorer.fields.astype(int))
+    text += _array("double", "bufgym_networks", scorer.networks)
+    text += _array("double", "bufgym_mix", scorer.mix) if len(scorer.mix) else ""
+    sizes = inputs, scorer.context, scorer.first, scorer.second, scorer.size, len(scorer.mix)
+    arrays = f"bufgym_fields, bufgym_networks, {'bufgym_mix' if len(scorer.mix) else '0'}"
+    text += f"static const struct bufgym_scorer bufgym_scorer = {{{', '.join(map(str, sizes))}, {arrays}}};\n"
     scratch = (
         "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"
         f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{learned.CONTEXT}];\n"
@@ -162,22 +135,6 @@ def _scorers(policy: Policy) -> dict[str, Any]:
         "SCRATCH": scratch,
         "SLOT_FIELDS": _enum(learned.SLOT_NAMES),
         "CONTEXT_FIELDS": _enum(learned.CONTEXT_NAMES),
-        "PLANS": _array("int64_t", "bufgym_plans", small_queue.packed() if shortcuts else [0]),
-    }
-
-
-def _plans(value: Value) -> dict[str, Any]:
-    """Collect the values for the plans of small queues, besides the plans themselves."""
-    log_base = float(value.array[1]) if value.array[0] == EXPONENTIAL else 0.0
-    return {
-        "PLAN_LOG_BASE": repr(log_base),
-        "PLAN_FIRST": repr(small_queue.FIRST),
-        "PLAN_STEP": repr(small_queue.STEP),
-        "PLAN_SLACK": repr(small_queue.SLACK),
-        "PLAN_BASES": len(small_queue.BASES),
-        "PLAN_ALL": small_queue.EACH,
-        "PLAN_SIZE": small_queue.PLAN,
-        "PLAN_LONGEST": small_queue.LONGEST,
     }
 
 

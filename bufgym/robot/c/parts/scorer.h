@@ -71,50 +71,13 @@ static inline double bufgym_score(
     return common + own;
 }
 
-/* Whether the scene moves evenly, from message to message. */
-static inline int bufgym_even(const struct bufgym_queue *q, const struct bufgym_message *arrival)
-{
-    const double moved = arrival->x - q->dequeued_x, step = arrival->x - q->previous_x;
-    return fabs(step * (double)(arrival->seq - q->dequeued_seq) - moved) <= @STEADY@ * moved;
-}
-
-/* The decision that scores highest, or that of what decides instead; of equal scores the oldest message's. */
+/* The decision that scores highest; of equal scores the oldest message's. */
 static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
-    const int still = q->service_ratio < @STILL@, even = bufgym_even(q, arrival);
-    const int leaves = BUFGYM_SHORTCUTS && (BUFGYM_MEASURED_IN == BUFGYM_MOTION || even);
-    const struct bufgym_scorer *scorer = &bufgym_scorers[still ? BUFGYM_SCORERS - 1 : 0];
+    const struct bufgym_scorer *scorer = &bufgym_scorer;
     const int s = q->occupancy, L = BUFGYM_CAPACITY;
     double common, best = -HUGE_VAL;
     int i, k, decision = BUFGYM_REJECT;
-#if BUFGYM_THINS
-    bufgym_remember(q, arrival, BUFGYM_MEASURED_IN);
-#endif
-    if (leaves && @STRAIGHT@)
-        return bufgym_greedy(q, arrival);
-    if (bufgym_steady(q)) {
-#if BUFGYM_THINS
-        if (!bufgym_bursty(q) && bufgym_has_space(q, arrival)) {
-            const int smallest = bufgym_smallest_gap(q, arrival, BUFGYM_MEASURED_IN, 0.0);
-            if (bufgym_spare(q, arrival, smallest, BUFGYM_MEASURED_IN))
-                return smallest;
-        }
-#endif
-        if (leaves && !even && (q->service_ratio >= @FLOWS@ || L <= @FEW@))
-            return bufgym_greedy(q, arrival);
-    }
-#if BUFGYM_THINS
-    else {
-        const double g = bufgym_target(q, arrival, BUFGYM_MEASURED_IN);
-        if (g > 0.0)
-            return bufgym_approach(q, arrival, g, BUFGYM_MEASURED_IN);
-    }
-#endif
-    if (leaves && still && q->drained_bytes == 0) {
-        const int plan = bufgym_planned(q, arrival);
-        if (plan != BUFGYM_NO_PLAN)
-            return plan;
-    }
     bufgym_observe_context(q, arrival);
     bufgym_observe_slots(q, arrival);
     for (i = 0; i < scorer->context; i++)
@@ -128,10 +91,6 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
         }
     }
     if (bufgym_has_space(q, arrival)) {
-#if BUFGYM_THINS
-        if (!still && !bufgym_bursty(q) && bufgym_spare(q, arrival, decision, BUFGYM_MEASURED_IN))
-            return decision;
-#endif
         common = bufgym_begin(q, scorer, BUFGYM_KEEP);
         if (bufgym_score(q, scorer, BUFGYM_KEEP, common, L) >= best)
             decision = BUFGYM_ACCEPT;

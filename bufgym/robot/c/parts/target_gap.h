@@ -4,7 +4,7 @@ enum { BUFGYM_RATE, BUFGYM_SENT_US, BUFGYM_PACE, BUFGYM_SEEN_US, BUFGYM_PERIOD, 
 
 /* Renew the long means. */
 static inline void
-bufgym_remember(struct bufgym_queue *q, const struct bufgym_message *arrival, int measured_in)
+bufgym_remember(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     double *memory = q->memory;
     const double sent_us = (double)q->drained_us, us = (double)(arrival->arrival_us - q->previous_us);
@@ -18,7 +18,7 @@ bufgym_remember(struct bufgym_queue *q, const struct bufgym_message *arrival, in
     memory[BUFGYM_PERIOD] += weight * (us - memory[BUFGYM_PERIOD]);
     memory[BUFGYM_SQUARE] += weight * (us * us - memory[BUFGYM_SQUARE]);
     if (us > 0.0) {
-        const double step = measured_in == BUFGYM_MESSAGES ? 1.0 : arrival->x - q->previous_x;
+        const double step = arrival->x - q->previous_x;
         bufgym_average(&memory[BUFGYM_PACE], step, us, memory[BUFGYM_SEEN_US], @PACE_US@);
         memory[BUFGYM_SEEN_US] += us;
     }
@@ -32,7 +32,7 @@ static inline int bufgym_bursty(const struct bufgym_queue *q)
 
 /* The gap at which the link and the room that is left carry what comes within the horizon; 0 where it cannot be told. */
 static inline double
-bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival, int measured_in)
+bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     const double *memory = q->memory;
     const int L = bufgym_places(q, arrival);
@@ -49,26 +49,25 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
     r = (recent / 1e6 + @REST@ * memory[BUFGYM_RATE]) / bufgym_mean_bytes(q, arrival);
     if (L > r * memory[BUFGYM_SEEN_US])
         return 0.0;
-    m = @UNPACED@ * bufgym_come(q, arrival, measured_in) / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
+    m = @UNPACED@ * (arrival->x - q->dequeued_x) / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
     return m * @HORIZON_US@ / (r * @HORIZON_US@ + L - q->occupancy);
 }
 
 /* The decision that brings the gaps to g. */
 static inline int bufgym_approach(
-    const struct bufgym_queue *q, const struct bufgym_message *arrival, double g, int measured_in)
+    const struct bufgym_queue *q, const struct bufgym_message *arrival, double g)
 {
     const int s = q->occupancy, room = bufgym_has_space(q, arrival);
-    double head, left;
     int victim;
     if (room && (s == 0 || q->busy == 0))
         return BUFGYM_ACCEPT;
     if (s > 0 && (double)q->left_bytes * 1e6 < @NEAR@ * q->period_us * (1e6 * q->short_rate)) {
-        bufgym_gap(q, arrival, 0, measured_in, &head, &left);
-        if (fabs(left - g) < fabs(head - g))
+        const struct bufgym_gaps head = bufgym_gaps_of(q, arrival, 0);
+        if (fabs(head.before_x + head.after_x - g) < fabs(head.before_x - g))
             return 0;
     }
-    victim = bufgym_smallest_gap(q, arrival, measured_in, @DISCOUNT@);
-    if (room && bufgym_gap_left(q, arrival, victim, measured_in) > @WITHIN@ * g)
+    victim = bufgym_smallest_gap(q, arrival, @DISCOUNT@);
+    if (room && bufgym_gap_left(q, arrival, victim) > @WITHIN@ * g)
         return BUFGYM_ACCEPT;
     return victim;
 }

@@ -29,52 +29,25 @@ static inline double bufgym_send_us(const struct bufgym_queue *q, const struct b
     return rate > 0.0 ? 1e6 * bufgym_mean_bytes(q, arrival) / rate : 0.0;
 }
 
-enum { BUFGYM_MOTION = @MOTION@, BUFGYM_MESSAGES = @MESSAGES@ };
-
-/* How far the scene has moved on, or how many messages have come, since the message dequeued last. */
-static inline double
-bufgym_come(const struct bufgym_queue *q, const struct bufgym_message *arrival, int measured_in)
-{
-    return measured_in == BUFGYM_MESSAGES ? (double)(arrival->seq - q->dequeued_seq) : arrival->x - q->dequeued_x;
-}
-
-/* The gap before slot k (q->occupancy: the newcomer) and the one that is left if it goes, in motion or in messages. */
-static inline void bufgym_gap(
-    const struct bufgym_queue *q, const struct bufgym_message *arrival, int k, int measured_in, double *own, double *left)
-{
-    const int s = q->occupancy;
-    const int64_t before = k > 0 ? q->slots[k - 1].seq : q->dequeued_seq, at = k < s ? q->slots[k].seq : arrival->seq;
-    const int64_t after = k == s ? arrival->seq + 1 : k + 1 < s ? q->slots[k + 1].seq : arrival->seq;
-    if (measured_in == BUFGYM_MOTION) {
-        const struct bufgym_gaps gaps = bufgym_gaps_of(q, arrival, k);
-        *own = gaps.before_x;
-        *left = gaps.before_x + gaps.after_x;
-    } else {
-        *own = at > before ? (double)(at - before) : 0.0;
-        *left = after > before ? (double)(after - before) : 0.0;
-    }
-}
-
 /* The gap that is left if `victim` goes: a slot, or BUFGYM_REJECT for the newcomer. */
 static inline double bufgym_gap_left(
-    const struct bufgym_queue *q, const struct bufgym_message *arrival, int victim, int measured_in)
+    const struct bufgym_queue *q, const struct bufgym_message *arrival, int victim)
 {
-    double own, left;
-    bufgym_gap(q, arrival, victim == BUFGYM_REJECT ? q->occupancy : victim, measured_in, &own, &left);
-    return left;
+    const struct bufgym_gaps gaps = bufgym_gaps_of(q, arrival, victim == BUFGYM_REJECT ? q->occupancy : victim);
+    return gaps.before_x + gaps.after_x;
 }
 
 /* The slot that would leave the smallest gap, BUFGYM_REJECT for the newcomer; of equals the oldest. That of slot k of s
    counts `discount` (1 - k / s) less. */
 static inline int bufgym_smallest_gap(
-    const struct bufgym_queue *q, const struct bufgym_message *arrival, int measured_in, double discount)
+    const struct bufgym_queue *q, const struct bufgym_message *arrival, double discount)
 {
     const int s = q->occupancy;
     double smallest = HUGE_VAL;
     int k, victim = BUFGYM_REJECT;
     for (k = 0; k <= s; k++) {
-        double own, left;
-        bufgym_gap(q, arrival, k, measured_in, &own, &left);
+        const struct bufgym_gaps gaps = bufgym_gaps_of(q, arrival, k);
+        double left = gaps.before_x + gaps.after_x;
         if (k < s)
             left *= 1 - discount * (1 - (double)k / s);
         if (left < smallest) {
@@ -88,7 +61,7 @@ static inline int bufgym_smallest_gap(
 /* Whether a queue with room can spare `victim`: enough wait for the link, a full queue would soon be sent, and the
    victim's neighbours then lie no farther apart than the link sends. */
 static inline int bufgym_spare(
-    const struct bufgym_queue *q, const struct bufgym_message *arrival, int victim, int measured_in)
+    const struct bufgym_queue *q, const struct bufgym_message *arrival, int victim)
 {
     const int s = q->occupancy, L = bufgym_places(q, arrival);
     const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
@@ -99,7 +72,7 @@ static inline int bufgym_spare(
     if (L * each_us > @SOON_US@)
         return 0;
     each_us = @STEADY_US@ / (@STEADY_US@ / each_us + L - s);
-    return bufgym_gap_left(q, arrival, victim, measured_in) * elapsed_us
-        <= bufgym_come(q, arrival, measured_in) * each_us;
+    return bufgym_gap_left(q, arrival, victim) * elapsed_us
+        <= (arrival->x - q->dequeued_x) * each_us;
 }
 
