@@ -12,7 +12,7 @@ import pytest
 from safetensors.numpy import load_file
 from train_cases import columns, in_a_folder_of_its_own  # noqa: F401
 
-from agents import training
+from agents import cluster, training
 from agents.cma_es import Evolution
 from agents.mixed_env import Cell, cells
 from agents.objectives import queue
@@ -20,7 +20,6 @@ from agents.objectives.objective import to_vector, with_vector
 from agents.runs import MODEL, prepare
 from agents.settings import LINK, MOTION, SEES, Settings
 from bufgym import policies
-from bufgym.benchmark import cluster
 from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import exponential
 from bufgym.oracle import integer, law
