@@ -1,7 +1,6 @@
 """The parts of training on a suite: padded rows, the slot network, double DQN, evaluation sets, ablation."""
 
 import dataclasses
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,11 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cli_cases import Patch
 from stable_baselines3.common.logger import Logger
 from train_cases import DropOldest
 
-from agents import ablation, mixed_env, runs, training
+from agents import mixed_env, runs, training
 from agents.dqn import INVALID, valid_actions
 from agents.evaluation import EvaluationSet, sweep_for
 from agents.settings import Settings
@@ -223,27 +221,3 @@ def test_the_best_validation_is_the_earliest_of_equals(tmp_path: Path) -> None:
     best = [validations.add(steps, 0.0, (regret,)) for steps, regret in ((0, 0.5), (20, 0.4), (30, 0.4))]
     assert best == [True, True, False] and validations.best[0] == 20
     assert [validations.due(steps) for steps in (30, 40, 49, 50)] == [False, True, True, True]
-
-
-HEAD = "steps,seconds,score,regret,over_afr,over_rivals\n"
-
-
-def run_of(folder: Path, name: str, algo: str, validations: dict[int, str]) -> Path:
-    """A run's folder, as train.py leaves it, but for the agents."""
-    run = folder / name
-    settings = dataclasses.replace(Settings(suite="interruption-v1", name=name), algo=algo, seeds=3)
-    for seed, rows in validations.items():
-        (run / f"seed-{seed}").mkdir(parents=True)
-        (run / f"seed-{seed}" / "validation.csv").write_text(HEAD + rows, encoding="utf-8")
-    (run / "settings.json").write_text(json.dumps({"command": settings.command, **dataclasses.asdict(settings)}))
-    return run
-
-
-def test_the_best_of_n_seeds_is_chosen_by_validation_and_shown_on_the_test(tmp_path: Path, monkeypatch: Patch) -> None:
-    """Validation says 0.5, 0.6, 0.7, the test 0.58, 0.55, 0.9: of two, seed 0 is chosen twice and seed 1 once."""
-    validations = {s: f"0,0,0,0,0,1.5\n1,1,0,0,0,{over}\n" for s, over in enumerate((0.5, 0.6, 0.7))}
-    run = run_of(tmp_path, "mine", "evolution", validations)
-    tested = {"seed-0": 0.58, "seed-1": 0.55, "seed-2": 0.9}
-    monkeypatch.setattr(ablation, "tested", lambda settings, model: [tested[model.parent.name]])
-    rows = ["| best of 1 | 0.600 | 0.677 |", "| best of 2 | 0.533 | 0.570 |", "| best of 3 | 0.500 | 0.580 |"]
-    assert ablation.more_seeds(run)[2:] == rows

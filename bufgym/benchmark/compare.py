@@ -124,7 +124,7 @@ def compare(
         capacity: L, messages, or several; by default 8, or the suite's.
         seeds: so many episodes on each trace, or these; by default 10, or the suite's.
         progress: show a bar on stderr, where that is a terminal.
-        about: a line that stands above the table; by default what ``on`` is.
+        about: lines that stand above the table and explain it; by default what ``on`` is.
         settings: of a queue, ``max_bytes`` and ``decide_at``; the others are parameters of a scenario that is named.
 
     Raises:
@@ -155,6 +155,8 @@ def compare(
         rows = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
         floor = run([BASELINE], stream, capacities, seeds, label=label, bound=False, **queue) if alone else []
         shown = table.of(rows, floor)
+        if not about and "score" in shown.head:
+            shown = shown._replace(notes=[table.SCORE, *shown.notes])
     return Comparison(rows, about or label or repr(stream), shown.plain(), shown.markdown(), shown.html())
 
 

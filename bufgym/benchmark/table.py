@@ -226,7 +226,7 @@ def of(rows: Rows, floor: Rows = ()) -> Table:
     blocks = [("", [[written(entry[c.key], c) for c in columns] for entry in block]) for block in by_capacity]
     notes = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked(rows).items()]
     notes += [*told_once(same(rows)), *([f"note: {UPPER_BOUND}"] if inexact else []), *invalid(rows)]
-    return Table(titles, blocks, [*([SCORE] if "score" in bounded else []), *notes])
+    return Table(titles, blocks, notes)
 
 
 def written(number: Any, column: Column) -> str:

@@ -43,10 +43,10 @@ def _fleets() -> None:
 
 
 PARTS: dict[str, Callable[[], object]] = {
-    "policies of one queue": lambda: run(policies.names(for_topics=False), Interruption(t_max=5), [_L], 1),
+    "policies of one queue": lambda: run(list(policies.names(for_topics=False)), Interruption(t_max=5), [_L], 1),
     "environments": _environments,
     "policies of several topics": lambda: run(
-        policies.names(for_topics=True), scenario.get("topics", duration_s=1.0), [_L], 1
+        list(policies.names(for_topics=True)), scenario.get("topics", duration_s=1.0), [_L], 1
     ),
     "the clairvoyant": _bound,
     "fleets": _fleets,

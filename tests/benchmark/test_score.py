@@ -318,7 +318,7 @@ def test_policies_that_no_row_tells_apart_are_one_line() -> None:
     assert table.same(rows) == {"drop-oldest": ["ros-keep-last"]}
     lines = table.of(rows).plain().split("\n")
     assert [line.split()[0] for line in lines[1:4]] == ["mine", "drop-oldest", "near"]
-    assert lines[5] == "note: ros-keep-last: the same rows here as drop-oldest"
+    assert lines[4] == "note: ros-keep-last: the same rows here as drop-oldest"
     assert "| drop-oldest |" in table.of(rows).markdown() and "| ros-keep-last |" not in table.of(rows).markdown()
     # One that does not compete is a line of its own, whatever its rows.
     unbounded = [{**entry, "policy": "rosbridge"} for entry in BASE]

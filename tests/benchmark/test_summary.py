@@ -109,12 +109,6 @@ def test_margins_by_hand() -> None:
     )
 
 
-def test_an_episode_over_two_transports_is_one() -> None:
-    again = [one(policy, seed, 4.5, 4.5, "ros1") for policy in ("afr", "random") for seed in (0, 1)]
-    [margin] = margins([*AFR, one("random", 0, 4.1, 4.2), one("random", 1, 3.2, 3.2), *again])
-    assert margin.episodes == 2 and margin.live.value == pytest.approx(0.3 / 20)
-
-
 def test_nothing_is_said_of_a_single_episode_or_without_the_reference() -> None:
     assert margins([AFR[0], one("random", 0, 4.1, 4.2)]) == []
     assert margins([one("random", 0, 4.1, 4.2), one("random", 1, 4.1, 4.2)]) == []
